@@ -1,11 +1,13 @@
 //! Atomic files: complete under their name, or absent, and written by one process at a time. Everything that writes files
 //! uses them.
 
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::fs::{self, File, Metadata, TryLockError};
 use std::hash::{BuildHasher, RandomState};
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 /// Bytes that are buffered before a write.
@@ -50,14 +52,12 @@ impl AtomicFile {
     /// Creates the file, and its folder if necessary.
     ///
     /// # Errors
-    /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, is writing the file.
+    /// Those of [`require_replaceable`]; the system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, is
+    /// writing the file.
     pub fn create(path: &Path, unfinished: IfUnfinished) -> io::Result<Self> {
+        require_replaceable(path)?;
         if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder)?;
-        }
-        if fs::metadata(path).is_ok_and(|found| !found.is_file()) {
-            let reason = "something is there that is not a regular file; expected a file or a new name";
-            return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
         }
         let (partial_path, file) = create_partial(path)?;
         let partial = Self {
@@ -120,6 +120,99 @@ impl AtomicFile {
         kept.push(PARTIAL);
         kept.into()
     }
+}
+
+/// Files that a command reads, which nothing in this process replaces while this lives.
+#[derive(Debug, Default)]
+pub struct ProtectedInputs(Vec<FileKey>);
+
+/// A file by what the system knows it by, whatever names lead to it.
+#[cfg(unix)]
+type FileKey = (u64, u64);
+#[cfg(not(unix))]
+type FileKey = PathBuf;
+
+/// Inputs of all commands, and how many protect each.
+static PROTECTED: Mutex<BTreeMap<FileKey, usize>> = Mutex::new(BTreeMap::new());
+
+impl ProtectedInputs {
+    /// Protects regular files; others, and names that lead nowhere, are left to those who open them.
+    pub fn of<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Self {
+        let keys: Vec<FileKey> = paths.into_iter().filter_map(|path| key_of(path.as_ref())).collect();
+        let mut protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
+        keys.iter().for_each(|key| *protected.entry(key.clone()).or_default() += 1);
+        Self(keys)
+    }
+}
+
+impl Drop for ProtectedInputs {
+    fn drop(&mut self) {
+        let mut protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
+        for key in &self.0 {
+            if let Some(count) = protected.get_mut(key) {
+                *count -= 1;
+            }
+        }
+        protected.retain(|_, count| *count > 0);
+    }
+}
+
+#[cfg(unix)]
+fn key_of(path: &Path) -> Option<FileKey> {
+    use std::os::unix::fs::MetadataExt;
+    fs::metadata(path).ok().filter(Metadata::is_file).map(|found| (found.dev(), found.ino()))
+}
+
+#[cfg(not(unix))]
+fn key_of(path: &Path) -> Option<FileKey> {
+    fs::canonicalize(path).ok().filter(|path| path.is_file())
+}
+
+/// Requires that a file may be written at `path`, in place of what is there: the one gate of everything that writes files.
+///
+/// # Errors
+/// [`io::ErrorKind::InvalidInput`] for an input of a command in this process, by whatever name, for a link to another file, and for
+/// anything that is not a regular file.
+pub fn require_replaceable(path: &Path) -> io::Result<()> {
+    let refuse = |reason: String| Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
+    let protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
+    if key_of(path).is_some_and(|key| protected.contains_key(&key)) {
+        return refuse("it is read as an input, which would be lost; expected another name".to_owned());
+    }
+    match fs::symlink_metadata(path) {
+        Ok(found) if found.is_symlink() => {
+            let to = fs::read_link(path).unwrap_or_default();
+            refuse(format!(
+                "it is a link to {}; expected a file, a new name, or that name itself",
+                to.display()
+            ))
+        }
+        Ok(found) if !found.is_file() => {
+            refuse("something is there that is not a regular file; expected a file or a new name".to_owned())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// A file that is written as it grows, for those who follow it. It takes the place of an older one at once, whole and empty; a pipe or
+/// a terminal is written to.
+///
+/// # Errors
+/// As [`AtomicFile::create`].
+pub fn growing_file(path: &Path) -> io::Result<File> {
+    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+        return File::options().write(true).open(path);
+    }
+    require_replaceable(path)?;
+    if let Some(folder) = folder_of(path) {
+        fs::create_dir_all(folder)?;
+    }
+    let (partial_path, file) = create_partial(path)?;
+    if let Err(error) = fs::rename(&partial_path, path) {
+        let _ = fs::remove_file(&partial_path);
+        return Err(error);
+    }
+    Ok(file)
 }
 
 /// A new, locked file for the content of `path`, in its folder.
@@ -251,6 +344,20 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish().map(|_| ())
 }
 
+/// Reads a text of at most `bytes_max` bytes: what never ends, such as a device, is an error and no loss of memory.
+///
+/// # Errors
+/// The system's error; [`io::ErrorKind::FileTooLarge`]; [`io::ErrorKind::InvalidData`] for what is not UTF-8.
+pub fn read_text(path: &Path, bytes_max: u64) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(bytes_max.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > bytes_max {
+        let reason = format!("longer than {bytes_max} bytes, the most that is expected of it");
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, reason));
+    }
+    String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+}
+
 /// A new file in a folder that has no name there: it is gone once it is closed, however the process ends.
 ///
 /// # Errors
@@ -353,6 +460,18 @@ impl Drop for FolderLock {
             }
         }
     }
+}
+
+/// Room and size of the disk that a folder is on, bytes; `None` if the system does not tell.
+#[must_use]
+pub fn disk_room(folder: &Path) -> Option<[u64; 2]> {
+    #[cfg(unix)]
+    return rustix::fs::statvfs(folder).ok().map(|found| {
+        let bytes = |blocks: u64| blocks.saturating_mul(found.f_frsize);
+        [bytes(found.f_bavail), bytes(found.f_blocks)]
+    });
+    #[cfg(not(unix))]
+    return folder.file_name().and(None);
 }
 
 /// Whether `path` leads to an open file.
@@ -509,6 +628,61 @@ mod tests {
         write_atomically(&path, b"whole").unwrap();
         assert_eq!(fs::read(&victim).unwrap(), b"precious");
         assert_eq!(fs::read(&path).unwrap(), b"whole");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn inputs_and_links_are_not_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = |name: &str| folder.path().join(name);
+        for name in ["input", "other"] {
+            fs::write(place(name), name).unwrap();
+        }
+        fs::hard_link(place("input"), place("second-name")).unwrap();
+        std::os::unix::fs::symlink(place("other"), place("link")).unwrap();
+        std::os::unix::fs::symlink(place("nowhere"), place("dangling")).unwrap();
+        let said = |name: &str| write_atomically(&place(name), b"new").unwrap_err().to_string();
+        {
+            let _inputs = ProtectedInputs::of([place("input"), place("missing")]);
+            let _twice = ProtectedInputs::of([place("input")]);
+            drop(ProtectedInputs::of([place("input")]));
+            for name in ["input", "second-name"] {
+                assert!(said(name).contains("read as an input"), "{}", said(name));
+                assert!(growing_file(&place(name)).is_err());
+            }
+            write_atomically(&place("missing"), b"new").unwrap();
+        }
+        assert!(said("link").contains("is a link to") && said("dangling").contains("is a link to"));
+        assert!(growing_file(&place("link")).is_err());
+        assert_eq!(fs::read(place("input")).unwrap(), b"input");
+        assert_eq!(fs::read(place("other")).unwrap(), b"other");
+        // Once nobody reads it, it is a file as others.
+        write_atomically(&place("second-name"), b"new").unwrap();
+        assert_eq!(fs::read(place("input")).unwrap(), b"input");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_never_ends_is_not_read() {
+        assert_eq!(read_text(Path::new("/dev/zero"), 1000).unwrap_err().kind(), io::ErrorKind::FileTooLarge);
+        let file = tempfile::NamedTempFile::new().unwrap();
+        fs::write(file.path(), "text").unwrap();
+        assert_eq!(read_text(file.path(), 4).unwrap(), "text");
+        assert!(read_text(file.path(), 3).is_err());
+    }
+
+    #[test]
+    fn a_growing_file_takes_the_place_of_the_older_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("events");
+        fs::write(&path, "older").unwrap();
+        let older = File::open(&path).unwrap();
+        let mut file = growing_file(&path).unwrap();
+        file.write_all(b"first\n").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"first\n");
+        // Whoever has the older one open keeps it.
+        assert_eq!(io::read_to_string(older).unwrap(), "older");
+        assert_eq!(names(folder.path()), ["events"]);
     }
 
     #[test]

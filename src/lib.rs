@@ -1,62 +1,72 @@
 //! The open data chain of a lunar-orbit radio interferometer, from a sky to a map of it.
 //!
+//! A mission is simulated, sent down as bytes, received and mapped in one chain of calls:
+//!
 //! ```
-//! use lunarray::downlink::Contents;
-//! use lunarray::pipeline::{ConfigSource, Plan, run};
-//! use lunarray::runtime::Cancel;
+//! use lunarray::prelude::*;
 //! use lunarray::sky::fits::{ReadOptions, read_map};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! // The pipeline `quicklook`, made small. `pipelines/reference.toml` lists all keys.
-//! let keys = ["sky.nside=8", "spacecraft.channels_hz=[3e6]", "spacecraft.every_nth_window=300",
-//!     "spacecraft.every_nth_integration=2", "spacecraft.baseline_wavelengths_max=16.0",
-//!     "map.nside=4", "map.epsilon=1e-4", "products.pictures=false"];
-//! let source = ConfigSource { overrides: keys.map(str::to_owned).to_vec(), ..ConfigSource::default() };
-//! let plan = Plan::new(source.load()?)?;
+//! # let out = tempfile::tempdir()?;
+//! # let out = out.path();
+//! let summary = Mission::dsl()
+//!     .channels(&[3e6])
+//!     .nside(4)
+//!     .set("spacecraft.every_nth_integration", 15) // Seconds instead of minutes: pipelines/reference.toml has all keys.
+//!     .set("spacecraft.baseline_wavelengths_max", 16)
+//!     .out(out)
+//!     .run()?;
+//! println!("{} visibilities are in the map", summary.channels[0].visibilities);
 //!
-//! // Sky, spacecraft, downlink, ground and products, on a thread a stage.
-//! let out = tempfile::tempdir()?;
-//! let summary = run(&plan, out.path(), &Cancel::new(), &mut |_watched| {})?;
-//! assert_eq!(summary.channels.len(), 1);
-//!
-//! // What went down, and what was made of it.
-//! let contents = Contents::read(&out.path().join("downlink.ccsds"))?;
+//! let contents = Contents::read(&out.join("downlink.ccsds"))?;
 //! assert!(contents.visibilities.count >= summary.channels[0].visibilities);
-//! let map = read_map(&out.path().join("3.000MHz/map.fits"), &ReadOptions::default())?;
+//! let map = read_map(&out.join("3.000MHz/map.fits"), &ReadOptions::default())?;
 //! assert_eq!(map.nside(), 4);
 //! # Ok(())
 //! # }
 //! ```
 //!
-//! Modules stand in the order in which data passes them: a [`sky`] is seen by an [`mod@array`] of satellites through
-//! the beam matrix ([`response`]), sampled by the [`daughters`], correlated and integrated by the [`mother`], sent down
-//! ([`downlink`]), calibrated ([`calibration`]), turned into maps ([`imaging`]: normal equations and
-//! their solution) by the [`ground`], and written out ([`products`]). The [`runtime`] moves data between stages and knows no physics; the
-//! [`pipeline`] turns a configuration into a running graph. A module uses only modules before it in `docs/ARCHITECTURE.md`,
-//! which also says where to add what; `tests/tree/` enforces it.
-//!
-//! Ground modules never import `daughters` or `mother`: the only thing that crosses is bytes.
-//!
-//! # Entry points
+//! # Where to begin
 //! | to | use | example |
 //! |---|---|---|
-//! | run the chain, or one segment of it | [`pipeline::run`], [`pipeline::simulate`], [`pipeline::replay`] | above |
+//! | simulate and map a mission | [`pipeline::Mission`] | `examples/quick_map.rs` |
+//! | map a sky of one's own | [`pipeline::Mission::set`], [`sky::fits`] | `examples/own_sky.rs` |
+//! | simulate the spacecraft, map a downlink | [`pipeline::Mission::simulate`], [`pipeline::Mission::replay`] | `examples/damaged_downlink.rs` |
+//! | watch a run, or build it from its parts | [`pipeline::Plan`], [`pipeline::run`], [`pipeline::simulate`], [`pipeline::replay`] | there |
 //! | read a downlink | [`downlink::Contents`], [`downlink::DownlinkReader`] | `examples/read_downlink.rs` |
 //! | calibrate in a way of one's own | [`calibration::Calibration`] | `examples/calibration_hook.rs` |
-//! | make a map of visibilities from elsewhere | [`imaging::PixelEngine`], [`imaging::solve_pixels`] | `examples/map_from_visibilities.rs` |
-//! | build a graph of stages | [`runtime::Graph`], [`runtime::Stage`] | `examples/own_stage.rs` |
-//! | know where the satellites are | [`array::Array`] | there |
+//! | map visibilities from elsewhere | [`imaging::PixelEngine`], [`imaging::solve_pixels`] | `examples/map_from_visibilities.rs` |
+//! | know where the satellites are | [`array::Array`] | `examples/geometry.rs` |
+//! | predict what a pair measures | [`response::pixel::sky_sums`] | `examples/predict_visibility.rs` |
+//! | make skies and their spectra | [`sky::generated::generate`], [`sky::harmonics`], [`sky::spectra`] | `examples/spectrum_of_the_sky.rs` |
+//! | add a stage to the chain | [`runtime::Stage`], [`runtime::Graph`] | `examples/own_stage.rs` |
 //!
-//! Units are SI throughout and stand in names; temperatures are in K, visibilities in K sr.
-//! "The paper" is Deng et al., arXiv:2511.18494.
+//! [`prelude`] has what most programs need.
+//!
+//! # How data pass
+//! A [`sky`] is seen by an [`mod@array`] of satellites through the beam matrix ([`response`]), sampled and correlated on board, sent down
+//! ([`downlink`]), given positions and calibrated ([`calibration`]), summed into normal equations and solved ([`imaging`]), and written out
+//! ([`products`]). The [`runtime`] moves data between stages and knows no physics; what it moves is in [`frames`]. The [`pipeline`] turns a
+//! configuration into a running graph. Spacecraft and ground share no state: the only thing that crosses is bytes.
+//!
+//! # Conventions
+//! Units are SI throughout and stand in names; temperatures are in K, visibilities in K sr. Positions are in Moon-centred ecliptic axes,
+//! times in seconds since the mission's epoch. Maps are HEALPix in RING order. "The paper" is Deng et al., arXiv:2511.18494.
+//!
+//! What is not documented here is public for the program, its tests and the Python package alone, and changes without notice.
 
 // They panic when nobody reads any more; `cli/output.rs` has what does not.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod units;
 
+#[doc(hidden)]
+pub mod numerics;
+
+#[doc(hidden)]
 pub mod files;
 
+#[doc(hidden)]
 pub mod ranks;
 
 pub mod frames;
@@ -69,8 +79,10 @@ pub mod array;
 
 pub mod response;
 
+#[doc(hidden)]
 pub mod daughters;
 
+#[doc(hidden)]
 pub mod mother;
 
 pub mod downlink;
@@ -85,11 +97,17 @@ pub mod products;
 
 pub mod pipeline;
 
+pub mod prelude;
+
+#[doc(hidden)]
 pub mod figures;
 
+#[doc(hidden)]
 #[cfg(feature = "serve")]
 pub mod serve;
 
+#[doc(hidden)]
 pub mod bench;
 
+#[doc(hidden)]
 pub mod cli;

@@ -1,24 +1,25 @@
-//! A downlink to look at: two channels, a few windows, seconds to simulate.
+//! A mission to look at: two channels, a few windows, seconds to simulate.
 
 use std::error::Error;
 use std::path::Path;
 
-use lunarray::pipeline::{ConfigSource, Plan, simulate};
-use lunarray::runtime::Cancel;
+use lunarray::prelude::*;
 
-/// Simulates a small mission and writes its downlink to `file`; returns what was simulated.
-pub fn small_downlink(file: &Path) -> Result<Plan, Box<dyn Error>> {
-    let overrides = [
-        "sky.nside=8",
-        "spacecraft.channels_hz=[3e6, 10e6]",
-        "spacecraft.every_nth_window=400",
-        "spacecraft.every_nth_integration=4",
-        "spacecraft.baseline_wavelengths_max=16.0",
-        "map.nside=4",
-        "map.epsilon=1e-4",
-    ];
-    let source = ConfigSource { overrides: overrides.map(str::to_owned).to_vec(), ..ConfigSource::default() };
-    let plan = Plan::new(source.load()?)?;
-    simulate(&plan, &file, &Cancel::new(), &mut |_| {})?;
-    Ok(plan)
+/// A small mission.
+pub fn small_mission() -> Mission {
+    Mission::dsl()
+        .channels(&[3e6, 10e6])
+        .nside(4)
+        .set("sky.nside", 8)
+        .set("spacecraft.every_nth_window", 41)
+        .set("spacecraft.every_nth_integration", 40)
+        .set("spacecraft.baseline_wavelengths_max", 16)
+        .set("map.epsilon", 1e-4)
+}
+
+/// Simulates it and writes its downlink to `file`.
+#[allow(dead_code, reason = "examples that simulate it themselves")]
+pub fn small_downlink(file: &Path) -> Result<(), Box<dyn Error>> {
+    small_mission().simulate(file)?;
+    Ok(())
 }

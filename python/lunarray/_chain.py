@@ -6,11 +6,13 @@ import json
 import os
 import tempfile
 from os import PathLike
-from typing import Any, Callable, Iterable
+from typing import Any, Iterable, Iterator
 
 from . import _native
 from ._map import Map
+from ._progress import Progress, progress_of
 from ._settings import Settings, overrides
+from ._values import number, numbers, octets
 
 
 class Run:
@@ -37,15 +39,21 @@ def run(
     set: Settings = None,
     seed: int | None = None,
     out: str | PathLike[str] | None = None,
-    progress: Callable[[dict[str, tuple[int, str]]], object] | None = None,
+    progress: Progress = None,
 ) -> Run:
     """Runs the whole chain: sky, spacecraft, downlink, ground, maps. As ``lunarray run``.
 
     ``pipeline`` is a file (the quicklook if not given), ``set`` replaces some of its settings, ``out`` is the folder of the products
-    (out/NAME if not given). ``progress`` is called some times a second with what each stage has done so far; an exception in it
-    ends the run, as Ctrl-C does: in order, with products of the data so far.
+    (out/NAME if not given). Terminals and notebooks show how far it is, unless ``progress=False``. A function as ``progress`` is
+    called some times a second with what each stage has done so far; an exception in it ends the run, as Ctrl-C does: in order, with
+    products of the data so far.
     """
-    return Run(*_native.run(pipeline, overrides(set), seed, out, progress))
+    shown = progress_of(progress)
+    try:
+        return Run(*_native.run(pipeline, overrides(set), seed, out, shown))
+    finally:
+        if shown is not None:
+            shown.close()
 
 
 class Replay:
@@ -54,14 +62,19 @@ class Replay:
     ``summary`` is there once all maps have been taken. ``close()`` ends it early, as does the end of a ``with`` block.
     """
 
-    def __init__(self, native: _native.NativeReplay, truth: Any, folder: Any) -> None:
-        self._native, self._truth, self._folder = native, truth, folder
+    def __init__(self, native: _native.NativeReplay, truth: Any, folder: Any, shown: Any) -> None:
+        self._native, self._truth, self._folder, self._shown = native, truth, folder, shown
 
     def __iter__(self) -> Replay:
         return self
 
     def __next__(self) -> Map:
-        found = self._native.next_map()
+        try:
+            found = self._native.next_map()
+        finally:
+            # Between maps others may write.
+            if self._shown is not None:
+                self._shown.close()
         if found is None:
             raise StopIteration
         made = Map(**found)
@@ -94,14 +107,15 @@ def replay(
     state: str | PathLike[str] | None = None,
     out: str | PathLike[str] | None = None,
     truth: Any = None,
+    progress: Progress = None,
 ) -> Replay:
     """Runs the ground segment on downlink files; iterate over what it returns to get its maps. As ``lunarray replay``.
 
     ``map`` is a map file (a pipeline file is one). Without one the settings of the maps are those of the state, if it has any; of the
     run that made the downlink, if its ``pipeline.toml`` lies beside the first file or it was the quicklook; then the defaults.
-    ``every`` is the mission time between two snapshots, s (none if not given), ``state`` a folder that keeps everything received, ``out`` a folder for products (none are kept if not given). ``truth`` is the true sky:
+    ``every`` is the mission time between two snapshots, s or a quantity (none if not given), ``state`` a folder that keeps everything received, ``out`` a folder for products (none are kept if not given). ``truth`` is the true sky:
     a file or pixels, or ``[(sky, frame), ..]`` by channel; then maps have ``rho_l``. The next map is made while one is looked at, and
-    no more than that.
+    no more than that. ``progress`` is that of :func:`run`.
     """
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     folder = None
@@ -111,11 +125,17 @@ def replay(
         out = folder.name
         more = {"products__pictures": False}
     if every is not None or map is None:
-        more["map__snapshot_every_s"] = float(every or 0)
+        more["map__snapshot_every_s"] = duration_s(every) or 0.0
     settings = overrides(None, **more) + overrides(set)
     if truth is not None and not isinstance(truth, list):
         truth = (truth,)
-    return Replay(_native.NativeReplay(files, out, map, settings, state), truth, folder)
+    shown = progress_of(progress)
+    return Replay(_native.NativeReplay(files, out, map, settings, state, shown), truth, folder, shown)
+
+
+def duration_s(every: Any) -> float | None:
+    """The time between snapshots."""
+    return None if every is None else number(every, "s", "every")
 
 
 class State:
@@ -124,7 +144,7 @@ class State:
     def __init__(self, path: str | PathLike[str]) -> None:
         self.path = os.fspath(path)
         if not os.path.isdir(self.path):
-            raise _native.LunarrayError(f"no state in {self.path}: expected a folder that replay(state=..) or lunarray replay --state has made")
+            raise _native.Error(f"no state in {self.path}: expected a folder that replay(state=..) or lunarray replay --state has made")
 
     def solve(
         self,
@@ -137,8 +157,10 @@ class State:
         ``epsilon`` is one regularisation or a list of them, each for all channels; that of the settings if not given. Settings on
         which the sums depend are those of the state; ``map`` and ``set`` give others, such as ``map.prior_k``.
         """
-        values = [] if epsilon is None else [epsilon] if isinstance(epsilon, (int, float)) else list(epsilon)
-        found = _native.solve_state(self.path, map, overrides(set), [float(value) for value in values])
+        if isinstance(epsilon, Iterator):
+            epsilon = list(epsilon)
+        values = [] if epsilon is None else numbers(epsilon, "", "epsilon").ravel().tolist()
+        found = _native.solve_state(self.path, map, overrides(set), values)
         return [Map(**one) for one in found]
 
 
@@ -155,15 +177,15 @@ class Ground:
         every: float | None = None,
         state: str | PathLike[str] | None = None,
     ) -> None:
-        settings = overrides(None, map__snapshot_every_s=None if every is None else float(every)) + overrides(set)
+        settings = overrides(None, map__snapshot_every_s=duration_s(every)) + overrides(set)
         self._native = _native.NativeGround(map, settings, state)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Map]:
         """Takes bytes of the downlink, in pieces of any size; returns the snapshots that became due (with ``every``)."""
-        return [Map(**found) for found in self._native.feed(bytes(data))]
+        return [Map(**found) for found in self._native.feed(octets(data))]
 
     def finish(self) -> list[Map]:
-        """Ends the downlink, saves the state if there is one, and returns the final maps."""
+        """Ends the downlink, saves the state if there is one, and returns the final maps. Bytes without any packet are refused."""
         return [Map(**found) for found in self._native.finish()]
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _native
 from ._rows import AUTO, VISIBILITY
+from ._values import seconds
 
 
 def open(path: str | PathLike[str]) -> Downlink:
@@ -61,7 +62,7 @@ class Downlink:
         # The native function counts in 16 bits, and Python would say no more than that another number does not fit.
         number, count = operator.index(channel), len(self.channels_hz)
         if not 0 <= number < count:
-            raise _native.LunarrayError(f"channel {number}: expected one of the file's {count} channels, from 0")
+            raise _native.Error(f"channel {number}: expected one of the file's {count} channels, from 0")
         return self._native.visibilities(number).view(VISIBILITY)
 
     def autos(self) -> NDArray[np.void]:
@@ -76,9 +77,9 @@ class Downlink:
         return found
 
     def ephemeris(self, t: ArrayLike) -> NDArray[np.float64]:
-        """Positions of the satellites at a time or times, s since the epoch: shape ``t.shape + (satellites, 3)``, m, Moon-centred
+        """Positions of the satellites at a time or times, s since the epoch (or ``astropy.time.Time``): shape ``t.shape + (satellites, 3)``, m, Moon-centred
         ecliptic axes; NaN where the file has none."""
-        times = np.asarray(t, dtype=float)
+        times = seconds(t, self.instrument["epoch_tai_s"])
         return self._native.positions(times.ravel()).reshape(*times.shape, self.satellites, 3)
 
     def write_uvh5(
@@ -89,19 +90,32 @@ class Downlink:
     ) -> int:
         """Writes the good visibilities of a channel as UVH5, for pyuvdata and what reads its files; returns their number.
 
-        Values are in Jy, phased to a centre (right ascension and declination, degrees, ICRS; that of the Galaxy if not given).
-        UVH5 holds one position an antenna; the true ones are in the file's group ``lunarray``. Needs h5py and pyuvdata
+        Values are in Jy, phased to a centre (right ascension and declination, degrees or quantities of angle, ICRS; that of the Galaxy if
+        not given). They are those of pyuvdata's baselines r_j - r_i: V = sum of T exp(+2 pi i (nu / c) (n - s) . (r_j - r_i)), with the
+        centre s. ``nsample_array`` times ``integration_time`` is proportional to the weights (inverse variances), the largest
+        ``nsample`` is 1. UVH5 holds one position an antenna; the true ones, and the weights, are in the file's group ``lunarray``:
+        ``UVData.phase`` needs ``use_ant_pos=False``. Replaces a UVH5 file, and nothing else. Needs h5py and pyuvdata
         (``pip install lunarray[uvh5]``).
         """
         from ._uvh5 import write_uvh5
 
         return write_uvh5(self, path, channel, phase_centre)
 
+    def write_calh5(self, path: str | PathLike[str], solutions: str | PathLike[str]) -> int:
+        """Writes gains of ``solutions.csv`` as calh5, which pyuvdata's ``UVCal`` reads; returns the number of solutions.
+
+        The downlink is the one that was calibrated. Gains that are not good are flagged; stated deviations and states are in the
+        file's group ``lunarray``. Needs h5py and pyuvdata (``pip install lunarray[uvh5]``).
+        """
+        from ._calh5 import write_calh5
+
+        return write_calh5(self, path, solutions)
+
     def write_parquet(self, path: str | PathLike[str], channel: int = 0) -> int:
         """Writes the visibilities of a channel as Parquet, flagged ones too; returns their number.
 
         The columns are those of ``lunarray export visibilities``, numbers as they are in the downlink; their units and the
-        description of the instrument are in the file's metadata. Needs pyarrow (``pip install lunarray[parquet]``).
+        description of the instrument are in the file's metadata. Replaces a Parquet file, and nothing else. Needs pyarrow (``pip install lunarray[parquet]``).
         """
         from ._parquet import write_parquet
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _native
+from ._values import numbers
 
 
 def read_map(path: str | PathLike[str], frame: str | None = None) -> tuple[NDArray[np.float64], str]:
@@ -22,9 +23,12 @@ def sky_of(sky: Any, frame: str | None) -> tuple[NDArray[np.float64], str]:
     """Pixels and frame of a sky that is a file, a :class:`Map`, or an array of pixels."""
     if isinstance(sky, Map):
         return sky.pixels, "E"
-    if isinstance(sky, (str, bytes)) or hasattr(sky, "__fspath__"):
+    if isinstance(sky, str) or hasattr(sky, "__fspath__"):
         return read_map(sky, frame)
-    return np.ascontiguousarray(sky, dtype=float), frame or "E"
+    pixels = numbers(sky, "K", "the sky")
+    if pixels.ndim != 1:
+        raise _native.Error(f"the sky has shape {pixels.shape}: expected its pixels one after the other, in RING order")
+    return pixels, frame or "E"
 
 
 class Map:

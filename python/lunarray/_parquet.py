@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 
+from ._write import needed, writing
+
 #: Units of the columns.
 UNITS = {
     "time_s": "s since the mission's epoch, middle of the integration",
@@ -23,7 +25,7 @@ UNITS = {
 
 def to_table(downlink, channel):
     """The visibilities of a channel as a ``pyarrow.Table``."""
-    import pyarrow as pa
+    pa = needed("pyarrow", "parquet")
 
     rows = downlink.visibilities(channel)
     columns = {name: np.ascontiguousarray(rows[name]) for name in ("time_s", "tai", "utc", "dt_s", "i", "j")}
@@ -50,8 +52,8 @@ def to_table(downlink, channel):
 
 def write_parquet(downlink, path, channel):
     """Writes a file; see ``Downlink.write_parquet``."""
-    import pyarrow.parquet
-
+    parquet = needed("pyarrow.parquet", "parquet")
     table = to_table(downlink, channel)
-    pyarrow.parquet.write_table(table, path)
+    with writing(path, downlink.path, b"PAR1", "Parquet") as unfinished:
+        parquet.write_table(table, unfinished)
     return len(table)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _native
 from ._array import Array
 from ._map import Map, sky_of
-from ._settings import hertz
+from ._values import hertz, pairs_of, seconds
 
 
 def predict(
@@ -24,17 +24,15 @@ def predict(
 ) -> NDArray[np.complex128]:
     """Visibilities of a sky by a direct sum over its pixel centres, in double precision, K sr.
 
-    ``sky`` is a HEALPix map in K: a file, a :class:`Map`, or pixels in RING order (``frame`` E, G or C; ecliptic if not said).
-    ``freq`` in Hz or with its unit (``"3MHz"``), ``t`` in s since the epoch, ``pairs`` of satellites from 1 (all if not given), ``array`` an :class:`Array` (the
+    ``sky`` is a HEALPix map in K (or a quantity of temperature): a file, a :class:`Map`, or pixels in RING order (``frame`` E, G or C; ecliptic if not said).
+    ``freq`` in Hz or with its unit (``"3MHz"``), ``t`` in s since the epoch (or a quantity, or ``astropy.time.Time``), ``pairs`` of satellites from 1 (all if not given), ``array`` an :class:`Array` (the
     paper's if not given). Returns shape ``t.shape + (pairs,)``. Directions that the Moon hides from either satellite count
     nothing.
     """
     array = Array() if array is None else array
-    pairs = array.pairs if pairs is None else [tuple(pair) for pair in pairs]
+    indices = pairs_of(array.pairs if pairs is None else pairs, array.satellites)
     pixels, letter = sky_of(sky, frame)
-    times = np.asarray(t, dtype=float)
+    times = seconds(t, array.epoch_tai_s)
     places = array.positions(times.ravel()).reshape(times.size, -1)
-    # Number 0 becomes one that no array has, so that it is refused like any other.
-    indices = [tuple(n - 1 if n > 0 else 2**32 for n in pair) for pair in pairs]
     found = _native.predict(pixels, letter, hertz(freq), places, indices, array.moon_radius_m, array.dipoles)
-    return found.reshape(*times.shape, len(pairs))
+    return found.reshape(*times.shape, len(indices))

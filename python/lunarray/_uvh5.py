@@ -9,7 +9,9 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ._native import LunarrayError
+from ._native import Error
+from ._values import number
+from ._write import needed, writing
 
 #: Mean obliquity of the ecliptic at J2000, rad (IAU 1976, which HEALPix uses).
 OBLIQUITY = np.radians(23.4392911)
@@ -35,21 +37,40 @@ def axes(phase_centre):
     return np.array([east, north, centre])
 
 
+def centre_of(phase_centre):
+    """Right ascension and declination, degrees, of two numbers or angles."""
+    try:
+        ra, dec = phase_centre
+    except (TypeError, ValueError) as error:
+        raise Error(f"phase_centre = {phase_centre!r}: expected right ascension and declination, degrees") from error
+    return number(ra, "deg", "the right ascension"), number(dec, "deg", "the declination")
+
+
+def samples(rows):
+    """The part of its integration time that would give each visibility its weight, if the best one had all its time.
+
+    The format defines ``nsample_array`` times ``integration_time`` as the time that went into a visibility."""
+    each = rows["weight"].astype(float) / rows["dt_s"]
+    best = each.max()
+    return (each / best if best > 0 else each).astype(np.float32)
+
+
 def to_uvdata(downlink, channel, phase_centre):
     """The good visibilities of a channel as a ``pyuvdata.UVData``, and the rows that they are, in order."""
+    pyuvdata = needed("pyuvdata", "uvh5")
     from astropy.coordinates import EarthLocation
     from astropy.time import Time
     from astropy.utils import iers
-    from pyuvdata import Telescope, UVData
 
+    phase_centre = centre_of(phase_centre)
     ra_deg, dec_deg = phase_centre
     if not (-360 <= ra_deg <= 360 and -90 <= dec_deg <= 90):
-        raise LunarrayError(f"phase_centre = {phase_centre}: expected right ascension and declination, degrees")
+        raise Error(f"phase_centre = {phase_centre}: expected right ascension and declination, degrees")
     rows = downlink.visibilities(channel)
     rows = rows[(rows["flag"] == 0) & np.isfinite(rows["uvw_m"][:, 0])]
     rows = rows[np.argsort(rows["time_s"], kind="stable")]
     if len(rows) == 0:
-        raise LunarrayError(f"{downlink.path}: no good visibility of channel {channel} with positions")
+        raise Error(f"{downlink.path}: no good visibility of channel {channel} with positions")
     frequency_hz = downlink.channels_hz[channel]
     frame = axes(phase_centre) @ ECLIPTIC_TO_ICRS
     uvw = -(rows["uvw_m"] @ frame.T)
@@ -66,7 +87,7 @@ def to_uvdata(downlink, channel, phase_centre):
     with ExitStack() as stack:
         for name, value in offline.items():
             stack.enter_context(iers.conf.set_temp(name, value))
-        telescope = Telescope.new(
+        telescope = pyuvdata.Telescope.new(
             name="lunarray",
             # UVH5 has telescopes on the Earth: a place on its equator stands for the Moon's orbit.
             location=EarthLocation.from_geodetic(0.0, 0.0, 0.0),
@@ -78,7 +99,7 @@ def to_uvdata(downlink, channel, phase_centre):
             update_from_known=False,
         )
         ra, dec = np.radians(phase_centre)
-        made = UVData.new(
+        made = pyuvdata.UVData.new(
             freq_array=np.array([frequency_hz]),
             polarization_array=["pI"],
             times=times,
@@ -90,7 +111,7 @@ def to_uvdata(downlink, channel, phase_centre):
             update_telescope_from_known=False,
             data_array=data.reshape(-1, 1, 1),
             flag_array=np.zeros((len(rows), 1, 1), bool),
-            nsample_array=np.ones((len(rows), 1, 1), np.float32),
+            nsample_array=samples(rows).reshape(-1, 1, 1),
             phase_center_catalog={
                 0: {
                     "cat_name": "centre",
@@ -112,10 +133,16 @@ def to_uvdata(downlink, channel, phase_centre):
 
 def write_uvh5(downlink, path, channel, phase_centre):
     """Writes a file; see ``Downlink.write_uvh5``."""
-    import h5py
-
+    h5py = needed("h5py", "uvh5")
     made, rows = to_uvdata(downlink, channel, phase_centre)
-    made.write_uvh5(path, clobber=True, run_check=False)
+    with writing(path, downlink.path, b"\x89HDF", "UVH5") as unfinished:
+        made.write_uvh5(unfinished, run_check=False)
+        add_truth(h5py, unfinished, rows)
+    return len(rows)
+
+
+def add_truth(h5py, path, rows):
+    """Adds what UVH5 has no place for."""
     with h5py.File(path, "a") as file:
         beside = file.create_group("lunarray")
         beside.attrs["about"] = (
@@ -126,4 +153,3 @@ def write_uvh5(downlink, path, channel, phase_centre):
         beside["position_2_m"] = rows["r_j_m"]
         beside["time_s"] = rows["time_s"]
         beside["weight"] = rows["weight"]
-    return len(rows)

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 use crate::error::{exception, refused};
 use crate::maps::sky_map;
-use crate::wait::wait;
+use crate::wait::{require_threads, wait};
 
 /// Times beyond which nothing is known, s.
 const TIME_S_MAX: f64 = 1e9;
@@ -65,6 +65,9 @@ impl NativeArray {
     fn new(pipeline: Option<PathBuf>, overrides: Vec<String>) -> PyResult<Self> {
         let source = ConfigSource { file: pipeline, overrides, seed: None };
         let config = source.load().map_err(exception)?;
+        if config.array.propagate.days > 0.0 {
+            require_threads()?;
+        }
         let array = Array::new(&config.array).map_err(exception)?;
         Ok(Self { array, config })
     }
@@ -72,6 +75,12 @@ impl NativeArray {
     #[getter]
     fn satellites(&self) -> usize {
         self.array.satellites()
+    }
+
+    /// The mission's epoch: TAI seconds since 1958-01-01.
+    #[getter]
+    fn epoch_tai_s(&self) -> f64 {
+        self.config.spacecraft.epoch_tai_s
     }
 
     #[getter]

@@ -9,7 +9,9 @@ use std::time::Duration;
 use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
 use lunarray::imaging::SolveWatch;
-use lunarray::pipeline::{self, Config, ConfigSource, MemoryLimit, Plan, Segment, Watched, use_threads};
+use lunarray::pipeline::{
+    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, Segment, Watched, use_threads,
+};
 use lunarray::runtime::{Cancel, Metrics};
 use pyo3::exceptions::PyUserWarning;
 use pyo3::prelude::*;
@@ -17,7 +19,7 @@ use pyo3::types::PyDict;
 
 use crate::error::{Failure, exception, refused};
 use crate::maps::{Collected, MapData, MapTaker, dicts};
-use crate::wait::{wait, wait_for};
+use crate::wait::{require_process, require_threads, wait, wait_for};
 
 /// How often an iterator looks for Ctrl-C while it waits for a map.
 const POLL: Duration = Duration::from_millis(50);
@@ -42,23 +44,27 @@ pub(crate) fn ground_config(
     Ok(source.load_ground()?)
 }
 
-/// The stages of a graph at work, once it has begun.
+/// The stages of a graph at work, once it has begun, and the windows that it integrates (0 if it integrates none).
 #[derive(Clone, Default)]
-struct Watch(Arc<OnceLock<Arc<Metrics>>>);
+struct Watch(Arc<OnceLock<(Arc<Metrics>, u64)>>);
 
 impl Watch {
-    fn begin(&self, watched: &Watched) {
-        let _ = self.0.set(Arc::clone(&watched.metrics));
+    fn begin(&self, watched: &Watched, windows: u64) {
+        let _ = self.0.set((Arc::clone(&watched.metrics), windows));
     }
 
-    /// Tells what every stage has done so far: its name, and a number with its unit.
+    /// Tells what every stage has done so far: its name, and a number with its unit; and how many windows of how many are done.
     fn tell(&self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
-        let Some((metrics, progress)) = self.0.get().zip(progress) else { return Ok(()) };
+        let Some(((metrics, windows), progress)) = self.0.get().zip(progress) else { return Ok(()) };
         let stages = PyDict::new(py);
+        let mut done = 0;
         for stage in metrics.snapshot() {
+            if stage.name == INTEGRATE {
+                done = stage.items_in.saturating_sub(1);
+            }
             stages.set_item(stage.name, (stage.units.count, stage.units.name))?;
         }
-        progress.call1(py, (stages,)).map(|_| ())
+        progress.call1(py, (stages, (done, windows))).map(|_| ())
     }
 }
 
@@ -95,8 +101,9 @@ pub(crate) fn run<'py>(
         let plan = Plan::new(config)?;
         use_threads(&plan.config.runtime)?;
         plan.cost().require_memory(Segment::Whole, MemoryLimit::of_machine())?;
+        let windows = plan.windows_watched();
         let summary = pipeline::run(&plan, &products, &ended, &mut |watched| {
-            begun.begin(&watched);
+            begun.begin(&watched, windows);
             let found = found.clone();
             let take = move |map: MapData| {
                 if map.is_final {
@@ -145,25 +152,33 @@ pub(crate) struct NativeReplay {
     maps: Mutex<Option<Receiver<MapData>>>,
     thread: Mutex<Option<JoinHandle<Ended>>>,
     summary: OnceLock<String>,
+    /// The process that has its thread.
+    process: u32,
+    watch: Watch,
+    progress: Option<Py<PyAny>>,
 }
 
 #[pymethods]
 impl NativeReplay {
     #[new]
-    #[pyo3(signature = (files, out, map=None, overrides=Vec::new(), state=None))]
+    #[pyo3(signature = (files, out, map=None, overrides=Vec::new(), state=None, progress=None))]
     fn new(
         files: Vec<PathBuf>,
         out: PathBuf,
         map: Option<PathBuf>,
         overrides: Vec<String>,
         state: Option<PathBuf>,
+        progress: Option<Py<PyAny>>,
     ) -> PyResult<Self> {
+        require_threads()?;
         // A state that is to be made takes the settings given; one that is there may be used without naming them again.
         let known = state.as_deref().filter(|folder| Ground::settings_in(folder).is_ok());
         let config = ground_config(map, overrides, known, &files).map_err(exception)?;
         let (sender, receiver) = sync_channel(1);
         let cancel = Cancel::new();
         let ended = cancel.clone();
+        let watch = Watch::default();
+        let begun = watch.clone();
         let work = move || -> Ended {
             use_threads(&config.runtime)?;
             let settings = config.ground(WAIT_BYTES);
@@ -173,6 +188,7 @@ impl NativeReplay {
             };
             let source = FileSource::open(&files)?;
             let summary = pipeline::replay(source, &config, ground, &out, &ended, &mut |watched| {
+                begun.begin(&watched, 0);
                 let (sender, ended) = (sender.clone(), ended.clone());
                 watched.maps.join(Box::new(MapTaker(move |map| {
                     if sender.send(map).is_err() {
@@ -185,11 +201,20 @@ impl NativeReplay {
         let thread = std::thread::Builder::new().name("lunarray".to_owned()).spawn(work);
         let thread = thread.map_err(exception)?;
         let summary = OnceLock::new();
-        Ok(Self { cancel, maps: Mutex::new(Some(receiver)), thread: Mutex::new(Some(thread)), summary })
+        Ok(Self {
+            cancel,
+            maps: Mutex::new(Some(receiver)),
+            thread: Mutex::new(Some(thread)),
+            summary,
+            process: std::process::id(),
+            watch,
+            progress,
+        })
     }
 
     /// The next map; `None` once there is none left.
     fn next_map<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
+        require_process(self.process)?;
         loop {
             let found = py.detach(|| {
                 let maps = self.maps.lock().unwrap_or_else(PoisonError::into_inner);
@@ -198,7 +223,10 @@ impl NativeReplay {
             match found {
                 Ok(map) => return map.into_dict(py).map(Some),
                 Err(RecvTimeoutError::Disconnected) => return self.finish(py).map(|()| None),
-                Err(RecvTimeoutError::Timeout) => py.check_signals().inspect_err(|_| self.end(py))?,
+                Err(RecvTimeoutError::Timeout) => {
+                    let told = py.check_signals().and_then(|()| self.watch.tell(py, self.progress.as_ref()));
+                    told.inspect_err(|_| self.end(py))?;
+                }
             }
         }
     }
@@ -216,6 +244,10 @@ impl NativeReplay {
 
 impl NativeReplay {
     fn end(&self, py: Python<'_>) {
+        if require_process(self.process).is_err() {
+            // The thread is the parent's.
+            return;
+        }
         self.cancel.cancel();
         // A sender that waits for room gives up.
         self.maps.lock().unwrap_or_else(PoisonError::into_inner).take();

@@ -16,7 +16,7 @@ use serde_json::json;
 
 use crate::array::places;
 use crate::error::refused;
-use crate::wait::wait;
+use crate::wait::{wait, wait_to_read};
 
 /// Nanoseconds from 1958-01-01, where TAI is counted from, to 1970-01-01, where numpy's `datetime64` is.
 const FROM_1958_NS: i128 = 4383 * 86_400 * 1_000_000_000;
@@ -27,7 +27,7 @@ const LEAP_NS: i64 = 37_000_000_000;
 /// What is in a downlink file, as `lunarray inspect --json` prints it.
 #[pyfunction]
 pub(crate) fn inspect(py: Python<'_>, path: PathBuf) -> PyResult<String> {
-    wait(py, &Cancel::new(), move || {
+    wait_to_read(py, &Cancel::new(), move || {
         let mut survey = GeometrySurvey::new(GeometryLimits::default());
         let contents = Contents::read_with(&path, &mut |frame| survey.see(frame))?;
         let mut value = serde_json::to_value(&contents)?;
@@ -48,7 +48,7 @@ impl NativeDownlink {
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let cancel = Cancel::new();
         let watched = cancel.clone();
-        let table = wait(py, &cancel, move || Ok(VisibilityTable::read(&path, &watched)?))?;
+        let table = wait_to_read(py, &cancel, move || Ok(VisibilityTable::read(&path, &watched)?))?;
         Ok(Self(Arc::new(table)))
     }
 

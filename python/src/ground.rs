@@ -13,7 +13,7 @@ use pyo3::types::PyDict;
 use crate::chain::{CHECKPOINT_EVERY, ground_config};
 use crate::error::{Failure, exception, refused};
 use crate::maps::{MapData, dicts};
-use crate::wait::wait;
+use crate::wait::{require_threads, wait};
 
 /// Ground and solver.
 struct Segment {
@@ -33,6 +33,21 @@ impl Segment {
             self.solver.step(snapshot, &mut maps)?;
         }
         Ok(maps.take().iter().map(MapData::new).collect())
+    }
+
+    /// Requires that bytes which left no map were those of a downlink.
+    fn require_downlink(&self, maps: &[MapData]) -> Result<(), Failure> {
+        let outcome = self.ground.outcome();
+        let received = outcome.reception.lock().unwrap_or_else(PoisonError::into_inner);
+        let foreign = received.bytes_garbage + received.bytes_truncated;
+        if maps.is_empty() && received.bytes > 0 && foreign >= received.bytes {
+            let bytes = received.bytes;
+            return Err(format!(
+                "finish: {bytes} bytes were fed and no packet was among them: expected those of a downlink"
+            )
+            .into());
+        }
+        Ok(())
     }
 }
 
@@ -56,6 +71,7 @@ impl NativeGround {
             };
             Ok(Segment { ground, solver: Solver::new(config.solver(SolveWatch::default())?) })
         };
+        require_threads()?;
         let segment = open().map_err(exception)?;
         Ok(Self(Arc::new(Mutex::new(Some(segment)))))
     }
@@ -73,16 +89,22 @@ impl NativeGround {
 
     /// Ends the downlink; returns the final maps. With a state this writes it.
     fn finish<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyDict>>> {
+        require_threads()?;
         let taken = self.0.lock().unwrap_or_else(PoisonError::into_inner).take();
         let Some(mut segment) = taken else {
             return Err(refused("finish: this ground has finished already".to_owned()));
         };
-        let maps = wait(py, &Cancel::new(), move || segment.advance(None))?;
+        let maps = wait(py, &Cancel::new(), move || {
+            let maps = segment.advance(None)?;
+            segment.require_downlink(&maps)?;
+            Ok(maps)
+        })?;
         dicts(py, maps)
     }
 
     /// What became of every visibility, by reason: `(accumulated, flagged, lost, sampled)` as JSON.
     fn ledger(&self) -> PyResult<String> {
+        require_threads()?;
         let held = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let segment = held.as_ref().ok_or_else(|| refused("ledger: this ground has finished".to_owned()))?;
         let report = segment.ground.outcome().ledger.report();

@@ -39,7 +39,7 @@ mod native {
     #[pymodule_export]
     use super::downlink::{NativeDownlink, inspect};
     #[pymodule_export]
-    use super::error::{ConfigurationError, LunarrayError};
+    use super::error::{ConfigurationError, Error};
     #[pymodule_export]
     use super::ground::NativeGround;
     #[pymodule_export]

@@ -89,7 +89,7 @@ def test_geometry_is_what_the_command_prints():
 def test_what_cannot_be_is_refused():
     refusals = [
         (dict(pairs=[(1, 9)]), "pair 1-9: expected two of the array's 8 satellites"),
-        (dict(pairs=[(0, 1)]), "expected two of the array's 8 satellites"),
+        (dict(pairs=[(0, 1)]), "pair 0-1: expected two of the array's 8 satellites"),
         (dict(freq="3 feet"), "frequency is .3 feet.: expected a number of Hz, or one with"),
         (dict(freq=1e12), "frequency 1000000000000 Hz: expected"),
         (dict(sky=np.ones(13)), "13"),

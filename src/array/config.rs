@@ -219,12 +219,14 @@ const ORBIT_M_MAX: f64 = 1e8;
 impl ArrayConfig {
     /// Whether satellites have orbits of their own, in place of a formation on one.
     #[must_use]
+    #[doc(hidden)]
     pub fn has_own_orbits(&self) -> bool {
         !self.kepler.is_empty() || !self.oem.is_empty() || self.propagate.is_on()
     }
 
     /// Whether all satellites follow each other on one circle.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_circle(&self) -> bool {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
@@ -236,6 +238,7 @@ impl ArrayConfig {
 
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         const POSITIVE: &str = "a positive number";
         const FINITE: &str = "a finite number";
@@ -249,8 +252,6 @@ impl ArrayConfig {
             checks.number(key, value, inside, "above 0 and at most 1e8 m, beyond which the Earth takes over");
         }
         for (key, value) in [
-            ("precession_period_s", self.precession_period_s),
-            ("breathing.period_s", breathing.period_s),
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
             ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
         ] {
@@ -260,6 +261,11 @@ impl ArrayConfig {
             [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
         {
             checks.number(key, value, value >= 1.0, "a number of at least 1");
+        }
+        for (key, period) in
+            [("precession_period_s", self.precession_period_s), ("breathing.period_s", breathing.period_s)]
+        {
+            checks.number(key, period, period >= 1e3, "at least 1000 s");
         }
         let period = self.orbital_period_s;
         // Bounds the number of windows in the longest mission to a million.

@@ -113,17 +113,20 @@ impl Ephemeris {
 
     /// Number of segments.
     #[must_use]
+    #[doc(hidden)]
     pub fn len(&self) -> usize {
         self.segments.len()
     }
 
     /// Whether the table is empty.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_empty(&self) -> bool {
         self.segments.is_empty()
     }
 
     /// All segments, in order of their start.
+    #[doc(hidden)]
     pub fn segments(&self) -> impl Iterator<Item = &EphemerisSegment> {
         self.segments.values()
     }
@@ -152,11 +155,13 @@ impl Ephemeris {
 
     /// The segment that starts at a given time.
     #[must_use]
+    #[doc(hidden)]
     pub fn segment(&self, start: MissionTime) -> Option<&EphemerisSegment> {
         self.segments.get(&start)
     }
 
     /// Removes the segment that starts at a given time.
+    #[doc(hidden)]
     pub fn remove(&mut self, start: MissionTime) -> Option<EphemerisSegment> {
         self.segments.remove(&start)
     }

@@ -21,17 +21,30 @@ mod state;
 mod track;
 mod windows;
 
+#[doc(hidden)]
 pub use baseline::scaled_baseline;
-pub use config::{ArrayConfig, ArrayError, BreathingConfig, NodeMotion, Spacing};
-pub use ephemeris::{Ephemeris, Insertion, segments_for};
+pub use config::{ArrayConfig, ArrayError};
+#[doc(hidden)]
+pub use config::{BreathingConfig, NodeMotion, Spacing};
+pub use ephemeris::Ephemeris;
+#[doc(hidden)]
+pub use ephemeris::{Insertion, segments_for};
+#[doc(hidden)]
 pub use export::{OemExport, tai_s_of};
+#[doc(hidden)]
 pub use formation::{Formation, Progression};
 pub use integration::{IntegrationRule, integration_time_s};
+#[doc(hidden)]
 pub use interpolation::interpolation_error_m;
+#[doc(hidden)]
 pub use kepler::KeplerElements;
 pub use orbit::{Array, hidden_by_moon};
+#[doc(hidden)]
 pub use placing::PlacingCounts;
+#[doc(hidden)]
 pub use propagate::{Keeping, PropagateConfig, tell_propagation};
 pub use state::SatelliteState;
+#[doc(hidden)]
 pub use track::{orbit_normal_hat, tilted_axes, track_axes, track_offset_m};
+#[doc(hidden)]
 pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};

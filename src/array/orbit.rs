@@ -90,6 +90,21 @@ impl Shape {
 }
 
 /// The array in motion: positions at any time.
+///
+/// ```
+/// use lunarray::array::{Array, ArrayConfig, IntegrationRule, integration_time_s};
+/// use lunarray::units::vector::{norm, sub};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let array = Array::new(&ArrayConfig::default())?;
+/// let [first, last] = [0, 7].map(|n| array.state(n, 3600.0));
+/// let baseline_m = sub(first.position_m, last.position_m);
+/// assert!(norm(baseline_m) > 1e3);
+/// let dt_s = integration_time_s(IntegrationRule::default(), 10e6, first.velocity_m_s, last.velocity_m_s);
+/// assert!(dt_s <= 25.0);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
     /// The formation on one orbit, if there is one.
@@ -157,6 +172,7 @@ impl Array {
 
     /// Memory of the states of orbits that are given by tables (files, or what was propagated), bytes. Clones share it.
     #[must_use]
+    #[doc(hidden)]
     pub fn table_bytes(&self) -> u64 {
         let bytes = |orbit: &OwnOrbit| match orbit {
             OwnOrbit::Table(orbit) => orbit.table_bytes(),
@@ -187,18 +203,21 @@ impl Array {
 
     /// Radius of the orbit, or the semi-major axis of satellite 1, m.
     #[must_use]
+    #[doc(hidden)]
     pub fn orbit_radius_m(&self) -> f64 {
         self.own.first().map_or(self.orbit_radius_m, OwnOrbit::semi_major_axis_m)
     }
 
     /// Inclination of the orbit, or of that of satellite 1, to the ecliptic, rad.
     #[must_use]
+    #[doc(hidden)]
     pub fn inclination_rad(&self) -> f64 {
         self.own.first().map_or(self.inclination_rad, OwnOrbit::inclination_rad)
     }
 
     /// Greatest distance of a satellite from the Moon's centre, m.
     #[must_use]
+    #[doc(hidden)]
     pub fn farthest_m(&self) -> f64 {
         let farthest_m = self.own.iter().map(OwnOrbit::farthest_m).fold(0.0, f64::max);
         let eccentricity = self.shape.map_or(0.0, |shape| shape.eccentricity);
@@ -213,6 +232,7 @@ impl Array {
 
     /// The daughters' arcs, if they follow each other on a circle.
     #[must_use]
+    #[doc(hidden)]
     pub fn formation(&self) -> Option<&Formation> {
         self.formation.as_ref().filter(|_| self.shape.is_none())
     }
@@ -293,6 +313,7 @@ impl Array {
 
     /// Position of a satellite that trails daughter 1 by an arc `arc_m` on its osculating circle, m.
     #[must_use]
+    #[doc(hidden)]
     pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
         let ahead_m = self.position_m(0, t_s);
         let own_m = self.formation.as_ref().map_or(0.0, |formation| formation.arc_m(0, t_s).0);
@@ -303,12 +324,14 @@ impl Array {
 
     /// Normal of the orbital plane, or of that of satellite 1.
     #[must_use]
+    #[doc(hidden)]
     pub fn orbit_normal_hat(&self, t_s: f64) -> Vec3 {
         self.normal_hat(0, t_s)
     }
 
     /// Normal of the plane in which satellite `n` (from 0) moves.
     #[must_use]
+    #[doc(hidden)]
     pub fn normal_hat(&self, n: usize, t_s: f64) -> Vec3 {
         if let Some(orbit) = self.own.get(n) {
             return orbit.normal_hat(t_s);
@@ -359,6 +382,7 @@ impl Array {
 
     /// Depth of the Earth behind the limb for daughter `n` (from 0), m: positive when hidden.
     #[must_use]
+    #[doc(hidden)]
     pub fn earth_depth_of_m(&self, n: usize, t_s: f64) -> f64 {
         let position = self.position_m(n, t_s);
         hiding_depth_m(position, self.earth_hat(t_s), self.moon_radius_m)
@@ -368,6 +392,7 @@ impl Array {
 impl Array {
     /// Angle of the Earth below the Moon's limb for daughter `n` (from 0), rad: positive when hidden.
     #[must_use]
+    #[doc(hidden)]
     pub fn earth_below_limb_rad(&self, n: usize, t_s: f64) -> f64 {
         let position_m = self.position_m(n, t_s);
         let distance_m = norm(position_m);

@@ -28,6 +28,7 @@ impl Ephemeris {
     /// `frequency_hz` is that of the block's channel. The result is a function of each visibility's own
     /// time: it does not depend on how blocks are split.
     #[must_use]
+    #[doc(hidden)]
     pub fn place(&self, block: &VisibilityBlock, frequency_hz: f64) -> (PlacedVisibilities, PlacingCounts) {
         let mut out = PlacedVisibilities {
             channel: block.channel,
@@ -47,6 +48,7 @@ impl Ephemeris {
 
     /// The counts of [`Self::place`] alone, and the mission time of the middle of the first visibility that it places, s.
     #[must_use]
+    #[doc(hidden)]
     pub fn count(&self, block: &VisibilityBlock) -> (PlacingCounts, Option<f64>) {
         let mut first = None;
         let counts = self.runs(block, &mut |range, _| {

@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use super::{chain, median, seconds_of, timed};
+use super::chain;
+use super::timing::{median, seconds_of, timed};
 use crate::pipeline::config::Config;
 use crate::pipeline::error::PipelineError;
 use crate::pipeline::plan::Plan;

@@ -6,12 +6,13 @@
 mod chain;
 mod display;
 mod growth;
+mod timing;
 
 use std::convert::Infallible;
-use std::time::Instant;
 
 use serde::Serialize;
 
+use self::timing::{Spent, median, seconds_of, timed};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
@@ -180,26 +181,6 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-/// Mission time of a plan's windows, s.
-fn seconds_of(plan: &Plan) -> f64 {
-    plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
-}
-
-/// Processor time of all threads of this process, s. Linux reports it in ticks of 10 ms (proc(5), fields 14 and 15 of
-/// stat).
-fn core_seconds_used() -> Option<f64> {
-    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // The name, in parentheses, may contain spaces.
-    let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
-    let mut ticks = || fields.next()?.parse::<f64>().ok();
-    Some((ticks()? + ticks()?) / 100.0)
-}
-
 fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     while source.next(&mut out)? == Flow::Continue {}
@@ -289,21 +270,6 @@ fn time_stage(
             spent
         }
     })
-}
-
-/// Time spent on a piece of work.
-struct Spent {
-    seconds: f64,
-    /// Processor time of the whole process, s; `None` where the system does not report it.
-    core_seconds: Option<f64>,
-}
-
-fn timed<T>(work: impl FnOnce() -> T) -> (Spent, T) {
-    let (before_s, since) = (core_seconds_used(), Instant::now());
-    let value = work();
-    let seconds = since.elapsed().as_secs_f64();
-    let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
-    (Spent { seconds, core_seconds }, value)
 }
 
 impl Material {

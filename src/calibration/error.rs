@@ -13,6 +13,9 @@ pub enum CalibrationError {
     /// A value of the configuration that is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
+    /// A block whose arrays are not of one length, as it came or as a hook left it.
+    #[error(transparent)]
+    Lengths(#[from] crate::frames::UnequalLengths),
     /// The gains file cannot be read.
     #[error("gains file {}: cannot be read", path.display())]
     Read {

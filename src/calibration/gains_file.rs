@@ -5,7 +5,11 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::CalibrationError;
+use crate::files::read_text;
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, shortened};
+
+/// Longest file, bytes: gains of all channels in a month of passes take some megabytes.
+const BYTES_MAX: u64 = 1 << 30;
 
 /// Longest line of a message that is repeated whole, characters.
 const LINE_CHARS: usize = 300;
@@ -96,7 +100,7 @@ impl GainsFile {
     /// # Errors
     /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        let text = std::fs::read_to_string(path)
+        let text = read_text(path, BYTES_MAX)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
             serde_json::from_str(&text).map_err(message)
@@ -108,6 +112,7 @@ impl GainsFile {
 
     /// Everything that is wrong with the values; empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("");
         let tolerance_hz = self.frequency_tolerance_hz;
@@ -149,6 +154,7 @@ impl GainsFile {
 
     /// Number of satellites in the first solution; 0 if there is none.
     #[must_use]
+    #[doc(hidden)]
     pub fn satellites(&self) -> usize {
         let first = self.channels.iter().find_map(|channel| channel.solutions.first());
         first.map_or(0, |solution| solution.gains.len())

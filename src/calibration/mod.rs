@@ -16,25 +16,69 @@ mod error;
 mod gains;
 mod gains_file;
 mod solved;
+#[doc(hidden)]
 pub mod solver;
 mod stage;
 mod sub_bands;
 mod van_vleck;
 
+#[doc(hidden)]
 pub use autos::{AUTOS_MAX, AutoTable};
+#[doc(hidden)]
 pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
+#[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;
+#[doc(hidden)]
 pub use gains::AntennaGains;
+#[doc(hidden)]
 pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+#[doc(hidden)]
 pub use solved::{ClosedPass, SolvedGains};
 pub use stage::Calibrator;
+#[doc(hidden)]
 pub use sub_bands::SubBands;
+#[doc(hidden)]
 pub use van_vleck::{QuantiserBitsError, VanVleck};
 
 use crate::frames::{Instrument, PlacedVisibilities, VisibilityReason};
 
 /// Corrects visibilities in place.
+///
+/// ```
+/// use lunarray::prelude::*;
+///
+/// /// Takes out a gain that all satellites share.
+/// struct CommonGain(f64);
+///
+/// impl Calibration for CommonGain {
+///     fn name(&self) -> &'static str {
+///         "common gain"
+///     }
+///
+///     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
+///         for (value, weight) in block.value_k_sr.iter_mut().zip(&mut block.weight) {
+///             *value /= self.0;
+///             *weight *= self.0 * self.0;
+///         }
+///         Ok(CalibrationReport { kept: block.len(), unusable_gain: 0 })
+///     }
+/// }
+///
+/// let mut block = PlacedVisibilities {
+///     time_s: vec![0.0],
+///     r_i_m: vec![[2e6, 0.0, 0.0]],
+///     r_j_m: vec![[2e6, 100.0, 0.0]],
+///     value_k_sr: vec![8.0.into()],
+///     weight: vec![1.0],
+///     ..PlacedVisibilities::default()
+/// };
+/// CommonGain(4.0).apply(&mut block)?;
+/// assert_eq!((block.value_k_sr[0].re, block.weight[0]), (2.0, 16.0));
+/// # Ok::<(), CalibrationError>(())
+/// ```
+///
+/// A [`Calibrator`] passes every block of a downlink through it, once positions are known.
 pub trait Calibration: Send {
     /// Name as in the configuration.
     fn name(&self) -> &'static str;
@@ -74,6 +118,7 @@ pub struct CalibrationReport {
 impl CalibrationReport {
     /// Reason and number of those removed, for a ledger; zeros included.
     #[must_use]
+    #[doc(hidden)]
     pub fn removed(&self) -> [(VisibilityReason, usize); 1] {
         [(VisibilityReason::UnusableGain, self.unusable_gain)]
     }

@@ -52,24 +52,28 @@ impl Calibrator {
 
     /// Visibilities of other channels are counted and left out, where calibration would not remove any; `None` for no others.
     #[must_use]
+    #[doc(hidden)]
     pub fn of_group(self, group: Option<BTreeSet<ChannelId>>) -> Self {
         Self { group, ..self }
     }
 
     /// Corrects the quantiser's effect on correlations first.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_van_vleck(self, van_vleck: Option<VanVleck>) -> Self {
         Self { van_vleck, ..self }
     }
 
     /// Keeps auto-correlations, each once, by channel, daughter and time; without this they are flagged.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_autos(self) -> Self {
         Self { autos: Some(AutoTable::default()), ..self }
     }
 
     /// Keeps positions of `segments_max` segments.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_segments(self, segments_max: usize) -> Self {
         Self { ephemeris: Ephemeris::new(segments_max), ..self }
     }
@@ -78,6 +82,7 @@ impl Calibrator {
     ///
     /// If the calibration refuses the instrument, it does so again with the first visibilities.
     #[must_use]
+    #[doc(hidden)]
     pub fn resume(
         mut self,
         instrument: Option<Instrument>,
@@ -102,17 +107,20 @@ impl Calibrator {
 
     /// Blocks received.
     #[must_use]
+    #[doc(hidden)]
     pub fn blocks(&self) -> &ReceivedBlocks {
         &self.blocks
     }
 
     /// Removes a segment of positions.
+    #[doc(hidden)]
     pub fn remove_segment(&mut self, start: MissionTime) {
         self.ephemeris.remove(start);
     }
 
     /// Auto-correlations so far; `None` if they are not kept.
     #[must_use]
+    #[doc(hidden)]
     pub fn autos(&self) -> Option<&AutoTable> {
         self.autos.as_ref()
     }
@@ -128,7 +136,9 @@ impl Calibrator {
     ///
     /// # Errors
     /// As [`Calibrator::accept`].
+    #[doc(hidden)]
     pub fn calibrated(&mut self, block: VisibilityBlock) -> Result<PlacedVisibilities, CalibrationError> {
+        block.check_lengths()?;
         let ledger = std::mem::take(&mut self.ledger);
         let placed = self.place(block);
         self.ledger = ledger;
@@ -139,7 +149,9 @@ impl Calibrator {
     ///
     /// # Errors
     /// As [`Calibrator::accept`].
+    #[doc(hidden)]
     pub fn remove_autos(&mut self, block: VisibilityBlock) -> Result<u64, CalibrationError> {
+        block.check_lengths()?;
         let ledger = std::mem::take(&mut self.ledger);
         let placed = self.calibrate_autos(block);
         self.ledger = ledger;
@@ -150,7 +162,7 @@ impl Calibrator {
     /// Takes the next frame; returns what is to be accumulated of it.
     ///
     /// # Errors
-    /// [`CalibrationError`] if calibration was not made for this instrument.
+    /// [`CalibrationError`] if calibration was not made for this instrument, or the arrays of a block have unequal lengths.
     pub fn accept(&mut self, frame: GroundFrame) -> Result<Option<PlacedFrame>, CalibrationError> {
         match frame {
             // The decoder reports descriptions that contradict the first.
@@ -174,6 +186,7 @@ impl Calibrator {
     }
 
     /// Counts visibilities that were received and that the next session will add.
+    #[doc(hidden)]
     pub fn leave_for_later(&mut self, block: &VisibilityBlock) {
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(block) else { return };
@@ -188,12 +201,14 @@ impl Calibrator {
 
     /// Counts visibilities that the decoder left out of a block whose window starts at `window`, because their values
     /// cannot be used.
+    #[doc(hidden)]
     pub fn count_bad(&mut self, window: MissionTime, visibilities: u64) {
         self.blocks.count_bad(window, visibilities);
     }
 
     /// Posts to the ledger what was sampled, and what was lost before it was received; returns whether that is known to
     /// be all.
+    #[doc(hidden)]
     pub fn close(&self, missing: MissingPackets) -> Completeness {
         self.blocks.close(&self.ledger, missing)
     }
@@ -202,6 +217,7 @@ impl Calibrator {
         &mut self,
         block: VisibilityBlock,
     ) -> Result<Option<PlacedFrame>, CalibrationError> {
+        block.check_lengths()?;
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(&block) else { return Ok(None) };
         if !self.blocks.insert(key) {
@@ -314,6 +330,7 @@ impl Calibrator {
 
     fn calibrate(&mut self, placed: &mut PlacedVisibilities) -> Result<(), CalibrationError> {
         let calibrated = self.calibration.apply(placed)?;
+        placed.check_lengths()?;
         for (reason, count) in calibrated.removed() {
             self.ledger.left_out(reason, count as u64);
         }

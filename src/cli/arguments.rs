@@ -8,6 +8,7 @@ use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use super::output::print_notes;
 use crate::array::tai_s_of;
+use crate::files::ProtectedInputs;
 use crate::ground::GroundError;
 use crate::pipeline::{Config, ConfigError, ConfigSource, GroupSize, MemoryLimit};
 use crate::sky::Frame;
@@ -111,6 +112,11 @@ pub(super) struct StateMapArgs {
 }
 
 impl ArrayArgs {
+    /// The pipeline file, if there is one.
+    pub(super) fn inputs(&self) -> Vec<PathBuf> {
+        self.pipeline.iter().cloned().collect()
+    }
+
     pub(super) fn source(&self) -> ConfigSource {
         ConfigSource { file: self.pipeline.clone(), overrides: self.overrides.clone(), seed: None }
     }
@@ -155,6 +161,11 @@ impl PipelineArgs {
             print_notes(notes);
         }
         Ok(config)
+    }
+
+    /// Keeps the files that are read from being replaced by what is written, while the result lives.
+    pub(super) fn protect(&self, config: &Config) -> ProtectedInputs {
+        ProtectedInputs::of(self.pipeline.iter().cloned().chain(config.input_files()))
     }
 
     /// The memory that the run may take.

@@ -8,6 +8,7 @@ use super::arguments::{MapFileArgs, input_path, output_path, require_repeatable}
 use super::interrupt::Interrupt;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::CalibrateLines;
+use crate::files::ProtectedInputs;
 use crate::pipeline::{CalibrateJob, CalibrateSummary, ConfigSource, calibrate, use_threads};
 use crate::sky::fits::read_known_sky;
 
@@ -47,6 +48,8 @@ pub(super) struct CalibrateArgs {
 pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     let source = ConfigSource { file: args.map.clone(), overrides: args.overrides.clone(), seed: None };
     let config = source.load_ground()?;
+    let named = args.files.iter().chain(&args.model).chain(&args.map).cloned();
+    let _inputs = ProtectedInputs::of(named.chain(config.input_files()));
     if config.calibrate.map_rounds > 0 {
         let reason = "calibrate.map_rounds above 0 reads the downlink again for each round";
         args.files.iter().try_for_each(|path| require_repeatable(path, reason))?;

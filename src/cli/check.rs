@@ -4,13 +4,15 @@ use clap::Args;
 use serde::Serialize;
 
 use super::arguments::{PipelineArgs, group_size};
-use super::output::{CommandResult, Completion, print_config_notes, print_json_line, print_text};
-use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment};
+use super::output::{
+    CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
+};
+use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment, sky_notes};
 
 /// Check a pipeline and estimate its cost, without running it.
 ///
-/// Lists all problems of the file at once. If there are none, prints the number of visibilities by channel, downlink
-/// bytes, memory, operations and an estimated run time. Fails if the memory is more than this machine has available;
+/// Lists all problems of the file at once. If there are none, prints what was understood of each map and catalogue (frequency, frame,
+/// unit, resolution), the number of visibilities by channel, downlink bytes, memory, operations and an estimated run time. Fails if the memory is more than this machine has available;
 /// --memory-max states another machine's.
 ///
 /// Example: lunarray check pipelines/reference.toml --set map.nside=32
@@ -37,6 +39,9 @@ struct Checked<'a> {
     cost: &'a Cost,
     #[serde(skip_serializing_if = "Option::is_none")]
     groups: Option<&'a RunGroups>,
+    /// What was understood of each map and catalogue.
+    #[serde(skip_serializing_if = "<[String]>::is_empty")]
+    files: &'a [String],
 }
 
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
@@ -44,20 +49,25 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
+    print_notes(plan.thinning_notes());
     let problems = plan.file_problems();
     if !problems.is_empty() {
         return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));
     }
     let ranks = usize::from(args.ranks);
     plan.config.require_shareable(ranks)?;
+    print_notes(sky_notes(&plan)?);
     let cost = plan.cost_among(ranks).on_nodes(args.pipeline.memory_limit());
+    cost.require_finite()?;
+    let files = plan.files_understood();
     let limit = args.pipeline.memory_limit();
     let groups = args.groups.map(|size| plan.run_groups(size, limit)).transpose();
     let found = groups.as_ref().ok().and_then(Option::as_ref);
     if args.json {
-        print_json_line(&Checked { cost: &cost, groups: found })?;
+        print_json_line(&Checked { cost: &cost, groups: found, files: &files })?;
     } else {
-        print_text(&format!("{}: no problems\n\n{cost}", source.origin()))?;
+        let files: String = files.iter().map(|line| format!("{line}\n")).collect();
+        print_text(&format!("{}: no problems\n{files}\n{cost}", source.origin()))?;
         if let Some(groups) = found {
             print_text(&format!("{groups}\nMemory above is that of all channels at once."))?;
         }

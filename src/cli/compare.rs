@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::arguments::MapFileArgs;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
+use crate::files::ProtectedInputs;
 use crate::products::{RunFigures, draw_comparison, draw_relative_error, draw_runs, runs_csv};
 use crate::sky::Frame;
 use crate::sky::fits::read_whole_map_file;
@@ -53,6 +54,7 @@ pub(super) struct CompareArgs {
 }
 
 pub(super) fn execute(args: &CompareArgs) -> CommandResult {
+    let _inputs = ProtectedInputs::of(args.paths.iter().chain(&args.noise));
     let [map_path, truth_path] = &args.paths[..] else { return compare_runs(args) };
     if map_path.is_dir() {
         return compare_runs(args);
@@ -91,7 +93,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
 /// Reads a map in K, and its frequency, Hz, if the file has one.
 fn read(path: &Path, maps: MapFileArgs) -> Result<(SkyMap, Option<f64>), CommandError> {
     let file = read_whole_map_file(path, &maps.options())?;
-    let frequency_hz = file.header.real("FREQ");
+    let frequency_hz = file.frequency_hz;
     Ok((file.map, frequency_hz))
 }
 

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::arguments::output_path;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::files::write_atomically;
+use crate::files::{ProtectedInputs, write_atomically};
 use crate::products::pictures::{ColourScale, Palette, Patch, Scaling, draw_patches};
 use crate::sky::fits::{ReadOptions, read_whole_map};
 use crate::sky::{Cutout, Frame, PlaneProjection};
@@ -111,6 +111,7 @@ pub(super) fn execute(args: &CutoutArgs) -> CommandResult {
         size_deg: args.size,
         pixels: args.pixels.into(),
     };
+    let _inputs = ProtectedInputs::of(&args.maps);
     let mut pieces: Vec<Vec<f64>> = Vec::new();
     for path in &args.maps {
         let mut map = read_whole_map(path, &ReadOptions::default())?;

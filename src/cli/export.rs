@@ -12,7 +12,7 @@ use super::output::{
     print_text,
 };
 use crate::array::{Array, OemExport};
-use crate::files::write_atomically;
+use crate::files::{ProtectedInputs, write_atomically};
 use crate::products::pictures::Scaling;
 use crate::products::{Hips, HipsReport, RunFigures, VisibilityTable, spectra_csv};
 use crate::runtime::Cancel;
@@ -160,6 +160,17 @@ struct Destination {
 }
 
 impl ExportArgs {
+    /// The files that are read.
+    fn inputs(&self) -> Vec<PathBuf> {
+        match &self.what {
+            What::Visibilities(args) => vec![args.file.clone()],
+            What::Spectra(args) => args.runs.iter().map(|run| run.join("summary.json")).collect(),
+            What::Alm(args) => vec![args.map.clone()],
+            What::Hips(args) => vec![args.map.clone()],
+            What::Orbits(args) => args.array.inputs(),
+        }
+    }
+
     fn refuse_misuse_of_standard_output(&self) -> Result<(), CommandError> {
         let (to, is_table) = match &self.what {
             What::Visibilities(args) => (&args.to, true),
@@ -179,6 +190,7 @@ impl ExportArgs {
 
 pub(super) fn execute(args: &ExportArgs) -> CommandResult {
     args.refuse_misuse_of_standard_output()?;
+    let _inputs = ProtectedInputs::of(args.inputs());
     let (to, rows, of) = match &args.what {
         What::Hips(args) => return hips(args),
         What::Orbits(args) => return orbits(args),
@@ -257,7 +269,7 @@ fn alm(args: &AlmArgs) -> Result<usize, CommandError> {
 
 fn hips(args: &HipsArgs) -> CommandResult {
     let file = read_map_file(&args.map, &args.maps.options())?;
-    let frequency_hz = file.header.real("FREQ").filter(|hz| *hz > 0.0);
+    let frequency_hz = file.frequency_hz;
     let name = args.map.display();
     let title = args.title.clone().unwrap_or_else(|| match frequency_hz {
         Some(hz) => format!("{name}, {} MHz", hz / 1e6),
@@ -304,6 +316,7 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
         }
         (None, array) => array.oem_epoch.clone(),
     };
+    let _inputs = ProtectedInputs::of(config.input_files());
     let export = OemExport::new(&epoch, until_s, args.step)?;
     let array = Array::new(&config.array)?;
     let mut states = 0;

@@ -7,6 +7,7 @@ use clap::Args;
 use super::arguments::{TimeOfMission, input_path, output_path, time_of_mission};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::figures::{FIGURES, FigureRequest, make_figure};
+use crate::files::ProtectedInputs;
 use crate::pipeline::{ConfigSource, Plan, use_threads};
 use crate::units::Pair;
 
@@ -52,6 +53,7 @@ pub(super) struct FigureArgs {
 pub(super) fn execute(args: &FigureArgs) -> CommandResult {
     let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed: None };
     let plan = Plan::new(source.load()?)?;
+    let _inputs = ProtectedInputs::of(args.pipeline.iter().cloned().chain(plan.config.input_files()));
     use_threads(&plan.config.runtime)?;
     let at_s = args.at.map(|time| time.since_s(plan.config.spacecraft.epoch_tai_s));
     let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s };

@@ -12,7 +12,7 @@ use clap::ValueEnum;
 use serde::Serialize;
 use serde_json::Value;
 
-use super::output::{json_text, printable_text};
+use super::printable_text::{json_text, printable_text};
 use crate::units::calendar::{TAI_1970_S, tai_text};
 
 /// Form of the log.

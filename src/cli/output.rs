@@ -5,8 +5,8 @@ use std::io::Write;
 use serde_json::{Value, json};
 
 use super::log::{self, Level};
+pub(super) use super::printable_text::{json_text, printable_text};
 use crate::pipeline::{Config, RunSummary};
-use crate::units::printable;
 
 /// Why a command failed; the message says where and what was expected.
 pub(super) type CommandError = Box<dyn std::error::Error + Send + Sync>;
@@ -42,19 +42,6 @@ pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), Comma
     print(&json_text(value)?)
 }
 
-/// A JSON object whose strings hold no character that a terminal would obey. JSON itself allows some of them.
-pub(super) fn json_text(value: &impl serde::Serialize) -> Result<String, serde_json::Error> {
-    let text = serde_json::to_string(value)?;
-    let escaped = |c: char| match printable(c.encode_utf8(&mut [0; 4])) {
-        std::borrow::Cow::Borrowed(_) => c.to_string(),
-        std::borrow::Cow::Owned(_) => format!("\\u{:04x}", u32::from(c)),
-    };
-    match printable(&text) {
-        std::borrow::Cow::Borrowed(_) => Ok(text),
-        std::borrow::Cow::Owned(_) => Ok(text.chars().map(escaped).collect()),
-    }
-}
-
 /// Prints text for people.
 pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
     print(&printable_text(text))
@@ -73,11 +60,6 @@ pub(super) fn of_stdout(error: std::io::Error) -> CommandError {
         std::io::ErrorKind::BrokenPipe => error.into(),
         _ => format!("standard output: cannot write: {error}").into(),
     }
-}
-
-/// Text for a terminal, with its line breaks: names and replies of others in it are shown, not obeyed.
-pub(super) fn printable_text(text: &str) -> String {
-    text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
 }
 
 /// Prints notes to standard error.

@@ -64,6 +64,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     if job.is_first() {
         print_config_notes(&config);
     }
+    let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
     if job.is_first() {
         print_notes(sky_notes(&plan)?);
@@ -76,7 +77,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     let cost = plan.cost_among(job.ranks().share().count);
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&plan.config, "whole", None)?;
+    let page = args.serve.start(&plan.config, "whole", None, None)?;
     let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
     let windows = plan.windows_watched();

@@ -73,6 +73,7 @@ fn rate(text: &str) -> Result<f64, String> {
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
+    let _inputs = args.pipeline.protect(&config);
     let plan = Plan::new(config)?;
     print_notes(sky_notes(&plan)?);
     use_threads(&plan.config.runtime)?;
@@ -81,7 +82,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     }
     plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&plan.config, "space", None)?;
+    let page = args.serve.start(&plan.config, "space", None, None)?;
     let cancel = interrupt.cancel();
     let token = args.token.as_ref().map(|path| Stations::read(path)?.only_token(path)).transpose()?;
     let options =

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::arguments::{MapFileArgs, band_text, frequency_hz, output_path};
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
-use crate::files::write_atomically;
+use crate::files::{ProtectedInputs, write_atomically};
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
@@ -74,6 +74,7 @@ pub(super) struct SkyArgs {
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let SkyArgs { nside, seed, .. } = *args;
+    let _inputs = ProtectedInputs::of(args.pipeline.iter().chain(&args.like));
     if let (Some(path), Some(correlation)) = (&args.like, args.correlation) {
         return resemble(args, path, correlation);
     }
@@ -120,13 +121,12 @@ fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     if !(0.0..=1.0).contains(&correlation) {
         return Err(format!("--correlation {correlation}: expected 0 to 1").into());
     }
-    let MapFile { map: other, header, .. } = read_whole_map_file(path, &args.maps.options())?;
+    let MapFile { map: other, frequency_hz, .. } = read_whole_map_file(path, &args.maps.options())?;
     let seed = args.seed.unwrap_or(0);
     let map = other.correlated(correlation, seed)?;
     // It is of the frequency of what it resembles.
-    let freq_hz = header.real("FREQ").filter(|hz| hz.is_finite() && *hz > 0.0);
     let what = format!("correlation {correlation} with {}", path.display());
-    let mut made = Made::write(args, &map, freq_hz, &what)?;
+    let mut made = Made::write(args, &map, frequency_hz, &what)?;
     let title = format!("A sky of correlation {correlation} with another");
     made.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
     made.print(args)

@@ -10,6 +10,7 @@ use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::{CalibrateLines, Progress};
+use crate::files::ProtectedInputs;
 use crate::pipeline::{
     INTEGRATE, MemoryLimit, READ, Segment, Study, StudyStep, StudySummary, run_study, use_threads,
 };
@@ -54,6 +55,8 @@ pub(super) struct StudyArgs {
 
 pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     let study = Study::read(&args.study, &args.overrides)?;
+    let configs = study.cases.iter().flat_map(|case| case.plan.config.input_files());
+    let _inputs = ProtectedInputs::of(configs.chain([args.study.clone()]));
     let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
     for case in &study.cases {
         case.plan.cost().require_memory(Segment::Whole, limit)?;

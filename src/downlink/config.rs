@@ -61,6 +61,7 @@ impl Default for DownlinkConfig {
 impl DownlinkConfig {
     /// All invalid values; empty for a valid configuration.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("downlink");
         let bytes = self.packet_bytes_max;
@@ -79,12 +80,14 @@ impl DownlinkConfig {
 
     /// The Reed-Solomon code of the frames; `None` for plain packets.
     #[must_use]
+    #[doc(hidden)]
     pub fn code(&self) -> Option<ReedSolomon> {
         ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)
     }
 
     /// Bytes sent for each byte of packets: 1279 for 1107 with five codewords a frame.
     #[must_use]
+    #[doc(hidden)]
     pub fn expansion(&self) -> f64 {
         match self.format {
             Format::Packets => 1.0,
@@ -94,6 +97,7 @@ impl DownlinkConfig {
 
     /// Rate available to visibilities, without headers and coding, bytes/s; `None` for no limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn payload_bytes_per_s(&self) -> Option<f64> {
         let payload = self.packet_bytes_max.saturating_sub(HEADER_BYTES + TRAILER_BYTES);
         let visibilities = VISIBILITY_BYTES * visibilities_in(payload).max(1);
@@ -103,6 +107,7 @@ impl DownlinkConfig {
 
     /// The frame encoder of the configured format; `None` for plain packets.
     #[must_use]
+    #[doc(hidden)]
     pub fn encoder(&self) -> Option<CaduEncoder> {
         self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
     }

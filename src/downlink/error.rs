@@ -118,15 +118,17 @@ pub enum DownlinkError {
     },
     /// The file holds no downlink packet.
     #[error(
-        "{}: no downlink packet in {bytes} bytes; expected CCSDS space packets with APIDs 0x101 to \
+        "{}: no downlink in {bytes} bytes: {}; expected CCSDS space packets with APIDs 0x101 to \
          0x105 and CUC times (P-field 0x1F), plain or in CADUs of AOS frames, as `lunarray simulate` writes them",
-        path.display()
+        path.display(), name.as_deref().unwrap_or("no packet that could be one of it")
     )]
     Foreign {
         /// The file.
         path: PathBuf,
-        /// Its length, bytes.
+        /// Bytes read of it.
         bytes: u64,
+        /// What it is, if that is known.
+        name: Option<String>,
     },
 }
 
@@ -137,11 +139,16 @@ impl DownlinkError {
     }
 }
 
-/// Requires that a file of `bytes` bytes held a packet.
-pub(crate) fn require_packets(path: &std::path::Path, bytes: u64, packets: u64) -> Result<(), DownlinkError> {
+/// Requires that a file of `bytes` bytes held a packet; `name` says what it is if it did not.
+pub(crate) fn require_packets(
+    path: &std::path::Path,
+    bytes: u64,
+    packets: u64,
+    name: impl FnOnce() -> Option<String>,
+) -> Result<(), DownlinkError> {
     match (bytes, packets) {
         (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
-        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), bytes }),
+        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), bytes, name: name() }),
         _ => Ok(()),
     }
 }

@@ -60,15 +60,23 @@
 mod config;
 pub(crate) mod error;
 pub mod link;
+#[doc(hidden)]
 pub mod receive;
+#[doc(hidden)]
 pub mod transport;
+#[doc(hidden)]
 pub mod wire;
 
 pub use config::DownlinkConfig;
 pub use error::DownlinkError;
+pub use receive::ReceptionCounters;
 pub use receive::inspect::Contents;
-pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceivedSet, ReceptionCounters};
-pub use transport::{DownlinkReader, DownlinkWriter, FileSource, Pace, Paced, Recorder, Steps, Transmitter};
+#[doc(hidden)]
+pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceivedSet};
+pub use transport::{DownlinkReader, DownlinkWriter, FileSource};
+#[doc(hidden)]
+pub use transport::{Pace, Paced, Recorder, Steps, Transmitter};
+#[doc(hidden)]
 pub use wire::{
     CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,
     Packetizer, TRAILER_BYTES, Transmission,

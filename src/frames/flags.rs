@@ -10,16 +10,22 @@ impl Flags {
     /// No flag.
     pub const GOOD: Self = Self(0);
     /// Radio interference.
+    #[doc(hidden)]
     pub const INTERFERENCE: Self = Self(1);
     /// Samples are missing for part of the integration.
+    #[doc(hidden)]
     pub const INCOMPLETE: Self = Self(2);
     /// A receiver was saturated.
+    #[doc(hidden)]
     pub const SATURATED: Self = Self(4);
     /// Calibration rejected it.
+    #[doc(hidden)]
     pub const UNCALIBRATED: Self = Self(8);
     /// The Earth was in sight of one of the two daughters during part of the integration.
+    #[doc(hidden)]
     pub const EARTH: Self = Self(16);
     /// The artificial signal for calibration was on.
+    #[doc(hidden)]
     pub const BEACON: Self = Self(32);
 
     /// Whether no bit is set.

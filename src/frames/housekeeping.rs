@@ -19,10 +19,12 @@ pub struct Housekeeping {
 impl Housekeeping {
     /// The time of the last report of a mission: the end of the range of times, 136 years after the epoch. Nothing is
     /// sampled after that report.
+    #[doc(hidden)]
     pub const FOREVER: MissionTime = MissionTime((1 << 32) * TICKS_PER_SECOND);
 
     /// Whether this is the last report of a mission.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_last(&self) -> bool {
         self.time >= Self::FOREVER
     }

@@ -33,6 +33,7 @@ pub enum AntennaResponse {
 impl AntennaResponse {
     /// Receivers whose correlations are averaged.
     #[must_use]
+    #[doc(hidden)]
     pub fn receivers(self) -> u8 {
         match self {
             Self::Isotropic | Self::DipoleNormal => 1,
@@ -42,6 +43,7 @@ impl AntennaResponse {
 
     /// Degree of the response of two such antennas as a polynomial in the direction, whatever their attitudes.
     #[must_use]
+    #[doc(hidden)]
     pub fn degree(self) -> usize {
         match self {
             Self::Isotropic => 0,
@@ -106,6 +108,7 @@ impl Instrument {
     /// Antenna response and whether there is thermal noise, in one byte of packets and of states: 0 (isotropic), 1 (dipole) or 2
     /// (three dipoles), plus 128 without noise.
     #[must_use]
+    #[doc(hidden)]
     pub fn response_code(&self) -> u8 {
         let response = match self.response {
             AntennaResponse::Isotropic => 0,
@@ -117,6 +120,7 @@ impl Instrument {
 
     /// What [`Instrument::response_code`] stands for; `None` if nothing has that code.
     #[must_use]
+    #[doc(hidden)]
     pub fn response_of_code(code: u8) -> Option<(AntennaResponse, bool)> {
         let response = match code & !NOISELESS {
             0 => AntennaResponse::Isotropic,
@@ -135,6 +139,7 @@ impl Instrument {
 
     /// The channel in which `pair` measures; `None` if it has no such channel.
     #[must_use]
+    #[doc(hidden)]
     pub fn channel_of(&self, channel: ChannelId, pair: Pair) -> Option<Channel> {
         let index = usize::from(channel.0);
         if !self.is_spectrum(pair) {
@@ -148,6 +153,7 @@ impl Instrument {
 
     /// Whether `pair` is the auto-correlation of the spectrometer.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_spectrum(&self, pair: Pair) -> bool {
         self.spectrometer.is_some() && (pair.i, pair.j) == (self.satellites, self.satellites)
     }

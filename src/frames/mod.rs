@@ -14,12 +14,21 @@ mod visibility;
 
 pub use ephemeris::EphemerisSegment;
 pub use flags::Flags;
-pub use ground::{CountedVisibilities, PlacedFrame};
+#[doc(hidden)]
+pub use ground::CountedVisibilities;
+pub use ground::PlacedFrame;
 pub use housekeeping::Housekeeping;
-pub use instrument::{AntennaResponse, Channel, Instrument, Spectrometer};
-pub use reason::{SampleReason, VisibilityReason};
+#[doc(hidden)]
+pub use instrument::Spectrometer;
+pub use instrument::{AntennaResponse, Channel, Instrument};
+#[doc(hidden)]
+pub use reason::SampleReason;
+pub use reason::VisibilityReason;
+#[doc(hidden)]
 pub use samples::{SampleBlock, Samples, SpaceFrame};
-pub use visibility::{AutoPower, PlacedVisibilities, VisibilityBlock};
+#[doc(hidden)]
+pub use visibility::AutoPower;
+pub use visibility::{PlacedVisibilities, UnequalLengths, VisibilityBlock};
 
 /// Frames that the ground reads from a downlink, in the order in which they were sent.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,6 +45,7 @@ pub enum GroundFrame {
 
 /// An observing window: an interval in which the Moon hides the Earth from the first daughter.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct ObservingWindow {
     /// Number of the window since the mission epoch; one an orbit.
     pub index: u64,

@@ -74,6 +74,7 @@ pub enum VisibilityReason {
 impl VisibilityReason {
     /// Whether the sums leave visibilities out for it; calibration and reception do for the others.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_of_sums(self) -> bool {
         matches!(
             self,

@@ -1,14 +1,41 @@
 //! Integrated visibilities, before and after the ground has assigned positions to them.
 
 use num_complex::{Complex32, Complex64};
+use thiserror::Error;
 
 use super::Flags;
 use crate::units::vector::Vec3;
 use crate::units::{ChannelId, MissionTime, Pair};
 
+/// Arrays of a block of visibilities that are not of one length.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+#[error("a block of {expected} visibilities of satellites {} and {} has {found} values of {name}: expected as many", pair.i + 1, pair.j + 1)]
+pub struct UnequalLengths {
+    /// Pair of the block.
+    pub pair: Pair,
+    /// The array of another length.
+    pub name: &'static str,
+    /// Its length.
+    pub found: usize,
+    /// The number of visibilities.
+    pub expected: usize,
+}
+
+/// Requires arrays, by their names, of the expected length.
+fn require_lengths<const N: usize>(
+    pair: Pair,
+    expected: usize,
+    arrays: [(&'static str, usize); N],
+) -> Result<(), UnequalLengths> {
+    match arrays.into_iter().find(|(_, found)| *found != expected) {
+        None => Ok(()),
+        Some((name, found)) => Err(UnequalLengths { pair, name, found, expected }),
+    }
+}
+
 /// Consecutive integrations of one pair in one channel, as the mother produces them.
 ///
-/// Structure of arrays; all arrays have the same length.
+/// Structure of arrays; all arrays have the same length ([`VisibilityBlock::check_lengths`]).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct VisibilityBlock {
     /// Channel.
@@ -42,11 +69,27 @@ impl VisibilityBlock {
         self.value_k_sr.is_empty()
     }
 
+    /// Requires that all arrays have the same length, as everything that takes blocks does.
+    ///
+    /// # Errors
+    /// The array that has not.
+    pub fn check_lengths(&self) -> Result<(), UnequalLengths> {
+        let Self { pair, offset_ticks, duration_ticks, weight, flags, .. } = self;
+        let arrays = [
+            ("offset_ticks", offset_ticks.len()),
+            ("duration_ticks", duration_ticks.len()),
+            ("weight", weight.len()),
+            ("flags", flags.len()),
+        ];
+        require_lengths(*pair, self.len(), arrays)
+    }
+
     /// Splits the integrations from `at` on off into a block of their own.
     ///
     /// # Panics
     /// If the block is shorter than that.
     #[must_use]
+    #[doc(hidden)]
     pub fn split_off(&mut self, at: usize) -> Self {
         Self {
             channel: self.channel,
@@ -88,7 +131,7 @@ pub struct AutoPower {
 
 /// Calibrated visibilities with the positions of their two satellites, ready for accumulation.
 ///
-/// Structure of arrays; all arrays have the same length. Times increase.
+/// Structure of arrays; all arrays have the same length ([`PlacedVisibilities::check_lengths`]). Times increase.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlacedVisibilities {
     /// Channel.
@@ -126,14 +169,33 @@ impl PlacedVisibilities {
         self.time_s.is_empty()
     }
 
+    /// Requires that all arrays have the same length, as everything that takes blocks does; `duration_s` may be empty.
+    ///
+    /// # Errors
+    /// The array that has not.
+    pub fn check_lengths(&self) -> Result<(), UnequalLengths> {
+        let Self { pair, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
+        let durations = if duration_s.is_empty() { self.len() } else { duration_s.len() };
+        let arrays = [
+            ("r_i_m", r_i_m.len()),
+            ("r_j_m", r_j_m.len()),
+            ("value_k_sr", value_k_sr.len()),
+            ("weight", weight.len()),
+            ("duration_s", durations),
+        ];
+        require_lengths(*pair, self.len(), arrays)
+    }
+
     /// The same channel and pair, with no visibilities.
     #[must_use]
+    #[doc(hidden)]
     pub fn without_visibilities(&self) -> Self {
         let Self { channel, band, frequency_hz, pair, .. } = *self;
         Self { channel, band, frequency_hz, pair, ..Self::default() }
     }
 
     /// Adds visibility `k` of `other`, which has one.
+    #[doc(hidden)]
     pub fn push_of(&mut self, other: &Self, k: usize) {
         self.time_s.push(other.time_s[k]);
         self.r_i_m.push(other.r_i_m[k]);
@@ -144,6 +206,7 @@ impl PlacedVisibilities {
     }
 
     /// Keeps the first `len` visibilities.
+    #[doc(hidden)]
     pub fn truncate(&mut self, len: usize) {
         let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
         time_s.truncate(len);
@@ -152,5 +215,30 @@ impl PlacedVisibilities {
         value_k_sr.truncate(len);
         weight.truncate(len);
         duration_s.truncate(len);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arrays_of_other_lengths_are_named() {
+        let block = VisibilityBlock {
+            pair: Pair { i: 0, j: 4 },
+            offset_ticks: vec![0, 5],
+            duration_ticks: vec![5, 5],
+            value_k_sr: vec![Complex32::ZERO; 2],
+            weight: vec![1.0; 2],
+            flags: vec![Flags::default(); 2],
+            ..VisibilityBlock::default()
+        };
+        assert_eq!(block.check_lengths(), Ok(()));
+        let wrong = VisibilityBlock { flags: vec![Flags::default()], ..block };
+        let told = wrong.check_lengths().unwrap_err().to_string();
+        assert_eq!(
+            told,
+            "a block of 2 visibilities of satellites 1 and 5 has 1 values of flags: expected as many"
+        );
     }
 }

@@ -289,7 +289,7 @@ impl Collector {
         while let Some(found) = self.flush_next() {
             take(found);
         }
-        require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum())
+        require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum(), || None)
     }
 
     /// The instrument that a file describes first, read no further than that; `None` if it describes none.

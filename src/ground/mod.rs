@@ -6,6 +6,7 @@
 //! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; knows nothing of the spacecraft, of
 //! solving, or of the pipeline.
 
+#[doc(hidden)]
 pub mod archive;
 mod collector;
 mod config;
@@ -23,15 +24,29 @@ mod sky_hits;
 mod uvw_density;
 
 pub use self::core::Ground;
+#[doc(hidden)]
+pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
+#[doc(hidden)]
 pub use collector::{Collector, CollectorState, CollectorStep, CollectorView, DeliveredPacket, Delivery};
-pub use config::{GroundConfig, WAIT_BYTES};
+#[doc(hidden)]
+pub use config::GroundConfig;
+pub use config::WAIT_BYTES;
 pub use error::GroundError;
+#[doc(hidden)]
 pub use hold_buffer::{Due, HeldPacket, HoldBuffer};
+#[doc(hidden)]
 pub use lookout::{ArrayNow, Lookout};
+#[doc(hidden)]
 pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
+#[doc(hidden)]
 pub use pass_gate::{PassGateState, PassObserver};
+#[doc(hidden)]
 pub use pass_line::{KindLine, MissingRange, PassLine};
+#[doc(hidden)]
 pub use power_waterfall::PowerWaterfall;
+#[doc(hidden)]
 pub use reception::Reception;
+#[doc(hidden)]
 pub use sky_hits::{HitsMap, SkyHits};
+#[doc(hidden)]
 pub use uvw_density::UvwDensity;

@@ -13,9 +13,9 @@ use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
-use crate::sky::Frame;
 use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
+use crate::sky::{Frame, TEMPERATURE_K_MAX};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, Checks, InvalidValue, PerChannel};
 
@@ -258,18 +258,21 @@ impl MapConfig {
 
     /// Whether rows of B are made again for each product over pixels.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_remade(&self) -> bool {
         self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Remade
     }
 
     /// Whether visibilities are held one by one instead of sums.
     #[must_use]
+    #[doc(hidden)]
     pub fn holds_visibilities(&self) -> bool {
         self.refine.is_on() || self.is_remade()
     }
 
     /// All invalid settings; empty if there are none.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("map");
         let is_harmonic = self.engine == EngineKind::Harmonic;
@@ -284,9 +287,11 @@ impl MapConfig {
         let channels = self.channels_max;
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
-        checks.number("baseline_bp_max", longest, longest > 0.0, "a positive number, in units of b_p");
+        let expected = "above 0 and at most 1e12, in units of b_p";
+        checks.number("baseline_bp_max", longest, longest > 0.0 && longest <= 1e12, expected);
         checks.numbers("epsilon", self.epsilon().values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
-        checks.numbers("prior_k", self.prior_k.values(), |k| k >= 0.0, "K, not negative");
+        let is_temperature = |k| (0.0..=TEMPERATURE_K_MAX).contains(&k);
+        checks.numbers("prior_k", self.prior_k.values(), is_temperature, "0 to 1e16 K");
         let fwhm = self.prior_fwhm_deg;
         checks.number("prior_fwhm_deg", fwhm, (0.0..=180.0).contains(&fwhm), "0 to 180");
         let share = self.moon_reflection;
@@ -457,12 +462,14 @@ impl MapConfig {
 
     /// Greatest degree of a map from the harmonic engine.
     #[must_use]
+    #[doc(hidden)]
     pub fn degree(&self) -> usize {
         if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
     /// The settings that determine the sums, by key; the others determine only what is solved from them.
     #[must_use]
+    #[doc(hidden)]
     pub fn of_sums(&self) -> Vec<(&'static str, String)> {
         // Every field is named: whoever adds a key decides here whether a state depends on it.
         let Self {
@@ -525,6 +532,7 @@ impl MapConfig {
 
     /// What the rows of a refined map are made with.
     #[must_use]
+    #[doc(hidden)]
     pub fn belief(&self) -> RowBelief {
         let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
         RowBelief {
@@ -538,6 +546,7 @@ impl MapConfig {
     ///
     /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4).
     #[must_use]
+    #[doc(hidden)]
     pub fn baseline_m_max(&self, frequency_hz: f64) -> f64 {
         let pixel_rad = pixel_area_sr(self.nside).sqrt();
         self.baseline_bp_max * SPEED_OF_LIGHT_M_S / frequency_hz / pixel_rad
@@ -545,6 +554,7 @@ impl MapConfig {
 
     /// Whether a channel is mapped.
     #[must_use]
+    #[doc(hidden)]
     pub fn maps(&self, channel: ChannelId) -> bool {
         self.channels.is_empty() || self.channels.contains(&channel.0)
     }
@@ -554,6 +564,7 @@ impl MapConfig {
     ///
     /// # Errors
     /// [`AccumulationError::Memory`].
+    #[doc(hidden)]
     pub fn require_memory(
         &self,
         channels: usize,
@@ -580,12 +591,14 @@ impl MapConfig {
     ///
     /// # Errors
     /// [`AccumulationError::Prior`].
+    #[doc(hidden)]
     pub fn check_priors(&self, instrument: &Instrument) -> Result<(), AccumulationError> {
         Ok(check_frequencies(&self.prior_files, &instrument.frequencies_hz())?)
     }
 
     /// Settings by channel that do not match an instrument of `channels` channels.
     #[must_use]
+    #[doc(hidden)]
     pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
         let epsilon = self.epsilon();
         let (files, tables) = (self.prior_files.len(), self.power_files().len());

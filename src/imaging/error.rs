@@ -15,6 +15,9 @@ pub enum AccumulationError {
     /// Rows of B cannot be computed.
     #[error(transparent)]
     Response(#[from] ResponseError),
+    /// A block whose arrays are not of one length.
+    #[error(transparent)]
+    Lengths(#[from] crate::frames::UnequalLengths),
     /// A prior map that cannot be used.
     #[error("map.prior_files: {0}")]
     Prior(#[from] crate::sky::fits::FitsError),

@@ -2,14 +2,16 @@
 //! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R_l = 1 / C_l`, C_l the sky's angular power as the data have it ([`SkyPower`]);
 //! or `R = epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4), or another [`Regulariser`].
 //!
-//! A folder holds one map method, its sums and their solution: [`pixel`] forms the matrix itself (or makes its rows again for each product);
+//! A folder holds one map method, its sums and their solution: `pixel` forms the matrix itself (or makes its rows again for each product);
 //! [`circle`] holds what makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines
-//! its maps with rows at the true positions. [`exact`] is what they share to sum: integers, whose bits depend on the visibilities in them alone,
+//! its maps with rows at the true positions. `exact` is what they share to sum: integers, whose bits depend on the visibilities in them alone,
 //! and the format of checkpoints. `solver` is what they share to solve: conjugate gradients, eigenvalues, traces. `stage` holds the two stages of the
 //! pipeline, [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
 mod antennas;
+#[doc(hidden)]
 pub mod anywhere;
+#[doc(hidden)]
 pub mod circle;
 mod config;
 pub(crate) mod cost;
@@ -22,26 +24,35 @@ mod regulariser;
 mod solver;
 mod stage;
 
+#[doc(hidden)]
 pub use circle::{
     HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,
     solve_regularised,
 };
-pub use config::{ChannelGroup, EngineKind, MapConfig, MatrixKind, REFINED, RefineConfig, RegulariserChoice};
+pub use config::MapConfig;
+#[doc(hidden)]
+pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig, RegulariserChoice};
 pub use error::AccumulationError;
 pub use exact::ExactEngine;
+#[doc(hidden)]
 pub use exact::automatic_weight_max;
+#[doc(hidden)]
 pub use pixel::{
-    Cholesky, ColumnBlock, Diagnostics, NotPositive, PixelEngine, PixelExtras, PixelSetup, PixelSolution,
-    PixelSums, PointBeam, RemadeSums, RemadeVisibilities, SymmetricTiles, TILE, solve_pixels,
-    solve_pixels_with, solve_pixels_with_power, solve_remade,
+    Cholesky, ColumnBlock, NotPositive, PixelExtras, PointBeam, RemadeSums, RemadeVisibilities,
+    SymmetricTiles, TILE, solve_pixels_with, solve_pixels_with_power, solve_remade,
 };
+pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 pub use power::{SkyPower, Uncertainty};
+#[doc(hidden)]
 pub use regulariser::Regulariser;
+pub use solver::SolveError;
+#[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, HELD_MAX, LargestEigenvalue, NamedWatch, SolveError, SolveWatch, Solving,
-    SolvingPart, Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam,
-    largest_eigenvalue, noise_variance, probed_traces, regularisation, spectrum, traces,
+    Convergence, Estimate, Fit, HELD_MAX, LargestEigenvalue, NamedWatch, SolveWatch, Solving, SolvingPart,
+    Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
+    noise_variance, probed_traces, regularisation, spectrum, traces,
 };
+#[doc(hidden)]
 pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotSums, Solution, Solver, SolverSetup};
 
 use std::collections::BTreeMap;
@@ -130,7 +141,7 @@ pub trait NormalEngine: Send {
     /// Adds visibilities.
     ///
     /// # Errors
-    /// A block of another frequency. A visibility that the engine does not cover, or has no room for, is counted as
+    /// A block of another frequency, or with arrays of unequal lengths. A visibility that the engine does not cover, or has no room for, is counted as
     /// refused instead.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
@@ -140,11 +151,12 @@ pub trait NormalEngine: Send {
     /// others were added.
     ///
     /// # Errors
-    /// A block of another frequency; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
+    /// A block of another frequency, or with arrays of unequal lengths; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
     /// removed. Nothing changes then.
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
     /// Sums the pending visibilities now instead of with the next batch; the sums get the same bits either way.
+    #[doc(hidden)]
     fn flush(&mut self);
 
     /// Adds the sums of another engine of the same setup.
@@ -159,6 +171,7 @@ pub trait NormalEngine: Send {
     ///
     /// # Errors
     /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if the engine holds less.
+    #[doc(hidden)]
     fn subtract(&mut self, other: Self) -> Result<(), AccumulationError>
     where
         Self: Sized;
@@ -167,6 +180,7 @@ pub trait NormalEngine: Send {
     fn counts(&self) -> SumCounts;
 
     /// The sums of all visibilities so far, as a copy.
+    #[doc(hidden)]
     fn sums(&mut self) -> Self::Equations;
 
     /// The sums of all visibilities, without a copy.
@@ -178,12 +192,14 @@ pub trait NormalEngine: Send {
     ///
     /// # Errors
     /// The writer's.
+    #[doc(hidden)]
     fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
 
     /// Reads an engine that [`NormalEngine::checkpoint`] wrote; it resumes to the same bits.
     ///
     /// # Errors
     /// Data that is damaged, truncated, or of another format.
+    #[doc(hidden)]
     fn restore(from: &mut dyn std::io::Read) -> Result<Self, AccumulationError>
     where
         Self: Sized;
@@ -198,6 +214,7 @@ pub trait NormalSums: Send {
     fn apply(&self, x: &[f64], y: &mut [f64]);
 
     /// `BtN^-1B x` of each x, with the bits of [`NormalSums::apply`]; cheaper than one by one where reading the sums takes time.
+    #[doc(hidden)]
     fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
         let product = |x: &&[f64]| {
             let mut y = vec![0.0; x.len()];
@@ -211,15 +228,18 @@ pub trait NormalSums: Send {
     fn right_hand_side(&self) -> &[f64];
 
     /// `BtN^-1n` for noise n of the data's own weights: the right-hand side of a noise-only map.
+    #[doc(hidden)]
     fn noise_right_hand_side(&self) -> &[f64];
 
     /// Number and weight of the visibilities in the sums.
     fn counts(&self) -> SumCounts;
 
     /// How well the eigenvalues of `BtN^-1B` are known.
+    #[doc(hidden)]
     fn accuracy(&self) -> Accuracy;
 
     /// Why sums on disk could not be read: products are not numbers from then on.
+    #[doc(hidden)]
     fn failure(&self) -> Option<&str> {
         None
     }
@@ -228,6 +248,7 @@ pub trait NormalSums: Send {
 /// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`
 /// W_max. Those of the harmonic engine have been compared with rows one by one in f64; those of the other are estimates.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[doc(hidden)]
 pub struct Accuracy {
     /// Of the eigenvalue itself.
     pub relative: f64,

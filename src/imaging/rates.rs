@@ -1,6 +1,6 @@
 //! Rates of one core, measured once, from which times are estimated.
 //!
-//! The machine: a virtual machine with 2 cores of an AMD EPYC without AVX-512; the figures are those of the README's
+//! The machine: a virtual machine with 2 cores of an AMD EPYC without AVX-512; the figures are those of `docs/evidence.md`'s
 //! table of speeds, halved where they are for both cores. Another machine is faster or slower by some factor: what counts is which part takes longest, and
 //! whether it is minutes or days.
 

@@ -3,6 +3,7 @@
 
 use std::path::Path;
 
+use crate::files::read_text;
 use crate::imaging::circle::degrees;
 use crate::imaging::solver::SolveError;
 
@@ -64,11 +65,7 @@ impl Regulariser {
     /// A file that cannot be read or is no such table; power that is not positive.
     pub fn read(path: &Path) -> Result<Self, SolveError> {
         let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
-        let bytes = std::fs::metadata(path).map_err(|error| failed(error.to_string()))?.len();
-        if bytes > FILE_BYTES_MAX {
-            return Err(failed(format!("{bytes} bytes")));
-        }
-        let text = std::fs::read_to_string(path).map_err(|error| failed(error.to_string()))?;
+        let text = read_text(path, FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
         power_of(&text).map(Self::Wiener).map_err(failed)
     }
 

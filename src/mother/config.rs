@@ -7,6 +7,7 @@ use super::correlator::{Division, SUB_BANDS_MAX, dump_samples, shortest_integrat
 use super::ninth::NinthConfig;
 use super::receiver::{ReceiverNoise, check_channels, is_none, is_zero};
 use super::schedule::Schedule;
+use super::thinning::{self, WindowThinning};
 use crate::array::{Array, IntegrationRule};
 use crate::frames::{AntennaResponse, Channel};
 use crate::response::model::ModelChoice;
@@ -19,12 +20,13 @@ pub const CHANNELS_MAX: usize = 30;
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
-/// Size of one visibility in the store and on the link, bytes.
-pub const VISIBILITY_BYTES: u64 = 21;
-
 /// Narrowest channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute, in which the
 /// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
+
+fn is_one(number: &u64) -> bool {
+    *number == 1
+}
 
 /// The `[spacecraft]` section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -38,6 +40,10 @@ pub struct SpacecraftConfig {
     pub channel_width_hz: f64,
     /// Length of the mission, s.
     pub duration_s: f64,
+    /// Keep one visibility in this many, from windows that have all phases of month, breathing and precession; in place of
+    /// `every_nth_window` and `every_nth_integration`.
+    #[serde(skip_serializing_if = "is_one")] // Missions without it keep their hash.
+    pub thin: u64,
     /// Observe only in every n-th window.
     pub every_nth_window: u64,
     /// Observe only for this time from the start of each window, s; 0 for all of it.
@@ -176,6 +182,7 @@ impl Default for SpacecraftConfig {
             channels_hz: vec![10e6],
             channel_width_hz: 8_000.0,
             duration_s: 1.3 * YEAR_S,
+            thin: 1,
             every_nth_window: 1,
             window_s_max: 0.0,
             flag_earth: true,
@@ -237,6 +244,15 @@ impl SpacecraftConfig {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
     }
 
+    /// Which windows are observed.
+    #[must_use]
+    pub fn window_thinning(&self) -> WindowThinning {
+        match self.thin {
+            0 | 1 => WindowThinning::EveryNth(self.every_nth_window),
+            thin => WindowThinning::Spread(thinning::shares(thin).0),
+        }
+    }
+
     /// One schedule a channel.
     #[must_use]
     pub fn schedules(&self) -> Vec<Schedule> {
@@ -244,8 +260,11 @@ impl SpacecraftConfig {
             rule: self.rule(),
             frequency_hz,
             baseline_wavelengths_max: self.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
-            every_nth: self.every_nth_integration.get(channel).unwrap_or(1),
-            every_nth_window: self.every_nth_window,
+            every_nth: match self.thin {
+                0 | 1 => self.every_nth_integration.get(channel).unwrap_or(1),
+                thin => thinning::shares(thin).1,
+            },
+            windows: self.window_thinning(),
         };
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
@@ -445,6 +464,11 @@ impl SpacecraftConfig {
             self.every_nth_window >= 1,
             "at least 1",
         );
+        checks.number("thin", self.thin as f64, self.thin >= 1, "at least 1");
+        let is_alone =
+            self.every_nth_window == 1 && self.every_nth_integration.values().iter().all(|&nth| nth == 1);
+        let expected = "1, or every_nth_window = 1 and every_nth_integration = 1, which it replaces";
+        checks.number("thin", self.thin as f64, self.thin <= 1 || is_alone, expected);
         let some = self.every_nth_integration.values().iter().all(|&nth| nth >= 1);
         checks.require("every_nth_integration", 0, some, "at least 1");
         let limits = self.baseline_wavelengths_max.values();

@@ -19,13 +19,14 @@ mod observer;
 mod powers;
 mod receiver;
 mod schedule;
+mod sizes;
 mod spool;
 mod store;
+mod thinning;
 mod troubles;
 
 pub use config::{
     Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, MoonMirror, SpacecraftConfig, StoreDrop,
-    VISIBILITY_BYTES,
 };
 pub use integrator::{ChannelModel, Integrator, MeasurementOptions, NoiseModel};
 pub use merger::Merger;
@@ -33,5 +34,7 @@ pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use observer::Observer;
 pub use receiver::ReceiverNoise;
 pub use schedule::{Integration, Schedule};
+pub use sizes::VISIBILITY_BYTES;
 pub use spool::{SpoolError, SpoolReader, SpoolWriter};
 pub use store::{PacedLink, Store};
+pub use thinning::{WindowThinning, largest_gap};

@@ -6,9 +6,10 @@ use num_complex::Complex32;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::config::VISIBILITY_BYTES;
+use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
+use crate::numerics::lagrange;
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, Checks, InvalidValue, Pair, StreamKind, TICKS_PER_SECOND, random_stream};
@@ -167,15 +168,6 @@ impl NinthSky {
             }
         }
     }
-}
-
-/// Lagrange weights of the values at `nodes` for interpolation at `x`.
-fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
-    let weight = |k: usize| {
-        let others = nodes.iter().enumerate().filter(|(m, _)| *m != k);
-        others.map(|(_, node)| (x - node) / (nodes[k] - node)).product()
-    };
-    (0..nodes.len()).map(weight).collect()
 }
 
 /// What [`Ninth`] needs.

@@ -1,5 +1,6 @@
 //! The source of the space segment in visibility fidelity: the observing windows.
 
+use super::thinning::WindowThinning;
 use crate::array::{Array, ObservingWindows};
 use crate::frames::ObservingWindow;
 use crate::runtime::{Flow, Outlet, Source};
@@ -17,12 +18,10 @@ impl Observer {
         Self { windows: windows.into_iter() }
     }
 
-    /// Every `every_nth`-th window of `array` from the epoch to `duration_s`, in the order of time.
+    /// The windows of `array` from the epoch to `duration_s` that `thinning` keeps, in the order of time.
     #[must_use]
-    pub fn windows(array: &Array, duration_s: f64, every_nth: u64) -> Vec<ObservingWindow> {
-        ObservingWindows::new(array, 0.0, duration_s)
-            .filter(|window| window.index.is_multiple_of(every_nth.max(1)))
-            .collect()
+    pub fn windows(array: &Array, duration_s: f64, thinning: WindowThinning) -> Vec<ObservingWindow> {
+        ObservingWindows::new(array, 0.0, duration_s).filter(|window| thinning.keeps(window.index)).collect()
     }
 }
 

@@ -1,5 +1,6 @@
 //! The integrations of a window.
 
+use super::thinning::WindowThinning;
 use crate::array::{Array, IntegrationRule, integration_time_s};
 use crate::frames::ObservingWindow;
 use crate::units::vector::{norm, sub};
@@ -27,8 +28,8 @@ pub struct Schedule {
     pub baseline_wavelengths_max: f64,
     /// Keep only every n-th integration.
     pub every_nth: u64,
-    /// Only every n-th window is observed; keeps the two kinds of thinning from running in step.
-    pub every_nth_window: u64,
+    /// Which windows are observed; keeps the two kinds of thinning from running in step.
+    pub windows: WindowThinning,
 }
 
 impl Schedule {
@@ -48,7 +49,7 @@ impl Schedule {
         }
         let mut found = Vec::new();
         let mut offset_ticks = 0;
-        let mut number = window.index / self.every_nth_window.max(1);
+        let mut number = self.windows.first_integration(window.index, self.every_nth);
         while offset_ticks < length_ticks {
             let t_s = window.start.plus_ticks(i64::from(offset_ticks)).seconds();
             let (i, j) = (array.state(pair.i.into(), t_s), array.state(pair.j.into(), t_s));
@@ -112,7 +113,13 @@ mod tests {
 
     fn schedule(baseline_wavelengths_max: f64, every_nth: u64) -> Schedule {
         let rule = IntegrationRule::default();
-        Schedule { rule, frequency_hz: 10e6, baseline_wavelengths_max, every_nth, every_nth_window: 1 }
+        Schedule {
+            rule,
+            frequency_hz: 10e6,
+            baseline_wavelengths_max,
+            every_nth,
+            windows: WindowThinning::EveryNth(1),
+        }
     }
 
     #[test]

@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::convert::Infallible;
 use std::sync::Arc;
 
-use super::config::{SpacecraftConfig, StoreDrop, VISIBILITY_BYTES};
+use super::config::{SpacecraftConfig, StoreDrop};
+use super::sizes::VISIBILITY_BYTES;
 use crate::array::{Array, earth_in_sight_s};
 use crate::frames::{GroundFrame, Housekeeping, VisibilityBlock};
 use crate::runtime::{Outlet, Stage, Units};

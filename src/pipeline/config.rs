@@ -63,9 +63,7 @@ impl Config {
         let mut found = Problems::default();
         found.extend(self.sky.problems(channels));
         let mut checks = Checks::of("");
-        let bad = |c: char| c.is_control() || c == '/' || c == '\\';
-        let is_folder =
-            !(self.name.len() > 60 || self.name.contains(bad) || [".", ".."].contains(&self.name.as_str()));
+        let is_folder = is_folder_name(&self.name);
         let expected = "at most 60 bytes, without slashes and control characters";
         checks.require("name", format!("{:?}", self.name), is_folder, expected);
         let (space, ground) = (self.spacecraft.sub_bands, self.calibration.sub_bands);
@@ -223,6 +221,7 @@ impl Config {
 
     /// Everything that is wrong with the ground segment's sections; empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn ground_problems(&self) -> Problems {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
@@ -241,6 +240,7 @@ impl Config {
     /// files that they name. The downlink is not part of it: the same data may arrive through two stations, or in two
     /// formats.
     #[must_use]
+    #[doc(hidden)]
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
@@ -260,6 +260,7 @@ impl Config {
     /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for
     /// provenance.
     #[must_use]
+    #[doc(hidden)]
     pub fn ground_hash(&self) -> u64 {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);
@@ -276,9 +277,19 @@ impl Config {
     }
 }
 
+/// Whether a name stays within the folder that it is joined to; an empty one is that folder.
+pub(super) fn is_folder_name(name: &str) -> bool {
+    let bad = |c: char| c.is_control() || c == '/' || c == '\\';
+    !(name.len() > 60 || name.contains(bad) || [".", ".."].contains(&name))
+}
+
 /// Replaces the path of a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
 /// run when it is needed.
 fn contents(path: &Path) -> PathBuf {
+    // Devices and pipes may never end.
+    if !path.is_file() {
+        return path.to_owned();
+    }
     let sum = crc_fast::checksum_file(crc_fast::CrcAlgorithm::Crc64Nvme, &path.to_string_lossy(), None);
     sum.map_or_else(|_| path.to_owned(), |sum| PathBuf::from(format!("{sum:016x}")))
 }

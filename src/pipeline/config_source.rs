@@ -93,6 +93,7 @@ pub struct ConfigSource {
 impl ConfigSource {
     /// Name of this source in messages.
     #[must_use]
+    #[doc(hidden)]
     pub fn origin(&self) -> String {
         self.file.as_deref().map_or_else(|| QUICKLOOK_NAME.into(), |path| path.display().to_string())
     }
@@ -101,6 +102,7 @@ impl ConfigSource {
     ///
     /// # Errors
     /// An unreadable file; everything that is not TOML, not a key or not of its type, and every bad override.
+    #[doc(hidden)]
     pub fn parse(&self) -> Result<Config, ConfigError> {
         self.parse_text(&self.text()?)
     }
@@ -109,6 +111,7 @@ impl ConfigSource {
     ///
     /// # Errors
     /// As [`Self::parse`].
+    #[doc(hidden)]
     pub fn parse_text(&self, text: &str) -> Result<Config, ConfigError> {
         self.checked(text, self.origin(), |_| Problems::default())
     }
@@ -138,6 +141,7 @@ impl ConfigSource {
     ///
     /// # Errors
     /// As [`Self::load`].
+    #[doc(hidden)]
     pub fn load_noting(&self, notes: &mut Vec<String>) -> Result<Config, ConfigError> {
         self.checked_noting(&self.text()?, self.origin(), Config::problems, notes)
     }

@@ -123,12 +123,14 @@ impl ChannelCost {
 impl Plan {
     /// What the pipeline will cost. Nothing is measured: times are estimates at rates measured once.
     #[must_use]
+    #[doc(hidden)]
     pub fn cost(&self) -> Cost {
         self.cost_among(1)
     }
 
     /// As [`Plan::cost`], for one of some ranks that share the sums.
     #[must_use]
+    #[doc(hidden)]
     pub fn cost_among(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
@@ -299,11 +301,38 @@ impl Cost {
         self
     }
 
+    /// Requires that all estimates are finite: what cannot be estimated may never end.
+    ///
+    /// # Errors
+    /// [`PipelineError::Unbounded`].
+    pub fn require_finite(&self) -> Result<(), PipelineError> {
+        let channels = self.channels.iter().flat_map(|channel| {
+            let of = |what| format!("{what} of the channel at {:.3} MHz", channel.frequency_hz / 1e6);
+            [
+                (of("number of visibilities"), channel.visibilities_sent),
+                (of("time of the simulation"), channel.simulation_s()),
+                (of("time of the map"), channel.mapping_s),
+            ]
+        });
+        let whole = [
+            ("size of the downlink", self.downlink_bytes),
+            ("memory", self.memory_bytes),
+            ("memory of the simulation", self.simulation_memory_bytes),
+            ("time", self.predicted_s),
+        ];
+        let all = channels.chain(whole.map(|(what, value)| (what.to_owned(), value)));
+        match all.into_iter().find(|(_, value)| !value.is_finite() || *value < 0.0) {
+            None => Ok(()),
+            Some((what, value)) => Err(PipelineError::Unbounded { what, value }),
+        }
+    }
+
     /// Requires that the memory that a segment needs is within the limit.
     ///
     /// # Errors
-    /// [`PipelineError::Memory`].
+    /// [`PipelineError::Memory`]; those of [`Cost::require_finite`].
     pub fn require_memory(&self, segment: Segment, limit: Option<MemoryLimit>) -> Result<(), PipelineError> {
+        self.require_finite()?;
         let needed_bytes = match segment {
             Segment::Whole => self.memory_bytes,
             Segment::Space => self.simulation_memory_bytes,

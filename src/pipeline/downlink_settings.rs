@@ -18,6 +18,7 @@ impl ConfigSource {
     /// So `simulate` and `replay` give the maps of `run` when none of them is told anything. Only ordinary files are looked at: what
     /// is read from a pipe is gone.
     #[must_use]
+    #[doc(hidden)]
     pub fn of_downlink(mut self, files: &[PathBuf]) -> (Self, Option<String>) {
         let first = files.first().filter(|path| self.file.is_none() && path.is_file());
         // A file that cannot be read is told when the ground reads it.

@@ -104,15 +104,13 @@ pub enum PipelineError {
     /// No observing window.
     #[error(
         "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \
-         daughter 1, within an orbit of {orbit_s:.0} s, and only one of every_nth_window = {every_nth} is used"
+         daughter 1, within an orbit of {orbit_s:.0} s, and spacecraft.thin and every_nth_window leave out more"
     )]
     NoWindow {
         /// Length of the mission, s.
         duration_s: f64,
         /// An orbit, s.
         orbit_s: f64,
-        /// Distance between used windows, windows.
-        every_nth: u64,
     },
     /// A downlink that cannot be read more than once.
     #[error("{}: not a regular file; expected one with --groups, which reads the downlink once a group", path.display())]
@@ -158,6 +156,17 @@ pub enum PipelineError {
     /// Visibilities cannot be put aside, or read back.
     #[error(transparent)]
     Spool(#[from] crate::mother::SpoolError),
+    /// An estimate that is no number.
+    #[error(
+        "the estimated {what} is {value}: nothing bounds this run; expected settings of which the work can be estimated: look for periods, \
+         motions and times near 0, and for very large numbers"
+    )]
+    Unbounded {
+        /// What was estimated.
+        what: String,
+        /// The estimate.
+        value: f64,
+    },
     /// More memory needed than there is.
     #[error(
         "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \

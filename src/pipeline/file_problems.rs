@@ -1,28 +1,31 @@
 //! Checks of the files that a pipeline names.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use super::config::Config;
 use super::plan::Plan;
 use super::problems::Problems;
 use crate::imaging::Regulariser;
-use crate::sky::AddedSky;
-use crate::sky::fits::{FitsError, FitsProblem, ReadOptions, check_frequency, read_sky, read_whole_map};
+use crate::sky::fits::{
+    FitsError, FitsProblem, MapUnderstood, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
+};
+use crate::sky::{AddedSky, SkyConfig};
+use crate::units::InvalidValue;
 
 impl Plan {
     /// Reads every file that the configuration names; everything that is wrong with them, empty if they are good.
     #[must_use]
+    #[doc(hidden)]
     pub fn file_problems(&self) -> Problems {
         let mut found = Problems::default();
         let (sky, spacecraft) = (&self.config.sky, &self.config.spacecraft);
-        let channels = spacecraft.channels_hz.iter().zip(spacecraft.receiver_k_sr()).enumerate();
-        let skies = channels.filter_map(|(k, channel)| Some((sky.file.as_ref()?.get(k)?, channel)));
-        let skies = skies.map(|(path, (&frequency_hz, receiver_k_sr))| {
-            read_sky(&path, frequency_hz, sky, receiver_k_sr > 0.0)
-        });
+        let channels = 0..spacecraft.channels_hz.len();
+        let skies = channels.filter_map(|channel| Some((sky.file.as_ref()?.get(channel)?, channel)));
+        let skies = skies.map(|(path, channel)| read_sky(&path, &self.sky_channel(channel), sky));
         let priors = self.config.map.prior_files.iter();
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
-        let priors = priors.map(|path| read_whole_map(path, &options));
+        let priors = priors.map(|path| read_prior(path, &options));
         // A file that stands for several channels is told once.
         let mut told = BTreeSet::new();
         for problem in skies.chain(priors).filter_map(Result::err) {
@@ -41,6 +44,9 @@ impl Plan {
         for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
             found.push(|| problem);
         }
+        if let Some(problem) = self.sky_l_max_problem() {
+            found.push(|| problem);
+        }
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {
             found.push(|| problem);
         }
@@ -51,5 +57,53 @@ impl Plan {
             found.push(|| problem);
         }
         found
+    }
+
+    /// A greatest degree of the sky that some channel's map does not determine.
+    fn sky_l_max_problem(&self) -> Option<InvalidValue> {
+        let least = self.sky_nsides().into_iter().min()?;
+        SkyConfig::check_l_max(self.config.sky.l_max, least).err()
+    }
+
+    /// What is understood of every map and catalogue that the configuration names, a line each. Files that cannot be read are told
+    /// by [`Plan::file_problems`].
+    #[must_use]
+    #[doc(hidden)]
+    pub fn files_understood(&self) -> Vec<String> {
+        let Config { sky, spacecraft, map, calibrate, .. } = &self.config;
+        let mut lines: Vec<String> = Vec::new();
+        let mut tell = |key: &str, line: Option<String>| {
+            let line = line.map(|line| format!("{key}: {line}"));
+            lines.extend(line.filter(|line| !lines.contains(line)));
+        };
+        for (channel, &hz) in spacecraft.channels_hz.iter().enumerate() {
+            let path = sky.file.as_ref().and_then(|files| files.get(channel));
+            let read = path.and_then(|path| MapUnderstood::of(&path, &sky_options(sky, hz)).ok());
+            tell("sky.file", read.map(|read| read.to_string()));
+        }
+        for (key, files, frame) in [
+            ("map.prior_files", &map.prior_files, map.prior_frame),
+            ("calibrate.model_files", &calibrate.model_files, None),
+        ] {
+            let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
+            for path in files {
+                tell(key, MapUnderstood::of(path, &options).ok().map(|read| read.to_string()));
+            }
+        }
+        let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());
+        tell("sky.added.catalogue", catalogue);
+        lines
+    }
+}
+
+impl Config {
+    /// Every file that the configuration names: what a run reads, and must not replace.
+    #[must_use]
+    pub fn input_files(&self) -> Vec<PathBuf> {
+        let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
+        let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
+        let maps = self.map.prior_files.iter().chain(self.map.power_files());
+        let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file).cloned();
+        skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
     }
 }

@@ -12,9 +12,9 @@ use crate::imaging::anywhere::RefineRule;
 use crate::imaging::{
     Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
 };
-use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
+use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{ReadOptions, read_prior};
 
 /// Name of the stage that keeps the state.
 pub(super) const GROUND: &str = "ground";
@@ -43,6 +43,7 @@ impl Config {
     ///
     /// # Errors
     /// Prior maps and tables of power that cannot be read.
+    #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
         Ok(SolverSetup {
@@ -82,6 +83,8 @@ pub(super) struct Mapping<'a> {
     pub(super) watch: SolveWatch,
     /// Sees maps.
     pub(super) viewers: MapWatch,
+    /// Is told of products that cannot be written, which then end nothing.
+    pub(super) trouble: Option<ProductsWatch>,
 }
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
@@ -95,7 +98,7 @@ pub(super) fn add(
     ground: Ground,
     mapping: Mapping<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let Mapping { out, truth, watch, viewers } = mapping;
+    let Mapping { out, truth, watch, viewers, trouble } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
@@ -110,6 +113,7 @@ pub(super) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher =
         Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
+    let publisher = trouble.iter().fold(publisher, Publisher::persisting);
     let mut writer = GainsWriter::new(config, out);
     let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
     // Sums are large: one waits while another is solved.
@@ -147,7 +151,7 @@ fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let map = &config.map;
     let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };
     let read = |path: &std::path::PathBuf| {
-        let prior = read_whole_map(path, &options)?.to_ecliptic();
+        let prior = read_prior(path, &options)?.to_ecliptic();
         let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
         Ok(smooth.resized(map.nside)?.into_values())
     };

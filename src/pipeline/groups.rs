@@ -16,7 +16,7 @@ use super::cost::memory_bytes;
 use super::error::PipelineError;
 use super::memory::MemoryLimit;
 use super::plan::Plan;
-use super::run::{Watched, downlink_file, finish, ground_alone, lock_folder, summarise, write_settings};
+use super::run::{Watched, downlink_file, finish, ground_alone, lock_products, summarise, write_settings};
 use super::simulation_groups::simulate_in_groups;
 use super::space_segment;
 use super::summary::{PassRecord, RunScope, RunSummary};
@@ -254,7 +254,7 @@ pub fn replay_in_groups(
     cancel: &Cancel,
     watch: GroupWatcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    let _lock = lock_folder(out)?;
+    let _lock = lock_products(config, out)?;
     let passes = Passes { scope: RunScope::Ground, files, config, groups, out };
     let summary = passes.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
     finish(summary, out)
@@ -331,7 +331,7 @@ impl Passes<'_> {
                 pass.earlier_reports.push(before.report);
             }
             if !is_cut && !is_last {
-                let record = PassRecord::of(&pass);
+                let record = PassRecord::of(&pass, out)?;
                 record.write(&path, key)?;
                 done.push(record);
             }
@@ -405,6 +405,7 @@ impl Plan {
     ///
     /// # Errors
     /// Samples; a channel for which alone there is too little memory.
+    #[doc(hidden)]
     pub fn run_groups(
         &self,
         size: GroupSize,
@@ -430,7 +431,7 @@ pub fn run_in_groups(
     watch: GroupStepWatcher<'_>,
 ) -> Result<Option<RunSummary>, PipelineError> {
     let config = &plan.config;
-    let _lock = lock_folder(out)?;
+    let _lock = lock_products(config, out)?;
     write_settings(config, out)?;
     let RunGroups { simulated, mapped } = groups;
     let file = out.join(downlink_file(config.downlink.format));

@@ -19,11 +19,12 @@ use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
     Load, ModelChoice, ModelKind, ModelPlan, Reflected, SphereMirrored, TimeAverage, VisibilityModel,
+    degrees_seen,
 };
-use crate::sky::fits::{ReadOptions, read_whole_map};
+use crate::sky::fits::{read_nside, sky_options};
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::healpix::pixel_count;
-use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
+use crate::sky::{Frame, GENERATED_NSIDE_MAX, MapError, SkyConfig, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
 use crate::units::{Pair, all_pairs};
@@ -31,6 +32,7 @@ use crate::units::{Pair, all_pairs};
 impl Plan {
     /// The choice of model for each channel, with skies of these nsides, channel by channel.
     #[must_use]
+    #[doc(hidden)]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
         self.model_plans_for(&self.visibilities(), nsides)
     }
@@ -75,16 +77,54 @@ impl Plan {
 impl Plan {
     /// nside of each channel's simulated sky; a map file that cannot be read counts as a generated sky.
     #[must_use]
+    #[doc(hidden)]
     pub fn sky_nsides(&self) -> Vec<usize> {
         let sky = &self.config.sky;
-        let options = ReadOptions { frame_if_missing: sky.frame, ..ReadOptions::default() };
         let nside = |channel: usize| {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let map = path.and_then(|path| read_whole_map(&path, &options).ok());
+            let options = sky_options(sky, self.schedules[channel].frequency_hz);
+            let of_map = path.and_then(|path| read_nside(&path, &options).ok());
             let least = if sky.added.is_some() { sky.nside } else { 1 };
-            map.map_or(sky.nside, |map| map.nside().max(least))
+            of_map.map_or(sky.nside, |nside| nside.max(least))
         };
         (0..self.schedules.len()).map(nside).collect()
+    }
+
+    /// Channels whose baselines see finer scales than the sky's pixels hold, if there are any: direct sums take pixels for points,
+    /// harmonics leave out what is finer, and neither is the sky.
+    #[must_use]
+    pub(super) fn coarse_sky_note(&self) -> Option<String> {
+        let apart_m = match self.array.formation() {
+            Some(_) => 0.0,
+            None => farthest_apart_m(&self.array, &self.windows),
+        };
+        let coarse: Vec<(String, usize, usize)> = self
+            .schedules
+            .iter()
+            .zip(self.sky_nsides())
+            .map(|(schedule, nside)| {
+                let longest = longest_baseline_wavelengths(&self.array, apart_m, schedule);
+                let name = format!("{:.3} MHz ({longest:.1} wavelengths)", schedule.frequency_hz / 1e6);
+                (name, degrees_seen(longest), nside)
+            })
+            .filter(|&(_, seen, nside)| seen > SkyConfig::l_max_held(nside))
+            .collect();
+        let (_, seen, nside) = coarse.iter().max_by_key(|(_, seen, _)| *seen)?;
+        let (held, most) = (SkyConfig::l_max_held(*nside), SkyConfig::l_max_held(GENERATED_NSIDE_MAX));
+        let names: Vec<&str> = coarse.iter().map(|(name, ..)| name.as_str()).take(4).collect();
+        let more = if coarse.len() > names.len() { ", .." } else { "" };
+        let needed =
+            (0..).map(|k| 1 << k).find(|&nside| SkyConfig::l_max_held(nside) >= *seen).unwrap_or(nside * 2);
+        let mend = match *seen <= most {
+            true => format!("a sky of nside {needed} (sky.nside, or a finer map) or shorter baselines"),
+            false => "shorter baselines".to_owned(),
+        };
+        Some(format!(
+            "the sky is too coarse for the longest baselines of {}{more}: they see degrees up to l = {seen}, its pixels (nside {nside}) \
+             hold l up to {held}. Beyond, direct sums take the pixels for points and harmonics leave out what is finer: the two may \
+             differ by tens of per cent. Expected {mend} (spacecraft.baseline_wavelengths_max)",
+            names.join(", ")
+        ))
     }
 
     /// Memory of the known sky from whose visibilities gains are found while the data arrive, bytes; what cannot be read counts nothing.
@@ -167,6 +207,7 @@ fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
 pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
     let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
+    nsides.iter().try_for_each(|&nside| SkyConfig::check_l_max(plan.config.sky.l_max, nside))?;
     let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {

@@ -8,6 +8,7 @@ use crate::array::Array;
 use crate::daughters::{AntennaErrors, DaughtersConfig, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule, SpacecraftConfig};
+use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A configuration that has been checked, with what follows from it.
@@ -47,12 +48,11 @@ impl Plan {
             noiseless: !spacecraft.thermal_noise,
         };
         let schedules = spacecraft.schedules();
-        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.every_nth_window);
+        let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.window_thinning());
         if windows.is_empty() {
             return Err(PipelineError::NoWindow {
                 duration_s: spacecraft.duration_s,
                 orbit_s: config.array.orbital_period_s,
-                every_nth: spacecraft.every_nth_window,
             });
         }
         if spacecraft.window_s_max > 0.0 {
@@ -64,8 +64,21 @@ impl Plan {
         Ok(Self { config, array, instrument, schedules, windows })
     }
 
+    /// The channel for which a sky is read.
+    #[must_use]
+    pub(super) fn sky_channel(&self, channel: usize) -> SkyChannel {
+        let Config { sky, spacecraft, .. } = &self.config;
+        let channels = spacecraft.channels_hz.len();
+        SkyChannel {
+            frequency_hz: spacecraft.channels_hz[channel],
+            may_be_dark: spacecraft.receiver_k_sr()[channel] > 0.0,
+            shares_file: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
+        }
+    }
+
     /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.
     #[must_use]
+    #[doc(hidden)]
     pub fn samples_bits_per_s(&self) -> Option<f64> {
         let Config { spacecraft, daughters, .. } = &self.config;
         let (count, channels) = (self.array.satellites(), spacecraft.channels_hz.len());
@@ -76,6 +89,7 @@ impl Plan {
     /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; `None` without
     /// samples or limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn link_bits_per_s(&self) -> Option<[f64; 2]> {
         let needed = self.samples_bits_per_s()? / self.array.satellites() as f64;
         let limit = self.config.daughters.link_bits_per_s_max;
@@ -84,6 +98,7 @@ impl Plan {
 
     /// Errors of the instrument and of what packets say of positions and times; `None` if there are none.
     #[must_use]
+    #[doc(hidden)]
     pub fn instrument_errors(&self) -> Option<Arc<InstrumentErrors>> {
         let Config { instrument, navigation, seed, spacecraft, .. } = &self.config;
         let channels = spacecraft.channels();
@@ -92,6 +107,7 @@ impl Plan {
 
     /// Antennas of the daughters that are not ideal; `None` if all are.
     #[must_use]
+    #[doc(hidden)]
     pub fn antenna_errors(&self) -> Option<Arc<AntennaErrors>> {
         let (errors, elements) = (self.instrument_errors()?, self.instrument.response);
         AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, elements)
@@ -99,12 +115,14 @@ impl Plan {
 
     /// The true errors in every pass as a table (CSV); `None` if there are none.
     #[must_use]
+    #[doc(hidden)]
     pub fn instrument_truth(&self) -> Option<String> {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
     }
 
     /// Keys for samples that differ from their defaults while the fidelity has no samples.
     #[must_use]
+    #[doc(hidden)]
     pub fn without_effect(&self) -> Vec<String> {
         let Config { spacecraft, daughters, .. } = &self.config;
         let mut found = Vec::new();
@@ -128,6 +146,7 @@ impl Plan {
 
     /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without it.
     #[must_use]
+    #[doc(hidden)]
     pub fn ninth_bits_per_s(&self) -> Option<f64> {
         let ninth = &self.config.spacecraft.ninth;
         ninth.on.then(|| ninth.bits_per_s())
@@ -135,6 +154,7 @@ impl Plan {
 
     /// Windows by which progress is measured; 0 for samples, whose stages do not take whole windows.
     #[must_use]
+    #[doc(hidden)]
     pub fn windows_watched(&self) -> u64 {
         match self.config.spacecraft.fidelity {
             Fidelity::Visibilities => self.windows.len() as u64,

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
+use std::{fs, io};
 
 use super::config::Config;
 use super::error::PipelineError;
@@ -19,7 +20,7 @@ use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
 use crate::imaging::EngineKind;
 use crate::imaging::SolveWatch;
-use crate::products::{MapShape, MapWatch, ProductsError, Truth, write_autos};
+use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
@@ -37,13 +38,15 @@ pub struct Watched {
     pub ground: Option<GroundOutcome>,
     /// The maps, for those who want to see them.
     pub maps: MapWatch,
+    /// How their files go, of a ground that goes on without them.
+    pub products: Option<ProductsWatch>,
 }
 
 impl Watched {
     /// Handles of a graph without a ground.
     pub(super) fn of_space(graph: &Graph) -> Self {
         let (solving, maps) = (SolveWatch::default(), MapWatch::default());
-        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps }
+        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps, products: None }
     }
 }
 
@@ -53,9 +56,18 @@ pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
     fn listening(&self) -> Option<Listening> {
         None
     }
+
+    /// Whether it goes on until it is told to end: reception then does not end because maps cannot be written.
+    fn is_service(&self) -> bool {
+        false
+    }
 }
 
-impl GroundSource for FileSource {}
+impl GroundSource for FileSource {
+    fn is_service(&self) -> bool {
+        self.is_followed()
+    }
+}
 
 impl<S: GroundSource> GroundSource for Paced<S> {
     fn listening(&self) -> Option<Listening> {
@@ -66,6 +78,10 @@ impl<S: GroundSource> GroundSource for Paced<S> {
 impl GroundSource for SocketSource {
     fn listening(&self) -> Option<Listening> {
         Some(SocketSource::listening(self))
+    }
+
+    fn is_service(&self) -> bool {
+        true
     }
 }
 
@@ -139,7 +155,7 @@ pub fn run_among(
             expected: "neither: simulate first, then replay --mpi",
         });
     }
-    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
+    let _lock = ranks.is_first().then(|| lock_products(&plan.config, out)).transpose()?;
     let file = out.join(downlink_file(plan.config.downlink.format));
     let recorder = if ranks.is_first() {
         write_settings(&plan.config, out)?;
@@ -163,10 +179,11 @@ pub fn run_among(
     let ground =
         Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
     let maps = MapWatch::default();
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground, maps };
+    let watched =
+        Watched { metrics: graph.metrics(), solving, listening: None, ground, maps, products: None };
     let report = start(graph, ranks, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
@@ -256,7 +273,7 @@ pub(super) fn replay_knowing<S: GroundSource + 'static>(
 ) -> Result<RunSummary, PipelineError> {
     let ranks = ground.ranks().clone();
     config.require_shareable(ranks.share().count)?;
-    let _lock = ranks.is_first().then(|| lock_folder(out)).transpose()?;
+    let _lock = ranks.is_first().then(|| lock_products(config, out)).transpose()?;
     let ended = ground_alone(truth, source, config, ground, out, cancel, watch)?;
     conclude(RunScope::Ground, &ranks, config, out, ended)
 }
@@ -272,17 +289,20 @@ pub(super) fn ground_alone<S: GroundSource + 'static>(
     watch: Watcher<'_>,
 ) -> Result<Ended, PipelineError> {
     let mut graph = Graph::new();
-    let listening = source.listening();
+    let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ranks = ground.ranks().clone();
     let ground = ground.cancelled_by(cancel, grace.to_add);
     let maps = MapWatch::default();
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
+    let trouble = is_service.then(ProductsWatch::default);
+    let (viewers, products) = (maps.clone(), trouble.clone());
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers, trouble };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps };
+    let watched =
+        Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps, products };
     let report = start(graph, &ranks, &config.runtime, cancel, (watched, watch))?;
     Ok(Ended { report, outcome, listening, samples: None })
 }
@@ -292,6 +312,7 @@ impl Config {
     ///
     /// # Errors
     /// [`PipelineError::NotShareable`].
+    #[doc(hidden)]
     pub fn require_shareable(&self, ranks: usize) -> Result<(), PipelineError> {
         let found = match self {
             _ if ranks < 2 => None,
@@ -356,13 +377,39 @@ pub(super) fn write_settings(config: &Config, out: &Path) -> Result<(), Pipeline
         "# All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were \
          given.\n\n{settings}"
     );
+    // A run of the settings that it left may leave them.
+    let has_its_length =
+        fs::metadata(&path).is_ok_and(|found| found.is_file() && found.len() == text.len() as u64);
+    if has_its_length && fs::read(&path).is_ok_and(|known| known == text.as_bytes()) {
+        return Ok(());
+    }
     Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+}
+
+/// As [`lock_folder`], for maps: no file that the configuration names may be in the place of one.
+pub(super) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
+    for input in config.input_files() {
+        if is_place_of_product(&input, out) {
+            let reason = "the configuration names it as an input, and the run would replace it; expected another output folder";
+            let source = io::Error::new(io::ErrorKind::InvalidInput, reason);
+            return Err(ProductsError::Write { path: input, source }.into());
+        }
+    }
+    lock_folder(out)
 }
 
 /// Creates and locks the folder before anything is computed, so that an error shows at once.
 pub(super) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
     locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+}
+
+/// Whether a file lies in one of the folders of channels in `out`.
+fn is_place_of_product(input: &Path, out: &Path) -> bool {
+    let (Ok(input), Ok(out)) = (fs::canonicalize(input), fs::canonicalize(out)) else { return false };
+    let Some(folder) = input.parent() else { return false };
+    folder.parent() == Some(out.as_path())
+        && folder.file_name().is_some_and(|name| name.to_string_lossy().ends_with("MHz"))
 }
 
 /// How the time after cancellation is divided.

@@ -29,6 +29,7 @@ impl Plan {
     ///
     /// # Errors
     /// Samples, which are simulated for all channels together; a channel for which alone there is too little memory.
+    #[doc(hidden)]
     pub fn simulation_groups(
         &self,
         size: GroupSize,

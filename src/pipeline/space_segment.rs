@@ -15,7 +15,7 @@ use crate::mother::{
 };
 use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
-use crate::sky::fits::{read_sky, read_unit};
+use crate::sky::fits::{read_notes, read_sky, sky_options};
 use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
 use crate::units::ChannelId;
@@ -42,8 +42,7 @@ pub(super) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineErr
     match config.file.as_ref() {
         Some(files) => {
             let path = files.get(channel).unwrap_or_default();
-            let may_be_dark = plan.config.spacecraft.receiver_k_sr()[channel] > 0.0;
-            let map = read_sky(&path, frequency_hz, config, may_be_dark)?;
+            let map = read_sky(&path, &plan.sky_channel(channel), config)?;
             let Some(added) = &config.added else { return Ok(map) };
             let seed = plan.config.seed;
             Ok(added.add_to(map, &config.generated, frequency_hz, config.nside, seed)?)
@@ -55,17 +54,23 @@ pub(super) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineErr
     }
 }
 
-/// What is assumed about the map files of the sky: those without a unit are in K.
+/// What is assumed about the map files of the sky, such as their unit, and whether the sky is too coarse for the baselines.
 ///
 /// # Errors
 /// A map whose header cannot be read.
 pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
-    let mut notes = Vec::new();
-    for path in plan.config.sky.file.iter().flat_map(|files| files.values()) {
-        if read_unit(path)?.trim().is_empty() {
-            notes.push(format!("{}: the map states no unit (TUNIT); it is taken as K", path.display()));
+    let (sky, mut notes) = (&plan.config.sky, Vec::new());
+    for (channel, &frequency_hz) in plan.config.spacecraft.channels_hz.iter().enumerate() {
+        let Some(path) = sky.file.as_ref().and_then(|files| files.get(channel)) else { continue };
+        for note in read_notes(&path, &sky_options(sky, frequency_hz))? {
+            let note = format!("{}: {note}", path.display());
+            // A file that stands for several channels is told once.
+            if !notes.contains(&note) {
+                notes.push(note);
+            }
         }
     }
+    notes.extend(plan.coarse_sky_note());
     Ok(notes)
 }
 

@@ -18,6 +18,7 @@ impl ConfigSource {
     /// # Errors
     /// A folder without a usable state; [`GroundError::FilesOfState`] where the state was made with gains of a file, or maps of
     /// the known sky, that no override names: it holds only their checksums.
+    #[doc(hidden)]
     pub fn of_state(self, folder: &Path) -> Result<Self, GroundError> {
         self.of_settings(folder, Ground::settings_in)
     }
@@ -26,6 +27,7 @@ impl ConfigSource {
     ///
     /// # Errors
     /// Likewise.
+    #[doc(hidden)]
     pub fn of_state_for_ranks(self, folder: &Path) -> Result<Self, GroundError> {
         self.of_settings(folder, Ground::settings_for_ranks)
     }

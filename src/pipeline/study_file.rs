@@ -2,14 +2,17 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use thiserror::Error;
 
+use super::config::is_folder_name;
 use super::config_source::{ConfigSource, has_sections, study_key};
 use super::error::PipelineError;
 use super::plan::Plan;
+use crate::files::read_text;
 use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, check_frequencies, read_known_sky};
 
@@ -177,7 +180,7 @@ impl Study {
     /// # Errors
     /// A file that cannot be read or is no study; a case whose settings are wrong.
     pub fn read(path: &Path, more: &[String]) -> Result<Self, StudyError> {
-        let text = read_text(path)?;
+        let text = read_study(path)?;
         let wrong = |found: String, expected| StudyError::File { path: path.to_owned(), found, expected };
         let file: StudyFile = toml::from_str(&text).map_err(|error| match is_pipeline(&text) {
             true => wrong(
@@ -325,6 +328,12 @@ impl Study {
             return Err(wrong(found, "labels that differ in letters or digits"));
         }
         let (name, covariance_at_deg) = (file.name.unwrap_or(stem), file.covariance_at_deg);
+        if name.is_empty() || !is_folder_name(&name) {
+            return Err(wrong(
+                format!("name = {name:?}"),
+                "1 to 60 bytes, without slashes and control characters",
+            ));
+        }
         Ok(Self { name, cases, realisations, covariance_at_deg, models, model_files })
     }
 }
@@ -351,18 +360,15 @@ fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
     Ok((maps, crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &sums)))
 }
 
-fn read_text(path: &Path) -> Result<String, StudyError> {
-    let failed = |source| StudyError::Read { path: path.to_owned(), source };
-    let bytes = fs::metadata(path).map_err(failed)?.len();
-    if bytes > FILE_BYTES_MAX {
-        let found = format!("{bytes} bytes");
-        return Err(StudyError::File {
+fn read_study(path: &Path) -> Result<String, StudyError> {
+    read_text(path, FILE_BYTES_MAX).map_err(|source| match source.kind() {
+        ErrorKind::FileTooLarge => StudyError::File {
             path: path.to_owned(),
-            found,
+            found: source.to_string(),
             expected: "a study, at most a megabyte",
-        });
-    }
-    fs::read_to_string(path).map_err(failed)
+        },
+        _ => StudyError::Read { path: path.to_owned(), source },
+    })
 }
 
 /// Label and overrides of each step of an axis; `None` for one without steps.

@@ -3,7 +3,7 @@
 //! [`Publisher`] is the sink that writes every [`crate::imaging::Solution`]; [`write_autos`] writes the
 //! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
 //!
-//! May use [`crate::imaging::solver`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! May use [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
@@ -25,25 +25,43 @@ mod truth;
 mod viewer;
 mod visibility_table;
 
+#[doc(hidden)]
 pub use autos::{AutoSummary, summarise, write_autos};
+#[doc(hidden)]
 pub use beam::EffectiveBeam;
+#[doc(hidden)]
 pub use channel::{draw_comparison, draw_relative_error};
+#[doc(hidden)]
 pub use config::{PostProcessing, ProductsConfig};
+#[doc(hidden)]
 pub use epsilons::{
     EpsilonChoice, EpsilonChoices, EpsilonPoint, draw_epsilons, epsilon_choices, epsilons_csv,
 };
+#[doc(hidden)]
 pub use error::ProductsError;
+#[doc(hidden)]
 pub use hips::{Hips, HipsReport};
+#[doc(hidden)]
 pub use latitudes::LatitudeError;
+#[doc(hidden)]
 pub use point_beams::{BeamWidths, PointBeamSummary};
+#[doc(hidden)]
 pub use provenance::Provenance;
-pub use publisher::Publisher;
+#[doc(hidden)]
+pub use publisher::{ProductsReport, ProductsWatch, Publisher};
+#[doc(hidden)]
 pub use runs::{
     BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,
     RunFigures, TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,
 };
-pub use summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
+pub use summary::ChannelSummary;
+#[doc(hidden)]
+pub use summary::{PowerSpectra, SnapshotSummary};
+#[doc(hidden)]
 pub use time_coverage::draw_coverage;
+#[doc(hidden)]
 pub use truth::{MapShape, Truth};
+#[doc(hidden)]
 pub use viewer::{MapViewer, MapWatch, PublishedMap};
+#[doc(hidden)]
 pub use visibility_table::{VisibilityRow, VisibilityTable, jansky_per_k_sr};

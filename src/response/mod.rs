@@ -15,11 +15,16 @@
 //! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
 //! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
 
+#[doc(hidden)]
 pub mod beacon;
+#[doc(hidden)]
 pub mod general;
+#[doc(hidden)]
 pub mod harmonic;
+#[doc(hidden)]
 pub mod model;
 mod patterns_by_frequency;
 pub mod pixel;
 
+#[doc(hidden)]
 pub use patterns_by_frequency::PatternsByFrequency;

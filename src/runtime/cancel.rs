@@ -31,6 +31,7 @@ impl Cancel {
 
     /// The flag itself; setting it cancels. For signal handlers.
     #[must_use]
+    #[doc(hidden)]
     pub fn flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.flag)
     }
@@ -43,6 +44,7 @@ impl Cancel {
 
     /// Time since it was first seen to be triggered; `None` if it was not. A running graph looks often.
     #[must_use]
+    #[doc(hidden)]
     pub fn elapsed(&self) -> Option<Duration> {
         self.is_cancelled().then(|| self.seen.get_or_init(Instant::now).elapsed())
     }

@@ -146,6 +146,7 @@ impl Graph {
 
     /// Makes the run fail after this time without progress: no step of any stage has ended, no item was received or
     /// sent. Must exceed the longest step.
+    #[doc(hidden)]
     pub fn fail_after_stall(&mut self, stall: Duration) {
         self.stall = Some(stall);
     }
@@ -157,6 +158,7 @@ impl Graph {
     /// over, everything else ends, and its outputs are discarded; stages in a long step are left behind, too. They keep
     /// running, as after a failure, so the process should end. Sources that hand over what they have, and kept stages, may
     /// take longer.
+    #[doc(hidden)]
     pub fn cut_after(&mut self, grace: Duration, kept: &[&str]) {
         self.grace = Some(grace);
         for node in &mut self.nodes {

@@ -49,6 +49,7 @@ impl<R: Reason> Ledger<R> {
     }
 
     /// Posts all counts of a report.
+    #[doc(hidden)]
     pub fn post_report(&self, report: &LedgerReport<R>) {
         let mut counts = self.counts();
         add(&mut counts.sampled, report.sampled);
@@ -59,6 +60,7 @@ impl<R: Reason> Ledger<R> {
     }
 
     /// Subtracts all counts of a report that was posted before; entries that reach zero go.
+    #[doc(hidden)]
     pub fn withdraw(&self, report: &LedgerReport<R>) {
         let mut counts = self.counts();
         counts.sampled = counts.sampled.saturating_sub(report.sampled);
@@ -73,6 +75,7 @@ impl<R: Reason> Ledger<R> {
 
     /// Returns all counts and resets them to zero.
     #[must_use]
+    #[doc(hidden)]
     pub fn take(&self) -> LedgerReport<R> {
         std::mem::take(&mut *self.counts())
     }
@@ -87,6 +90,7 @@ impl<R: Reason> Ledger<R> {
     ///
     /// # Errors
     /// [`LedgerImbalance`] unless sampled = accumulated + flagged + lost.
+    #[doc(hidden)]
     pub fn close(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
         let report = self.report();
         if report.unaccounted() == 0 { Ok(report) } else { Err(LedgerImbalance { report }) }
@@ -133,6 +137,7 @@ impl<R: Reason> LedgerReport<R> {
     /// The ledger of two passes over the same samples, each of which took some of them to its result. Reasons of which
     /// `is_of_pass` are those of one pass alone, the others of both; what neither pass took counts under `elsewhere`.
     #[must_use]
+    #[doc(hidden)]
     pub fn of_two_passes(&self, other: &Self, is_of_pass: impl Fn(R) -> bool, elsewhere: R) -> Self {
         let mut both = self.clone();
         add(&mut both.accumulated, other.accumulated);
@@ -174,6 +179,7 @@ impl<R: Reason> LedgerReport<R> {
 
     /// Samples without an entry; negative if the entries are more than the samples.
     #[must_use]
+    #[doc(hidden)]
     pub fn unaccounted(&self) -> i128 {
         let known = u128::from(self.accumulated) + self.flagged_total() + self.lost_total();
         // A u64 an entry: 2^63 entries would have to be full to leave the range.

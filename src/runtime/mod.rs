@@ -31,13 +31,24 @@ mod worker;
 mod tests;
 
 pub use cancel::Cancel;
+#[doc(hidden)]
 pub use config::RuntimeConfig;
-pub use error::{BoxError, Laggards, Moment, RuntimeError};
+pub use error::RuntimeError;
+#[doc(hidden)]
+pub use error::{BoxError, Laggards, Moment};
 pub use graph::{Graph, Link};
-pub use ledger::{Ledger, LedgerImbalance, LedgerReport};
+#[doc(hidden)]
+pub use ledger::LedgerImbalance;
+pub use ledger::{Ledger, LedgerReport};
+#[doc(hidden)]
 pub use live_timing::DurationCounts;
-pub use metrics::{Metrics, StageProgress, Units};
+#[doc(hidden)]
+pub use metrics::StageProgress;
+pub use metrics::{Metrics, Units};
 pub use outlet::Outlet;
-pub use report::{QueueReport, Report, StageReport};
+#[doc(hidden)]
+pub use report::QueueReport;
+pub use report::{Report, StageReport};
 pub use stage::{Flow, Sink, Source, Stage};
+#[doc(hidden)]
 pub use timing::TimingSummary;

@@ -48,6 +48,7 @@ impl<T> Outlet<T> {
     }
 
     /// As [`Outlet::push`] of a source, for an item that was there `since` an instant: from then on its latencies count.
+    #[doc(hidden)]
     pub fn push_since(&mut self, item: T, since: Instant) {
         self.descend_from(since);
         self.push(item);
@@ -57,6 +58,7 @@ impl<T> Outlet<T> {
     }
 
     /// As [`Outlet::push`], but gives up waiting for room when `cancel` is triggered; for items that no one needs then.
+    #[doc(hidden)]
     pub fn push_unless(&mut self, item: T, cancel: &Cancel) {
         match &mut self.0 {
             Target::Queue(queue) => queue.push_unless(item, cancel),
@@ -66,6 +68,7 @@ impl<T> Outlet<T> {
 
     /// Whether pushed items are discarded, as the run has failed or was cut short.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_closed(&self) -> bool {
         match &self.0 {
             Target::Queue(queue) => queue.closed || queue.halt.is_set(),
@@ -75,6 +78,7 @@ impl<T> Outlet<T> {
 
     /// Items of a collecting outlet; empty for a queue.
     #[must_use]
+    #[doc(hidden)]
     pub fn items(&self) -> &[T] {
         match &self.0 {
             Target::Queue(_) => &[],

@@ -17,6 +17,34 @@ pub enum Flow {
 /// Turns each input into any number of outputs, in order.
 ///
 /// A stage never spawns threads, logs in its loop or reads clocks: the runner does that.
+///
+/// ```
+/// use lunarray::prelude::*;
+///
+/// /// Doubles numbers, and leaves out odd ones.
+/// struct Doubled;
+///
+/// impl Stage for Doubled {
+///     type In = u32;
+///     type Out = u32;
+///     type Error = std::convert::Infallible;
+///
+///     fn step(&mut self, number: u32, out: &mut Outlet<u32>) -> Result<(), Self::Error> {
+///         if number % 2 == 0 {
+///             out.push(2 * number);
+///         }
+///         Ok(())
+///     }
+/// }
+///
+/// // Alone, as in tests; `Graph::stage` puts it on a thread between bounded queues.
+/// let mut out = Outlet::collect();
+/// for number in 0..4 {
+///     Doubled.step(number, &mut out)?;
+/// }
+/// assert_eq!(out.into_vec(), [0, 4]);
+/// # Ok::<(), std::convert::Infallible>(())
+/// ```
 pub trait Stage: Send {
     /// Type of its inputs.
     type In: Send;
@@ -42,6 +70,7 @@ pub trait Stage: Send {
 
     /// Called after a step when no further input waits, so that what it shows of itself need not be shown in every step to be the
     /// newest while nothing comes.
+    #[doc(hidden)]
     fn rest(&mut self) {}
 
     /// Units processed so far; the name of the unit must not change.

@@ -18,6 +18,8 @@ pub struct Subject {
     pub state: Option<PathBuf>,
     /// Says where the Earth is.
     pub model: Option<Array>,
+    /// Folders on whose disks there has to be room, by what they hold.
+    pub folders: Vec<(&'static str, PathBuf)>,
 }
 
 impl Subject {
@@ -29,6 +31,21 @@ impl Subject {
         // Nothing but the Earth is asked of it; the orbits come down.
         let earth_longitude_deg = config.array.earth_longitude_deg;
         let model = Array::new(&ArrayConfig { earth_longitude_deg, ..ArrayConfig::default() }).ok();
-        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned), model }
+        let (name, state) = (config.name.clone(), state.map(Path::to_owned));
+        Self {
+            name,
+            segment,
+            config: text,
+            folders: state.iter().map(|path| ("state", path.clone())).collect(),
+            state,
+            model,
+        }
+    }
+
+    /// As [`Subject::new`], and tells of the disk on which maps are written.
+    #[must_use]
+    pub fn with_maps_in(mut self, out: &Path) -> Self {
+        self.folders.push(("maps", out.to_owned()));
+        self
     }
 }

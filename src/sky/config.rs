@@ -88,6 +88,13 @@ impl SkyConfig {
         format!("0, or at most {most}: 2.5 nside of the sky, and {L_MAX}")
     }
 
+    /// Highest degree that the analysis of a map of `nside` determines exactly: 9/4 nside.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn l_max_held(nside: usize) -> usize {
+        9 * nside / 4
+    }
+
     /// Requires that a map of `nside` determines coefficients up to `l_max`.
     ///
     /// # Errors

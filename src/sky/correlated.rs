@@ -20,6 +20,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::BadPixels`] for a map with invalid pixels.
+    #[doc(hidden)]
     pub fn correlated(&self, correlation: f64, seed: u64) -> Result<Self, MapError> {
         let l_max = 2 * self.nside();
         let own = self.harmonics(l_max, &AnalysisOptions::default())?;

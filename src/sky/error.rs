@@ -37,7 +37,7 @@ pub enum MapError {
     /// Pixels without a usable value.
     #[error(
         "{count} of {total} pixels have no usable value, the first is RING pixel {first} with {value:e}; \
-         expected finite numbers everywhere (UNSEEN is -1.6375e30): fill or mask these pixels first"
+         expected finite numbers everywhere (UNSEEN is -1.6375e30, in another unit a power of ten of it): fill or mask these pixels first"
     )]
     BadPixels {
         /// Number of pixels that are NaN, infinite or UNSEEN.

@@ -60,6 +60,7 @@ impl Frame {
 
     /// The letter of COORDSYS: E, G or C.
     #[must_use]
+    #[doc(hidden)]
     pub fn letter(self) -> char {
         match self {
             Self::Ecliptic => 'E',
@@ -70,6 +71,7 @@ impl Frame {
 
     /// The frame of a COORDSYS value: a letter (C or Q for equatorial) or the name, upper or lower case.
     #[must_use]
+    #[doc(hidden)]
     pub fn from_coordsys(text: &str) -> Option<Self> {
         match text.trim().to_ascii_uppercase().as_str() {
             "E" | "ECLIPTIC" => Some(Self::Ecliptic),

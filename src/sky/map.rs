@@ -17,6 +17,9 @@ const PIXELS_PER_TASK: usize = 4096;
 /// square of a visibility and its inverse stay within single precision.
 pub const TEMPERATURE_K_MAX: f64 = 1e16;
 
+/// Powers of ten by which UNSEEN may have been scaled: values remain beyond any temperature.
+const UNSEEN_DECADES: f64 = 13.0;
+
 /// A HEALPix map in RING order, in K unless stated otherwise.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SkyMap {
@@ -30,6 +33,13 @@ pub struct SkyMap {
 #[must_use]
 pub fn is_unseen(value: f64) -> bool {
     (value - HEALPIX_UNSEEN).abs() <= 1e-5 * HEALPIX_UNSEEN.abs()
+}
+
+/// Whether a value is UNSEEN, or that times a power of ten, which conversions of units leave behind.
+fn is_scaled_unseen(value: f64) -> bool {
+    let decades = (value / HEALPIX_UNSEEN).log10();
+    // Single precision keeps seven digits.
+    decades.abs() <= UNSEEN_DECADES && (decades - decades.round()).abs() < 1e-6 || is_unseen(value)
 }
 
 impl SkyMap {
@@ -70,6 +80,7 @@ impl SkyMap {
     }
 
     /// Mutable values in RING order.
+    #[doc(hidden)]
     pub fn values_mut(&mut self) -> &mut [f64] {
         &mut self.values
     }
@@ -104,6 +115,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is above the map's own.
+    #[doc(hidden)]
     pub fn degrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside > self.nside {
@@ -137,6 +149,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is below the map's own.
+    #[doc(hidden)]
     pub fn upgrade(&self, nside: usize) -> Result<Self, MapError> {
         check_nside(nside)?;
         if nside < self.nside {
@@ -162,6 +175,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::NoTemperature`] with the number and the first of the others.
+    #[doc(hidden)]
     pub fn check_temperatures(&self) -> Result<(), MapError> {
         let bad = |&(_, value): &(usize, &f64)| !(-TEMPERATURE_K_MAX..=TEMPERATURE_K_MAX).contains(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);
@@ -177,9 +191,10 @@ impl SkyMap {
     /// Checks that every pixel has a usable value.
     ///
     /// # Errors
-    /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN.
+    /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN, in another unit too.
+    #[doc(hidden)]
     pub fn check_whole(&self) -> Result<(), MapError> {
-        let bad = |&(_, &value): &(usize, &f64)| !value.is_finite() || is_unseen(value);
+        let bad = |&(_, &value): &(usize, &f64)| !value.is_finite() || is_scaled_unseen(value);
         let mut pixels = self.values.iter().enumerate().filter(bad);
         match pixels.next() {
             None => Ok(()),

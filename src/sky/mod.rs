@@ -25,10 +25,19 @@ mod map;
 mod rotation;
 pub mod spectra;
 
-pub use compare::{Comparison, ErrorSummary, InputSky, compare, compare_with};
+pub use compare::{Comparison, compare};
+#[doc(hidden)]
+pub use compare::{ErrorSummary, InputSky, compare_with};
+#[doc(hidden)]
 pub use config::{AddedSky, GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
+#[doc(hidden)]
 pub use cutout::{Cutout, PlaneProjection};
 pub use error::MapError;
-pub use frame::{Frame, Rotation, rotate};
-pub use map::{SkyMap, is_unseen};
+pub use frame::Frame;
+#[doc(hidden)]
+pub use frame::{Rotation, rotate};
+pub use map::SkyMap;
+#[doc(hidden)]
+pub use map::{TEMPERATURE_K_MAX, is_unseen};
+#[doc(hidden)]
 pub use rotation::Bilinear;

@@ -127,6 +127,7 @@ impl SkyMap {
     /// The map in another frame, by [`Bilinear`] interpolation at the new pixel centres (healpy: `rotate_map_pixel`).
     /// Loses some power near the pixel scale; [`SkyMap::directions_ecliptic`] avoids that loss.
     #[must_use]
+    #[doc(hidden)]
     pub fn rotate_pixels(&self, frame: Frame) -> Self {
         let (Ok(bilinear), true) = (Bilinear::new(self.nside()), frame != self.frame()) else {
             return self.clone();

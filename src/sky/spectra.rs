@@ -28,6 +28,7 @@ pub fn auto_cl(alm: &Alm) -> Vec<f64> {
 /// Ratio of a cross spectrum to the geometric mean of two spectra, by degree: rho_l with the spectra of both maps,
 /// SNR_l with those of the input and of a noise map (the paper, Sect. 4). NaN where a spectrum is zero.
 #[must_use]
+#[doc(hidden)]
 pub fn normalised(cross: &[f64], one: &[f64], other: &[f64]) -> Vec<f64> {
     cross
         .iter()
@@ -45,12 +46,14 @@ pub fn rho(a: &Alm, b: &Alm) -> Vec<f64> {
 /// Factors of a_lm for a Gaussian beam of a FWHM (rad), l = 0 .. `l_max`:
 /// exp(-l (l + 1) sigma^2 / 2), sigma = FWHM / sqrt(8 ln 2).
 #[must_use]
+#[doc(hidden)]
 pub fn gaussian_beam(fwhm_rad: f64, l_max: usize) -> Vec<f64> {
     let variance = fwhm_rad * fwhm_rad / (8.0 * LN_2);
     (0..=l_max).map(|l| (-0.5 * variance * (l * (l + 1)) as f64).exp()).collect()
 }
 
 /// Multiplies a_lm by `factors[l]`; degrees without a factor become 0.
+#[doc(hidden)]
 pub fn multiply_degrees(alm: &mut Alm, factors: &[f64]) {
     for m in 0..=alm.l_max() {
         for (value, l) in alm.order_mut(m).iter_mut().zip(m..) {
@@ -64,6 +67,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for `l_max` above 3 nside - 1.
+    #[doc(hidden)]
     pub fn harmonics(&self, l_max: usize, options: &AnalysisOptions) -> Result<Alm, MapError> {
         self.check_whole()?;
         Ok(Transform::new(self.nside(), l_max)?.analysis(self.values(), options)?.alm)
@@ -76,6 +80,7 @@ impl SkyMap {
     ///
     /// # Errors
     /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for an invalid nside.
+    #[doc(hidden)]
     pub fn band_limited(&self, nside: usize, l_max: usize) -> Result<Self, MapError> {
         let l_max = l_max.min(3 * self.nside() - 1);
         let alm = self.harmonics(l_max, &AnalysisOptions::default())?;
@@ -108,6 +113,7 @@ impl SkyMap {
     /// # Errors
     /// [`MapError::Nside`] unless `factor` is a power of two that leads to a valid nside; as
     /// [`SkyMap::smoothed`].
+    #[doc(hidden)]
     pub fn refined(&self, factor: usize, fwhm_rad: f64) -> Result<Self, MapError> {
         self.upgrade(self.nside().saturating_mul(factor))?.smoothed(fwhm_rad)
     }

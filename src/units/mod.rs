@@ -4,6 +4,7 @@
 //! Uses nothing else of the crate.
 
 pub(crate) mod arithmetic;
+#[doc(hidden)]
 pub mod calendar;
 mod checks;
 pub mod constants;
@@ -18,13 +19,25 @@ mod text;
 mod time;
 pub mod vector;
 
+#[doc(hidden)]
 pub use checks::{Checks, InvalidValue};
+#[doc(hidden)]
 pub use echo::{echo, shortened};
-pub use ids::{ChannelId, MAX_SATELLITES, Pair, PairError, all_pairs};
+pub use ids::{ChannelId, Pair, all_pairs};
+#[doc(hidden)]
+pub use ids::{MAX_SATELLITES, PairError};
+#[doc(hidden)]
 pub use interval_set::IntervalSet;
+#[doc(hidden)]
 pub use per_channel::PerChannel;
+#[doc(hidden)]
 pub use quantity::Dimension;
+#[doc(hidden)]
 pub use random::{StreamKind, random_stream};
+#[doc(hidden)]
 pub use reason::Reason;
+#[doc(hidden)]
 pub use text::printable;
-pub use time::{MissionTime, TICKS_PER_SECOND};
+pub use time::MissionTime;
+#[doc(hidden)]
+pub use time::TICKS_PER_SECOND;

@@ -29,6 +29,7 @@ impl MissionTime {
 
     /// This time plus a number of ticks (us), saturating at the ends of the range.
     #[must_use]
+    #[doc(hidden)]
     pub fn plus_ticks(self, ticks: i64) -> Self {
         Self(self.0.saturating_add(ticks))
     }

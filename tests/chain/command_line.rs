@@ -45,6 +45,8 @@ fn every_command_has_help_that_teaches() {
         "cutout",
         "gaps",
         "merge",
+        "rebuild",
+        "extract",
         "retract",
         "recalibrate",
         "bench",
@@ -54,6 +56,7 @@ fn every_command_has_help_that_teaches() {
         "completions",
         "man",
         "calibrate",
+        "bound",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
@@ -178,8 +181,10 @@ fn a_map_without_a_frame_is_refused_until_one_is_named() {
     let compared = done(format!("compare {bare} {whole} --frame galactic --json"));
     let compared: Value = serde_json::from_str(&compared).unwrap();
     assert!((compared["rho"][2].as_f64().unwrap() - 1.0).abs() < 1e-9);
-    // One file stands for all channels where it says no frequency.
-    done(format!("check --set sky.file={bare} --set sky.frame=galactic"));
+    // What says no frequency stands for one channel, and cannot for several.
+    done(format!("check --set sky.file={bare} --set sky.frame=galactic --set spacecraft.channels_hz=[3e6]"));
+    let told = refused(format!("check --set sky.file={bare} --set sky.frame=galactic"));
+    assert!(told.contains("FREQ") && told.contains("one map for several channels"), "{told}");
 }
 
 #[test]
@@ -200,8 +205,9 @@ fn geometry_speaks_json() {
 }
 
 #[test]
+#[ignore = "needs LUNARRAY_SHARED"]
 fn geometry_agrees_with_independent_values() {
-    let Some(path) = common::shared("reference/formation.json") else { return };
+    let path = common::shared("reference/formation.json");
     let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
     for epoch in reference["epochs"].as_array().unwrap() {
         let at = epoch["t_s"].to_string();
@@ -229,8 +235,9 @@ fn test_sky(n: [f64; 3]) -> f64 {
 }
 
 #[test]
+#[ignore = "needs LUNARRAY_SHARED"]
 fn predict_agrees_with_independent_values() {
-    let Some(path) = common::shared("reference/visibilities_nside64.json") else { return };
+    let path = common::shared("reference/visibilities_nside64.json");
     let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
     let values = reference["values"].as_array().unwrap();
     let folder = tempfile::tempdir().unwrap();
@@ -363,8 +370,9 @@ fn an_unwritable_output_is_named() {
 }
 
 #[test]
+#[ignore = "needs LUNARRAY_SHARED"]
 fn a_sky_of_another_frequency_is_a_problem_of_the_file() {
-    let Some(sky) = common::shared("sky/ulsa_3mhz_galactic_nside64.fits") else { return };
+    let sky = common::shared("sky/ulsa_3mhz_galactic_nside64.fits");
     let file = format!("sky.file={:?}", sky.to_str().unwrap());
     let one_channel =
         ["spacecraft.channels_hz=[10e6]", "spacecraft.every_nth_integration=1", "map.epsilon=1e-4"];
@@ -388,4 +396,84 @@ fn a_sky_like_another_has_its_nside() {
     assert!(told.contains("--nside") && told.contains("cannot be used with"), "{told}");
     assert!(!Path::new(&out).exists());
     assert!(said(&args).contains("nside 4"));
+}
+
+#[test]
+fn what_would_fail_at_the_last_step_fails_in_check() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = write(folder.path(), "small.toml", common::workplace::SMALL);
+    for (set, key) in [
+        ("map.baseline_bp_max=1e308", "map.baseline_bp_max"),
+        ("map.prior_k=1e308", "map.prior_k"),
+        ("array.precession_period_s=1e-300", "array.precession_period_s"),
+        ("array.breathing.period_s=1e-300", "array.breathing.period_s"),
+    ] {
+        let said = complaint(&["check", &small, "--set", set]);
+        assert!(said.contains(key) && said.contains("expected"), "{set}: {said}");
+    }
+}
+
+#[test]
+fn a_sky_too_coarse_for_its_baselines_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = write(folder.path(), "small.toml", common::workplace::SMALL);
+    let channels = "spacecraft.channels_hz=[5e6]";
+    let check = |more: &[&str]| {
+        let sets: Vec<&str> = more.iter().flat_map(|set| ["--set", *set]).collect();
+        let output = lunarray().args([&["check", &small][..], &sets].concat()).output().unwrap();
+        (output.status.success(), String::from_utf8(output.stderr).unwrap())
+    };
+    // 2 pi 31.3 = 196.7, and the decay of the Bessel functions beyond it: above 2.25 times 64, below 2.25 times 128.
+    let long = "spacecraft.baseline_wavelengths_max=31.3";
+    let (good, said) = check(&[channels, long, "sky.nside=64"]);
+    assert!(good && said.contains("too coarse") && said.contains("nside 128"), "{said}");
+    let (good, said) = check(&[channels, long, "sky.nside=128"]);
+    assert!(good && !said.contains("too coarse"), "{said}");
+    // A degree that the map does not hold is no degree: neither of a generated sky nor of a file.
+    let map = folder.path().join("map.fits");
+    let values = vec![1e5; 12 * 64 * 64];
+    let cards = vec![lunarray::sky::fits::Card::real("FREQ", 5e6, "Hz")];
+    let options = WriteOptions { cards, ..WriteOptions::default() };
+    write_map(&map, &SkyMap::new(Frame::Ecliptic, values).unwrap(), &options).unwrap();
+    let file = format!("sky.file={:?}", map.to_str().unwrap());
+    for (l_max, is_good) in [("sky.l_max=191", false), ("sky.l_max=160", true)] {
+        let (good, said) = check(&[channels, &file, l_max]);
+        assert_eq!(good, is_good, "{said}");
+        assert!(is_good || said.contains("sky.l_max = 191: expected 0, or at most 160"), "{said}");
+    }
+    let out = folder.path().join("x.ccsds");
+    let run = ["simulate", &small, "--out", out.to_str().unwrap(), "--set", channels, "--set", &file];
+    let said = complaint(&[&run[..], &["--set", "sky.l_max=191"]].concat());
+    assert!(said.contains("sky.l_max = 191"), "{said}");
+}
+
+#[test]
+fn check_tells_what_it_understood_of_each_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let small = write(folder.path(), "small.toml", common::workplace::SMALL);
+    let map = folder.path().join("map.fits");
+    let cards = vec![lunarray::sky::fits::Card::text("FREQ", "3 MHz", "")];
+    let options = WriteOptions { cards, ..WriteOptions::default() };
+    write_map(&map, &SkyMap::new(Frame::Galactic, vec![2e6; 768]).unwrap(), &options).unwrap();
+    let sources =
+        write(folder.path(), "gleam.csv", "GLEAM,RAJ2000,DEJ2000,Fintwide,alpha\nA,10.5,-20,1.5,-0.7\n");
+    let sets = [
+        format!("sky.file={:?}", map.to_str().unwrap()),
+        format!("sky.added.catalogue={sources:?}"),
+        "spacecraft.channels_hz=[3e6]".to_owned(),
+    ];
+    let mut args = vec!["check", &small];
+    sets.iter().for_each(|set| args.extend(["--set", set]));
+    let told = said(&args);
+    for part in [
+        "map.fits: 3 MHz, Galactic frame, K, nside 8",
+        "mean 2.0000e6 K",
+        "gleam.csv: 1 sources, equatorial positions",
+        "at 200 MHz",
+    ] {
+        assert!(told.contains(part), "{part}: {told}");
+    }
+    args.push("--json");
+    let told: Value = serde_json::from_str(&said(&args)).unwrap();
+    assert_eq!(told["files"].as_array().unwrap().len(), 2);
 }

@@ -119,8 +119,9 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
     let mut truth: BTreeMap<(u16, u8), Vec<Receiver>> = BTreeMap::new();
     for line in table.lines().skip(1) {
         let number: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
-        let [_, t_s, daughter, channel, hz, ln, deg, ns, ..] = number[..] else { panic!("{line}") };
-        let gain = Complex64::from_polar(ln.exp(), deg.to_radians() - std::f64::consts::TAU * hz * ns * 1e-9);
+        let [_, t_s, daughter, channel, _, ln, deg, ..] = number[..] else { panic!("{line}") };
+        // The clock is in the phase.
+        let gain = Complex64::from_polar(ln.exp(), deg.to_radians());
         let dead = number[11] == 1.0;
         truth.entry((channel as u16, daughter as u8 - 1)).or_default().push((t_s, gain, dead));
     }
@@ -167,7 +168,8 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
     let options = lunarray::sky::fits::WriteOptions::default();
     lunarray::sky::fits::write_map(Path::new(&path), &map, &options).unwrap();
     let n_hat = lunarray::sky::healpix::pixel_directions(nside)[pixel];
-    let file = format!("sky.file={path}");
+    // Sky by sky, as the map says no frequency.
+    let file = format!("sky.file=[{path:?}, {path:?}]");
     let set = [
         &file,
         "spacecraft.thermal_noise=false",

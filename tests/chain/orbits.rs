@@ -366,8 +366,9 @@ fn three_dipoles_have_the_noise_of_three_receivers() {
 
 /// A day of three satellites under the Moon's oblateness, integrated by other code.
 #[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
 fn orbits_from_files_are_flown_and_mapped() {
-    let Some(python) = common::python() else { return };
+    let python = common::python();
     let kepler = TRIPLE.find("kepler").unwrap()..TRIPLE.find("[spacecraft]").unwrap();
     let mut pipeline = TRIPLE.replace("every_nth_window = 100", "duration_s = 86400.0\nevery_nth_window = 3");
     pipeline.replace_range(kepler, "");

@@ -85,3 +85,78 @@ fn what_a_kill_leaves_is_removed_by_the_next() {
     succeed(&["simulate", pipeline, "--out", &file]);
     assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1);
 }
+
+/// That a command is refused with these words and leaves a file as it was.
+fn spares(file: &str, args: &[&str], words: &str) {
+    let before = std::fs::read(file).unwrap();
+    let said = fail(args);
+    assert!(said.contains(words), "{args:?}: {said}");
+    assert!(std::fs::read(file).unwrap() == before, "{args:?}");
+}
+
+#[test]
+fn outputs_never_replace_inputs() {
+    let place = Workplace::new(SMALL);
+    let (pipeline, out) = (place.pipeline.clone(), place.path("out"));
+    let file = place.simulate("small.ccsds", &[]);
+    let second = place.path("second-name.ccsds");
+    std::fs::hard_link(&file, &second).unwrap();
+    let map = place.path("map.fits");
+    succeed(&["sky", &pipeline, "--freq-hz", "3e6", "--nside", "8", "--out", &map, "--no-picture"]);
+    let words = "read as an input";
+    for name in [&file, &second] {
+        spares(&file, &["export", "visibilities", &file, "--out", name], words);
+        spares(&file, &["gaps", &file, "--picture", name], words);
+        spares(&file, &["replay", &file, "--map", &pipeline, "--out", &out, "--events", name], words);
+    }
+    spares(&file, &["corrupt", &file, "--out", &second, "--frame-loss", "0.1"], words);
+    spares(&pipeline, &["simulate", &pipeline, "--out", &pipeline], words);
+    spares(&pipeline, &["run", &pipeline, "--out", &out, "--events", &pipeline], words);
+    spares(&map, &["export", "alm", &map, "--out", &map], words);
+    spares(&map, &["cutout", &map, "--centre", "0,0", "--out", &map], words);
+    spares(&map, &["sky", "--like", &map, "--correlation", "0.5", "--out", &map], words);
+    // The user's own file in the folder of the products: before anything is computed.
+    let folder = place.path("");
+    spares(&pipeline, &["run", &pipeline, "--out", &folder], words);
+    // What a run has left repeats it in its place.
+    succeed(&["run", &pipeline, "--out", &out]);
+    let left = format!("{out}/pipeline.toml");
+    let before = std::fs::read(&left).unwrap();
+    succeed(&["run", &left, "--out", &out]);
+    assert!(std::fs::read(&left).unwrap() == before);
+    spares(&left, &["run", &left, "--out", &out, "--set", "seed=8"], words);
+    // A map of the folder as a prior: refused before it is replaced.
+    let prior = format!("{out}/3.000MHz/map.fits");
+    let set = format!("map.prior_files=[{prior:?}, {:?}]", format!("{out}/10.000MHz/map.fits"));
+    spares(&prior, &["replay", &file, "--map", &pipeline, "--out", &out, "--set", &set], "would replace it");
+}
+
+#[test]
+fn events_take_the_place_of_an_older_file_and_follow_no_link() {
+    let place = Workplace::new(SMALL);
+    let file = place.simulate("small.ccsds", &[]);
+    let (victim, events, out) = (place.file("victim", b"precious"), place.path("events"), place.path("out"));
+    std::os::unix::fs::symlink(&victim, &events).unwrap();
+    let replay = ["replay", file.as_str(), "--map", &place.pipeline, "--out", &out, "--events", &events];
+    spares(&victim, &replay, "is a link to");
+    std::fs::remove_file(&events).unwrap();
+    std::fs::hard_link(&victim, &events).unwrap();
+    succeed(&replay);
+    assert_eq!(std::fs::read(&victim).unwrap(), b"precious");
+    let told = std::fs::read_to_string(&events).unwrap();
+    assert!(told.lines().last().unwrap().contains("\"complete\""), "{told}");
+    assert!(hidden(Path::new(&place.path(""))).is_empty());
+}
+
+#[test]
+fn the_name_of_a_study_stays_in_the_folder_of_outputs() {
+    let place = Workplace::new(SMALL);
+    for name in ["../../evil", "/tmp/evil", "..", "a/b", ""] {
+        let study = format!(
+            "name = {name:?}\npipeline = \"pipeline.toml\"\n[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4]\n"
+        );
+        let study = place.file("study.toml", study.as_bytes());
+        let said = fail(&["study", &study]);
+        assert!(said.contains("without slashes"), "{name}: {said}");
+    }
+}

@@ -84,8 +84,9 @@ fn assert_equal(found: &str, expected: &str) {
 }
 
 #[test]
-fn ranks_leave_the_bytes_of_one_process() {
-    let Some(program) = mpi_program() else { return };
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_ranks_leave_the_bytes_of_one_process() {
+    let program = mpi_program();
     let place = Workplace::new(SHARED);
     let downlink = place.simulate("x.ccsds", &[]);
     let replay = |out: &str, more: &[&str]| -> Vec<String> {
@@ -138,7 +139,14 @@ fn what_ranks_cannot_share_is_refused_by_name() {
     // The program that tests come with knows no MPI.
     let said = fail(&["run", &place.pipeline, "--out", &out, "--mpi"]);
     assert!(said.contains("--features mpi") && said.contains("docs/cluster.md"), "{said}");
-    let Some(program) = mpi_program() else { return };
+}
+
+#[test]
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_what_ranks_cannot_share_is_refused_by_the_ranks() {
+    let program = mpi_program();
+    let place = Workplace::new(SHARED);
+    let out = place.path("out");
     let overrides = [
         ("map.engine=\"pixel\"", "expected \"harmonic\""),
         ("map.refine={passes_max=2}", "map.refine.passes_max"),
@@ -157,8 +165,9 @@ fn what_ranks_cannot_share_is_refused_by_name() {
 }
 
 #[test]
-fn ranks_that_hold_different_data_make_no_map() {
-    let Some(program) = mpi_program() else { return };
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_ranks_that_hold_different_data_make_no_map() {
+    let program = mpi_program();
     let place = Workplace::new(SHARED);
     let whole = place.simulate("whole.ccsds", &[]);
     let bytes = std::fs::read(&whole).unwrap();
@@ -207,8 +216,9 @@ fn has_downlink(folder: &str) -> bool {
 }
 
 #[test]
-fn a_job_ends_soon_after_one_of_its_ranks() {
-    let Some(program) = mpi_program() else { return };
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_a_job_ends_soon_after_one_of_its_ranks() {
+    let program = mpi_program();
     let program = program.canonicalize().unwrap();
     let place = Workplace::new(SHARED);
     // Every window and integration, and all degrees: longer than any gate.
@@ -262,8 +272,9 @@ fn checkpoints(state: &str) -> Vec<String> {
 }
 
 #[test]
-fn a_state_of_ranks_goes_on_with_another_number_of_them() {
-    let Some(program) = mpi_program() else { return };
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_a_state_of_ranks_goes_on_with_another_number_of_them() {
+    let program = mpi_program();
     let program = program.canonicalize().unwrap();
     let place = Workplace::new(SHARED);
     // So many data that no job comes to its end before it is told to.
@@ -315,8 +326,9 @@ fn a_state_of_ranks_goes_on_with_another_number_of_them() {
 const NO_SNAPSHOTS: &str = "map.snapshot_every_s=0";
 
 #[test]
-fn a_full_disk_of_one_rank_ends_the_job() {
-    let Some(program) = mpi_program() else { return };
+#[ignore = "needs LUNARRAY_MPI"]
+fn mpi_a_full_disk_of_one_rank_ends_the_job() {
+    let program = mpi_program();
     let place = Workplace::new(SHARED);
     let downlink = place.simulate("x.ccsds", &[]);
     let (state, out, alone) = (place.path("state"), place.path("out"), place.path("alone"));

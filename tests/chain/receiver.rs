@@ -44,7 +44,8 @@ fn simulate_sky(nside: usize, sky_k: f64, set: &[&str]) -> Vec<VisibilityBlock> 
     let sky = place.path("dark.fits");
     let map = SkyMap::new(Frame::Ecliptic, vec![sky_k; 12 * nside * nside]).unwrap();
     write_map(Path::new(&sky), &map, &WriteOptions::default()).unwrap();
-    let file = format!("sky.file={sky:?}");
+    // One a channel, as the map says no frequency.
+    let file = format!("sky.file={:?}", CHANNELS_HZ.map(|_| &sky));
     let set: Vec<&str> = [&[file.as_str()], set].concat().iter().flat_map(|set| ["--set", *set]).collect();
     let downlink = place.simulate("downlink.ccsds", &set);
     let mut reader = DownlinkReader::open(Path::new(&downlink)).unwrap();

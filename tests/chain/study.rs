@@ -4,9 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use lunarray::pipeline::Study;
-use lunarray::sky::fits::{
-    Card, ReadOptions, WriteOptions, read_map_file, read_unit, read_whole_map, write_map,
-};
+use lunarray::sky::fits::{Card, ReadOptions, WriteOptions, read_map_file, read_whole_map, write_map};
 use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
 
@@ -270,7 +268,10 @@ covariance_at_deg = [[45.0, 85.0], [315.0, -85.0]]
     // The first pixel lies at 45 deg beside the north pole, the last one at 315 deg beside the south pole.
     for (name, pixel) in [(files[1], 0), (files[2], sigma_k.len() - 1)] {
         let found_k2 = map(format!("{out}/{name}"));
-        assert_eq!(read_unit(Path::new(&format!("{out}/{name}"))).unwrap(), "K^2");
+        assert_eq!(
+            read_map_file(Path::new(&format!("{out}/{name}")), &ReadOptions::default()).unwrap().unit,
+            "K^2"
+        );
         for (other, found_k2) in found_k2.iter().enumerate() {
             let expected_k2 = noises.iter().map(|noise| noise[pixel] * noise[other]).sum::<f64>() / 60.0;
             // Files in 32 or 64 bits.

@@ -8,33 +8,27 @@ pub mod workplace;
 
 use std::path::PathBuf;
 
-/// A file of the independent reference values and sky maps, below the folder that `LUNARRAY_SHARED`
-/// names; `None`, said aloud, when the variable is not set.
-pub fn shared(file: &str) -> Option<PathBuf> {
+/// A file of the independent reference values and sky maps, below the folder that `LUNARRAY_SHARED` names.
+///
+/// Tests that ask for it are ignored by name, and fail without it when somebody asks for ignored ones.
+pub fn shared(file: &str) -> PathBuf {
     find("LUNARRAY_SHARED", file)
 }
 
-/// The Python interpreter that has healpy and friends, from `LUNARRAY_PYTHON`; `None`, said aloud, when it
-/// is not set.
-pub fn python() -> Option<PathBuf> {
+/// The Python interpreter that has healpy and friends, from `LUNARRAY_PYTHON`.
+pub fn python() -> PathBuf {
     find("LUNARRAY_PYTHON", "")
 }
 
-/// A program with MPI, from `LUNARRAY_MPI`; `None`, said aloud, when it is not set: only `.ci/run mpi` builds it.
-pub fn mpi_program() -> Option<PathBuf> {
-    if std::env::var_os("LUNARRAY_MPI").is_none() {
-        eprintln!("without MPI: LUNARRAY_MPI is not set");
-        return None;
-    }
+/// A program with MPI, from `LUNARRAY_MPI`: only `.ci/run mpi` builds it, and runs the tests whose names begin with `mpi_`.
+pub fn mpi_program() -> PathBuf {
     find("LUNARRAY_MPI", "")
 }
 
-fn find(variable: &str, file: &str) -> Option<PathBuf> {
-    let Some(base) = std::env::var_os(variable) else {
-        eprintln!("skipped: {variable} is not set");
-        return None;
-    };
+fn find(variable: &str, file: &str) -> PathBuf {
+    let base = std::env::var_os(variable)
+        .unwrap_or_else(|| panic!("{variable} is not set; CONTRIBUTING.md says what it names"));
     let path = if file.is_empty() { PathBuf::from(base) } else { PathBuf::from(base).join(file) };
     assert!(path.exists(), "{variable} is set, but there is no {}", path.display());
-    Some(path)
+    path
 }

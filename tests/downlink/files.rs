@@ -4,8 +4,9 @@ use std::fs;
 use std::path::Path;
 
 use lunarray::array::{Array, ArrayConfig, Ephemeris, segments_for};
+use lunarray::downlink::wire::cadu::randomize;
 use lunarray::downlink::{
-    Contents, DownlinkConfig, DownlinkError, DownlinkReader, DownlinkWriter, PacketHeader,
+    Contents, DownlinkConfig, DownlinkError, DownlinkReader, DownlinkWriter, FileSource, Format, PacketHeader,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
@@ -214,6 +215,129 @@ fn empty_foreign_and_missing_files_are_named() {
     fs::write(&path, "SIMPLE  =                    T".repeat(96)).unwrap();
     assert!(matches!(said(&path), DownlinkError::Foreign { bytes: 2880, .. }));
     assert!(said(&path).to_string().contains("expected CCSDS space packets"));
+    for (bytes, name) in [
+        (&b"SIMPLE  =                    T"[..], "a FITS file"),
+        (b"\x1f\x8b\x08\x00\x00\x00", "a gzip file: expand it first"),
+        (b"\x28\xb5\x2f\xfd\x24\x01", "a zstd file: expand it first"),
+        (b"\x89HDF\r\n\x1a\n\0\0", "an HDF5 file"),
+        (b"<?xml version=\"1.0\"?><ndm></ndm>", "an XML document (<ndm>)"),
+    ] {
+        fs::write(&path, bytes).unwrap();
+        assert!(said(&path).to_string().contains(name), "{name}: {}", said(&path));
+    }
+}
+
+/// Packets of a file, each whole.
+fn packets(bytes: &[u8]) -> Vec<&[u8]> {
+    let (mut rest, mut found) = (bytes, Vec::new());
+    while let Some(header) = PacketHeader::parse(rest) {
+        let (packet, after) = rest.split_at(header.bytes);
+        found.push(packet);
+        rest = after;
+    }
+    found
+}
+
+/// An idle packet of the standard: APID all ones, no secondary header.
+fn idle_packet(bytes: usize) -> Vec<u8> {
+    let mut packet = vec![0x07, 0xFF, 0xC0, 0x00];
+    packet.extend(((bytes - 7) as u16).to_be_bytes());
+    packet.resize(bytes, 0x55);
+    packet
+}
+
+#[test]
+fn idle_packets_are_no_garbage() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let bytes = fs::read(&path).unwrap();
+    let mut filled = idle_packet(100);
+    for packet in packets(&bytes) {
+        filled.extend_from_slice(packet);
+        filled.extend(idle_packet(7));
+        filled.extend(idle_packet(1500));
+    }
+    let idle = filled.len() - bytes.len();
+    fs::write(&path, &filled).unwrap();
+    let contents = Contents::read(&path).unwrap();
+    assert!(contents.is_sound(), "{contents}");
+    assert_eq!((contents.idle_bytes, contents.visibilities.count), (idle as u64, 8_000));
+    // Nothing is passed over by a claim: what follows an idle packet has to be one, or ours.
+    let mut forged = packets(&bytes)[0].to_vec();
+    forged.extend(&idle_packet(30_000)[..6]);
+    packets(&bytes)[1..].iter().for_each(|packet| forged.extend_from_slice(packet));
+    fs::write(&path, &forged).unwrap();
+    let contents = Contents::read(&path).unwrap();
+    assert_eq!((contents.garbage.count, contents.visibilities.count), (1, 8_000));
+    // A file that ends within one is cut.
+    fs::write(&path, &filled[..filled.len() - 1]).unwrap();
+    assert_eq!(Contents::read(&path).unwrap().truncated_bytes, 1_499);
+}
+
+#[test]
+fn a_file_that_lacks_visibilities_is_not_sound() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.ccsds");
+    write(&path);
+    let bytes = fs::read(&path).unwrap();
+    // Without its first packets of visibilities: no gap shows it.
+    let is_visibilities =
+        |packet: &&&[u8]| PacketHeader::parse(packet).is_some_and(|header| header.kind.apid() == 0x103);
+    let all = packets(&bytes);
+    let first = all.iter().position(|packet| is_visibilities(&packet)).unwrap();
+    let rest: Vec<u8> =
+        all.iter().enumerate().filter(|(k, _)| *k != first).flat_map(|(_, packet)| packet.to_vec()).collect();
+    fs::write(&path, &rest).unwrap();
+    let contents = Contents::read(&path).unwrap();
+    let lost = 8_000 - contents.visibilities.count;
+    assert!(lost > 0 && contents.gaps.count == 0 && contents.is_undamaged() && !contents.is_sound());
+    assert_eq!(contents.found_less_reported(), Some(-(lost as i64)));
+    let text = contents.to_string();
+    assert!(text.contains(&format!("not sound: {lost} of 8000 visibilities")), "{text}");
+    assert!(!text.contains("\nsound"), "{text}");
+    // Without the spacecraft's counts nothing is known.
+    let uncounted: Vec<u8> = all
+        .iter()
+        .filter(|packet| PacketHeader::parse(packet).is_none_or(|header| header.kind.apid() != 0x105))
+        .flat_map(|packet| packet.to_vec())
+        .collect();
+    fs::write(&path, &uncounted).unwrap();
+    let contents = Contents::read(&path).unwrap();
+    assert!(!contents.is_sound() && contents.to_string().contains("no report of the spacecraft's counts"));
+}
+
+#[test]
+fn frames_of_another_kind_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("pass.cadu");
+    let config = DownlinkConfig { format: Format::Cadu, ..DownlinkConfig::default() };
+    let mut writer = DownlinkWriter::create(&path, &config).unwrap();
+    frames().iter().for_each(|frame| writer.write(frame).unwrap());
+    writer.finish().unwrap();
+    let cadus = fs::read(&path).unwrap();
+    assert!(Contents::read(&path).unwrap().is_sound());
+    // 1279 octets each: a marker and 5 x 255 of which 5 x 223 are the frame.
+    let blocks: Vec<Vec<u8>> = cadus
+        .chunks_exact(1279)
+        .map(|cadu| {
+            let mut block = cadu[4..].to_vec();
+            randomize(&mut block);
+            block
+        })
+        .collect();
+    let said = |bytes: Vec<u8>| {
+        fs::write(&path, bytes).unwrap();
+        let replayed = FileSource::open(&[path.clone()]).err().map(|error| error.to_string());
+        let inspected = Contents::read(&path).unwrap_err().to_string();
+        assert_eq!(replayed.as_ref(), Some(&inspected));
+        inspected
+    };
+    let bare = said(blocks.iter().flat_map(|block| block[..5 * 223].to_vec()).collect());
+    assert!(bare.contains("AOS transfer frames of 1115 bytes without sync markers"), "{bare}");
+    let plain =
+        said(blocks.iter().flat_map(|block| [&[0x1A, 0xCF, 0xFC, 0x1D], &block[..]].concat()).collect());
+    assert!(plain.contains("CADUs of 1279 bytes whose blocks are not randomized"), "{plain}");
 }
 
 #[test]

@@ -103,8 +103,9 @@ fn pixel_sums(blocks: &[PlacedVisibilities], nside: usize) -> PixelSums {
 }
 
 #[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
 fn the_fit_of_pixels_is_that_of_dense_rows() {
-    let Some(python) = common::python() else { return };
+    let python = common::python();
     // Fainter than the noise, and a hundred times as bright.
     for signal_k in [2e3, 2e6] {
         let blocks = noisy(3e6, 1_500.0, 1_200, signal_k);
@@ -138,8 +139,9 @@ fn the_fit_of_pixels_is_that_of_dense_rows() {
 
 /// Their residual is known to the accuracy of the engine's matrix, and says so; an R of the degree gives the map of least squares.
 #[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
 fn fit_and_regulariser_of_harmonics_are_those_of_dense_rows() {
-    let Some(python) = common::python() else { return };
+    let python = common::python();
     const L_MAX: usize = 12;
     let blocks = noisy(3e6, 300.0, 900, 2e4);
     let sums = harmonic_sums(&blocks, L_MAX, 300.0);

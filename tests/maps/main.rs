@@ -9,6 +9,7 @@ mod engines;
 mod epsilon;
 mod exact_sums;
 mod forged;
+mod lengths;
 mod refined;
 mod remade;
 mod tikhonov;

@@ -11,8 +11,8 @@ use lunarray::frames::{
     AntennaResponse, Channel, GroundFrame, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame,
     VisibilityBlock,
 };
-use lunarray::mother::Schedule;
 use lunarray::mother::correlator::{Correlator, CorrelatorCounts, CorrelatorSetup, Division};
+use lunarray::mother::{Schedule, WindowThinning};
 use lunarray::response::model::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use lunarray::runtime::{Flow, Outlet, Source, Stage};
 use lunarray::units::MissionTime;
@@ -147,7 +147,7 @@ impl Spacecraft {
             frequency_hz: channel.frequency_hz,
             baseline_wavelengths_max: 0.0,
             every_nth: 1,
-            every_nth_window: 1,
+            windows: WindowThinning::EveryNth(1),
         };
         let setup = CorrelatorSetup {
             array: Arc::clone(&self.array),

@@ -121,6 +121,10 @@ fn every_page_is_in_the_book_and_every_link_leads_somewhere() {
     assert_eq!(once, pages, "SUMMARY.md and the pages in docs/");
     assert!(pages.len() > 12);
 
+    // One screen: the rest stands on the site.
+    let readme_bytes = std::fs::read(Path::new(ROOT).join("README.md")).unwrap().len();
+    assert!(readme_bytes <= 6_000, "README.md has {readme_bytes} bytes, expected at most 6,000");
+
     let mut problems: Vec<String> = found.iter().flat_map(|(name, page)| broken(&docs, name, page)).collect();
     let readme = std::fs::read_to_string(Path::new(ROOT).join("README.md")).unwrap();
     problems.extend(broken(Path::new(ROOT), Path::new("README.md"), &readme));

@@ -9,6 +9,7 @@
 #![allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 
 mod book;
+mod public;
 mod rules;
 mod source;
 
@@ -18,8 +19,9 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) directly below `src/`, each after all that it may use.
-const ORDER: [&str; 21] = [
+const ORDER: [&str; 23] = [
     "units",
+    "numerics",
     "files",
     "ranks",
     "frames",
@@ -35,6 +37,7 @@ const ORDER: [&str; 21] = [
     "ground",
     "products",
     "pipeline",
+    "prelude",
     "figures",
     "serve",
     "bench",

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use num_complex::Complex64;
 
 use crate::frames::AntennaResponse;
+use crate::numerics::median;
 use crate::response::harmonic::{GeometryLimits, PairOrientation, RotationTable};
 use crate::response::model::{
     DirectSum, HarmonicSum, HarmonicSumSetup, ModelError, PairPosition, VisibilityModel,
@@ -76,11 +77,6 @@ impl Circle {
 /// Inclination of a pair's plane, rad, whichever satellite leads.
 fn prograde_rad(pair: &PairOrientation) -> f64 {
     pair.inclination_rad.min(PI - pair.inclination_rad)
-}
-
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// Longest baseline of the tables for a map, wavelengths.

@@ -17,7 +17,6 @@ use rayon::prelude::*;
 use super::expansion::{degree_for, harmonics, offset_factors, real_harmonics};
 use super::model::KnownSignal;
 use super::moments::{MomentSetup, PairMoments, fixed_axes};
-use super::positions::KEPT_COST;
 use super::reach::reach_radians;
 use crate::frames::PlacedVisibilities;
 use crate::response::model::ModelError;
@@ -45,6 +44,9 @@ const SAME_RADIANS: f64 = 0.7;
 
 /// Offsets whose models are computed at once.
 const BATCH: usize = 256;
+
+/// Cost (-2 ln of the likelihood) above the least up to which positions are kept for the next daughter or channel.
+pub(super) const KEPT_COST: f64 = 60.0;
 
 /// Data of one channel.
 pub(super) struct GlobalSearch<'a> {

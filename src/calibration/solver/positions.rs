@@ -11,13 +11,13 @@ use std::collections::BTreeMap;
 use rayon::prelude::*;
 
 use super::config::SolverConfig;
-use super::global::GlobalSearch;
+use super::global::{GlobalSearch, KEPT_COST};
 use super::layout::{ParameterLayout, Values};
 use super::model::{KnownSignal, Offsets};
 use super::newton::{Found, Near};
 use super::reach::is_searched;
 use super::robust::{judge, misfit};
-use super::solution::sums_of;
+use super::robust_fit::sums_of;
 use super::sums::{ModelTerms, ModelledBlock, PairSums};
 use crate::frames::PlacedVisibilities;
 use crate::response::model::ModelError;
@@ -41,9 +41,6 @@ const SETTLED_WAVELENGTHS: f64 = 1e-3;
 
 /// Positions closer than this, in wavelengths of the highest channel, are the same.
 const SAME_WAVELENGTHS: f64 = 0.1;
-
-/// Cost (-2 ln of the likelihood) above the least up to which positions are kept for the next daughter or channel.
-pub(super) const KEPT_COST: f64 = 60.0;
 
 /// Cost above the least within which other positions explain the data as well: three and a half standard deviations.
 const AMBIGUOUS_COST: f64 = 12.0;

@@ -66,6 +66,7 @@ impl Default for LinkConfig {
 impl LinkConfig {
     /// Whether the link has any faults.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_on(&self) -> bool {
         let rates = [
             self.bit_error_rate,
@@ -83,6 +84,7 @@ impl LinkConfig {
 
     /// All values that are invalid for a format; empty for a valid configuration.
     #[must_use]
+    #[doc(hidden)]
     pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
         let mut checks = Checks::of("downlink.link");
         for (key, value) in [

@@ -11,7 +11,7 @@ use crate::downlink::config::DownlinkConfig;
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::EventReader;
 use crate::downlink::wire::cadu::ReedSolomon;
-use crate::files::{AtomicFile, IfUnfinished, write_atomically};
+use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
 
 /// Bytes read at a time.
@@ -95,6 +95,7 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
     if std::fs::canonicalize(to).is_ok_and(|to| std::fs::canonicalize(from).is_ok_and(|from| from == to)) {
         return Err(DownlinkError::SameFile { path: to.to_owned() });
     }
+    let _input = ProtectedInputs::of([from]);
     let mut simulator = LinkSimulator::new(config, seed, code_of(from)?)?;
     let mut source = File::open(from).map_err(io_error(from, "open the file"))?;
     let mut file = AtomicFile::create(to, IfUnfinished::Remove).map_err(io_error(to, "create the file"))?;

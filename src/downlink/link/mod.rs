@@ -15,6 +15,11 @@ mod splitter;
 mod truth;
 
 pub use config::LinkConfig;
-pub use file::{LinkStage, corrupt, truth_path};
+pub use file::corrupt;
+#[doc(hidden)]
+pub use file::{LinkStage, truth_path};
+#[doc(hidden)]
 pub use simulator::LinkSimulator;
-pub use truth::{FrameFate, LinkTruth, LostFrames, PacketRange};
+pub use truth::LinkTruth;
+#[doc(hidden)]
+pub use truth::{FrameFate, LostFrames, PacketRange};

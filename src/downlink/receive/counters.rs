@@ -128,7 +128,7 @@ impl FaultCounts {
 pub struct ReceptionCounters {
     /// Counters of coded frames, if packets came in such. All other counters are of recovered packets.
     pub frames: Option<FrameCounters>,
-    /// Bytes received; for coded frames, recovered packet bytes.
+    /// Bytes received, without idle packets; for coded frames, recovered packet bytes.
     pub bytes: u64,
     /// Bytes that belong to no packet.
     pub bytes_garbage: u64,
@@ -177,6 +177,7 @@ pub struct ReceptionCounters {
 impl ReceptionCounters {
     /// Counts of one kind.
     #[must_use]
+    #[doc(hidden)]
     pub fn kind(&self, kind: Kind) -> &KindCounts {
         match kind {
             Kind::Instrument => &self.instrument,
@@ -256,6 +257,7 @@ impl ReceptionCounters {
 
     /// Sound packets of all kinds.
     #[must_use]
+    #[doc(hidden)]
     pub fn packets(&self) -> u64 {
         Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
     }

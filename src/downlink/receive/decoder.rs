@@ -118,6 +118,7 @@ impl Decoder {
                 counts.missing += header.count - expected;
             }
             Event::Restart { header, .. } => counters.kind_mut(header.kind).restarts += 1,
+            Event::Idle { .. } => {}
             Event::Garbage { bytes, .. } => {
                 counters.bytes += bytes;
                 counters.bytes_garbage += bytes;

@@ -54,6 +54,8 @@ pub struct EventReader<R = File> {
     feed: ByteFeed<R>,
     intake: Intake,
     packets: u64,
+    /// Whether the stream has been looked at for frames of another kind.
+    looked: bool,
 }
 
 impl EventReader<File> {
@@ -74,7 +76,7 @@ impl<R: Read> EventReader<R> {
     }
 
     fn of(feed: ByteFeed<R>) -> Self {
-        Self { feed, intake: Intake::new(), packets: 0 }
+        Self { feed, intake: Intake::new(), packets: 0, looked: false }
     }
 
     /// The same source through [`Intake::unfiltered`]: every sound packet, duplicates too.
@@ -86,12 +88,13 @@ impl<R: Read> EventReader<R> {
     /// Reads on until `take` returns something; `None` at the end of the source.
     ///
     /// # Errors
-    /// The source cannot be read.
+    /// The source cannot be read, or is of transfer frames of another kind.
     pub fn find<T>(
         &mut self,
         mut take: impl FnMut(&Event<'_>) -> Option<T>,
     ) -> Result<Option<T>, DownlinkError> {
         loop {
+            self.refuse_foreign_frames()?;
             while let Some(event) = self.intake.next_event() {
                 self.packets += u64::from(matches!(event, Event::Packet(_)));
                 if let Some(found) = take(&event) {
@@ -100,6 +103,21 @@ impl<R: Read> EventReader<R> {
             }
             if !self.feed.feed(&mut self.intake)? {
                 return Ok(None);
+            }
+        }
+    }
+
+    /// Packets may be seen in transfer frames of another kind, but most are cut by the frames' headers: once events are due, the stream
+    /// is looked at.
+    fn refuse_foreign_frames(&mut self) -> Result<(), DownlinkError> {
+        if self.looked || self.intake.bytes() == 0 {
+            return Ok(());
+        }
+        self.looked = self.intake.has_whole_head();
+        match self.intake.foreign_frames() {
+            None => Ok(()),
+            name => {
+                Err(DownlinkError::Foreign { path: self.feed.path.clone(), bytes: self.intake.bytes(), name })
             }
         }
     }
@@ -120,7 +138,7 @@ impl<R: Read> EventReader<R> {
     /// # Errors
     /// [`DownlinkError::Empty`] for a source without a byte, [`DownlinkError::Foreign`] for one without a packet.
     pub fn require_packets(&self) -> Result<(), DownlinkError> {
-        require_packets(&self.feed.path, self.intake.bytes(), self.packets)
+        require_packets(&self.feed.path, self.intake.bytes(), self.packets, || self.intake.foreign_name())
     }
 
     /// Packets read so far.

@@ -3,6 +3,7 @@
 use std::io::{self, Read};
 
 use super::cadu::{CaduReceiver, FrameCounters};
+use super::foreign::{HEAD_BYTES, frames_of, name_of};
 use super::{Event, PacketReceiver};
 use crate::downlink::wire::{Format, Kind};
 
@@ -22,6 +23,8 @@ pub struct Intake {
     chunk: Vec<u8>,
     recovered: Vec<u8>,
     unfiltered: bool,
+    /// The first bytes of the stream.
+    head: Vec<u8>,
 }
 
 impl Intake {
@@ -39,6 +42,7 @@ impl Intake {
 
     /// Takes the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
+        self.keep_head(bytes);
         self.bytes += bytes.len() as u64;
         if self.format != Some(Format::Cadu) {
             self.packets.push(bytes);
@@ -109,6 +113,29 @@ impl Intake {
     pub fn held_bytes(&self) -> usize {
         let chunks = self.chunk.capacity() + self.recovered.capacity();
         self.packets.held_bytes() + self.frames.held_bytes() + chunks
+    }
+
+    /// What the stream is, as far as its first bytes tell, if it is no downlink.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn foreign_name(&self) -> Option<String> {
+        name_of(&self.head)
+    }
+
+    /// Transfer frames of another kind, in which packets may be seen by chance: what they are.
+    #[must_use]
+    pub(in crate::downlink) fn foreign_frames(&self) -> Option<String> {
+        frames_of(&self.head)
+    }
+
+    /// Whether as much is held of the beginning as will be.
+    pub(super) fn has_whole_head(&self) -> bool {
+        self.head.len() == HEAD_BYTES
+    }
+
+    fn keep_head(&mut self, bytes: &[u8]) {
+        let room = HEAD_BYTES - self.head.len();
+        self.head.extend_from_slice(&bytes[..room.min(bytes.len())]);
     }
 
     /// Restarts of the packet count of a kind, independent of the order of arrival.

@@ -16,6 +16,7 @@ pub mod cadu;
 mod counters;
 mod decoder;
 mod event_reader;
+mod foreign;
 pub mod inspect;
 mod intake;
 mod listing;

@@ -4,10 +4,14 @@ use std::collections::VecDeque;
 use std::io::{self, Read};
 
 use super::sequence::{Arrival, Sequence};
-use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_holds};
+use crate::downlink::wire::cadu::framer::{IDLE_APID, PACKET_HEADER_BYTES as PRIMARY_HEADER_BYTES};
+use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_check, packet_holds};
 
 /// Bytes that [`PacketReceiver::fill_from`] reads at a time.
 const CHUNK_BYTES: usize = 1 << 18;
+
+/// First byte of an idle packet of telemetry; that of a command has one bit more.
+const IDLE_FIRST_BYTE: u8 = (IDLE_APID >> 8) as u8;
 
 /// A sound packet: its checksums are right.
 #[derive(Clone, Copy, Debug)]
@@ -22,6 +26,18 @@ pub struct Packet<'a> {
     pub check: u32,
     /// Whether it fills a gap reported earlier.
     pub late: bool,
+}
+
+impl Packet<'_> {
+    /// Appends it as it was sent. Parsed headers hold every bit of the originals.
+    pub(crate) fn append_to(&self, out: &mut Vec<u8>) {
+        let start = out.len();
+        out.reserve(self.header.bytes.min(HEADER_BYTES + self.payload.len() + TRAILER_BYTES));
+        out.extend_from_slice(&self.header.to_bytes());
+        out.extend_from_slice(self.payload);
+        let check = packet_check(&out[start..]);
+        out.extend_from_slice(&check);
+    }
 }
 
 /// What a stream contains, in order. Events other than [`Event::Gap`] and [`Event::Restart`] cover each byte of the
@@ -65,6 +81,13 @@ pub enum Event<'a> {
         /// The count that was due.
         expected: u64,
     },
+    /// Idle packets (APID 0x7FF), which fill a stream and say nothing.
+    Idle {
+        /// Offset in the stream, bytes.
+        offset: u64,
+        /// Number of bytes.
+        bytes: u64,
+    },
     /// Bytes that belong to no packet.
     Garbage {
         /// Offset in the stream, bytes.
@@ -87,6 +110,7 @@ enum PendingEvent {
     Packet { header: PacketHeader, late: bool },
     Duplicate(PacketHeader),
     Damaged(PacketHeader, usize),
+    Idle(usize),
     Gap { header: PacketHeader, expected: u64 },
     Restart { header: PacketHeader, expected: u64 },
     Garbage { offset: u64, bytes: u64 },
@@ -99,6 +123,8 @@ enum PacketMatch {
     Good(PacketHeader),
     /// Sound headers of a damaged packet; bytes to skip.
     Bad(PacketHeader, usize),
+    /// An idle packet, of so many bytes.
+    Idle(usize),
     /// Headers of a packet in which the stream ends.
     Cut,
     /// More bytes are needed to decide.
@@ -111,6 +137,8 @@ enum PacketMatch {
 ///
 /// Push bytes, then take events until there are none. At the end call [`PacketReceiver::finish`] and take the rest.
 /// Used so, memory stays below the longest packet plus twice the longest chunk.
+///
+/// Idle packets (APID 0x7FF) between packets are passed over.
 ///
 /// After damage it searches for the next sound headers. Time is linear in the stream: a packet checksum is computed
 /// once per sound headers, which noise yields once in 10^11 bytes and a forger at most once in 22.
@@ -188,7 +216,10 @@ impl PacketReceiver {
         let of_packet = |next: &PendingEvent| {
             matches!(
                 next,
-                PendingEvent::Packet { .. } | PendingEvent::Duplicate(_) | PendingEvent::Damaged(..)
+                PendingEvent::Packet { .. }
+                    | PendingEvent::Duplicate(_)
+                    | PendingEvent::Damaged(..)
+                    | PendingEvent::Idle(_)
             )
         };
         self.pending.iter().any(of_packet)
@@ -234,6 +265,10 @@ impl PacketReceiver {
                 self.begin += bytes;
                 Event::Damaged { offset, header, bytes: bytes as u64 }
             }
+            PendingEvent::Idle(bytes) => {
+                self.begin += bytes;
+                Event::Idle { offset, bytes: bytes as u64 }
+            }
             PendingEvent::Truncated { bytes } => {
                 self.begin += bytes;
                 Event::Truncated { offset, bytes: bytes as u64 }
@@ -266,6 +301,7 @@ impl PacketReceiver {
             match self.find() {
                 PacketMatch::Good(header) => return self.take_good(header),
                 PacketMatch::Bad(header, bytes) => return self.take_damaged(header, bytes),
+                PacketMatch::Idle(bytes) => return self.pending.push_back(PendingEvent::Idle(bytes)),
                 PacketMatch::Unknown => return,
                 PacketMatch::Cut => {
                     self.cut_at.get_or_insert(self.offset + self.begin as u64);
@@ -282,6 +318,12 @@ impl PacketReceiver {
     /// Examines the beginning of the unconsumed bytes.
     fn find(&self) -> PacketMatch {
         let rest = &self.buffer[self.begin..self.end];
+        // Idle packets have no checksum: they are taken for such only where a packet is due.
+        if self.garbage_from.is_none()
+            && let Some(idle) = self.find_idle(rest)
+        {
+            return idle;
+        }
         let Some(bytes) = rest.get(..HEADER_BYTES) else {
             // Too short for headers: the beginning of a packet if it follows one and looks like one.
             return match (self.finished, rest[0] == PacketHeader::FIRST_BYTE) {
@@ -308,6 +350,25 @@ impl PacketReceiver {
             Some(_) => PacketHeader::parse(after).is_some(),
         };
         PacketMatch::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
+    }
+
+    /// An idle packet at the beginning of `rest`; another packet, or the end, must follow it.
+    fn find_idle(&self, rest: &[u8]) -> Option<PacketMatch> {
+        let begins = |bytes: &[u8]| matches!(bytes, [first, 0xFF, ..] if first & 0xEF == IDLE_FIRST_BYTE);
+        if !begins(rest) {
+            return None;
+        }
+        let undecided = if self.finished { PacketMatch::Cut } else { PacketMatch::Unknown };
+        let Some(&[.., high, low]) = rest.first_chunk::<PRIMARY_HEADER_BYTES>() else {
+            return Some(undecided);
+        };
+        let bytes = PRIMARY_HEADER_BYTES + 1 + usize::from(u16::from_be_bytes([high, low]));
+        let Some(after) = rest.get(bytes..) else { return Some(undecided) };
+        if after.len() < HEADER_BYTES && !self.finished {
+            return Some(PacketMatch::Unknown);
+        }
+        let follows = after.is_empty() || begins(after) || PacketHeader::parse(after).is_some();
+        follows.then_some(PacketMatch::Idle(bytes))
     }
 
     /// Skips one byte, then all up to the next that could begin a packet.
@@ -392,6 +453,7 @@ mod tests {
                     Event::Packet(packet) => packet.header.bytes as u64,
                     Event::Duplicate { header, .. } => header.bytes as u64,
                     Event::Damaged { bytes, .. }
+                    | Event::Idle { bytes, .. }
                     | Event::Garbage { bytes, .. }
                     | Event::Truncated { bytes, .. } => bytes,
                     Event::Gap { .. } | Event::Restart { .. } => 0,

@@ -70,6 +70,13 @@ impl FileSource {
         Ok(source)
     }
 
+    /// Whether the last file is followed as it grows.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_followed(&self) -> bool {
+        self.patience.is_some()
+    }
+
     /// Requires one format for the whole stream.
     fn note_format(&mut self, path: &Path, format: Format) -> Result<(), DownlinkError> {
         match &self.format {
@@ -100,6 +107,9 @@ impl FileSource {
     fn probe(&mut self, open: &mut OpenFile, bytes: &[u8]) -> Result<(), DownlinkError> {
         let Some(probe) = &mut open.probe else { return Ok(()) };
         probe.push(bytes);
+        if let name @ Some(_) = probe.foreign_frames() {
+            return Err(DownlinkError::Foreign { path: open.path.clone(), bytes: open.bytes, name });
+        }
         while let Some(event) = probe.next_event() {
             if matches!(event, Event::Packet(_)) {
                 let format = probe.format().unwrap_or_default();
@@ -115,6 +125,7 @@ impl FileSource {
     ///
     /// # Errors
     /// Those of [`FileSource::open`] for all files but the last, which need only exist.
+    #[doc(hidden)]
     pub fn follow(paths: &[PathBuf], idle_s: f64) -> Result<Self, DownlinkError> {
         let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
         let file = File::open(last).map_err(io_error(last, "open the file"))?;
@@ -141,6 +152,14 @@ impl FileSource {
 }
 
 impl OpenFile {
+    /// At its end, a file in which no packet was found, if it is known what it is.
+    fn refuse_foreign(&self) -> Result<(), DownlinkError> {
+        match self.probe.as_ref().and_then(|probe| probe.foreign_name()) {
+            None => Ok(()),
+            name => Err(DownlinkError::Foreign { path: self.path.clone(), bytes: self.bytes, name }),
+        }
+    }
+
     /// Checks that the path still leads to the same file and that it has not shrunk. Bytes written over those that were
     /// read would go unnoticed.
     fn check_place(&self) -> Result<(), DownlinkError> {
@@ -192,6 +211,8 @@ impl Source for FileSource {
             }
         } else if self.wait(&open)? {
             self.current = Some(open);
+        } else {
+            open.refuse_foreign()?;
         }
         Ok(Flow::Continue)
     }

@@ -10,6 +10,27 @@ use crate::downlink::receive::{Decoder, EventReader, ReceptionCounters};
 use crate::frames::GroundFrame;
 
 /// Reads ground frames from a file of either format, in bounded memory.
+///
+/// ```
+/// use lunarray::prelude::*;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let file = folder.path().join("mission.ccsds");
+/// # Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_window", 900).simulate(&file)?;
+/// let mut reader = DownlinkReader::open(&file)?;
+/// let mut good = 0;
+/// while let Some(frame) = reader.next_frame()? {
+///     if let GroundFrame::Visibilities(block) = frame {
+///         good += block.flags.iter().filter(|flags| flags.is_good()).count();
+///     }
+/// }
+/// // What is in it as a whole, and what is wrong with it.
+/// let contents = Contents::read(&file)?;
+/// assert!(good > 0 && good as u64 <= contents.visibilities.count);
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct DownlinkReader<R = File> {
     events: EventReader<R>,
@@ -29,18 +50,21 @@ impl DownlinkReader<File> {
 impl<R: Read> DownlinkReader<R> {
     /// Reads from any source; `path` names it in errors.
     #[must_use]
+    #[doc(hidden)]
     pub fn new(source: R, path: &Path) -> Self {
         Self { events: EventReader::new(source, path), decoder: Decoder::new() }
     }
 
     /// Continues with the decoder of an earlier file: its instrument description and its counters.
     #[must_use]
+    #[doc(hidden)]
     pub fn with_decoder(self, decoder: Decoder) -> Self {
         Self { decoder, ..self }
     }
 
     /// The decoder, for the next file.
     #[must_use]
+    #[doc(hidden)]
     pub fn into_decoder(self) -> Decoder {
         self.decoder
     }
@@ -72,6 +96,7 @@ impl<R: Read> DownlinkReader<R> {
 
     /// The counters of the coded frames, if the file holds any.
     #[must_use]
+    #[doc(hidden)]
     pub fn frames(&self) -> Option<FrameCounters> {
         self.events.intake().frames()
     }

@@ -55,6 +55,7 @@ impl Ground {
     /// # Errors
     /// Those of [`Ground::open`] and [`Ground::retract`]; packets whose gains change and that are in no file; channels that
     /// would begin with other positions.
+    #[doc(hidden)]
     pub fn recalibrate(
         folder: &Path,
         files: &[PathBuf],

@@ -71,9 +71,9 @@ impl VisibilityArchive {
     /// Takes visibilities.
     ///
     /// # Errors
-    /// A block of another frequency. A visibility without a row of B, or for which there is no room, is counted as refused.
+    /// A block of another frequency, or with arrays of unequal lengths. A visibility without a row of B, or for which there is no room, is counted as refused.
     pub fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.check_frequency(placed)?;
+        self.check(placed)?;
         self.flush();
         let mut added = Added::default();
         for k in 0..placed.len() {
@@ -95,7 +95,7 @@ impl VisibilityArchive {
     /// # Errors
     /// A block of another frequency.
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.check_frequency(placed)?;
+        self.check(placed)?;
         self.sort();
         let mut removed = Added::default();
         for k in 0..placed.len() {
@@ -305,13 +305,12 @@ impl VisibilityArchive {
         Ok(archive)
     }
 
-    fn check_frequency(&self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
+    fn check(&self, placed: &PlacedVisibilities) -> Result<(), AccumulationError> {
         let (expected_hz, found_hz) = (self.setup.frequency_hz, placed.frequency_hz);
-        if found_hz == expected_hz {
-            Ok(())
-        } else {
-            Err(AccumulationError::Frequency { expected_hz, found_hz })
+        if found_hz != expected_hz {
+            return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
+        Ok(placed.check_lengths()?)
     }
 
     fn checked(&self, placed: &PlacedVisibilities, k: usize) -> Result<HeldVisibility, Refusal> {

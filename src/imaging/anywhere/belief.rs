@@ -7,7 +7,14 @@ use crate::response::general::{PairAt, PairResponse};
 use crate::response::pixel::SatelliteAntenna;
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
-use super::sums::is_same_pass;
+/// A satellite's positions further apart in time than this say nothing of its plane, s: a quarter of a low orbit.
+const SAME_PASS_S: f64 = 1500.0;
+
+/// Whether one visibility follows another of the same pair soon after.
+pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
+    let apart_s = after.time_s - before.time_s;
+    before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
+}
 
 /// Angle between the normals of two satellites' orbits and that of their plane, rad, up to which dipoles along either are the same: rows
 /// err by it.

@@ -7,7 +7,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::belief::{PairAntennas, RowBelief};
+use super::belief::{PairAntennas, RowBelief, is_same_pass};
 use super::held::{HeldVisibility, RefinedSetup};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums};
@@ -102,19 +102,10 @@ pub struct Departures {
     pub radial_deg_max: f64,
 }
 
-/// A satellite's positions further apart in time than this say nothing of its plane, s: a quarter of a low orbit.
-const SAME_PASS_S: f64 = 1500.0;
-
 /// The normal of the orbit, m^2 and as the satellite turns, from where it moves to until the next visibility of the pair; `None` if
 /// the next is another pair's or another pass's. The planes of pairs lie across the orbit's if satellites do not follow each other.
 fn orbit_normal(before: &PairAt, after: &PairAt) -> Option<Vec3> {
     is_same_pass(before, after).then(|| cross(before.r_i_m, after.r_i_m))
-}
-
-/// Whether one visibility follows another of the same pair soon after.
-pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
-    let apart_s = after.time_s - before.time_s;
-    before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
 }
 
 /// Mean inclination of the orbits' planes; `None` if each visibility stands alone.

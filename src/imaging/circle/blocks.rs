@@ -7,10 +7,10 @@ use faer::{Accum, Mat, MatMut, MatRef, Par, Side};
 use rayon::prelude::*;
 
 use super::HarmonicSetup;
+use super::grid::ALPHAS;
 use super::grid::{Grids, NODES};
 use super::stored::TorusPart;
 use super::tori::Tori;
-use super::workspace::ALPHAS;
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::imaging::power::Block;
 use crate::ranks::Ranks;

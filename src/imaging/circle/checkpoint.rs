@@ -3,9 +3,10 @@
 //! nothing follows) and its sums, i32 for bounds below 2^31, else i64.
 
 use super::HarmonicSetup;
-use super::exact::{ExactNode, ExactTori};
+use super::exact::ExactTori;
+use super::grid::ALPHAS;
 use super::grid::Grids;
-use super::workspace::ALPHAS;
+use super::quanta::ExactNode;
 use crate::imaging::AccumulationError;
 use crate::imaging::exact::checkpoint::{FrameReader, FrameWriter, RESPONSES, number_of, refused};
 use crate::imaging::exact::fixed_point::rows::IntegerRow;

@@ -2,13 +2,12 @@
 
 use std::f64::consts::TAU;
 
-use super::workspace::ALPHAS;
 use crate::imaging::exact::fixed_point::rows::RowLayout;
+use crate::numerics::fft_length;
 use crate::ranks::RankShare;
 use crate::response::harmonic::NodeGrid;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::response::harmonic::kernel::{Kernel, LANES};
-use crate::response::harmonic::sizes::fft_length;
 
 /// Nodes in u per wavelength; a pattern's band of |n_y| <= 1 needs 2.
 const NODES_PER_WAVELENGTH: f64 = 3.5;
@@ -16,6 +15,8 @@ const NODES_PER_WAVELENGTH: f64 = 3.5;
 pub(super) const NODES: usize = 5;
 /// Nodes of a group: a cache line of patterns.
 pub(super) const NODE_GROUP: usize = 8;
+/// Alphas of a block. Each of them is a column of the matrix products for every sky.
+pub(super) const ALPHAS: usize = 16;
 /// Nodes in alpha that a weight is spread to.
 const WEIGHT_ALPHAS: usize = 16;
 /// Kaiser parameter of the weights' kernels: ripples below 2e-4 of a weight, from differences of orders up to 1.7 l_max.

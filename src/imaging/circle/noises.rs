@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::exact::Quanta;
 use super::grid::{Grids, NODES};
 use super::operator::{RightHandSide, SharedTori};
+use super::quanta::Quanta;
 use super::spread::{LocatedNoise, TorusPoint, spread_noises};
 use super::sums::{HarmonicSums, unknowns_of_gradient};
 use super::tori::{NodeSums, Tori};

@@ -9,11 +9,12 @@ use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
+use super::grid::ALPHAS;
 use super::grid::{Grids, NODE_GROUP, NODES};
 use super::lines::multiply_line;
 use super::stored::TorusPart;
 use super::tori::{BlockRows, Tori};
-use super::workspace::{ALPHAS, NodeRange, Workspace};
+use super::workspace::{NodeRange, Workspace};
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;
 use crate::response::harmonic::filter::FilteredPatterns;

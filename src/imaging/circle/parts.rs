@@ -7,12 +7,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rayon::prelude::*;
 
 use super::HarmonicEngine;
-use super::exact::{ExactNode, ExactTori, Quanta};
+use super::exact::ExactTori;
+use super::grid::ALPHAS;
 use super::grid::Grids;
+use super::quanta::{ExactNode, Quanta};
 use super::stored::{StoredBlock, StoredTori, TorusPart};
 use super::sums::HarmonicSums;
 use super::tori::Tori;
-use super::workspace::ALPHAS;
 use crate::files::write_at;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::{AccumulationError, SumCounts};

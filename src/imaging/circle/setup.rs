@@ -1,8 +1,8 @@
 //! Setup of a harmonic engine, and the memory it takes.
 
+use super::grid::ALPHAS;
 use super::grid::Grids;
 use super::operator::Operator;
-use super::workspace::ALPHAS;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::AccumulationError;
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};

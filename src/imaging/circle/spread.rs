@@ -3,9 +3,9 @@
 use num_complex::Complex64;
 use pulp::{Arch, Simd, WithSimd};
 
-use super::exact::{BIAS, ExactNode, Quanta, TERM_MAX, biases};
+use super::grid::ALPHAS;
 use super::grid::{Grids, NODES};
-use super::workspace::ALPHAS;
+use super::quanta::{BIAS, ExactNode, Quanta, TERM_MAX, biases};
 use crate::imaging::exact::engine::Accepted;
 use crate::imaging::exact::fixed_point::Direction;
 use crate::imaging::exact::fixed_point::rows::{IntegerRow, Integers};

@@ -5,9 +5,9 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::grid::ALPHAS;
 use super::grid::Grids;
 use super::stored::{ReadRows, StoredTori, TorusPart};
-use super::workspace::ALPHAS;
 use crate::ranks::Ranks;
 
 /// The sums at one node.

@@ -5,11 +5,8 @@ use std::sync::Arc;
 use num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
-use super::grid::NODE_GROUP;
+use super::grid::{ALPHAS, NODE_GROUP};
 use crate::response::harmonic::degrees;
-
-/// Alphas of a block. Each of them is a column of the matrix products for every sky.
-pub(super) const ALPHAS: usize = 16;
 
 /// Whole groups of nodes that hold all sums.
 #[derive(Clone, Copy)]

@@ -166,6 +166,7 @@ impl<B: SkyBasis> ExactEngine<B> {
 
     /// Setup.
     #[must_use]
+    #[doc(hidden)]
     pub fn setup(&self) -> &B::Setup {
         &self.setup
     }
@@ -193,6 +194,7 @@ impl<B: SkyBasis> ExactEngine<B> {
         if found_hz != expected_hz {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
+        placed.check_lengths()?;
         // Not in the pool, which sums the batch before: this is the other half of the work.
         let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
         let scale = self.scale;

@@ -132,6 +132,52 @@ pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f6
 ///
 /// # Errors
 /// No data, a prior of another size, or a matrix that is not positive definite.
+///
+/// ```
+/// use lunarray::prelude::*;
+/// use lunarray::response::pixel::{Directions, PairGeometry, PixelMethod, sky_sums};
+/// use lunarray::units::constants::MOON_RADIUS_M;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// // Visibilities from elsewhere: here of a sky of 1e6 K, of two satellites that turn about the Moon.
+/// let (sky, frequency_hz) = (SkyMap::constant(16, Frame::Ecliptic, 1e6)?, 3e6);
+/// let pair = |k: u32| {
+///     let (sin, cos) = (0.1 * f64::from(k)).sin_cos();
+///     let r_i_m = [2.04e6 * cos, 2.04e6 * sin, 0.0];
+///     let r_j_m = [r_i_m[0], r_i_m[1] + f64::from(k % 7), 0.3 * f64::from(k % 5)];
+///     PairGeometry { r_i_m, r_j_m, frequency_hz, moon_radius_m: MOON_RADIUS_M, response: AntennaResponse::Isotropic }
+/// };
+/// let pairs: Vec<PairGeometry> = (0..500).map(pair).collect();
+/// let values: Vec<f32> = sky.values().iter().map(|&kelvin| kelvin as f32).collect();
+/// let directions = Directions::from(sky.directions_ecliptic().as_slice());
+/// let sums = sky_sums(&pairs, &directions, &values, lunarray::sky::healpix::pixel_area_sr(16))?;
+///
+/// // The weight is the inverse variance, (K sr)^-2.
+/// let block = PlacedVisibilities {
+///     frequency_hz,
+///     time_s: (0..500).map(f64::from).collect(),
+///     r_i_m: pairs.iter().map(|pair| pair.r_i_m).collect(),
+///     r_j_m: pairs.iter().map(|pair| pair.r_j_m).collect(),
+///     value_k_sr: sums.iter().map(|sum| sum.visibility_k_sr).collect(),
+///     weight: vec![1e-8; 500],
+///     ..PlacedVisibilities::default()
+/// };
+/// let mut engine = PixelEngine::new(PixelSetup {
+///     nside: 1,
+///     frequency_hz,
+///     method: PixelMethod::Average,
+///     moon_radius_m: MOON_RADIUS_M,
+///     response: AntennaResponse::Isotropic,
+///     companion_seed: 1,
+///     weight_max: 2e-8,
+/// })?;
+/// assert_eq!(engine.add(&block)?.visibilities, 500);
+/// let solution = solve_pixels(engine.into_sums(), 1e-6, None)?;
+/// let mean_k = solution.map_k.iter().sum::<f64>() / 12.0;
+/// assert!((mean_k / 1e6 - 1.0).abs() < 0.01, "{mean_k} K");
+/// # Ok(())
+/// # }
+/// ```
 pub fn solve_pixels(
     sums: PixelSums,
     epsilon: f64,

@@ -7,7 +7,7 @@
 
 use pulp::Arch;
 
-use super::kernel::{LANES, ProductSums, SLICE, product};
+use super::lanes::{LANES, ProductSums, SLICE, product};
 
 /// Parts of eight channels, real and imaginary alternating.
 type Half = [i16; 16];

@@ -111,7 +111,8 @@ impl GroupIntegrator {
         };
         for at in 0..own.pairs.len() {
             for lane in 0..own.schedules.len() {
-                own.pairs[at].number[lane] = window.index / own.schedules[lane].every_nth_window.max(1);
+                let Schedule { windows, every_nth, .. } = own.schedules[lane];
+                own.pairs[at].number[lane] = windows.first_integration(window.index, every_nth);
                 own.open(at, lane, array);
             }
         }

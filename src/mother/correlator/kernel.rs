@@ -8,21 +8,11 @@ use multiversion::multiversion;
 use pulp::{Arch, Simd, WithSimd};
 
 use super::integers::{Codes, Levels};
+pub use super::lanes::{LANES, ProductSums, SLICE, product};
 use crate::frames::Samples;
-
-/// Channels that are processed together.
-pub const LANES: usize = 16;
-/// Samples per slice: 16 kB for eight daughters.
-pub const SLICE: usize = 16;
 
 /// Planes per group: real and imaginary parts of two daughters.
 const PLANES: usize = 4;
-
-/// Index of the product of daughters `i <= j`.
-#[must_use]
-pub fn product(i: usize, j: usize) -> usize {
-    j * (j + 1) / 2 + i
-}
 
 /// A slice of samples of all daughters in the kernel's order: by sample, daughter, part, channel.
 #[derive(Clone, Debug)]
@@ -149,9 +139,6 @@ fn weave(from: &[f32; SLICE * LANES], to: &mut [f32; SLICE * LANES]) {
         to[2 * k + 1] = from[k + HALF];
     }
 }
-
-/// Sums over a dump: by product, real and imaginary parts of `x_i conj(x_j)`, one value per channel.
-pub type ProductSums = Vec<[[f32; LANES]; 2]>;
 
 /// Zero sums for `daughters`, rounded up to an even number.
 #[must_use]

@@ -10,6 +10,7 @@ mod autos;
 mod integers;
 mod integrate;
 pub mod kernel;
+mod lanes;
 mod spectra;
 mod stage;
 

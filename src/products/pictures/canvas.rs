@@ -2,14 +2,8 @@
 
 use std::ops::Range;
 
+pub(super) use super::colour::{Colour, FAINT, INK, WHITE};
 use super::text::{self, Align, Style};
-
-/// Red, green, blue, 0-255.
-pub(super) type Colour = [u8; 3];
-
-pub(super) const WHITE: Colour = [255, 255, 255];
-pub(super) const INK: Colour = [38, 38, 43];
-pub(super) const FAINT: Colour = [120, 120, 128];
 
 /// A rectangle of the page, pixels, y downwards.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -98,7 +92,7 @@ impl Canvas {
         self.shapes.push(Shape::Line { points: points.to_vec(), stroke, clip: self.clip });
     }
 
-    /// Draws a line of text ([`text::draw`]).
+    /// Draws a line of text; `anchor` is at mid-height of its capitals, `_{...}` marks subscripts.
     pub fn text(&mut self, text: &str, anchor: (f64, f64), align: Align, style: Style) {
         self.shapes.push(Shape::Text { text: text.to_owned(), anchor, align, style });
     }
@@ -117,7 +111,13 @@ impl Canvas {
                     self.paint_line(points, *stroke);
                 }
                 Shape::Text { text, anchor, align, style } => {
-                    text::paint(self, text, *anchor, *align, *style);
+                    text::paint(
+                        &mut |x, y, colour, alpha| self.blend(x, y, colour, alpha),
+                        text,
+                        *anchor,
+                        *align,
+                        *style,
+                    );
                 }
             }
         }

@@ -77,7 +77,7 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
     let mut canvas = Canvas::new(width, height);
     if !title.is_empty() {
         let style = Style::new(1.45 * FONT, INK).medium();
-        text::draw(&mut canvas, title, (0.5 * width as f64, 38.0), Align::Middle, style);
+        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
     }
     for (number, plot) in plots.iter().enumerate() {
         let share = Rect {
@@ -243,7 +243,7 @@ pub(super) fn write_axes(
     for (value, label) in &x_ticks.labelled {
         let x = to_page(*value, 1.0).0;
         canvas.polyline(&[(x, frame.bottom()), (x, frame.bottom() - 7.0)], thin);
-        text::draw(canvas, label, (x, frame.bottom() + 0.95 * FONT), Align::Middle, style);
+        canvas.text(label, (x, frame.bottom() + 0.95 * FONT), Align::Middle, style);
     }
     for value in &x_ticks.minor {
         let x = to_page(*value, 1.0).0;
@@ -252,7 +252,7 @@ pub(super) fn write_axes(
     for (value, label) in &y_ticks.labelled {
         let y = to_page(1.0, *value).1;
         canvas.polyline(&[(frame.x, y), (frame.x + 7.0, y)], thin);
-        text::draw(canvas, label, (frame.x - 0.5 * FONT, y), Align::End, style);
+        canvas.text(label, (frame.x - 0.5 * FONT, y), Align::End, style);
     }
     for value in &y_ticks.minor {
         let y = to_page(1.0, *value).1;
@@ -263,14 +263,14 @@ pub(super) fn write_axes(
         exponent => format!("{label}  [{}]", labels::power_of_ten(exponent)),
     };
     let below = (frame.middle_x(), frame.bottom() + 2.6 * FONT);
-    text::draw(canvas, &named(&plot.x.label, x_ticks), below, Align::Middle, Style::new(1.05 * FONT, INK));
+    canvas.text(&named(&plot.x.label, x_ticks), below, Align::Middle, Style::new(1.05 * FONT, INK));
     let widest = y_ticks.labelled.iter().map(|(_, label)| text::length(label, style)).fold(0.0, f64::max);
     let beside = (frame.x - widest - 1.7 * FONT, frame.middle_y());
     let upwards = Style::new(1.05 * FONT, INK).upwards();
-    text::draw(canvas, &named(&plot.y.label, y_ticks), beside, Align::Middle, upwards);
+    canvas.text(&named(&plot.y.label, y_ticks), beside, Align::Middle, upwards);
     if !plot.title.is_empty() {
         let above = (frame.middle_x(), frame.y - 0.95 * FONT);
-        text::draw(canvas, &plot.title, above, Align::Middle, Style::new(1.1 * FONT, INK).medium());
+        canvas.text(&plot.title, above, Align::Middle, Style::new(1.1 * FONT, INK).medium());
     }
 }
 
@@ -319,7 +319,7 @@ impl<'a> Legend<'a> {
             let x = place.x + 0.5 * FONT;
             canvas.polyline(&[(x, y), (x + LEGEND_SAMPLE, y)], stroke_of(*number, curve));
             let at = (x + LEGEND_SAMPLE + 0.5 * FONT, y);
-            text::draw(canvas, &curve.label, at, Align::Start, Self::style());
+            canvas.text(&curve.label, at, Align::Start, Self::style());
         }
     }
 }

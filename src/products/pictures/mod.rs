@@ -4,6 +4,7 @@
 //! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
 
 mod canvas;
+mod colour;
 mod curves;
 mod error;
 mod labels;
@@ -20,12 +21,19 @@ mod tile;
 
 pub use curves::{Axis, Curve, Plot, draw_plots};
 pub use error::PictureError;
-pub use mollweide::{Sampling, View};
+#[doc(hidden)]
+pub use mollweide::Sampling;
+pub use mollweide::View;
+#[doc(hidden)]
 pub use patch::{Patch, draw_patches};
 pub use png_file::Picture;
+#[doc(hidden)]
 pub use raster::{Raster, draw_rasters};
 pub use scale::{ColourScale, Palette, Scaling};
-pub use sheet::{Bars, MapPanel, Sheet, draw_map, draw_sheet};
+#[doc(hidden)]
+pub use sheet::{Bars, Sheet, draw_sheet};
+pub use sheet::{MapPanel, draw_map};
+#[doc(hidden)]
 pub use tile::tile_png;
 
 #[cfg(test)]

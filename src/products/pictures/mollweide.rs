@@ -7,7 +7,6 @@ use rayon::prelude::*;
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::projection::{Parallel, forward};
 use super::scale::{ColourScale, is_seen};
-use super::text;
 use super::text::{Align, Style};
 use crate::sky::Frame;
 use crate::sky::healpix::{Ring, pixel_of, ring};
@@ -272,7 +271,7 @@ fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &ColourScale, centre: f6
         };
         let text = format!("{sign}{}°", parallel.abs());
         let lift = -0.45 * size * parallel.to_radians().sin() / 60_f64.to_radians().sin();
-        text::draw(canvas, &text, (x - 0.45 * size, y + lift), Align::End, outside);
+        canvas.text(&text, (x - 0.45 * size, y + lift), Align::End, outside);
     }
     let on_map = Style::new(0.9 * size, if scale.is_light() { INK } else { WHITE }).alpha(0.75);
     for meridian in 0..6 {
@@ -282,7 +281,7 @@ fn label(canvas: &mut Canvas, ellipse: &Ellipse, scale: &ColourScale, centre: f6
             continue;
         }
         let (x, y) = ellipse.to_page(forward(longitude, 0.0));
-        text::draw(canvas, &format!("{degrees}°"), (x + 0.3 * size, y + 0.7 * size), Align::Start, on_map);
+        canvas.text(&format!("{degrees}°"), (x + 0.3 * size, y + 0.7 * size), Align::Start, on_map);
     }
 }
 

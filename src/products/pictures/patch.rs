@@ -5,7 +5,6 @@ use super::error::PictureError;
 use super::png_file::Picture;
 use super::scale::ColourScale;
 use super::sheet::draw_bar;
-use super::text;
 use super::text::{Align, Style};
 use crate::sky::{Cutout, Frame};
 
@@ -53,7 +52,7 @@ pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Resul
     let mut canvas = Canvas::new(width, height);
     if !title.is_empty() {
         let style = Style::new(1.3 * FONT, INK).medium();
-        text::draw(&mut canvas, title, (0.5 * width as f64, 38.0), Align::Middle, style);
+        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
     }
     for (number, patch) in patches.iter().enumerate() {
         let frame = Rect {
@@ -83,7 +82,7 @@ fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
     canvas.outline(frame, Stroke::solid(INK, 1.0, 1.4));
     if !patch.caption.is_empty() {
         let style = Style::new(1.1 * FONT, INK).medium();
-        text::draw(canvas, &patch.caption, (frame.middle_x(), frame.y - 0.95 * FONT), Align::Middle, style);
+        canvas.text(&patch.caption, (frame.middle_x(), frame.y - 0.95 * FONT), Align::Middle, style);
     }
     let name = match patch.cutout.frame {
         Frame::Galactic => "Galactic",
@@ -91,13 +90,7 @@ fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
         Frame::Equatorial => "equatorial",
     };
     let below = (frame.middle_x(), frame.bottom() + 2.7 * FONT);
-    text::draw(
-        canvas,
-        &format!("{name} longitude and latitude"),
-        below,
-        Align::Middle,
-        Style::new(FONT, FAINT),
-    );
+    canvas.text(&format!("{name} longitude and latitude"), below, Align::Middle, Style::new(FONT, FAINT));
     let bar = Rect {
         x: frame.x + 0.08 * frame.width,
         y: frame.bottom() + 4.2 * FONT,
@@ -155,7 +148,7 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
         if let Some(place) = crossing {
             let (x, y) = to_page(place);
             let text = format!("{}°", shown(l.rem_euclid(360.0)));
-            text::draw(canvas, &text, (x, y + 0.9 * FONT), Align::Middle, label);
+            canvas.text(&text, (x, y + 0.9 * FONT), Align::Middle, label);
         }
     }
     for &b in &parallels {
@@ -163,7 +156,7 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
             let (x, y) = to_page(place);
             let sign = if b > 0.0 { "+" } else { "" };
             let text = format!("{sign}{}°", shown(b)).replace('-', "−");
-            text::draw(canvas, &text, (x - 0.4 * FONT, y), Align::End, label);
+            canvas.text(&text, (x - 0.4 * FONT, y), Align::End, label);
         }
     }
 }

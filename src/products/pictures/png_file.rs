@@ -53,18 +53,21 @@ impl Picture {
 
     /// Width, pixels.
     #[must_use]
+    #[doc(hidden)]
     pub fn width(&self) -> usize {
         self.width
     }
 
     /// Height, pixels.
     #[must_use]
+    #[doc(hidden)]
     pub fn height(&self) -> usize {
         self.height
     }
 
     /// The pixels, three bytes each, row by row from the top.
     #[must_use]
+    #[doc(hidden)]
     pub fn rgb(&self) -> &[u8] {
         &self.rgb
     }

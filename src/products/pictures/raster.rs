@@ -54,7 +54,7 @@ pub fn draw_rasters(title: &str, rasters: &[Raster<'_>], columns: usize) -> Resu
     let mut canvas = Canvas::new(width, height);
     if !title.is_empty() {
         let style = Style::new(1.3 * FONT, INK).medium();
-        text::draw(&mut canvas, title, (0.5 * width as f64, 38.0), Align::Middle, style);
+        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
     }
     for (number, raster) in rasters.iter().enumerate() {
         let share = Rect {

@@ -4,7 +4,11 @@ use super::canvas::Colour;
 use super::error::PictureError;
 use super::labels;
 use super::labels::Ticks;
+use crate::numerics::percentiles;
 use crate::sky::is_unseen;
+
+/// Suits any scale, where there are no values.
+const ANY_SCALE: (f64, f64) = (1.0, 1.0);
 
 /// How values map to positions on a scale.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -64,15 +68,17 @@ impl ColourScale {
     #[must_use]
     pub fn robust(values: &[f64], scaling: Scaling, palette: Palette) -> Self {
         let usable = |v: &f64| is_seen(*v) && (scaling == Scaling::Linear || *v > 0.0);
-        let (low, high) = percentiles(values.iter().copied().filter(usable).collect(), 0.5, 99.5);
+        let (low, high) =
+            percentiles(values.iter().copied().filter(usable).collect(), 0.5, 99.5).unwrap_or(ANY_SCALE);
         Self::widened(low, high, scaling, palette)
     }
 
     /// A diverging scale, symmetric about zero, up to the 99 % quantile of `|values|`.
     #[must_use]
+    #[doc(hidden)]
     pub fn symmetric(values: &[f64]) -> Self {
         let sizes = values.iter().copied().filter(|v| is_seen(*v)).map(f64::abs).collect();
-        let (_, reach) = percentiles(sizes, 0.0, 99.0);
+        let (_, reach) = percentiles(sizes, 0.0, 99.0).unwrap_or(ANY_SCALE);
         let reach = if reach > 0.0 { reach.clamp(1e-300, 1e300) } else { 1.0 };
         Self { low: -reach, high: reach, scaling: Scaling::Linear, palette: Palette::Diverging }
     }
@@ -93,12 +99,14 @@ impl ColourScale {
 
     /// Lower limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn low(&self) -> f64 {
         self.low
     }
 
     /// Upper limit.
     #[must_use]
+    #[doc(hidden)]
     pub fn high(&self) -> f64 {
         self.high
     }
@@ -155,19 +163,4 @@ impl ColourScale {
 /// Whether a pixel holds a value: finite and not UNSEEN.
 pub(super) fn is_seen(value: f64) -> bool {
     value.is_finite() && !is_unseen(value)
-}
-
-/// Two percentiles, interpolated linearly; 1 and 1, which suit any scale, without values.
-fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> (f64, f64) {
-    if values.is_empty() {
-        return (1.0, 1.0);
-    }
-    values.sort_unstable_by(f64::total_cmp);
-    let at = |percent: f64| {
-        let place = percent / 100.0 * (values.len() - 1) as f64;
-        let before = place.floor() as usize;
-        let after = (before + 1).min(values.len() - 1);
-        values[before] + (place - before as f64) * (values[after] - values[before])
-    };
-    (at(low), at(high))
 }

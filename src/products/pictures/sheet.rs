@@ -2,11 +2,11 @@
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
+use super::mollweide;
 use super::mollweide::{MapField, View};
 use super::png_file::Picture;
 use super::scale::{ColourScale, is_seen};
 use super::text::{Align, Style};
-use super::{mollweide, text};
 use crate::sky::healpix::nside_of;
 
 /// One map of a page.
@@ -107,7 +107,7 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
         if !panel.caption.is_empty() {
             let anchor = (place.middle_x(), place.y + 0.5 * layout.caption);
             let style = Style::new(layout.font, INK).medium();
-            text::draw(&mut canvas, &panel.caption, anchor, Align::Middle, style);
+            canvas.text(&panel.caption, anchor, Align::Middle, style);
         }
         let map = Rect { y: place.y + layout.caption, height: layout.map_height, ..place };
         mollweide::draw(&mut canvas, map, field, &panel.scale, &sheet.view);
@@ -131,12 +131,12 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
     if !footnote.is_empty() {
         let size = 0.85 * layout.font;
         let anchor = (1.2 * size, layout.height as f64 - 1.2 * size);
-        text::draw(&mut canvas, &footnote, anchor, Align::Start, Style::new(size, FAINT));
+        canvas.text(&footnote, anchor, Align::Start, Style::new(size, FAINT));
     }
     if !sheet.view.frame.is_empty() {
         let size = 0.85 * layout.font;
         let anchor = (sheet.width_px as f64 - 1.2 * size, layout.height as f64 - 1.2 * size);
-        text::draw(&mut canvas, &sheet.view.frame, anchor, Align::End, Style::new(size, FAINT));
+        canvas.text(&sheet.view.frame, anchor, Align::End, Style::new(size, FAINT));
     }
     Ok(Picture::from_canvas(canvas, sheet.width_px, layout.height, &sheet.title))
 }
@@ -229,12 +229,12 @@ impl Layout {
         let mut y = 1.4 * self.title;
         if !sheet.title.is_empty() {
             let style = Style::new(self.title, INK).medium();
-            text::draw(canvas, &sheet.title, (middle, y), Align::Middle, style);
+            canvas.text(&sheet.title, (middle, y), Align::Middle, style);
             y += 1.2 * self.title;
         }
         if !sheet.subtitle.is_empty() {
             let style = Style::new(0.66 * self.title, FAINT);
-            text::draw(canvas, &sheet.subtitle, (middle, y), Align::Middle, style);
+            canvas.text(&sheet.subtitle, (middle, y), Align::Middle, style);
         }
     }
 }
@@ -260,8 +260,8 @@ pub(super) fn draw_bar(canvas: &mut Canvas, bar: Rect, (scale, unit): (&ColourSc
         let x = x_of(*value);
         canvas.polyline(&[(x, bar.bottom()), (x, bar.bottom() + 0.4 * font)], thin);
         let anchor = (x, bar.bottom() + 1.1 * font);
-        text::draw(canvas, label, anchor, Align::Middle, Style::new(font, INK));
+        canvas.text(label, anchor, Align::Middle, Style::new(font, INK));
     }
     let anchor = (bar.right() + 0.7 * font, bar.middle_y());
-    text::draw(canvas, &ticks.unit(unit), anchor, Align::Start, Style::new(font, INK));
+    canvas.text(&ticks.unit(unit), anchor, Align::Start, Style::new(font, INK));
 }

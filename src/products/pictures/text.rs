@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use ab_glyph::{Font, FontRef, Glyph, PxScaleFont, ScaleFont, point};
 
-use super::canvas::{Canvas, Colour};
+use super::colour::Colour;
 
 static REGULAR: LazyLock<FontRef<'static>> =
     LazyLock::new(|| parse(include_bytes!("font/Roboto-Regular.subset.ttf")));
@@ -95,19 +95,20 @@ pub(super) fn length(text: &str, style: Style) -> f64 {
         .sum()
 }
 
-/// Draws a line of text; `anchor` is at mid-height of its capitals, `_{...}` marks subscripts.
-pub(super) fn draw(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: Align, style: Style) {
-    canvas.text(text, anchor, align, style);
-}
-
 /// Height of capitals, half of it, for a size of 1: those of Roboto are 0.711 em high, and an em is 0.853 of ascent plus descent.
 pub(super) const HALF_CAPITAL: f64 = 0.5 * 0.711 * EM;
 
 /// An em, for a size of 1.
 pub(super) const EM: f64 = 0.853;
 
-/// Paints it onto the pixels.
-pub(super) fn paint(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: Align, style: Style) {
+/// Paints it with a function that blends a colour into one pixel.
+pub(super) fn paint(
+    blend: &mut dyn FnMut(usize, usize, Colour, f32),
+    text: &str,
+    anchor: (f64, f64),
+    align: Align,
+    style: Style,
+) {
     let back = match align {
         Align::Start => 0.0,
         Align::Middle => 0.5 * length(text, style),
@@ -139,7 +140,7 @@ pub(super) fn paint(canvas: &mut Canvas, text: &str, anchor: (f64, f64), align: 
                     (x, y)
                 };
                 if x >= 0.0 && y >= 0.0 {
-                    canvas.blend(x as usize, y as usize, style.colour, style.alpha * covered.clamp(0.0, 1.0));
+                    blend(x as usize, y as usize, style.colour, style.alpha * covered.clamp(0.0, 1.0));
                 }
             });
         }

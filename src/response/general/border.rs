@@ -17,8 +17,8 @@ use super::RowsSetup;
 use super::lanes::Value;
 use super::view::PairView;
 use crate::frames::AntennaResponse;
-use crate::response::harmonic::quadrature::GaussLegendre;
-use crate::response::harmonic::trigonometry::sin_cos;
+use crate::numerics::quadrature::GaussLegendre;
+use crate::numerics::trigonometry::sin_cos;
 
 /// Relative error of Legendre functions as series.
 const SERIES_ERROR: f64 = 1e-7;

@@ -23,17 +23,17 @@ use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
 use super::RowsSetup;
-use super::bessel::BesselOrders;
 use super::border::{Border, BorderBuffers};
 use super::classes::{NodeClass, rings_for};
 use super::lanes::{LANES, VALUES, Value};
 use super::plan::RowNode;
 use super::turns::{QuarterTurns, rows_apart_mut};
 use crate::frames::AntennaResponse;
+use crate::numerics::bessel::BesselOrders;
+use crate::numerics::legendre::Legendre;
+use crate::numerics::quadrature::GaussLegendre;
+use crate::numerics::trigonometry::sin_cos;
 use crate::response::harmonic::degrees;
-use crate::response::harmonic::legendre::Legendre;
-use crate::response::harmonic::quadrature::GaussLegendre;
-use crate::response::harmonic::trigonometry::sin_cos;
 
 /// Values of [`LANES`] pairs, complex.
 const COMPLEX: usize = 2 * LANES;

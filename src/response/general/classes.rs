@@ -3,7 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, TAU};
 
 use super::view::PairView;
-use crate::response::harmonic::quadrature::GaussLegendre;
+use crate::numerics::quadrature::GaussLegendre;
 
 /// Width of a class of limbs that share quadrature points, in units of a harmonic's wave length over 2 pi: what lies between
 /// a class's limb and a pair's takes a series of as many terms more. With little memory classes are wider.

@@ -17,8 +17,8 @@ use num_complex::Complex64;
 use super::lanes::{LANES, Value};
 use super::plan::RowNode;
 use super::skies::{Turned, make_room};
+use crate::numerics::trigonometry::sin_cos;
 use crate::response::harmonic::degrees;
-use crate::response::harmonic::trigonometry::sin_cos;
 use crate::units::vector::{Vec3, dot};
 
 /// Waves. More than twice as many numbers as frames may be chosen.

@@ -4,7 +4,7 @@
 //! `2^(2n) n!^4 / ((2n + 1) (2n)!^3) h^(2n)` at most. Within an integration h is half of what phases move by: those of the fringe, and
 //! those of the limb's harmonics, in which there is little power.
 
-use crate::response::harmonic::quadrature::GaussLegendre;
+use crate::numerics::quadrature::GaussLegendre;
 
 /// Error of the mean of a fringe that moves as fast as any in the sky: few directions do.
 const FRINGE_ERROR: f64 = 1e-4;

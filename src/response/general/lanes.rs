@@ -1,10 +1,6 @@
 //! Pairs are computed several at a time: they are the lanes of vectors.
 
-/// Pairs that are computed together.
-pub(super) const LANES: usize = 8;
-
-/// One number for each pair.
-pub(super) type Lanes = [f64; LANES];
+pub(super) use crate::numerics::bessel::{LANES, Lanes};
 
 /// Type of patterns. Their sums keep 1e-6 of a row's rms, of the 1e-4 that interpolation may cost.
 pub(super) type Value = f32;

@@ -12,7 +12,6 @@
 //! Results do not depend on the number of threads.
 
 mod antennas;
-mod bessel;
 mod border;
 mod cap;
 mod classes;

@@ -11,8 +11,8 @@ use num_complex::Complex64;
 use rustfft::{Fft, FftPlanner};
 
 use super::lanes::{LANES, Lanes};
+use crate::numerics::fft_length;
 use crate::response::harmonic::kernel::{Kernel, LANES as TAPS};
-use crate::response::harmonic::sizes::fft_length;
 
 /// Error of the kernel, of the largest value: below that of patterns in f32.
 const TOLERANCE: f64 = 1e-8;

@@ -5,8 +5,8 @@ use num_complex::Complex64;
 use super::lanes::{LANES, Value};
 use super::plan::RowNode;
 use super::turns::{QuarterTurns, place};
+use crate::numerics::trigonometry::sin_cos;
 use crate::response::harmonic::degrees;
-use crate::response::harmonic::trigonometry::sin_cos;
 use crate::sky::harmonics::Alm;
 
 /// Skies turned into frames, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.

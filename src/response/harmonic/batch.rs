@@ -5,21 +5,19 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use num_complex::{Complex32, Complex64};
 use rayon::prelude::*;
 
+use super::HarmonicError;
+use super::PairState;
 use super::blocked::{BLOCK_NODES, PATTERN_LANES};
 use super::forward::{
     ALPHAS_MAX, AlphaPart, ORDER_LANES, OrderBlock, Projection, RunGroup, RunPlan, project,
 };
 use super::kernel::LANES;
-use super::model::{ALPHA_TOLERANCE, HarmonicModel, TERMS};
+use super::model::{ALPHA_BLOCK, ALPHA_TOLERANCE, BLOCKS_KEPT, HarmonicModel, TERMS};
 use super::rotation::orders;
-use super::runs::Run;
-use super::{PairState, chebyshev};
+use super::runs::{Run, split};
+use crate::numerics::chebyshev;
 use crate::units::arithmetic::sinc;
 
-/// Alphas of the grid for which the sky is rotated together.
-pub(super) const ALPHA_BLOCK: usize = 64;
-/// Blocks of alphas kept, and the most that a batch may use.
-pub(super) const BLOCKS_KEPT: usize = 4;
 /// Most runs in a batch; bounds its memory.
 const RUNS_AT_ONCE: usize = 256;
 /// Target number of alphas in groups of several runs.
@@ -167,6 +165,38 @@ fn plan(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> R
 }
 
 impl HarmonicModel {
+    /// Visibilities (K sr) of `states`, in order.
+    ///
+    /// Any order is correct. Consecutive integrations of a pair are fast, and many pairs over several observing windows
+    /// in one call are fastest. At a baseline of zero the result is the auto-correlation power `Int T S A dn`.
+    ///
+    /// # Errors [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline,
+    /// [`HarmonicError::Lengths`].
+    pub fn visibilities(
+        &mut self,
+        states: &[PairState],
+        values: &mut [Complex64],
+    ) -> Result<(), HarmonicError> {
+        if states.len() != values.len() {
+            return Err(HarmonicError::Lengths { states: states.len(), values: values.len() });
+        }
+        self.check_states(states)?;
+        let runs = split(states, self.limits());
+        let mut order: Vec<usize> = (0..runs.len()).collect();
+        let alpha = |k: &usize| (runs[*k].node[0] - FRAC_PI_2).rem_euclid(TAU);
+        order.sort_by(|a, b| alpha(a).total_cmp(&alpha(b)).then(a.cmp(b)));
+        let mut rest = &order[..];
+        while !rest.is_empty() {
+            let (batch, taken) = Batch::new(self, &runs, rest);
+            for (run, piece) in rest[..taken].iter().zip(self.evaluate(states, &batch)) {
+                let first = runs[*run].first;
+                values[first..first + piece.len()].copy_from_slice(&piece);
+            }
+            rest = &rest[taken..];
+        }
+        Ok(())
+    }
+
     /// The visibilities of each run of a batch.
     pub(super) fn evaluate(&mut self, states: &[PairState], batch: &Batch) -> Vec<Vec<Complex64>> {
         self.rotate_sky(&batch.blocks);

@@ -11,7 +11,7 @@
 
 use std::f64::consts::PI;
 
-use super::quadrature::GaussLegendre;
+use crate::numerics::quadrature::GaussLegendre;
 use crate::units::arithmetic::sinc;
 
 /// Greatest width of a kernel, nodes.

@@ -16,28 +16,23 @@
 
 mod batch;
 mod blocked;
-mod chebyshev;
 mod error;
 pub(crate) mod filter;
 mod forward;
 mod geometry;
 pub(crate) mod kernel;
-pub(crate) mod legendre;
 mod model;
 pub(crate) mod pattern;
-pub(crate) mod quadrature;
-pub(crate) mod real;
 mod ring;
 pub(crate) mod rotation;
 mod runs;
-pub(crate) mod sizes;
-pub(crate) mod trigonometry;
 
 pub use error::HarmonicError;
 pub use geometry::{GeometryLimits, GeometryRefusal, NominalOrbit, NominalPair, PairOrientation};
 pub use model::{HarmonicModel, ModelSettings};
 pub use pattern::{NodeGrid, PatternGeometry, PatternTable, degrees};
-pub use real::Real;
+
+pub use crate::numerics::Real;
 pub use rotation::{RotationTable, orders};
 
 /// Position and baseline length of a pair: all that a visibility depends on besides the sky.

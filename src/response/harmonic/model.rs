@@ -1,25 +1,27 @@
 //! Visibilities of a band-limited sky at any states of a pair.
 
-use std::f64::consts::{FRAC_PI_2, TAU};
+use rustfft::{Fft, FftPlanner};
+use std::f64::consts::TAU;
 use std::sync::Arc;
 
-use num_complex::Complex64;
-use rustfft::{Fft, FftPlanner};
-
-use super::batch::{ALPHA_BLOCK, BLOCKS_KEPT, Batch};
 use super::blocked::{BLOCK_NODES, BlockedPatterns};
 use super::filter::FilteredPatterns;
 use super::forward::ALPHAS_MAX;
 use super::kernel::{Kernel, LANES};
 use super::rotation::{RotatedSky, RotationTable};
-use super::runs::{RunLimits, split};
-use super::sizes::fft_length;
-use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable, chebyshev};
+use super::runs::RunLimits;
+use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable};
+use crate::numerics::chebyshev;
+use crate::numerics::fft_length;
 use crate::sky::harmonics::Alm;
 
 /// Nodes a wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes
 /// suffices.
 const NODES_PER_WAVELENGTH: f64 = 4.5;
+/// Alphas of the grid for which the sky is rotated together.
+pub(super) const ALPHA_BLOCK: usize = 64;
+/// Blocks of alphas kept, and the most that a batch may use.
+pub(super) const BLOCKS_KEPT: usize = 4;
 /// Chebyshev terms along a run.
 pub(super) const TERMS: usize = 8;
 
@@ -190,39 +192,7 @@ impl HarmonicModel {
         &self.settings
     }
 
-    /// Visibilities (K sr) of `states`, in order.
-    ///
-    /// Any order is correct. Consecutive integrations of a pair are fast, and many pairs over several observing windows
-    /// in one call are fastest. At a baseline of zero the result is the auto-correlation power `Int T S A dn`.
-    ///
-    /// # Errors [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline,
-    /// [`HarmonicError::Lengths`].
-    pub fn visibilities(
-        &mut self,
-        states: &[PairState],
-        values: &mut [Complex64],
-    ) -> Result<(), HarmonicError> {
-        if states.len() != values.len() {
-            return Err(HarmonicError::Lengths { states: states.len(), values: values.len() });
-        }
-        self.check_states(states)?;
-        let runs = split(states, self.limits());
-        let mut order: Vec<usize> = (0..runs.len()).collect();
-        let alpha = |k: &usize| (runs[*k].node[0] - FRAC_PI_2).rem_euclid(TAU);
-        order.sort_by(|a, b| alpha(a).total_cmp(&alpha(b)).then(a.cmp(b)));
-        let mut rest = &order[..];
-        while !rest.is_empty() {
-            let (batch, taken) = Batch::new(self, &runs, rest);
-            for (run, piece) in rest[..taken].iter().zip(self.evaluate(states, &batch)) {
-                let first = runs[*run].first;
-                values[first..first + piece.len()].copy_from_slice(&piece);
-            }
-            rest = &rest[taken..];
-        }
-        Ok(())
-    }
-
-    fn check_states(&self, states: &[PairState]) -> Result<(), HarmonicError> {
+    pub(super) fn check_states(&self, states: &[PairState]) -> Result<(), HarmonicError> {
         let u_max = self.settings.u_max;
         for (index, state) in states.iter().enumerate() {
             let all = [state.node_rad, state.phase_rad, state.baseline_wavelengths, state.span_rad];
@@ -256,7 +226,7 @@ impl HarmonicModel {
         }
     }
 
-    fn limits(&self) -> RunLimits {
+    pub(super) fn limits(&self) -> RunLimits {
         let tolerance = self.settings.tolerance;
         RunLimits {
             l_max: self.sky.l_max() as f64,

@@ -21,11 +21,11 @@
 use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
-use super::legendre::Legendre;
-use super::quadrature::GaussLegendre;
-use super::real::Real;
 use super::ring::RingSolver;
 use crate::frames::AntennaResponse;
+use crate::numerics::Real;
+use crate::numerics::legendre::Legendre;
+use crate::numerics::quadrature::GaussLegendre;
 
 /// Parameters of a pattern besides the baseline.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -20,8 +20,8 @@
 
 use std::f64::consts::PI;
 
-use super::quadrature::{GaussLegendre, Rules};
-use super::trigonometry::sin_cos;
+use crate::numerics::quadrature::{GaussLegendre, Rules};
+use crate::numerics::trigonometry::sin_cos;
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]

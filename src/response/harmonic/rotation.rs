@@ -15,7 +15,7 @@ use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::real::Real;
+use crate::numerics::Real;
 use crate::sky::harmonics::{Alm, WignerTable};
 
 /// `d+` and `d-` for even l + mu, mu >= 0, by degree.

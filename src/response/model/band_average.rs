@@ -5,7 +5,7 @@ use std::f64::consts::{E, PI};
 use num_complex::Complex64;
 
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel, predict_means};
-use crate::response::harmonic::quadrature::GaussLegendre;
+use crate::numerics::quadrature::GaussLegendre;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 

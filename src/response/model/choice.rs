@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{general, harmonic};
 use crate::response::general::row_tables_bytes;
+use crate::sky::SkyConfig;
 
 /// The model asked for in the configuration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -66,7 +67,7 @@ pub struct Load {
     pub sky_nside: usize,
     /// Longest baseline, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Greatest band limit; 0 for the limit that the baselines need. A map never gets more than it determines.
+    /// Greatest band limit; 0 for the limit that the baselines need, or what the map determines if that is less.
     pub l_max: usize,
     /// Whether visibilities are averages over their integrations.
     pub smeared: bool,
@@ -106,24 +107,16 @@ const POSITION_BYTES: f64 = 600.0;
 /// Most memory of a harmonic model that was not asked for, bytes.
 const BYTES_ALLOWED: f64 = 8e9;
 
-/// Greatest degree that the analysis of a map determines exactly, in units of nside, as a fraction.
-const DEGREES_OF_NSIDE: (usize, usize) = (9, 4);
-
 impl ModelPlan {
     /// Chooses the model for `load`. Does not depend on the machine, because results depend on the model.
     #[must_use]
     pub fn new(choice: ModelChoice, load: Load) -> Self {
         let u_max = load.baseline_wavelengths_max;
         let l_max = match load.l_max {
-            0 => band_limit(u_max).min(held(load.sky_nside)),
-            // The configuration may ask for a little more than the default.
-            most => {
-                if most > 5 * load.sky_nside / 2 {
-                    held(load.sky_nside)
-                } else {
-                    most
-                }
-            }
+            0 => band_limit(u_max).min(SkyConfig::l_max_held(load.sky_nside)),
+            // The configuration may ask for a little more than the default; what the map does not determine is refused by those who
+            // make its coefficients.
+            asked => asked,
         };
         let pixels = 12.0 * (load.sky_nside as f64).powi(2);
         let direct_fringes = pixels * load.visibilities;
@@ -184,18 +177,16 @@ impl ModelPlan {
     }
 }
 
-/// Greatest degree that fringes of `u_max` wavelengths reach: 2 pi u plus the width of the Airy function's decay; at
-/// most 1024.
+/// As [`degrees_seen`], at most 1024.
 fn band_limit(u_max: f64) -> usize {
-    let turning = TAU * u_max;
-    let wanted = (turning + 6.0 * turning.cbrt()).ceil() as usize + 8;
-    wanted.min(L_MAX)
+    degrees_seen(u_max).min(L_MAX)
 }
 
-/// Greatest degree that a map of `nside` determines well.
-fn held(nside: usize) -> usize {
-    let (of, nsides) = DEGREES_OF_NSIDE;
-    of * nside / nsides
+/// Greatest degree that fringes of `u_max` wavelengths reach: 2 pi u plus the width of the Airy function's decay.
+#[must_use]
+pub fn degrees_seen(u_max: f64) -> usize {
+    let turning = TAU * u_max;
+    (turning + 6.0 * turning.cbrt()).ceil() as usize + 8
 }
 
 #[cfg(test)]
@@ -215,7 +206,8 @@ mod tests {
         // 2 pi 125.2 = 787, and the fall beyond.
         assert!((840..860).contains(&paper.l_max), "{}", paper.l_max);
         assert_eq!(plan(load(2.6e7, 64, 125.2)).l_max, 144);
-        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 64, 125.2) }).l_max, 144);
+        // What is asked for is taken, or refused where the map does not hold it.
+        assert_eq!(plan(Load { l_max: 191, ..load(2.6e7, 64, 125.2) }).l_max, 191);
         assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 512, 125.2) }).l_max, 1024);
         // All pairs at 10 MHz ask for gigabytes of patterns.
         assert_eq!(plan(load(1.9e9, 512, 3336.0)).kind, ModelKind::Direct);

@@ -18,7 +18,7 @@ mod time_average;
 
 pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
-pub use choice::{Load, ModelChoice, ModelKind, ModelPlan};
+pub use choice::{Load, ModelChoice, ModelKind, ModelPlan, degrees_seen};
 pub use direct::{DirectMoments, DirectSum};
 pub use emission::Emitting;
 pub use general::GeneralSum;

@@ -19,18 +19,21 @@ impl Directions {
 
     /// Whether there are none.
     #[must_use]
+    #[doc(hidden)]
     pub fn is_empty(&self) -> bool {
         self.x.is_empty()
     }
 
     /// Direction `k`.
     #[must_use]
+    #[doc(hidden)]
     pub fn get(&self, k: usize) -> Vec3 {
         [self.x[k], self.y[k], self.z[k]]
     }
 
     /// The directions rotated by a matrix, given by rows.
     #[must_use]
+    #[doc(hidden)]
     pub fn rotated(&self, rotation: &[Vec3; 3]) -> Self {
         (0..self.len()).map(|k| rotation.map(|row| dot(row, self.get(k)))).collect()
     }

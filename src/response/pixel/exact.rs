@@ -12,6 +12,7 @@ use crate::units::vector::{Vec3, dot};
 
 /// Envelope A S_i S_j of a pair: 0 where the Moon hides the direction from either satellite.
 #[must_use]
+#[doc(hidden)]
 pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
     let hidden = |r_m| hidden_by_moon(r_m, n_hat, pair.moon_radius_m);
     if hidden(pair.r_i_m) || hidden(pair.r_j_m) {

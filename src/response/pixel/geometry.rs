@@ -31,6 +31,7 @@ impl PairGeometry {
     /// [`AntennaResponse::DipoleNormal`] point. `None` if both lie in the same or in opposite directions from the
     /// centre, which leaves the plane undefined. For one satellite use [`SingleGeometry`].
     #[must_use]
+    #[doc(hidden)]
     pub fn orbit_normal(&self) -> Option<Vec3> {
         let normal = cross(self.r_i_m, self.r_j_m);
         let length = norm(normal);
@@ -41,6 +42,7 @@ impl PairGeometry {
 
     /// Power response A in direction `n_hat`; not a number for dipoles without an orbital plane.
     #[must_use]
+    #[doc(hidden)]
     pub fn antenna(&self, n_hat: Vec3) -> f64 {
         match self.response {
             AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 1.0,

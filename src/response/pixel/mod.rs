@@ -23,6 +23,7 @@ mod blocks;
 mod combs;
 mod directions;
 mod edge;
+#[doc(hidden)]
 pub mod exact;
 mod geometry;
 mod kernel;
@@ -34,15 +35,23 @@ mod sums;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+#[doc(hidden)]
 pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
-pub use geometry::{PairGeometry, SatelliteAntenna, SingleGeometry};
+pub use geometry::PairGeometry;
+#[doc(hidden)]
+pub use geometry::{SatelliteAntenna, SingleGeometry};
+#[doc(hidden)]
 pub use products::RowProducts;
+#[doc(hidden)]
 pub use rows::{RowMaker, RowValue};
-pub use sums::{SkySum, antenna_powers, antenna_sums, four_sky_sums, sky_powers, sky_sums};
+pub use sums::{SkySum, sky_sums};
+#[doc(hidden)]
+pub use sums::{antenna_powers, antenna_sums, four_sky_sums, sky_powers};
 
 /// Sample points along each side of a pixel in pixel averages: the paper evaluates at nside 1024 and averages down to
 /// nside 64.
+#[doc(hidden)]
 pub const CHILDREN: usize = 16;
 
 /// How a row of B represents a pixel.

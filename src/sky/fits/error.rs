@@ -114,7 +114,8 @@ pub enum FitsProblem {
     NoFrame,
     /// A map of a quantity other than temperature.
     #[error(
-        "the map's unit (TUNIT) is `{found}`; expected K, mK, uK, kK, MK or none, which is K: convert the map"
+        "the map's unit (TUNIT) is `{found}`; expected K, mK, uK, kK or MK, thermodynamic or Rayleigh-Jeans (K_CMB, K_RJ), Jy/sr, \
+         kJy/sr or MJy/sr in a map that states its frequency (FREQ), or none, which is K: convert the map"
     )]
     Unit {
         /// The unit.

@@ -1,34 +1,132 @@
-//! Maps of the sky at the frequency of a channel.
+//! Maps of the sky at the frequency of a channel, and what is understood of a map's file.
 
-use std::path::Path;
+use std::fmt;
+use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
+use super::claims::is_same_hz;
 use super::error::{FitsError, FitsProblem};
-use super::header::Header;
-use super::read::{MapFile, ReadOptions, read_header, read_whole_map, read_whole_map_file};
-use crate::sky::{MapError, MapFrequency, SkyConfig, SkyMap};
+use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map, read_whole_map_file};
+use crate::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use crate::units::Dimension;
 
-/// Relative difference up to which two frequencies are the same: a digit lost in a header.
-const SAME: f64 = 1e-6;
+/// The channel for which a sky is read.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SkyChannel {
+    /// Centre frequency, Hz.
+    pub frequency_hz: f64,
+    /// Whether a sky without power will do, as the receivers have noise.
+    pub may_be_dark: bool,
+    /// Whether one file stands for several channels, so that it has to say its frequency.
+    pub shares_file: bool,
+}
 
-/// Reads the map of a sky, in K, for a channel at `frequency_hz`: temperatures in every pixel, of a mean above 0 unless
-/// `may_be_dark`.
+/// What is understood of a map's file.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct MapUnderstood {
+    /// The file.
+    pub file: PathBuf,
+    /// Its frame.
+    pub frame: Frame,
+    /// Whether the file does not say so.
+    pub frame_assumed: bool,
+    /// Frequency for which it holds, Hz; `None` if it does not say so.
+    pub frequency_hz: Option<f64>,
+    /// Unit (TUNIT); empty if it states none, which is K.
+    pub unit: String,
+    /// Name of the column; may be empty.
+    pub column: String,
+    /// Columns of maps in the table.
+    pub columns: usize,
+    /// HEALPix nside.
+    pub nside: usize,
+    /// Side of a pixel, degrees.
+    pub pixel_deg: f64,
+    /// Greatest degree that the pixels determine well.
+    pub l_max: usize,
+    /// Pixels without a value: NaN, infinite, UNSEEN or BAD_DATA. A map that has any is refused.
+    pub bad_pixels: usize,
+    /// Mean, least and greatest value, K.
+    pub mean_min_max_k: [f64; 3],
+}
+
+impl MapUnderstood {
+    /// What is understood of the map of a channel, or of the first map without one.
+    ///
+    /// # Errors
+    /// As [`super::read_whole_map`].
+    pub fn of(path: &Path, options: &ReadOptions) -> Result<Self, FitsError> {
+        let file = read_whole_map_file(path, options)?;
+        let (nside, values) = (file.map.nside(), file.map.values());
+        let (least, most) =
+            values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &value| {
+                (least.min(value), most.max(value))
+            });
+        Ok(Self {
+            file: path.to_owned(),
+            frame: file.map.frame(),
+            frame_assumed: file.frame_assumed,
+            frequency_hz: file.frequency_hz,
+            unit: file.unit.clone(),
+            column: file.name.clone(),
+            columns: file.columns,
+            nside,
+            pixel_deg: (41_252.961_249_419_27 / values.len() as f64).sqrt(),
+            l_max: SkyConfig::l_max_held(nside),
+            bad_pixels: 0,
+            mean_min_max_k: [values.iter().sum::<f64>() / values.len() as f64, least, most],
+        })
+    }
+}
+
+impl fmt::Display for MapUnderstood {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let frequency = match self.frequency_hz {
+            Some(hz) => Dimension::Frequency.show(hz),
+            None => "no frequency (FREQ)".to_owned(),
+        };
+        let frame = if self.frame_assumed { " (as configured)" } else { "" };
+        let unit = if self.unit.is_empty() { "no unit, taken as K" } else { &self.unit };
+        let column = match self.columns {
+            0 | 1 => String::new(),
+            columns => format!(", column `{}` of {columns}", self.column),
+        };
+        let [mean, least, most] = self.mean_min_max_k;
+        write!(
+            f,
+            "{}: {frequency}, {} frame{frame}, {unit}{column}, nside {} (pixels of {:.2} deg, l up to {}), {} bad pixels, mean {mean:.4e} \
+             K, {least:.3e} K to {most:.3e} K",
+            self.file.display(),
+            self.frame,
+            self.nside,
+            self.pixel_deg,
+            self.l_max,
+            self.bad_pixels
+        )
+    }
+}
+
+/// How the map files of a sky are read for a channel at `frequency_hz`.
+#[must_use]
+pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
+    ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), ..ReadOptions::default() }
+}
+
+/// Reads the map of a sky, in K, for a channel: temperatures in every pixel, of a mean above 0 unless it may be dark.
 ///
-/// A map says by FREQ (Hz) for which frequency it holds. One of another frequency is refused, or scaled by a power law, as
-/// `config` says. One without FREQ is taken as it is, but cannot be scaled.
+/// A map says by FREQ, or by the name of its column, for which frequency it holds. One of another frequency is refused, or scaled by
+/// a power law, as `config` says. One that does not say is taken as it is if it is of this channel alone, but cannot be scaled.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`FitsProblem::Keyword`] or [`FitsProblem::Missing`] for FREQ;
 /// [`MapError::NoTemperature`], [`MapError::Dark`].
-pub fn read_sky(
-    path: &Path,
-    frequency_hz: f64,
-    config: &SkyConfig,
-    may_be_dark: bool,
-) -> Result<SkyMap, FitsError> {
-    let map = read_at(path, frequency_hz, config)?;
+pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
+    let map = read_at(path, channel, config)?;
     match mean_k(path, &map)? {
-        value if value <= 0.0 && !may_be_dark => Err(FitsError::new(path, MapError::Dark { value }.into())),
+        value if value <= 0.0 && !channel.may_be_dark => {
+            Err(FitsError::new(path, MapError::Dark { value }.into()))
+        }
         _ => Ok(map),
     }
 }
@@ -46,14 +144,22 @@ pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
     }
 }
 
-/// Requires that a map is of a channel at `frequency_hz`, if it says by FREQ (Hz) of which frequency it is. Reads only headers.
+/// Reads a prior map, in K: temperatures in every pixel.
+///
+/// # Errors
+/// As [`super::read_whole_map`]; [`MapError::NoTemperature`].
+pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
+    let map = read_whole_map(path, options)?;
+    mean_k(path, &map).map(|_| map)
+}
+
+/// Requires that a map is of a channel at `frequency_hz`, if it says of which frequency it is. Reads only headers.
 ///
 /// # Errors
 /// A file that cannot be read; [`FitsProblem::Keyword`] for FREQ.
 pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> {
-    let header = read_header(path)?;
-    match map_hz(&header).map_err(|problem| FitsError::new(path, problem))? {
-        Some(map_hz) if !is_same(map_hz, frequency_hz) => {
+    match read_frequency(path)? {
+        Some(map_hz) if !is_same_hz(map_hz, frequency_hz) => {
             Err(FitsError::new(path, other_frequency(map_hz, frequency_hz, "")))
         }
         _ => Ok(()),
@@ -77,17 +183,6 @@ fn mean_k(path: &Path, map: &SkyMap) -> Result<f64, FitsError> {
     Ok(map.values().iter().sum::<f64>() / map.values().len() as f64)
 }
 
-/// FREQ of a map, if it has one.
-fn map_hz(header: &Header) -> Result<Option<f64>, FitsProblem> {
-    let Some(found) = header.get("FREQ") else { return Ok(None) };
-    let map_hz = header.real("FREQ").filter(|map_hz| map_hz.is_finite() && *map_hz > 0.0);
-    map_hz.map(Some).ok_or_else(|| FitsProblem::keyword("FREQ", found, "a positive number, Hz"))
-}
-
-fn is_same(map_hz: f64, frequency_hz: f64) -> bool {
-    (map_hz - frequency_hz).abs() <= SAME * frequency_hz
-}
-
 /// A map of another frequency than the channel's; `otherwise` is what can be done besides giving another map.
 fn other_frequency(map_hz: f64, frequency_hz: f64, otherwise: &str) -> FitsProblem {
     let [found, expected] = [map_hz, frequency_hz].map(|hz| Dimension::Frequency.show(hz));
@@ -96,24 +191,31 @@ fn other_frequency(map_hz: f64, frequency_hz: f64, otherwise: &str) -> FitsProbl
 }
 
 /// The map at the channel's frequency.
-fn read_at(path: &Path, frequency_hz: f64, config: &SkyConfig) -> Result<SkyMap, FitsError> {
-    let rule = config.frequency;
-    let options = ReadOptions { frame_if_missing: config.frame, ..ReadOptions::default() };
-    let MapFile { mut map, header, .. } = read_whole_map_file(path, &options)?;
+fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
+    let (rule, wanted_hz) = (config.frequency, channel.frequency_hz);
+    let options = sky_options(config, wanted_hz);
+    let MapFile { mut map, frequency_hz, .. } = read_whole_map_file(path, &options)?;
     let refuse = |problem| FitsError::new(path, problem);
-    let scales = matches!(rule, MapFrequency::SpectralIndex(_));
-    let Some(map_hz) = map_hz(&header).map_err(refuse)? else {
-        let expected = "the map's frequency, Hz, for sky.frequency = { spectral_index = .. } to scale from";
-        return if scales { Err(refuse(FitsProblem::missing("FREQ", expected))) } else { Ok(map) };
+    let Some(map_hz) = frequency_hz else {
+        let expected = match rule {
+            MapFrequency::SpectralIndex(_) => {
+                "the map's frequency, Hz, for sky.frequency = { spectral_index = .. } to scale from"
+            }
+            MapFrequency::MustMatch if channel.shares_file => {
+                "the map's frequency, Hz, as sky.file is one map for several channels: add the keyword, or give one map a channel"
+            }
+            MapFrequency::MustMatch => return Ok(map),
+        };
+        return Err(refuse(FitsProblem::missing("FREQ", expected)));
     };
     match rule {
-        _ if is_same(map_hz, frequency_hz) => Ok(map),
+        _ if is_same_hz(map_hz, wanted_hz) => Ok(map),
         MapFrequency::MustMatch => {
             let otherwise = ", or have it scaled by sky.frequency = { spectral_index = -2.5 }";
-            Err(refuse(other_frequency(map_hz, frequency_hz, otherwise)))
+            Err(refuse(other_frequency(map_hz, wanted_hz, otherwise)))
         }
         MapFrequency::SpectralIndex(index) => {
-            let factor = (frequency_hz / map_hz).powf(index);
+            let factor = (wanted_hz / map_hz).powf(index);
             map.values_mut().iter_mut().for_each(|value| *value *= factor);
             Ok(map)
         }

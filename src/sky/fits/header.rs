@@ -50,10 +50,26 @@ impl Header {
         &self.cards
     }
 
+    /// With the cards of the file's first header after its own, where maps say what the table's leaves out.
+    pub(super) fn with_primary(mut self, primary: Self) -> Self {
+        self.cards.extend(primary.cards);
+        self
+    }
+
+    #[cfg(test)]
+    pub(super) fn of(cards: Vec<Card>) -> Self {
+        Self { cards }
+    }
+
+    /// The first card of a keyword.
+    pub(super) fn card(&self, key: &str) -> Option<&Card> {
+        self.cards.iter().find(|card| card.key == key)
+    }
+
     /// The value of a keyword's first card.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&CardValue> {
-        self.cards.iter().find(|card| card.key == key).map(|card| &card.value)
+        self.card(key).map(|card| &card.value)
     }
 
     /// The text of a keyword; numbers are not text.

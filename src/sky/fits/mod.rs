@@ -7,6 +7,7 @@
 
 mod alm;
 mod card;
+mod claims;
 mod error;
 mod frequency;
 mod header;
@@ -15,14 +16,27 @@ mod read;
 mod table;
 mod write;
 
+#[doc(hidden)]
 pub use alm::write_alm;
+#[doc(hidden)]
 pub use card::{Card, CardValue};
-pub use error::{FitsError, FitsProblem};
-pub use frequency::{check_frequencies, check_frequency, read_known_sky, read_sky};
-pub use header::Header;
-pub use image::image_bytes;
-pub use read::{
-    MapFile, ReadOptions, read_map, read_map_file, read_map_from, read_unit, read_whole_map,
-    read_whole_map_file,
+pub use error::FitsError;
+#[doc(hidden)]
+pub use error::FitsProblem;
+#[doc(hidden)]
+pub use frequency::{
+    MapUnderstood, SkyChannel, check_frequencies, check_frequency, read_known_sky, read_prior, read_sky,
+    sky_options,
 };
-pub use write::{Column, Ordering, Precision, WriteOptions, map_bytes, write_columns, write_map};
+#[doc(hidden)]
+pub use header::Header;
+#[doc(hidden)]
+pub use image::image_bytes;
+#[doc(hidden)]
+pub use read::{
+    MapFile, read_map_file, read_map_from, read_notes, read_nside, read_whole_map, read_whole_map_file,
+};
+pub use read::{ReadOptions, read_map};
+#[doc(hidden)]
+pub use write::{Column, Ordering, Precision, map_bytes, write_columns};
+pub use write::{WriteOptions, write_map};

@@ -5,6 +5,7 @@ use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use super::card::CardValue;
+use super::claims::{MapUnit, column_hz, frequency_hz, is_same_hz};
 use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
 use super::table::{CellType, ColumnLayout, TableLayout};
@@ -20,12 +21,14 @@ const UNITS_MAX: usize = 1000;
 const NSIDE_MAX_SPARSE: usize = 1024;
 
 /// How to read a map.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReadOptions {
     /// Map column of the table, counted from 0 (pixel numbers of a partial map are not counted).
     pub column: usize,
     /// Frame of files without COORDSYS; `None` makes such files an error.
     pub frame_if_missing: Option<Frame>,
+    /// Of columns that say their frequencies, the one of this frequency, Hz, or the nearest is read, in place of `column`.
+    pub frequency_hz: Option<f64>,
 }
 
 /// A map with the information of its file.
@@ -39,7 +42,11 @@ pub struct MapFile {
     pub unit: String,
     /// Whether the file has no COORDSYS, so that the frame is an assumption of the reader.
     pub frame_assumed: bool,
-    /// The header of the table.
+    /// The frequency for which it holds, Hz, as its column or either header says.
+    pub frequency_hz: Option<f64>,
+    /// Columns with maps of this size in the table.
+    pub columns: usize,
+    /// The header of the table, then that of the file.
     pub header: Header,
 }
 
@@ -65,54 +72,80 @@ pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
 /// # Errors
 /// As [`read_whole_map`].
 pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
-    let MapFile { map, name, unit, frame_assumed, header } = read_map_file(path, options)?;
+    let mut file = read_map_file(path, options)?;
     let refuse = |problem| FitsError::new(path, problem);
-    map.check_whole().map_err(|problem| refuse(problem.into()))?;
-    let map = match kelvin(&unit).ok_or_else(|| refuse(FitsProblem::Unit { found: unit.clone() }))? {
-        1.0 => map,
-        factor => {
-            let values = map.values().iter().map(|value| factor * value).collect();
-            SkyMap::new(map.frame(), values).map_err(|problem| refuse(problem.into()))?
-        }
-    };
-    Ok(MapFile { map, name, unit, frame_assumed, header })
+    file.map.check_whole().map_err(|problem| refuse(problem.into()))?;
+    let unit =
+        MapUnit::parse(&file.unit).ok_or_else(|| refuse(FitsProblem::Unit { found: file.unit.clone() }))?;
+    let factor = unit.kelvin(file.frequency_hz).ok_or_else(|| {
+        refuse(FitsProblem::missing("FREQ", format!("the map's frequency, to convert {} to K", file.unit)))
+    })?;
+    if factor != 1.0 {
+        file.map.values_mut().iter_mut().for_each(|value| *value *= factor);
+    }
+    Ok(file)
 }
 
-/// The unit (TUNIT) of the first map in a file, empty if it states none; reads only headers.
+/// What is assumed of a map that its file does not say: its unit, its frequency, which of its columns is meant. Reads only headers.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.
-pub fn read_unit(path: &Path) -> Result<String, FitsError> {
-    let header = read_header(path)?;
-    let read = || unit(&header, 1 + usize::from(is_explicit(&header)?));
-    read().map_err(|problem| FitsError::new(path, problem))
+pub fn read_notes(path: &Path, options: &ReadOptions) -> Result<Vec<String>, FitsError> {
+    read_headers(path, |header, table| {
+        let explicit = is_explicit(header)?;
+        let chosen = chosen_column(header, table, explicit, options)?;
+        let number = chosen + 1 + usize::from(explicit);
+        let mut notes = Vec::new();
+        if unit(header, number)?.is_empty() {
+            notes.push("the map states no unit (TUNIT); it is taken as K".to_owned());
+        }
+        if frequency_hz(header, number)?.is_none() {
+            notes.push("the map states no frequency (FREQ); it is taken as one at the channel's".to_owned());
+        }
+        let (_, column) = choose_columns(table, explicit, chosen)?;
+        let columns = table.maps_like(column, explicit);
+        if columns > 1 && column_hz(header, number)?.is_none() {
+            notes.push(format!(
+                "the table has {columns} columns of maps and does not say their frequencies; `{}`, the first, is used",
+                column.name
+            ));
+        }
+        Ok(notes)
+    })
 }
 
-/// The header of the first map in a file.
-pub(super) fn read_header(path: &Path) -> Result<Header, FitsError> {
-    let read = || {
+/// nside of a map; reads only headers.
+///
+/// # Errors
+/// [`FitsError`] with the file and its problem.
+pub fn read_nside(path: &Path, options: &ReadOptions) -> Result<usize, FitsError> {
+    read_headers(path, |header, table| {
+        let explicit = is_explicit(header)?;
+        let chosen = chosen_column(header, table, explicit, options)?;
+        let (_, column) = choose_columns(table, explicit, chosen)?;
+        nside(header, table.rows.saturating_mul(column.repeat as u64), explicit)
+    })
+}
+
+/// The frequency of the first map in a file, Hz, if it says so; reads only headers.
+pub(super) fn read_frequency(path: &Path) -> Result<Option<f64>, FitsError> {
+    read_headers(path, |header, _| frequency_hz(header, 1 + usize::from(is_explicit(header)?)))
+}
+
+/// What `read` takes from the headers of a file's first map.
+fn read_headers<T>(
+    path: &Path,
+    read: impl FnOnce(&Header, &TableLayout) -> Result<T, FitsProblem>,
+) -> Result<T, FitsError> {
+    let from_file = || {
         let file = File::open(path).map_err(FitsProblem::io("open"))?;
         let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
         let mut reader = BufReader::new(file);
         check_start(&mut reader, length)?;
-        Ok(find_table(&mut reader, length)?.0)
+        let (header, start) = find_table(&mut reader, length)?;
+        read(&header, &TableLayout::new(&header, start, length)?)
     };
-    read().map_err(|problem| FitsError::new(path, problem))
-}
-
-/// A unit of temperature in K, whether thermodynamic or Rayleigh-Jeans: at these frequencies they are the same. `None`
-/// for a unit of another quantity; a map without a unit is in K.
-fn kelvin(unit: &str) -> Option<f64> {
-    let unit = unit.trim().trim_matches(['[', ']', '(', ')']);
-    let name = unit.split_once('_').map_or(unit, |(name, _)| name);
-    match name {
-        "" | "K" | "Kelvin" | "kelvin" | "KELVIN" | "Kelvins" => Some(1.0),
-        "mK" | "milliK" => Some(1e-3),
-        "uK" | "muK" | "microK" => Some(1e-6),
-        "kK" => Some(1e3),
-        "MK" => Some(1e6),
-        _ => None,
-    }
+    from_file().map_err(|problem| FitsError::new(path, problem))
 }
 
 /// Reads a map with its header.
@@ -144,20 +177,25 @@ pub fn read_map_from(
     reader.seek(SeekFrom::Start(start)).map_err(FitsProblem::io("seek"))?;
 
     let explicit = is_explicit(&header)?;
-    let (index, column) = choose_columns(&table, explicit, options.column)?;
+    let chosen = chosen_column(&header, &table, explicit, options)?;
+    let (index, column) = choose_columns(&table, explicit, chosen)?;
     let cells = table.rows.saturating_mul(column.repeat as u64);
     let nside = nside(&header, cells, explicit)?;
     let nested = is_nested(&header)?;
     let (frame, frame_assumed) = frame(&header, options)?;
 
-    let values = match index {
+    let mut values = match index {
         None => read_implicit(reader, &table, column, nside)?,
         Some(index) => read_explicit(reader, &table, index, column, nside)?,
     };
+    let is_bad = bad_values(&header);
+    values.iter_mut().filter(|value| is_bad(**value)).for_each(|value| *value = HEALPIX_UNSEEN);
     let values = if nested { to_ring(nside, &values) } else { values };
-    let unit = unit(&header, options.column + 1 + usize::from(explicit))?;
+    let number = chosen + 1 + usize::from(explicit);
+    let (unit, frequency_hz) = (unit(&header, number)?, frequency_hz(&header, number)?);
     let map = SkyMap::new(frame, values)?;
-    Ok(MapFile { map, name: column.name.clone(), unit, frame_assumed, header })
+    let columns = table.maps_like(column, explicit);
+    Ok(MapFile { map, name: column.name.clone(), unit, frame_assumed, frequency_hz, columns, header })
 }
 
 fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsProblem> {
@@ -177,21 +215,51 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     Err(FitsProblem::NotFits { found })
 }
 
-/// The header of the first binary table, and the offset of its rows.
+/// Whether a value stands for none: UNSEEN, or what the header calls BAD_DATA.
+fn bad_values(header: &Header) -> impl Fn(f64) -> bool + use<> {
+    let stated = header.real("BAD_DATA");
+    // Single precision keeps seven digits.
+    move |value| is_unseen(value) || stated.is_some_and(|bad| (value - bad).abs() <= 1e-6 * bad.abs())
+}
+
+/// The map column to be read, counted from 0: of those that say their frequencies the nearest to the one asked for.
+fn chosen_column(
+    header: &Header,
+    table: &TableLayout,
+    explicit: bool,
+    options: &ReadOptions,
+) -> Result<usize, FitsProblem> {
+    let Some(wanted_hz) = options.frequency_hz else { return Ok(options.column) };
+    let mut nearest: Option<(f64, usize)> = None;
+    for column in 0..table.columns.len() - usize::from(explicit) {
+        let Some(hz) = column_hz(header, column + 1 + usize::from(explicit))? else { continue };
+        let apart = if is_same_hz(hz, wanted_hz) { 0.0 } else { (hz / wanted_hz).ln().abs() };
+        if nearest.is_none_or(|(least, _)| apart < least) {
+            nearest = Some((apart, column));
+        }
+    }
+    Ok(nearest.map_or(options.column, |(_, column)| column))
+}
+
+/// The header of the first binary table with that of the file after it, and the offset of the table's rows.
 fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u64), FitsProblem> {
     let mut at = 0;
     let mut units = 0;
+    let mut primary = Header::default();
     while at < length && units < UNITS_MAX {
         let (header, data) = Header::read(reader, at, length)?;
         units += 1;
         if header.text("XTENSION") == Some("BINTABLE") {
-            return Ok((header, data));
+            return Ok((header.with_primary(primary), data));
         }
         let needed = data.saturating_add(header.data_bytes()?);
         if needed > length {
             return Err(FitsProblem::Truncated { expected: "data before the table", needed, length });
         }
         at = needed.next_multiple_of(BLOCK_BYTES as u64);
+        if units == 1 {
+            primary = header;
+        }
     }
     Err(FitsProblem::NoTable { units })
 }
@@ -281,9 +349,10 @@ fn is_nested(header: &Header) -> Result<bool, FitsProblem> {
 }
 
 fn frame(header: &Header, options: &ReadOptions) -> Result<(Frame, bool), FitsProblem> {
-    match (header.get("COORDSYS"), options.frame_if_missing) {
+    let named = header.text("SKYCOORD").and_then(Frame::from_coordsys);
+    match (header.get("COORDSYS"), named.or(options.frame_if_missing)) {
         (None, None) => Err(FitsProblem::NoFrame),
-        (None, Some(frame)) => Ok((frame, true)),
+        (None, Some(frame)) => Ok((frame, named.is_none())),
         (Some(found), _) => header
             .text("COORDSYS")
             .and_then(Frame::from_coordsys)
@@ -331,9 +400,6 @@ fn read_implicit(
         column.decode(column.cells(row), HEALPIX_UNSEEN, &mut values);
         Ok(())
     })?;
-    for value in values.iter_mut().filter(|value| is_unseen(**value)) {
-        *value = HEALPIX_UNSEEN;
-    }
     Ok(values)
 }
 
@@ -365,7 +431,7 @@ fn read_explicit(
             match usize::try_from(pixel).ok().filter(|&p| p < pixels && !filled[p]) {
                 Some(p) => {
                     filled[p] = true;
-                    values[p] = if is_unseen(value) { HEALPIX_UNSEEN } else { value };
+                    values[p] = value;
                 }
                 None => {
                     return Err(FitsProblem::Pixel { row: row_number, pixel, last: pixels as u64 - 1 });

@@ -1,26 +1,16 @@
 //! Small scales and point sources on a map of one's own: the paper's input is a smooth map (ULSA) with both.
 
-use std::path::Path;
-
 use thiserror::Error;
 
+use super::catalogue::{Catalogue, CatalogueError, Source};
 use super::fluctuations::{RandomField, gaussian_field, small_scale_fraction, small_scale_power};
 use super::sources::{COUNTS_HZ, draw, kelvin_sr_per_jansky};
 use super::{FLUCTUATION_FLOOR, GeneratedSky, HASLAM_HZ};
 use crate::sky::healpix::{pixel_area_sr, pixel_of};
 use crate::sky::{AddedSky, MapError, SkyMap};
-use crate::units::vector::Vec3;
 
 /// Temperature index by which a map's emission is taken to 408 MHz, where the amplitude of small scales is known.
 const INDEX_TO_HASLAM: f64 = 2.5;
-
-/// Longest catalogue, bytes; lines of some 50.
-const CATALOGUE_BYTES_MAX: u64 = 256 << 20;
-
-/// Columns of a catalogue that have to be there, as `lunarray sky --sources` writes them.
-const COLUMNS: [&str; 3] = ["ecliptic_longitude_deg", "ecliptic_latitude_deg", "flux_154mhz_jy"];
-/// A column of each source's own spectral index.
-const INDEX_COLUMN: &str = "spectral_index";
 
 /// Why nothing could be added to a map.
 #[derive(Debug, Error)]
@@ -33,34 +23,8 @@ pub enum AddedSkyError {
     #[error("sky.added.small_scales: {0}")]
     Fluctuations(#[from] crate::sky::harmonics::HarmonicsError),
     /// A catalogue that cannot be read.
-    #[error("the catalogue {}: {source}", path.display())]
-    Read {
-        /// Path.
-        path: std::path::PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
-    /// A catalogue that is none.
-    #[error("the catalogue {}, line {line}: found {found}, expected {expected}", path.display())]
-    Catalogue {
-        /// Path.
-        path: std::path::PathBuf,
-        /// Line, from 1.
-        line: usize,
-        /// What was found.
-        found: String,
-        /// What was expected.
-        expected: String,
-    },
-}
-
-/// A point source of a catalogue.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Source {
-    direction: Vec3,
-    flux_jy: f64,
-    /// Its own spectral index; that of the section if the catalogue has none.
-    index: Option<f64>,
+    #[error(transparent)]
+    Catalogue(#[from] CatalogueError),
 }
 
 impl AddedSky {
@@ -69,7 +33,16 @@ impl AddedSky {
     /// # Errors
     /// One that cannot be read.
     pub fn check(&self) -> Result<(), AddedSkyError> {
-        self.catalogue.as_deref().map_or(Ok(()), |path| read_catalogue(path).map(drop))
+        self.catalogue_understood().map(drop)
+    }
+
+    /// What is understood of the catalogue, if there is one.
+    ///
+    /// # Errors
+    /// One that cannot be read.
+    pub fn catalogue_understood(&self) -> Result<Option<String>, AddedSkyError> {
+        let understood = |path| Ok(Catalogue::read(path)?.to_string());
+        self.catalogue.as_deref().map(understood).transpose()
     }
 
     /// The map with what is to be added, on ecliptic axes, at `nside` or the map's own if that is finer.
@@ -113,67 +86,23 @@ impl AddedSky {
             sources.extend(drawn.map(|one| Source {
                 direction: one.direction,
                 flux_jy: one.flux_jy,
+                at_hz: COUNTS_HZ,
                 index: None,
             }));
         }
         if let Some(path) = &self.catalogue {
-            sources.extend(read_catalogue(path)?);
+            sources.extend(Catalogue::read(path)?.sources);
         }
         for source in sources {
             let index = source.index.unwrap_or(generated.source_spectral_index);
-            let scale = (frequency_hz / COUNTS_HZ).powf(index - generated.source_spectral_index);
+            let at_counts = (COUNTS_HZ / source.at_hz).powf(index);
+            let scale = at_counts * (frequency_hz / COUNTS_HZ).powf(index - generated.source_spectral_index);
             let kelvin =
                 scale * source.flux_jy * kelvin_sr_per_jansky(generated, frequency_hz) / pixel_area_sr(nside);
             map.values_mut()[pixel_of(nside, source.direction)] += kelvin;
         }
         Ok(map)
     }
-}
-
-/// The sources of a table (CSV) with a line of names.
-fn read_catalogue(path: &Path) -> Result<Vec<Source>, AddedSkyError> {
-    let failed = |source| AddedSkyError::Read { path: path.to_owned(), source };
-    let bytes = std::fs::metadata(path).map_err(failed)?.len();
-    let wrong = |line: usize, found: String, expected: &str| AddedSkyError::Catalogue {
-        path: path.to_owned(),
-        line,
-        found,
-        expected: expected.to_owned(),
-    };
-    if bytes > CATALOGUE_BYTES_MAX {
-        return Err(wrong(1, format!("{bytes} bytes"), "at most 268 MB"));
-    }
-    let text = std::fs::read_to_string(path).map_err(failed)?;
-    let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let names: Vec<&str> =
-        lines.next().map_or_else(Vec::new, |(_, line)| line.split(',').map(str::trim).collect());
-    let place = |name: &str| names.iter().position(|found| *found == name);
-    let mut places = [0; 3];
-    for (place_of, name) in places.iter_mut().zip(COLUMNS) {
-        let expected =
-            format!("the columns {}, and {INDEX_COLUMN} if sources have their own", COLUMNS.join(", "));
-        *place_of = place(name).ok_or_else(|| wrong(1, format!("no column {name}"), &expected))?;
-    }
-    let index_place = place(INDEX_COLUMN);
-    let source = |(number, line): (usize, &str)| {
-        let cells: Vec<&str> = line.split(',').map(str::trim).collect();
-        let number_at = |place: usize, expected: &str, good: fn(f64) -> bool| {
-            let cell = cells.get(place).copied().unwrap_or_default();
-            let value = cell.parse::<f64>().ok().filter(|value| value.is_finite() && good(*value));
-            let shown: String = cell.chars().take(40).collect();
-            value.ok_or_else(|| wrong(number + 1, format!("`{}`", shown.escape_debug()), expected))
-        };
-        let lon = number_at(places[0], "a longitude, degrees", |_| true)?.to_radians();
-        let lat =
-            number_at(places[1], "a latitude of -90 to 90 degrees", |lat| lat.abs() <= 90.0)?.to_radians();
-        let flux_jy = number_at(places[2], "a flux density above 0, Jy", |flux| flux > 0.0)?;
-        let index = index_place
-            .map(|place| number_at(place, "a spectral index of -10 to 10", |index| index.abs() <= 10.0))
-            .transpose()?;
-        let direction = [lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()];
-        Ok(Source { direction, flux_jy, index })
-    };
-    lines.map(source).collect()
 }
 
 #[cfg(test)]
@@ -253,30 +182,12 @@ mod tests {
             .iter()
             .map(|one| format!("{:.9},{:.9},{:e}", one.place_deg[0], one.place_deg[1], one.flux_154mhz_jy))
             .collect();
-        let file = file(&format!("{}\n{}\n", COLUMNS.join(","), lines.join("\n")));
+        let head = "ecliptic_longitude_deg,ecliptic_latitude_deg,flux_154mhz_jy";
+        let file = file(&format!("{head}\n{}\n", lines.join("\n")));
         let listed = AddedSky { catalogue: Some(file.path().to_owned()), ..AddedSky::default() };
         let again = listed.add_to(flat(64), &config, 1e7, 64, 99).unwrap();
         let differ = map.values().iter().zip(again.values()).filter(|(a, b)| (*a - *b).abs() > 1e-6 * *a);
         // A source within 1e-9 degrees of a pixel's edge may change sides.
         assert!(differ.count() <= 2);
-    }
-
-    #[test]
-    fn catalogues_that_are_none_say_where() {
-        let said = |text: &str| read_catalogue(file(text).path()).unwrap_err().to_string();
-        let head = COLUMNS.join(",");
-        assert!(said("a,b\n1,2").contains("line 1: found no column ecliptic_longitude_deg"));
-        assert!(said("").contains("no column"));
-        for (row, words) in [
-            ("1,2,x", "found `x`, expected a flux density"),
-            ("1,2,-3", "above 0"),
-            ("1,91,3", "-90 to 90"),
-            ("NaN,1,3", "a longitude"),
-            ("1,2", "found ``"),
-        ] {
-            let found = said(&format!("{head}\n0,0,1\n{row}\n"));
-            assert!(found.contains("line 3") && found.contains(words), "{found}");
-        }
-        assert!(matches!(read_catalogue(Path::new("/nowhere/x.csv")), Err(AddedSkyError::Read { .. })));
     }
 }

@@ -17,14 +17,20 @@
 //! | 10 | 3.77e5 | 2.26e5 | 3.20e5 | 7.51e5 | 3.07e5 | 2.40e5 | 5.09e5 |
 
 mod added;
+mod catalogue;
+mod columns;
 mod config;
 mod features;
 mod fluctuations;
 mod galaxy;
 mod sources;
 
+#[doc(hidden)]
 pub use added::AddedSkyError;
+#[doc(hidden)]
+pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};
+#[doc(hidden)]
 pub use sources::{CatalogueSource, catalogue};
 
 use rayon::prelude::*;

@@ -26,6 +26,7 @@ impl Alm {
 
     /// Number of coefficients for `l_max`.
     #[must_use]
+    #[doc(hidden)]
     pub fn len_for(l_max: usize) -> usize {
         (l_max + 1) * (l_max + 2) / 2
     }
@@ -39,6 +40,7 @@ impl Alm {
     /// Index of `(l, m)`, `m <= l <= l_max`, among the values.
     #[inline]
     #[must_use]
+    #[doc(hidden)]
     pub fn index(&self, l: usize, m: usize) -> usize {
         debug_assert!(m <= l && l <= self.l_max);
         m * (2 * self.l_max + 1 - m) / 2 + l
@@ -53,6 +55,7 @@ impl Alm {
 
     /// Mutable `a_lm` for `m >= 0`.
     #[inline]
+    #[doc(hidden)]
     pub fn get_mut(&mut self, l: usize, m: usize) -> &mut Complex64 {
         let index = self.index(l, m);
         &mut self.values[index]
@@ -60,12 +63,14 @@ impl Alm {
 
     /// The coefficients l = m .. l_max of order `m`.
     #[must_use]
+    #[doc(hidden)]
     pub fn order(&self, m: usize) -> &[Complex64] {
         let first = self.index(m, m);
         &self.values[first..=first + self.l_max - m]
     }
 
     /// Mutable coefficients l = m .. l_max of order `m`.
+    #[doc(hidden)]
     pub fn order_mut(&mut self, m: usize) -> &mut [Complex64] {
         let first = self.index(m, m);
         let last = first + self.l_max - m;
@@ -79,6 +84,7 @@ impl Alm {
     }
 
     /// Mutable values in healpy's order.
+    #[doc(hidden)]
     pub fn values_mut(&mut self) -> &mut [Complex64] {
         &mut self.values
     }

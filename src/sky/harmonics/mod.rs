@@ -19,13 +19,16 @@ mod lanes;
 mod recurrence;
 mod rings;
 mod rotated;
-pub(crate) mod scaled;
 mod transform;
-mod wigner;
 
-pub use analysis::{Analysis, AnalysisOptions, Method, analysis, synthesis};
+#[doc(hidden)]
+pub use crate::numerics::wigner::{WignerRows, WignerTable, wigner_d};
+#[doc(hidden)]
+pub use analysis::Method;
+pub use analysis::{Analysis, AnalysisOptions, analysis, synthesis};
 pub use coefficients::Alm;
+#[doc(hidden)]
 pub use directions::{Component, times_direction, times_direction_transposed};
 pub use error::HarmonicsError;
+#[doc(hidden)]
 pub use transform::{L_MAX, Transform};
-pub use wigner::{WignerRows, WignerTable, wigner_d};

@@ -23,6 +23,7 @@ const PARTS: usize = 8;
 impl Alm {
     /// The coefficients of the field rotated by `rotation`, which takes old directions to new ones.
     #[must_use]
+    #[doc(hidden)]
     pub fn rotated(&self, rotation: &Rotation) -> Self {
         let [alpha, beta, gamma] = euler_angles(rotation);
         let table = WignerTable::new(self.l_max(), beta);

@@ -219,14 +219,37 @@ pub struct Contents {
     pub faults: Listing<FaultEntry>,
     /// Bytes of an unfinished packet at the end.
     pub truncated_bytes: u64,
+    /// Bytes of idle packets.
+    pub idle_bytes: u64,
     /// All counters of the reception.
     pub reception: ReceptionCounters,
 }
 
 impl Contents {
-    /// Whether nothing is missing or damaged and every payload was decoded.
+    /// Visibilities in sound packets less those that the spacecraft's latest report counts as sampled and not dropped on board: 0
+    /// if all that were sent are in the file. `None` without a report.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn found_less_reported(&self) -> Option<i64> {
+        let HousekeepingSummary { sampled, dropped, .. } = self.housekeeping.as_ref()?;
+        let found = self.visibilities.count + self.reception.visibilities_bad_value;
+        Some(
+            i64::try_from(i128::from(found) + i128::from(*dropped) - i128::from(*sampled))
+                .unwrap_or(i64::MIN),
+        )
+    }
+
+    /// Whether nothing is missing or damaged and every payload was decoded, and all visibilities that the spacecraft has sampled are
+    /// in the file or were dropped on board.
     #[must_use]
     pub fn is_sound(&self) -> bool {
+        self.is_undamaged() && self.found_less_reported() == Some(0)
+    }
+
+    /// Whether nothing is missing between what is there, nothing is damaged, and every payload was decoded.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_undamaged(&self) -> bool {
         let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
         let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);
         let all_decoded =

@@ -43,6 +43,7 @@ impl Contents {
     ///
     /// # Errors
     /// Those of [`Contents::read`].
+    #[doc(hidden)]
     pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
         Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
     }
@@ -51,6 +52,7 @@ impl Contents {
     ///
     /// # Errors
     /// Those of [`Contents::read`].
+    #[doc(hidden)]
     pub fn read_from(
         source: impl Read,
         path: &Path,
@@ -131,6 +133,7 @@ struct Inspector {
     damaged: Listing<(DamagedEntry, CucTime)>,
     garbage: Listing<GarbageEntry>,
     faults: Listing<FaultEntry>,
+    idle_bytes: u64,
 }
 
 impl Inspector {
@@ -158,6 +161,7 @@ impl Inspector {
                 let entry = DamagedEntry { offset, kind, apid, count, bytes: bytes as u64, time_s: None };
                 self.damaged.push((entry, time));
             }
+            Event::Idle { bytes, .. } => self.idle_bytes += bytes,
             Event::Garbage { offset, bytes } => self.garbage.push(GarbageEntry { offset, bytes }),
             Event::Duplicate { .. } | Event::Restart { .. } | Event::Truncated { .. } => {}
         }
@@ -275,6 +279,8 @@ impl Inspector {
             garbage: self.garbage,
             faults: self.faults,
             truncated_bytes: reception.bytes_truncated,
+            idle_bytes: self.idle_bytes
+                + reception.frames.as_ref().map_or(0, |frames| frames.bytes_idle_packets),
             reception: reception.clone(),
         }
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use super::{Contents, VisibilityCounts};
+use super::{Contents, HousekeepingSummary, VisibilityCounts};
 use crate::downlink::receive::{Listing, ReceptionCounters};
 use crate::units::printable;
 
@@ -171,7 +171,30 @@ impl Contents {
             writeln!(f, "\n{restarts}")?;
         }
         if self.is_sound() {
-            return writeln!(f, "\nsound: no gaps, no bad checksums, no garbage, not truncated");
+            return writeln!(
+                f,
+                "\nsound: no gaps, no bad checksums, no garbage, not truncated; all visibilities that were sampled and not dropped on \
+                 board are here"
+            );
+        }
+        if self.is_undamaged() {
+            writeln!(f, "\nno gaps, no bad checksums, no garbage, not truncated")?;
+        }
+        match self.found_less_reported().zip(self.housekeeping.as_ref()) {
+            None => writeln!(
+                f,
+                "\nno report of the spacecraft's counts: whether visibilities are missing is not known"
+            )?,
+            Some((found, HousekeepingSummary { sampled, dropped, .. })) if found < 0 => writeln!(
+                f,
+                "\nnot sound: {} of {sampled} visibilities that were sampled are not in this file ({dropped} were dropped on board)",
+                found.unsigned_abs()
+            )?,
+            Some((found, _)) if found > 0 => writeln!(
+                f,
+                "\n{found} visibilities follow the last report of the spacecraft's counts: whether more are missing is not known"
+            )?,
+            Some(_) => {}
         }
         show_list(f, "gaps", &self.gaps, |gap| {
             format!(

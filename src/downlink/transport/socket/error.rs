@@ -5,8 +5,6 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::url::TcpUrl;
-
 /// Why listening or sending failed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -21,7 +19,7 @@ pub enum SocketError {
     #[error("{url}: the host has no address: {source}")]
     Resolve {
         /// The URL.
-        url: TcpUrl,
+        url: String,
         /// The system's error.
         source: io::Error,
     },
@@ -32,13 +30,13 @@ pub enum SocketError {
     )]
     Remote {
         /// The URL.
-        url: TcpUrl,
+        url: String,
     },
     /// The address cannot be bound.
     #[error("cannot listen on {url}: {source}")]
     Listen {
         /// The URL.
-        url: TcpUrl,
+        url: String,
         /// The system's error.
         source: io::Error,
     },
@@ -58,7 +56,7 @@ pub enum SocketError {
     )]
     Connect {
         /// The URL.
-        url: TcpUrl,
+        url: String,
         /// Time spent trying, s.
         waited_s: f64,
         /// The system's last error.
@@ -68,7 +66,7 @@ pub enum SocketError {
     #[error("{url}: the receiver closed the connection; {bytes} bytes had been sent: {reason}")]
     Closed {
         /// The URL.
-        url: TcpUrl,
+        url: String,
         /// Bytes sent until then.
         bytes: u64,
         /// The receiver's answer, or the system's error.

@@ -1,28 +1,23 @@
-//! The listening thread: accepts connections until its end condition holds.
+//! What all connections of the listening thread share.
 
 use std::net::SocketAddr;
 use std::pin::pin;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::Poll;
-use std::time::Duration;
 
 use crossbeam_channel::Sender;
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
-use tokio::task::JoinSet;
-use tokio::time::{Instant, sleep, timeout};
+use tokio::time::Instant;
 
 use super::config::ListenConfig;
-use super::connection::serve;
 use super::held::HeldAnswers;
 use super::report::{BUSY, ListenEvent, ListenNote, Listening};
-use super::seats::{Room, Seats};
+use super::seats::Seats;
 use super::sender_intake::Mission;
 use super::stations::Stations;
-
-/// Interval between two checks of the end condition.
-const TICK: Duration = Duration::from_millis(50);
+use crate::downlink::transport::packet_archive::{PacketArchive, Ticket};
 
 /// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
@@ -47,6 +42,14 @@ pub(super) struct PacketBatch {
     pub(super) arrived: std::time::Instant,
 }
 
+/// What became of a batch that was passed on.
+pub(super) struct Passed {
+    /// Bytes in all batches up to its end.
+    pub(super) mark: u64,
+    /// What has to reach the disk; why it cannot; or `None` without an archive.
+    pub(super) ticket: Result<Option<Ticket>, String>,
+}
+
 /// What all connections share.
 pub(super) struct ListenContext {
     pub(super) config: ListenConfig,
@@ -60,6 +63,8 @@ pub(super) struct ListenContext {
     pub(super) passed: Mutex<u64>,
     /// Who is told what checkpoints hold; `None` if there are none.
     pub(super) held: Option<HeldAnswers>,
+    /// Where packets are kept before a sender is told that they are taken; `None` if they are not.
+    pub(super) archive: Option<PacketArchive>,
     /// Who may send; `None` for everyone.
     pub(super) stations: Option<Arc<Stations>>,
     /// True once reading must stop.
@@ -75,11 +80,13 @@ impl ListenContext {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
     }
 
-    /// Passes a batch on; returns the bytes in all batches up to its end, or `None` if nobody takes it.
-    pub(super) fn pass(&self, batch: PacketBatch) -> Option<u64> {
+    /// Keeps a batch in the archive, if there is one, and passes it on, also if it could not be kept. `None` if nobody takes it.
+    pub(super) fn pass(&self, batch: PacketBatch) -> Option<Passed> {
         let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
         *passed += batch.bytes.len() as u64;
-        self.batches.send(batch).ok().map(|()| *passed)
+        let mark = *passed;
+        let ticket = self.archive.as_ref().map(|archive| archive.append(&batch.bytes, mark));
+        self.batches.send(batch).ok().map(|()| Passed { mark, ticket: ticket.transpose() })
     }
 
     pub(super) fn note_sign(&self) {
@@ -92,7 +99,7 @@ impl ListenContext {
         let _ = self.stop.subscribe().wait_for(|stop| *stop).await;
     }
 
-    fn is_over(&self) -> bool {
+    pub(super) fn is_over(&self) -> bool {
         let status = &self.listening.status;
         let Until { idle_s, connections } = self.until;
         if connections > 0 && status.done.load(Ordering::Relaxed) >= connections {
@@ -106,54 +113,13 @@ impl ListenContext {
         idle_s > 0.0 && sign.elapsed().as_secs_f64() > idle_s
     }
 
-    fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
+    pub(super) fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
         self.listening.write().refused += 1;
         // A sender need not read the answer.
         let _ =
             stream.try_write(format!("{BUSY}there are downlink.listen.connections_max others\n").as_bytes());
         self.notes.say(ListenEvent::SenderRefused { peer: peer.to_string() });
     }
-}
-
-/// Listens until the end condition holds, then waits for all connections to end.
-pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
-    let mut connections = JoinSet::new();
-    // Accepted, and without a place yet. Others wait in the system's queue, in the order in which they came.
-    let mut newcomer: Option<(TcpStream, SocketAddr)> = None;
-    shared.note_sign();
-    while !shared.is_over() {
-        while connections.try_join_next().is_some() {}
-        if let Some((stream, peer)) = newcomer.take() {
-            if connections.len() < shared.config.connections_max {
-                connections.spawn(serve(stream, peer, Arc::clone(&shared)));
-                continue;
-            }
-            match shared.seats.make_room(peer.ip(), Instant::now()) {
-                Room::None => shared.refuse(&stream, peer),
-                Room::Soon => {
-                    newcomer = Some((stream, peer));
-                    match first(shared.stopped(), timeout(TICK, connections.join_next())).await {
-                        First::A(()) => break,
-                        First::B(_) => {}
-                    }
-                }
-            }
-            continue;
-        }
-        match first(shared.stopped(), timeout(TICK, listener.accept())).await {
-            First::A(()) => break,
-            First::B(Err(_)) => {}
-            First::B(Ok(Ok(accepted))) => newcomer = Some(accepted),
-            // Too many open files, or the peer is gone already: others may connect.
-            First::B(Ok(Err(error))) => {
-                shared.notes.say(ListenEvent::AcceptFailed { reason: error.to_string() });
-                sleep(TICK).await;
-            }
-        }
-    }
-    drop((listener, newcomer));
-    shared.stop.send_replace(true);
-    while connections.join_next().await.is_some() {}
 }
 
 /// Which of two futures completed first.

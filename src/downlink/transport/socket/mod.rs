@@ -29,6 +29,7 @@
 //! machine require an explicit option. With [`Stations`] a connection has to begin with the line `token TOKEN` of one of them, and
 //! is reported by its name.
 
+mod accept;
 mod config;
 mod connection;
 mod error;

@@ -109,7 +109,7 @@ impl SocketSink {
             let waited_s = since.elapsed().as_secs_f64();
             if waited_s >= self.options.connect_s || self.cancel.is_cancelled() {
                 let waited_s = (10.0 * waited_s).round() / 10.0;
-                return Err(SocketError::Connect { url: self.url.clone(), waited_s, source: failed });
+                return Err(SocketError::Connect { url: self.url.to_string(), waited_s, source: failed });
             }
             self.pause(POLL);
         }
@@ -230,7 +230,7 @@ impl SocketSink {
         let (url, bytes) = (self.url.clone(), self.bytes);
         // The receiver's words are shown as they are, but for what a terminal would take for a command.
         let shown = |reason: E| printable(&reason.to_string()).into_owned();
-        move |reason| SocketError::Closed { url: url.clone(), bytes, reason: shown(reason) }
+        move |reason| SocketError::Closed { url: url.to_string(), bytes, reason: shown(reason) }
     }
 
     /// Sends a piece; blocks while the receiver does not read.

@@ -22,10 +22,11 @@ impl TcpUrl {
         let found = (self.host.as_str(), self.port).to_socket_addrs().map(Vec::from_iter);
         match found {
             Ok(found) if !found.is_empty() => Ok(found),
-            Ok(_) => {
-                Err(SocketError::Resolve { url: self.clone(), source: std::io::ErrorKind::NotFound.into() })
-            }
-            Err(source) => Err(SocketError::Resolve { url: self.clone(), source }),
+            Ok(_) => Err(SocketError::Resolve {
+                url: self.to_string(),
+                source: std::io::ErrorKind::NotFound.into(),
+            }),
+            Err(source) => Err(SocketError::Resolve { url: self.to_string(), source }),
         }
     }
 
@@ -37,7 +38,7 @@ impl TcpUrl {
         let found = self.addresses()?;
         match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {
             true => Ok(found),
-            false => Err(SocketError::Remote { url: self.clone() }),
+            false => Err(SocketError::Remote { url: self.to_string() }),
         }
     }
 }

@@ -4,8 +4,8 @@ use std::sync::LazyLock;
 
 use multiversion::multiversion;
 
+use super::code::{ERRORS_MAX, PARITY_BYTES, ROOT_FIRST, ROOT_STEP};
 use super::field::{FIELD, ORDER, times_primitive};
-use super::reed_solomon::{ERRORS_MAX, PARITY_BYTES, ROOT_FIRST, ROOT_STEP};
 
 /// Wrong octets of a codeword.
 #[derive(Clone, Copy, Debug)]

@@ -27,6 +27,7 @@
 //! the frame is filled with an idle packet, so that a lost pass does not damage its neighbours.
 
 pub(crate) mod bits;
+mod code;
 mod encoder;
 mod field;
 pub(crate) mod frame;

@@ -12,23 +12,10 @@ use std::sync::LazyLock;
 
 use multiversion::multiversion;
 
+pub use super::code::{CODEWORD_BYTES, DATA_BYTES, ERRORS_MAX, INTERLEAVES, PARITY_BYTES};
+use super::code::{ROOT_FIRST, ROOT_STEP};
 use super::field::{FIELD, ORDER};
 use super::locator::{Errors, locate};
-
-/// Octets of a codeword.
-pub const CODEWORD_BYTES: usize = 255;
-/// Octets of parity in a codeword.
-pub const PARITY_BYTES: usize = 32;
-/// Octets of data in a codeword.
-pub const DATA_BYTES: usize = CODEWORD_BYTES - PARITY_BYTES;
-/// Maximum number of correctable octets in a codeword.
-pub const ERRORS_MAX: usize = PARITY_BYTES / 2;
-/// Permitted depths of interleaving.
-pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
-
-/// Exponents of the generator's roots: 11 times 112 to 143.
-pub(super) const ROOT_STEP: usize = 11;
-pub(super) const ROOT_FIRST: usize = 112;
 
 /// Octets processed per table lookup.
 const SLICE: usize = 4;

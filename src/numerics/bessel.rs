@@ -5,8 +5,13 @@
 
 use std::f64::consts::PI;
 
-use super::lanes::{LANES, Lanes};
-use crate::response::harmonic::trigonometry::sin_cos;
+use super::trigonometry::sin_cos;
+
+/// Arguments that are computed together.
+pub(crate) const LANES: usize = 8;
+
+/// One number for each argument.
+pub(crate) type Lanes = [f64; LANES];
 
 /// From here on Hankel's series gives Bessel functions to rounding.
 const HANKEL_X_MIN: f64 = 30.0;
@@ -19,13 +24,13 @@ const FAR_MARGIN: usize = 40;
 
 /// Evaluates orders 0, 1, .. for [`LANES`] arguments.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BesselOrders {
+pub(crate) struct BesselOrders {
     values: Vec<Lanes>,
 }
 
 impl BesselOrders {
     /// `J_n(x)`, n = 0 ..= `order_max`, for x >= 0.
-    pub(super) fn cylindrical(&mut self, x: &Lanes, order_max: usize) -> &[Lanes] {
+    pub(crate) fn cylindrical(&mut self, x: &Lanes, order_max: usize) -> &[Lanes] {
         let start = if x.iter().all(|x| *x >= HANKEL_X_MIN) {
             hankel(x)
         } else {
@@ -40,7 +45,7 @@ impl BesselOrders {
     }
 
     /// `j_n(x)`, n = 0 ..= `order_max`, for x > 0.
-    pub(super) fn spherical(&mut self, x: &Lanes, order_max: usize) -> &[Lanes] {
+    pub(crate) fn spherical(&mut self, x: &Lanes, order_max: usize) -> &[Lanes] {
         let mut start = [[0.0; LANES]; 2];
         for k in 0..LANES {
             let (sin, cos) = x[k].sin_cos();
@@ -149,7 +154,7 @@ fn recurrence(x: &Lanes, shift: f64, start: &[Lanes; 2], values: &mut [Lanes], o
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::response::harmonic::quadrature::GaussLegendre;
+    use crate::numerics::quadrature::GaussLegendre;
 
     const XS: [f64; 16] = [
         1e-6,

@@ -1,7 +1,7 @@
 //! Associated Legendre functions at many colatitudes at once.
 
-use super::real::Real;
-use crate::sky::harmonics::scaled::{LaneSlices, ScaledLanes, advance};
+use super::Real;
+use super::scaled::{LaneSlices, ScaledLanes, advance};
 
 /// Orthonormal `lambda_{l mu}(theta) = Y_{l mu}(theta, 0)`, Condon-Shortley phase.
 #[derive(Clone, Debug)]

@@ -1,0 +1,40 @@
+//! What a piece of work takes.
+
+use std::time::Instant;
+
+use crate::pipeline::plan::Plan;
+
+/// Time spent on a piece of work.
+pub(super) struct Spent {
+    pub(super) seconds: f64,
+    /// Processor time of the whole process, s; `None` where the system does not report it.
+    pub(super) core_seconds: Option<f64>,
+}
+
+/// Mission time of a plan's windows, s.
+pub(super) fn seconds_of(plan: &Plan) -> f64 {
+    plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
+}
+
+pub(super) fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Processor time of all threads of this process, s. Linux reports it in ticks of 10 ms (proc(5), fields 14 and 15 of
+/// stat).
+pub(super) fn core_seconds_used() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The name, in parentheses, may contain spaces.
+    let mut fields = text.rsplit_once(')')?.1.split_whitespace().skip(11);
+    let mut ticks = || fields.next()?.parse::<f64>().ok();
+    Some((ticks()? + ticks()?) / 100.0)
+}
+
+pub(super) fn timed<T>(work: impl FnOnce() -> T) -> (Spent, T) {
+    let (before_s, since) = (core_seconds_used(), Instant::now());
+    let value = work();
+    let seconds = since.elapsed().as_secs_f64();
+    let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
+    (Spent { seconds, core_seconds }, value)
+}

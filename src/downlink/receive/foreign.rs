@@ -1,0 +1,241 @@
+//! What a stream is that is no downlink, by its first bytes.
+
+use crate::downlink::wire::cadu::{FrameHeader, IDLE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
+
+/// First bytes of a stream that are kept to name it.
+pub(super) const HEAD_BYTES: usize = 16 << 10;
+
+/// Lengths of transfer frames, with what stands around them.
+const FRAME_BYTES: std::ops::RangeInclusive<usize> = 32..=2 * 2048;
+/// Frames that have to follow one another before they are taken for frames.
+const FRAMES_MIN: usize = 3;
+
+/// Formats by what they begin with, and what is to be done with them.
+const SIGNATURES: [(&[u8], &str); 17] = [
+    (b"\x1f\x8b", "a gzip file: expand it first (gunzip)"),
+    (b"\x28\xb5\x2f\xfd", "a zstd file: expand it first (unzstd)"),
+    (b"\xfd7zXZ\x00", "an xz file: expand it first (unxz)"),
+    (b"BZh", "a bzip2 file: expand it first (bunzip2)"),
+    (b"\x04\x22\x4d\x18", "an lz4 file: expand it first (unlz4)"),
+    (b"PK\x03\x04", "a zip file: expand it first (unzip)"),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z file: expand it first"),
+    (b"\x89HDF\r\n\x1a\n", "an HDF5 file (as UVH5 is)"),
+    (b"CDF", "a netCDF file"),
+    (b"SIMPLE  =", "a FITS file"),
+    (b"PAR1", "a Parquet file"),
+    (b"\x93NUMPY", "a numpy array"),
+    (b"\x89PNG", "a PNG picture"),
+    (b"%PDF", "a PDF document"),
+    (b"LNRSTA", "a checkpoint of a state: name its folder as a state"),
+    (b"\xd4\xc3\xb2\xa1", "a recording of a network (pcap)"),
+    (b"\x0a\x0d\x0d\x0a", "a recording of a network (pcapng)"),
+];
+
+/// What a stream with these first bytes is, if it is known and no downlink.
+pub(super) fn name_of(head: &[u8]) -> Option<String> {
+    let by_signature = SIGNATURES.iter().find(|(signature, _)| head.starts_with(signature));
+    if let Some((_, name)) = by_signature {
+        return Some((*name).to_owned());
+    }
+    if head.get(257..262) == Some(b"ustar") {
+        return Some("a tar archive: unpack it first (tar -x)".to_owned());
+    }
+    frames_of(head).or_else(|| marked_frames_of(head)).or_else(|| packets_of(head)).or_else(|| text_of(head))
+}
+
+/// Transfer frames that are not as the receiver expects them, although packets may be seen inside.
+pub(super) fn frames_of(head: &[u8]) -> Option<String> {
+    if let Some(bytes) = period(|at| head.get(at..)) {
+        return Some(format!(
+            "AOS transfer frames of {bytes} bytes without sync markers: give the CADUs as they were received, or the packets that a \
+             frame processor takes out of them"
+        ));
+    }
+    let (marked, bytes) = marker_period(head)?;
+    is_chain(bytes, |at| marked.get(at + SYNC_MARKER_BYTES..)).then(|| {
+        format!(
+            "CADUs of {bytes} bytes whose blocks are not randomized: expected the pseudo-randomizer of CCSDS 131.0-B, and \
+             Reed-Solomon (255, 223) parity"
+        )
+    })
+}
+
+/// Frames behind sync markers that no code of the receiver fits.
+fn marked_frames_of(head: &[u8]) -> Option<String> {
+    let (marked, bytes) = marker_period(head)?;
+    let plain = |at: usize| {
+        let block = marked.get(at + SYNC_MARKER_BYTES..)?;
+        let mut start = block.get(..block.len().min(8))?.to_vec();
+        randomize(&mut start);
+        Some(start)
+    };
+    let is_aos = (0..3).all(|k| plain(k * bytes).is_some_and(|start| FrameHeader::parse(&start).is_some()));
+    let of = if is_aos { "randomized AOS frames" } else { "frames of another kind or code" };
+    Some(format!(
+        "{of} of {bytes} bytes with sync markers that are no CADUs as expected: blocks of 255 to 2040 bytes with Reed-Solomon \
+         (255, 223) parity, randomized"
+    ))
+}
+
+/// Distance of frames that begin at byte 0 and follow one another.
+fn period<'a>(at: impl Fn(usize) -> Option<&'a [u8]>) -> Option<usize> {
+    FrameHeader::parse(at(0)?)?;
+    FRAME_BYTES.into_iter().find(|&bytes| is_chain(bytes, &at))
+}
+
+/// Whether headers at multiples of `bytes` are of one spacecraft, and count the frames of each virtual channel.
+fn is_chain<'a>(bytes: usize, at: impl Fn(usize) -> Option<&'a [u8]>) -> bool {
+    let mut newest: Vec<Option<u32>> = vec![None; 64];
+    let (mut spacecraft, mut counted, mut frames) = (None, 0, 0);
+    while let Some(start) = at(frames * bytes).filter(|start| start.len() >= 8) {
+        let Some(header) = FrameHeader::parse(start) else { return false };
+        if *spacecraft.get_or_insert(header.spacecraft) != header.spacecraft {
+            return false;
+        }
+        let before = newest[usize::from(header.channel & 0x3F)].replace(header.count);
+        match before {
+            Some(before) if before + 1 == header.count => counted += 1,
+            Some(_) if header.channel != IDLE => return false,
+            _ => {}
+        }
+        frames += 1;
+    }
+    frames >= FRAMES_MIN && counted + 1 >= FRAMES_MIN
+}
+
+/// The stream from its first sync marker on, and the distance at which it repeats.
+fn marker_period(head: &[u8]) -> Option<(&[u8], usize)> {
+    let marker = SYNC_MARKER.to_be_bytes();
+    let marked = &head[head.windows(SYNC_MARKER_BYTES).position(|bytes| bytes == marker)?..];
+    let is_marked = |at: usize| marked.get(at..at + SYNC_MARKER_BYTES) == Some(&marker[..]);
+    let period = FRAME_BYTES.into_iter().find(|&bytes| {
+        let whole = (marked.len() / bytes).max(FRAMES_MIN);
+        (1..whole).all(|k| is_marked(k * bytes))
+    })?;
+    Some((marked, period))
+}
+
+/// Space packets of other missions: headers whose lengths lead from one to the next.
+fn packets_of(head: &[u8]) -> Option<String> {
+    let (mut at, mut apids) = (0, Vec::new());
+    while let Some(&[a, b, _, _, c, d]) = head.get(at..).and_then(<[u8]>::first_chunk) {
+        let apid = u16::from_be_bytes([a, b]) & 0x7FF;
+        // Version 000, and no packet without a byte: zeros are none.
+        if a >> 5 != 0 || (apid == 0 && c == 0 && d == 0) {
+            return None;
+        }
+        apids.push(apid);
+        at += usize::from(u16::from_be_bytes([c, d])) + 7;
+    }
+    if apids.len() < FRAMES_MIN {
+        return None;
+    }
+    apids.sort_unstable();
+    apids.dedup();
+    let shown: Vec<String> = apids.iter().take(4).map(|apid| format!("{apid:#05x}")).collect();
+    let more = if apids.len() > shown.len() { ", .." } else { "" };
+    Some(format!("space packets of other APIDs: {}{more}", shown.join(", ")))
+}
+
+/// Text, by what it begins with.
+fn text_of(head: &[u8]) -> Option<String> {
+    let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
+    let is_text = |byte: &u8| matches!(byte, b'\t' | b'\n' | b'\r' | 0x20..=0x7e | 0x80..);
+    if head.is_empty()
+        || !head.iter().all(is_text)
+        || std::str::from_utf8(&head[..head.len().min(512)]).is_err_and(|error| error.error_len().is_some())
+    {
+        return None;
+    }
+    let text = String::from_utf8_lossy(head);
+    let text = text.trim_start();
+    Some(match text {
+        _ if text.starts_with('<') => format!("an XML document (<{}>)", root_of(text)),
+        _ if text.starts_with("CCSDS_") => {
+            let name = text.split(|c: char| c == '=' || c.is_whitespace()).next().unwrap_or_default();
+            format!("a CCSDS message ({name}), as array.oem takes them for orbits")
+        }
+        _ if text.starts_with(['{', '[']) => "JSON or TOML".to_owned(),
+        _ => "a text file".to_owned(),
+    })
+}
+
+/// Name of the first element of a document.
+fn root_of(text: &str) -> String {
+    let elements = text.split('<').skip(1).filter(|element| !element.starts_with(['?', '!']));
+    let name = |element: &str| {
+        element.chars().take_while(|c| c.is_alphanumeric() || "_-:".contains(*c)).take(40).collect()
+    };
+    elements.map(name).next().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::downlink::wire::cadu::SCIENCE;
+
+    fn frames(count: u32, bytes: usize) -> Vec<Vec<u8>> {
+        let frame = |count: u32| {
+            let channel = if count % 3 == 2 { IDLE } else { SCIENCE };
+            let number = if channel == IDLE { count / 3 } else { count - count / 3 };
+            let mut frame =
+                FrameHeader { spacecraft: 0x4C, channel, count: number, count_bits: 28 }.to_bytes().to_vec();
+            frame.extend((6..bytes).map(|k| (k as u32 * 7 + count) as u8));
+            frame
+        };
+        (0..count).map(frame).collect()
+    }
+
+    #[test]
+    fn frames_are_named_by_what_they_lack() {
+        let bare = frames(9, 1115).concat();
+        assert!(
+            name_of(&bare).unwrap().starts_with("AOS transfer frames of 1115 bytes without sync markers")
+        );
+        let marked = |of: fn(&mut [u8])| -> Vec<u8> {
+            let block = |mut frame: Vec<u8>| {
+                of(&mut frame);
+                [&SYNC_MARKER.to_be_bytes()[..], &frame].concat()
+            };
+            frames(9, 1115).into_iter().flat_map(block).collect()
+        };
+        let plain = name_of(&marked(|_| {})).unwrap();
+        assert!(plain.starts_with("CADUs of 1119 bytes whose blocks are not randomized"), "{plain}");
+        let no_parity = name_of(&marked(|frame| randomize(frame))).unwrap();
+        assert!(
+            no_parity.starts_with("randomized AOS frames of 1119 bytes with sync markers"),
+            "{no_parity}"
+        );
+        // Frames that are randomized may be sound: they are no reason to refuse a stream.
+        assert_eq!(frames_of(&marked(|frame| randomize(frame))), None);
+        // A stream may begin anywhere.
+        assert_eq!(name_of(&marked(|_| {})[500..]), Some(plain));
+    }
+
+    #[test]
+    fn files_of_other_kinds_have_names() {
+        let packet = |apid: u16, bytes: usize| {
+            let mut packet = (0x0800 | apid).to_be_bytes().to_vec();
+            packet.extend([0xC0, 0, 0, (bytes - 1) as u8]);
+            packet.extend(vec![0xA5; bytes]);
+            packet
+        };
+        let packets = [packet(0x2A1, 30), packet(0x2A2, 7), packet(0x2A1, 12)].concat();
+        for (head, name) in [
+            (&b"\x1f\x8b\x08\x00"[..], "gzip"),
+            (b"\x28\xb5\x2f\xfd\x04", "zstd"),
+            (b"\x89HDF\r\n\x1a\n\0", "HDF5"),
+            (b"SIMPLE  =                    T", "FITS"),
+            (b"\xef\xbb\xbf<?xml version=\"1.0\"?>\n<!-- x -->\n<ndm id=\"1\">", "an XML document (<ndm>)"),
+            (b"CCSDS_OEM_VERS = 2.0\n", "a CCSDS message (CCSDS_OEM_VERS)"),
+            (b"{\"a\": 1}", "JSON"),
+            (b"a,b,c\n1,2,3\n", "a text file"),
+            (&packets, "space packets of other APIDs: 0x2a1, 0x2a2"),
+        ] {
+            assert!(name_of(head).is_some_and(|found| found.contains(name)), "{name}: {:?}", name_of(head));
+        }
+        for unknown in [&[0; 600][..], &[0xFF; 600], b"", b"\x01"] {
+            assert_eq!(name_of(unknown), None);
+        }
+    }
+}

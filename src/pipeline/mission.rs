@@ -1,0 +1,149 @@
+//! The common run, step by step: a pipeline with some keys changed, simulated, replayed, or both.
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use super::config_source::ConfigSource;
+use super::cost::Segment;
+use super::error::PipelineError;
+use super::memory::MemoryLimit;
+use super::plan::Plan;
+use super::run::{replay, run, simulate, use_threads};
+use super::summary::RunSummary;
+use crate::downlink::FileSource;
+use crate::ground::{Ground, WAIT_BYTES};
+use crate::runtime::{Cancel, Report};
+
+/// A mission that is simulated, mapped, or both: a pipeline file, of which some keys are changed.
+///
+/// Keys are those of `pipelines/reference.toml`. Whatever is wrong with them is told when the mission is planned, all at once.
+///
+/// ```
+/// use lunarray::prelude::*;
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// # let folder = tempfile::tempdir()?;
+/// # let out = folder.path();
+/// let summary = Mission::dsl()
+///     .channels(&[3e6])
+///     .nside(4)
+///     .set("spacecraft.every_nth_integration", 15)
+///     .set("spacecraft.baseline_wavelengths_max", 16)
+///     .out(out)
+///     .run()?;
+/// let rho = summary.channels[0].rho.as_ref().ok_or("the generated sky is known")?;
+/// assert!(rho[4] > 0.9, "rho_4 = {}", rho[4]);
+/// assert!(out.join("3.000MHz/map.fits").exists());
+/// # Ok(())
+/// # }
+/// ```
+#[derive(Clone, Debug)]
+#[must_use]
+pub struct Mission {
+    source: ConfigSource,
+    out: Option<PathBuf>,
+    cancel: Cancel,
+}
+
+impl Mission {
+    /// The paper's array of eight satellites and its three channels of 1, 3 and 10 MHz over one precession of the orbit, thinned
+    /// to seconds or minutes of work: what `lunarray run` does without a file.
+    pub fn dsl() -> Self {
+        Self { source: ConfigSource::default(), out: None, cancel: Cancel::new() }
+    }
+
+    /// The mission of a pipeline file.
+    pub fn of_file(pipeline: impl Into<PathBuf>) -> Self {
+        let source = ConfigSource { file: Some(pipeline.into()), ..ConfigSource::default() };
+        Self { source, ..Self::dsl() }
+    }
+
+    /// Centre frequencies of the channels, Hz. Settings by channel follow the nearest channel of the pipeline.
+    pub fn channels(self, channels_hz: &[f64]) -> Self {
+        let listed: Vec<String> = channels_hz.iter().map(|hz| format!("{hz:e}")).collect();
+        self.set("spacecraft.channels_hz", format!("[{}]", listed.join(", ")))
+    }
+
+    /// Resolution of the maps: 12 nside^2 pixels.
+    pub fn nside(self, nside: usize) -> Self {
+        self.set("map.nside", nside)
+    }
+
+    /// Seed of all that is random; the same seed gives the same bytes.
+    pub fn seed(self, seed: u64) -> Self {
+        Self { source: ConfigSource { seed: Some(seed), ..self.source }, ..self }
+    }
+
+    /// Changes a key of the pipeline file, such as `("map.epsilon", 1e-4)` or `("map.snapshot_every_s", "30d")`.
+    pub fn set(mut self, key: &str, value: impl Display) -> Self {
+        self.source.overrides.push(format!("{key}={value}"));
+        self
+    }
+
+    /// Folder of the products; `out/NAME` without this.
+    pub fn out(self, folder: impl Into<PathBuf>) -> Self {
+        Self { out: Some(folder.into()), ..self }
+    }
+
+    /// Ends the run in order once this is cancelled, with products of the data so far.
+    pub fn cancelled_by(self, cancel: &Cancel) -> Self {
+        Self { cancel: cancel.clone(), ..self }
+    }
+
+    /// The settings, checked, with what follows from them.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the settings.
+    pub fn plan(&self) -> Result<Plan, PipelineError> {
+        let plan = Plan::new(self.source.load()?)?;
+        use_threads(&plan.config.runtime)?;
+        Ok(plan)
+    }
+
+    /// Simulates the mission and maps the sky: downlink, maps, pictures and `summary.json` are in the folder of products.
+    ///
+    /// # Errors
+    /// Wrong settings; more memory than the machine has; the first failure of any stage.
+    pub fn run(&self) -> Result<RunSummary, PipelineError> {
+        let plan = self.plan()?;
+        plan.cost().require_memory(Segment::Whole, MemoryLimit::of_machine())?;
+        run(&plan, &self.folder(&plan), &self.cancel, &mut |_| {})
+    }
+
+    /// Simulates the space segment alone, to a downlink file.
+    ///
+    /// # Errors
+    /// Wrong settings; the first failure of any stage.
+    ///
+    /// ```
+    /// use lunarray::prelude::*;
+    ///
+    /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+    /// # let folder = tempfile::tempdir()?;
+    /// let file = folder.path().join("mission.ccsds");
+    /// let mission = Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_integration", 30).out(folder.path());
+    /// mission.simulate(&file)?;
+    /// // The ground makes the maps of the bytes alone.
+    /// let summary = mission.replay(&[file])?;
+    /// assert_eq!(summary.ledger.accumulated, summary.channels[0].visibilities);
+    /// # Ok(())
+    /// # }
+    /// ```
+    pub fn simulate(&self, file: impl AsRef<Path>) -> Result<Report, PipelineError> {
+        simulate(&self.plan()?, &file, &self.cancel, &mut |_| {})
+    }
+
+    /// Maps downlink files, of this mission or another, with the settings of this one.
+    ///
+    /// # Errors
+    /// Wrong settings; a file that cannot be read; the first failure of any stage; no visibility for any map.
+    pub fn replay(&self, files: &[PathBuf]) -> Result<RunSummary, PipelineError> {
+        let plan = self.plan()?;
+        let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?;
+        replay(FileSource::open(files)?, &plan.config, ground, &self.folder(&plan), &self.cancel, &mut |_| {})
+    }
+
+    fn folder(&self, plan: &Plan) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| Path::new("out").join(&plan.config.name))
+    }
+}

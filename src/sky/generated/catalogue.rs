@@ -1,0 +1,439 @@
+//! Catalogues of point sources as they are published: tables of text with a line of names.
+
+use std::fmt;
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+use super::columns::{Columns, plain};
+use crate::sky::Frame;
+use crate::sky::frame::rotate;
+use crate::units::Dimension;
+use crate::units::vector::Vec3;
+
+/// Longest catalogue, bytes; lines of some 50.
+const BYTES_MAX: u64 = 256 << 20;
+
+/// Why a catalogue cannot be used.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum CatalogueError {
+    /// It cannot be read.
+    #[error("the catalogue {}: {source}", path.display())]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// It is no catalogue.
+    #[error("the catalogue {}, line {line}: found {found}, expected {expected}", path.display())]
+    Content {
+        /// Path.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+}
+
+/// A point source of a catalogue.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Source {
+    /// On ecliptic axes.
+    pub direction: Vec3,
+    pub flux_jy: f64,
+    /// Frequency of the flux, Hz.
+    pub at_hz: f64,
+    /// Its own spectral index; that of the section if the catalogue has none.
+    pub index: Option<f64>,
+}
+
+/// The sources of a catalogue, and how its columns were understood.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Catalogue {
+    pub sources: Vec<Source>,
+    path: PathBuf,
+    frame: Frame,
+    /// Names of the columns of flux and, if there is one, spectral index.
+    names: (String, Option<String>),
+    flux_unit: &'static str,
+}
+
+impl fmt::Display for Catalogue {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut hz: Vec<f64> = self.sources.iter().map(|source| source.at_hz).collect();
+        hz.sort_by(f64::total_cmp);
+        let at = match (hz.first(), hz.last()) {
+            (Some(&least), Some(&most)) if least == most => Dimension::Frequency.show(least),
+            (Some(&least), Some(&most)) => {
+                format!("{} to {}", Dimension::Frequency.show(least), Dimension::Frequency.show(most))
+            }
+            _ => "no frequency".to_owned(),
+        };
+        let (flux, index) = &self.names;
+        let own = self.sources.iter().filter(|source| source.index.is_some()).count();
+        let index = index.as_ref().map_or_else(
+            || "sky.generated.source_spectral_index for all".to_owned(),
+            |name| format!("spectral index `{name}` of {own}"),
+        );
+        let total: f64 = self.sources.iter().map(|source| source.flux_jy).sum();
+        write!(
+            f,
+            "{}: {} sources, {} positions, flux `{flux}` ({}) at {at}, {total:.4e} Jy together, {index}",
+            self.path.display(),
+            self.sources.len(),
+            self.frame,
+            self.flux_unit
+        )
+    }
+}
+
+impl Catalogue {
+    /// Reads a catalogue.
+    pub(super) fn read(path: &Path) -> Result<Self, CatalogueError> {
+        Reader { path }.read()
+    }
+}
+
+/// Lines of a table, and how they are cut into cells.
+struct Table<'a> {
+    names: Vec<String>,
+    units: Vec<String>,
+    rows: Vec<(usize, &'a str)>,
+    mark: char,
+}
+
+struct Reader<'a> {
+    path: &'a Path,
+}
+
+impl Reader<'_> {
+    fn wrong(&self, line: usize, found: impl Into<String>, expected: impl Into<String>) -> CatalogueError {
+        let (found, expected) = (found.into(), expected.into());
+        CatalogueError::Content { path: self.path.to_owned(), line, found, expected }
+    }
+
+    fn read(&self) -> Result<Catalogue, CatalogueError> {
+        let text = self.text()?;
+        let table = self.table(&text)?;
+        let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
+        let is_vlssr = comments.chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
+        let columns = Columns::of(&table.names, is_vlssr).map_err(|expected| {
+            let names: Vec<String> = table.names.iter().take(40).map(|name| shown(name)).collect();
+            let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
+            self.wrong(first, format!("the columns {}", names.join(", ")), expected)
+        })?;
+        let flux_unit = flux_unit(&table.names[columns.flux], &table.units[columns.flux])
+            .map_err(|found| self.wrong(1, found, "a flux density in Jy or mJy"))?;
+        let sources = table
+            .rows
+            .iter()
+            .map(|&(line, text)| self.source(line, &cells(text, table.mark), &columns, &table, flux_unit.1))
+            .collect::<Result<_, _>>()?;
+        let name = |place: usize| table.names[place].clone();
+        Ok(Catalogue {
+            sources,
+            path: self.path.to_owned(),
+            frame: columns.frame,
+            names: (name(columns.flux), columns.index.map(name)),
+            flux_unit: flux_unit.0,
+        })
+    }
+
+    /// The file's text. Names in other encodings than UTF-8 keep their numbers.
+    fn text(&self) -> Result<String, CatalogueError> {
+        let failed = |source| CatalogueError::Read { path: self.path.to_owned(), source };
+        let mut bytes = Vec::new();
+        let file = File::open(self.path).map_err(failed)?;
+        file.take(BYTES_MAX + 1).read_to_end(&mut bytes).map_err(failed)?;
+        let found = match bytes.as_slice() {
+            all if all.len() as u64 > BYTES_MAX => "more than 268 MB",
+            [0x1f, 0x8b, ..] => "a gzip file",
+            [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => "text in UTF-16",
+            all if all.starts_with(b"SIMPLE  =") => "a FITS file",
+            all if all.trim_ascii_start().starts_with(b"<") => "an XML document (VOTable)",
+            all if all.starts_with(b"PAR1") || all.starts_with(b"\x89HDF") => "a binary table",
+            _ => {
+                let text = String::from_utf8_lossy(&bytes);
+                return Ok(text.strip_prefix('\u{feff}').unwrap_or(&text).to_owned());
+            }
+        };
+        Err(self.wrong(1, found, "a table as plain text (CSV, TSV), at most 268 MB"))
+    }
+
+    /// Names, units and rows: the names are the first line, or the last comment before numbers.
+    fn table<'a>(&self, text: &'a str) -> Result<Table<'a>, CatalogueError> {
+        let mut comment = None;
+        let mut lines = text.lines().zip(1..).map(|(text, line)| (line, text)).filter(|(_, text)| {
+            let is_comment = text.trim_start().starts_with('#');
+            if is_comment {
+                comment = Some(text.trim_start().trim_start_matches('#').trim());
+            }
+            !is_comment && !text.trim().is_empty()
+        });
+        let first = lines.next();
+        let mut rest: Vec<(usize, &str)> = lines.collect();
+        let Some((line, first)) = first else {
+            return Err(self.wrong(1, "no columns", "a line of names, then a line a source"));
+        };
+        let mark = mark_of(first);
+        let is_data = |text: &str| cells(text, mark).iter().any(|cell| cell.parse::<f64>().is_ok());
+        let names = match (is_data(first), comment) {
+            (true, Some(comment)) => {
+                rest.insert(0, (line, first));
+                cells(comment, mark)
+            }
+            _ => cells(first, mark),
+        };
+        let is_rule = |text: &str| !text.is_empty() && text.chars().all(|c| "-=+| \t;,".contains(c));
+        let mut units = vec![String::new(); names.len()];
+        let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text, mark)));
+        if has_units {
+            let found = cells(rest.remove(0).1, mark);
+            units.iter_mut().zip(found).for_each(|(unit, found)| *unit = found);
+        }
+        rest.retain(|(_, text)| !is_rule(text));
+        Ok(Table { names, units, rows: rest, mark })
+    }
+
+    fn source(
+        &self,
+        line: usize,
+        cells: &[String],
+        columns: &Columns,
+        table: &Table<'_>,
+        flux_jy: f64,
+    ) -> Result<Source, CatalogueError> {
+        let cell = |place: usize| cells.get(place).map_or("", String::as_str);
+        let joined = |places: &[usize]| places.iter().map(|&place| cell(place)).collect::<Vec<_>>().join(" ");
+        let angle = |k: usize, expected: &str, most: f64| {
+            let text = joined(&columns.places[k]);
+            let unit = &table.units[columns.places[k][0]];
+            let is_hours = k == 0
+                && columns.frame == Frame::Equatorial
+                && (columns.places[k].len() > 1
+                    || is_sexagesimal(&text)
+                    || unit.to_ascii_lowercase().starts_with('h'));
+            let degrees = angle_of(&text).map(|value| if is_hours { 15.0 * value } else { value });
+            let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= most);
+            found.ok_or_else(|| self.wrong(line, format!("`{}`", shown(&text)), expected))
+        };
+        let lon = angle(0, "a longitude: degrees, or hours, minutes and seconds", 360.0)?.to_radians();
+        let lat = angle(1, "a latitude of -90 to 90 degrees", 90.0)?.to_radians();
+        let number = |place: usize, expected: &str, good: fn(f64) -> bool| {
+            let value = number_of(cell(place), table.mark).filter(|value| good(*value));
+            value.ok_or_else(|| self.wrong(line, format!("`{}`", shown(cell(place))), expected))
+        };
+        let flux = number(columns.flux, "a flux density above 0", |flux| flux > 0.0)?;
+        let at_hz = match columns.frequency_place {
+            None => columns.flux_hz,
+            Some((place, unit)) => unit * number(place, "a frequency above 0", |value| value > 0.0)?,
+        };
+        let index = match columns.index {
+            // Sources that are not fitted have none.
+            Some(place) if !is_blank(cell(place)) => {
+                Some(number(place, "a spectral index of -10 to 10", |index| index.abs() <= 10.0)?)
+            }
+            _ => None,
+        };
+        let own = [lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()];
+        let direction = match columns.frame {
+            Frame::Ecliptic => own,
+            frame => rotate(&frame.to_ecliptic(), own),
+        };
+        Ok(Source { direction, flux_jy: flux_jy * flux, at_hz, index })
+    }
+}
+
+/// A cell as it is shown: short, and without control characters.
+fn shown(cell: &str) -> String {
+    cell.chars().take(40).collect::<String>().escape_debug().to_string()
+}
+
+/// What divides the cells of a line: the first of these that occurs, or blanks.
+fn mark_of(line: &str) -> char {
+    ['\t', ';', '|', ','].into_iter().find(|mark| line.contains(*mark)).unwrap_or(' ')
+}
+
+/// The cells of a line; one in quotes may hold the mark, and a doubled quote is one.
+fn cells(line: &str, mark: char) -> Vec<String> {
+    if mark == ' ' {
+        return line.split_whitespace().map(|cell| cell.trim_matches('"').to_owned()).collect();
+    }
+    let (mut cells, mut cell, mut quoted) = (Vec::new(), String::new(), false);
+    let mut letters = line.chars().peekable();
+    while let Some(c) = letters.next() {
+        match c {
+            '"' if quoted && letters.peek() == Some(&'"') => {
+                letters.next();
+                cell.push('"');
+            }
+            '"' if quoted => quoted = false,
+            // A quote within a cell, as of inches and arcseconds, is one.
+            '"' if cell.trim().is_empty() => quoted = true,
+            c if c == mark && !quoted => cells.push(std::mem::take(&mut cell)),
+            c => cell.push(c),
+        }
+    }
+    cells.push(cell);
+    cells.into_iter().map(|cell| cell.trim().to_owned()).collect()
+}
+
+/// Whether a row holds units: no numbers, and at least one unit of what a catalogue has.
+fn is_unit_row(cells: &[String]) -> bool {
+    let units = ["deg", "jy", "mjy", "h:m:s", "d:m:s", "h m s", "d m s", "hms", "hourangle", "hours"];
+    let plain = |cell: &String| cell.trim_matches(['"', '\'', '(', ')', '[', ']']).to_ascii_lowercase();
+    cells.iter().all(|cell| cell.parse::<f64>().is_err())
+        && cells.iter().any(|cell| units.contains(&plain(cell).as_str()))
+}
+
+/// The unit of fluxes by the name of their column or the row of units, and how many Jy it is.
+fn flux_unit(name: &str, unit: &str) -> Result<(&'static str, f64), String> {
+    let bracketed = name.split_once(['(', '[']).map_or("", |(_, unit)| unit.trim_end_matches([')', ']']));
+    let unit = if unit.is_empty() { bracketed } else { unit };
+    let plain_name = plain(name);
+    match unit.trim().to_ascii_lowercase().as_str() {
+        "mjy" => Ok(("mJy", 1e-3)),
+        "jy" => Ok(("Jy", 1.0)),
+        "" if plain_name.ends_with("mjy") => Ok(("mJy", 1e-3)),
+        "" => Ok(("Jy", 1.0)),
+        other => Err(format!("the unit `{}` of `{}`", shown(other), shown(name))),
+    }
+}
+
+fn is_blank(cell: &str) -> bool {
+    let cell = cell.to_ascii_lowercase();
+    ["", "nan", "--", "-", "null", "none", "n/a"].contains(&cell.as_str())
+}
+
+/// A finite number; with semicolons between cells a comma may be its point.
+fn number_of(cell: &str, mark: char) -> Option<f64> {
+    let pointed = if mark == ';' { cell.replace(',', ".") } else { cell.to_owned() };
+    pointed.parse().ok().filter(|value: &f64| value.is_finite())
+}
+
+fn is_sexagesimal(text: &str) -> bool {
+    angle_parts(text).len() > 1
+}
+
+/// The numbers of an angle, between colons, blanks or the letters and signs of units.
+fn angle_parts(text: &str) -> Vec<&str> {
+    let signs = |c: char| c.is_whitespace() || ":hdms\u{b0}'\"\u{2032}\u{2033}".contains(c);
+    text.split(signs).filter(|part| !part.is_empty()).collect()
+}
+
+/// An angle of one number, or of up to three with minutes and seconds, in units of the first.
+fn angle_of(text: &str) -> Option<f64> {
+    let text = text.trim().replace('\u{2212}', "-").replace(',', ".");
+    let (sign, rest) = match text.strip_prefix(['-', '+']) {
+        Some(rest) if text.starts_with('-') => (-1.0, rest),
+        Some(rest) => (1.0, rest),
+        None => (1.0, text.as_str()),
+    };
+    let numbers: Vec<f64> = angle_parts(rest).iter().map(|part| part.parse().ok()).collect::<Option<_>>()?;
+    match numbers[..] {
+        [whole] => Some(sign * whole),
+        [whole, ref parts @ ..] if parts.len() <= 2 && whole >= 0.0 => {
+            let good = parts.iter().all(|part| (0.0..60.0).contains(part));
+            let minutes = parts.iter().rev().fold(0.0, |sum, part| (sum + part) / 60.0);
+            good.then_some(sign * (whole + minutes))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(text: &[u8]) -> tempfile::NamedTempFile {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        file
+    }
+
+    /// Ecliptic longitude and latitude, degrees.
+    fn place(source: &Source) -> [f64; 2] {
+        let [x, y, z] = source.direction;
+        [y.atan2(x).to_degrees().rem_euclid(360.0), z.asin().to_degrees()]
+    }
+
+    #[test]
+    fn positions_of_all_frames_are_one_place() {
+        // Cassiopeia A: RA 23h23m26s, Dec +58d48m (FK5), by astropy in the other frames.
+        let (galactic, ecliptic) = ([111.733_805_2, -2.145_148_7], [27.366_809_7, 54.837_230_0]);
+        let tables = [
+            "name,ra,dec,S74\nCas A,350.85833,58.8000,17690\n".to_owned(),
+            "\u{feff}Name;RAJ2000;DEJ2000;S74\n\"Cas A\";23:23:26.0;+58:48:00;17690\n".to_owned(),
+            "#RA (J2000)\n#\n#Name\tRAJ2000\tDEJ2000\tS74\nCas A\t23 23 26.0\t+58 48 00\t17690\n".to_owned(),
+            "Name|RAJ2000|DEJ2000|S74\n|\"h:m:s\"|\"d:m:s\"|mJy\n-----|----|----|----\nCas A|23h23m26s|58d48m|17690000\n".to_owned(),
+            "RAh,RAm,RAs,DE-,DEd,DEm,DEs,S74\n23,23,26,+,58,48,0,17690\n".to_owned(),
+            format!("GLON,GLAT,flux_74_mhz\n{},{},17690\n", galactic[0], galactic[1]),
+            format!("elon elat S74\n{} {} 17690\n", ecliptic[0], ecliptic[1]),
+            "ra;dec;S74\n350,85833;58,8;17690\n".to_owned(),
+        ];
+        for table in &tables {
+            let read = Catalogue::read(file(table.as_bytes()).path()).unwrap();
+            let [source] = read.sources[..] else { panic!("{table}") };
+            assert!((source.flux_jy / 17_690.0 - 1.0).abs() < 1e-12 && source.at_hz == 74e6, "{table}");
+            let found = place(&source);
+            // Right ascensions in the tables have four digits of a degree.
+            let apart = (found[0] - ecliptic[0]).abs().max((found[1] - ecliptic[1]).abs());
+            assert!(apart < 1e-4, "{table}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn sources_that_are_not_fitted_have_the_common_index() {
+        let table = "GLEAM,RAJ2000,DEJ2000,Fintwide,Fint076,alpha\nA,10,-20,1.5,2,-0.7\nB,11,-21,0.5,1,\nC,12,-22,0.4,1,NaN\n";
+        let read = Catalogue::read(file(table.as_bytes()).path()).unwrap();
+        let indices: Vec<_> = read.sources.iter().map(|source| source.index).collect();
+        assert_eq!(indices, [Some(-0.7), None, None]);
+        assert!(read.sources.iter().all(|source| source.at_hz == 200e6));
+        let said = read.to_string();
+        for part in ["3 sources", "equatorial", "`Fintwide` (Jy) at 200", "2.4000e0 Jy", "`alpha` of 1"] {
+            assert!(said.contains(part), "{part}: {said}");
+        }
+    }
+
+    #[test]
+    fn a_flux_is_of_its_row_s_frequency() {
+        for flux in ["flux_mjy", "flux (mJy)", "S [mJy]"] {
+            let table = format!("l,b,{flux},frequency_mhz\n1,2,300,151\n1,2,400,408\n");
+            let read = Catalogue::read(file(table.as_bytes()).path()).unwrap();
+            let found: Vec<_> = read.sources.iter().map(|one| (one.flux_jy, one.at_hz)).collect();
+            assert_eq!(found, [(0.3, 151e6), (0.4, 408e6)], "{flux}");
+        }
+    }
+
+    #[test]
+    fn catalogues_that_are_none_say_where() {
+        let said = |text: &[u8]| Catalogue::read(file(text).path()).unwrap_err().to_string();
+        let head = "ecliptic_longitude_deg,ecliptic_latitude_deg,flux_154mhz_jy";
+        let found = said(b"a,b\n1,2");
+        assert!(found.contains("line 1: found the columns a, b, expected columns of longitude"), "{found}");
+        assert!(said(b"").contains("no columns"));
+        assert!(said(b"\x1f\x8b\x08").contains("gzip"));
+        assert!(said(b"<?xml version='1.0'?><VOTABLE/>").contains("VOTable"));
+        assert!(said(b"ra,dec,S74 (K)\n1,2,3\n").contains("the unit `k` of `S74 (K)`"));
+        for (row, words) in [
+            ("1,2,x", "found `x`, expected a flux density"),
+            ("1,2,-3", "above 0"),
+            ("1,91,3", "-90 to 90"),
+            ("NaN,1,3", "a longitude"),
+            ("1,2", "found ``"),
+            ("10:61:00,2,3", "a longitude"),
+        ] {
+            let found = said(format!("{head}\n0,0,1\n{row}\n").as_bytes());
+            assert!(found.contains("line 3") && found.contains(words), "{found}");
+        }
+        assert!(matches!(Catalogue::read(Path::new("/nowhere/x.csv")), Err(CatalogueError::Read { .. })));
+    }
+}
