@@ -80,7 +80,7 @@ impl NativeArray {
     /// The mission's epoch: TAI seconds since 1958-01-01.
     #[getter]
     fn epoch_tai_s(&self) -> f64 {
-        self.config.spacecraft.epoch_tai_s
+        self.config.epoch_tai_s(&self.array)
     }
 
     #[getter]

@@ -187,6 +187,7 @@ impl Array {
     ///
     /// # Errors
     /// [`ArrayError::NotKnown`] beyond [`Self::known_s`].
+    #[doc(hidden)]
     pub fn require_known(&self, t_s: f64) -> Result<(), ArrayError> {
         match self.known_s() {
             // Dates of files are to a microsecond.
@@ -198,12 +199,14 @@ impl Array {
     }
 
     /// Epoch of a mission whose orbits have dates: TAI seconds since 1958-01-01; `None` if the configuration is to say.
+    #[doc(hidden)]
     #[must_use]
     pub fn epoch_tai_s(&self) -> Option<f64> {
         self.epoch.map(Tai::from_1958)
     }
 
     /// What files of orbits hold and is not used.
+    #[doc(hidden)]
     #[must_use]
     pub fn notes(&self) -> &[String] {
         &self.notes
@@ -409,6 +412,7 @@ impl Array {
     }
 
     /// Direction of the Sun from the Moon's centre (to 0.002 degrees from 2020 to 2040); `None` without dates.
+    #[doc(hidden)]
     #[must_use]
     pub fn sun_hat(&self, t_s: f64) -> Option<Vec3> {
         match &self.earth {

@@ -77,7 +77,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     } else {
         let files: String = files.iter().map(|line| format!("{line}\n")).collect();
         let mission = format!("epoch {epoch_utc} UTC; the Earth is {earth}");
-        print_text(&format!("{}: no problems\n{mission}\n{files}\n{cost}", source.origin()))?;
+        print_text(&format!("{}: no problems\n{files}{mission}\n\n{cost}", source.origin()))?;
         if let Some(groups) = found {
             print_text(&format!("{groups}\nMemory above is that of all channels at once."))?;
         }

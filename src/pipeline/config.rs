@@ -116,6 +116,7 @@ impl Config {
     }
 
     /// Epoch of the mission, TAI seconds since 1958-01-01: that of the orbits, where they have dates.
+    #[doc(hidden)]
     #[must_use]
     pub fn epoch_tai_s(&self, array: &Array) -> f64 {
         array.epoch_tai_s().unwrap_or(self.spacecraft.epoch_tai_s)

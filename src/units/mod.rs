@@ -17,6 +17,7 @@ mod random;
 mod reason;
 mod text;
 mod time;
+#[doc(hidden)]
 pub mod time_scales;
 pub mod vector;
 

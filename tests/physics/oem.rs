@@ -433,7 +433,7 @@ fn files_are_read_as_others_write_them() {
     same(&|u| xml(u, "km").into_bytes());
     let refused =
         |text: String| array_of(folder.path(), |_| text.clone().into_bytes()).unwrap_err().to_string();
-    assert!(refused(xml(1e-3, "m")).contains("line 13: found X in \"m\"; expected units=\"km\""));
+    assert!(refused(xml(1e-3, "m")).contains("line 12: found X in \"m\"; expected units=\"km\""));
     assert!(
         refused(xml(1e-3, "km").replace("UTC", "SCLK")).contains("line 9: found SCLK; expected TIME_SYSTEM")
     );
