@@ -462,6 +462,18 @@ impl Drop for FolderLock {
     }
 }
 
+/// Room and size of the disk that a folder is on, bytes; `None` if the system does not tell.
+#[must_use]
+pub fn disk_room(folder: &Path) -> Option<[u64; 2]> {
+    #[cfg(unix)]
+    return rustix::fs::statvfs(folder).ok().map(|found| {
+        let bytes = |blocks: u64| blocks.saturating_mul(found.f_frsize);
+        [bytes(found.f_bavail), bytes(found.f_blocks)]
+    });
+    #[cfg(not(unix))]
+    return folder.file_name().and(None);
+}
+
 /// Whether `path` leads to an open file.
 pub fn is_at(file: &File, path: &Path) -> bool {
     let found = file.metadata().and_then(|here| Ok((here, fs::metadata(path)?)));

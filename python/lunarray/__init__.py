@@ -6,6 +6,9 @@ axes (x to ecliptic longitude 0, z to the north ecliptic pole). Satellites are c
 
     V_ij = sum over pixels of T A S_i S_j exp(-2 pi i (nu / c) n . (r_i - r_j)) dOmega    (K sr)
 
+Quantities of astropy are converted to these units, its ``Time`` to seconds since the epoch; masked values, complex skies and ``datetime64``, which
+does not say whether it is UTC or TAI, are refused.
+
 Settings are those of pipeline files (``pipelines/reference.toml`` has all); ``set={"map.nside": 8}`` replaces some of them.
 Work that takes time releases the interpreter's lock and ends in order on Ctrl-C.
 """

@@ -101,6 +101,16 @@ class Downlink:
 
         return write_uvh5(self, path, channel, phase_centre)
 
+    def write_calh5(self, path: str | PathLike[str], solutions: str | PathLike[str]) -> int:
+        """Writes gains of ``solutions.csv`` as calh5, which pyuvdata's ``UVCal`` reads; returns the number of solutions.
+
+        The downlink is the one that was calibrated. Gains that are not good are flagged; stated deviations and states are in the
+        file's group ``lunarray``. Needs h5py and pyuvdata (``pip install lunarray[uvh5]``).
+        """
+        from ._calh5 import write_calh5
+
+        return write_calh5(self, path, solutions)
+
     def write_parquet(self, path: str | PathLike[str], channel: int = 0) -> int:
         """Writes the visibilities of a channel as Parquet, flagged ones too; returns their number.
 

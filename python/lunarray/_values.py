@@ -124,7 +124,7 @@ def _since(time: Any, epoch_tai_s: float | None, what: str) -> NDArray[np.float6
     days = (np.asarray(tai.jd1) - 2436204.5) + np.asarray(tai.jd2)
     whole = np.floor(days)
     rest = (np.asarray(tai.jd1) - 2436204.5 - whole) + np.asarray(tai.jd2)
-    return np.ascontiguousarray((whole * 86_400.0 - epoch_tai_s) + rest * 86_400.0)
+    return np.asarray((whole * 86_400.0 - epoch_tai_s) + rest * 86_400.0, dtype=float)
 
 
 def hertz(frequency: Any) -> float:

@@ -18,7 +18,7 @@ def needed(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise ImportError(f"{error}: pip install 'lunarray[{extra}]' brings {module}", name=module) from error
+        raise ImportError(f"{error}: pip install 'lunarray[{extra}]' brings {module.split('.')[0]}", name=module) from error
 
 
 @contextmanager

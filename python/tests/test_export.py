@@ -111,7 +111,7 @@ def test_uvh5_has_the_weights(small, tmp_path):
     downlink.write_uvh5(tmp_path / "v.uvh5", 0)
     data = UVData.from_file(tmp_path / "v.uvh5", run_check=False)
     rows = downlink.visibilities(0)
-    rows = rows[rows["flag"] == 0]
+    rows = rows[(rows["flag"] == 0) & np.isfinite(rows["uvw_m"][:, 0])]
     rows = rows[np.argsort(rows["time_s"], kind="stable")]
     ratio = data.nsample_array[:, 0, 0] * data.integration_time / rows["weight"]
     # Single precision, twice.
@@ -354,3 +354,51 @@ def test_hips_tiles_have_the_values_of_the_map(tmp_path, frame):
     assert picture[bright][:, :3].mean() > picture[~bright & ~np.isnan(data)][:, :3].mean() + 20
     again = export("hips", tmp_path / "map.fits", "--out", tmp_path / "hips")
     assert again.returncode == 1 and "expected a new or empty folder" in again.stderr
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_calh5_has_the_gains_times_and_flags_of_solutions(tmp_path):
+    """What pyuvdata reads is what the table says, by daughter, channel and solution."""
+    from types import SimpleNamespace
+
+    import h5py
+    from pyuvdata import UVCal
+
+    from lunarray._calh5 import write_calh5
+
+    header = (
+        "pass,from_s,until_s,daughter,frequency_hz,amplitude,ln_amplitude_sigma,phase_deg,phase_sigma_deg,visibilities,outliers,"
+        "chi_square,state,phase_scatter_deg,unexplained,reference"
+    )
+    gains = {}
+    lines = [header]
+    for time, (from_s, until_s) in enumerate([(100.0, 2800.0), (8358.0, 9000.0), (9000.0, 11000.0)]):
+        for daughter in (1, 2, 3):
+            for channel, hz in enumerate((3000000.0, 10000000.0)):
+                amplitude, phase_deg = 1 + 0.1 * daughter + 0.01 * time, 20.0 * daughter * (channel + 1) - 30 * time
+                state = "dead" if (daughter, time) == (3, 1) else "good"
+                gains[daughter, channel, time] = amplitude * np.exp(1j * np.radians(phase_deg)), state
+                lines.append(f"{time},{from_s},{until_s},{daughter},{hz},{amplitude},0.01,{phase_deg},0.5,9,0,1.02,{state},0.3,0.04,1")
+    (tmp_path / "solutions.csv").write_text("\n".join(lines) + "\n")
+    downlink = SimpleNamespace(
+        path="small.ccsds",
+        channels_hz=[3e6, 10e6],
+        satellites=3,
+        instrument={"name": "small", "epoch_tai_s": 2.3e9, "widths_hz": [8e3, 8e3]},
+        ephemeris=lambda _: 1e6 * np.eye(3),
+    )
+    assert write_calh5(downlink, tmp_path / "gains.calh5", tmp_path / "solutions.csv") == 3
+    found = UVCal.from_file(tmp_path / "gains.calh5")
+    assert found.check() and found.gain_convention == "divide" and found.ref_antenna_name == "1"
+    assert found.gain_array.shape == (3, 2, 3, 1)
+    for (daughter, channel, time), (gain, state) in gains.items():
+        assert abs(found.gain_array[daughter - 1, channel, time, 0] - gain) < 1e-12
+        assert found.flag_array[daughter - 1, channel, time, 0] == (state != "good")
+    # Julian days have a resolution of 40 us.
+    np.testing.assert_allclose(np.diff(found.time_range, axis=1)[:, 0] * 86400, [2700, 642, 2000], atol=1e-3)
+    with h5py.File(tmp_path / "gains.calh5") as file:
+        np.testing.assert_allclose(file["lunarray/phase_sigma_deg"], 0.5)
+        assert file["lunarray/state"][2, 0, 1] == b"dead"
+    (tmp_path / "solutions.csv").write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(lunarray.Error, match="a line for each solution"):
+        write_calh5(downlink, tmp_path / "gains.calh5", tmp_path / "solutions.csv")

@@ -24,7 +24,7 @@ def shown_in_a_terminal(folder, progress):
     import pty
 
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-c", RUN.format(progress), folder]
+    command = [sys.executable, "-W", "ignore", "-c", RUN.format(progress), folder]
     with subprocess.Popen(command, stderr=theirs, stdout=subprocess.DEVNULL) as process:
         os.close(theirs)
         shown = b""
@@ -46,13 +46,13 @@ def shown_in_a_terminal(folder, progress):
 def test_a_terminal_shows_a_line_and_takes_it_away(tmp_path):
     shown = shown_in_a_terminal(tmp_path / "shown", None)
     lines = shown.split("\r\x1b[K")
-    assert len(lines) > 2 and " windows" in lines[1] and " visibilities" in shown and lines[-1] == ""
+    assert len(lines) > 2 and " windows" in lines[1] and "integrate " in shown and lines[-1] == ""
     assert max(map(len, lines)) <= 80
     assert shown_in_a_terminal(tmp_path / "not", False) == ""
 
 
 def test_what_is_no_terminal_is_shown_nothing(tmp_path):
-    command = [sys.executable, "-c", RUN.format(None), tmp_path]
+    command = [sys.executable, "-W", "ignore", "-c", RUN.format(None), tmp_path]
     told = subprocess.run(command, capture_output=True, text=True)
     assert (told.returncode, told.stdout, told.stderr) == (0, "", "")
 

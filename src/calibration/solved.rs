@@ -34,6 +34,8 @@ impl ClosedPass {
                 && solution.normal_hat.len() == satellites
                 && solution.daughters.iter().all(|daughter| daughter.gains.len() == channels)
                 && solution.outlier_parts.is_of(channels)
+                && solution.model_error.len() == channels
+                && (1..=satellites).contains(&(solution.reference as usize))
         };
         self.span_s.iter().all(|time_s| time_s.is_finite())
             && self.span_s[0] <= self.span_s[1]

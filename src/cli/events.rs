@@ -11,7 +11,9 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use clap::Args;
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use serde::Serialize;
+use serde_json::json;
 
+use super::log::{Level, is_json, note, say, say_entry};
 use super::output::{CommandError, json_text, print_notes};
 use crate::calibration::solver::InstrumentEvent;
 use crate::downlink::ReceptionCounters;
@@ -173,6 +175,19 @@ struct MapEntry {
     figures: SnapshotSummary,
 }
 
+impl MapEntry {
+    fn of(map: PublishedMap<'_>) -> Self {
+        let PublishedMap { solution, figures, .. } = map;
+        let index = usize::from(solution.channel.0);
+        Self {
+            channel: solution.channel.0,
+            frequency_hz: solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz),
+            is_final: solution.is_final,
+            figures: figures.clone(),
+        }
+    }
+}
+
 #[derive(Debug, Serialize)]
 struct End {
     /// `complete`, `cancelled` or `failed`.
@@ -212,7 +227,7 @@ impl EventWriter {
         let (messages, received) = bounded(WAITING_MAX);
         let (is_alive, over) = bounded(0);
         let untold = Arc::new(AtomicU64::new(0));
-        let lines = Lines { out, since: Instant::now() };
+        let lines = Lines { out, since: Instant::now(), failed: 0 };
         let counted = Arc::clone(&untold);
         std::thread::spawn(move || {
             write_events(lines, &name, segment, &received, &counted);
@@ -246,14 +261,7 @@ struct EventViewer {
 
 impl MapViewer for EventViewer {
     fn view(&self, map: PublishedMap<'_>) {
-        let PublishedMap { solution, figures, .. } = map;
-        let index = usize::from(solution.channel.0);
-        let entry = MapEntry {
-            channel: solution.channel.0,
-            frequency_hz: solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz),
-            is_final: solution.is_final,
-            figures: figures.clone(),
-        };
+        let entry = MapEntry::of(map);
         if self.messages.try_send(Message::Map(entry)).is_err() {
             self.untold.fetch_add(1, Ordering::Relaxed);
         }
@@ -264,6 +272,8 @@ impl MapViewer for EventViewer {
 struct Lines {
     out: Box<dyn Write + Send>,
     since: Instant,
+    /// Lines that could not be written since the last one that could.
+    failed: u64,
 }
 
 impl Lines {
@@ -272,8 +282,34 @@ impl Lines {
         let unix_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
         let line = EventLine { unix_s, elapsed_s: self.since.elapsed().as_secs_f64(), entry };
         let text = json_text(&line).map_err(std::io::Error::other)?;
-        self.out.write_all(format!("{text}\n").as_bytes())?;
-        self.out.flush()
+        // After a line that was cut off another begins.
+        let before = if self.failed > 0 { "\n" } else { "" };
+        let written =
+            self.out.write_all(format!("{before}{text}\n").as_bytes()).and_then(|()| self.out.flush());
+        match written {
+            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => return Err(error),
+            Err(error) => {
+                self.failed += 1;
+                if self.failed == 1 {
+                    let fields = json!({ "unwritten": error.to_string() });
+                    note(
+                        "events",
+                        &fields,
+                        format_args!("events cannot be written: {error}; the run goes on"),
+                    );
+                }
+            }
+            Ok(()) if self.failed > 0 => {
+                let failed = std::mem::take(&mut self.failed);
+                say(
+                    "events",
+                    &json!({ "failed": failed }),
+                    format_args!("events are written again; {failed} lines are missing"),
+                );
+            }
+            Ok(()) => {}
+        }
+        Ok(())
     }
 }
 
@@ -372,6 +408,78 @@ fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<
         senders: watched.listening.as_ref().map(|listening| listening.status.open()),
         solving,
         untold,
+    }
+}
+
+/// What the log has been told of a run.
+#[derive(Default)]
+pub(super) struct LogTold {
+    told: Told,
+    products: Option<String>,
+    archive: Option<String>,
+}
+
+impl LogTold {
+    /// Says what has happened since the last time: troubles and their ends; for programs everything that `--events` has.
+    pub(super) fn tell(&mut self, watched: &Watched) {
+        let stages = watched.metrics.snapshot();
+        self.told.ended.resize(stages.len(), false);
+        for (was, stage) in self.told.ended.iter_mut().zip(&stages) {
+            if stage.ended && !std::mem::replace(was, true) && is_json() {
+                say_entry(Level::Info, &Entry::StageEnded { stage: &stage.name }, None);
+            }
+        }
+        if let Some(saving) = watched.ground.as_ref().and_then(|ground| ground.saving.report()) {
+            self.tell_saving(saving);
+        }
+        if let Some(products) = &watched.products {
+            let now = products.report().unwritten;
+            tell_trouble("products", "maps", &mut self.products, now);
+        }
+        let archive = watched.listening.as_ref().and_then(|listening| listening.archive.as_ref());
+        if let Some(archive) = archive {
+            let now = archive.report().unwritten;
+            tell_trouble("archive", "the raw archive, and nothing is taken: packets", &mut self.archive, now);
+        }
+    }
+
+    fn tell_saving(&mut self, saving: SavingReport) {
+        let before = std::mem::replace(&mut self.told.saving, saving);
+        let now = &self.told.saving;
+        if (before.written, before.failed) == (now.written, now.failed) {
+            return;
+        }
+        let level = if now.unsaved.is_some() { Level::Warn } else { Level::Info };
+        if is_json() {
+            return say_entry(level, &Entry::Checkpoint { saving: now.clone() }, Some(&now.to_string()));
+        }
+        match (&before.unsaved, &now.unsaved) {
+            (None, Some(_)) | (Some(_), None) => print_notes([now.to_string()]),
+            _ => {}
+        }
+    }
+}
+
+/// Says that something cannot be written, and when it can be again.
+fn tell_trouble(event: &str, what: &str, before: &mut Option<String>, now: Option<String>) {
+    match (&before, &now) {
+        (None, Some(reason)) => {
+            note(event, &json!({ "unwritten": reason }), format_args!("{what} cannot be written: {reason}"));
+        }
+        (Some(_), None) => {
+            say(event, &json!({ "unwritten": null }), format_args!("{what} are written again"))
+        }
+        _ => {}
+    }
+    *before = now;
+}
+
+/// Sees maps for the log of programs.
+pub(super) struct LogViewer;
+
+impl MapViewer for LogViewer {
+    fn view(&self, map: PublishedMap<'_>) {
+        say_entry(Level::Info, &Entry::Map(MapEntry::of(map)), None);
     }
 }
 

@@ -30,6 +30,9 @@ pub(super) struct GapsArgs {
     /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]
     most: usize,
+    /// Fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many percent; for scripts.
+    #[arg(long, value_name = "any|PERCENT", value_parser = fail_if)]
+    fail_if: Option<FailIf>,
     /// Write a picture (PNG) of integration time over mission time, channel by channel.
     #[arg(long, value_name = "FILE.png")]
     picture: Option<PathBuf>,
@@ -51,7 +54,35 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     } else {
         print_text(table(&gaps, args.most).trim_end())?;
     }
-    Ok(Completion::Done)
+    let packets: u64 = gaps.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
+    let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>();
+    match args.fail_if {
+        Some(FailIf::Any) if packets > 0 => {
+            Err(format!("{packets} packets are missing; expected none").into())
+        }
+        Some(FailIf::Above(most)) if adds > most => {
+            Err(format!("the {packets} missing packets would add {adds:.4} %; expected at most {most} %")
+                .into())
+        }
+        _ => Ok(Completion::Done),
+    }
+}
+
+/// What is too much.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum FailIf {
+    /// Anything.
+    Any,
+    /// More than so many percent.
+    Above(f64),
+}
+
+fn fail_if(text: &str) -> Result<FailIf, String> {
+    match (text, text.trim_end_matches('%').trim().parse::<f64>()) {
+        ("any", _) => Ok(FailIf::Any),
+        (_, Ok(percent)) if (0.0..1e9).contains(&percent) => Ok(FailIf::Above(percent)),
+        _ => Err("expected any, or a percentage of at least 0".into()),
+    }
 }
 
 fn table(gaps: &Gaps, most: usize) -> String {

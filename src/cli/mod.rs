@@ -5,6 +5,7 @@
 
 mod arguments;
 mod bench;
+mod bound;
 mod calibrate;
 mod check;
 mod compare;
@@ -15,6 +16,7 @@ mod documented;
 mod events;
 mod explain;
 mod export;
+mod extract;
 mod figure;
 mod gaps;
 mod geometry;
@@ -30,6 +32,7 @@ mod output;
 mod predict;
 mod printable_text;
 mod progress;
+mod rebuild;
 mod recalibrate;
 mod replay;
 mod retract;
@@ -54,6 +57,10 @@ use serde_json::Value;
 
 use log::{Level, LogFormat};
 use output::{Completion, is_broken_pipe, print_error};
+
+use crate::ground::GroundError;
+use crate::pipeline::{ConfigError, PipelineError};
+use crate::units::InvalidValue;
 
 /// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
 ///
@@ -95,8 +102,10 @@ enum Command {
     Inspect(inspect::InspectArgs),
     Corrupt(corrupt::CorruptArgs),
     Export(export::ExportArgs),
+    Extract(extract::ExtractArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
+    Rebuild(rebuild::RebuildArgs),
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
     Compare(compare::CompareArgs),
@@ -104,6 +113,7 @@ enum Command {
     Figure(figure::FigureArgs),
     Cutout(cutout::CutoutArgs),
     Calibrate(calibrate::CalibrateArgs),
+    Bound(bound::BoundArgs),
     Predict(predict::PredictArgs),
     Check(check::CheckArgs),
     Bench(bench::BenchArgs),
@@ -121,12 +131,72 @@ fn asks_for_json(words: &[OsString]) -> bool {
     words.windows(2).any(is_option) || words.iter().any(|word| word == "--log=json")
 }
 
-/// Exit code of a failure.
+/// Exit code of a failure: of the data, or any other.
 const FAILED: u8 = 1;
+
+/// Exit code of a configuration that cannot be used, as of wrong usage: to start again is of no use.
+const MISCONFIGURED: u8 = 2;
+
+/// Exit code of what the system refused: a disk, a socket, a lock, memory.
+const SYSTEM: u8 = 3;
+
+/// The code that says of which sort a failure is.
+fn exit_code(error: &(dyn std::error::Error + 'static)) -> u8 {
+    let causes = || std::iter::successors(Some(error), |error| error.source());
+    if causes().any(is_configuration) {
+        return MISCONFIGURED;
+    }
+    match causes().any(is_of_system) {
+        true => SYSTEM,
+        false => FAILED,
+    }
+}
+
+fn is_configuration(error: &(dyn std::error::Error + 'static)) -> bool {
+    let is_of_ground = |error: &GroundError| {
+        use GroundError::{FilesOfState, MergedIntoPart, NamedTwice, Occupied, Settings};
+        matches!(
+            error,
+            Settings { .. }
+                | FilesOfState { .. }
+                | Occupied { .. }
+                | NamedTwice { .. }
+                | MergedIntoPart { .. }
+        )
+    };
+    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+        PipelineError::Config(_) | PipelineError::Invalid(_) => true,
+        PipelineError::Ground(error) => is_of_ground(error),
+        _ => false,
+    });
+    of_pipeline
+        || error.is::<ConfigError>()
+        || error.is::<InvalidValue>()
+        || error.downcast_ref::<GroundError>().is_some_and(is_of_ground)
+}
+
+fn is_of_system(error: &(dyn std::error::Error + 'static)) -> bool {
+    let is_locked =
+        |error: &GroundError| matches!(error, GroundError::Locked { .. } | GroundError::FolderLost { .. });
+    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+        PipelineError::Unsaved { .. } | PipelineError::Memory { .. } => true,
+        PipelineError::Ground(error) => is_locked(error),
+        _ => false,
+    });
+    // A file that is not there, or is not what it should be, is not the system's fault.
+    let is_of_system = |error: &std::io::Error| {
+        use std::io::ErrorKind::{InvalidData, NotFound};
+        ![InvalidData, NotFound].contains(&error.kind())
+    };
+    of_pipeline
+        || error.downcast_ref::<std::io::Error>().is_some_and(is_of_system)
+        || error.downcast_ref::<GroundError>().is_some_and(is_locked)
+}
 
 /// Runs the command on the process's command line and returns the exit code.
 ///
-/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage.
+/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage, or a
+/// configuration that cannot be used. 3: the system refused: a disk, a socket, a lock, memory.
 /// 128 and the number of the signal: ended early, by Ctrl-C with 130, by SIGTERM with 143, by SIGHUP with 129; a second
 /// signal ends the process at once with the same code. For a ground that listens or follows, SIGTERM is the regular end: 0.
 #[must_use]
@@ -162,8 +232,10 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Inspect(args) => inspect::execute(&args),
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Export(args) => export::execute(&args),
+        Command::Extract(args) => extract::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
+        Command::Rebuild(args) => rebuild::execute(&args),
         Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
         Command::Compare(args) => compare::execute(&args),
@@ -171,6 +243,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Figure(args) => figure::execute(&args),
         Command::Cutout(args) => cutout::execute(&args),
         Command::Calibrate(args) => calibrate::execute(&args),
+        Command::Bound(args) => bound::execute(&args),
         Command::Predict(args) => predict::execute(&args),
         Command::Check(args) => check::execute(&args),
         Command::Bench(args) => bench::execute(&args),
@@ -187,7 +260,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Err(error) if is_broken_pipe(error.as_ref()) => 0,
         Err(error) => {
             print_error(error.as_ref());
-            FAILED
+            exit_code(error.as_ref())
         }
     }
 }

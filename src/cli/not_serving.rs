@@ -18,6 +18,7 @@ impl ServeArgs {
         _config: &Config,
         _segment: &str,
         _state: Option<&Path>,
+        _out: Option<&Path>,
     ) -> Result<Page, CommandError> {
         Ok(Page)
     }
@@ -36,6 +37,8 @@ impl Page {
     ) -> Result<T, CommandError> {
         result.map_err(Into::into)
     }
+
+    pub(super) fn tell_failure(&self, _interrupt: &Interrupt) {}
 
     pub(super) fn stay(self, _interrupt: &Interrupt) {}
 }

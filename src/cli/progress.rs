@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use indicatif::{DecimalBytes, HumanCount, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use super::events::progress_of;
+use super::events::{LogTold, LogViewer, progress_of};
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
@@ -55,6 +55,9 @@ impl Progress {
     pub(super) fn watch(watched: Watched, stage: &'static str, total: u64, cancel: &Cancel) -> Self {
         let (stop, stopped) = channel();
         let cancel = cancel.clone();
+        if is_json() {
+            watched.maps.join(Box::new(LogViewer));
+        }
         let thread = std::thread::spawn(move || {
             let mut shown = ProgressView::new(total);
             let every = if shown.bar.is_some() { POLL } else { LINE_EVERY };
@@ -240,6 +243,7 @@ struct ProgressView {
     since: Instant,
     /// Events of the instrument that were told.
     events_told: usize,
+    told: LogTold,
     /// The solution being shown: its number, when it was first shown, and its residual then.
     solution: Option<(u64, Instant, f64)>,
 }
@@ -256,7 +260,15 @@ impl ProgressView {
             ProgressBar::new(total).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
         });
         let now = Instant::now();
-        Self { bar, total, received: (0, now), since: now, events_told: 0, solution: None }
+        Self {
+            bar,
+            total,
+            received: (0, now),
+            since: now,
+            events_told: 0,
+            told: LogTold::default(),
+            solution: None,
+        }
     }
 
     /// The state of the solver, with the time left if the residual keeps falling at the same rate.
@@ -292,8 +304,9 @@ impl ProgressView {
         )
     }
 
-    /// Says what happened to the instrument, as it happens.
+    /// Says what happened to the instrument, to checkpoints, archive and products, as it happens.
     fn tell_events(&mut self, watched: &Watched) {
+        self.told.tell(watched);
         let gains = watched.ground.as_ref().and_then(|ground| ground.gains.as_ref());
         for event in gains.map(|gains| gains.events_since(self.events_told)).unwrap_or_default() {
             say("instrument", &json!({ "what": event }), &event);

@@ -29,7 +29,7 @@ use crate::downlink::transport::socket::{
 use crate::downlink::{FileSource, Pace, Paced, Steps};
 use crate::files::ProtectedInputs;
 use crate::frames::Instrument;
-use crate::ground::{Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
+use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
     RunSummary, channel_groups, replay, replay_in_groups, use_threads,
@@ -71,6 +71,18 @@ pub(super) struct ReplayArgs {
     /// Number of visibilities between two checkpoints of the state; the end always writes one.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
+    /// Folder of the raw archive, where a ground that listens keeps every packet on disk before it answers `taken`: the folder
+    /// `archive` in that of the state if not given. `lunarray rebuild` makes a new state of it.
+    #[arg(long, value_name = "DIR", requires_all = ["state", "listen"])]
+    archive: Option<PathBuf>,
+    /// Keep no raw archive: what came after the last checkpoint is then lost when the ground is killed, although it was answered
+    /// with `taken`.
+    #[arg(long, requires_all = ["state", "listen"], conflicts_with = "archive")]
+    no_archive: bool,
+    /// Greatest size of the raw archive, with a unit, such as 20GB; beyond it the oldest segments go, once two checkpoints hold
+    /// them. 64 GiB if not given.
+    #[arg(long, value_name = "SIZE", value_parser = size_bytes, requires_all = ["state", "listen"])]
+    archive_max: Option<u64>,
     /// Capacity of the hold buffer for visibilities without positions, bytes; when it is full, the oldest are flagged.
     /// Default 256 MiB, or 1 MiB when listening without a state; an existing state keeps its own.
     #[arg(long, value_name = "BYTES")]
@@ -204,7 +216,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&config, "ground", args.state.as_deref())?;
+    let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
     let events = args.events.start(&config, "ground")?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
     let ended = match &args.listen {
@@ -216,6 +228,9 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let ended = page.conclude(ended, |summary| summary.cancelled);
     events.conclude(&ended, |summary| summary.cancelled);
+    if ended.is_err() && (args.listen.is_some() || args.follow) {
+        page.tell_failure(&interrupt);
+    }
     let summary = ended.inspect_err(|error| {
         let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
         // Another failure must not hide that nothing was saved.
@@ -366,7 +381,12 @@ impl Session<'_> {
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
-            (source, ground) = (source.answering(&answers), ground.answering(&answers));
+            (source, ground) = (source.answering(&answers), ground.answering(&answers).beginning_with_maps());
+            if !args.no_archive {
+                let bytes_max = args.archive_max.unwrap_or(ARCHIVE_BYTES_MAX);
+                let kept = ground.keep_packets(args.archive.as_deref(), bytes_max)?;
+                source = kept.iter().fold(source, |source, archive| source.keeping(archive));
+            }
         }
         let address = source.url();
         let fields = json!({ "url": address.to_string() });

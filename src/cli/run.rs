@@ -78,7 +78,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     let cost = plan.cost_among(job.ranks().share().count);
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&plan.config, "whole", None)?;
+    let page = args.serve.start(&plan.config, "whole", None, None)?;
     let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
     let windows = plan.windows_watched();

@@ -1,7 +1,7 @@
 //! `--serve`: the page of a running command.
 
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use clap::Args;
 use serde_json::json;
@@ -11,6 +11,9 @@ use super::log::say;
 use super::output::CommandError;
 use crate::pipeline::{Config, Watched};
 use crate::serve::{ServeAddress, ServeError, Server, Subject};
+
+/// Longest time for which a failure is served: some intervals at which metrics are read.
+const FAILURE_SERVED: Duration = Duration::from_secs(20);
 
 /// Interval of looking for a signal.
 const POLL: Duration = Duration::from_millis(100);
@@ -37,9 +40,12 @@ impl ServeArgs {
         config: &Config,
         segment: &'static str,
         state: Option<&Path>,
+        out: Option<&Path>,
     ) -> Result<Page, ServeError> {
         let Some(address) = &self.serve else { return Ok(Page { server: None, stays: false }) };
-        let server = Server::start(address, self.serve_remote, Subject::new(config, segment, state))?;
+        let subject = Subject::new(config, segment, state);
+        let subject = out.into_iter().fold(subject, Subject::with_maps_in);
+        let server = Server::start(address, self.serve_remote, subject)?;
         let url = server.url().to_string();
         say("serving", &json!({ "url": url }), format_args!("serving on {url}"));
         Ok(Page { server: Some(server), stays: self.serve_after })
@@ -73,6 +79,18 @@ impl Page {
             server.conclude(error, result.as_ref().is_ok_and(cancelled));
         }
         result
+    }
+
+    /// After a failure: serves for a while that the run has failed, so that whoever watches it learns it; a signal ends that.
+    pub(super) fn tell_failure(&self, interrupt: &Interrupt) {
+        let Some(server) = &self.server else { return };
+        let since = Instant::now();
+        while since.elapsed() < FAILURE_SERVED
+            && !interrupt.cancel().is_cancelled()
+            && !server.is_failure_told()
+        {
+            std::thread::sleep(POLL);
+        }
     }
 
     /// After a run that was not ended early: goes on serving until a signal, if that is wanted.

@@ -83,7 +83,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     }
     plan.cost().require_memory(Segment::Space, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
-    let page = args.serve.start(&plan.config, "space", None)?;
+    let page = args.serve.start(&plan.config, "space", None, None)?;
     let cancel = interrupt.cancel();
     let token = args.token.as_ref().map(|path| Stations::read(path)?.only_token(path)).transpose()?;
     let options =

@@ -23,6 +23,10 @@ const LOOK_EVERY: Duration = Duration::from_millis(500);
 /// Longest wait for a key.
 const POLL: Duration = Duration::from_millis(100);
 
+/// How long the end may take after a signal, or after the terminal has gone; and the code to exit with then, as after SIGHUP.
+const END_WITHIN: Duration = Duration::from_secs(1);
+const HUNG_UP: i32 = 129;
+
 /// Width and height of a frame that is printed, characters; empty lines at its end are left out.
 const PRINTED: (u16, u16) = (120, 50);
 
@@ -75,12 +79,25 @@ pub(super) fn execute(args: &TopArgs) -> CommandResult {
     let (answer, answers) = channel();
     // It ends with the channels, or with the process: a server that does not answer holds up nothing.
     std::thread::spawn(move || look_again(&client, &asked, &answer));
+    end_with_terminal(&interrupt);
     let watched = {
         let mut terminal = Restored(ratatui::try_init()?);
         watch(&mut terminal.0, &mut screen, &interrupt, &ask, &answers)
     };
     watched?;
     Ok(interrupt.completion(interrupt.cancel().is_cancelled()))
+}
+
+/// Ends the process once its terminal is gone, or a signal has come and nothing has followed of it: waiting for a key may never end then.
+fn end_with_terminal(interrupt: &Interrupt) {
+    let cancel = interrupt.cancel().clone();
+    std::thread::spawn(move || {
+        while !cancel.is_cancelled() && std::io::stdout().is_terminal() {
+            std::thread::sleep(POLL);
+        }
+        std::thread::sleep(END_WITHIN);
+        std::process::exit(HUNG_UP);
+    });
 }
 
 /// A terminal that is as it was before, once dropped.

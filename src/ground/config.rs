@@ -13,6 +13,7 @@ use crate::runtime::Ledger;
 use crate::sky::fits::check_frequencies;
 
 /// Default capacity of the hold buffer, bytes: a week of thirty channels.
+#[doc(hidden)]
 pub const WAIT_BYTES: u64 = 1 << 28;
 
 /// Segments of positions that are kept: more than two years of windows.

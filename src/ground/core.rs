@@ -1,5 +1,6 @@
 //! The ground as one stage: bytes of a downlink to sums.
 
+use std::sync::atomic::Ordering;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -39,6 +40,8 @@ pub struct Ground {
     pub(super) cancel: Cancel,
     /// How long it goes on adding then, if there is no archive.
     pub(super) linger: Duration,
+    /// Whether it begins with a snapshot of what earlier sessions have summed.
+    pub(super) begins_with_maps: bool,
     /// Steps so far.
     pub(super) steps: u64,
     /// To senders that wait for a checkpoint.
@@ -66,6 +69,7 @@ impl Ground {
             archive: None,
             cancel: Cancel::new(),
             linger: Duration::ZERO,
+            begins_with_maps: false,
             steps: 0,
             promises: SenderPromises::default(),
         })
@@ -101,6 +105,14 @@ impl Ground {
     #[doc(hidden)]
     pub fn answering(self, answers: &HeldAnswers) -> Self {
         Self { promises: self.promises.answering(answers), ..self }
+    }
+
+    /// Begins with a snapshot of what earlier sessions have summed, if snapshots are wanted: a ground that was started again has maps at
+    /// once, and not when the next one is due.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn beginning_with_maps(self) -> Self {
+        Self { begins_with_maps: true, ..self }
     }
 
     /// Tells `observer` of each pass whose gains it has found, on its own thread.
@@ -295,6 +307,14 @@ impl Ground {
         // First, so that nobody sees counters that are newer.
         self.spotter.show(occasion, &self.collector, self.calibrator.ephemeris());
         fill(&self.outcome.reception, self.collector.counters());
+        self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
+    }
+
+    /// Shows what earlier sessions have received, before anything comes.
+    pub(super) fn show_state(&mut self, latest_s: Option<f64>) {
+        self.spotter.resume(latest_s, &self.collector, self.calibrator.ephemeris());
+        fill(&self.outcome.reception, self.collector.counters());
+        self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
     /// Packets of visibilities that are known to be missing.
@@ -320,8 +340,32 @@ impl Ground {
             (&self.calibrator, self.gate.as_ref()),
             &mut self.accumulator,
         );
+        if written.is_ok() {
+            archive.mark_packets(self.promises.bytes);
+        }
         self.promises.keep(self.collector.packets(), written.is_ok());
+        self.note_unsaved();
         written
+    }
+
+    /// Tells how much no checkpoint holds.
+    fn note_unsaved(&self) {
+        if self.archive.is_some() {
+            let has_new = self.promises.has_new(self.collector.packets());
+            self.outcome.saving.note_received(self.collector.bytes(), has_new);
+        }
+    }
+
+    /// Whether what no checkpoint holds has become old; not of a rank, which writes where the others do.
+    fn is_old(&self) -> bool {
+        let saves = self.archive.as_ref().is_some_and(Archive::saves_on_the_way);
+        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
+    }
+
+    /// Whether the only checkpoint in the folder is the one that would be written now.
+    pub(super) fn is_written(&self) -> Result<bool, GroundError> {
+        let Some(archive) = &self.archive else { return Ok(false) };
+        archive.is_written(&self.collector, (&self.calibrator, self.gate.as_ref()), &self.accumulator)
     }
 
     /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
@@ -359,10 +403,14 @@ impl Stage for Ground {
     type Error = GroundError;
 
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
+        if std::mem::take(&mut self.begins_with_maps) {
+            self.accumulator.emit_resumed(out)?;
+        }
         self.collector.push(&bytes);
         self.advance(out)?;
-        self.promises.bytes = self.collector.bytes();
-        if self.promises.are_due(self.collector.packets()) {
+        self.promises.note_bytes(self.collector.bytes());
+        self.note_unsaved();
+        if self.promises.are_due(self.collector.packets()) || self.is_old() {
             // If it fails, it is tried again while anyone waits.
             let _ = self.checkpoint();
         }

@@ -125,8 +125,8 @@ pub enum GroundError {
     },
     /// There are checkpoints, and none can be used.
     #[error(
-        "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away to \
-         start again from the files",
+        "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away, and \
+         make a new state of its raw archive by `lunarray rebuild`, or of the files",
         path.display()
     )]
     NoneHolds {
@@ -165,6 +165,18 @@ pub enum GroundError {
         found: u64,
         /// Visibilities that the journal has.
         expected: u32,
+    },
+    /// A state whose raw archive has more than its checkpoints.
+    #[error(
+        "{}: the last checkpoint lacks {bytes} bytes of packets that were taken after it and are in the raw archive; they are added \
+         by the next `lunarray replay --state` of this folder",
+        path.display()
+    )]
+    Unsaved {
+        /// The folder.
+        path: PathBuf,
+        /// Bytes of packets.
+        bytes: u64,
     },
     /// A new archive where there is one.
     #[error("{}: holds a state already; expected a new folder", path.display())]

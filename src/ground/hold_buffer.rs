@@ -102,6 +102,12 @@ impl HoldBuffer {
         self.bytes_max
     }
 
+    /// Bytes of visibilities that wait, 128 a packet beyond its own included.
+    #[must_use]
+    pub fn waiting_bytes(&self) -> u64 {
+        self.bytes
+    }
+
     /// Inserts a packet.
     pub fn insert(&mut self, packet: HeldPacket) {
         let PacketHeader { kind, time, count, .. } = packet.header;

@@ -178,6 +178,12 @@ impl Spotter {
         Self { lookout: lookout.clone(), ..Self::default() }
     }
 
+    /// Puts what earlier sessions received into the lookout, of which the latest visibilities were made at a time.
+    pub(super) fn resume(&mut self, latest_s: Option<f64>, collector: &Collector, ephemeris: &Ephemeris) {
+        self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
+        self.put(collector, ephemeris);
+    }
+
     /// A block of auto-correlations that is about to be calibrated, if somebody may look.
     pub(super) fn expect_powers(&self, frame: Option<&GroundFrame>) -> Option<AutoSpan> {
         let Some(GroundFrame::Visibilities(block)) = frame else { return None };
@@ -225,7 +231,13 @@ impl Spotter {
         let Shared { is_open, is_due, .. } = &*self.lookout.0;
         let is_open = is_open.load(Ordering::Relaxed);
         let is_time = is_open && (occasion == Occasion::Rest || is_due.swap(false, Ordering::Relaxed));
-        let Some(instrument) = collector.instrument().filter(|_| is_time) else { return };
+        if is_time {
+            self.put(collector, ephemeris);
+        }
+    }
+
+    fn put(&self, collector: &Collector, ephemeris: &Ephemeris) {
+        let Some(instrument) = collector.instrument() else { return };
         let passes = PassLine::of(instrument.epoch_tai_s, collector.received());
         let array = self.latest_s.and_then(|latest_s| ArrayNow::at(ephemeris, instrument, latest_s));
         *self.lookout.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };

@@ -25,6 +25,8 @@ mod uvw_density;
 
 pub use self::core::Ground;
 #[doc(hidden)]
+pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
+#[doc(hidden)]
 pub use collector::{Collector, CollectorState, CollectorStep, CollectorView, DeliveredPacket, Delivery};
 #[doc(hidden)]
 pub use config::GroundConfig;

@@ -9,6 +9,8 @@ pub(super) struct SenderPromises {
     answers: Option<HeldAnswers>,
     /// Bytes of the stream of which every packet has been applied, or is held.
     pub(super) bytes: u64,
+    /// Bytes that were applied before the stream began: from the raw archive.
+    before: u64,
     /// Packets that the newest checkpoint has.
     packets: u64,
 }
@@ -17,6 +19,21 @@ impl SenderPromises {
     /// Of a ground whose newest checkpoint has this number of packets.
     pub(super) fn since(packets: u64) -> Self {
         Self { packets, ..Self::default() }
+    }
+
+    /// The stream begins after so many bytes.
+    pub(super) fn begin(&mut self, bytes: u64) {
+        (self.before, self.bytes) = (bytes, 0);
+    }
+
+    /// So many bytes have been applied, or are held.
+    pub(super) fn note_bytes(&mut self, bytes: u64) {
+        self.bytes = bytes.saturating_sub(self.before);
+    }
+
+    /// Whether there are more than `packets` of the newest checkpoint.
+    pub(super) fn has_new(&self, packets: u64) -> bool {
+        packets > self.packets
     }
 
     /// From now on tells these.

@@ -70,6 +70,7 @@ impl Plan {
     /// What is understood of every map and catalogue that the configuration names, a line each. Files that cannot be read are told
     /// by [`Plan::file_problems`].
     #[must_use]
+    #[doc(hidden)]
     pub fn files_understood(&self) -> Vec<String> {
         let Config { sky, spacecraft, map, calibrate, .. } = &self.config;
         let mut lines: Vec<String> = Vec::new();

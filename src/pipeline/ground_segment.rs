@@ -10,7 +10,7 @@ use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::imaging::MapConfig;
 use crate::imaging::anywhere::RefineRule;
 use crate::imaging::{Regulariser, Solution, SolveWatch, Solver, SolverSetup, StoppingRule};
-use crate::products::{ChannelSummary, MapWatch, ProductsError, Provenance, Publisher, Truth};
+use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_prior};
 
@@ -80,6 +80,8 @@ pub(super) struct Mapping<'a> {
     pub(super) watch: SolveWatch,
     /// Sees maps.
     pub(super) viewers: MapWatch,
+    /// Is told of products that cannot be written, which then end nothing.
+    pub(super) trouble: Option<ProductsWatch>,
 }
 
 /// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
@@ -93,7 +95,7 @@ pub(super) fn add(
     ground: Ground,
     mapping: Mapping<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let Mapping { out, truth, watch, viewers } = mapping;
+    let Mapping { out, truth, watch, viewers, trouble } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
@@ -108,6 +110,7 @@ pub(super) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher =
         Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
+    let publisher = trouble.iter().fold(publisher, Publisher::persisting);
     let mut writer = GainsWriter::new(config, out);
     let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
     // Sums are large: one waits while another is solved.

@@ -331,7 +331,7 @@ impl Passes<'_> {
                 pass.earlier_reports.push(before.report);
             }
             if !is_cut && !is_last {
-                let record = PassRecord::of(&pass);
+                let record = PassRecord::of(&pass, out)?;
                 record.write(&path, key)?;
                 done.push(record);
             }

@@ -2,6 +2,7 @@
 //!
 //! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it.
 
+mod bound;
 mod calibrate;
 mod calibrate_products;
 mod channel_lists;
@@ -37,6 +38,8 @@ mod study;
 mod study_file;
 mod summary;
 
+#[doc(hidden)]
+pub use bound::{BoundSummary, bound};
 pub use calibrate::{CalibrateJob, calibrate};
 #[doc(hidden)]
 pub use calibrate::{CalibrateProgress, CalibrateWatcher, with_gains};

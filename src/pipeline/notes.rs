@@ -98,6 +98,7 @@ impl Config {
 impl Plan {
     /// Periods of which `spacecraft.every_nth_window` leaves parts out.
     #[must_use]
+    #[doc(hidden)]
     pub fn thinning_notes(&self) -> Vec<String> {
         let (spacecraft, array) = (&self.config.spacecraft, &self.config.array);
         let every_nth = spacecraft.every_nth_window;

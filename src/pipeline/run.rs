@@ -20,7 +20,7 @@ use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
 use crate::imaging::EngineKind;
 use crate::imaging::SolveWatch;
-use crate::products::{MapShape, MapWatch, ProductsError, Truth, write_autos};
+use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
@@ -38,13 +38,15 @@ pub struct Watched {
     pub ground: Option<GroundOutcome>,
     /// The maps, for those who want to see them.
     pub maps: MapWatch,
+    /// How their files go, of a ground that goes on without them.
+    pub products: Option<ProductsWatch>,
 }
 
 impl Watched {
     /// Handles of a graph without a ground.
     pub(super) fn of_space(graph: &Graph) -> Self {
         let (solving, maps) = (SolveWatch::default(), MapWatch::default());
-        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps }
+        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps, products: None }
     }
 }
 
@@ -54,9 +56,18 @@ pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
     fn listening(&self) -> Option<Listening> {
         None
     }
+
+    /// Whether it goes on until it is told to end: reception then does not end because maps cannot be written.
+    fn is_service(&self) -> bool {
+        false
+    }
 }
 
-impl GroundSource for FileSource {}
+impl GroundSource for FileSource {
+    fn is_service(&self) -> bool {
+        self.is_followed()
+    }
+}
 
 impl<S: GroundSource> GroundSource for Paced<S> {
     fn listening(&self) -> Option<Listening> {
@@ -67,6 +78,10 @@ impl<S: GroundSource> GroundSource for Paced<S> {
 impl GroundSource for SocketSource {
     fn listening(&self) -> Option<Listening> {
         Some(SocketSource::listening(self))
+    }
+
+    fn is_service(&self) -> bool {
+        true
     }
 }
 
@@ -164,10 +179,11 @@ pub fn run_among(
     let ground =
         Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
     let maps = MapWatch::default();
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: None, ground, maps };
+    let watched =
+        Watched { metrics: graph.metrics(), solving, listening: None, ground, maps, products: None };
     let report = start(graph, ranks, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
     let ended = Ended { report, outcome, listening: None, samples };
@@ -273,17 +289,20 @@ pub(super) fn ground_alone<S: GroundSource + 'static>(
     watch: Watcher<'_>,
 ) -> Result<Ended, PipelineError> {
     let mut graph = Graph::new();
-    let listening = source.listening();
+    let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ranks = ground.ranks().clone();
     let ground = ground.cancelled_by(cancel, grace.to_add);
     let maps = MapWatch::default();
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone() };
+    let trouble = is_service.then(ProductsWatch::default);
+    let (viewers, products) = (maps.clone(), trouble.clone());
+    let mapping = Mapping { out, truth, watch: solving.clone(), viewers, trouble };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
-    let watched = Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps };
+    let watched =
+        Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps, products };
     let report = start(graph, &ranks, &config.runtime, cancel, (watched, watch))?;
     Ok(Ended { report, outcome, listening, samples: None })
 }

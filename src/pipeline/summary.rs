@@ -157,6 +157,8 @@ impl RunSummary {
 /// What a summary says of a group that is mapped.
 #[derive(bincode::Encode, bincode::Decode)]
 pub(super) struct PassRecord {
+    /// Checksums of its products, in the order in which its channels name them.
+    sums: Vec<u64>,
     pub(super) ledger: LedgerReport<VisibilityReason>,
     pub(super) channels: Vec<ChannelSummary>,
     pub(super) seed: Option<u64>,
@@ -172,16 +174,28 @@ const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = binc
     .with_limit::<RECORD_BYTES_MAX>();
 
 impl PassRecord {
-    pub(super) fn of(summary: &RunSummary) -> Self {
-        Self {
+    /// What `summary` says of a group whose products are in `out`.
+    ///
+    /// # Errors
+    /// A product that cannot be read.
+    pub(super) fn of(summary: &RunSummary, out: &Path) -> Result<Self, ProductsError> {
+        let sum = |file: &String| {
+            let path = out.join(file);
+            checksum_of(&path).map_err(|source| ProductsError::Read { path, source })
+        };
+        let sums =
+            summary.channels.iter().flat_map(|channel| &channel.files).map(sum).collect::<Result<_, _>>()?;
+        Ok(Self {
+            sums,
             ledger: summary.ledger.clone(),
             channels: summary.channels.clone(),
             seed: summary.seed,
             space_hash: summary.space_hash.clone(),
-        }
+        })
     }
 
-    /// The record of a group that is mapped by the same settings; `None` if there is none, or if its products are gone.
+    /// The record of a group that is mapped by the same settings; `None` if there is none, or if its products are gone or
+    /// are no longer what they were.
     pub(super) fn read(path: &Path, key: u64, out: &Path) -> Option<Self> {
         let bytes = fs::read(path).ok().filter(|bytes| bytes.len() <= RECORD_BYTES_MAX)?;
         let (body, crc) = bytes.split_last_chunk::<8>()?;
@@ -192,7 +206,11 @@ impl PassRecord {
         }
         let (record, _) = bincode::decode_from_slice::<Self, _>(body, CODEC).ok()?;
         let mut files = record.channels.iter().flat_map(|channel| &channel.files);
-        files.all(|file| out.join(file).is_file()).then_some(record)
+        let holds = files
+            .by_ref()
+            .zip(&record.sums)
+            .all(|(file, sum)| checksum_of(&out.join(file)).is_ok_and(|found| found == *sum));
+        (holds && files.next().is_none()).then_some(record)
     }
 
     pub(super) fn write(&self, path: &Path, key: u64) -> Result<(), ProductsError> {
@@ -202,6 +220,21 @@ impl PassRecord {
         let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &body);
         let bytes = [key.to_le_bytes().as_slice(), &body, &crc.to_le_bytes()].concat();
         write_atomically(path, &bytes).map_err(failed)
+    }
+}
+
+/// Checksum of a file, read piece by piece.
+fn checksum_of(path: &Path) -> std::io::Result<u64> {
+    let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc64Nvme);
+    let mut file = std::io::BufReader::with_capacity(1 << 16, fs::File::open(path)?);
+    loop {
+        let piece = std::io::BufRead::fill_buf(&mut file)?;
+        if piece.is_empty() {
+            return Ok(crc.finalize());
+        }
+        crc.update(piece);
+        let length = piece.len();
+        std::io::BufRead::consume(&mut file, length);
     }
 }
 

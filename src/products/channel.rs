@@ -15,12 +15,15 @@ use super::provenance::Provenance;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
-use crate::files::write_atomically;
+use crate::files::{disk_room, write_atomically};
 use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
 use crate::units::constants::DAY_S;
+
+/// A ground that listens leaves this part of its disk free.
+const KEPT_FREE: u64 = 20;
 
 /// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
 const SHEET_MAPS_MAX: usize = 6;
@@ -45,6 +48,8 @@ pub(super) struct ChannelFolder {
     files: Vec<String>,
     summary: Option<ChannelSummary>,
     beams: Vec<PointBeamSummary>,
+    /// Whether the last of the disk is left to others.
+    leaves_room: bool,
 }
 
 impl ChannelFolder {
@@ -72,11 +77,49 @@ impl ChannelFolder {
             files: Vec::new(),
             summary: None,
             beams: Vec::new(),
+            leaves_room: false,
         })
     }
 
-    /// Writes the products of one solution; the complete set if the solution is final.
+    /// Leaves the last of the disk to the state and the raw archive of a ground, which may be on the same one.
+    pub(super) fn leaving_room(self) -> Self {
+        Self { leaves_room: true, ..self }
+    }
+
+    /// Final maps may take it: nothing comes after them.
+    fn require_room(&self, solution: &Solution) -> Result<(), ProductsError> {
+        let leaves = self.leaves_room && !solution.is_final;
+        match disk_room(&self.root).filter(|_| leaves) {
+            Some([free, size]) if free < size / KEPT_FREE => {
+                let reason = "less than a twentieth of the disk is free, which is left to state and archive";
+                let source = std::io::Error::new(std::io::ErrorKind::StorageFull, reason);
+                Err(ProductsError::Write { path: self.root.clone(), source })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Writes the products of one solution; the complete set if the solution is final. If they cannot be written, it is as if there had
+    /// been none, but for viewers, who see the map.
     pub(super) fn publish(
+        &mut self,
+        solution: &Solution,
+        provenance: &Provenance,
+        viewers: &MapWatch,
+    ) -> Result<(), ProductsError> {
+        let (snapshots, beams) = (self.snapshots.len(), self.beams.len());
+        let published = self.publish_whole(solution, provenance, viewers);
+        if published.is_err() {
+            if self.snapshots.len() > snapshots {
+                self.show(None, Origin { provenance, solution }, viewers);
+            }
+            self.snapshots.truncate(snapshots);
+            self.beams.truncate(beams);
+        }
+        published
+    }
+
+    fn publish_whole(
         &mut self,
         solution: &Solution,
         provenance: &Provenance,
@@ -93,6 +136,7 @@ impl ChannelFolder {
         let shown = processed.as_ref().unwrap_or(&solved);
         let comparison = self.compare(solution, shown)?;
         self.note(solution, shown, comparison.as_ref());
+        self.require_room(solution)?;
         if self.config.snapshot_maps && !solution.is_final {
             let name = format!("{}.fits", map_name(solution));
             self.write_map(&name, &solved.map, None, origin)?;

@@ -48,7 +48,7 @@ pub use point_beams::{BeamWidths, PointBeamSummary};
 #[doc(hidden)]
 pub use provenance::Provenance;
 #[doc(hidden)]
-pub use publisher::Publisher;
+pub use publisher::{ProductsReport, ProductsWatch, Publisher};
 #[doc(hidden)]
 pub use runs::{
     BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,

@@ -3,6 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use serde::Serialize;
 
 use super::channel::ChannelFolder;
 use super::config::ProductsConfig;
@@ -25,6 +28,40 @@ pub struct Publisher {
     summaries: Arc<Mutex<Vec<ChannelSummary>>>,
     published: u64,
     viewers: MapWatch,
+    /// Where failures are told, if they end nothing.
+    trouble: Option<ProductsWatch>,
+    /// The last map of a channel whose files could not be written.
+    unwritten: BTreeMap<ChannelId, Solution>,
+}
+
+/// Waits before files that could not be written are tried a last time.
+const LAST_WAITS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1)];
+
+/// How the files of products went.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct ProductsReport {
+    /// Attempts that failed.
+    pub failed: u64,
+    /// Why the last attempt failed; `None` if it did not.
+    pub unwritten: Option<String>,
+}
+
+/// The report on the products of a ground at work; clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct ProductsWatch(Arc<Mutex<ProductsReport>>);
+
+impl ProductsWatch {
+    /// The report so far.
+    #[must_use]
+    pub fn report(&self) -> ProductsReport {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn update(&self, failure: Option<&ProductsError>) {
+        let mut report = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        report.failed += u64::from(failure.is_some());
+        report.unwritten = failure.map(ToString::to_string);
+    }
 }
 
 impl Publisher {
@@ -52,6 +89,8 @@ impl Publisher {
             summaries,
             published: 0,
             viewers,
+            trouble: None,
+            unwritten: BTreeMap::new(),
         })
     }
 
@@ -60,6 +99,38 @@ impl Publisher {
     pub fn shown_to(self, viewers: MapWatch) -> Self {
         Self { viewers, ..self }
     }
+
+    /// Goes on if files cannot be written, says so to `watch`, and tries again with the next map and at the end.
+    #[must_use]
+    pub fn persisting(self, watch: &ProductsWatch) -> Self {
+        Self { trouble: Some(watch.clone()), ..self }
+    }
+
+    fn publish(&mut self, solution: &Solution, viewers: &MapWatch) -> Result<(), ProductsError> {
+        let channel = solution.channel;
+        if !self.channels.contains_key(&channel) {
+            let truth = self.truth.channel(channel);
+            let opened = ChannelFolder::open(&self.folder, &self.config, truth, solution)?;
+            let opened = if self.trouble.is_some() { opened.leaving_room() } else { opened };
+            self.channels.insert(channel, opened);
+        }
+        if let Some(folder) = self.channels.get_mut(&channel) {
+            folder.publish(solution, &self.provenance, viewers)?;
+            self.published += 1;
+        }
+        Ok(())
+    }
+
+    /// Tries to write what could not be written.
+    fn try_again(&mut self) -> Result<(), ProductsError> {
+        while let Some((channel, solution)) = self.unwritten.pop_first() {
+            if let Err(error) = self.publish(&solution, &MapWatch::default()) {
+                self.unwritten.insert(channel, solution);
+                return Err(error);
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Sink for Publisher {
@@ -67,20 +138,32 @@ impl Sink for Publisher {
     type Error = ProductsError;
 
     fn take(&mut self, solution: Solution) -> Result<(), ProductsError> {
-        let channel = solution.channel;
-        if !self.channels.contains_key(&channel) {
-            let truth = self.truth.channel(channel);
-            let opened = ChannelFolder::open(&self.folder, &self.config, truth, &solution)?;
-            self.channels.insert(channel, opened);
-        }
-        if let Some(folder) = self.channels.get_mut(&channel) {
-            folder.publish(&solution, &self.provenance, &self.viewers)?;
-            self.published += 1;
-        }
+        let viewers = self.viewers.clone();
+        let Some(trouble) = self.trouble.clone() else { return self.publish(&solution, &viewers) };
+        // A newer map takes the place of one that could not be written.
+        self.unwritten.remove(&solution.channel);
+        let written = self.publish(&solution, &viewers);
+        let failure = match written {
+            Err(error) => {
+                self.unwritten.insert(solution.channel, solution);
+                Some(error)
+            }
+            Ok(()) => self.try_again().err(),
+        };
+        trouble.update(failure.as_ref());
         Ok(())
     }
 
     fn finish(&mut self) -> Result<(), ProductsError> {
+        let mut last = Ok(());
+        for wait in LAST_WAITS {
+            std::thread::sleep(wait);
+            last = self.try_again();
+            if last.is_ok() {
+                break;
+            }
+        }
+        last?;
         let channels = std::mem::take(&mut self.channels).into_values();
         let finished: Vec<ChannelSummary> = channels.filter_map(ChannelFolder::into_summary).collect();
         *self.summaries.lock().unwrap_or_else(PoisonError::into_inner) = finished;

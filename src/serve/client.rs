@@ -2,7 +2,7 @@
 
 use std::io::{self, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use thiserror::Error;
 
@@ -10,6 +10,9 @@ use super::address::ServeAddress;
 
 /// Longest wait for a connection, and for the next bytes of an answer.
 const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Longest time for a whole exchange.
+const WHOLE_TIME: Duration = Duration::from_secs(10);
 
 /// Longest answer, bytes. A status of 1000 channels has some 1 MB.
 const ANSWER_BYTES_MAX: u64 = 64 << 20;
@@ -77,13 +80,26 @@ impl Client {
     /// The whole answer. The server closes after it.
     fn exchange(&self, path: &str) -> io::Result<Vec<u8>> {
         let address = self.address();
+        // All of it takes no longer than that, however slowly the answer comes.
+        let until = Instant::now() + WHOLE_TIME;
         let mut stream = connect(&address)?;
-        stream.set_read_timeout(Some(PATIENCE))?;
         stream.set_write_timeout(Some(PATIENCE))?;
         let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
         stream.write_all(request.as_bytes())?;
-        let mut answer = Vec::new();
-        stream.take(ANSWER_BYTES_MAX).read_to_end(&mut answer)?;
+        let (mut answer, mut piece) = (Vec::new(), vec![0; 1 << 16]);
+        while (answer.len() as u64) < ANSWER_BYTES_MAX {
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+            stream.set_read_timeout(Some(left.min(PATIENCE)))?;
+            match stream.read(&mut piece) {
+                Ok(0) => break,
+                Ok(read) => answer.extend_from_slice(&piece[..read]),
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            }
+        }
         Ok(answer)
     }
 }

@@ -1,6 +1,7 @@
 //! The same figures for Prometheus, in the text format that it scrapes.
 
 use std::fmt;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use prometheus_client::collector::Collector;
@@ -14,6 +15,8 @@ use super::console::Console;
 use super::status::{Phase, Status};
 use crate::downlink::Kind;
 use crate::downlink::transport::socket::ConnectionEnd;
+use crate::files::disk_room;
+use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
 
@@ -26,7 +29,8 @@ pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0
 /// None in practice: writing to a string does not fail.
 pub(super) fn scrape(console: &Arc<Console>) -> Result<String, fmt::Error> {
     let mut registry = Registry::with_prefix("lunarray");
-    registry.register_collector(Box::new(Scrape { status: console.status(), progress: console.progress() }));
+    let (status, progress, folders) = (console.status(), console.progress(), console.folders.clone());
+    registry.register_collector(Box::new(Scrape { folders, status, progress }));
     let mut out = String::new();
     text::encode(&mut out, &registry)?;
     Ok(out)
@@ -34,8 +38,16 @@ pub(super) fn scrape(console: &Arc<Console>) -> Result<String, fmt::Error> {
 
 #[derive(Debug)]
 struct Scrape {
+    folders: Vec<(&'static str, PathBuf)>,
     status: Status,
     progress: Vec<StageProgress>,
+}
+
+/// Memory of this process, bytes; `None` where the system does not tell.
+fn resident_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
+    line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
 /// Labels of a sample, and its value.
@@ -78,6 +90,11 @@ fn gauge(out: &mut DescriptorEncoder<'_>, about: About, value: f64) -> fmt::Resu
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
+/// A gauge of which there may be no value.
+fn gauge_if(out: &mut DescriptorEncoder<'_>, about: About, value: Option<f64>) -> fmt::Result {
+    value.map_or(Ok(()), |value| gauge(out, about, value))
+}
+
 fn counter(out: &mut DescriptorEncoder<'_>, about: About, value: u64) -> fmt::Result {
     let About(name, help, unit) = about;
     let value = ConstCounter::new(value);
@@ -91,6 +108,7 @@ impl Collector for Scrape {
         self.ground(&mut out)?;
         self.senders(&mut out)?;
         self.maps(&mut out)?;
+        self.machine(&mut out)?;
         self.visitors(&mut out)
     }
 }
@@ -176,8 +194,8 @@ impl Scrape {
         if let Some(ledger) = &self.status.ledger {
             // Not counters: what is retracted leaves them.
             let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
-            let [sampled, accumulated] = [ledger.report.sampled, ledger.report.accumulated];
-            let entries = [entry("sampled", sampled), entry("accumulated", accumulated)];
+            let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
+            let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
             gauges(out, About("ledger", "Visibilities by what became of them", visibilities()), entries)?;
             let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
                 let stage = reason.lost_in().unwrap_or("");
@@ -185,9 +203,10 @@ impl Scrape {
             });
             let about = About("ledger_left_out", "Visibilities flagged, or lost in a stage", visibilities());
             gauges(out, about, left_out)?;
-            let about = "Visibilities without an entry; zero at the end of a run";
+            let about =
+                "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
             let about = About("ledger_unaccounted", about, visibilities());
-            gauge(out, about, ledger.unaccounted as f64)?;
+            gauge_if(out, about, ledger.sampled.map(|(_, rest)| rest as f64))?;
         }
         if let Some(reception) = &self.status.reception {
             let packets = || Some(Unit::Other("packets".into()));
@@ -207,6 +226,10 @@ impl Scrape {
             let again = kinds(&|kind| reception.kind(kind).duplicates);
             gauges(out, About("reception_duplicate", "Packets received before", packets()), again)?;
         }
+        if let Some(waiting) = self.status.waiting_bytes {
+            let about = "Visibilities that wait for their positions";
+            gauge(out, About("waiting", about, Some(Unit::Bytes)), waiting as f64)?;
+        }
         if let Some(saving) = &self.status.saving {
             let written = About("checkpoints_written", "Checkpoints written in this session", None);
             counter(out, written, saving.written)?;
@@ -221,8 +244,38 @@ impl Scrape {
                 About("state_unsaved", "1 if the last checkpoint could not be written", None),
                 unsaved,
             )?;
+            let about = "Received since the newest checkpoint";
+            gauge(out, About("state_unsaved", about, Some(Unit::Bytes)), saving.unsaved_bytes as f64)?;
+            let about = "Age of the oldest packet that no checkpoint holds";
+            gauge(out, About("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
+            let about =
+                About("checkpoint_age", "Age of the newest checkpoint of this session", Some(Unit::Seconds));
+            gauge_if(out, about, saving.checkpoint_s)?;
+        }
+        if let Some(products) = &self.status.products {
+            let about = About("products_failed", "Attempts to write maps and pictures that failed", None);
+            counter(out, about, products.failed)?;
+            let about =
+                About("products_unwritten", "1 if the last attempt to write maps and pictures failed", None);
+            gauge(out, about, f64::from(u8::from(products.unwritten.is_some())))?;
         }
         Ok(())
+    }
+
+    /// Room on disks, and memory.
+    fn machine(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let disks: Vec<_> =
+            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_room(path)?))).collect();
+        let label = |name: &str| [("folder", name.to_owned())];
+        let free = disks.iter().map(|(name, [free, _])| (label(name), *free as f64));
+        gauges(out, About("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;
+        let size = disks.iter().map(|(name, [_, size])| (label(name), *size as f64));
+        gauges(out, About("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
+        let available = MemoryLimit::of_machine().map(|limit| limit.bytes as f64);
+        let about = "Memory that this process can still have: of the machine, or below the limit of its control group";
+        gauge_if(out, About("memory_available", about, Some(Unit::Bytes)), available)?;
+        let resident = resident_bytes().map(|bytes| bytes as f64);
+        gauge_if(out, About("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
     }
 
     fn senders(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
@@ -238,6 +291,26 @@ impl Scrape {
         counter(out, About("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
         let about = "Read from senders and not taken by the ground yet";
         gauge(out, About("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
+        // Who has not been heard is silent since the ground began.
+        let up_s = self.status.up_s;
+        let silence_s = listening.silence_s.unwrap_or(up_s);
+        let about = "Time since the last sound packet from anyone, or since the ground began";
+        gauge(out, About("senders_silence", about, Some(Unit::Seconds)), silence_s)?;
+        if let Some(archive) = &listening.archive {
+            gauge(
+                out,
+                About("archive", "Packets in the raw archive", Some(Unit::Bytes)),
+                archive.bytes as f64,
+            )?;
+            let about =
+                About("archive_failed", "Pieces that could not be written into the raw archive", None);
+            counter(out, about, archive.failed)?;
+            let about = "1 if the last piece could not be written into the raw archive";
+            let unwritten = f64::from(u8::from(archive.unwritten.is_some()));
+            gauge(out, About("archive_unwritten", about, None), unwritten)?;
+            let about = "1 while the raw archive reaches back to the first packet";
+            gauge(out, About("archive_whole", about, None), f64::from(u8::from(archive.is_whole)))?;
+        }
         // From zero on: an increase from nothing to one is none for Prometheus.
         let ended = ConnectionEnd::ALL.iter().filter_map(|end| {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
@@ -247,6 +320,11 @@ impl Scrape {
         let stations = || report.stations.iter().map(|(name, counts)| ([("station", name.clone())], counts));
         let about = About("station_read", "Read from a station known by its token", Some(Unit::Bytes));
         counters(out, about, stations().map(|(label, counts)| (label, counts.bytes)))?;
+        let silences = stations()
+            .map(|(label, counts)| (label, counts.heard.map_or(up_s, |heard| heard.elapsed().as_secs_f64())));
+        let about = "Time since the last sound packet from a station, or since the ground began";
+        let about = About("station_silence", about, Some(Unit::Seconds));
+        gauges(out, about, silences)?;
         let about = About("station_connections", "Connections of a station that have ended", None);
         counters(out, about, stations().map(|(label, counts)| (label, counts.connections)))
     }
@@ -264,6 +342,12 @@ impl Scrape {
         let about =
             About("map_until", "Mission time of the last data in a channel's map", Some(Unit::Seconds));
         gauges(out, about, times)?;
+        let ages = channels.iter().map(|channel| (label(channel.frequency_hz), channel.age_s));
+        gauges(
+            out,
+            About("map_age", "Time since the last map of a channel was made", Some(Unit::Seconds)),
+            ages,
+        )?;
         let noise = channels.iter().map(|channel| (label(channel.frequency_hz), channel.noise_rms_k));
         let unit = Some(Unit::Other("kelvin".into()));
         gauges(out, About("map_noise_rms", "RMS of the noise-only map of a channel", unit), noise)?;

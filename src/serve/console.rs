@@ -1,7 +1,7 @@
 //! What all connections read: the run, its maps and its log.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
 
@@ -11,13 +11,14 @@ use super::event_log::EventLog;
 use super::geometry::Geometry;
 use super::pulse::{Pulse, whole_run};
 use super::shelf::Shelf;
-use super::status::{ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
+use super::status::{LedgerStatus, ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
 use crate::array::EarthModel;
+use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::imaging::Solving;
 use crate::pipeline::Watched;
-use crate::products::{MapViewer, PublishedMap};
+use crate::products::{MapViewer, ProductsReport, ProductsWatch, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
 use crate::units::ChannelId;
 
@@ -62,6 +63,8 @@ struct Memory {
     ended: Vec<bool>,
     senders: u64,
     saving: SavingReport,
+    products: ProductsReport,
+    archive: ArchiveReport,
     status: Option<Status>,
 }
 
@@ -76,30 +79,36 @@ pub(super) struct Console {
     pub(super) state: Option<PathBuf>,
     /// Says where the Earth is.
     earth: EarthModel,
+    /// Folders on whose disks there has to be room, by what they hold.
+    pub(super) folders: Vec<(&'static str, PathBuf)>,
     pub(super) started: Instant,
     pub(super) shelf: Arc<Shelf>,
     pub(super) log: Arc<EventLog>,
     pub(super) visitors: VisitorCounts,
     pub(super) watched: OnceLock<Watched>,
     ending: Mutex<Option<Ending>>,
+    /// Metrics were read since the run failed.
+    pub(super) failure_told: AtomicBool,
     memory: Mutex<Memory>,
 }
 
 impl Console {
     pub(super) fn new(subject: Subject) -> Self {
-        let Subject { name, segment, config, state, earth } = subject;
+        let Subject { name, segment, config, state, earth, folders } = subject;
         Self {
             name,
             segment,
             config: config.into(),
             state,
             earth,
+            folders,
             started: Instant::now(),
             shelf: Arc::default(),
             log: Arc::default(),
             visitors: VisitorCounts::default(),
             watched: OnceLock::new(),
             ending: Mutex::default(),
+            failure_told: AtomicBool::new(false),
             memory: Mutex::default(),
         }
     }
@@ -218,6 +227,8 @@ impl Console {
                 open: listening.status.open(),
                 bytes: listening.status.bytes(),
                 backlog_bytes: listening.status.backlog_bytes(),
+                silence_s: listening.status.silence().map(|silence| silence.as_secs_f64()),
+                archive: listening.archive.as_ref().map(PacketArchive::report),
                 report,
             }
         });
@@ -243,11 +254,13 @@ impl Console {
             elapsed_s,
             stages: stages_of(&progress, &rates),
             solving: solving.map(|solving| memory.solver(solving, now)),
-            ledger: ground.map(|ground| ground.ledger.report().into()),
+            ledger: ground.map(|ground| LedgerStatus::of(ground.ledger.report(), phase == Phase::Ended)),
             completeness,
             reception,
+            waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving,
+            products: watched.and_then(|watched| watched.products.as_ref()).map(ProductsWatch::report),
             channels: self.shelf.status(),
             has_state: self.state.is_some(),
             visitors: self.visitors.status(),
@@ -304,7 +317,24 @@ impl Memory {
             }
             self.saving = saving.clone();
         }
+        if let Some(products) = &status.products {
+            found.extend(change("maps", "written", &self.products.unwritten, &products.unwritten));
+            self.products = products.clone();
+        }
+        if let Some(archive) = status.listening.as_ref().and_then(|listening| listening.archive.as_ref()) {
+            found.extend(change("the raw archive", "written", &self.archive.unwritten, &archive.unwritten));
+            self.archive = archive.clone();
+        }
         found
+    }
+}
+
+/// What is said when something begins to fail, or no longer does.
+fn change(what: &str, done: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
+    match (before, now) {
+        (None, Some(reason)) => Some((true, format!("{what} cannot be {done}: {reason}"))),
+        (Some(_), None) => Some((false, format!("{what}: {done} again"))),
+        _ => None,
     }
 }
 

@@ -19,13 +19,14 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use futures_util::stream::{Stream, unfold};
 use serde::Serialize;
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::address::is_own_host;
 use super::collector;
 use super::console::Console;
 use super::shelf::{HeldMap, Which};
 use super::status::Phase;
+use crate::downlink::transport::socket::Listening;
 use crate::ground::archive::CoverageSurvey;
 use crate::sky::{Frame, Rotation};
 use crate::units::ChannelId;
@@ -50,7 +51,12 @@ pub(super) struct Desk {
     pub(super) any_host: bool,
     /// One slow answer is made at a time: the sums need the processors.
     pub(super) slow: Arc<Semaphore>,
+    /// Places of those who read events: fewer than all connections, so that health, metrics and status are answered.
+    pub(super) readers: Arc<Semaphore>,
 }
+
+/// Most readers of `/events` at a time.
+pub(super) const READERS_MAX: usize = 96;
 
 /// All routes.
 pub(super) fn router(desk: Desk) -> Router {
@@ -293,7 +299,12 @@ async fn gaps(State(desk): State<Desk>) -> Response {
 
 async fn metrics(State(desk): State<Desk>) -> Response {
     match collector::scrape(&desk.console) {
-        Ok(text) => answer(collector::CONTENT_TYPE, text),
+        Ok(text) => {
+            if desk.console.phase() == Phase::Failed {
+                desk.console.failure_told.store(true, Ordering::Relaxed);
+            }
+            answer(collector::CONTENT_TYPE, text)
+        }
         Err(error) => refusal(StatusCode::INTERNAL_SERVER_ERROR, &error.to_string()),
     }
 }
@@ -306,7 +317,14 @@ async fn healthz(State(desk): State<Desk>) -> Response {
 }
 
 async fn readyz(State(desk): State<Desk>) -> Response {
+    let is_unwritten = |listening: &Listening| {
+        listening.archive.as_ref().is_some_and(|archive| archive.report().unwritten.is_some())
+    };
+    let listening = desk.console.watched.get().and_then(|watched| watched.listening.as_ref());
     match desk.console.phase() {
+        Phase::Running if listening.is_some_and(is_unwritten) => {
+            refusal(StatusCode::SERVICE_UNAVAILABLE, "the raw archive cannot be written: nothing is taken")
+        }
         Phase::Running => answer("text/plain; charset=utf-8", "running\n"),
         phase => refusal(StatusCode::SERVICE_UNAVAILABLE, phase.name()),
     }
@@ -317,10 +335,20 @@ struct Reader {
     desk: Desk,
     seen: u64,
     queue: Vec<Event>,
+    _place: OwnedSemaphorePermit,
 }
 
-async fn events(State(desk): State<Desk>) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
-    let mut reader = Reader { desk, seen: 0, queue: Vec::new() };
+async fn events(State(desk): State<Desk>) -> Response {
+    match Arc::clone(&desk.readers).try_acquire_owned() {
+        Ok(place) => events_for(desk, place).into_response(),
+        Err(_) => {
+            refusal(StatusCode::SERVICE_UNAVAILABLE, "too many readers of events; /api/status has the same")
+        }
+    }
+}
+
+fn events_for(desk: Desk, place: OwnedSemaphorePermit) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
+    let mut reader = Reader { desk, seen: 0, queue: Vec::new(), _place: place };
     reader.desk.news.mark_changed();
     let next = |mut reader: Reader| async move {
         loop {

@@ -17,8 +17,12 @@ const KINDS: [&str; 4] = ["instrument", "ephemeris", "visibilities", "housekeepi
 /// Characters of a queue's bar.
 const QUEUE_WIDTH: usize = 10;
 
-/// Most characters of the panel of packets.
+/// Most characters of the panel of packets, and least: its counts have five characters then.
 const RECEPTION_WIDTH: u16 = 58;
+const RECEPTION_WIDTH_MIN: u16 = 40;
+
+/// Fewer characters than this are narrow: what does not fit is left out, or shown with a prefix; no number is cut off.
+const NARROW: u16 = 72;
 
 const QUIET: Style = Style::new().fg(Color::DarkGray);
 const GOOD: Style = Style::new().fg(Color::Cyan);
@@ -46,7 +50,9 @@ impl Screen {
     pub fn draw(&self, frame: &mut Frame<'_>) {
         let status = &self.status;
         let stages = list(&status["stages"]).len();
-        let ledger = self.ledger_lines();
+        let width = frame.area().width;
+        let reception = RECEPTION_WIDTH.min((width / 2).max(RECEPTION_WIDTH_MIN)).min(width);
+        let ledger = self.ledger_lines(usize::from(width - reception).saturating_sub(2));
         let has_ground = !status["reception"].is_null();
         let ground = if has_ground { 2 + (KINDS.len() + 2).max(ledger.len()) } else { 0 };
         let channels = list(&status["channels"]).len();
@@ -56,14 +62,11 @@ impl Screen {
         let [title, chain, ground, maps, curve, keys] =
             Layout::vertical(rows.into_iter().chain([Constraint::Min(0), Constraint::Length(1)]))
                 .areas(frame.area());
-        frame.render_widget(self.title(), title);
+        frame.render_widget(self.title(usize::from(width)), title);
         self.draw_stages(frame, chain);
         if has_ground {
-            let [left, right] = Layout::horizontal([
-                Constraint::Fill(1),
-                Constraint::Length(RECEPTION_WIDTH.min(ground.width / 2)),
-            ])
-            .areas(ground);
+            let [left, right] =
+                Layout::horizontal([Constraint::Fill(1), Constraint::Length(reception)]).areas(ground);
             frame.render_widget(
                 Paragraph::new(ledger).block(Block::bordered().title(" Ledger of visibilities ")),
                 left,
@@ -77,7 +80,8 @@ impl Screen {
         frame.render_widget(Line::styled("q quit   \u{2190} \u{2192} channel of the curve", QUIET), keys);
     }
 
-    fn title(&self) -> Line<'_> {
+    /// As much of it as fits: the address and the segment may be left out.
+    fn title(&self, width: usize) -> Line<'_> {
         let status = &self.status;
         let segment = match text(&status["segment"]).as_str() {
             "whole" => "whole chain".to_owned(),
@@ -95,8 +99,17 @@ impl Screen {
             Span::styled("lunarray ", HEAD),
             Span::raw(format!("{} \u{b7} {segment} \u{b7} ", text(&status["name"]))),
             Span::styled(shown, style),
-            Span::raw(format!(" \u{b7} {} \u{b7} {}", clock(number(&status["elapsed_s"])), self.address)),
+            Span::raw(format!(" \u{b7} {}", clock(number(&status["elapsed_s"])))),
         ];
+        let address = format!(" \u{b7} {}", self.address);
+        let has_room =
+            |spans: &[Span<'_>], more: usize| spans.iter().map(Span::width).sum::<usize>() + more <= width;
+        if has_room(&spans, address.chars().count()) {
+            spans.push(Span::raw(address));
+        }
+        if !has_room(&spans, 0) {
+            spans[1] = Span::raw("");
+        }
         if let Some(lost) = &self.lost {
             spans.push(Span::styled(format!("  not connected, last state: {}", printable(lost)), BAD));
         } else if !status["error"].is_null() {
@@ -142,20 +155,17 @@ impl Screen {
                 Cell::from(p99(&stage["since_source"])),
                 Cell::from(if stage["ended"] == true { "ended".to_owned() } else { percent(busy) }),
             ];
-            Row::new(cells).style(style)
+            (cells.to_vec(), style)
         });
-        let widths = [
-            Constraint::Length(12),
-            Constraint::Length(QUEUE_WIDTH as u16 + 12),
-            Constraint::Fill(1),
-            Constraint::Length(10),
-            Constraint::Length(10),
-            Constraint::Length(6),
-        ];
+        let widths = [12, QUEUE_WIDTH as u16 + 12, 0, 10, 10, 6].map(|width| match width {
+            0 => Constraint::Fill(1),
+            width => Constraint::Length(width),
+        });
         let head = ["stage", "queue before it", "rate", "step p99", "age p99", "busy"];
-        let table = Table::new(rows, widths).header(Row::new(head).style(QUIET));
         let block = Block::bordered().title(" Stages ");
         let inner = block.inner(area);
+        let is_shown = |column: &usize| inner.width >= NARROW || ![3, 4].contains(column);
+        let table = table_of(&head, rows.collect(), &widths, is_shown);
         frame.render_widget(block, area);
         let [table_area, solver] = Layout::vertical([
             Constraint::Fill(1),
@@ -163,10 +173,10 @@ impl Screen {
         ])
         .areas(inner);
         frame.render_widget(table, table_area);
-        frame.render_widget(self.solver(), solver);
+        frame.render_widget(self.solver(usize::from(solver.width)), solver);
     }
 
-    fn solver(&self) -> Line<'_> {
+    fn solver(&self, width: usize) -> Line<'_> {
         let solving = &self.status["solving"];
         if solving.is_null() {
             return Line::default();
@@ -177,30 +187,33 @@ impl Screen {
             None => String::new(),
         };
         let done = (residual.ln() / target.ln()).clamp(0.0, 1.0);
-        Line::styled(
-            format!(
-                "{} {}: iteration {}, residual {residual:.1e} of {target:.0e}{left}",
-                bar(done, QUEUE_WIDTH),
-                text(&solving["what"]),
-                whole(&solving["iteration"])
-            ),
-            BUSY,
-        )
+        let iteration = whole(&solving["iteration"]);
+        let short = format!("iteration {iteration}, residual {residual:.1e} of {target:.0e}");
+        let long = format!("{} {}: {short}{left}", bar(done, QUEUE_WIDTH), text(&solving["what"]));
+        Line::styled(if long.chars().count() <= width { long } else { short }, BUSY)
     }
 
-    fn ledger_lines(&self) -> Vec<Line<'static>> {
+    fn ledger_lines(&self, width: usize) -> Vec<Line<'static>> {
+        // Numbers first: names may be cut.
+        let digits = 15.min((width / 2).max(7));
         let ledger = &self.status["ledger"];
         let phase = text(&self.status["phase"]);
         let is_over = phase == "ended" || phase == "failed";
-        let rest = number(&ledger["unaccounted"]);
+        // Null while it is not known.
+        let rest = ledger["unaccounted"].as_f64().unwrap_or(0.0);
         let (verdict, style) = match (is_over, rest == 0.0) {
             (true, true) => ("closed".to_owned(), GOOD),
             (true, false) => (format!("does not close: {} unaccounted", count(rest)), BAD),
             (false, _) => ("open while data flow".to_owned(), QUIET),
         };
-        let entry = |name: String, value: &Value| Line::from(format!("{:>15}  {name}", whole(value)));
+        let entry = |name: String, value: &Value| {
+            Line::from(format!("{:>digits$}  {name}", fit(number(value), digits)))
+        };
         let mut lines = vec![Line::styled(verdict, style)];
-        lines.push(entry("sampled".into(), &ledger["sampled"]));
+        lines.push(match ledger["sampled"].is_null() {
+            true => Line::from(format!("{:>digits$}  sampled: told at the end", "\u{2013}")),
+            false => entry("sampled".into(), &ledger["sampled"]),
+        });
         lines.push(entry("accumulated".into(), &ledger["accumulated"]));
         if let Some(flagged) = ledger["flagged"].as_object() {
             lines.extend(
@@ -215,9 +228,11 @@ impl Screen {
 
     fn draw_reception(&self, frame: &mut Frame<'_>, area: Rect) {
         let reception = &self.status["reception"];
+        // Four columns beside the names, a space before each.
+        let digits = usize::from(area.width.saturating_sub(2 + 12 + 4) / 4);
         let cell = |value: &Value, is_bad: bool| {
             let style = if is_bad && number(value) > 0.0 { BAD } else { Style::new() };
-            Cell::from(Line::from(whole(value)).right_aligned()).style(style)
+            Cell::from(Line::from(fit(number(value), digits)).right_aligned()).style(style)
         };
         let rows = KINDS.map(|kind| {
             let of = &reception[kind];
@@ -250,6 +265,8 @@ impl Screen {
                 prefixed(number(&listening["backlog_bytes"]))
             ),
         };
+        let has_room = from.chars().count() + 4 <= usize::from(area.width);
+        let from = if has_room { from } else { format!("{}B read", prefixed(number(&listening["bytes"]))) };
         let mut block = Block::bordered().title(" Reception ").title_bottom(format!(" {from} "));
         if !self.status["saving"]["unsaved"].is_null() {
             block = block.title(Line::styled(" state not saved ", BAD));
@@ -275,16 +292,26 @@ impl Screen {
                 format!("{:.3}", number(&channel["frequency_hz"]) / 1e6),
                 name,
                 format!("{days:.1}"),
-                whole(&figures["visibilities"]),
+                fit(number(&figures["visibilities"]), 15),
                 short(&channel["noise_rms_k"]),
                 short(&figures["rms_error_over_rms_truth"]),
                 short(&figures["rho_mean"]),
             ];
-            Row::new(cells).style(if place == self.place { HEAD } else { Style::new() })
+            (cells.map(Cell::from).to_vec(), if place == self.place { HEAD } else { Style::new() })
         });
         let head = ["", "ch", "MHz", "map", "days", "visibilities", "noise, K", "error", "rho"];
-        let widths = [1, 4, 8, 13, 8, 15, 10, 9, 9].map(Constraint::Length);
-        let table = Table::new(rows, widths).header(Row::new(head).style(QUIET));
+        let lengths = [1_u16, 4, 8, 13, 8, 15, 10, 9, 9];
+        // What is left out first where there is no room.
+        let mut left_out = Vec::new();
+        let mut needed = lengths.iter().map(|length| length + 1).sum::<u16>() + 1;
+        for column in [8, 7, 3, 4] {
+            if needed > area.width {
+                needed -= lengths[column] + 1;
+                left_out.push(column);
+            }
+        }
+        let widths = lengths.map(Constraint::Length);
+        let table = table_of(&head, rows.collect(), &widths, |column| !left_out.contains(column));
         frame.render_widget(table.block(Block::bordered().title(" Maps ")), area);
     }
 
@@ -364,6 +391,36 @@ fn count(number: f64) -> String {
         grouped.push(digit);
     }
     grouped
+}
+
+/// A whole number in so many characters: with a prefix if all of its digits have no room.
+fn fit(number: f64, characters: usize) -> String {
+    let all = count(number);
+    if all.chars().count() <= characters {
+        return all;
+    }
+    let scales = [(1e15, 'P'), (1e12, 'T'), (1e9, 'G'), (1e6, 'M'), (1e3, 'k')];
+    let scaled = scales.into_iter().find(|(size, _)| number.abs() >= *size);
+    let Some((size, prefix)) = scaled else { return "#".repeat(characters) };
+    let texts = [1, 0].map(|digits| format!("{:.digits$}{prefix}", number / size));
+    let fitting = texts.into_iter().find(|text| text.chars().count() <= characters);
+    fitting.unwrap_or_else(|| "#".repeat(characters))
+}
+
+/// A table of the columns that are shown.
+fn table_of<'a>(
+    head: &[&'static str],
+    rows: Vec<(Vec<Cell<'a>>, Style)>,
+    widths: &[Constraint],
+    is_shown: impl Fn(&usize) -> bool,
+) -> Table<'a> {
+    let shown: Vec<usize> = (0..head.len()).filter(is_shown).collect();
+    let rows = rows.into_iter().map(|(cells, style)| {
+        let cells: Vec<Cell<'a>> = shown.iter().filter_map(|&column| cells.get(column).cloned()).collect();
+        Row::new(cells).style(style)
+    });
+    let head: Vec<&'static str> = shown.iter().map(|&column| head[column]).collect();
+    Table::new(rows, shown.iter().map(|&column| widths[column])).header(Row::new(head).style(QUIET))
 }
 
 /// A number with a few digits; a dash if it is not there.
@@ -507,6 +564,42 @@ mod tests {
         open.figures = json!({"spectra": {"cl_map": [0.0, 1e4, 1e5, 1e3]}});
         let text = drawn(&open, 100, 46);
         assert!(text.contains("does not close: 17 unaccounted") && text.contains("C_l of the map"), "{text}");
+    }
+
+    #[test]
+    fn no_digit_is_cut_off() {
+        let mut screen = running();
+        let kind =
+            json!({"packets": 123_456_789, "missing": 5_000_000_u64, "damaged": 0, "duplicates": 12_345});
+        for name in KINDS {
+            screen.status["reception"][name] = kind.clone();
+        }
+        screen.status["ledger"]["accumulated"] = json!(98_765_432_109_876_u64);
+        screen.status["channels"][0]["figures"]["visibilities"] = json!(98_765_432_109_876_u64);
+        for (width, height) in [(60, 40), (80, 24), (80, 40), (100, 40), (120, 50)] {
+            let text = drawn(&screen, width, height);
+            let row = text.lines().find(|line| line.contains("\u{2502}ephemeris ")).unwrap();
+            let words: Vec<&str> =
+                row.trim_end_matches('\u{2502}').split_whitespace().rev().take(4).collect();
+            // All digits, or fewer with a prefix.
+            let expected = [
+                &["12,345", "12.3k", "12k"][..],
+                &["0"],
+                &["5,000,000", "5.0M", "5M"],
+                &["123,456,789", "123.5M", "123M"],
+            ];
+            for (word, expected) in words.iter().zip(expected) {
+                assert!(expected.contains(word), "{word} at {width}:\n{text}");
+            }
+            let of_ledger = text.lines().find(|line| line.contains("  accu")).unwrap();
+            let number = of_ledger.trim_start_matches('\u{2502}').split_whitespace().next().unwrap();
+            assert!(["98,765,432,109,876", "98.8T", "99T"].contains(&number), "{number} at {width}:\n{text}");
+            if let Some(map) = text.lines().find(|line| line.contains("   3.000 ")) {
+                assert!(map.contains(" 98.8T ") && map.contains("1.50e6"), "{width}:\n{text}");
+            }
+            assert!(text.contains("running \u{b7} 1:02:05"), "{width}:\n{text}");
+            assert!(text.contains("residual 1.0e-3 of 1e-6"), "{width}:\n{text}");
+        }
     }
 
     #[test]

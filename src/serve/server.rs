@@ -13,7 +13,7 @@ use super::address::ServeAddress;
 use super::connection::accept;
 use super::console::Console;
 use super::error::ServeError;
-use super::routes::{Desk, router};
+use super::routes::{Desk, READERS_MAX, router};
 use super::subject::Subject;
 use crate::pipeline::Watched;
 
@@ -46,8 +46,9 @@ impl Server {
         let console = Arc::new(Console::new(subject));
         let (news, reader) = watch::channel(Arc::<str>::default());
         let (stop, stopped) = watch::channel(false);
-        let slow = Arc::new(Semaphore::new(1));
-        let desk = Desk { console: Arc::clone(&console), news: reader, own, any_host: allow_remote, slow };
+        let (slow, readers) = (Arc::new(Semaphore::new(1)), Arc::new(Semaphore::new(READERS_MAX)));
+        let desk =
+            Desk { console: Arc::clone(&console), news: reader, own, any_host: allow_remote, slow, readers };
         let runtime =
             Builder::new_current_thread().enable_all().max_blocking_threads(1).build().map_err(start)?;
         let teller = news.clone();
@@ -68,6 +69,12 @@ impl Server {
     pub fn watch(&self, watched: &Watched) {
         self.console.begin(watched);
         tell(&self.console, &self.news);
+    }
+
+    /// Whether metrics were read since the run failed.
+    #[must_use]
+    pub fn is_failure_told(&self) -> bool {
+        self.console.failure_told.load(std::sync::atomic::Ordering::Relaxed)
     }
 
     /// The run has ended: `cancelled` early, or with an `error`.

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::SystemTime;
 
 use axum::body::Bytes;
 use serde::Serialize;
@@ -124,6 +125,8 @@ struct ChannelShelf {
     input: Option<Arc<HeldMap>>,
     figures: Vec<SnapshotSummary>,
     spectra: Option<SpectraOfMap>,
+    /// When the last map was made.
+    made: SystemTime,
 }
 
 /// What the status says of a channel.
@@ -145,6 +148,8 @@ pub(super) struct ChannelStatus {
     held: Vec<u32>,
     /// Whether the true sky is known.
     has_input: bool,
+    /// Time since the last map was made, s.
+    pub(super) age_s: f64,
     /// Figures of the last map.
     pub(super) figures: Option<SnapshotSummary>,
     /// RMS of the noise-only map, K.
@@ -234,6 +239,7 @@ impl Shelf {
             input,
             figures: all_figures,
             spectra: comparison.map(SpectraOfMap::from),
+            made: SystemTime::now(),
         };
         channels.insert(solution.channel, shelf);
         thin_all(&mut channels);
@@ -266,6 +272,7 @@ impl Shelf {
             span_s: shelf.span_s,
             held: shelf.maps.iter().map(|snapshot| snapshot.number).collect(),
             has_input: shelf.input.is_some(),
+            age_s: shelf.made.elapsed().map_or(0.0, |age| age.as_secs_f64()),
             figures: shelf.figures.last().cloned(),
             noise_rms_k: shelf.noise_rms_k,
             diagnostics: shelf.diagnostics,

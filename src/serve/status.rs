@@ -6,9 +6,11 @@ use super::pulse::StageRate;
 use super::shelf::ChannelStatus;
 use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
+use crate::downlink::transport::packet_archive::ArchiveReport;
 use crate::downlink::transport::socket::ListenReport;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
+use crate::products::ProductsReport;
 use crate::runtime::{LedgerReport, StageProgress, TimingSummary};
 
 /// Where a run is.
@@ -103,18 +105,28 @@ pub(super) struct SolverStatus {
     pub(super) left_s: Option<f64>,
 }
 
-/// The ledger of visibilities so far.
-#[derive(Clone, Debug, Serialize)]
+/// The ledger of visibilities so far. How many were sampled is known at the end of a run: until then that and the rest are null.
+#[derive(Clone, Debug)]
 pub(super) struct LedgerStatus {
-    #[serde(flatten)]
     pub(super) report: LedgerReport<VisibilityReason>,
-    /// Visibilities without an entry: on their way while the run goes on, zero at its end.
-    pub(super) unaccounted: i128,
+    /// Visibilities that were sampled, and those without an entry, zero unless the ledger does not close.
+    pub(super) sampled: Option<(u64, i128)>,
 }
 
-impl From<LedgerReport<VisibilityReason>> for LedgerStatus {
-    fn from(report: LedgerReport<VisibilityReason>) -> Self {
-        Self { unaccounted: report.unaccounted(), report }
+impl LedgerStatus {
+    /// Of a run that has ended, or goes on.
+    pub(super) fn of(report: LedgerReport<VisibilityReason>, is_over: bool) -> Self {
+        let sampled = is_over.then(|| (report.sampled, report.unaccounted()));
+        Self { report, sampled }
+    }
+}
+
+impl Serialize for LedgerStatus {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut fields = serde_json::to_value(&self.report).map_err(serde::ser::Error::custom)?;
+        fields["sampled"] = self.sampled.map(|(sampled, _)| sampled).into();
+        fields["unaccounted"] = self.sampled.and_then(|(_, rest)| i64::try_from(rest).ok()).into();
+        fields.serialize(serializer)
     }
 }
 
@@ -127,6 +139,10 @@ pub(super) struct ListenerStatus {
     pub(super) bytes: u64,
     /// Bytes read that the ground has not taken yet.
     pub(super) backlog_bytes: u64,
+    /// Time since the last sound packet from anyone, s; null before the first of this session.
+    pub(super) silence_s: Option<f64>,
+    /// The raw archive, if there is one.
+    pub(super) archive: Option<ArchiveReport>,
     /// Connections that have ended.
     pub(super) report: ListenReport,
 }
@@ -164,10 +180,16 @@ pub(super) struct Status {
     /// Known at the end.
     pub(super) completeness: Option<Completeness>,
     pub(super) reception: Option<ReceptionCounters>,
+    /// Bytes of visibilities that wait for their positions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) waiting_bytes: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) listening: Option<ListenerStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) saving: Option<SavingReport>,
+    /// How the files of maps go, of a ground that goes on without them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) products: Option<ProductsReport>,
     pub(super) channels: Vec<ChannelStatus>,
     /// Whether `/api/gaps` answers.
     pub(super) has_state: bool,

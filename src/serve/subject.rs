@@ -18,6 +18,8 @@ pub struct Subject {
     pub state: Option<PathBuf>,
     /// Says where the Earth is.
     pub earth: EarthModel,
+    /// Folders on whose disks there has to be room, by what they hold.
+    pub folders: Vec<(&'static str, PathBuf)>,
 }
 
 impl Subject {
@@ -27,6 +29,21 @@ impl Subject {
         // A configuration that was read can be written.
         let text = serde_json::to_vec(config).unwrap_or_default();
         let earth = EarthModel::of(&config.array);
-        Self { name: config.name.clone(), segment, config: text, state: state.map(Path::to_owned), earth }
+        let (name, state) = (config.name.clone(), state.map(Path::to_owned));
+        Self {
+            name,
+            segment,
+            config: text,
+            folders: state.iter().map(|path| ("state", path.clone())).collect(),
+            state,
+            earth,
+        }
+    }
+
+    /// As [`Subject::new`], and tells of the disk on which maps are written.
+    #[must_use]
+    pub fn with_maps_in(mut self, out: &Path) -> Self {
+        self.folders.push(("maps", out.to_owned()));
+        self
     }
 }

@@ -45,6 +45,8 @@ fn every_command_has_help_that_teaches() {
         "cutout",
         "gaps",
         "merge",
+        "rebuild",
+        "extract",
         "retract",
         "recalibrate",
         "bench",
@@ -54,6 +56,7 @@ fn every_command_has_help_that_teaches() {
         "completions",
         "man",
         "calibrate",
+        "bound",
     ] {
         let output = lunarray().args([command, "--help"]).output().unwrap();
         assert!(output.status.success());
@@ -463,7 +466,7 @@ fn check_tells_what_it_understood_of_each_file() {
     sets.iter().for_each(|set| args.extend(["--set", set]));
     let told = said(&args);
     for part in [
-        "map.fits: 3 MHz, galactic frame, K, nside 8",
+        "map.fits: 3 MHz, Galactic frame, K, nside 8",
         "mean 2.0000e6 K",
         "gleam.csv: 1 sources, equatorial positions",
         "at 200 MHz",

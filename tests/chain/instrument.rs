@@ -119,8 +119,9 @@ fn visibilities_weights_and_dead_receivers_follow_the_truth() {
     let mut truth: BTreeMap<(u16, u8), Vec<Receiver>> = BTreeMap::new();
     for line in table.lines().skip(1) {
         let number: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
-        let [_, t_s, daughter, channel, hz, ln, deg, ns, ..] = number[..] else { panic!("{line}") };
-        let gain = Complex64::from_polar(ln.exp(), deg.to_radians() - std::f64::consts::TAU * hz * ns * 1e-9);
+        let [_, t_s, daughter, channel, _, ln, deg, ..] = number[..] else { panic!("{line}") };
+        // The clock is in the phase.
+        let gain = Complex64::from_polar(ln.exp(), deg.to_radians());
         let dead = number[11] == 1.0;
         truth.entry((channel as u16, daughter as u8 - 1)).or_default().push((t_s, gain, dead));
     }

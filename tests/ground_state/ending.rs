@@ -123,7 +123,7 @@ fn a_state_that_is_moved_away_is_not_saved_elsewhere() {
         signal(&child, "TERM");
         let output = output(child);
         let said = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{case}: {said}");
+        assert_eq!(output.status.code(), Some(3), "{case}: {said}");
         assert!(said.contains(expected) && said.contains(&state), "{case}: {said}");
         let after = checkpoints(Path::new(if case == "unlocked" { &state } else { &elsewhere }));
         assert_eq!(before, after, "{case}");
@@ -146,4 +146,21 @@ fn sigterm_is_the_regular_end_of_a_session_that_follows() {
     assert_eq!(end(&mut child).0.code(), Some(0));
     place.replay("state", &[&file], &[]);
     assert!(place.bytes("state") == place.bytes("whole"));
+}
+
+#[test]
+fn a_failure_says_by_its_code_of_which_sort_it_is() {
+    let place = Ground::new();
+    let file = place.downlink();
+    place.replay("state", &[&file], &[]);
+    let code = |state: &str, files: &[&str], more: &[&str]| place.output(state, files, more).status.code();
+    // A configuration that does not fit, or cannot be read.
+    assert_eq!(code("state", &[], &["--set", "map.nside=8"]), Some(2));
+    assert_eq!(code("new", &[&file], &["--set", "map.nside=7"]), Some(2));
+    // Data.
+    let foreign = place.file("foreign", &[7; 5000]);
+    assert_eq!(code("new", &[&foreign], &[]), Some(1));
+    // The system: a folder that cannot be made, as a file is in its place.
+    place.file("file", b"x");
+    assert_eq!(code("file/state", &[&file], &[]), Some(3));
 }

@@ -12,7 +12,7 @@ use lunarray::runtime::{Ledger, Outlet, Stage};
 use lunarray::units::Pair;
 use serde_json::Value;
 
-use super::common::workplace::{SMALL, Workplace, json, succeed};
+use super::common::workplace::{SMALL, Workplace, json, lunarray, succeed};
 use super::{Ground, VISIBILITIES, identity, leave_out, packets};
 
 /// Identifier of packets of positions.
@@ -229,4 +229,40 @@ fn a_state_of_other_settings_is_refused() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(!output.status.success());
     assert!(said.contains("map.nside = 4") && said.contains("expected 8"), "{said}");
+}
+
+#[test]
+fn what_is_missing_is_cut_out_and_fails_a_script_until_it_has_come() {
+    let place = Ground::new();
+    let file = place.downlink();
+    let lacking = place.file("lacking.ccsds", &leave_out(&file, 5..9));
+    place.replay("state", &[&lacking], &[]);
+    let state = place.path("state");
+    assert!(lunarray(&["gaps", &state, "--fail-if", "99"]).status.success());
+    for limit in ["any", "0"] {
+        let output = lunarray(&["gaps", &state, "--fail-if", limit]);
+        assert_eq!(output.status.code(), Some(1), "{limit}");
+        // The list is printed all the same.
+        assert!(String::from_utf8(output.stdout).unwrap().contains("0x103"), "{limit}");
+    }
+    let found = place.gaps("state");
+    let ranges: Vec<String> = found["gaps"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|gap| format!("{} {} {}\n", gap["apid"], gap["from"], gap["to"]))
+        .collect();
+    let ranges = place.file("ranges", ranges.concat().as_bytes());
+    let again = place.path("again.ccsds");
+    // From a coded downlink, too.
+    let coded = place.simulate("small.cadu", &["--format", "cadu"]);
+    let said = json(&["extract", &coded, "--ranges", &ranges, "--out", &again]);
+    assert_eq!([&said["packets"], &said["missing"]], [4, 0]);
+    let cut: Vec<Vec<u8>> = packets(&again);
+    let meant = |packet: &&Vec<u8>| identity(packet).0 == 0x103 && (5..9).contains(&identity(packet).1);
+    assert!(cut.iter().eq(packets(&file).iter().filter(meant)));
+    place.replay("state", &[&again], &[]);
+    assert!(lunarray(&["gaps", &state, "--fail-if", "any"]).status.success());
+    place.replay("once", &[&file], &[]);
+    assert!(place.bytes("state") == place.bytes("once"));
 }

@@ -59,6 +59,25 @@ fn states_make_one_whatever_their_order() {
 }
 
 #[test]
+fn a_merge_that_was_ended_after_its_checkpoint_is_repeated() {
+    for (engine, more) in ENGINES.into_iter().chain([("refined", super::refined::REFINED)]) {
+        let place = Ground::with(more);
+        let file = place.downlink();
+        for (name, lost) in [("first", 41..1000), ("second", 0..41)] {
+            let path = place.file(&format!("{name}.ccsds"), &leave_out(&file, lost));
+            place.replay(name, &[&path], &[]);
+        }
+        succeed(&strs(&merge(&place, &["first", "second"], "both")));
+        let bytes = place.bytes("both");
+        succeed(&strs(&merge(&place, &["second", "first"], "both")));
+        assert!(place.bytes("both") == bytes, "{engine}");
+        // Of other states it is not the same.
+        let said = fail(&strs(&merge(&place, &["first"], "both")));
+        assert!(said.contains("holds a state already"), "{engine}: {said}");
+    }
+}
+
+#[test]
 fn states_of_the_same_visibilities_are_refused() {
     let place = Ground::new();
     let file = place.downlink();

@@ -6,6 +6,12 @@ use std::path::{Path, PathBuf};
 use super::common::workplace::{fail, json, lunarray, succeed};
 use super::{Ground, VISIBILITIES, checkpoints, identity, leave_out, packets};
 
+/// The second file of a segment.
+fn copy_of(segment: &Path) -> PathBuf {
+    let name = segment.file_name().unwrap().to_str().unwrap().replace(".segment", ".copy.segment");
+    segment.with_file_name(name)
+}
+
 /// Two passes show all that more would, and an inner solution goes on to where it depends on the sums alone.
 pub const REFINED: &str = "[map]\nengine = \"harmonic\"\nresidual_max = 1e-9\nrefine = { passes_max = 2 }";
 
@@ -57,13 +63,18 @@ fn any_order_and_any_sessions_make_the_same(engine: &str) {
     let last = place.replay("thrice", &[], &[]);
     assert_eq!(last["ledger"]["accumulated"], once["ledger"]["accumulated"]);
     assert!(place.maps("thrice") == place.maps("once"));
-    // Each of the two checkpoints that are kept has its segments, and nothing else is left: without any of the files one of them does not
-    // hold.
+    // Each of the two checkpoints that are kept has its segments, and nothing else is left: without both files of any of them one
+    // checkpoint does not hold.
     let state = place.path("thrice");
     assert!(!segments(&state).is_empty() && checkpoints(state.as_ref()).len() == 2);
     for segment in segments(&state) {
+        if segment.to_str().unwrap().ends_with(".copy.segment") {
+            continue;
+        }
         let bytes = std::fs::read(&segment).unwrap();
+        assert_eq!(std::fs::read(copy_of(&segment)).unwrap(), bytes);
         std::fs::remove_file(&segment).unwrap();
+        std::fs::remove_file(copy_of(&segment)).unwrap();
         let broken = |checkpoint: &PathBuf| {
             let alone = tempfile::tempdir().unwrap();
             for file in segments(&state).iter().chain([checkpoint]) {
@@ -75,6 +86,7 @@ fn any_order_and_any_sessions_make_the_same(engine: &str) {
                 .success()
         };
         assert!(checkpoints(state.as_ref()).iter().any(broken), "{}", segment.display());
+        std::fs::write(copy_of(&segment), &bytes).unwrap();
         std::fs::write(&segment, bytes).unwrap();
     }
     // States of different stations, put together in either order.
@@ -169,6 +181,27 @@ fn a_damaged_segment_is_told_and_the_checkpoint_before_serves() {
     let good = std::fs::read(&newest).unwrap();
     let mut bad = good.clone();
     bad[40] ^= 1;
+    // One bit of any one file loses nothing.
+    for segment in segments(&folder) {
+        let whole = std::fs::read(&segment).unwrap();
+        let mut flipped = whole.clone();
+        flipped[100] ^= 1;
+        std::fs::write(&segment, flipped).unwrap();
+        let survey = json(&["gaps", &folder]);
+        assert_eq!(survey["gaps"].as_array().unwrap().len(), 0);
+        let alone = tempfile::tempdir().unwrap();
+        for file in segments(&folder).into_iter().chain(checkpoints(Path::new(&folder))) {
+            std::fs::copy(&file, alone.path().join(file.file_name().unwrap())).unwrap();
+        }
+        let [out, alone] = [place.path("alone"), alone.path().to_str().unwrap().to_owned()];
+        let output = lunarray(&["replay", "--map", &place.pipeline, "--out", &out, "--state", &alone]);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success() && !said.contains("segment"), "{said}");
+        std::fs::write(&segment, whole).unwrap();
+    }
+    // Of both it loses a checkpoint.
+    let newest = PathBuf::from(newest.to_str().unwrap().replace(".copy.segment", ".segment"));
+    std::fs::write(copy_of(&newest), &bad).unwrap();
     std::fs::write(&newest, &bad).unwrap();
     // The one before lacks the second half, which comes again.
     let before = checkpoints(Path::new(&folder)).len();

@@ -94,7 +94,9 @@ fn notes_errors_and_wrong_usage_are_objects_too() {
     assert_eq!(told[0]["event"], "serving");
     // Without the last report nobody knows what else is missing, or with it all is known: then nothing is said.
     assert!(
-        events(&told).iter().all(|event| ["serving", "note", "incomplete", "progress"].contains(event)),
+        events(&told)
+            .iter()
+            .all(|event| ["serving", "note", "incomplete", "progress", "map", "stage-ended"].contains(event)),
         "{text}"
     );
     // An error with its causes; the option may stand anywhere.

@@ -1,6 +1,7 @@
 //! A listening ground, a sending spacecraft, and paced replays: the same bits as through a file.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // Also in the helpers.
 
+mod archive;
 mod broker;
 #[path = "../common/mod.rs"]
 mod common;
@@ -11,6 +12,7 @@ mod log;
 mod pace;
 mod page;
 mod panels;
+mod restart;
 mod senders;
 mod service;
 mod serving;

@@ -123,8 +123,21 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
     let ids: BTreeSet<u64> = panels.iter().map(|panel| panel["id"].as_u64().unwrap()).collect();
     assert_eq!(ids.len(), panels.len());
     // Labels that rules choose by have the values that they name.
-    for label in ["phase=\"failed\"", "phase=\"ended\"", "stage=\"ground\"", "kind=\"visibilities\""] {
+    for label in ["phase=\"failed\"", "stage=\"ground\"", "kind=\"visibilities\""] {
         assert!(text.contains(label) && ours("docs/deploy/alerts.yml").contains(label), "{label}");
     }
     drop(served);
+    // Each alert leads to its place in the runbook, and each place there is an alert's.
+    let (rules, runbook) = (ours("docs/deploy/alerts.yml"), ours("docs/runbook.md"));
+    let alerts: BTreeSet<&str> =
+        rules.lines().filter_map(|line| line.trim().strip_prefix("- alert: ")).collect();
+    let places: BTreeSet<&str> = runbook.lines().filter_map(|line| line.strip_prefix("## ")).collect();
+    assert!(alerts.len() > 10);
+    assert_eq!(alerts, places);
+    for alert in alerts {
+        assert!(
+            rules.contains(&format!("runbook_url: \"docs/runbook.md#{}\"", alert.to_lowercase())),
+            "{alert}"
+        );
+    }
 }

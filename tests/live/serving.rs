@@ -14,10 +14,10 @@ pub(super) const SNAPSHOTS: [&str; 4] =
 
 /// A command that serves; ends when dropped.
 pub(super) struct Served {
-    child: Child,
+    pub(super) child: Child,
     pub(super) address: String,
     /// What it says after that.
-    said: Arc<Mutex<String>>,
+    pub(super) said: Arc<Mutex<String>>,
 }
 
 impl Served {
@@ -28,8 +28,9 @@ impl Served {
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
         let address = loop {
             let line = lines.next().expect("it ended before it served").unwrap();
-            if let Some(url) = line.strip_prefix("serving on http://") {
-                break url.trim_end_matches('/').to_owned();
+            // Also in a line for programs.
+            if let Some((_, url)) = line.split_once("serving on http://") {
+                break url.split('/').next().unwrap_or_default().to_owned();
             }
         };
         let said = Arc::new(Mutex::new(String::new()));
@@ -39,6 +40,12 @@ impl Served {
             lines.for_each(|line| *heard.lock().unwrap() += &format!("{}\n", line.unwrap_or_default()));
         });
         Self { child, address, said }
+    }
+
+    /// Ends it with SIGKILL.
+    pub(super) fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
     }
 
     /// Its process.
@@ -115,9 +122,9 @@ impl Drop for Served {
 #[derive(Debug)]
 pub(super) struct Reply {
     /// 0 if there was no answer.
-    status: u16,
+    pub(super) status: u16,
     headers: BTreeMap<String, String>,
-    body: Vec<u8>,
+    pub(super) body: Vec<u8>,
 }
 
 impl Reply {

@@ -100,7 +100,8 @@ fn several_columns_and_provenance_are_kept() {
     let second = read_map_file(&path, &ReadOptions { column: 1, ..ReadOptions::default() }).unwrap();
     assert_eq!((second.map, second.name.as_str(), second.unit.as_str()), (two, "NOISE", ""));
     assert_eq!(second.header.get("CFGHASH"), Some(&CardValue::Text(hash)));
-    assert!(second.header.cards().ends_with(&cards));
+    // Those of the file's first header follow.
+    assert!(second.header.cards().windows(cards.len()).any(|some| some == cards));
     let third = read_map(&path, &ReadOptions { column: 2, ..ReadOptions::default() });
     assert!(matches!(*third.unwrap_err().problem, FitsProblem::NoColumn { column: 2, columns: 2 }));
 }
@@ -427,7 +428,7 @@ fn the_first_header_says_what_the_table_s_leaves_out() {
     // At nside 1 both orders are the same.
     assert_eq!((map.frame(), map.values()[3]), (Frame::Galactic, 23.0));
     let understood = MapUnderstood::of(&path, &ReadOptions::default()).unwrap().to_string();
-    for part in ["408 MHz", "galactic frame", "mK", "column `TEMPERATURE` of 2", "nside 1", "mean 2.55"] {
+    for part in ["408 MHz", "Galactic frame", "mK", "column `TEMPERATURE` of 2", "nside 1", "mean 2.55"] {
         assert!(understood.contains(part), "{part}: {understood}");
     }
 }

@@ -85,7 +85,7 @@ pub struct SolverConfig {
     pub iterations_max: u32,
     /// Most predictions of the model at positions found before.
     pub position_rounds: u32,
-    /// Part of a daughter's signal that a solution with positions may leave unexplained; with more, its data are left out of maps.
+    /// Part of a daughter's signal that a solution may leave unexplained; with more, its data are left out of maps.
     pub unexplained_max: f64,
     /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
     pub phase_sigma_deg_max: f64,
@@ -126,7 +126,7 @@ impl Default for SolverConfig {
             iterations_max: 50,
             position_rounds: 3,
             unexplained_max: 0.15,
-            phase_sigma_deg_max: 30.0,
+            phase_sigma_deg_max: 15.0,
             dead_amplitude: 0.05,
             model_files: Vec::new(),
             model_nside: 0,

@@ -7,6 +7,7 @@
 
 use super::layout::ParameterLayout;
 use super::newton::Found;
+use super::robust_fit::Fitted;
 use super::sums::ModelledBlock;
 
 /// Standard deviations of noise beyond which something is left.
@@ -23,10 +24,16 @@ struct Left {
 }
 
 impl Left {
-    fn of(layout: &ParameterLayout, found: &Found, block: &ModelledBlock) -> Self {
+    fn of(
+        layout: &ParameterLayout,
+        found: &Found,
+        block: &ModelledBlock,
+        [from_s, until_s]: [f64; 2],
+    ) -> Self {
         let (gain, u) = layout.pair(&found.values, block.channel, block.pair);
         let (mut count, mut residual, mut power) = (0.0, 0.0, 0.0);
-        for k in (0..block.time_s.len()).filter(|&k| !block.is_out[k]) {
+        let is_used = |k: &usize| !block.is_out[*k] && (from_s..until_s).contains(&block.time_s[*k]);
+        for k in (0..block.time_s.len()).filter(is_used) {
             let model: num_complex::Complex64 =
                 block.model[k].iter().zip(&u).map(|(term, factor)| term * factor).sum();
             let (value, weight) = (block.value_k_sr[k], block.weight[k]);
@@ -62,18 +69,23 @@ impl Left {
 /// Part of the signal of each daughter in each channel (by channel, then daughter) that its solution leaves. The worst daughter of a
 /// channel answers for its pairs, if it is above `most`; the next one for what remains.
 pub(super) fn unexplained(
-    layout: &ParameterLayout,
-    found: &Found,
+    fitted: &Fitted,
     blocks: &[ModelledBlock],
+    span_s: [f64; 2],
     most: f64,
 ) -> Vec<f64> {
+    let Fitted { layout, found, takes_part, .. } = fitted;
     let n = layout.satellites;
     let mut parts = vec![0.0; n * layout.channels()];
     for (channel, parts) in parts.chunks_mut(n.max(1)).enumerate() {
         let mut pairs: Vec<([usize; 2], Left)> = blocks
             .iter()
-            .filter(|block| block.channel == channel)
-            .map(|block| ([block.pair.i, block.pair.j].map(usize::from), Left::of(layout, found, block)))
+            .zip(takes_part)
+            .filter(|(block, takes_part)| block.channel == channel && **takes_part)
+            .map(|(block, _)| {
+                let pair = [block.pair.i, block.pair.j].map(usize::from);
+                (pair, Left::of(layout, found, block, span_s))
+            })
             .collect();
         loop {
             let of = |daughter: usize| {

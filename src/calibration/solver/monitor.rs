@@ -2,11 +2,16 @@
 //!
 //! | event | pattern |
 //! |---|---|
-//! | clock jump | phases of one daughter change in proportion to the frequency; of all daughters alike: the reference's clock |
+//! | clock jump | phases of one daughter change in proportion to the frequency |
 //! | phase step | phases of one daughter change otherwise |
 //! | gain step | amplitudes of one daughter change |
+//! | dead | a daughter delivers noise |
+//! | drift | a gain changes within an interval, and not at once |
+//! | wrong model | pairs have residuals that no gains explain |
 //! | interference | outliers in one channel, of most pairs and most of the time |
 //! | burst | outliers at one time, of most pairs and channels |
+//!
+//! Phases of all daughters against the reference that change alike are a change of the reference's.
 
 use std::f64::consts::{PI, TAU};
 use std::fmt;
@@ -32,8 +37,10 @@ const FIT: f64 = 9.0;
 pub enum InstrumentEvent {
     /// A clock jumped.
     ClockJump {
-        /// Pass after it.
+        /// Pass after it, or in which it happened.
         pass: u64,
+        /// Last time before it and first time after it, s since the epoch.
+        between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
         /// By this much, ns.
@@ -41,8 +48,10 @@ pub enum InstrumentEvent {
     },
     /// Phases changed.
     PhaseStep {
-        /// Pass after it.
+        /// Pass after it, or in which it happened.
         pass: u64,
+        /// Last time before it and first time after it, s since the epoch.
+        between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
         /// Channels, from 0, and changes, deg.
@@ -50,12 +59,41 @@ pub enum InstrumentEvent {
     },
     /// Amplitudes changed.
     GainStep {
-        /// Pass after it.
+        /// Pass after it, or in which it happened.
         pass: u64,
+        /// Last time before it and first time after it, s since the epoch.
+        between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
         /// Channels, from 0, and factors.
         channels: Vec<(usize, f64)>,
+    },
+    /// A daughter delivers noise from this pass on.
+    Dead {
+        /// First such pass.
+        pass: u64,
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0.
+        channels: Vec<usize>,
+    },
+    /// A phase changes within an interval, and not at once.
+    Drift {
+        /// Pass.
+        pass: u64,
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0, and root mean square changes, deg.
+        channels: Vec<(usize, f64)>,
+    },
+    /// The model is not that of the data: the sky's, or the artificial signal's.
+    WrongModel {
+        /// First such pass.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Part of the signal that no gains explain.
+        unexplained: f64,
     },
     /// A channel is disturbed.
     Interference {
@@ -85,6 +123,9 @@ impl InstrumentEvent {
             Self::ClockJump { pass, .. }
             | Self::PhaseStep { pass, .. }
             | Self::GainStep { pass, .. }
+            | Self::Dead { pass, .. }
+            | Self::Drift { pass, .. }
+            | Self::WrongModel { pass, .. }
             | Self::Interference { pass, .. }
             | Self::Burst { pass, .. } => *pass,
         }
@@ -99,16 +140,38 @@ impl fmt::Display for InstrumentEvent {
             each.collect::<Vec<_>>().join(", ")
         };
         match self {
-            Self::ClockJump { pass, daughter, change_ns } => {
-                write!(f, "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns")
+            Self::ClockJump { pass, daughter, change_ns, between_s } => {
+                let when = when(between_s);
+                write!(f, "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns{when}")
             }
-            Self::PhaseStep { pass, daughter, channels } => {
-                write!(f, "pass {pass}: phases of daughter {daughter} changed by {}", list(channels, " deg"))
+            Self::PhaseStep { pass, daughter, channels, between_s } => {
+                let (list, when) = (list(channels, " deg"), when(between_s));
+                write!(f, "pass {pass}: phases of daughter {daughter} changed by {list}{when}")
             }
-            Self::GainStep { pass, daughter, channels } => {
-                let factors = list(channels, "");
-                write!(f, "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}")
+            Self::GainStep { pass, daughter, channels, between_s } => {
+                let (factors, when) = (list(channels, ""), when(between_s));
+                write!(
+                    f,
+                    "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{when}"
+                )
             }
+            Self::Dead { pass, daughter, channels } => {
+                let channels: Vec<String> = channels.iter().map(usize::to_string).collect();
+                write!(
+                    f,
+                    "pass {pass}: daughter {daughter} delivers noise in channels {}",
+                    channels.join(", ")
+                )
+            }
+            Self::Drift { pass, daughter, channels } => {
+                let list = list(channels, " deg");
+                write!(f, "pass {pass}: phases of daughter {daughter} drift within the pass by {list} rms")
+            }
+            Self::WrongModel { pass, channel, unexplained } => write!(
+                f,
+                "pass {pass}: the model is not that of the data in channel {channel}: no gains explain {:.1} % of the signal",
+                100.0 * unexplained
+            ),
             Self::Interference { pass, channel, outliers } => write!(
                 f,
                 "pass {pass}: interference in channel {channel}, {:.1} % of its visibilities are outliers",
@@ -119,6 +182,11 @@ impl fmt::Display for InstrumentEvent {
             }
         }
     }
+}
+
+/// When something happened within a pass.
+fn when([from_s, until_s]: &[f64; 2]) -> String {
+    if until_s - from_s > 1.0 { String::new() } else { format!(", at {:.1} s", 0.5 * (from_s + until_s)) }
 }
 
 /// Changes of a daughter from one solution to the next, by channel.
@@ -138,10 +206,16 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
     let mut changes = changes(solutions);
     widen(&mut changes, |change| &mut change.phases);
     widen(&mut changes, |change| &mut change.amplitudes);
+    for at in 1..solutions.len() {
+        let mut of_pass: Vec<&mut Change> = changes.iter_mut().filter(|change| change.at == at).collect();
+        find_reference(&mut of_pass, solutions[at].reference as usize - 1);
+    }
     let mut events = Vec::new();
     for (at, solution) in solutions.iter().enumerate() {
         let of_pass: Vec<&Change> = changes.iter().filter(|change| change.at == at).collect();
-        daughters(&of_pass, solution, &mut events);
+        let before = at.checked_sub(1).map(|before| &solutions[before]);
+        daughters(&of_pass, before, solution, &mut events);
+        states(before, solution, &mut events);
         disturbances(solution, &mut events);
     }
     events
@@ -153,8 +227,9 @@ fn changes(solutions: &[PassSolution]) -> Vec<Change> {
     let is_spoilt = |at: usize, channel: usize| spoilt[at].get(channel) == Some(&true);
     for (at, two) in solutions.windows(2).enumerate() {
         for (n, (before, after)) in two[0].daughters.iter().zip(&two[1].daughters).enumerate() {
-            // What outliers leave of a disturbed channel is no gain to judge the daughter by.
-            let known = |gain: &GainEstimate| gain.state == GainState::Good;
+            // What outliers leave of a disturbed channel is no gain to judge the daughter by; phases against another reference are others.
+            let is_same = two[0].reference == two[1].reference;
+            let known = |gain: &GainEstimate| is_same && gain.state == GainState::Good;
             let pairs = before.gains.iter().zip(&after.gains).enumerate();
             let pairs: Vec<_> = pairs
                 .filter(|(c, (a, b))| known(a) && known(b) && !is_spoilt(at, *c) && !is_spoilt(at + 1, *c))
@@ -209,10 +284,58 @@ fn jumped((_, change, sigma): &&(usize, f64, f64)) -> bool {
     change.abs() > (JUMP_SIGMAS * sigma).max(CHANGE_MIN)
 }
 
-/// Events of daughters between a pass and the one before.
-fn daughters(changes: &[&Change], solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
+/// Part of a common change by which changes may differ, and standard deviations.
+const ALIKE: f64 = 0.05;
+const ALIKE_SIGMAS: f64 = 4.0;
+
+/// Takes phases of most daughters that change alike, against the reference, for a change of the reference.
+fn find_reference(changes: &mut [&mut Change], reference: usize) {
+    let mut channels: Vec<usize> = changes.iter().flat_map(|one| one.phases.iter().map(|p| p.0)).collect();
+    channels.sort_unstable();
+    channels.dedup();
+    for channel in channels {
+        let phase = |one: &Change| one.phases.iter().find(|phase| phase.0 == channel).copied();
+        let others: Vec<(usize, f64, f64)> =
+            changes.iter().filter(|one| one.daughter != reference).filter_map(|one| phase(one)).collect();
+        let is_alike = |one: &&(usize, f64, f64), about: &(usize, f64, f64)| {
+            let most = (ALIKE * about.1.abs()).max(ALIKE_SIGMAS * one.2.hypot(about.2));
+            wrapped(one.1 - about.1).abs() < most
+        };
+        let count = |about: &(usize, f64, f64)| others.iter().filter(|one| is_alike(one, about)).count();
+        // Of the reference nothing is known but by all others.
+        let of_reference = changes.iter_mut().filter(|one| one.daughter == reference);
+        of_reference.for_each(|one| one.phases.retain(|phase| phase.0 != channel));
+        let Some(most) = others.iter().filter(jumped).max_by_key(|jump| count(jump)) else { continue };
+        let jumps = others.iter().filter(jumped).filter(|one| is_alike(one, most));
+        let alike: Vec<(f64, f64)> = jumps.map(|jump| (wrapped(jump.1 - most.1), jump.2)).collect();
+        // Two daughters alone cannot say which of them it was.
+        if alike.len() < 2 || 2 * count(most) <= others.len() {
+            continue;
+        }
+        let weight: f64 = alike.iter().map(|one| one.1.max(1e-6).powi(-2)).sum();
+        let mean = alike.iter().map(|one| one.0 * one.1.max(1e-6).powi(-2)).sum::<f64>() / weight;
+        let (change, sigma) = (most.1 + mean, weight.recip().sqrt());
+        for one in &mut *changes {
+            if one.daughter == reference {
+                one.phases.push((channel, -wrapped(change), sigma));
+                continue;
+            }
+            for phase in one.phases.iter_mut().filter(|phase| phase.0 == channel) {
+                *phase = (channel, wrapped(phase.1 - change), phase.2.hypot(sigma));
+            }
+        }
+    }
+}
+
+/// Events of daughters between a solution and the one before.
+fn daughters(
+    changes: &[&Change],
+    before: Option<&PassSolution>,
+    solution: &PassSolution,
+    events: &mut Vec<InstrumentEvent>,
+) {
     let pass = solution.pass;
-    let mut clocks: Vec<(u32, f64)> = Vec::new();
+    let between_s = [before.map_or(solution.from_s, |before| before.until_s), solution.from_s];
     for change in changes {
         let daughter = change.daughter as u32 + 1;
         let list = |list: &[(usize, f64, f64)], of: fn(f64) -> f64| -> Vec<(usize, f64)> {
@@ -220,33 +343,67 @@ fn daughters(changes: &[&Change], solution: &PassSolution, events: &mut Vec<Inst
         };
         let amplitudes = list(&change.amplitudes, f64::exp);
         if !amplitudes.is_empty() {
-            events.push(InstrumentEvent::GainStep { pass, daughter, channels: amplitudes });
+            events.push(InstrumentEvent::GainStep { pass, daughter, channels: amplitudes, between_s });
         }
         let phases = list(&change.phases, f64::to_degrees);
         if phases.is_empty() {
             continue;
         }
-        match clock_ns(change, solution) {
-            Some(ns) => clocks.push((daughter, ns)),
-            None => events.push(InstrumentEvent::PhaseStep { pass, daughter, channels: phases }),
+        events.push(match clock_ns(change, solution) {
+            Some(change_ns) => InstrumentEvent::ClockJump { pass, daughter, change_ns, between_s },
+            None => InstrumentEvent::PhaseStep { pass, daughter, channels: phases, between_s },
+        });
+    }
+}
+
+/// Least change of a phase within an interval, deg, least part of the variance of a phase that it is, and least part of the signal that a
+/// model leaves, that are told.
+const DRIFT_MIN_DEG: f64 = 4.0;
+const DRIFT_PART: f64 = 0.92;
+const MODEL_MIN: f64 = 0.01;
+
+/// What solutions say of themselves, where the one before did not.
+fn states(before: Option<&PassSolution>, solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
+    let pass = solution.pass;
+    let channels = solution.model_error.len();
+    let spoilt = spoilt_channels(solution);
+    let is_spoilt = |c: usize| spoilt.get(c) == Some(&true);
+    for (n, daughter) in solution.daughters.iter().enumerate() {
+        let number = daughter.daughter;
+        let is_dead = |of: &PassSolution, c: usize| of.daughters[n].gains[c].state == GainState::Dead;
+        let dead = (0..channels).filter(|c| is_dead(solution, *c));
+        let dead: Vec<usize> = dead.filter(|c| before.is_none_or(|before| !is_dead(before, *c))).collect();
+        if !dead.is_empty() {
+            events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
+        }
+        // Where it is most of what is not known of the phase: noise alone seems to be as much as nine tenths of it.
+        let drifts = |gain: &GainEstimate| {
+            let known = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
+            gain.phase_scatter_deg > DRIFT_MIN_DEG && (gain.phase_scatter_deg / known).powi(2) > DRIFT_PART
+        };
+        let drifting = daughter.gains.iter().enumerate().filter(|(c, gain)| drifts(gain) && !is_spoilt(*c));
+        let drifting: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
+        if !drifting.is_empty() {
+            events.push(InstrumentEvent::Drift { pass, daughter: number, channels: drifting });
         }
     }
-    // All others against the reference, alike: it was the reference.
-    let known = changes.iter().filter(|change| !change.phases.is_empty()).count();
-    let mean_ns = clocks.iter().map(|(_, ns)| ns).sum::<f64>() / clocks.len().max(1) as f64;
-    let alike = clocks.iter().all(|(_, ns)| (ns - mean_ns).abs() < 0.1 * mean_ns.abs());
-    let reference = changes.iter().find(|change| {
-        let gains = &solution.daughters[change.daughter].gains;
-        !change.phases.is_empty() && gains.iter().all(|gain| gain.phase_sigma_deg == 0.0)
-    });
-    match reference {
-        Some(reference) if clocks.len() >= 2 && clocks.len() + 1 == known && alike => {
-            let daughter = reference.daughter as u32 + 1;
-            events.push(InstrumentEvent::ClockJump { pass, daughter, change_ns: -mean_ns });
-        }
-        _ => {
-            let jump = |(daughter, change_ns)| InstrumentEvent::ClockJump { pass, daughter, change_ns };
-            events.extend(clocks.into_iter().map(jump));
+    let part = |of: &PassSolution, c: usize| {
+        // A good part of the daughters: one alone may have another trouble.
+        let gains: Vec<&GainEstimate> = of.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
+        let known = |gain: &&&GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
+        let known = gains.iter().filter(known).count();
+        let poor = gains.iter().filter(|gain| gain.state == GainState::PoorFit).count();
+        let mut parts: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
+        parts.sort_unstable_by(f64::total_cmp);
+        let median = parts.get(parts.len() / 2).copied().unwrap_or(0.0);
+        let is_foreign = known > 0 && 2 * poor > known;
+        let part = of.model_error[c].max(median);
+        (is_foreign || part > MODEL_MIN).then_some(part)
+    };
+    for channel in (0..channels).filter(|c| !is_spoilt(*c)) {
+        let was = before.and_then(|before| part(before, channel)).is_some();
+        if let Some(unexplained) = part(solution, channel).filter(|_| !was) {
+            events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
         }
     }
 }

@@ -3,7 +3,7 @@
 use super::config::{CalibrationMode, SolverConfig};
 use super::model::{KnownSignal, Offsets};
 use super::positions::{Search, modelled};
-use super::solution::{PassData, PassSolution, solve_from};
+use super::solution::{PassData, PassSolution, solve_from, solve_pass_in_parts};
 use super::sums::ModelledBlock;
 use crate::array::{Ephemeris, orbit_normal_hat};
 use crate::calibration::{CalibrationError, VanVleck};
@@ -156,8 +156,11 @@ impl Task<'_> {
         let mut solutions = Vec::new();
         for _ in 0..if moves { config.position_rounds } else { 1 } {
             let mut blocks = modelled(&all, signal, &offsets)?;
-            solutions = self.parts().map(|span_s| self.part(span_s, &mut blocks, &offsets)).collect();
-            let [solution] = &solutions[..] else { break };
+            solutions = match moves {
+                true => self.parts().map(|span_s| self.part(span_s, &mut blocks, &offsets)).collect(),
+                false => self.parts().flat_map(|span_s| self.steady_parts(span_s, &mut blocks)).collect(),
+            };
+            let ([solution], true) = (&solutions[..], moves) else { break };
             let now: Vec<[f64; 3]> = solution.daughters.iter().map(|daughter| daughter.position_m).collect();
             let sigma = |n: usize, axis: usize| solution.daughters[n].position_sigma_m[axis];
             let apart = |(n, (now, before)): (usize, (&[f64; 3], &[f64; 3]))| {
@@ -190,6 +193,11 @@ impl Task<'_> {
         let normal_hat = self.normal_hat.clone();
         let data = PassData { pass: self.number, span_s, blocks, normal_hat };
         solve_from(self.config, self.frequencies, data, &about.offset_m)
+    }
+
+    fn steady_parts(&self, span_s: [f64; 2], blocks: &mut [ModelledBlock]) -> Vec<PassSolution> {
+        let data = PassData { pass: self.number, span_s, blocks, normal_hat: self.normal_hat.clone() };
+        solve_pass_in_parts(self.config, self.frequencies, data)
     }
 
     fn search<'a>(&'a self, placed: &'a [(PlacedVisibilities, bool)]) -> Search<'a> {

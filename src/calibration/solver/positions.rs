@@ -17,7 +17,7 @@ use super::model::{KnownSignal, Offsets};
 use super::newton::{Found, Near};
 use super::reach::is_searched;
 use super::robust::{judge, misfit};
-use super::solution::sums_of;
+use super::robust_fit::sums_of;
 use super::sums::{ModelTerms, ModelledBlock, PairSums};
 use crate::frames::PlacedVisibilities;
 use crate::response::model::ModelError;

@@ -1,20 +1,20 @@
-//! Solutions of a pass: robust rounds about Gauss-Newton, and what is told of them.
+//! Solutions of a pass, in parts where gains jump.
 
 use bincode::{Decode, Encode};
-use rayon::prelude::*;
 use serde::Serialize;
 
 use super::agree::is_contradicted;
 use super::config::SolverConfig;
 use super::fit::unexplained;
 use super::layout::ParameterLayout;
-use super::newton::Found;
-use super::robust::judge;
-use super::sums::{ModelledBlock, PairSums};
+use super::robust_fit::{Fitted, Interval};
+use super::stability::{Excess, jump_s};
+use super::sums::ModelledBlock;
+use super::verdict::Judge;
 use crate::units::vector::Vec3;
 
-/// Change of a pair's spread below which a round settles.
-const SPREAD_SETTLED: f64 = 0.02;
+/// Most parts that jumps divide an interval into.
+const PARTS_MAX: usize = 8;
 
 /// What became of the gain of a daughter in a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Encode, Decode)]
@@ -24,16 +24,35 @@ pub enum GainState {
     Good,
     /// No data.
     NoData,
-    /// An amplitude of almost nothing.
+    /// Noise where a receiver that works would deliver signal, or an amplitude of almost nothing.
     Dead,
-    /// A phase less well known than asked for.
+    /// Too little signal to tell, or a phase less well known than asked for.
     Uncertain,
     /// The iteration did not converge.
     NotConverged,
-    /// The solution leaves too much of the signal unexplained: a wrong minimum.
+    /// The model is not that of the data: the solution leaves too much of the signal unexplained.
     PoorFit,
     /// Another position explains the data as well, or daughters contradict one another.
     Ambiguous,
+    /// The gain changes within the interval by more than a phase may be uncertain.
+    Unstable,
+}
+
+impl GainState {
+    /// Its word in tables.
+    #[must_use]
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Good => "good",
+            Self::NoData => "no-data",
+            Self::Dead => "dead",
+            Self::Uncertain => "uncertain",
+            Self::NotConverged => "not-converged",
+            Self::PoorFit => "poor-fit",
+            Self::Ambiguous => "ambiguous",
+            Self::Unstable => "unstable",
+        }
+    }
 }
 
 /// Gain of one daughter in one channel.
@@ -43,12 +62,16 @@ pub struct GainEstimate {
     pub frequency_hz: f64,
     /// Amplitude of the voltage gain.
     pub amplitude: f64,
-    /// Standard deviation of its natural logarithm.
+    /// Standard deviation of its natural logarithm, with what residuals show beyond noise.
     pub amplitude_sigma: f64,
     /// Phase against the reference daughter, clock included, deg, -180 to 180.
     pub phase_deg: f64,
-    /// Its standard deviation, deg.
+    /// Its standard deviation, deg, with what residuals show beyond noise: changes within the interval and errors of the model.
     pub phase_sigma_deg: f64,
+    /// Root mean square change of the phase within the interval, deg; 0 where it may be noise.
+    pub phase_scatter_deg: f64,
+    /// Part of the daughter's signal that the solution leaves; 0 where it may be noise.
+    pub unexplained: f64,
     /// Visibilities used.
     pub visibilities: u64,
     /// Left out as outliers.
@@ -111,6 +134,12 @@ pub struct PassSolution {
     pub outliers: u64,
     /// Mean squared residual of a part of a visibility in units of its noise: 1 for a perfect model.
     pub chi_square: f64,
+    /// Part of the signal in each channel that errors of the model are; 0 where it may be noise.
+    pub model_error: Vec<f64>,
+    /// Daughter that phases are relative to, from 1: that of the settings, or another where that is dead or unstable.
+    pub reference: u32,
+    /// Whether a gain jumps where it begins, in the middle of a pass.
+    pub begins_with_jump: bool,
     /// Whether the pass is one that tests and is in no map.
     pub is_held_out: bool,
     /// By daughter.
@@ -155,6 +184,84 @@ pub fn solve_pass(config: &SolverConfig, frequencies_hz: &[f64], data: PassData<
     solve_from(config, frequencies_hz, data, &position_m)
 }
 
+/// [`solve_pass`] in parts: before and after each instant at which a gain jumps.
+#[must_use]
+pub fn solve_pass_in_parts(
+    config: &SolverConfig,
+    frequencies_hz: &[f64],
+    data: PassData<'_>,
+) -> Vec<PassSolution> {
+    let PassData { pass, span_s, blocks, normal_hat } = data;
+    let position_m = vec![[0.0; 3]; normal_hat.len()];
+    let whole = interval_of(config, frequencies_hz, span_s, &position_m);
+    let mut drifting = vec![false; position_m.len() * frequencies_hz.len()];
+    let (parts, jumps) = loop {
+        let (parts, jumps) = steady_parts(&whole, blocks, &drifting);
+        // What jumps twice within a pass drifts.
+        let again = (0..drifting.len()).filter(|k| jumps.iter().filter(|jump| *jump == k).count() > 1);
+        let again: Vec<usize> = again.collect();
+        if again.is_empty() {
+            break (parts, jumps);
+        }
+        again.into_iter().for_each(|k| drifting[k] = true);
+    };
+    let suspects: Vec<bool> = (0..drifting.len()).map(|k| drifting[k] || jumps.contains(&k)).collect();
+    let solution = |(k, span_s): (usize, [f64; 2])| {
+        let interval = Interval { span_s, ..whole };
+        let fitted = interval.fit(blocks, None);
+        let solution =
+            told(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat.clone()));
+        PassSolution { begins_with_jump: k > 0, ..solution }
+    };
+    parts.into_iter().enumerate().map(solution).collect()
+}
+
+/// Parts of an interval between jumps, and which gains jump: by channel, then daughter, once for each jump.
+fn steady_parts(
+    whole: &Interval<'_>,
+    blocks: &mut [ModelledBlock],
+    drifting: &[bool],
+) -> (Vec<[f64; 2]>, Vec<usize>) {
+    // Intervals in the order of time, the next one last.
+    let (mut open, mut steady, mut jumps) = (vec![whole.span_s], Vec::new(), Vec::new());
+    while let Some(span_s) = open.pop() {
+        let interval = Interval { span_s, ..*whole };
+        let has_room = steady.len() + open.len() + 2 <= PARTS_MAX;
+        let fitted = has_room.then(|| interval.fit(blocks, None));
+        match fitted.and_then(|fitted| jump_of(&interval, &fitted, (&*blocks, drifting))) {
+            Some((at_s, gains)) => {
+                jumps.extend(gains);
+                open.extend([[at_s, span_s[1]], [span_s[0], at_s]]);
+            }
+            None => steady.push(span_s),
+        }
+    }
+    (steady, jumps)
+}
+
+fn interval_of<'a>(
+    config: &'a SolverConfig,
+    frequencies_hz: &'a [f64],
+    span_s: [f64; 2],
+    position_m: &'a [[f64; 3]],
+) -> Interval<'a> {
+    Interval { config, frequencies_hz, satellites: position_m.len(), span_s, position_m }
+}
+
+/// Instant of the largest jump of a gain, if one jumps, and which gains jump then.
+fn jump_of(
+    interval: &Interval<'_>,
+    fitted: &Fitted,
+    (blocks, drifting): (&[ModelledBlock], &[bool]),
+) -> Option<(f64, Vec<usize>)> {
+    let (daughter, channels) =
+        interval.residuals(fitted, blocks, Some(interval.config.outlier_sigma)).jumping(drifting)?;
+    let Fitted { layout, found, spreads, takes_part, .. } = fitted;
+    let which = (interval.config.outlier_sigma, daughter, &channels[..]);
+    let at_s = jump_s(layout, &found.values, blocks, (spreads, takes_part), interval.span_s, which)?;
+    Some((at_s, channels.into_iter().map(|c| c * layout.satellites + daughter).collect()))
+}
+
 /// [`solve_pass`] that begins with daughters off by `position_m`.
 pub(super) fn solve_from(
     config: &SolverConfig,
@@ -163,89 +270,114 @@ pub(super) fn solve_from(
     position_m: &[[f64; 3]],
 ) -> PassSolution {
     let PassData { pass, span_s, blocks, normal_hat } = data;
-    let layout = ParameterLayout::new(config, normal_hat.len(), frequencies_hz);
-    let mut spreads = vec![1.0; blocks.len()];
-    blocks.par_iter_mut().for_each(|block| block.is_out.fill(false));
-    let mut sums = sums_of(blocks, span_s, &layout, &spreads);
-    let mut found =
-        layout.minimise(layout.start(&sums, position_m), &sums, None, config.iterations_max as usize);
-    let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
-    for round in 0..=config.outlier_rounds {
-        let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
-            let before = (block.is_out.clone(), *spread);
-            let (gain, u) = layout.pair(&found.values, sums.channel, sums.pair);
-            let chi_square = judge(block, span_s, config.outlier_sigma, gain, &u, spread);
-            let changed = block.is_out != before.0 || (*spread / before.1 - 1.0).abs() > SPREAD_SETTLED;
-            (chi_square, changed)
-        };
-        let judged: Vec<((f64, f64), bool)> =
-            blocks.par_iter_mut().zip(&mut spreads).zip(&sums).map(judge).collect();
-        let changed = judged.iter().any(|(_, changed)| *changed);
-        chi_squares = judged.into_iter().map(|(chi_square, _)| chi_square).collect();
-        if !changed || round == config.outlier_rounds {
-            break;
-        }
-        sums = sums_of(blocks, span_s, &layout, &spreads);
-        found = layout.minimise(found.values, &sums, None, config.iterations_max as usize);
-    }
-    let (square, count) =
-        chi_squares.iter().fold((0.0, 0.0), |(a, b), (square, count)| (a + square, b + count));
-    let counts = Counts::of(blocks, span_s, &layout);
-    let unexplained = match layout.terms() {
-        1 => vec![0.0; layout.satellites * layout.channels()],
-        _ => unexplained(&layout, &found, blocks, config.unexplained_max),
-    };
-    let doubted = layout.terms() > 1
-        && found.converged
-        && config.unexplained_max < 1.0
-        && is_contradicted(&layout, &found, &sums);
-    let told = |n: usize| daughter(config, &layout, (&found, &counts, &unexplained), n);
-    let mut solution = PassSolution {
-        pass,
-        from_s: span_s[0],
-        until_s: span_s[1],
-        converged: found.converged,
-        iterations: found.iterations,
-        visibilities: counts.used,
-        outliers: counts.out,
-        chi_square: if count > 0.0 { square / (2.0 * count) } else { f64::NAN },
-        is_held_out: false,
-        outlier_parts: counts.parts(),
-        daughters: (0..layout.satellites).map(told).collect(),
-        normal_hat,
-    };
-    if doubted {
-        solution.doubt(|n, _| n != layout.reference);
-    }
-    solution
+    let interval = interval_of(config, frequencies_hz, span_s, position_m);
+    let fitted = interval.fit(blocks, None);
+    let suspects = vec![false; fitted.dropped.len()];
+    told(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat))
 }
 
-pub(super) fn sums_of(
-    blocks: &[ModelledBlock],
-    span_s: [f64; 2],
-    layout: &ParameterLayout,
-    spreads: &[f64],
-) -> Vec<PairSums> {
-    let of = |(block, spread): (&ModelledBlock, &f64)| PairSums::of(block, span_s, layout.terms(), *spread);
-    blocks.par_iter().zip(spreads).map(of).collect()
+/// A fit, and what its residuals show.
+struct Told {
+    fitted: Fitted,
+    excess: Vec<Excess>,
+    model_error: Vec<f64>,
+    unexplained: Vec<f64>,
+    counts: Counts,
+}
+
+/// Judges a fit; with a reference that is not steady, phases are solved for once more against another daughter.
+fn told(
+    interval: &Interval<'_>,
+    mut fitted: Fitted,
+    blocks: &mut [ModelledBlock],
+    suspects: &[bool],
+) -> Told {
+    let (mut excess, mut model_error) = interval.residuals(&fitted, blocks, None).excess(suspects);
+    if let Some(steady) = steadier(interval.config, &fitted, &excess) {
+        fitted = interval.fit(blocks, Some(steady));
+        (excess, model_error) = interval.residuals(&fitted, blocks, None).excess(suspects);
+    }
+    let unexplained = unexplained(&fitted, blocks, interval.span_s, interval.config.unexplained_max);
+    let counts = Counts::of(blocks, interval.span_s, &fitted);
+    Told { fitted, excess, model_error, unexplained, counts }
+}
+
+/// Another daughter to be the reference, seen and steady in all channels, if the one of a fit changes too much.
+fn steadier(config: &SolverConfig, fitted: &Fitted, excess: &[Excess]) -> Option<usize> {
+    let layout = &fitted.layout;
+    let n = layout.satellites;
+    let most = config.phase_sigma_deg_max.to_radians().powi(2);
+    let is_steady =
+        |daughter: usize| (0..layout.channels()).all(|c| excess[c * n + daughter].scatter[1] <= most);
+    let channels = |daughter: usize| (0..layout.channels()).filter(|c| fitted.is_seen(*c, daughter)).count();
+    let reference = layout.reference;
+    if is_steady(reference) {
+        return None;
+    }
+    (0..n).find(|daughter| is_steady(*daughter) && channels(*daughter) == channels(reference))
+}
+
+impl Told {
+    fn solution(self, interval: &Interval<'_>, (pass, normal_hat): (u64, Vec<Vec3>)) -> PassSolution {
+        let Self { fitted, excess, model_error, unexplained, counts } = &self;
+        let (config, Fitted { layout, found, .. }) = (interval.config, fitted);
+        let (square, count) =
+            fitted.chi_squares.iter().fold((0.0, 0.0), |(a, b), (square, count)| (a + square, b + count));
+        let doubted = layout.terms() > 1
+            && found.converged
+            && config.unexplained_max < 1.0
+            && is_contradicted(layout, found, &fitted.used());
+        let judge = Judge { config, fitted, counts, unexplained, excess };
+        let mut solution = PassSolution {
+            pass,
+            from_s: interval.span_s[0],
+            until_s: interval.span_s[1],
+            converged: found.converged,
+            iterations: found.iterations,
+            visibilities: counts.used,
+            outliers: counts.out,
+            chi_square: if count > 0.0 { square / (2.0 * count) } else { f64::NAN },
+            model_error: model_error.clone(),
+            reference: layout.reference as u32 + 1,
+            begins_with_jump: false,
+            is_held_out: false,
+            outlier_parts: counts.parts(),
+            daughters: judge.daughters(),
+            normal_hat,
+        };
+        if doubted {
+            solution.doubt(|n, _| n != layout.reference);
+        }
+        solution
+    }
 }
 
 /// Visibilities by channel and daughter.
-struct Counts {
+pub(super) struct Counts {
     used: u64,
     out: u64,
-    by_gain: Vec<[u64; 2]>,
+    pub(super) by_gain: Vec<[u64; 2]>,
     /// By channel and part of the interval: all, and outliers.
     by_time: Vec<[[u64; 2]; TIME_PARTS]>,
 }
 
 impl Counts {
-    fn of(blocks: &[ModelledBlock], [from_s, until_s]: [f64; 2], layout: &ParameterLayout) -> Self {
+    fn of(blocks: &[ModelledBlock], [from_s, until_s]: [f64; 2], fitted: &Fitted) -> Self {
+        let layout: &ParameterLayout = &fitted.layout;
         let gains = layout.satellites * layout.frequencies_hz.len();
         let by_time = vec![[[0; 2]; TIME_PARTS]; layout.frequencies_hz.len()];
         let mut counts = Self { used: 0, out: 0, by_gain: vec![[0; 2]; gains], by_time };
-        for block in blocks {
+        for (block, takes_part) in blocks.iter().zip(&fitted.takes_part) {
             let inside = (0..block.time_s.len()).filter(|&k| (from_s..until_s).contains(&block.time_s[k]));
+            if !takes_part {
+                // They count for who is left out alone.
+                let of = |n: u8| block.channel * layout.satellites + usize::from(n);
+                let left_out =
+                    [of(block.pair.i), of(block.pair.j)].into_iter().filter(|k| fitted.dropped[*k]);
+                let count = inside.count() as u64;
+                left_out.for_each(|k| counts.by_gain[k][0] += count);
+                continue;
+            }
             for k in inside.clone() {
                 let part = (block.time_s[k] - from_s) / (until_s - from_s) * TIME_PARTS as f64;
                 let [all, out] = &mut counts.by_time[block.channel][(part as usize).min(TIME_PARTS - 1)];
@@ -267,57 +399,5 @@ impl Counts {
             times.iter().map(|[all, out]| *out as f64 / *all as f64).collect::<Vec<f64>>()
         };
         OutlierParts { by_channel_and_time: self.by_time.iter().map(row).collect() }
-    }
-}
-
-fn daughter(
-    config: &SolverConfig,
-    layout: &ParameterLayout,
-    (found, counts, unexplained): (&Found, &Counts, &[f64]),
-    n: usize,
-) -> DaughterEstimate {
-    let order = layout.order();
-    let covariance = |a: Option<usize>, b: Option<usize>| match (a, b) {
-        (Some(a), Some(b)) => found.covariance[a * order + b],
-        _ => 0.0,
-    };
-    let sigma = |place: Option<usize>| covariance(place, place).sqrt();
-    let values = &found.values;
-    let gain = |c: usize| {
-        let (phase, clock) = (layout.phase(c, n), layout.clock(n));
-        // Of the sum of the phase and what the clock turns.
-        let per_ns = layout.per_ns(c);
-        let variance = covariance(phase, phase)
-            + 2.0 * per_ns * covariance(phase, clock)
-            + per_ns * per_ns * covariance(clock, clock);
-        let gain = layout.gain(values, c, n);
-        let [visibilities, outliers] = counts.by_gain[c * layout.satellites + n];
-        let phase_sigma_deg = variance.max(0.0).sqrt().to_degrees();
-        let state = match () {
-            () if visibilities == 0 => GainState::NoData,
-            () if !found.converged => GainState::NotConverged,
-            () if gain.norm() < config.dead_amplitude => GainState::Dead,
-            () if phase_sigma_deg > config.phase_sigma_deg_max => GainState::Uncertain,
-            () if unexplained[c * layout.satellites + n] > config.unexplained_max => GainState::PoorFit,
-            () => GainState::Good,
-        };
-        GainEstimate {
-            frequency_hz: layout.frequencies_hz[c],
-            amplitude: gain.norm(),
-            amplitude_sigma: sigma(layout.amplitude(c, n)),
-            phase_deg: gain.arg().to_degrees(),
-            phase_sigma_deg,
-            visibilities,
-            outliers,
-            state,
-        }
-    };
-    DaughterEstimate {
-        daughter: n as u32 + 1,
-        clock_ns: values.clock_ns[n],
-        clock_sigma_ns: sigma(layout.clock(n)),
-        position_m: values.position_m[n],
-        position_sigma_m: [0, 1, 2].map(|axis| sigma(layout.position(n, axis))),
-        gains: (0..layout.frequencies_hz.len()).map(gain).collect(),
     }
 }

@@ -37,6 +37,8 @@ pub(super) struct PairSums {
     pub(super) pair: Pair,
     /// Number of visibilities.
     pub(super) count: f64,
+    /// What weights are divided by.
+    pub(super) spread: f64,
     /// Sum of w |V|^2.
     pub(super) power: f64,
     /// Sums of w conj(f_k) V.
@@ -52,6 +54,7 @@ impl PairSums {
             channel: block.channel,
             pair: block.pair,
             count: 0.0,
+            spread,
             power: 0.0,
             cross: [Complex64::ZERO; MODEL_TERMS],
             gram: [[Complex64::ZERO; MODEL_TERMS]; MODEL_TERMS],

@@ -6,32 +6,26 @@ use super::solution::{GainState, PassSolution};
 use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
 use crate::frames::Channel;
 
+/// Time that a jump takes in a file of gains, s.
+const JUMP_S: f64 = 1e-6;
+
 /// Comma-separated values, one line a solution, daughter and channel.
 #[must_use]
 pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     let mut text = String::from(
         "pass,from_s,until_s,daughter,frequency_hz,amplitude,ln_amplitude_sigma,phase_deg,phase_sigma_deg,clock_ns,\
          clock_sigma_ns,along_m,along_sigma_m,across_m,across_sigma_m,radial_m,radial_sigma_m,visibilities,outliers,\
-         chi_square,converged,held_out,state\n",
+         chi_square,converged,held_out,state,phase_scatter_deg,unexplained,reference\n",
     );
     for solution in solutions {
         for daughter in &solution.daughters {
             for gain in &daughter.gains {
-                let state = match gain.state {
-                    GainState::Good => "good",
-                    GainState::NoData => "no-data",
-                    GainState::Dead => "dead",
-                    GainState::Uncertain => "uncertain",
-                    GainState::NotConverged => "not-converged",
-                    GainState::PoorFit => "poor-fit",
-                    GainState::Ambiguous => "ambiguous",
-                };
                 let ([x, y, z], [sx, sy, sz]) = (daughter.position_m, daughter.position_sigma_m);
                 // Writing to a String cannot fail.
                 let _ = writeln!(
                     text,
                     "{},{:.6},{:.6},{},{},{:.7},{:.3e},{:.6},{:.3e},{:.6},{:.3e},{x:.5},{sx:.3e},{y:.5},{sy:.3e},{z:.5},\
-                     {sz:.3e},{},{},{:.5},{},{},{state}",
+                     {sz:.3e},{},{},{:.5},{},{},{},{:.4},{:.5},{}",
                     solution.pass,
                     solution.from_s,
                     solution.until_s,
@@ -48,6 +42,10 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
                     solution.chi_square,
                     u8::from(solution.converged),
                     u8::from(solution.is_held_out),
+                    gain.state.word(),
+                    gain.phase_scatter_deg,
+                    gain.unexplained,
+                    solution.reference,
                 );
             }
         }
@@ -58,7 +56,7 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
 /// The gains as a file for `antenna-gains`: nothing is left of a gain that is not known, which removes its visibilities.
 /// With `without_held_out`, passes that test have no gains either.
 ///
-/// Gains hold over the whole of a pass with one solution; those of several are joined by their middles.
+/// Gains hold over the whole of a pass with one solution, and of each part between jumps; those of several are joined by their middles.
 #[must_use]
 pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held_out: bool) -> GainsFile {
     let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
@@ -81,10 +79,12 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
             }
         };
         for (k, solution) in solutions.iter().enumerate() {
-            let is_first = k == 0 || solutions[k - 1].pass != solution.pass;
-            let is_last = solutions.get(k + 1).is_none_or(|next| next.pass != solution.pass);
+            let is_first = k == 0 || solutions[k - 1].pass != solution.pass || solution.begins_with_jump;
+            let is_last =
+                solutions.get(k + 1).is_none_or(|next| next.pass != solution.pass || next.begins_with_jump);
             if is_first {
-                push(solution.from_s, solution);
+                // Times increase: the part before ends where this one begins.
+                push(solution.from_s + if solution.begins_with_jump { JUMP_S } else { 0.0 }, solution);
             }
             if !(is_first && is_last) {
                 push(0.5 * (solution.from_s + solution.until_s), solution);

@@ -339,7 +339,7 @@ fn a_clock_jump_is_told_from_other_events() {
     };
     for daughter in [2, 0] {
         let events = jump(daughter);
-        let [InstrumentEvent::ClockJump { pass: 3, daughter: told, change_ns }] = events[..] else {
+        let [InstrumentEvent::ClockJump { pass: 3, daughter: told, change_ns, .. }] = events[..] else {
             panic!("{events:?}")
         };
         assert!(told == daughter as u32 + 1 && (change_ns - 8.0).abs() < 1.0, "{events:?}");
@@ -353,7 +353,7 @@ fn gain_and_phase_steps_are_told_with_their_channels() {
             truth.gains[1][1] *= 1.5;
         }
     });
-    let [InstrumentEvent::GainStep { pass: 2, daughter: 2, ref channels }] = events[..] else {
+    let [InstrumentEvent::GainStep { pass: 2, daughter: 2, ref channels, .. }] = events[..] else {
         panic!("{events:?}")
     };
     assert!(channels.len() == 1 && channels[0].0 == 1 && (channels[0].1 - 1.5).abs() < 0.15, "{events:?}");
@@ -362,7 +362,7 @@ fn gain_and_phase_steps_are_told_with_their_channels() {
             truth.gains[3][1] *= Complex64::cis(2.0);
         }
     });
-    let [InstrumentEvent::PhaseStep { pass: 2, daughter: 2, ref channels }] = events[..] else {
+    let [InstrumentEvent::PhaseStep { pass: 2, daughter: 2, ref channels, .. }] = events[..] else {
         panic!("{events:?}")
     };
     assert!(channels.len() == 1 && channels[0].0 == 3, "{events:?}");

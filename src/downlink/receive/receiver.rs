@@ -5,7 +5,7 @@ use std::io::{self, Read};
 
 use super::sequence::{Arrival, Sequence};
 use crate::downlink::wire::cadu::framer::{IDLE_APID, PACKET_HEADER_BYTES as PRIMARY_HEADER_BYTES};
-use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_holds};
+use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_check, packet_holds};
 
 /// Bytes that [`PacketReceiver::fill_from`] reads at a time.
 const CHUNK_BYTES: usize = 1 << 18;
@@ -26,6 +26,18 @@ pub struct Packet<'a> {
     pub check: u32,
     /// Whether it fills a gap reported earlier.
     pub late: bool,
+}
+
+impl Packet<'_> {
+    /// Appends it as it was sent. Parsed headers hold every bit of the originals.
+    pub(crate) fn append_to(&self, out: &mut Vec<u8>) {
+        let start = out.len();
+        out.reserve(self.header.bytes.min(HEADER_BYTES + self.payload.len() + TRAILER_BYTES));
+        out.extend_from_slice(&self.header.to_bytes());
+        out.extend_from_slice(self.payload);
+        let check = packet_check(&out[start..]);
+        out.extend_from_slice(&check);
+    }
 }
 
 /// What a stream contains, in order. Events other than [`Event::Gap`] and [`Event::Restart`] cover each byte of the

@@ -70,6 +70,13 @@ impl FileSource {
         Ok(source)
     }
 
+    /// Whether the last file is followed as it grows.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_followed(&self) -> bool {
+        self.patience.is_some()
+    }
+
     /// Requires one format for the whole stream.
     fn note_format(&mut self, path: &Path, format: Format) -> Result<(), DownlinkError> {
         match &self.format {

@@ -3,6 +3,7 @@
 //! - [`Transmitter`] encodes ground frames as bytes; [`Recorder`] writes a byte stream to a file.
 //! - [`FileSource`] reads files as a byte stream; [`Paced`] releases one at the pace of its packets.
 //! - [`DownlinkWriter`] and [`DownlinkReader`] write and read frames outside a pipeline.
+//! - [`packet_archive`] keeps packets on disk before their sender is told that they are taken.
 //! - [`socket`] sends a byte stream over TCP, and listens to several senders.
 //!
 //! Uses `wire`, `receive` and `runtime`. Bytes pass unchanged; a file is complete under its name or has the suffix
@@ -10,6 +11,7 @@
 
 mod file_source;
 mod pace;
+pub mod packet_archive;
 mod reader;
 mod recorder;
 pub mod socket;

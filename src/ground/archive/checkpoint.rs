@@ -16,11 +16,11 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA05";
+const MAGIC: &[u8; 8] = b"LNRSTA06";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 05; earlier versions keep less in their journal: \
-                       replay their files into a new folder";
+const VERSION: &str = "a checkpoint of the ground's state, version 06; earlier versions keep less: make a new state by `lunarray \
+                       rebuild`, or replay the files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
 
@@ -108,6 +108,23 @@ pub(super) fn write(
     engines(&mut summed)?;
     let crc = summed.crc.finalize();
     out.write_all(&crc.to_le_bytes()).map_err(failed())
+}
+
+/// Whether a checkpoint holds, and has this head.
+pub(super) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
+    let found = read(path, |head, engines| {
+        std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+        Ok(head.checksum)
+    });
+    let crc = Digest::new(CrcAlgorithm::Crc64Nvme);
+    let mut nothing = std::io::sink();
+    let mut pieces = BufWriter::with_capacity(1 << 16, ChecksumWriter { inner: &mut nothing, crc });
+    let encoded = bincode::encode_into_std_write(head, &mut pieces, bincode::config::standard());
+    let crc = match pieces.into_inner() {
+        Ok(summed) => summed.crc,
+        Err(_) => return Ok(false),
+    };
+    Ok(encoded.is_ok() && found.is_ok_and(|found| found == crc.finalize()))
 }
 
 /// Whether a file begins as a checkpoint of any version does.
@@ -442,13 +459,13 @@ mod tests {
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
             let mut old = written(head);
-            old[..8].copy_from_slice(b"LNRSTA04");
+            old[..8].copy_from_slice(b"LNRSTA05");
             let body = old.len() - 8;
             let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 05") && said.contains("replay their files into a new folder"),
+                said.contains("version 06") && said.contains("replay their files into a new folder"),
                 "{said}"
             );
         });

@@ -45,7 +45,21 @@ impl StateFolder {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        if ranks.is_first() {
+        Self::of_locked(path, ranks, lock)
+    }
+
+    /// Opens a folder to read it. One on a read-only file system, which nobody can change, needs no lock.
+    pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
+        match Self::open(path) {
+            Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
+                Self::of_locked(path, &Ranks::one(), None)
+            }
+            opened => opened,
+        }
+    }
+
+    fn of_locked(path: &Path, ranks: &Ranks, lock: Option<FolderLock>) -> Result<Self, GroundError> {
+        if ranks.is_first() && lock.is_some() {
             let [_, unfinished] = numbered(path)?;
             // What a job left that was ended meanwhile must not become whole by parts of another.
             for set in unfinished {
@@ -59,6 +73,20 @@ impl StateFolder {
         }
         let [held, _] = numbered(path)?;
         Ok(Self { path: path.to_owned(), held, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
+    }
+
+    /// Where it is.
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Number of the newest checkpoint, and of all of them.
+    pub(super) fn newest(&self) -> Option<u64> {
+        self.held.last().map(|newest| newest.number)
+    }
+
+    pub(super) fn numbers(&self) -> Vec<u64> {
+        self.held.iter().map(|held| held.number).collect()
     }
 
     /// Those that share it.
@@ -141,7 +169,7 @@ impl StateFolder {
         if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
             return;
         }
-        let named = || self.segments.values().flatten().map(HeldSegment::file_name);
+        let named = || self.segments.values().flatten().flat_map(HeldSegment::file_names);
         for entry in read_folder(&self.path).into_iter().flatten().flatten() {
             let name = entry.file_name();
             let name = name.to_string_lossy();

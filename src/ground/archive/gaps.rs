@@ -14,6 +14,9 @@ use crate::units::MissionTime;
 /// estimated.
 const NEAR: u64 = 4;
 
+/// Windows are further apart than this, s, and packets of a window are not.
+const APART_S: f64 = 600.0;
+
 /// What has been received, as input to [`find_gaps`].
 #[derive(Clone, Debug, Default)]
 pub struct ReceivedPackets {
@@ -190,7 +193,7 @@ fn gaps_of_era(
     };
     positions.sort_by_key(|known| known.count);
     let report = |gap: &Range<u64>| match kind {
-        Kind::Ephemeris => positions_missing(&received.readings, &positions, gap),
+        Kind::Ephemeris => positions_missing(&received.readings, &positions, &era.missing, gap),
         _ => schedule.report(kind, gap),
     };
     era.missing.iter().map(report).collect()
@@ -217,35 +220,79 @@ fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
     channels
 }
 
-/// The visibilities that wait for positions in missing packets: between those of the last packet before and of the next
-/// received.
+/// The visibilities that wait for positions in missing packets, of the windows that these packets are of.
+///
+/// Between the last positions before and the next received there may be several windows, each of some packets, of which others may be
+/// missing too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
+/// between in equal parts; what waits for a window counts for the missing packets of it, together once.
 fn positions_missing(
     readings: &[VisibilityPacket],
     positions: &[PositionsPacket],
+    missing: &[Range<u64>],
     gap: &Range<u64>,
 ) -> GapReport {
     let next = positions.partition_point(|known| known.count < gap.start);
-    let before = next.checked_sub(1).map(|at| positions[at].span);
+    let before = next.checked_sub(1).map(|at| positions[at]);
     // What follows may be a repeat of what came before.
-    let mut behind = positions[next..].iter().map(|known| known.span);
-    let after = behind.find(|[start, _]| before.is_none_or(|[from, _]| *start > from));
+    let is_later = |known: &&PositionsPacket| before.is_none_or(|before| known.span[0] > before.span[0]);
+    let after = positions[next..].iter().find(is_later);
     let waits = |reading: &&VisibilityPacket| {
         let entry = &reading.entry;
         reading.waits
-            && before.is_none_or(|[from, _]| entry.end > from)
-            && after.is_none_or(|[from, _]| entry.start < from)
+            && before.is_none_or(|before| entry.end > before.span[0])
+            && after.is_none_or(|after| entry.start < after.span[0])
     };
+    let mut waiting: Vec<&VisibilityPacket> = readings.iter().filter(waits).collect();
+    waiting.sort_by_key(|reading| reading.entry.start);
+    let windows = windows_of(&waiting);
+    let first = before.map_or(0, |before| before.count + 1);
+    let hole = first..after.map_or(gap.end, |after| after.count).max(gap.end);
+    let shares = shares_of(gap, missing, &hole, windows.len());
     let streams = PacketStreams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
     let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
-    for reading in readings.iter().filter(waits) {
-        let stream = reading.stream();
-        let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
-        sum.packets += 1;
-        sum.integration_s += reading.entry.integration_s;
-        sum.weight += reading.entry.weight * streams.usual(stream, reading.entry.sent(), NEAR).share();
+    for (window, share) in windows.into_iter().zip(shares).filter(|(_, share)| *share > 0.0) {
+        for reading in &waiting[window] {
+            let stream = reading.stream();
+            let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
+            sum.packets += 1;
+            sum.integration_s += share * reading.entry.integration_s;
+            sum.weight +=
+                share * reading.entry.weight * streams.usual(stream, reading.entry.sent(), NEAR).share();
+        }
     }
-    let between_s = [before.map(|[_, end]| end.seconds()), after.map(|[start, _]| start.seconds())];
+    let [before_s, after_s] = [before.map(|before| before.span[1]), after.map(|after| after.span[0])];
+    let between_s = [before_s, after_s].map(|time| time.map(MissionTime::seconds));
     GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
+}
+
+/// Readings in the order of time, by observing window.
+fn windows_of(waiting: &[&VisibilityPacket]) -> Vec<Range<usize>> {
+    let mut windows: Vec<Range<usize>> = Vec::new();
+    let mut until = f64::NEG_INFINITY;
+    for (at, reading) in waiting.iter().enumerate() {
+        match windows.last_mut() {
+            Some(window) if reading.entry.start.seconds() <= until + APART_S => window.end = at + 1,
+            _ => windows.push(at..at + 1),
+        }
+        until = until.max(reading.entry.end.seconds());
+    }
+    windows
+}
+
+/// What part of each window's loss a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
+/// the window over all missing ones of it.
+fn shares_of(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, windows: usize) -> Vec<f64> {
+    let per_window = (hole.end - hole.start) as f64 / windows.max(1) as f64;
+    let overlap = |packets: &Range<u64>, [from, to]: [f64; 2]| {
+        let [start, end] = [packets.start, packets.end].map(|count| count as f64 - hole.start as f64);
+        (end.min(to) - start.max(from)).max(0.0)
+    };
+    let share = |window: usize| {
+        let part = [window as f64 * per_window, (window + 1) as f64 * per_window];
+        let all: f64 = missing.iter().map(|packets| overlap(packets, part)).sum();
+        if all > 0.0 { overlap(gap, part) / all } else { 0.0 }
+    };
+    (0..windows).map(share).collect()
 }
 
 impl VisibilityPacket {
@@ -287,6 +334,22 @@ mod tests {
 
     const PASSES: u64 = 6;
     const STREAMS: u64 = 6;
+
+    #[test]
+    fn missing_positions_count_for_their_own_window_and_once() {
+        // Eight packets of four windows, of which one part each is missing but for the last, which lacks both.
+        let missing = [14..15, 16..17, 18..19, 20..22, 27..29];
+        let of = |gap: usize| shares_of(&missing[gap], &missing, &(14..22), 4);
+        assert_eq!(of(0), [1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(of(1), [0.0, 1.0, 0.0, 0.0]);
+        assert_eq!(of(3), [0.0, 0.0, 0.0, 1.0]);
+        // A window whose two packets are missing apart counts for both together once.
+        let apart = [0..1, 1..2];
+        assert_eq!(apart.each_ref().map(|gap| shares_of(gap, &apart, &(0..2), 1)), [[0.5], [0.5]]);
+        // Five packets of one hole, of which nothing is between: all of it, once.
+        assert_eq!(shares_of(&(3..8), &[3..8], &(3..8), 2), [1.0, 1.0]);
+        assert!(shares_of(&(3..8), &[3..8], &(3..8), 0).is_empty());
+    }
 
     /// Six passes of two channels and three pairs; channel 1 sends three packets a pass and pair, channel 0 one.
     fn journal() -> Vec<JournalEntry> {

@@ -44,14 +44,19 @@
 //! and a packet of visibilities takes some 100 bytes more, 60 in the received set, which grows with the number of creation
 //! times, and 20 to 40 in the set of blocks, which doubles when it grows.
 //!
+//! # The raw archive
+//! A ground that listens keeps every packet that it accepts in `archive/` beside its checkpoints before it answers `taken`
+//! ([`crate::downlink::transport::packet_archive`]). What came after the checkpoint is applied when the state is opened; a state of
+//! another version is made of it by [`crate::ground::Ground::rebuild`].
+//!
 //! # A checkpoint
-//! Magic `LNRSTA05`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA06`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed; the previous one
 //! is kept, and used, with a note, if the newest is damaged. Damaged is one whose checksum or contents are wrong, not one
 //! that the system fails to read: that is an error, after which the folder is as it was.
 //!
 //! With `map.refine` the visibilities themselves are kept: in segment files beside the checkpoint, which names each with its checksum. A
-//! segment never changes, and goes once no checkpoint names it. One that is damaged or missing makes its checkpoint a damaged one.
+//! segment never changes, is there twice, and goes once no checkpoint names it. One of which both files are damaged or missing makes its checkpoint a damaged one.
 //!
 //! Ranks of a job (`--mpi`) write a file each, `checkpoint-00000007.2-of-4.lunarray`: the whole head, and of the sums those that the
 //! rank holds. The heads of a set are equal, or it is damaged. Any number of ranks reads a set, and so does a process alone.
@@ -69,6 +74,7 @@ mod journal;
 mod names;
 mod packet_order;
 mod recalibrate;
+mod recovery;
 mod retract;
 mod sessions;
 mod settings;
@@ -83,6 +89,7 @@ pub use gaps::{
 };
 pub use journal::JournalEntry;
 pub use recalibrate::Recalibrated;
+pub use recovery::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use retract::{RefusedPacket, Retracted};
 pub(super) use store::Archive;
 pub use survey::CoverageSurvey;

@@ -69,6 +69,12 @@ impl Numbered {
     }
 }
 
+/// Number of the checkpoint that a file belongs to.
+pub(super) fn number_of(path: &Path) -> Option<u64> {
+    let name = path.file_name()?.to_string_lossy().into_owned();
+    Numbered::of_name(&name).map(|(found, _)| found.number)
+}
+
 /// What stands between the beginning and the end of a checkpoint's name.
 fn inner(text: &str) -> Option<&str> {
     text.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)

@@ -8,7 +8,9 @@ use serde::Serialize;
 use super::draft::digest;
 use super::folder::checkpoints;
 use super::journal::{Journal, OtherRecord, Sent};
+use super::recovery::forget;
 use crate::downlink::receive::EventReader;
+use crate::downlink::transport::packet_archive::PacketName;
 use crate::downlink::{Event, Kind, PacketHeader};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
@@ -63,6 +65,8 @@ struct Retraction {
     done: BTreeSet<RecordKey>,
     /// Packets of other kinds that were applied.
     others: BTreeSet<RecordKey>,
+    /// Packets that are removed, or had been.
+    removed: Vec<PacketName>,
 }
 
 impl Ground {
@@ -92,6 +96,7 @@ impl Ground {
             span,
             done: BTreeSet::new(),
             others: BTreeSet::new(),
+            removed: Vec::new(),
         };
         for file in files {
             retraction.retract_file(file)?;
@@ -138,10 +143,15 @@ impl Retraction {
             _ => self.journal.others.get(&key).map(|record| record.check),
         });
         match check {
-            None => self.report.absent += 1,
+            None => {
+                // Of an earlier retraction that was ended, or of a packet that never came.
+                self.removed.push((header.kind, header.count, header.time));
+                self.report.absent += 1;
+            }
             Some(check) if check != packet.check => self.refuse(&header, OTHER_CONTENT),
             Some(_) if held.is_some() => {
                 self.ground.collector.remove_held(&header);
+                self.removed.push((header.kind, header.count, header.time));
                 self.report.packets += 1;
                 self.report.waited += 1;
             }
@@ -183,6 +193,7 @@ impl Retraction {
             }
         }
         self.journal.visibilities.remove(&sent);
+        self.removed.push((header.kind, header.count, header.time));
         self.report.packets += 1;
         self.report.visibilities += u64::from(visibilities);
         self.report.accumulated += u64::from(accumulated);
@@ -208,6 +219,8 @@ impl Retraction {
             self.report.packets += keys.len() as u64;
             for key in &keys {
                 self.journal.others.remove(key);
+                let (kind, (time, count)) = *key;
+                self.removed.push((kind, count, time));
             }
             if let Some(start) = record.segment
                 && !self.journal.others.values().any(|other| other.segment == Some(start))
@@ -235,11 +248,13 @@ impl Retraction {
 
     /// Writes the archive without the packets: twice, so that the checkpoint before the newest does not bring them back.
     fn write(self, config: &GroundConfig) -> Result<(), GroundError> {
-        let Self { mut ground, journal, .. } = self;
+        let Self { mut ground, journal, removed, .. } = self;
         let is_empty = journal.is_empty() && ground.collector.held().packets().next().is_none();
         ground.accumulator.set_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             archive.journal = journal;
+            // First: a retraction that is ended before the checkpoints are written is repeated.
+            forget(archive.packets.as_ref(), &removed, archive.folder.path())?;
         }
         if is_empty {
             // As if nothing had ever been received.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
+use super::recovery::{kept_settings, require_saved};
 use super::store::{Archive, Opened};
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
@@ -35,13 +36,23 @@ impl Ground {
         checkpoint_every: u64,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        Opened::among(folder, config, true, ranks)?.resume(config, checkpoint_every)
+        let mut ground = Opened::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
+        // One of several ranks applies what there is, and leaves the archive to grounds that listen.
+        ground.recover(folder, !ranks.are_many())?;
+        let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());
+        ground.show_state(latest_s);
+        Ok(ground)
+    }
+
+    /// A new archive in `folder`; what may be in its raw archive stays out.
+    pub(super) fn open_anew(folder: &Path, config: &GroundConfig) -> Result<Self, GroundError> {
+        Opened::new(folder, config, true)?.resume(config, u64::MAX)
     }
 
     /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
     ///
     /// # Errors
-    /// A folder that holds an archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
+    /// A folder that holds another archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
     /// settings, or that hold the same visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
         let mut whole: Option<Opened> = None;
@@ -59,6 +70,7 @@ impl Ground {
                 return Err(GroundError::without_checkpoint(path));
             }
             let part = Opened::new(path, config, false)?;
+            require_saved(path, part.folder.newest())?;
             match &mut whole {
                 None => whole = Some(part),
                 Some(whole) => whole.merge(part)?,
@@ -66,26 +78,36 @@ impl Ground {
         }
         let mut whole = whole.ok_or_else(|| GroundError::without_checkpoint(into))?;
         whole.move_to(StateFolder::open(into)?);
-        if !checkpoints(into)?.is_empty() {
-            return Err(GroundError::Occupied { path: into.to_owned() });
-        }
+        let is_new = checkpoints(into)?.is_empty();
         let mut ground = whole.resume(config, u64::MAX)?;
         ground.advance(&mut Outlet::collect())?;
-        ground.checkpoint()?;
+        match is_new {
+            true => ground.checkpoint()?,
+            // A merge that was ended after its checkpoint was written, and is repeated.
+            false if ground.is_written()? => {}
+            false => return Err(GroundError::Occupied { path: into.to_owned() }),
+        }
         Ok(ground)
     }
 
-    /// The settings on which the sums of an archive depend, keys and values, as its newest usable checkpoint has them.
+    /// The settings on which the sums of an archive depend, keys and values, as its newest usable checkpoint has them, or its raw
+    /// archive.
     ///
     /// # Errors
     /// A folder without a usable checkpoint, or in use.
     #[doc(hidden)]
     pub fn settings_in(folder: &Path) -> Result<Vec<(String, String)>, GroundError> {
-        if checkpoints(folder)?.is_empty() {
-            return Err(GroundError::without_checkpoint(folder));
+        let of_checkpoint = match checkpoints(folder)?.is_empty() {
+            true => Err(GroundError::without_checkpoint(folder)),
+            false => StateFolder::open_to_read(folder)?.load(false, settings_at),
+        };
+        match of_checkpoint {
+            Ok((Some(found), _)) => Ok(found),
+            Ok((None, _)) => Err(GroundError::without_checkpoint(folder)),
+            // Of a ground that was killed before its first checkpoint, or of another version.
+            Err(error @ GroundError::Locked { .. }) => Err(error),
+            Err(error) => kept_settings(folder).ok_or(error),
         }
-        let (found, _) = StateFolder::open(folder)?.load(false, settings_at)?;
-        found.ok_or_else(|| GroundError::without_checkpoint(folder))
     }
 
     /// As [`Ground::settings_in`], for each of several ranks before they open the folder: it is not locked.
@@ -113,6 +135,7 @@ impl Ground {
             return Err(GroundError::without_checkpoint(folder));
         }
         let mut ground = Opened::new(folder, config, false)?.resume(config, u64::MAX)?;
+        ground.recover(folder, false)?;
         let mut out = Outlet::collect();
         ground.advance(&mut out)?;
         ground.flush(&mut out)?;

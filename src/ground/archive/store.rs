@@ -2,17 +2,18 @@
 
 use std::io::ErrorKind;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::calibration_state::CalibrationState;
 use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
 use super::draft::RecordDraft;
-use super::folder::StateFolder;
+use super::folder::{StateFolder, checkpoints};
 use super::journal::{Journal, OtherRecord};
 use super::names::parts_with;
 use super::settings::{compare, settings_of};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::lookout::Spotter;
@@ -37,12 +38,12 @@ const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 pub(in crate::ground) struct Archive {
     pub(super) folder: StateFolder,
     /// Settings that shape the sums.
-    settings: Vec<(String, String)>,
+    pub(super) settings: Vec<(String, String)>,
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
     pub(super) journal: Journal,
     /// Checkpoints that could not be used, in words.
-    notes: Vec<String>,
+    pub(super) notes: Vec<String>,
     /// What applying the current packet posts.
     posts: Ledger<VisibilityReason>,
     /// Visibilities from one checkpoint to the next.
@@ -51,6 +52,8 @@ pub(in crate::ground) struct Archive {
     wait: u64,
     since_attempt: u64,
     saving: SharedSaving,
+    /// The raw archive beside the checkpoints, if there is one.
+    pub(super) packets: Option<PacketArchive>,
 }
 
 impl Archive {
@@ -94,6 +97,11 @@ impl Archive {
         self.notes.iter().map(String::as_str)
     }
 
+    /// Whether checkpoints are written before the end of the session.
+    pub(in crate::ground) fn saves_on_the_way(&self) -> bool {
+        self.interval < u64::MAX
+    }
+
     /// Whether a checkpoint is due.
     pub(in crate::ground) fn is_due(&self) -> bool {
         self.since_attempt >= self.wait
@@ -104,6 +112,14 @@ impl Archive {
         self.posts.take()
     }
 
+    /// Notes in the raw archive what the newest checkpoint holds: so many bytes of what came this session. Without that note they
+    /// are read once more after a restart.
+    pub(in crate::ground) fn mark_packets(&self, passed: u64) {
+        if let (Some(packets), Some(newest)) = (&self.packets, self.folder.newest()) {
+            let _ = packets.mark(newest, passed, &self.folder.numbers());
+        }
+    }
+
     /// Writes a checkpoint, and keeps what became of it. After a failure everything is still there to be written again.
     pub(in crate::ground) fn checkpoint(
         &mut self,
@@ -111,8 +127,9 @@ impl Archive {
         (calibrator, gate): (&Calibrator, Option<&PassGate>),
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
+        let begun = Instant::now();
         let written = self.write(collector, (calibrator, gate), accumulator);
-        let failed_before = self.saving.update(written.as_ref().err());
+        let failed_before = self.saving.update(written.as_ref().err(), begun);
         self.since_attempt = 0;
         self.wait = match (&written, failed_before) {
             (Ok(()), _) => self.interval,
@@ -122,6 +139,21 @@ impl Archive {
         written
     }
 
+    /// Whether the only checkpoint of the folder is the one that would be written now: the sums follow from its journal.
+    pub(in crate::ground) fn is_written(
+        &self,
+        collector: &Collector,
+        (calibrator, gate): (&Calibrator, Option<&PassGate>),
+        accumulator: &Accumulator,
+    ) -> Result<bool, GroundError> {
+        let found = checkpoints(self.folder.path())?;
+        let [only] = &found[..] else { return Ok(false) };
+        let no_autos = AutoTable::default();
+        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
+        checkpoint::is_of_head(only, &head)
+    }
+
     fn write(
         &mut self,
         collector: &Collector,
@@ -129,18 +161,8 @@ impl Archive {
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
-        let head = ArchiveHeadView {
-            settings: &self.settings,
-            collector: collector.view(),
-            ephemeris: calibrator.ephemeris().segments().collect(),
-            autos: calibrator.autos().unwrap_or(&no_autos),
-            accumulator: accumulator.state(),
-            journal: &self.journal,
-            calibration: CalibrationState {
-                version: self.version,
-                passes: gate.map(PassGate::state).unwrap_or_default(),
-            },
-        };
+        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         let (folder, number) = self.folder.next();
         let place = SegmentPlace { folder: &folder, number };
         self.folder.save(|out, path| {
@@ -153,6 +175,37 @@ impl Archive {
         self.folder.names(accumulator.segments());
         self.folder.remove_unnamed();
         Ok(())
+    }
+}
+
+/// What an archive adds to the head of a checkpoint.
+struct HeadOf<'a> {
+    settings: &'a Vec<(String, String)>,
+    journal: &'a Journal,
+    version: u32,
+}
+
+impl<'a> HeadOf<'a> {
+    /// What a checkpoint has besides the sums.
+    fn view(
+        &self,
+        collector: &'a Collector,
+        (calibrator, gate): (&'a Calibrator, Option<&PassGate>),
+        accumulator: &Accumulator,
+        no_autos: &'a AutoTable,
+    ) -> ArchiveHeadView<'a> {
+        ArchiveHeadView {
+            settings: self.settings,
+            collector: collector.view(),
+            ephemeris: calibrator.ephemeris().segments().collect(),
+            autos: calibrator.autos().unwrap_or(no_autos),
+            accumulator: accumulator.state(),
+            journal: self.journal,
+            calibration: CalibrationState {
+                version: self.version,
+                passes: gate.map(PassGate::state).unwrap_or_default(),
+            },
+        }
     }
 }
 
@@ -264,7 +317,10 @@ impl Opened {
         if config.map.holds_visibilities() && ranks.are_many() {
             return Err(AccumulationError::HeldByRank.into());
         }
-        let mut folder = StateFolder::open_among(folder, ranks)?;
+        let mut folder = match sets_aside || ranks.are_many() {
+            true => StateFolder::open_among(folder, ranks)?,
+            false => StateFolder::open_to_read(folder)?,
+        };
         let settings = settings_of(config)?;
         let posts = Ledger::new();
         let (contents, notes) = folder.load(sets_aside, |path| {
@@ -336,6 +392,7 @@ impl Opened {
             wait,
             since_attempt,
             saving,
+            packets: None,
         };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());
@@ -349,6 +406,7 @@ impl Opened {
             archive: Some(archive),
             cancel,
             linger,
+            begins_with_maps: false,
             steps,
             promises,
             spotter,

@@ -8,6 +8,8 @@ use super::checkpoint::ArchiveHead;
 use super::folder::{checkpoints, note};
 use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, VisibilityPacket, find_gaps};
 use super::journal::JournalEntry;
+use super::names::number_of;
+use super::recovery::unsaved_note;
 use crate::array::Ephemeris;
 use crate::downlink::ReceptionCounters;
 use crate::frames::GroundFrame;
@@ -72,7 +74,8 @@ impl CoverageSurvey {
         for file in files.iter().rev() {
             match Self::of_checkpoint(file) {
                 Ok(found) => {
-                    let notes = bad.iter().map(|error| note(error, file)).collect();
+                    let notes = bad.iter().map(|error| note(error, file));
+                    let notes = notes.chain(unsaved_note(path, number_of(file))).collect();
                     return Ok(Self { notes, ..found });
                 }
                 Err(error @ GroundError::Damaged { .. }) => bad.push(error),

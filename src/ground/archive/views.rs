@@ -91,6 +91,11 @@ impl Journal {
         spans
     }
 
+    /// Mission time of the latest visibilities in the sums, s.
+    pub(super) fn latest_s(&self) -> Option<f64> {
+        self.spans_s().values().map(|[_, last]| *last).reduce(f64::max)
+    }
+
     /// Whether the sums hold visibilities of pairs whose positions lie in a span of time.
     pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
         self.visibilities.values().any(|JournalRecord { entry, accumulated, .. }| {

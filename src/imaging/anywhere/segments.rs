@@ -7,6 +7,8 @@
 //! | each: pair i and j (u8), sub-band (u16), time (s), positions of i and j (m), value (K sr) and weight ((K sr)^-2), f64; length of the integration (s), f32 | 88 |
 //! | CRC-64/NVME of all before | 8 |
 //!
+//! A segment is in two files of the same bytes, so that a damaged one loses nothing: it is written again from the other when it is read.
+//!
 //! All numbers are little-endian. A segment is written once and never changed: a checkpoint that keeps gigabytes of visibilities
 //! writes those that are new. Small segments are written again as one with what follows them, so that each is at least twice as long
 //! as all behind it: there are at most some thirty, and each visibility is written as often at most.
@@ -65,6 +67,17 @@ impl HeldSegment {
         format!("visibilities-{:08}-{:04}.segment", self.number, self.channel.0)
     }
 
+    /// Name of the second file.
+    fn copy_name(&self) -> String {
+        format!("visibilities-{:08}-{:04}.copy.segment", self.number, self.channel.0)
+    }
+
+    /// Names of both.
+    #[must_use]
+    pub fn file_names(&self) -> [String; 2] {
+        [self.file_name(), self.copy_name()]
+    }
+
     /// Whether a file may be a segment, by its name.
     #[must_use]
     pub fn is_name(name: &str) -> bool {
@@ -79,22 +92,29 @@ impl HeldSegment {
     ) -> Result<Self, AccumulationError> {
         let (visibilities, number) = (held.len() as u64, place.number);
         let mut segment = Self { channel, number, visibilities, checksum: 0 };
-        let path = place.folder.join(segment.file_name());
-        let mut file = AtomicFile::create(&path, IfUnfinished::Remove)?;
+        for name in segment.file_names() {
+            segment.checksum = segment.write_file(&place.folder.join(name), held)?;
+        }
+        Ok(segment)
+    }
+
+    /// Writes one of the two files; returns its checksum.
+    fn write_file(&self, path: &Path, held: &[HeldVisibility]) -> Result<u64, AccumulationError> {
+        let mut file = AtomicFile::create(path, IfUnfinished::Remove)?;
         let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
         let mut put = |bytes: &[u8]| {
             crc.update(bytes);
             file.write_all(bytes)
         };
         put(MAGIC)?;
-        put(&visibilities.to_le_bytes())?;
+        put(&self.visibilities.to_le_bytes())?;
         for piece in held.chunks(PIECE) {
             put(&piece.iter().flat_map(record).collect::<Vec<u8>>())?;
         }
-        segment.checksum = crc.finalize();
-        file.write_all(&segment.checksum.to_le_bytes())?;
+        let checksum = crc.finalize();
+        file.write_all(&checksum.to_le_bytes())?;
         file.finish()?;
-        Ok(segment)
+        Ok(checksum)
     }
 
     /// Reads the visibilities in `folder`, and hands them over piece by piece. Memory follows the bytes that are there.
@@ -103,9 +123,37 @@ impl HeldSegment {
         folder: &Path,
         take: &mut dyn FnMut(&mut dyn Iterator<Item = HeldVisibility>),
     ) -> Result<(), AccumulationError> {
-        let path = folder.join(self.file_name());
-        let damaged = |found: String| AccumulationError::Segment { path: path.clone(), found };
-        let mut file = File::open(&path).map_err(|error| match error.kind() {
+        // Nothing is handed over before it is known to hold.
+        let path = self.sound_file(folder)?;
+        self.read_file(&path, take)
+    }
+
+    /// The first of the two files that holds. The other is written again from it, if that is possible.
+    fn sound_file(&self, folder: &Path) -> Result<PathBuf, AccumulationError> {
+        let [first, second] = self.file_names().map(|name| folder.join(name));
+        let verify = |path: &Path| self.read_file(path, &mut |piece| piece.for_each(drop));
+        let error = match verify(&first) {
+            Ok(()) => return Ok(first),
+            Err(error @ AccumulationError::Segment { .. }) => error,
+            Err(error) => return Err(error),
+        };
+        // Of an earlier version there is one file.
+        if verify(&second).is_err() {
+            return Err(error);
+        }
+        // On a disk that cannot be written the second goes on to serve.
+        let _ = restore(&second, &first);
+        Ok(second)
+    }
+
+    /// Reads one of the files.
+    fn read_file(
+        &self,
+        path: &Path,
+        take: &mut dyn FnMut(&mut dyn Iterator<Item = HeldVisibility>),
+    ) -> Result<(), AccumulationError> {
+        let damaged = |found: String| AccumulationError::Segment { path: path.to_owned(), found };
+        let mut file = File::open(path).map_err(|error| match error.kind() {
             ErrorKind::NotFound => damaged("no such file".into()),
             _ => error.into(),
         })?;
@@ -144,12 +192,12 @@ impl HeldSegment {
         Ok(())
     }
 
-    /// Requires that the segment in `folder` holds.
+    /// Requires that the segment in `folder` holds, in one file at least.
     ///
     /// # Errors
     /// [`AccumulationError::Segment`], or the system's.
     pub fn verify(&self, folder: &Path) -> Result<(), AccumulationError> {
-        self.read(folder, &mut |piece| piece.for_each(drop))
+        self.sound_file(folder).map(drop)
     }
 
     /// Where it is.
@@ -162,6 +210,13 @@ impl HeldSegment {
     fn bytes(&self) -> Option<u64> {
         self.visibilities.checked_mul(HELD_BYTES)?.checked_add(FIXED_BYTES)
     }
+}
+
+/// Writes a file again from its copy.
+fn restore(from: &Path, to: &Path) -> std::io::Result<()> {
+    let mut file = AtomicFile::create(to, IfUnfinished::Remove)?;
+    std::io::copy(&mut File::open(from)?, &mut file)?;
+    file.finish().map(drop)
 }
 
 fn record(held: &HeldVisibility) -> [u8; HELD_BYTES as usize] {
@@ -234,6 +289,23 @@ mod tests {
         }
         let segment = HeldSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
         let path = segment.path(folder.path());
+        let copy = folder.path().join(segment.copy_name());
+        // While one file holds, nothing is lost, and the other is whole again.
+        let whole = std::fs::read(&path).unwrap();
+        for at in (0..whole.len()).step_by(17) {
+            for file in [&path, &copy] {
+                let mut bad = whole.clone();
+                bad[at] ^= 1;
+                std::fs::write(file, bad).unwrap();
+                assert_eq!(read(&segment, folder.path()).unwrap(), visibilities(3));
+                assert_eq!(std::fs::read(&path).unwrap(), whole);
+            }
+            std::fs::write(&copy, &whole).unwrap();
+        }
+        std::fs::remove_file(&path).unwrap();
+        assert_eq!(read(&segment, folder.path()).unwrap(), visibilities(3));
+        // Without the copy all damage is found.
+        std::fs::remove_file(&copy).unwrap();
         let good = std::fs::read(&path).unwrap();
         assert_eq!(good.len() as u64, 3 * HELD_BYTES + FIXED_BYTES);
         let is_told = || {
@@ -256,6 +328,7 @@ mod tests {
         // Another one of the same length, which holds in itself, is not the one that was named.
         HeldSegment::write(place, ChannelId(2), &visibilities(4)[1..]).unwrap();
         is_told();
+        std::fs::remove_file(&copy).unwrap();
         std::fs::remove_file(&path).unwrap();
         is_told();
         // A forged count costs nothing.

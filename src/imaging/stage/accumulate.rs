@@ -527,6 +527,14 @@ impl Accumulator {
         Ok(offered_s)
     }
 
+    /// Emits a snapshot of what earlier sessions have summed, if snapshots are wanted.
+    ///
+    /// # Errors
+    /// Sums that cannot be written down.
+    pub fn emit_resumed(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
+        if self.config.snapshot_every_s > 0.0 { self.emit(out) } else { Ok(()) }
+    }
+
     /// Emits a snapshot of each channel.
     fn emit(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let Some(instrument) = &self.instrument else { return Ok(()) };

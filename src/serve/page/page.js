@@ -228,11 +228,12 @@ function showLedger(ledger, phase) {
     part.style.width = `${100 * count / total}%`;
     return part;
   }));
-  const verdict = isOver ? (rest === 0 ? ["good", "✔ closed"] : ["bad", "✖ does not close"]) : ["", "open while data flow"];
+  const isKnown = isOver && rest !== null;
+  const verdict = isKnown ? (rest === 0 ? ["good", "✔ closed"] : ["bad", "✖ does not close"]) : ["", isOver ? "not closed: the run failed" : "open while data flow"];
   $("verdict").className = `verdict ${verdict[0]}`; $("verdict").textContent = verdict[1];
-  bar.className = `ledgerbar ${isOver ? (rest === 0 ? "closed" : "open") : ""}`;
+  bar.className = `ledgerbar ${isKnown ? (rest === 0 ? "closed" : "open") : ""}`;
   bar.setAttribute("aria-label", parts.map(([, name, count]) => `${name} ${count}`).join(", "));
-  const rows = [["", "sampled", ledger.sampled || !isOver && "told at the end" || 0], ...parts];
+  const rows = [["", "sampled", ledger.sampled ?? "told at the end"], ...parts];
   $("ledgerkeys").replaceChildren(...rows.map(([kind, name, count]) => make("li", {}, make("i", { class: kind }), make("span", {}, name), make("b", {}, typeof count === "string" ? count : number.format(count)))));
 }
 
@@ -250,7 +251,24 @@ function showReception(status) {
   const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
   const stations = Object.entries(listening?.report.stations ?? {}).map(([name, counts]) => `${name} ${prefixed(counts.bytes)}B`).join(", ");
   $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
-  $("saving").textContent = saving ? (saving.unsaved ? `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}` : `state saved, ${saving.written} checkpoints`) : "";
+  showSaving(saving, listening, status.products);
+}
+
+/** What is on disk, and what is not: trouble first. */
+function showSaving(saving, listening, products) {
+  const archive = listening?.archive, said = [];
+  const say = (isBad, text) => said.push(make("span", isBad ? { class: "bad" } : {}, text));
+  if (archive?.unwritten) say(true, `▲ nothing is taken: the raw archive cannot be written: ${archive.unwritten}`);
+  if (saving?.unsaved) say(true, `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}`);
+  if (products?.unwritten) say(true, `▲ maps are not written: ${products.unwritten}`);
+  if (saving && !saving.unsaved) {
+    const since = saving.checkpoint_s === undefined ? "none in this session" : `the last ${clock(saving.checkpoint_s)} ago`;
+    say(false, `${number.format(saving.written)} checkpoints, ${since}`);
+  }
+  if (saving?.unsaved_bytes) say(false, `${prefixed(saving.unsaved_bytes)}B in no checkpoint yet, since ${clock(saving.unsaved_s)}`);
+  if (archive) say(false, `${prefixed(archive.bytes)}B in the raw archive`);
+  if (listening && listening.silence_s !== null) say(false, `last packet ${clock(listening.silence_s)} ago`);
+  $("saving").replaceChildren(...said.flatMap((part, k) => (k ? [" · ", part] : [part])));
 }
 
 function showFigures() {
@@ -417,17 +435,29 @@ function update(status) {
   syncSlider();
 }
 
-let restarted = null;
+/** Says whether what is shown is of now; since when not, and whether another run has taken the place. */
+function stale(is) {
+  document.body.classList.toggle("stale", is);
+  const began = state.began ? ` · another run since ${state.began.toISOString().slice(0, 19)}Z` : "";
+  const age = state.heardAt ? clock((Date.now() - state.heardAt) / 1000) : null;
+  $("link").textContent = is ? `▲ not connected: ${age === null ? "nothing is known" : `what is shown is ${age} old`}` : `● live${began}`;
+}
+
+
 function listen() {
   const source = new EventSource("/events");
-  source.addEventListener("open", () => { $("link").textContent = "● live"; restarted = null; });
-  source.addEventListener("error", () => { $("link").textContent = "○ not connected; the page shows the last state"; });
+  source.addEventListener("open", () => { stale(false); });
+  source.addEventListener("error", () => stale(true));
+  setInterval(() => { if (document.body.classList.contains("stale")) stale(true); }, 1000);
   source.addEventListener("status", (event) => {
     const status = JSON.parse(event.data);
     // Another run has taken the place: nothing that is held is of it.
     if (state.status && status.up_s < state.status.up_s - 1) {
+      state.began = new Date(Date.now() - 1000 * status.up_s);
       state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; state.arrayKnown = null; $("log").replaceChildren();
     }
+    state.heardAt = Date.now();
+    stale(false);
     update(status);
   });
   source.addEventListener("log", (event) => {

@@ -12,11 +12,12 @@ use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::held::WaitingSender;
-use super::listener::{First, ListenContext, PacketBatch, first};
+use super::listener::{First, ListenContext, PacketBatch, Passed, first};
 use super::opening::Opening;
 use super::report::{BUSY, CLOSED, ConnectionEnd, ListenEvent, SenderReport};
 use super::sender_intake::{SenderIntake, Signs};
 use crate::downlink::receive::ReceptionCounters;
+use crate::downlink::transport::packet_archive::Ticket;
 
 /// Bytes read at a time; fewer at rates so low that a read would take longer than a tenth of a second.
 const READ_BYTES: usize = 1 << 16;
@@ -36,6 +37,8 @@ struct ConnectionState {
     packets: Vec<u8>,
     /// Bytes of all senders up to the last packet passed on.
     mark: u64,
+    /// What of them has to be on disk; why it cannot be; `None` without an archive.
+    ticket: Result<Option<Ticket>, String>,
     /// When the last bytes arrived.
     arrived: Instant,
 }
@@ -66,6 +69,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     let (mut packets, mut refused, mut format) = (0, 0, None);
     // Bytes of the downlink, and where its last packet is, for a sender that asks until it is held.
     let (mut sent, mut mark) = (bytes, None);
+    let (mut passed, mut ticket) = (0, Ok(None));
     let (mut counters, mut station) = (ReceptionCounters::default(), None);
     let finished = state.map(|mut state| {
         spawn_blocking(move || {
@@ -87,11 +91,20 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         let opening = state.intake.opening();
         sent = bytes - opening.bytes();
         mark = opening.asks_held().then_some(state.mark);
+        passed = state.mark;
+        ticket = state.ticket;
         station = opening.station().map(str::to_owned);
         counters = state.intake.stream();
         status.done.fetch_add(u64::from(state.intake.is_alive()), Ordering::Relaxed);
     }
+    let on_disk = on_disk(ticket, &shared).await;
+    if ended == ConnectionEnd::Whole && on_disk.is_err() {
+        ended = ConnectionEnd::NotOnDisk;
+    }
     let answer = match ended {
+        ConnectionEnd::NotOnDisk => {
+            format!("{BUSY}{sent} bytes are not on disk: {}\n", on_disk.err().unwrap_or_default())
+        }
         ConnectionEnd::Whole => format!("taken {sent} bytes\n"),
         ConnectionEnd::GaveWay => format!("{BUSY}closed after {bytes} bytes: {ended}\n"),
         other => format!("{CLOSED}after {bytes} bytes: {other}\n"),
@@ -103,6 +116,9 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     shared.listening.write().close(report, refused, &counters);
     status.open.fetch_sub(1, Ordering::Relaxed);
     drop(seat);
+    if let Some(held) = &shared.held {
+        held.note_end(passed);
+    }
     if let (ConnectionEnd::Whole, Some(mark), Some(held)) = (ended, mark, &shared.held)
         && let Ok(stream) = stream.into_std()
     {
@@ -129,6 +145,7 @@ async fn exchange(
         chunk: vec![0; read_bytes],
         packets: Vec::new(),
         mark: 0,
+        ticket: Ok(None),
         arrived: Instant::now(),
     };
     // Time spent waiting for the sender only.
@@ -149,13 +166,14 @@ async fn exchange(
         });
         let Ok((back, found)) = found.await else { return (None, ConnectionEnd::Failed) };
         state = back;
-        if let Some(station) = state.intake.opening().station() {
-            shared.listening.write().hear(station, read as u64);
-        }
         let Signs { is_alive, is_new } = found.unwrap_or_default();
+        if let Some(station) = state.intake.opening().station() {
+            shared.listening.write().hear(station, read as u64, is_alive);
+        }
         if is_alive {
             silence = Duration::ZERO;
             shared.note_sign();
+            shared.listening.status.note_heard();
         }
         if is_new {
             shared.seats.note_new(seat.number, Instant::now());
@@ -233,7 +251,27 @@ async fn hand_on(state: &mut ConnectionState, seat: &SeatTaken<'_>) -> bool {
         let mut report = shared.listening.write();
         report.backlog_bytes_max = report.backlog_bytes_max.max(backlog);
     }
-    let passed = shared.pass(PacketBatch { bytes, room, arrived: state.arrived.into_std() });
-    state.mark = passed.unwrap_or(state.mark);
-    passed.is_some()
+    let batch = PacketBatch { bytes, room, arrived: state.arrived.into_std() };
+    let passed = match shared.archive {
+        None => shared.pass(batch),
+        // A disk may be slow.
+        Some(_) => {
+            let shared = Arc::clone(shared);
+            spawn_blocking(move || shared.pass(batch)).await.ok().flatten()
+        }
+    };
+    let Some(Passed { mark, ticket }) = passed else { return false };
+    state.mark = mark;
+    // One piece that is not on disk is enough for the sender to send again.
+    if state.ticket.is_ok() {
+        state.ticket = ticket;
+    }
+    true
+}
+
+/// Waits until what a sender has sent is on disk, if there is an archive.
+async fn on_disk(ticket: Result<Option<Ticket>, String>, shared: &ListenContext) -> Result<(), String> {
+    let (Some(ticket), Some(archive)) = (ticket?, shared.archive.clone()) else { return Ok(()) };
+    let synced = spawn_blocking(move || archive.sync(ticket)).await;
+    synced.unwrap_or_else(|_| Err("the archive failed, which is a bug in the program".to_owned()))
 }

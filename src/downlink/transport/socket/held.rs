@@ -11,6 +11,10 @@ use super::report::BUSY;
 /// The line before the packets with which a sender asks. No packet and no frame begins like it.
 pub(super) const ASKS_HELD: &[u8] = b"answer held\n";
 
+/// A checkpoint is due once nothing came for so long, and once what came first is so old.
+const IDLE: Duration = Duration::from_secs(2);
+const AGE_MAX: Duration = Duration::from_secs(60);
+
 /// A checkpoint for senders is followed by so many times its own length without another.
 const REST: u32 = 9;
 
@@ -37,6 +41,13 @@ struct HeldState {
     waiting: VecDeque<WaitingSender>,
     /// Bytes of all senders that the newest checkpoint holds.
     held: u64,
+    /// Bytes of all senders that the ground has got, and when it got the last of them.
+    given: u64,
+    given_at: Instant,
+    /// When the first of those came that no checkpoint holds.
+    unsaved_since: Option<Instant>,
+    /// Bytes of all senders up to the last packet of a connection that has ended.
+    ended: u64,
     /// Bytes of all senders that a checkpoint is asked to hold, which has not begun.
     asked: Option<u64>,
     /// When the one that was asked for began.
@@ -52,7 +63,18 @@ impl HeldAnswers {
     #[must_use]
     pub fn new(pause: Duration) -> Self {
         let waiting = VecDeque::new();
-        let state = HeldState { waiting, held: 0, asked: None, begun: None, not_before: None, pause };
+        let state = HeldState {
+            waiting,
+            held: 0,
+            given: 0,
+            given_at: Instant::now(),
+            unsaved_since: None,
+            ended: 0,
+            asked: None,
+            begun: None,
+            not_before: None,
+            pause,
+        };
         Self(Arc::new(Mutex::new(state)))
     }
 
@@ -70,12 +92,24 @@ impl HeldAnswers {
         }
     }
 
-    /// Asks for a checkpoint, if a sender waits for one of which all is among the `given` bytes that the ground gets, and it is time.
-    /// Returns whether it does so now.
+    /// A connection has ended whose last packet is among so many bytes of all senders.
+    pub(super) fn note_end(&self, mark: u64) {
+        let mut state = self.state();
+        state.ended = state.ended.max(mark);
+    }
+
+    /// Asks for a checkpoint, if a sender waits for one of which all is among the `given` bytes that the ground gets; if a delivery
+    /// has ended; if nothing came for a while; or if what came first is old by now. Returns whether it does so now.
     pub(super) fn ask(&self, given: u64) -> bool {
         let mut state = self.state();
-        let is_time = state.not_before.is_none_or(|instant| Instant::now() >= instant);
-        let is_wanted = state.waiting.iter().any(|sender| sender.mark <= given);
+        let now = Instant::now();
+        state.note_given(given, now);
+        let is_time = state.not_before.is_none_or(|instant| now >= instant);
+        let has_ended = (state.held + 1..=given).contains(&state.ended);
+        let is_idle = now.saturating_duration_since(state.given_at) >= IDLE;
+        let unsaved = state.unsaved_since.map(|since| now.saturating_duration_since(since));
+        let is_due = unsaved.is_some_and(|age| has_ended || is_idle || age >= AGE_MAX);
+        let is_wanted = is_due || state.waiting.iter().any(|sender| sender.mark <= given);
         let asks = is_time && is_wanted && state.asked.is_none() && state.begun.is_none();
         if asks {
             state.asked = Some(given);
@@ -100,6 +134,11 @@ impl HeldAnswers {
         let mut state = self.state();
         state.end();
         state.held = state.held.max(bytes);
+        if state.held >= state.given {
+            state.unsaved_since = None;
+        } else if state.unsaved_since.is_some() {
+            state.unsaved_since = Some(Instant::now());
+        }
         let held = state.held;
         for sender in std::mem::take(&mut state.waiting) {
             match sender.mark <= held {
@@ -120,6 +159,16 @@ impl HeldAnswers {
 }
 
 impl HeldState {
+    /// The ground has got so many bytes.
+    fn note_given(&mut self, given: u64, now: Instant) {
+        if given > self.given {
+            (self.given, self.given_at) = (given, now);
+            if given > self.held {
+                self.unsaved_since.get_or_insert(now);
+            }
+        }
+    }
+
     /// The checkpoint that was asked for has ended.
     fn end(&mut self) {
         if let Some(begun) = self.begun.take() {
@@ -216,6 +265,28 @@ mod tests {
 
     fn wait_for(answers: &HeldAnswers) {
         while !answers.ask(100) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn a_delivery_that_has_ended_is_followed_by_a_checkpoint() {
+        let answers = HeldAnswers::new(Duration::ZERO);
+        answers.note_end(100);
+        // Its last bytes are on their way to the ground.
+        assert!(!answers.ask(99));
+        assert!(answers.ask(100) && answers.begin(100));
+        answers.hold(100);
+        // All is held, whoever sends it again.
+        wait_until_rested(&answers);
+        assert!(!answers.ask(100));
+        answers.note_end(100);
+        assert!(!answers.ask(100));
+    }
+
+    /// The pause after a checkpoint is over.
+    fn wait_until_rested(answers: &HeldAnswers) {
+        while answers.state().not_before.is_some_and(|instant| Instant::now() < instant) {
             std::thread::sleep(Duration::from_millis(1));
         }
     }

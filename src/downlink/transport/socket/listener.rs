@@ -17,6 +17,7 @@ use super::report::{BUSY, ListenEvent, ListenNote, Listening};
 use super::seats::Seats;
 use super::sender_intake::Mission;
 use super::stations::Stations;
+use crate::downlink::transport::packet_archive::{PacketArchive, Ticket};
 
 /// Number of notes allowed at once; after that one per second.
 const NOTES_AT_ONCE: f64 = 20.0;
@@ -41,6 +42,14 @@ pub(super) struct PacketBatch {
     pub(super) arrived: std::time::Instant,
 }
 
+/// What became of a batch that was passed on.
+pub(super) struct Passed {
+    /// Bytes in all batches up to its end.
+    pub(super) mark: u64,
+    /// What has to reach the disk; why it cannot; or `None` without an archive.
+    pub(super) ticket: Result<Option<Ticket>, String>,
+}
+
 /// What all connections share.
 pub(super) struct ListenContext {
     pub(super) config: ListenConfig,
@@ -54,6 +63,8 @@ pub(super) struct ListenContext {
     pub(super) passed: Mutex<u64>,
     /// Who is told what checkpoints hold; `None` if there are none.
     pub(super) held: Option<HeldAnswers>,
+    /// Where packets are kept before a sender is told that they are taken; `None` if they are not.
+    pub(super) archive: Option<PacketArchive>,
     /// Who may send; `None` for everyone.
     pub(super) stations: Option<Arc<Stations>>,
     /// True once reading must stop.
@@ -69,11 +80,13 @@ impl ListenContext {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
     }
 
-    /// Passes a batch on; returns the bytes in all batches up to its end, or `None` if nobody takes it.
-    pub(super) fn pass(&self, batch: PacketBatch) -> Option<u64> {
+    /// Keeps a batch in the archive, if there is one, and passes it on, also if it could not be kept. `None` if nobody takes it.
+    pub(super) fn pass(&self, batch: PacketBatch) -> Option<Passed> {
         let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
         *passed += batch.bytes.len() as u64;
-        self.batches.send(batch).ok().map(|()| *passed)
+        let mark = *passed;
+        let ticket = self.archive.as_ref().map(|archive| archive.append(&batch.bytes, mark));
+        self.batches.send(batch).ok().map(|()| Passed { mark, ticket: ticket.transpose() })
     }
 
     pub(super) fn note_sign(&self) {

@@ -4,11 +4,13 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
 use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::wire::Format;
 
 /// Begins an answer after which a sender may try again.
@@ -48,6 +50,8 @@ pub enum ConnectionEnd {
     NoToken,
     /// It began with a token that no station has.
     UnknownToken,
+    /// Its packets could not be written into the raw archive.
+    NotOnDisk,
     /// All places were taken, and it was the least useful.
     GaveWay,
     /// Its receiver failed: a bug in the program.
@@ -56,7 +60,7 @@ pub enum ConnectionEnd {
 
 impl ConnectionEnd {
     /// All of them.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::Whole,
         Self::Broken,
         Self::Stopped,
@@ -70,6 +74,7 @@ impl ConnectionEnd {
         Self::NoState,
         Self::NoToken,
         Self::UnknownToken,
+        Self::NotOnDisk,
         Self::GaveWay,
         Self::Failed,
     ];
@@ -95,6 +100,7 @@ impl fmt::Display for ConnectionEnd {
             }
             Self::NoToken => "it did not begin with `token TOKEN`, and the ground has --stations",
             Self::UnknownToken => "no station has its token",
+            Self::NotOnDisk => "its packets could not be written into the archive; it has to send them again",
             Self::GaveWay => "it gave way to another; all downlink.listen.connections_max were taken",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
@@ -182,6 +188,9 @@ pub struct StationCounts {
     pub bytes: u64,
     /// Sound packets passed to the ground by those that have ended.
     pub packets: u64,
+    /// When a sound packet or frame came last.
+    #[serde(skip)]
+    pub heard: Option<Instant>,
 }
 
 /// All connections of a run.
@@ -219,13 +228,19 @@ impl ListenReport {
         reception.add_stream(&self.streams);
     }
 
-    /// Counts bytes from a station.
-    pub(super) fn hear(&mut self, station: &str, bytes: u64) {
-        match self.stations.get_mut(station) {
-            Some(counts) => counts.bytes += bytes,
-            None => {
-                self.stations.insert(station.to_owned(), StationCounts { bytes, ..StationCounts::default() });
-            }
+    /// Stations that may send.
+    pub(super) fn know<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+        self.stations.extend(names.map(|name| (name.to_owned(), StationCounts::default())));
+    }
+
+    /// Counts bytes from a station; `is_sound` if there was a sound packet or frame among them.
+    pub(super) fn hear(&mut self, station: &str, bytes: u64, is_sound: bool) {
+        if !self.stations.contains_key(station) {
+            self.stations.insert(station.to_owned(), StationCounts::default());
+        }
+        if let Some(counts) = self.stations.get_mut(station) {
+            counts.bytes += bytes;
+            counts.heard = if is_sound { Some(Instant::now()) } else { counts.heard };
         }
     }
 
@@ -255,7 +270,7 @@ impl fmt::Display for ListenReport {
         for (ended, count) in &self.ended {
             write!(f, "\n  {count:>6}  {ended}")?;
         }
-        for (name, StationCounts { connections, bytes, packets }) in &self.stations {
+        for (name, StationCounts { connections, bytes, packets, .. }) in &self.stations {
             write!(f, "\n  {name}: {connections} connections, {bytes} bytes, {packets} packets")?;
         }
         Ok(())
@@ -272,6 +287,8 @@ pub struct ListenStatus {
     pub(super) waiting: AtomicUsize,
     /// Ended connections that delivered packets.
     pub(super) done: AtomicU64,
+    /// When the last sound packet or frame arrived.
+    heard: Mutex<Option<Instant>>,
 }
 
 impl ListenStatus {
@@ -285,6 +302,17 @@ impl ListenStatus {
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
+    }
+
+    /// Time since the last sound packet or frame from anyone; `None` before the first.
+    #[must_use]
+    pub fn silence(&self) -> Option<Duration> {
+        self.heard.lock().unwrap_or_else(PoisonError::into_inner).map(|heard| heard.elapsed())
+    }
+
+    /// A sound packet or frame has arrived.
+    pub(super) fn note_heard(&self) {
+        *self.heard.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
     }
 
     /// Marks the backlog as empty.
@@ -304,6 +332,8 @@ impl ListenStatus {
 pub struct Listening {
     /// Live status.
     pub status: Arc<ListenStatus>,
+    /// Where packets are kept before they are taken, if they are.
+    pub archive: Option<PacketArchive>,
     report: Arc<Mutex<ListenReport>>,
 }
 

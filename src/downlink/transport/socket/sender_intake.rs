@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::opening::Opening;
 use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
-use crate::downlink::receive::{Decoder, Event, Intake, Packet, ReceivedSet, ReceptionCounters};
-use crate::downlink::wire::{Format, HEADER_BYTES, Kind, PacketHeader, PacketSegment, packet_check};
+use crate::downlink::receive::{Decoder, Event, Intake, ReceivedSet, ReceptionCounters};
+use crate::downlink::wire::{Format, Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
@@ -299,7 +299,7 @@ impl SenderIntake {
                 self.packets_refused += 1;
                 continue;
             }
-            append(&packet, &mut self.group);
+            packet.append_to(&mut self.group);
             self.grouped += 1;
             let ends = matches!(packet.header.segment, PacketSegment::Whole | PacketSegment::Last);
             if ends || self.group.len() > GROUP_BYTES_MAX {
@@ -330,16 +330,6 @@ impl SenderIntake {
         self.held.append(&mut self.group);
         self.held_packets += std::mem::take(&mut self.grouped);
     }
-}
-
-/// Appends a packet as it was sent. Parsed headers hold every bit of the originals.
-fn append(packet: &Packet<'_>, out: &mut Vec<u8>) {
-    let start = out.len();
-    out.reserve(packet.header.bytes.min(HEADER_BYTES + packet.payload.len() + 4));
-    out.extend_from_slice(&packet.header.to_bytes());
-    out.extend_from_slice(packet.payload);
-    let check = packet_check(&out[start..]);
-    out.extend_from_slice(&check);
 }
 
 #[cfg(test)]

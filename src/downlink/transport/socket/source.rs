@@ -20,6 +20,7 @@ use super::sender_intake::{InstrumentCheck, Mission};
 use super::stations::Stations;
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::Instrument;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
@@ -36,6 +37,7 @@ pub struct SocketSource {
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     held: Option<HeldAnswers>,
+    archive: Option<PacketArchive>,
     stations: Option<Arc<Stations>>,
     stop: Arc<watch::Sender<bool>>,
     listening: Listening,
@@ -70,6 +72,7 @@ impl SocketSource {
             running: None,
             room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
             held: None,
+            archive: None,
             stations: None,
             stop: Arc::new(watch::Sender::new(false)),
             listening,
@@ -103,9 +106,19 @@ impl SocketSource {
         self
     }
 
+    /// Keeps packets in `archive` before it tells a sender that they are taken.
+    #[must_use]
+    pub fn keeping(mut self, archive: &PacketArchive) -> Self {
+        self.archive = Some(archive.clone());
+        self.listening.archive = Some(archive.clone());
+        self
+    }
+
     /// Takes packets of these stations only.
     #[must_use]
     pub fn of_stations(mut self, stations: Stations) -> Self {
+        // Also those that never send.
+        self.listening.write().know(stations.names());
         self.stations = Some(Arc::new(stations));
         self
     }
@@ -138,7 +151,8 @@ impl SocketSource {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
-            .max_blocking_threads(self.config.connections_max)
+            // One more, as packets of a connection that ends reach the disk while another takes its place.
+            .max_blocking_threads(self.config.connections_max + 1)
             .thread_name("listen-work")
             .build()
             .map_err(failed)?;
@@ -158,6 +172,7 @@ impl SocketSource {
             batches,
             passed: Mutex::new(0),
             held: self.held.clone(),
+            archive: self.archive.clone(),
             stations: self.stations.clone(),
             stop: Arc::clone(&self.stop),
             notes: Notes::new(tell),
@@ -189,6 +204,10 @@ impl Source for SocketSource {
     type Error = DownlinkError;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        if self.waiting.is_some() && self.held.is_some() {
+            // Nothing for the ground to take, but an occasion to show what its state holds.
+            out.push(Vec::new());
+        }
         self.start()?;
         let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
         match receiver.recv_timeout(POLL) {

@@ -77,6 +77,11 @@ impl Stations {
         if found.is_empty() { Err("no station; expected lines NAME TOKEN".into()) } else { Ok(Self(found)) }
     }
 
+    /// Names of the stations.
+    pub(super) fn names(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().map(|(name, _)| name.as_str())
+    }
+
     /// The station that has this token. The time it takes does not tell how much of a token was right.
     pub(super) fn of(&self, token: &[u8]) -> Option<&str> {
         let mut found = None;

@@ -1,0 +1,97 @@
+//! What the data of a pass can tell of gains, clocks and positions at best: the Cramer-Rao bound.
+//!
+//! The inverse of the Fisher information at no errors, with the priors of the settings. Values of visibilities do not enter, so that a
+//! pass can be judged that nobody has observed.
+
+use serde::Serialize;
+
+use super::config::SolverConfig;
+use super::dense::DenseFactor;
+use super::layout::ParameterLayout;
+use super::model::{KnownSignal, Offsets};
+use super::positions::modelled;
+use super::robust_fit::sums_of;
+use crate::calibration::CalibrationError;
+use crate::frames::{Instrument, PlacedVisibilities};
+use crate::sky::SkyMap;
+use crate::units::vector::Vec3;
+
+/// Least standard deviations of the gain of a daughter in a channel.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct GainBound {
+    /// Centre of the channel, Hz.
+    pub frequency_hz: f64,
+    /// Of the natural logarithm of the amplitude.
+    pub amplitude_sigma: f64,
+    /// Of the phase against the reference daughter, clock included, deg.
+    pub phase_sigma_deg: f64,
+    /// Visibilities of the daughter.
+    pub visibilities: u64,
+}
+
+/// Least standard deviations of what is known of a daughter after a pass.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct DaughterBound {
+    /// From 1.
+    pub daughter: u32,
+    /// Of the clock, ns; 0 where it is not solved for.
+    pub clock_sigma_ns: f64,
+    /// Of the position along the track, across it and away from the Moon, m; 0 where it is not solved for.
+    pub position_sigma_m: [f64; 3],
+    /// By channel.
+    pub gains: Vec<GainBound>,
+}
+
+/// Bounds of all daughters for visibilities of one pass, whose values do not matter, with maps (K) of the sky, one a channel, and the
+/// normal of each daughter's orbit.
+///
+/// # Errors
+/// Maps that the solver does not take.
+pub fn bounds(
+    config: &SolverConfig,
+    instrument: &Instrument,
+    maps: &[SkyMap],
+    placed: &[PlacedVisibilities],
+    normal_hat: Vec<Vec3>,
+) -> Result<Vec<DaughterBound>, CalibrationError> {
+    config.can_model(maps)?;
+    let mut signal = KnownSignal::new(config, instrument, maps)?;
+    let satellites = normal_hat.len();
+    let offsets = Offsets { offset_m: vec![[0.0; 3]; satellites], normal_hat };
+    let placed: Vec<(&PlacedVisibilities, bool)> = placed.iter().map(|placed| (placed, false)).collect();
+    let blocks = modelled(&placed, &mut signal, &offsets)?;
+    let layout = ParameterLayout::new(config, satellites, &instrument.frequencies_hz());
+    let sums = sums_of(&blocks, [f64::NEG_INFINITY, f64::INFINITY], &layout, &vec![1.0; blocks.len()]);
+    let order = layout.order();
+    let (information, _) = layout.normal(&layout.ideal(), &sums, None);
+    // Priors keep it positive definite.
+    let covariance = DenseFactor::new(&information, order).map_or_else(Vec::new, |factor| factor.inverse());
+    let of = |a: Option<usize>, b: Option<usize>| match (a, b) {
+        (Some(a), Some(b)) => covariance.get(a * order + b).copied().unwrap_or(f64::NAN),
+        _ => 0.0,
+    };
+    let gain = |c: usize, n: usize| {
+        let (amplitude, phase, clock) = (layout.amplitude(c, n), layout.phase(c, n), layout.clock(n));
+        let per_ns = layout.per_ns(c);
+        let variance =
+            of(phase, phase) + 2.0 * per_ns * of(phase, clock) + per_ns * per_ns * of(clock, clock);
+        let own = blocks.iter().filter(|block| block.channel == c);
+        let own = own.filter(|block| [block.pair.i, block.pair.j].map(usize::from).contains(&n));
+        GainBound {
+            frequency_hz: layout.frequencies_hz[c],
+            amplitude_sigma: of(amplitude, amplitude).sqrt(),
+            phase_sigma_deg: variance.max(0.0).sqrt().to_degrees(),
+            visibilities: own.map(|block| block.time_s.len() as u64).sum(),
+        }
+    };
+    let daughter = |n: usize| DaughterBound {
+        daughter: n as u32 + 1,
+        clock_sigma_ns: of(layout.clock(n), layout.clock(n)).sqrt(),
+        position_sigma_m: [0, 1, 2].map(|axis| {
+            let place = layout.position(n, axis);
+            of(place, place).sqrt()
+        }),
+        gains: (0..layout.channels()).map(|c| gain(c, n)).collect(),
+    };
+    Ok((0..satellites).map(daughter).collect())
+}
