@@ -119,6 +119,7 @@ impl Config {
     }
 
     /// Epoch of the mission, TAI seconds since 1958-01-01: that of the orbits, where they have dates.
+    #[doc(hidden)]
     #[must_use]
     #[doc(hidden)]
     pub fn epoch_tai_s(&self, array: &Array) -> f64 {
