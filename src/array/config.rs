@@ -261,7 +261,7 @@ impl ArrayConfig {
         for (key, period) in
             [("precession_period_s", self.precession_period_s), ("breathing.period_s", breathing.period_s)]
         {
-            checks.number(key, period, period >= 1e3, "at least 1000 s");
+            checks.number(key, period, period >= 100.0, "at least 100 s");
         }
         let period = self.orbital_period_s;
         // Bounds the number of windows in the longest mission to a million.

@@ -232,8 +232,8 @@ fn nobody_reads_and_nothing_panics() {
             stderr.map(|mut stderr| stderr.read_to_string(&mut said));
             stdout.map(|mut stdout| stdout.read_to_end(&mut Vec::new()));
             let (status, _) = end(&mut child);
-            let code =
-                if args[0].starts_with("no such") { 2 } else { i32::from(args[1..] == ["no such file"]) };
+            // A wrong command and a configuration that cannot be read are told alike.
+            let code = if args.concat().contains("no such") { 2 } else { 0 };
             assert_eq!(status.code(), Some(code), "{args:?}, {closes}: {said}");
             assert!(!said.contains("panicked"), "{args:?}: {said}");
         }

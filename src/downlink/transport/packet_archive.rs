@@ -616,15 +616,14 @@ mod tests {
     fn every_packet_is_kept_once_and_marks_say_which_a_checkpoint_lacks() {
         let place = tempfile::tempdir().unwrap();
         let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
-        // The last two come again, as from a second station.
-        let first = packets(0..5);
-        let ticket = archive.append(&first, first.len() as u64).unwrap();
-        archive.append(&packets(3..8), 2 * first.len() as u64).unwrap();
+        // The last two come again, as from a second station. Places are kept a step apart: a checkpoint between two has those of the first.
+        let ticket = archive.append(&packets(0..5), BATCH_STEP).unwrap();
+        archive.append(&packets(3..8), 2 * BATCH_STEP).unwrap();
         archive.sync(ticket).unwrap();
         assert_eq!(all_of(place.path()).0, packets(0..8));
         // Checkpoint 7 holds the first piece, 8 both.
-        archive.mark(7, first.len() as u64, &[7]).unwrap();
-        archive.mark(8, 2 * first.len() as u64, &[7, 8]).unwrap();
+        archive.mark(7, BATCH_STEP, &[7]).unwrap();
+        archive.mark(8, 2 * BATCH_STEP, &[7, 8]).unwrap();
         assert_eq!([behind(place.path(), 6), behind(place.path(), 7), behind(place.path(), 8)], [8, 3, 0]);
         drop(archive);
         // Another session begins a segment of its own, and goes on.

@@ -465,7 +465,7 @@ mod tests {
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 06") && said.contains("replay their files into a new folder"),
+                said.contains("version 06") && said.contains("replay the files into a new folder"),
                 "{said}"
             );
         });

@@ -4,7 +4,7 @@ use super::sigma::pixel_sigma_k;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::power::{Covariance, Drawn, Factors, FoundPower, Sought, Uncertainty};
+use crate::imaging::power::{Covariance, Drawn, Factors, FoundPower, SAMPLE_SETTLED, Sought, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::Fitted;
 use crate::imaging::solver::NamedWatch;
@@ -234,8 +234,8 @@ fn solve_with_power(
     let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
     let numbers: Vec<u64> = (0..samples as u64).collect();
     for which in numbers.chunks(NOISES_TOGETHER) {
-        let task = watch.start(&format!("samples from {}", which[0] + 1), rule.residual_max);
-        for Drawn { whole: mut sample, .. } in covariance.draw(which, &task) {
+        let task = watch.start(&format!("samples from {}", which[0] + 1), SAMPLE_SETTLED);
+        for Drawn { whole: mut sample, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
             sample.iter_mut().for_each(|value| *value *= factor);
             add(&mut sample, &whole);
             samples_k.push(map(&sample)?);

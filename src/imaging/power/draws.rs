@@ -13,8 +13,10 @@ use crate::imaging::solver::{dot, normalised, subtract};
 use crate::imaging::{NormalSums, regulariser::Diagonal};
 use crate::units::{StreamKind, random_stream};
 
-/// Change of a draw from step to step, relative, at which it is done: far below what a draw scatters by.
-pub(super) const DRAW_SETTLED: f64 = 1e-3;
+/// Change of a sample from step to step, relative, at which it is done: far below what samples scatter by.
+pub(in crate::imaging) const SAMPLE_SETTLED: f64 = 1e-3;
+/// The same of a draw from which traces are taken: what is left is the error of a mean over many degrees.
+pub(super) const TRACE_SETTLED: f64 = 1e-2;
 /// Most steps.
 const STEPS_MAX: usize = 100;
 
@@ -41,11 +43,12 @@ struct Path {
     /// `T^(-1/2) e1` of the last step.
     coefficients: Vec<f64>,
     change: f64,
+    settled: f64,
     is_open: bool,
 }
 
 impl Path {
-    fn new(start: Vec<f64>) -> Self {
+    fn new(start: Vec<f64>, settled: f64) -> Self {
         let length = dot(&start, &start).sqrt();
         Self {
             basis: vec![normalised(start)],
@@ -54,6 +57,7 @@ impl Path {
             length,
             coefficients: Vec::new(),
             change: f64::INFINITY,
+            settled,
             is_open: length > 0.0,
         }
     }
@@ -77,7 +81,7 @@ impl Path {
         self.coefficients = coefficients;
         let beta = dot(&next, &next).sqrt();
         let is_closed = beta.is_nan() || beta <= 1e-12 * self.alphas[0].abs();
-        self.is_open = !is_closed && self.change > DRAW_SETTLED && self.alphas.len() < STEPS_MAX;
+        self.is_open = !is_closed && self.change > self.settled && self.alphas.len() < STEPS_MAX;
         if self.is_open {
             self.betas.push(beta);
             self.basis.push(normalised(next));
@@ -131,15 +135,16 @@ impl Covariance<'_> {
         products
     }
 
-    /// Draws, one for each number of `which`, from numbers that depend on it alone. They share products.
-    pub(in crate::imaging) fn draw(&self, which: &[u64], task: &SolveTask<'_>) -> Vec<Drawn> {
+    /// Draws, one for each number of `which`, from numbers that depend on it alone, until none changes by more than `settled`. They share
+    /// products.
+    pub(in crate::imaging) fn draw(&self, which: &[u64], settled: f64, task: &SolveTask<'_>) -> Vec<Drawn> {
         let unknowns = self.sums.unknowns();
         let normal = |which: &u64| -> Vec<f64> {
             let mut stream = random_stream(3, StreamKind::Probe, [unknowns as u64, *which]);
             (0..unknowns).map(|_| StandardNormal.sample(&mut stream)).collect()
         };
         let starts: Vec<Vec<f64>> = which.iter().map(normal).collect();
-        let mut paths: Vec<Path> = starts.iter().cloned().map(Path::new).collect();
+        let mut paths: Vec<Path> = starts.iter().map(|start| Path::new(start.clone(), settled)).collect();
         loop {
             let wants: Vec<bool> = paths.iter().map(|path| path.is_open).collect();
             let change = paths.iter().map(|path| path.change).fold(0.0, f64::max).min(1.0);

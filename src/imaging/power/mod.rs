@@ -27,7 +27,7 @@ use faer::{Mat, Side};
 use serde::Serialize;
 
 pub(super) use blocks::{Block, Factors};
-pub(super) use draws::{Covariance, Drawn};
+pub(super) use draws::{Covariance, Drawn, SAMPLE_SETTLED};
 pub(super) use rounds::{FoundPower, Sought};
 
 use self::blocks::{evidence, greatest, multiply, value};

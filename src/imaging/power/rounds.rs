@@ -1,7 +1,7 @@
 //! Rounds of solution and power, until neither changes.
 
 use super::blocks::{Block, Factors};
-use super::draws::{Covariance, DRAW_SETTLED, Drawn};
+use super::draws::{Covariance, Drawn, TRACE_SETTLED};
 use super::knots::FREE;
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
@@ -119,7 +119,11 @@ impl Sought<'_> {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
-            ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
+            // Maps on the way do without draws, which take most of the time. The blocks know more than data of a short time do, so that the
+            // power comes out too small, and the map too smooth: on the safe side.
+            if watch.is_wanted() {
+                ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
+            }
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
@@ -159,8 +163,8 @@ impl Sought<'_> {
     ) -> Vec<f64> {
         let is_near = last.iter().all(|ratio| ratio.ln().abs() < NEAR);
         let which = if is_near { &TRACES[..1] } else { &TRACES };
-        let task = watch.start("draws for the sky's power", DRAW_SETTLED);
-        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, &task);
+        let task = watch.start("draws for the sky's power", TRACE_SETTLED);
+        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, TRACE_SETTLED, &task);
         self.ratio(&drawn, &factors.traces(self.l_max()))
     }
 

@@ -181,7 +181,7 @@ fn draws_have_the_covariance_of_the_posterior() {
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
     let covariance = Covariance { sums: &sums, regularisation: &regularisation, factors: &factors };
     let which: Vec<u64> = (0..DRAWS as u64).collect();
-    let drawn = covariance.draw(&which, &watch.named("test").start("draws", 0.0));
+    let drawn = covariance.draw(&which, SAMPLE_SETTLED, &watch.named("test").start("draws", 0.0));
     for i in 0..ORDER {
         let variance: f64 = drawn.iter().map(|d| d.whole[i].powi(2)).sum::<f64>() / DRAWS as f64;
         // Five standard errors of a variance.

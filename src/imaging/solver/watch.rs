@@ -120,6 +120,11 @@ impl SolveWatch {
 }
 
 impl<'a> NamedWatch<'a> {
+    /// Whether the map is one that the run leaves, not one on the way.
+    pub(in crate::imaging) fn is_wanted(self) -> bool {
+        self.wanted
+    }
+
     /// Whether the solution is wanted although the run was cancelled; it is unless this says otherwise.
     #[must_use]
     pub fn wanted(self, wanted: bool) -> Self {
