@@ -155,9 +155,9 @@ fn tags_find_positions_however_far_they_are_off() {
         }
     }
     let truth = std::fs::read_to_string(place.path("late.instrument.csv")).unwrap();
-    assert!(truth.lines().next().unwrap().ends_with(",time_tag_ms"));
+    let column = truth.lines().next().unwrap().split(',').position(|name| name == "time_tag_ms").unwrap();
     let tags_ms: Vec<f64> =
-        truth.lines().skip(1).map(|line| line.rsplit(',').next().unwrap().parse().unwrap()).collect();
+        truth.lines().skip(1).map(|line| line.split(',').nth(column).unwrap().parse().unwrap()).collect();
     assert!(tags_ms.iter().all(|ms| (ms - 9000.0).abs() < 1500.0) && tags_ms.iter().any(|ms| *ms != 9000.0));
 }
 
