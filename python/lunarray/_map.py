@@ -73,9 +73,9 @@ class Map:
         )
 
     @property
-    def epsilon(self) -> float:
-        """Regularisation: R = epsilon W_max I."""
-        return self.diagnostics["epsilon"]
+    def epsilon(self) -> float | None:
+        """Regularisation of R = epsilon W_max I; None where R is from the data."""
+        return self.diagnostics.get("epsilon")
 
     @property
     def alm(self) -> NDArray[np.complex128]:
