@@ -140,7 +140,7 @@ impl ProtectedInputs {
     pub fn of<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Self {
         let keys: Vec<FileKey> = paths.into_iter().filter_map(|path| key_of(path.as_ref())).collect();
         let mut protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
-        keys.iter().for_each(|key| *protected.entry(key.clone()).or_default() += 1);
+        keys.iter().for_each(|key| *protected.entry(*key).or_default() += 1);
         Self(keys)
     }
 }
@@ -198,15 +198,12 @@ pub fn require_replaceable(path: &Path) -> io::Result<()> {
 /// a terminal is written to.
 ///
 /// # Errors
-/// As [`AtomicFile::create`].
+/// As [`AtomicFile::create`]; a folder that does not exist.
 pub fn growing_file(path: &Path) -> io::Result<File> {
     if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return File::options().write(true).open(path);
     }
     require_replaceable(path)?;
-    if let Some(folder) = folder_of(path) {
-        fs::create_dir_all(folder)?;
-    }
     let (partial_path, file) = create_partial(path)?;
     if let Err(error) = fs::rename(&partial_path, path) {
         let _ = fs::remove_file(&partial_path);

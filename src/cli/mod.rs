@@ -12,6 +12,7 @@ mod compare;
 mod corrupt;
 mod cutout;
 #[cfg(all(test, feature = "serve"))]
+#[allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 mod documented;
 mod events;
 mod explain;

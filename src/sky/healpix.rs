@@ -177,7 +177,7 @@ pub fn ring_to_nested(nside: usize, pixel: usize) -> usize {
 fn ring_and_column(nside: usize, pixel: usize) -> (usize, usize) {
     let cap = 2 * nside * (nside - 1);
     // Rings 1 to k of a cap have 2 k (k + 1) pixels.
-    let ring_of_cap = |pixel: usize| (1 + (1 + 2 * pixel).isqrt()) / 2;
+    let ring_of_cap = |pixel: usize| (1 + 2 * pixel).isqrt().div_ceil(2);
     if pixel < cap {
         let ring = ring_of_cap(pixel);
         (ring, pixel - 2 * ring * (ring - 1))

@@ -328,7 +328,7 @@ fn frames_of_another_kind_are_named() {
         .collect();
     let said = |bytes: Vec<u8>| {
         fs::write(&path, bytes).unwrap();
-        let replayed = FileSource::open(&[path.clone()]).err().map(|error| error.to_string());
+        let replayed = FileSource::open(std::slice::from_ref(&path)).err().map(|error| error.to_string());
         let inspected = Contents::read(&path).unwrap_err().to_string();
         assert_eq!(replayed.as_ref(), Some(&inspected));
         inspected

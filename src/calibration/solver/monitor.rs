@@ -206,9 +206,9 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
     let mut changes = changes(solutions);
     widen(&mut changes, |change| &mut change.phases);
     widen(&mut changes, |change| &mut change.amplitudes);
-    for at in 1..solutions.len() {
+    for (at, solution) in solutions.iter().enumerate().skip(1) {
         let mut of_pass: Vec<&mut Change> = changes.iter_mut().filter(|change| change.at == at).collect();
-        find_reference(&mut of_pass, solutions[at].reference as usize - 1);
+        find_reference(&mut of_pass, solution.reference as usize - 1);
     }
     let mut events = Vec::new();
     for (at, solution) in solutions.iter().enumerate() {

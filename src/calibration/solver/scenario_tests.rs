@@ -176,7 +176,7 @@ impl Outcome {
 
 /// Solves all passes; `at` says of a seed's pass what it is.
 fn outcome(name: &str, solve: impl Fn(u64) -> (Vec<PassSolution>, Tally) + Send + Sync) -> Outcome {
-    let each: Vec<(Vec<PassSolution>, Tally)> = (0..PASSES).into_par_iter().map(|seed| solve(seed)).collect();
+    let each: Vec<(Vec<PassSolution>, Tally)> = (0..PASSES).into_par_iter().map(&solve).collect();
     let add =
         |a: Tally, b: &Tally| Tally { good: a.good + b.good, all: a.all + b.all, wrong: a.wrong + b.wrong };
     let tally = each.iter().fold(Tally::default(), |sum, (_, tally)| add(sum, tally));
@@ -227,9 +227,8 @@ fn all_is_well() {
         let gains = gains(seed as u64);
         for (c, hz) in FREQUENCIES_HZ.into_iter().enumerate() {
             let bounds = bounds_deg(&sky(3), hz, &gains[c]);
-            for n in 1..DAUGHTERS {
-                ratios.push(parts[0].daughters[n].gains[c].phase_sigma_deg / bounds[n]);
-            }
+            let daughters = parts[0].daughters.iter().zip(&bounds).take(DAUGHTERS).skip(1);
+            ratios.extend(daughters.map(|(found, bound)| found.gains[c].phase_sigma_deg / bound));
         }
     }
     ratios.sort_unstable_by(f64::total_cmp);

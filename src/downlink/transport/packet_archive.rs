@@ -523,6 +523,10 @@ fn segments(folder: &Path) -> Result<Vec<(u64, u64)>, DownlinkError> {
 
 /// Writes lines with their checksum as the last one.
 fn write_sealed(path: &Path, text: String) -> io::Result<()> {
+    // An archive that is gone is not begun anew: its disk may come back.
+    if path.parent().is_some_and(|folder| !folder.is_dir()) {
+        return Err(io::ErrorKind::NotFound.into());
+    }
     let sum = checksum(CrcAlgorithm::Crc64Nvme, text.as_bytes());
     write_atomically(path, format!("{text}checksum {sum:016x}\n").as_bytes())
 }

@@ -120,12 +120,11 @@ fn draw(factors: &Factors<'_>, count: usize, factor: f64, which: usize) -> Vec<f
     draw
 }
 
+/// Values at pixels of coefficients.
+type ToPixels<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
+
 /// The harmonics at the pixels, a column each.
-fn harmonics(
-    to_pixels: &dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>,
-    pixels: usize,
-    count: usize,
-) -> Result<Mat<f64>, SolveError> {
+fn harmonics(to_pixels: ToPixels<'_>, pixels: usize, count: usize) -> Result<Mat<f64>, SolveError> {
     let mut columns = Mat::zeros(pixels, count);
     let mut unit = vec![0.0; count];
     for column in 0..count {

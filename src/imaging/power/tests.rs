@@ -1,4 +1,5 @@
 //! Against dense matrices by formulas other than those of the code: densities of data, not of solutions.
+#![allow(clippy::print_stderr)] // They say what they measured.
 
 use std::borrow::Cow;
 
@@ -231,7 +232,7 @@ fn intervals_hold_as_often_as_they_say() {
             held[1] += usize::from(score.abs() < 1.96);
         }
     }
-    println!("of {skies} skies within 1 and 1.96 sigma: value, monopole, power {held:?}");
+    eprintln!("of {skies} skies within 1 and 1.96 sigma: value, monopole, power {held:?}");
     for (what, held) in ["value", "monopole", "power"].iter().zip(held) {
         for (held, expected) in held.into_iter().zip([0.683, 0.95]) {
             let share = held as f64 / skies as f64;
@@ -280,7 +281,7 @@ fn rounds_with_products_find_what_the_matrix_itself_gives() {
     let found = of(&near).found(None, rule, watch.named("test")).unwrap();
     for l in FREE..=L_MAX {
         let off = (found.power.power_k2[l] / expected.power.power_k2[l]).ln();
-        println!("{l}: {off:.3} of sigma {:.3}", expected.power.sigma_ln[l]);
+        eprintln!("{l}: {off:.3} of sigma {:.3}", expected.power.sigma_ln[l]);
         // Rounds end within a tenth; traces are of four draws of 81 numbers, and these blocks are off by a factor of three.
         assert!(
             off.abs() < 0.15 + 0.3 * expected.power.sigma_ln[l],

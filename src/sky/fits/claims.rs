@@ -158,14 +158,13 @@ impl MapUnit {
             ("M", 1e6),
             ("G", 1e9),
         ];
-        let found = prefixes.iter().find_map(|&(prefix, factor)| {
+        prefixes.iter().find_map(|&(prefix, factor)| {
             let base = unit.strip_prefix(prefix)?;
             if is_kelvin(base) {
                 return Some(Self::Kelvin(factor));
             }
             is_jansky_per_sr(base).then_some(Self::JanskyPerSr(factor))
-        });
-        found
+        })
     }
 
     /// Factor from this unit to K at a frequency; `None` if that has to be known and is not.
@@ -211,7 +210,7 @@ mod tests {
             (Card::text("FREQUENCY", "1.42GHz", ""), 1.42e9),
             (Card::real("RESTFRQ", 3e6, ""), 3e6),
         ] {
-            let found = frequency_hz(&header(&[card.clone()]), 1).unwrap().unwrap();
+            let found = frequency_hz(&header(std::slice::from_ref(&card)), 1).unwrap().unwrap();
             assert!((found / hz - 1.0).abs() < 1e-12, "{card:?}: {found}");
         }
         let with_key = [Card::real("FREQ", 408.0, ""), Card::text("FREQUNIT", "MHz", "")];
@@ -223,7 +222,7 @@ mod tests {
             Card::real("FREQ", 10.0, "Hz or MHz"),
             Card::logical("FREQ", true, ""),
         ] {
-            assert!(frequency_hz(&header(&[wrong.clone()]), 1).is_err(), "{wrong:?}");
+            assert!(frequency_hz(&header(std::slice::from_ref(&wrong)), 1).is_err(), "{wrong:?}");
         }
         let two = [Card::real("FREQ", 1e7, "Hz"), Card::text("FREQ", "408 MHz", "")];
         assert!(
