@@ -83,12 +83,14 @@ fn interrupted_traces_are_none() {
 
 /// Fringes end at l = 2 pi 2.5 = 16 or so: the harmonics beyond are hardly measured, and eigenvalues fall to nothing.
 #[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
 fn traces_of_harmonics_hardly_measured_are_right_or_refused_at_every_epsilon() {
     compare_with_rows(3e6, 250.0, 20, 3_000);
 }
 
 /// At 10 MHz up to b_p of nside 8. Up to 470 m, which takes minutes, eigenvalues are apart by less.
 #[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
 fn traces_of_harmonics_at_10_mhz_are_right_or_refused_at_every_epsilon() {
     compare_with_rows(10e6, 234.0, 20, 3_458);
 }
