@@ -189,7 +189,7 @@ fn is_of_system(error: &(dyn std::error::Error + 'static)) -> bool {
     // A file that is not there, or is not what it should be, is not the system's fault.
     let is_of_system = |error: &std::io::Error| {
         use std::io::ErrorKind::{InvalidData, NotFound, UnexpectedEof};
-        ![InvalidData, NotFound].contains(&error.kind())
+        ![InvalidData, NotFound, UnexpectedEof].contains(&error.kind())
     };
     of_pipeline
         || error.downcast_ref::<std::io::Error>().is_some_and(is_of_system)
