@@ -31,7 +31,7 @@ keys! {
     #[derive(Eq)]
     pub struct CalibrationConfig {
         /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": they are found while the data
-        /// arrive, by [calibrate].
+        /// arrive, by the section `calibrate`.
         everyday hook: CalibrationHook = CalibrationHook::Identity;
         /// File of gains for the hook "antenna-gains", such as "gains.json".
         #[serde(skip_serializing_if = "Option::is_none")]
