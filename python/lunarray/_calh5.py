@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ._native import LunarrayError
+from ._native import Error
 from ._uvh5 import ECLIPTIC_TO_ICRS
 
 #: Columns that are written beside the gains, with their units.
@@ -27,14 +27,14 @@ def read_solutions(path):
         rows = list(csv.DictReader(file))
     missing = {"from_s", "until_s", "daughter", "frequency_hz", "phase_deg", "reference", *BESIDE} - set(rows[0] if rows else ())
     if missing:
-        raise LunarrayError(f"{path}: no columns {sorted(missing)}: expected solutions.csv of `lunarray calibrate`, with solutions")
+        raise Error(f"{path}: no columns {sorted(missing)}: expected solutions.csv of `lunarray calibrate`, with solutions")
     lines = {}
     for row in rows:
         span = (float(row["from_s"]), float(row["until_s"]))
         lines[span, int(row["daughter"]), float(row["frequency_hz"])] = row
     spans, daughters, frequencies = (sorted({key[axis] for key in lines}) for axis in range(3))
     if len(lines) != len(spans) * len(daughters) * len(frequencies):
-        raise LunarrayError(f"{path}: expected a line for each solution, daughter and channel")
+        raise Error(f"{path}: expected a line for each solution, daughter and channel")
     return lines, spans, daughters, frequencies
 
 
@@ -48,7 +48,7 @@ def to_uvcal(downlink, solutions):
     lines, spans, daughters, frequencies = read_solutions(solutions)
     widths = dict(zip(downlink.channels_hz, downlink.instrument["widths_hz"], strict=True))
     if set(frequencies) != set(widths) or daughters != list(range(1, downlink.satellites + 1)):
-        raise LunarrayError(f"{solutions}: expected the daughters and channels of {downlink.path}")
+        raise Error(f"{solutions}: expected the daughters and channels of {downlink.path}")
     table = [[[lines[span, n, hz] for span in spans] for hz in frequencies] for n in daughters]
 
     def values(name):

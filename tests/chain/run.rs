@@ -355,13 +355,8 @@ fn the_quicklook_is_known_wherever_its_downlink_lies() {
     );
     let summary: Value =
         serde_json::from_slice(&std::fs::read(format!("{out}/summary.json")).unwrap()).unwrap();
-    // As in the paper, by channel.
-    let epsilons: Vec<f64> = summary["channels"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .map(|channel| channel["diagnostics"]["epsilon"].as_f64().unwrap())
-        .collect();
-    assert_eq!(epsilons, [1e-4, 1e-6, 1e-4]);
-    assert_eq!(summary["channels"][0]["snapshots"].as_array().unwrap().len(), 6);
+    // R from the data, without an epsilon, for its three channels.
+    let channels = summary["channels"].as_array().unwrap();
+    assert_eq!(channels.len(), 3);
+    assert!(channels.iter().all(|channel| channel["diagnostics"]["epsilon"].as_f64().is_none()));
 }
