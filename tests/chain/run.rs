@@ -359,4 +359,5 @@ fn the_quicklook_is_known_wherever_its_downlink_lies() {
     let channels = summary["channels"].as_array().unwrap();
     assert_eq!(channels.len(), 3);
     assert!(channels.iter().all(|channel| channel["diagnostics"]["epsilon"].as_f64().is_none()));
+    assert_eq!(channels[0]["snapshots"].as_array().unwrap().len(), 6);
 }
