@@ -21,6 +21,12 @@ pub(super) fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
+/// The quartiles of sorted values, nearest ranks.
+pub(super) fn quartiles(sorted: &[f64]) -> [f64; 2] {
+    let last = sorted.len() - 1;
+    [last / 4, last - last / 4].map(|at| sorted[at])
+}
+
 /// Processor time of all threads of this process, s. Linux reports it in ticks of 10 ms (proc(5), fields 14 and 15 of
 /// stat).
 pub(super) fn core_seconds_used() -> Option<f64> {

@@ -15,10 +15,9 @@ use crate::products::draw_coverage;
 /// List missing packets, and what they would add to the map.
 ///
 /// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what
-/// their recovery would add: their weight relative to that in the map of the same channel, summed over channels. Request
+/// their recovery would add: their weight relative to that in the map of the same channel, in the mean over channels. Request
 /// the given range of packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap
-/// is estimated from the order of channels and pairs in the downlink and from the packets that arrived, and, for a
-/// state, from the fraction of those that entered the map. Missing positions count as the visibilities that need them.
+/// is estimated from that of a whole window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities that need them.
 /// Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
 ///
 /// Example: lunarray gaps state/ --most 5 --picture coverage.png

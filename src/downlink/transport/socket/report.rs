@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::datagrams::DatagramReport;
 use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
 use crate::downlink::transport::packet_archive::PacketArchive;
@@ -212,6 +213,9 @@ pub struct ListenReport {
     pub backlog_bytes_max: u64,
     /// Connections by end.
     pub ended: BTreeMap<ConnectionEnd, u64>,
+    /// What came in datagrams, if the ground listens for them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub datagrams: Option<DatagramReport>,
     /// What came from each station that is known by its token.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub stations: BTreeMap<String, StationCounts>,
@@ -267,6 +271,23 @@ impl fmt::Display for ListenReport {
              {packets_refused} refused; backlog at most {} bytes",
             self.backlog_bytes_max
         )?;
+        if let Some(DatagramReport {
+            address,
+            received,
+            packets,
+            malformed,
+            refused,
+            dropped_by_system,
+            ..
+        }) = &self.datagrams
+        {
+            let dropped = dropped_by_system.map_or("unknown".to_owned(), |count| count.to_string());
+            write!(
+                f,
+                "\n  {address}: {received} datagrams, {packets} packets; {malformed} malformed, {refused} refused, {dropped} dropped \
+                 by the system"
+            )?;
+        }
         for (ended, count) in &self.ended {
             write!(f, "\n  {count:>6}  {ended}")?;
         }
