@@ -160,7 +160,7 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 pub(super) struct ConfigArgs {
     /// Print a file instead of the everyday keys.
     #[arg(long, value_enum)]
-    print: Option<Printed>,
+    print: Option<PrintedConfig>,
     /// Print all keys.
     #[arg(long, conflicts_with_all = ["print", "schema"])]
     all: bool,
@@ -173,7 +173,7 @@ pub(super) struct ConfigArgs {
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum Printed {
+enum PrintedConfig {
     /// What `lunarray run` runs without a file.
     Quicklook,
     /// Every key with its default: those for experts as comments.
@@ -192,8 +192,8 @@ pub(super) fn config(args: &ConfigArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let text = match args.print {
-        Some(Printed::Quicklook) => QUICKLOOK.to_owned(),
-        Some(Printed::Reference) => reference(Shown::Folded),
+        Some(PrintedConfig::Quicklook) => QUICKLOOK.to_owned(),
+        Some(PrintedConfig::Reference) => reference(Shown::Folded),
         None => reference(if args.all { Shown::All } else { Shown::Everyday }),
     };
     if args.json {

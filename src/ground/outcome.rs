@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::{GroundError, Lookout};
+use super::{GroundError, LiveView};
 
 use crate::calibration::{Completeness, SolvedGains};
 use crate::downlink::ReceptionCounters;
@@ -32,7 +32,7 @@ pub struct GroundOutcome {
     /// How its checkpoints went, at any time.
     pub saving: SharedSaving,
     /// Where visitors see it at work.
-    pub lookout: Lookout,
+    pub live_view: LiveView,
 }
 
 /// A checkpoint is due once what came first after the last one is so old.

@@ -7,4 +7,4 @@ mod orbit;
 mod xml;
 
 pub(super) use message::to_equatorial;
-pub(super) use orbit::{Stretch, TableOrbit, read};
+pub(super) use orbit::{OrbitArc, TableOrbit, read};

@@ -10,7 +10,7 @@ use super::layout::ParameterLayout;
 use super::robust_fit::{Fitted, Interval};
 use super::stability::{Excess, jump_s};
 use super::sums::ModelledBlock;
-use super::verdict::Judge;
+use super::verdict::VerdictInputs;
 use crate::units::vector::Vec3;
 
 /// Most parts that jumps divide an interval into.
@@ -277,7 +277,7 @@ pub(super) fn solve_from(
 }
 
 /// A fit, and what its residuals show.
-struct Told {
+struct CheckedFit {
     fitted: Fitted,
     excess: Vec<Excess>,
     model_error: Vec<f64>,
@@ -291,7 +291,7 @@ fn told(
     mut fitted: Fitted,
     blocks: &mut [ModelledBlock],
     suspects: &[bool],
-) -> Told {
+) -> CheckedFit {
     let (mut excess, mut model_error) = interval.residuals(&fitted, blocks, None).excess(suspects);
     if let Some(steady) = steadier(interval.config, &fitted, &excess) {
         fitted = interval.fit(blocks, Some(steady));
@@ -299,7 +299,7 @@ fn told(
     }
     let unexplained = unexplained(&fitted, blocks, interval.span_s, interval.config.unexplained_max);
     let counts = Counts::of(blocks, interval.span_s, &fitted);
-    Told { fitted, excess, model_error, unexplained, counts }
+    CheckedFit { fitted, excess, model_error, unexplained, counts }
 }
 
 /// Another daughter to be the reference, seen and steady in all channels, if the one of a fit changes too much.
@@ -317,7 +317,7 @@ fn steadier(config: &SolverConfig, fitted: &Fitted, excess: &[Excess]) -> Option
     (0..n).find(|daughter| is_steady(*daughter) && channels(*daughter) == channels(reference))
 }
 
-impl Told {
+impl CheckedFit {
     fn solution(self, interval: &Interval<'_>, (pass, normal_hat): (u64, Vec<Vec3>)) -> PassSolution {
         let Self { fitted, excess, model_error, unexplained, counts } = &self;
         let (config, Fitted { layout, found, .. }) = (interval.config, fitted);
@@ -327,7 +327,7 @@ impl Told {
             && found.converged
             && config.unexplained_max < 1.0
             && is_contradicted(layout, found, &fitted.used());
-        let judge = Judge { config, fitted, counts, unexplained, excess };
+        let judge = VerdictInputs { config, fitted, counts, unexplained, excess };
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],

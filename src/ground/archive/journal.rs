@@ -88,12 +88,12 @@ pub(super) struct JournalRecord {
     /// Visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
     /// What was offered to an engine.
-    pub(super) used: Option<Used>,
+    pub(super) used: Option<SumsSpan>,
 }
 
 /// Channel of the sums, which sub-bands share, and first and last mission time, s, of what was offered to its engine.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct Used {
+pub(super) struct SumsSpan {
     pub(super) channel: ChannelId,
     pub(super) span_s: [f64; 2],
 }
@@ -166,7 +166,7 @@ impl Journal {
             offered: draft.offered,
             accumulated: posts.accumulated as u32,
             left_out,
-            used: draft.used_s.map(|span_s| Used { channel: draft.channel, span_s }),
+            used: draft.used_s.map(|span_s| SumsSpan { channel: draft.channel, span_s }),
         };
         self.visibilities.insert((header.time, header.count), record);
     }

@@ -16,7 +16,7 @@ use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
-use crate::ground::lookout::Spotter;
+use crate::ground::live_view::LiveViewWriter;
 use crate::ground::pass_gate::PassGate;
 use crate::ground::promises::SenderPromises;
 use crate::ground::{
@@ -149,7 +149,7 @@ impl Archive {
         let found = checkpoints(self.folder.path())?;
         let [only] = &found[..] else { return Ok(false) };
         let no_autos = AutoTable::default();
-        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let of = ArchiveHeadRef { settings: &self.settings, journal: &self.journal, version: self.version };
         let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         checkpoint::is_of_head(only, &head)
     }
@@ -161,7 +161,7 @@ impl Archive {
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
-        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let of = ArchiveHeadRef { settings: &self.settings, journal: &self.journal, version: self.version };
         let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         let (folder, number) = self.folder.next();
         let place = SegmentPlace { folder: &folder, number };
@@ -179,13 +179,13 @@ impl Archive {
 }
 
 /// What an archive adds to the head of a checkpoint.
-struct HeadOf<'a> {
+struct ArchiveHeadRef<'a> {
     settings: &'a Vec<(String, String)>,
     journal: &'a Journal,
     version: u32,
 }
 
-impl<'a> HeadOf<'a> {
+impl<'a> ArchiveHeadRef<'a> {
     /// What a checkpoint has besides the sums.
     fn view(
         &self,
@@ -293,7 +293,7 @@ fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
 }
 
 /// A folder that is open, and what its newest usable checkpoint holds.
-pub(super) struct Opened {
+pub(super) struct OpenArchive {
     pub(super) folder: StateFolder,
     contents: Option<ArchiveContents>,
     notes: Vec<String>,
@@ -301,13 +301,13 @@ pub(super) struct Opened {
     posts: Ledger<VisibilityReason>,
 }
 
-impl Opened {
+impl OpenArchive {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
         Self::among(folder, config, sets_aside, &Ranks::one())
     }
 
-    /// As [`Opened::new`], as one rank of several.
+    /// As [`OpenArchive::new`], as one rank of several.
     pub(super) fn among(
         folder: &Path,
         config: &GroundConfig,
@@ -318,7 +318,7 @@ impl Opened {
             return Err(AccumulationError::HeldByRank.into());
         }
         let mut folder = match sets_aside || ranks.are_many() {
-            true => StateFolder::open_among(folder, ranks)?,
+            true => StateFolder::open_with_ranks(folder, ranks)?,
             false => StateFolder::open_to_read(folder)?,
         };
         let settings = settings_of(config)?;
@@ -396,7 +396,7 @@ impl Opened {
         };
         let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());
-        let spotter = Spotter::of(&outcome.lookout);
+        let live_view_writer = LiveViewWriter::of(&outcome.live_view);
         Ok(Ground {
             collector,
             calibrator,
@@ -409,7 +409,7 @@ impl Opened {
             begins_with_maps: false,
             steps,
             promises,
-            spotter,
+            live_view_writer,
         })
     }
 }

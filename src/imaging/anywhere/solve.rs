@@ -177,7 +177,7 @@ pub fn solve_refined(
     let regularisation = request.epsilon * w_max;
     let factors = blocks.factors(regularisation);
     drop(blocks);
-    let problem = Refining { sums, regularisation, inner: request.rule, factors };
+    let problem = RefinedProblem { sums, regularisation, inner: request.rule, factors };
     let mut data = sums.data.value_k_sr.clone();
     if let Some(prior) = &prior {
         let predicted = problem.forward(&[prior.as_slice()]);
@@ -233,7 +233,7 @@ pub fn solve_refined(
 }
 
 /// The true normal equations and their preconditioner.
-struct Refining<'a> {
+struct RefinedProblem<'a> {
     sums: &'a RefinedSums,
     regularisation: f64,
     /// When inner iterations stop, besides their residual.
@@ -286,7 +286,7 @@ impl Column {
     }
 }
 
-impl Refining<'_> {
+impl RefinedProblem<'_> {
     fn l_max(&self) -> usize {
         self.sums.circle.setup().l_max
     }

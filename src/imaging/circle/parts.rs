@@ -93,12 +93,12 @@ impl StoredTori {
 #[derive(Clone, Debug)]
 pub struct SumPart {
     share: RankShare,
-    made: Arc<Mutex<Made>>,
+    made: Arc<Mutex<FinishedParts>>,
 }
 
 /// What earlier parts have left.
 #[derive(Debug)]
-struct Made {
+struct FinishedParts {
     folder: PathBuf,
     tori: Option<StoredTori>,
     counts: Option<SumCounts>,
@@ -108,7 +108,7 @@ impl SumPart {
     /// The first of some parts, which are kept in a folder until the map is solved.
     #[must_use]
     pub fn first(count: usize, folder: &Path) -> Self {
-        let made = Made { folder: folder.to_owned(), tori: None, counts: None };
+        let made = FinishedParts { folder: folder.to_owned(), tori: None, counts: None };
         Self { share: RankShare { rank: 0, count: count.max(1) }, made: Arc::new(Mutex::new(made)) }
     }
 

@@ -28,7 +28,7 @@ use serde::Serialize;
 
 pub(super) use blocks::{Block, Factors};
 pub(super) use draws::{Covariance, Drawn, SAMPLE_SETTLED};
-pub(super) use rounds::{FoundPower, Sought};
+pub(super) use rounds::{FoundPower, PowerProblem};
 
 use self::blocks::{evidence, greatest, multiply, value};
 use self::knots::{FREE, Knots};

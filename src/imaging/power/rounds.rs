@@ -21,7 +21,7 @@ const RATIO_MAX: f64 = 30.0;
 const FACTOR_SETTLED: f64 = 0.03;
 
 /// Equations whose R is sought.
-pub(in crate::imaging) struct Sought<'a> {
+pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
     /// Blocks near the normal matrix, with which it is preconditioned.
     pub(in crate::imaging) blocks: &'a [Block<'a>],
@@ -52,7 +52,7 @@ impl FoundPower {
     }
 }
 
-impl Sought<'_> {
+impl PowerProblem<'_> {
     fn l_max(&self) -> usize {
         self.degrees.iter().copied().max().unwrap_or(0)
     }

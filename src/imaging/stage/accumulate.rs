@@ -6,11 +6,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::imaging::anywhere::{HeldSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
+use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, orbit_of};
 use crate::imaging::{
-    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
-    PixelSetup, PixelSums, RemadeVisibilities, SumCounts, automatic_weight_max,
+    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
+    NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
@@ -44,7 +44,7 @@ pub enum SnapshotSums {
     /// Visibilities one by one, for a refined map.
     Refined(Box<VisibilityArchive>),
     /// Visibilities one by one, for a map of pixels.
-    Remade(Box<RemadeVisibilities>),
+    MatrixFree(Box<MatrixFreeVisibilities>),
 }
 
 impl SnapshotSums {
@@ -62,7 +62,7 @@ impl SnapshotSums {
             Self::Pixel(sums) => sums.counts(),
             Self::Harmonic(sums) => sums.counts(),
             Self::Refined(archive) => archive.counts(),
-            Self::Remade(visibilities) => visibilities.counts(),
+            Self::MatrixFree(visibilities) => visibilities.counts(),
         }
     }
 }
@@ -71,7 +71,7 @@ impl SnapshotSums {
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
-    Held(Box<VisibilityArchive>),
+    Archive(Box<VisibilityArchive>),
 }
 
 impl Engine {
@@ -87,7 +87,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.add(placed),
             Self::Harmonic(engine) => engine.add(placed),
-            Self::Held(archive) => archive.add(placed),
+            Self::Archive(archive) => archive.add(placed),
         }
     }
 
@@ -95,7 +95,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.remove(placed),
             Self::Harmonic(engine) => engine.remove(placed),
-            Self::Held(archive) => archive.remove(placed),
+            Self::Archive(archive) => archive.remove(placed),
         }
     }
 
@@ -104,7 +104,7 @@ impl Engine {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
             Self::Harmonic(engine) => engine.counts(),
-            Self::Held(archive) => archive.counts(),
+            Self::Archive(archive) => archive.counts(),
         };
         counts.visibilities == 0
     }
@@ -112,26 +112,30 @@ impl Engine {
     /// A copy of the sums; of visibilities that are held for refinement, their sums on the nearest circle.
     fn sums(&mut self, config: &MapConfig) -> Result<SnapshotSums, AccumulationError> {
         Ok(match self {
-            Self::Held(archive) if config.is_remade() => remade(config, archive.copy()),
+            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, archive.copy()),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
-            Self::Held(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
+            Self::Archive(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
         })
     }
 
     fn into_sums(self, config: &MapConfig) -> SnapshotSums {
         match self {
-            Self::Held(archive) if config.is_remade() => remade(config, *archive),
+            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, *archive),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
-            Self::Held(archive) => SnapshotSums::Refined(archive),
+            Self::Archive(archive) => SnapshotSums::Refined(archive),
         }
     }
 }
 
 /// Visibilities for a map of pixels without its matrix.
-fn remade(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
-    SnapshotSums::Remade(Box::new(RemadeVisibilities { nside: config.nside, method: config.rows, archive }))
+fn matrix_free(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
+    SnapshotSums::MatrixFree(Box::new(MatrixFreeVisibilities {
+        nside: config.nside,
+        method: config.rows,
+        archive,
+    }))
 }
 
 /// State of an accumulator besides its engines, spans and ledger, from which another can resume. Snapshots are numbered
@@ -272,16 +276,16 @@ impl Accumulator {
             match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Held(archive) => archive.checkpoint(out, place)?,
+                Engine::Archive(archive) => archive.checkpoint(out, place)?,
             }
         }
         Ok(())
     }
 
     /// The files that engines were written to or read from, besides the checkpoint.
-    pub fn segments(&self) -> impl Iterator<Item = &HeldSegment> {
+    pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
         self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
-            Engine::Held(archive) => archive.segments(),
+            Engine::Archive(archive) => archive.segments(),
             Engine::Pixel(_) | Engine::Harmonic(_) => &[],
         })
     }
@@ -289,7 +293,7 @@ impl Accumulator {
     /// From now on another folder is meant, which has none of those files.
     pub fn leave_segments(&mut self) {
         for sums in self.channels.iter_mut().flatten() {
-            if let Engine::Held(archive) = &mut sums.engine {
+            if let Engine::Archive(archive) = &mut sums.engine {
                 archive.leave_segments();
             }
         }
@@ -331,7 +335,7 @@ impl Accumulator {
             let engine = match self.config.engine {
                 _ if self.config.holds_visibilities() => {
                     let most = refine.visibilities_max;
-                    Engine::Held(Box::new(VisibilityArchive::restore(from, folder, most)?))
+                    Engine::Archive(Box::new(VisibilityArchive::restore(from, folder, most)?))
                 }
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
@@ -384,7 +388,7 @@ impl Accumulator {
                     match (&mut ours.engine, theirs.engine) {
                         (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
                         (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
-                        (Engine::Held(ours), Engine::Held(theirs)) => ours.merge(*theirs)?,
+                        (Engine::Archive(ours), Engine::Archive(theirs)) => ours.merge(*theirs)?,
                         _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
                     }
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
@@ -594,10 +598,10 @@ fn engine(
     };
     Ok(match config.engine {
         _ if config.holds_visibilities() => {
-            Ok(Engine::Held(Box::new(VisibilityArchive::new(RefinedSetup {
+            Ok(Engine::Archive(Box::new(VisibilityArchive::new(RefinedSetup {
                 channel: placed.channel,
                 // Pixels have no degrees.
-                l_max: if config.is_remade() { 0 } else { config.degree() },
+                l_max: if config.is_matrix_free() { 0 } else { config.degree() },
                 frequency_hz,
                 baseline_m_max: config.baseline_m_max(frequency_hz),
                 moon_radius_m,

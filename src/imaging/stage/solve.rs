@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::frames::Instrument;
+use crate::imaging::anywhere::AssumedInstrument;
 use crate::imaging::anywhere::PassFile;
-use crate::imaging::anywhere::RowBelief;
 use crate::imaging::anywhere::{RefineRule, RefineSteps, Refinement, solve_refined};
 use crate::imaging::circle::harmonic_beams;
 use crate::imaging::circle::{HarmonicRequest, solve_regularised};
-use crate::imaging::pixel::solve_remade;
+use crate::imaging::pixel::solve_matrix_free;
 use crate::imaging::pixel::{PixelExtras, PointBeam, solve_pixels_with, solve_pixels_with_power};
 use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule, Uncertainty};
 use crate::imaging::{NormalSums, Snapshot, SnapshotSums, SumCounts};
@@ -73,7 +73,7 @@ pub struct SolverSetup {
     /// When the refinement of a harmonic map stops.
     pub refine: RefineRule,
     /// What rows are made with in it.
-    pub belief: RowBelief,
+    pub assumed: AssumedInstrument,
     /// Folder in which the passes of a refinement leave their solution, so that one that was interrupted can go on; `None` for
     /// nowhere.
     pub passes: Option<PathBuf>,
@@ -216,13 +216,13 @@ impl Stage for Solver {
                 }
                 (solved.map_k, solved.noise_k, solved.diagnostics)
             }
-            SnapshotSums::Remade(visibilities) => {
+            SnapshotSums::MatrixFree(visibilities) => {
                 let sums = visibilities.into_sums()?;
                 // The final one begins at nothing: its bits are then those of the data, whatever maps there were on the way.
                 let start = self.last.remove(&channel).filter(|_| !is_final);
                 let rule = self.setup.rule;
                 let (solved, unknowns) =
-                    match solve_remade(&sums, epsilon, prior.as_deref(), start, rule, watch) {
+                    match solve_matrix_free(&sums, epsilon, prior.as_deref(), start, rule, watch) {
                         Err(SolveError::Interrupted) => return Ok(()),
                         solved => solved?,
                     };
@@ -237,7 +237,7 @@ impl Stage for Solver {
             SnapshotSums::Refined(archive) => {
                 let request =
                     HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples: 0, probes: 0 };
-                let sums = archive.into_sums(&self.setup.belief)?;
+                let sums = archive.into_sums(&self.setup.assumed)?;
                 let rule = self.setup.refine;
                 let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
                 let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));

@@ -319,6 +319,15 @@ mod tests {
     }
 
     #[test]
+    fn an_old_value_is_refused_with_its_new_name() {
+        for (before, now) in [("held", "stored"), ("remade", "free")] {
+            let told = told("", &[&format!("map.matrix={before}")]);
+            assert!(told[1].ends_with(&format!("map.matrix: \"{before}\" was renamed to \"{now}\"")), "{told:?}");
+            assert!(with(&[&format!("map.matrix={now}")]).is_ok());
+        }
+    }
+
+    #[test]
     fn unknown_keys_wrong_types_and_bad_values_are_told_together() {
         let text = "sed = 1\n[map]\nnside = \"big\"\nepsilon = -1.0\nl_maxx = 3\n\n[sat]\na = 1\nb = 2\n[spacecraft]\n\
                     duration_s = -3\nninth = 9\n[sky]\nfile = 7\nnside = 7\n[products]\npictures = 1";

@@ -14,7 +14,7 @@ use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
 use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan};
-use super::skies::{TurnBuffers, Turned, lanes_of, make_room};
+use super::skies::{TurnBuffers, TurnedSkies, lanes_of, make_room};
 use super::turns::QuarterTurns;
 use super::{PairAt, RowsError, RowsSetup};
 use crate::sky::harmonics::Alm;
@@ -548,9 +548,9 @@ struct Workspace {
     batches: Vec<Batch>,
     turning: TurnBuffers,
     /// Skies in the frames of which others are combined, then gradients there.
-    basis: Turned,
+    basis: TurnedSkies,
     /// Those in the frames of a batch, and its weights.
-    turned: Turned,
+    turned: TurnedSkies,
     weights: Vec<Value>,
     /// `[node][sky][real or imaginary part][order]`.
     amplitudes: Vec<f64>,

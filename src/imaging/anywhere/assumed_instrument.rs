@@ -26,7 +26,7 @@ const SAME_ATTITUDE_RAD: f64 = 3e-3;
 
 /// The antenna of a daughter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct AntennaBelief {
+pub struct AssumedAntenna {
     /// Tilt of its axis from the orbit's normal towards the track's direction, and away from the Moon, degrees.
     pub tilt_deg: [f64; 2],
     /// q of a factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
@@ -35,11 +35,11 @@ pub struct AntennaBelief {
 
 /// What rows of the true positions are made with.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct RowBelief {
+pub struct AssumedInstrument {
     /// Whether visibilities are averages over their integrations, or instants in their middle.
     pub smear_integrations: bool,
     /// Antennas by daughter; those beyond the list are ideal.
-    pub antennas: Vec<AntennaBelief>,
+    pub antennas: Vec<AssumedAntenna>,
     /// Distortions of their patterns by frequency, which are added to theirs.
     pub patterns: PatternsByFrequency,
 }
@@ -47,13 +47,13 @@ pub struct RowBelief {
 /// Antennas of pairs whose response is not that of rows.
 #[derive(Clone, Debug)]
 pub(in crate::imaging) struct PairAntennas {
-    antennas: Vec<AntennaBelief>,
+    antennas: Vec<AssumedAntenna>,
     patterns: PatternsByFrequency,
     frequency_hz: f64,
     elements: AntennaResponse,
 }
 
-impl RowBelief {
+impl AssumedInstrument {
     /// The antennas of the pairs of sorted visibilities, where rows of a response alone do not have them.
     pub(in crate::imaging) fn antennas_of(
         &self,

@@ -88,9 +88,9 @@ struct Shared {
 /// Where visitors see passes, positions and baselines; clones share it. The ground puts the newest there when it rests, and at
 /// times while it works.
 #[derive(Clone, Debug, Default)]
-pub struct Lookout(Arc<Shared>);
+pub struct LiveView(Arc<Shared>);
 
-impl Lookout {
+impl LiveView {
     /// From now on visitors may come. To be called before the ground begins: what went before is not counted.
     pub fn open(&self) {
         self.0.is_open.store(true, Ordering::Relaxed);
@@ -150,11 +150,11 @@ impl Lookout {
 
 /// When a ground shows itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Occasion {
+pub(super) enum Activity {
     /// Between two steps of many.
-    Work,
+    Working,
     /// Nothing waits to be done, or it has finished.
-    Rest,
+    Idle,
 }
 
 /// Which auto-correlations a block holds.
@@ -165,20 +165,20 @@ pub(super) struct AutoSpan {
     span: [MissionTime; 2],
 }
 
-/// The ground's side of a [`Lookout`].
+/// The ground's side of a [`LiveView`].
 #[derive(Debug, Default)]
-pub(super) struct Spotter {
-    lookout: Lookout,
+pub(super) struct LiveViewWriter {
+    live_view: LiveView,
     latest_s: Option<f64>,
 }
 
-impl Spotter {
-    /// That of a lookout.
-    pub(super) fn of(lookout: &Lookout) -> Self {
-        Self { lookout: lookout.clone(), ..Self::default() }
+impl LiveViewWriter {
+    /// That of a live view.
+    pub(super) fn of(live_view: &LiveView) -> Self {
+        Self { live_view: live_view.clone(), ..Self::default() }
     }
 
-    /// Puts what earlier sessions received into the lookout, of which the latest visibilities were made at a time.
+    /// Puts what earlier sessions received into the live view, of which the latest visibilities were made at a time.
     pub(super) fn resume(&mut self, latest_s: Option<f64>, collector: &Collector, ephemeris: &Ephemeris) {
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
         self.put(collector, ephemeris);
@@ -190,13 +190,13 @@ impl Spotter {
         let (Pair { i, j }, last) = (block.pair, block.len().checked_sub(1)?);
         let length = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
         let span = [i64::from(block.offset_ticks[0]), length].map(|ticks| block.start.plus_ticks(ticks));
-        let is_wanted = i == j && self.lookout.0.is_open.load(Ordering::Relaxed);
+        let is_wanted = i == j && self.live_view.0.is_open.load(Ordering::Relaxed);
         is_wanted.then_some(AutoSpan { channel: block.channel, daughter: i, span })
     }
 
     /// Notes the powers that a block has become.
     pub(super) fn see_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
-        let mut powers = self.lookout.all_powers();
+        let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
             let waterfall = powers.entry(channel).or_default();
             autos
@@ -208,7 +208,7 @@ impl Spotter {
     /// Notes visibilities that have got their positions.
     pub(super) fn see(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
-            && self.lookout.0.is_open.load(Ordering::Relaxed)
+            && self.live_view.0.is_open.load(Ordering::Relaxed)
         {
             self.note(placed);
         }
@@ -217,20 +217,20 @@ impl Spotter {
     fn note(&mut self, placed: &PlacedVisibilities) {
         let latest_s = placed.time_s.last().copied();
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
-        let mut densities = self.lookout.densities();
+        let mut densities = self.live_view.densities();
         if densities.len() < CHANNELS_MAX || densities.contains_key(&placed.channel) {
             let density = densities.entry(placed.channel);
             density.or_insert_with(|| UvwDensity::new(placed.frequency_hz)).add(placed);
-            let mut hits = self.lookout.all_hits();
+            let mut hits = self.live_view.all_hits();
             hits.entry(placed.channel).or_insert_with(|| SkyHits::new(placed.frequency_hz)).add(placed);
         }
     }
 
-    /// Puts the newest into the lookout, if it is time for that.
-    pub(super) fn show(&self, occasion: Occasion, collector: &Collector, ephemeris: &Ephemeris) {
-        let Shared { is_open, is_due, .. } = &*self.lookout.0;
+    /// Puts the newest into the live view, if it is time for that.
+    pub(super) fn show(&self, activity: Activity, collector: &Collector, ephemeris: &Ephemeris) {
+        let Shared { is_open, is_due, .. } = &*self.live_view.0;
         let is_open = is_open.load(Ordering::Relaxed);
-        let is_time = is_open && (occasion == Occasion::Rest || is_due.swap(false, Ordering::Relaxed));
+        let is_time = is_open && (activity == Activity::Idle || is_due.swap(false, Ordering::Relaxed));
         if is_time {
             self.put(collector, ephemeris);
         }
@@ -240,6 +240,6 @@ impl Spotter {
         let Some(instrument) = collector.instrument() else { return };
         let passes = PassLine::of(instrument.epoch_tai_s, collector.received());
         let array = self.latest_s.and_then(|latest_s| ArrayNow::at(ephemeris, instrument, latest_s));
-        *self.lookout.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
+        *self.live_view.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
     }
 }
