@@ -194,88 +194,72 @@ impl Scrape {
     }
 
     fn ground(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
-        let visibilities = || Some(Unit::Other("visibilities".into()));
-        if let Some(ledger) = &self.status.ledger {
-            // Not counters: what is retracted leaves them.
-            let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
-            let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
-            let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
-            gauges(
-                out,
-                MetricInfo("ledger", "Visibilities by what became of them", visibilities()),
-                entries,
-            )?;
-            let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
-                let stage = reason.lost_in().unwrap_or("");
-                ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
-            });
-            let about =
-                MetricInfo("ledger_left_out", "Visibilities flagged, or lost in a stage", visibilities());
-            gauges(out, about, left_out)?;
-            let about =
-                "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
-            let about = MetricInfo("ledger_unaccounted", about, visibilities());
-            gauge_if(out, about, ledger.sampled.map(|(_, rest)| rest as f64))?;
-        }
-        if let Some(reception) = &self.status.reception {
-            let packets = || Some(Unit::Other("packets".into()));
-            let kinds = |of: &dyn Fn(Kind) -> u64| {
-                Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64))
-            };
-            let sound = kinds(&|kind| reception.kind(kind).packets);
-            gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
-            let missing = kinds(&|kind| reception.kind(kind).missing);
-            gauges(
-                out,
-                MetricInfo("reception_missing", "Packets missing between those received", packets()),
-                missing,
-            )?;
-            let damaged = kinds(&|kind| reception.kind(kind).damaged);
-            gauges(out, MetricInfo("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
-            let again = kinds(&|kind| reception.kind(kind).duplicates);
-            gauges(out, MetricInfo("reception_duplicate", "Packets received before", packets()), again)?;
-        }
+        self.ledger(out)?;
+        self.reception(out)?;
         if let Some(waiting) = self.status.waiting_bytes {
             let about = "Visibilities that wait for their positions";
             gauge(out, MetricInfo("waiting", about, Some(Unit::Bytes)), waiting as f64)?;
         }
-        if let Some(saving) = &self.status.saving {
-            let written = MetricInfo("checkpoints_written", "Checkpoints written in this session", None);
-            counter(out, written, saving.written)?;
-            counter(
-                out,
-                MetricInfo("checkpoints_failed", "Checkpoints that could not be written", None),
-                saving.failed,
-            )?;
-            let unsaved = f64::from(u8::from(saving.unsaved.is_some()));
-            gauge(
-                out,
-                MetricInfo("state_unsaved", "1 if the last checkpoint could not be written", None),
-                unsaved,
-            )?;
-            let about = "Received since the newest checkpoint";
-            gauge(out, MetricInfo("state_unsaved", about, Some(Unit::Bytes)), saving.unsaved_bytes as f64)?;
-            let about = "Age of the oldest packet that no checkpoint holds";
-            gauge(out, MetricInfo("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
-            let about = MetricInfo(
-                "checkpoint_age",
-                "Age of the newest checkpoint of this session",
-                Some(Unit::Seconds),
-            );
-            gauge_if(out, about, saving.checkpoint_s)?;
-        }
-        if let Some(products) = &self.status.products {
-            let about =
-                MetricInfo("products_failed", "Attempts to write maps and pictures that failed", None);
-            counter(out, about, products.failed)?;
-            let about = MetricInfo(
-                "products_unwritten",
-                "1 if the last attempt to write maps and pictures failed",
-                None,
-            );
-            gauge(out, about, f64::from(u8::from(products.unwritten.is_some())))?;
-        }
-        Ok(())
+        self.saving(out)?;
+        let Some(products) = &self.status.products else { return Ok(()) };
+        let about = "Attempts to write maps and pictures that failed";
+        counter(out, MetricInfo("products_failed", about, None), products.failed)?;
+        let about = "1 if the last attempt to write maps and pictures failed";
+        let unwritten = f64::from(u8::from(products.unwritten.is_some()));
+        gauge(out, MetricInfo("products_unwritten", about, None), unwritten)
+    }
+
+    /// Gauges, not counters: what is retracted leaves the ledger.
+    fn ledger(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(ledger) = &self.status.ledger else { return Ok(()) };
+        let visibilities = || Some(Unit::Other("visibilities".into()));
+        let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
+        let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
+        let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
+        gauges(out, MetricInfo("ledger", "Visibilities by what became of them", visibilities()), entries)?;
+        let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
+            let stage = reason.lost_in().unwrap_or("");
+            ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
+        });
+        let about = "Visibilities flagged, or lost in a stage";
+        gauges(out, MetricInfo("ledger_left_out", about, visibilities()), left_out)?;
+        let about =
+            "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
+        let unaccounted = ledger.sampled.map(|(_, rest)| rest as f64);
+        gauge_if(out, MetricInfo("ledger_unaccounted", about, visibilities()), unaccounted)
+    }
+
+    fn reception(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(reception) = &self.status.reception else { return Ok(()) };
+        let packets = || Some(Unit::Other("packets".into()));
+        let kinds =
+            |of: &dyn Fn(Kind) -> u64| Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64));
+        let sound = kinds(&|kind| reception.kind(kind).packets);
+        gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
+        let missing = kinds(&|kind| reception.kind(kind).missing);
+        let about = "Packets missing between those received";
+        gauges(out, MetricInfo("reception_missing", about, packets()), missing)?;
+        let damaged = kinds(&|kind| reception.kind(kind).damaged);
+        gauges(out, MetricInfo("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
+        let again = kinds(&|kind| reception.kind(kind).duplicates);
+        gauges(out, MetricInfo("reception_duplicate", "Packets received before", packets()), again)
+    }
+
+    fn saving(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(saving) = &self.status.saving else { return Ok(()) };
+        let about = "Checkpoints written in this session";
+        counter(out, MetricInfo("checkpoints_written", about, None), saving.written)?;
+        let about = "Checkpoints that could not be written";
+        counter(out, MetricInfo("checkpoints_failed", about, None), saving.failed)?;
+        let about = "1 if the last checkpoint could not be written";
+        let unsaved = f64::from(u8::from(saving.unsaved.is_some()));
+        gauge(out, MetricInfo("state_unsaved", about, None), unsaved)?;
+        let about = "Received since the newest checkpoint";
+        gauge(out, MetricInfo("state_unsaved", about, Some(Unit::Bytes)), saving.unsaved_bytes as f64)?;
+        let about = "Age of the oldest packet that no checkpoint holds";
+        gauge(out, MetricInfo("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
+        let about = "Age of the newest checkpoint of this session";
+        gauge_if(out, MetricInfo("checkpoint_age", about, Some(Unit::Seconds)), saving.checkpoint_s)
     }
 
     /// Room on disks, and memory.

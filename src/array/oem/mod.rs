@@ -1,6 +1,7 @@
 //! Orbits from CCSDS Orbit Ephemeris Messages.
 
 mod checks;
+mod interpolate;
 mod kvn;
 mod message;
 mod orbit;

@@ -2,8 +2,8 @@
 
 use super::config::{AmplitudeScale, SolverConfig};
 use super::detect::SignalPresence;
+use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::robust_fit::Fitted;
-use super::solution::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::stability::Excess;
 
 /// Standard deviations that have to hold errors: angles wrap, and noise turns a weak gain further than its bound says.

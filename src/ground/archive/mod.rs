@@ -61,17 +61,20 @@
 //! Ranks of a job (`--mpi`) write a file each, `checkpoint-00000007.2-of-4.lunarray`: the whole head, and of the sums those that the
 //! rank holds. The heads of a set are equal, or it is damaged. Any number of ranks reads a set, and so does a process alone.
 //!
-//! A checkpoint that cannot be written ends nothing, but for a job of ranks, which it ends: a set without it is none. The ground goes on and tries again, first after an eighth of the
+//! A checkpoint that cannot be written ends nothing, but for a job of ranks, which it ends: a set that lacks a part is not used. The ground goes on and tries again, first after an eighth of the
 //! interval, then after twice as long each time, and three times at the end of the session; then it makes its maps, and
 //! says what the state lacks. Room for two checkpoints is enough: when a third finds none, the older one goes first.
 
 mod calibration_state;
 mod checkpoint;
 mod draft;
+mod entry;
 mod folder;
+mod gap_report;
 mod gaps;
 mod journal;
 mod names;
+mod open_archive;
 mod packet_order;
 mod recalibrate;
 mod recovery;
@@ -83,11 +86,9 @@ mod survey;
 mod views;
 
 pub(super) use draft::RecordDraft;
-pub use gaps::{
-    ChannelCoverage, GapReport, Gaps, LostStream, PositionsPacket, ReceivedPackets, RestartReport,
-    VisibilityPacket, find_gaps,
-};
-pub use journal::JournalEntry;
+pub use entry::JournalEntry;
+pub use gap_report::{GapReport, LostStream, VisibilityPacket};
+pub use gaps::{ChannelCoverage, Gaps, PositionsPacket, ReceivedPackets, RestartReport, find_gaps};
 pub use recalibrate::Recalibrated;
 pub use recovery::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use retract::{RefusedPacket, Retracted};

@@ -3,13 +3,10 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use super::gaps::{GapReport, LostStream, VisibilityPacket};
-use super::journal::{JournalEntry, Sent};
+use super::entry::JournalEntry;
+use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
+use super::journal::Sent;
 use crate::downlink::{CucTime, Kind};
-use crate::units::{ChannelId, Pair};
-
-/// Channel and pair: each sends its packets in turn, pass by pass.
-pub(super) type Stream = (ChannelId, Pair);
 
 /// Passes on either side of a gap from which the number of packets a pass is estimated.
 const PASSES: usize = 2;

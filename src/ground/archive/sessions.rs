@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
+use super::open_archive::OpenArchive;
 use super::recovery::{kept_settings, require_saved};
-use super::store::{Archive, OpenArchive};
+use super::store::Archive;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
 use crate::ranks::Ranks;

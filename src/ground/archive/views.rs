@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::journal::{Journal, JournalEntry, JournalRecord, Sent, SumsSpan};
+use super::entry::JournalEntry;
+use super::journal::{Journal, JournalRecord, Sent, SumsSpan};
 use crate::calibration::{BlockKey, ReceivedBlocks};
 use crate::downlink::{Kind, ReceptionCounters};
 use crate::frames::VisibilityReason;

@@ -322,7 +322,10 @@ mod tests {
     fn an_old_value_is_refused_with_its_new_name() {
         for (before, now) in [("held", "stored"), ("remade", "free")] {
             let told = told("", &[&format!("map.matrix={before}")]);
-            assert!(told[1].ends_with(&format!("map.matrix: \"{before}\" was renamed to \"{now}\"")), "{told:?}");
+            assert!(
+                told[1].ends_with(&format!("map.matrix: \"{before}\" was renamed to \"{now}\"")),
+                "{told:?}"
+            );
             assert!(with(&[&format!("map.matrix={now}")]).is_ok());
         }
     }
