@@ -120,7 +120,7 @@ fn put_row(page: &mut String, name: &str, described: &KeyDescription) {
     page.push_str(&format!("| `{name}` | {default} | {about}{} |\n", condition_of(described)));
 }
 
-/// Its own condition, of which the last is.
+/// Its own condition: the last of the list.
 fn condition_of(described: &KeyDescription) -> String {
     described.only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."))
 }

@@ -110,7 +110,7 @@ impl Drop for Restored {
     }
 }
 
-/// What a server says of a run at one time.
+/// The state of a run, as its server tells it at one time.
 struct ServerSnapshot {
     status: Value,
     /// Of the channel at this place in the list.

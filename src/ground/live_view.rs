@@ -1,5 +1,5 @@
-//! What visitors may see of a ground at work beyond its counters. Nothing is gathered unless somebody may look, and nothing of
-//! it enters a result.
+//! What visitors of the page see of a ground besides its counters. Nothing is gathered unless the page is served, and no
+//! result depends on it.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +19,7 @@ use crate::units::{ChannelId, MissionTime, Pair};
 /// Most channels of which baselines are counted.
 const CHANNELS_MAX: usize = 256;
 
-/// Most places of a track.
+/// Most points of a track.
 const TRACK_MAX: usize = 64;
 
 /// Where the satellites were at the time of the latest data.
@@ -33,7 +33,7 @@ pub struct ArrayNow {
     pub moon_radius_m: f64,
     /// Positions of the satellites, m, Moon-centred ecliptic axes.
     pub positions_m: Vec<Vec3>,
-    /// Satellite 1 at that time, or as near to it as its velocity is known.
+    /// Satellite 1 at that time, or at the nearest time with a known velocity.
     pub motion: SatelliteState,
     /// First and last time of the positions that came with the latest, s.
     pub known_s: [f64; 2],
@@ -72,12 +72,12 @@ struct Views {
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// Visitors may come at any time.
+    /// Whether visitors may come.
     is_open: AtomicBool,
-    /// Something new is due, even from a ground that never rests.
+    /// Whether visitors expect an update, even from a ground that never rests.
     is_due: AtomicBool,
     views: Mutex<Views>,
-    /// By channel; the ground waits for a copy of one at most, some microseconds.
+    /// By channel. The ground waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
     /// Likewise.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
@@ -85,18 +85,18 @@ struct Shared {
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
 
-/// Where visitors see passes, positions and baselines; clones share it. The ground puts the newest there when it rests, and at
-/// times while it works.
+/// Passes, positions and baselines for visitors of the page; clones share it. The ground updates it when it is idle, and from time to time
+/// while it works.
 #[derive(Clone, Debug, Default)]
 pub struct LiveView(Arc<Shared>);
 
 impl LiveView {
-    /// From now on visitors may come. To be called before the ground begins: what went before is not counted.
+    /// Opens it to visitors. Call it before the ground begins: earlier data are not counted.
     pub fn open(&self) {
         self.0.is_open.store(true, Ordering::Relaxed);
     }
 
-    /// Something new is due from a ground that never rests. To be called at the intervals at which visitors expect that.
+    /// Asks a busy ground for an update. Call it at the intervals at which visitors expect one.
     pub fn refresh(&self) {
         self.0.is_due.store(true, Ordering::Relaxed);
     }
@@ -119,7 +119,7 @@ impl LiveView {
         self.densities().get(&channel).cloned()
     }
 
-    /// Where the pairs of a channel stood, of this session.
+    /// Visibilities of this session by direction, for a channel.
     #[must_use]
     pub fn hits(&self, channel: ChannelId) -> Option<SkyHits> {
         self.all_hits().get(&channel).cloned()
@@ -148,7 +148,7 @@ impl LiveView {
     }
 }
 
-/// When a ground shows itself.
+/// What a ground is doing when it updates the view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Activity {
     /// Between two steps of many.
@@ -173,18 +173,18 @@ pub(super) struct LiveViewWriter {
 }
 
 impl LiveViewWriter {
-    /// That of a live view.
+    /// The writer of a live view.
     pub(super) fn of(live_view: &LiveView) -> Self {
         Self { live_view: live_view.clone(), ..Self::default() }
     }
 
-    /// Puts what earlier sessions received into the live view, of which the latest visibilities were made at a time.
+    /// Shows what earlier sessions received; `latest_s` is the time of their latest visibilities.
     pub(super) fn resume(&mut self, latest_s: Option<f64>, collector: &Collector, ephemeris: &Ephemeris) {
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
         self.put(collector, ephemeris);
     }
 
-    /// A block of auto-correlations that is about to be calibrated, if somebody may look.
+    /// The span of a block of auto-correlations that is about to be calibrated, if the page is served.
     pub(super) fn expect_powers(&self, frame: Option<&GroundFrame>) -> Option<AutoSpan> {
         let Some(GroundFrame::Visibilities(block)) = frame else { return None };
         let (Pair { i, j }, last) = (block.pair, block.len().checked_sub(1)?);
@@ -194,7 +194,7 @@ impl LiveViewWriter {
         is_wanted.then_some(AutoSpan { channel: block.channel, daughter: i, span })
     }
 
-    /// Notes the powers that a block has become.
+    /// Adds the calibrated powers of a block.
     pub(super) fn see_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
         let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
@@ -205,7 +205,7 @@ impl LiveViewWriter {
         }
     }
 
-    /// Notes visibilities that have got their positions.
+    /// Adds visibilities with positions.
     pub(super) fn see(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
             && self.live_view.0.is_open.load(Ordering::Relaxed)
@@ -226,7 +226,7 @@ impl LiveViewWriter {
         }
     }
 
-    /// Puts the newest into the live view, if it is time for that.
+    /// Updates the live view, if an update is due.
     pub(super) fn show(&self, activity: Activity, collector: &Collector, ephemeris: &Ephemeris) {
         let Shared { is_open, is_due, .. } = &*self.live_view.0;
         let is_open = is_open.load(Ordering::Relaxed);

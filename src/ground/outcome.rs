@@ -89,7 +89,7 @@ struct Saving {
     /// When the first packet came that no checkpoint holds.
     unsaved_since: Option<Instant>,
     written_at: Option<Instant>,
-    /// By age, none is due before.
+    /// Time before which no checkpoint is due by age.
     not_before: Option<Instant>,
 }
 

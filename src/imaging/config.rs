@@ -485,7 +485,7 @@ impl MapConfig {
     }
 
     /// Requires that the sums of the channels of a group, of `channels` in all, take at most `limit_bytes`. Those of the
-    /// harmonic engine grow with the data, so nothing is known of them beforehand.
+    /// harmonic engine grow with the data, so they are not known beforehand.
     ///
     /// # Errors
     /// [`AccumulationError::Memory`].

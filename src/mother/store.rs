@@ -20,7 +20,7 @@ pub struct PacedLink {
     pub bytes_per_s: f64,
 }
 
-/// A block in the store.
+/// A block that waits in the store.
 #[derive(Debug)]
 struct HeldBlock {
     window: u64,
@@ -40,7 +40,7 @@ const PARTS: usize = 32;
 /// latest are dropped first.
 type Rank = (u64, u32);
 
-/// Either end of a block.
+/// End of a block from which visibilities are dropped.
 #[derive(Clone, Copy, Debug)]
 enum StoreEnd {
     Front,

@@ -102,7 +102,7 @@ pub enum RuntimeError {
         /// Name of the stage that fills the queue.
         stage: String,
     },
-    /// A name that is no name for a thread, or in use.
+    /// A name that is invalid for a thread, or in use.
     #[error("stage name `{stage}`: expected a unique name, not empty and without NUL")]
     Name {
         /// The name.

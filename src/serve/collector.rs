@@ -90,7 +90,7 @@ fn gauge(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: f64) -> fmt:
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
-/// A gauge of which there may be no value.
+/// A gauge, if it has a value.
 fn gauge_if(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: Option<f64>) -> fmt::Result {
     value.map_or(Ok(()), |value| gauge(out, about, value))
 }

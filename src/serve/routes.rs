@@ -39,7 +39,7 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; c
 /// Colours of a palette.
 const PALETTE_STEPS: u32 = 256;
 
-/// What requests are answered from.
+/// What all request handlers share.
 #[derive(Clone)]
 pub(super) struct PageState {
     pub(super) console: Arc<Console>,

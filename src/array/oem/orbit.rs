@@ -23,7 +23,7 @@ pub(in crate::array) struct TableOrbit {
     message: Arc<OemMessage>,
     /// Epoch of the mission in the message's seconds.
     epoch_s: f64,
-    /// Between which of them positions are known without a gap.
+    /// Interval in which positions are known without a gap, of the mission's time.
     span_s: [f64; 2],
 }
 
@@ -63,7 +63,7 @@ const APART_M: f64 = 1.0;
 /// How far beyond its states an orbit goes on, s: ticks of time tags. Farther out nothing is known, and states are not numbers.
 const BEYOND_S: f64 = 1.0;
 
-/// Greatest gap between segments that is none, s: rounded epochs.
+/// Gap between segments that still counts as continuous, s: rounded epochs.
 const SEAM_S: f64 = 1e-6;
 
 /// The orbits of all satellites.

@@ -30,7 +30,7 @@ pub(super) struct NewtonFit {
     pub(super) converged: bool,
 }
 
-/// Holds positions near those about which the model is linear. It vanishes where they are, and is no part of what is known.
+/// Keeps positions near the point about which the model is linear. The term vanishes there, and is not part of the prior.
 pub(super) struct PositionPrior<'a> {
     pub(super) position_m: &'a [[f64; 3]],
     /// Along each axis.

@@ -16,7 +16,7 @@ const MARGIN: f64 = 1.1;
 /// Signal-to-noise ratio at which channels that tell nothing alone tell of a daughter together.
 const SEEN_TOGETHER: f64 = 5.0;
 
-/// What gains are judged by.
+/// Inputs of the verdict on gains.
 pub(super) struct VerdictInputs<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) fitted: &'a Fitted,

@@ -1,4 +1,4 @@
-//! The folder of an archive: numbered checkpoints, of which the newest two are kept. Room for three lets both stay until
+//! The folder of an archive: numbered checkpoints; the newest two are kept. Room for three lets both stay until
 //! another is whole; room for two is enough.
 //!
 //! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream, and nobody waits for the
@@ -94,7 +94,7 @@ impl StateFolder {
         &self.ranks
     }
 
-    /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
+    /// The newest usable checkpoint, read by `read`, or `None` if there is none; and notes on newer ones that
     /// are damaged, which are renamed if `sets_aside`. `read` gets the first of its files.
     ///
     /// A checkpoint that the system does not let us read may well hold: that is an error, and changes nothing.
@@ -229,7 +229,7 @@ impl StateFolder {
         file.finish().map_err(GroundError::io(path, "finish the file")).map(|_| ())
     }
 
-    /// Removes all checkpoints but the newest. That has to hold: otherwise an error, and nothing is removed.
+    /// Removes all checkpoints but the newest. If that is damaged, it is an error, and nothing is removed.
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
         if let Some(newest) = self.held.last().copied() {
             newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;

@@ -174,8 +174,8 @@ fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
 
 /// The visibilities that wait for positions in missing packets, of the windows that these packets are of.
 ///
-/// Between the last positions before and the next received there may be several windows, each of some packets, of which others may be
-/// missing too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
+/// There may be several windows between the last positions before and the next received, each of some packets; others of these may be
+/// missing, too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
 /// between in equal parts; what waits for a window counts for the missing packets of it, together once.
 fn positions_missing(
     readings: &[VisibilityPacket],

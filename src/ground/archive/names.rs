@@ -47,7 +47,7 @@ impl CheckpointSet {
         (0..self.parts).map(|part| self.path(folder, part)).collect()
     }
 
-    /// Removes its files; whether none is left.
+    /// Removes its files; returns whether all are gone.
     pub(super) fn remove(self, folder: &Path) -> bool {
         let stays =
             |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
@@ -92,7 +92,7 @@ pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     }
 }
 
-/// The checkpoints in a folder, oldest first: those of which all parts are there, and the others. A name that is like theirs and that
+/// The checkpoints in a folder, oldest first: complete ones, and those that lack parts. A name that is like theirs and that
 /// none can have may hide one: it is refused.
 pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundError> {
     let mut found: BTreeMap<CheckpointSet, BTreeSet<usize>> = BTreeMap::new();

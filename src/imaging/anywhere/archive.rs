@@ -151,7 +151,7 @@ impl VisibilityArchive {
         &self.segments
     }
 
-    /// From now on another folder is meant, which has none of the segments.
+    /// Forgets its segments: the next checkpoint goes into another folder.
     pub fn leave_segments(&mut self) {
         self.segments.clear();
     }
@@ -180,7 +180,7 @@ impl VisibilityArchive {
         (self.setup, parts.at, parts.data)
     }
 
-    /// Sorts the visibilities, plans their rows as `assumed` has them, and sums them on the nearest circle.
+    /// Sorts the visibilities, plans their rows for the `assumed` instrument, and sums them on the nearest circle.
     ///
     /// # Errors
     /// A setup that an engine does not take; no data.

@@ -414,7 +414,7 @@ impl RefinedProblem<'_> {
     }
 }
 
-/// Two right-hand sides of which nothing is solved yet; `data` is what the first is made from.
+/// The columns before the first iteration; `data` is what the first right-hand side is made from.
 fn columns(
     right: Vec<Vec<f64>>,
     directions: Vec<Vec<f64>>,

@@ -19,7 +19,7 @@ use crate::imaging::exact::engine::SkyBasis;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::exact::noise::{NoiseKey, unit_noise};
 
-/// A visibility of which noises are to be summed.
+/// A visibility whose noise realisations are summed.
 #[derive(Clone, Copy, Debug)]
 struct NoisyVisibility {
     place: TorusPoint,

@@ -20,7 +20,7 @@ use crate::imaging::{AccumulationError, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 
 impl StoredTori {
-    /// Writes the sums that `grids` says are held, of which there are none yet, and frees them node by node.
+    /// Writes the sums that `grids` holds, and frees them node by node; the file has none yet.
     fn append(&mut self, grids: &Grids, quanta: Quanta, exact: ExactTori) -> io::Result<()> {
         let is_filled = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
         let filled = exact.nodes.iter().enumerate().filter(|(_, node)| is_filled(node));
@@ -96,7 +96,7 @@ pub struct SumPart {
     made: Arc<Mutex<FinishedParts>>,
 }
 
-/// What earlier parts have left.
+/// The parts that are finished.
 #[derive(Debug)]
 struct FinishedParts {
     folder: PathBuf,

@@ -270,7 +270,7 @@ const GROUP: usize = 8;
 /// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
 struct Rows<'a, const K: usize> {
     rows: &'a mut [IntegerRow],
-    /// The blocks of alphas that are held; to others nothing is added.
+    /// The blocks of alphas that are held; others are left out.
     share: RankShare,
     stride: usize,
     first: [u32; 2],

@@ -67,7 +67,7 @@ impl SnapshotSums {
     }
 }
 
-/// Either engine, or visibilities that are held one by one.
+/// Sums of either engine, or an archive of single visibilities.
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
@@ -75,7 +75,7 @@ enum Engine {
 }
 
 impl Engine {
-    /// As one rank's of several. Other engines than the harmonic one hold all sums on every rank.
+    /// The part of one rank of several. Only the harmonic engine divides its sums; others hold all on every rank.
     fn among(self, ranks: &Ranks) -> Self {
         match self {
             Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.among(ranks))),
@@ -99,7 +99,7 @@ impl Engine {
         }
     }
 
-    /// Whether it holds nothing, so that there is no map to make.
+    /// Whether it is empty: then there is no map to make.
     fn is_empty(&self) -> bool {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
@@ -109,7 +109,7 @@ impl Engine {
         counts.visibilities == 0
     }
 
-    /// A copy of the sums; of visibilities that are held for refinement, their sums on the nearest circle.
+    /// A copy of the sums; for an archive to be refined, its sums on the nearest circle.
     fn sums(&mut self, config: &MapConfig) -> Result<SnapshotSums, AccumulationError> {
         Ok(match self {
             Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, archive.copy()),
@@ -147,7 +147,7 @@ pub struct AccumulatorState {
     channels: Vec<bool>,
 }
 
-/// First and last time of no data.
+/// The span of no data.
 const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
 /// The engine of one channel, and the span of its data.
@@ -171,7 +171,7 @@ pub struct Accumulator {
     memory_max_bytes: Option<u64>,
     /// The channels of a group; `None` for all.
     group: Option<ChannelGroup>,
-    /// Those that hold the other parts of the sums.
+    /// The ranks that hold the other parts of the sums.
     ranks: Ranks,
     /// The part of the sums that is made now, where they are made one after the other.
     part: Option<SumPart>,
@@ -199,7 +199,7 @@ impl Accumulator {
         }
     }
 
-    /// As one rank's of several: it takes all visibilities, and holds its part of the sums of the harmonic engine.
+    /// Makes it one rank of several: it takes all visibilities and holds its part of the harmonic engine's sums.
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
@@ -218,7 +218,7 @@ impl Accumulator {
         Self { noise_seeds: seeds.to_vec(), ..self }
     }
 
-    /// One with the same settings and ledger, without data.
+    /// A copy with the same settings and ledger, without data.
     #[must_use]
     pub fn without_sums(&self) -> Self {
         let (config, ledger) = (self.config.clone(), self.ledger.clone());
@@ -230,13 +230,13 @@ impl Accumulator {
             .cancelled_by(&self.cancel)
     }
 
-    /// Those that hold parts of the sums.
+    /// The ranks that hold parts of the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// Sums the channels of a group alone; `None` for all.
+    /// Restricts it to the channels of a group; `None` for all.
     #[must_use]
     pub fn of_group(self, group: Option<ChannelGroup>) -> Self {
         Self { group, ..self }
@@ -263,7 +263,7 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines one after another; visibilities that are held go into files of their own at `place`.
+    /// Writes its engines one after another; archives of visibilities go into files of their own at `place`.
     ///
     /// # Errors
     /// The writer's.
@@ -282,7 +282,7 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The files that engines were written to or read from, besides the checkpoint.
+    /// The archive files beside the checkpoint.
     pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
         self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
             Engine::Archive(archive) => archive.segments(),
@@ -290,7 +290,7 @@ impl Accumulator {
         })
     }
 
-    /// From now on another folder is meant, which has none of those files.
+    /// Forgets the archive files: the next checkpoint goes into another folder.
     pub fn leave_segments(&mut self) {
         for sums in self.channels.iter_mut().flatten() {
             if let Engine::Archive(archive) = &mut sums.engine {
@@ -313,8 +313,8 @@ impl Accumulator {
         self.resume_part(state, from, folder, RankShare::WHOLE)
     }
 
-    /// As [`Accumulator::resume`], from engines of which the rank that wrote them holds `part`. What this one holds of it is kept; the
-    /// other parts are to be joined.
+    /// As [`Accumulator::resume`], from engines that were written by the rank of `part`. Only what this rank holds is kept; join the
+    /// other parts.
     ///
     /// # Errors
     /// Likewise.
@@ -347,7 +347,7 @@ impl Accumulator {
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
 
-    /// Takes in another part of the same sums, channel by channel: of the same visibilities, at other alphas.
+    /// Joins another part of the same sums, channel by channel: the same visibilities at other alphas.
     ///
     /// # Errors
     /// Parts of different sums.
@@ -401,7 +401,7 @@ impl Accumulator {
 
     /// Subtracts visibilities from the sums of their channel; posts nothing to the ledger.
     ///
-    /// Those beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
+    /// Visibilities beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
     ///
     /// # Errors
     /// A channel that holds nothing, or as [`NormalEngine::remove`].

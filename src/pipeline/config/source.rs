@@ -158,7 +158,7 @@ impl ConfigSource {
         }
     }
 
-    /// Reads `text` and the overrides, and requires that there are no problems in reading and none of the values.
+    /// Reads `text` and the overrides, and requires that neither reading nor values have problems.
     fn checked(
         &self,
         text: &str,

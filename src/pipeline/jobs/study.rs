@@ -61,12 +61,12 @@ pub struct StudySummary {
     /// epsilon as several rules choose it, for the same cases, where at least three have traces.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub epsilons: Vec<EpsilonChoices>,
-    /// What realisations scatter by.
+    /// Scatter of realisations.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spreads: Vec<RealisationSpread>,
 }
 
-/// What a case is mapped from: data, gains, and sums that it shares with others.
+/// Input of a case's maps: data, gains, and sums that it shares with others.
 struct CaseInputs<'a> {
     file: &'a Path,
     /// That file, unless the state has taken it in.
@@ -75,7 +75,7 @@ struct CaseInputs<'a> {
     state: Option<&'a PathBuf>,
 }
 
-/// Where a study stands.
+/// What all steps of a study need.
 struct StudyContext<'a> {
     study: &'a Study,
     out: &'a Path,

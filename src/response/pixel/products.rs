@@ -20,8 +20,7 @@ use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 use crate::units::vector::{Vec3, add, norm, scale, sub};
 
-/// Rows that are made together: their elements fit the cache of a core or what it has of a shared one, and tables are read an eighth as
-/// often.
+/// Rows that are computed together: their elements fit a core's share of the cache, and tables are read an eighth as often.
 const ROWS: usize = 8;
 
 /// Parts of a product, each with sums of its own.
@@ -52,7 +51,7 @@ enum ChunkView {
     Open,
 }
 
-/// Rows of B of any pairs, in products alone. Vectors are maps in RING order; rows are times the pixels' area.
+/// Products with rows of B of any pairs; rows are not kept. Vectors are maps in RING order; rows are times the pixels' area.
 #[derive(Debug)]
 pub struct RowProducts {
     rows: RowMaker,
@@ -74,7 +73,7 @@ struct ChunkedRows {
     sights: Vec<[ChunkView; ROWS]>,
 }
 
-/// Rows that are made together: of one class of blocks.
+/// Rows that are computed together, of one class of blocks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct RowGroup {
     first: usize,
@@ -82,7 +81,7 @@ struct RowGroup {
     class: Option<usize>,
 }
 
-/// What comes back from a block of rows: factors of the real and imaginary parts of each, by column.
+/// Factors of the real and imaginary parts of each row of a block, by column.
 type Factors = Vec<[[f32; 2]; ROWS]>;
 
 /// Sums over a map, chunk by chunk.
@@ -107,7 +106,7 @@ impl RowProducts {
             let centre = scale(1.0 / places.len() as f64, sum);
             let radius = places.iter().map(|&pixel| norm(sub(n[pixel], centre))).fold(0.0, f64::max);
             caps.push(Cap { centre, radius: radius + margin });
-            // The last one is filled with its last pixel, which then counts once.
+            // The last chunk is filled with its last pixel, which counts once.
             let mut chunk = [[0.0; CHUNK]; 3];
             for lane in 0..CHUNK {
                 let pixel = places[lane.min(places.len() - 1)];
@@ -213,7 +212,7 @@ impl RowProducts {
         Scaled { chunks: self.ring.chunks(CHUNK).map(chunk).collect(), scale }
     }
 
-    /// Pairs in blocks, each of neighbours of one class. Tables that they need are made.
+    /// Divides pairs into blocks of neighbours of one class, and makes their tables.
     fn blocks(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
         let is_average = self.rows.method() == PixelMethod::Average;
         let mut blocks: Vec<RowGroup> = Vec::new();
@@ -277,7 +276,7 @@ impl RowProducts {
             (PixelMethod::Average, Some(class)) => {
                 averages(&prepared, self.rows.class(class), made);
             }
-            // For verification, and baselines of no use: one by one.
+            // For verification, and for baselines that no map uses: one by one.
             _ => self.fill(pairs, made),
         }
     }
@@ -555,7 +554,7 @@ mod tests {
                 }
                 let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
                 assert!(error < tolerance, "{what}, adjoint: {error:e}");
-                // A column has the bits that it has alone.
+                // Each column has the same bits as alone.
                 assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
             }
         }

@@ -47,7 +47,7 @@ impl Mission {
         Self { fits, ..self }
     }
 
-    /// Whether an instrument is the ground's. The first one becomes the ground's.
+    /// Whether an instrument is the ground's. The ground adopts the first one.
     pub(super) fn confirm(&self, found: &Instrument) -> bool {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.get_or_insert_with(|| found.clone()) == found
@@ -66,7 +66,7 @@ impl Mission {
 /// What is known of a sender's instrument.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum SenderStanding {
-    /// It has not described one, or the ground knows none and nothing has confirmed it.
+    /// It has not described its instrument, or the ground knows none and nothing has confirmed this one.
     Open,
     /// It is the ground's.
     Ours,
@@ -88,7 +88,7 @@ impl SenderCheck {
         Self { mission, standing: SenderStanding::Open, decoder: Decoder::new(), positions: Vec::new() }
     }
 
-    /// Whether packets may be passed on: all that came before may be, or none of them.
+    /// Whether packets may be passed on; if so, all that came before may be, too.
     fn passes(&mut self) -> bool {
         if self.standing == SenderStanding::Open {
             let known = self.mission.known.lock().unwrap_or_else(PoisonError::into_inner);
@@ -97,7 +97,7 @@ impl SenderCheck {
                     self.standing = SenderStanding::Refused(ConnectionEnd::OtherInstrument);
                 }
                 (Some(_), Some(_)) => self.standing = SenderStanding::Ours,
-                // It may not say.
+                // Headers may lack it.
                 (Some(_), None) => return true,
                 (None, _) => {}
             }
@@ -171,7 +171,7 @@ pub(super) struct SenderIntake {
     /// Packets of a payload that lacks its last segment.
     group: Vec<u8>,
     grouped: u64,
-    /// Whole payloads that may not be passed on yet.
+    /// Whole payloads that wait until the instrument is confirmed.
     held: Vec<u8>,
     held_packets: u64,
     packets: u64,
@@ -313,7 +313,7 @@ impl SenderIntake {
         }
     }
 
-    /// Passes whole payloads on if they may be.
+    /// Passes whole payloads on, if the instrument allows.
     fn pass_on(&mut self, out: &mut Vec<u8>) {
         if self.judge.passes() {
             out.append(&mut self.held);
