@@ -9,6 +9,7 @@ use crate::calibration::solver::{
 };
 use crate::calibration::{GainsFile, SolvedGains};
 use crate::frames::Instrument;
+use crate::numerics::median;
 
 /// Most events that are printed.
 const EVENTS_SHOWN: usize = 20;
@@ -183,11 +184,9 @@ impl FoundSolutions {
         let hz = |instrument: &Instrument| instrument.channels.iter().map(|one| one.frequency_hz).collect();
         let frequencies_hz: Vec<f64> = self.instrument.as_ref().map_or_else(Vec::new, hz);
         let channels = frequencies_hz.len();
-        let median = |c: usize, n: usize| {
-            let mut sigmas: Vec<f64> =
-                self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg).collect();
-            sigmas.sort_unstable_by(f64::total_cmp);
-            sigmas.get(sigmas.len() / 2).copied().unwrap_or(f64::NAN)
+        let sigma_deg = |c: usize, n: usize| {
+            let sigmas = self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg);
+            median(sigmas.collect()).unwrap_or(f64::NAN)
         };
         let gains = self.solutions.iter().flat_map(|one| &one.daughters).flat_map(|daughter| &daughter.gains);
         let (bad, all) =
@@ -201,7 +200,9 @@ impl FoundSolutions {
             unused: self.unused,
             late: self.late,
             gains_not_good: [bad, all],
-            phase_sigma_deg: (0..channels).map(|c| (0..satellites).map(|n| median(c, n)).collect()).collect(),
+            phase_sigma_deg: (0..channels)
+                .map(|c| (0..satellites).map(|n| sigma_deg(c, n)).collect())
+                .collect(),
             events: instrument_events(&self.solutions),
             conventions: solver.conventions(&frequencies_hz),
             warnings: self.warnings(solver),

@@ -422,6 +422,9 @@ impl Grace {
     }
 }
 
+/// How long stages have to end after a failure.
+pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
+
 /// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
 const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
 
@@ -449,8 +452,7 @@ fn start(
     // What these save is to be whole, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
-    let shutdown = Duration::from_secs_f64(config.shutdown_s);
-    Ok(graph.run(cancel, if ranks.are_many() { shutdown.min(SHUTDOWN_OF_RANK) } else { shutdown })?)
+    Ok(graph.run(cancel, if ranks.are_many() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.
