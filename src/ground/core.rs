@@ -125,7 +125,7 @@ impl Ground {
         self
     }
 
-    /// Those that hold parts of the sums.
+    /// The ranks that hold parts of the sums.
     #[must_use]
     #[doc(hidden)]
     pub fn ranks(&self) -> &Ranks {
@@ -421,7 +421,7 @@ impl Stage for Ground {
         Ok(())
     }
 
-    /// Who watches a link that falls silent sees all that came.
+    /// Updates the view when the link falls silent.
     fn rest(&mut self) {
         self.show(Activity::Idle);
     }

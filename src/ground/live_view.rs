@@ -79,7 +79,7 @@ struct Shared {
     views: Mutex<Views>,
     /// By channel. The ground waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
-    /// Likewise.
+    /// Directions seen, by channel; copied like `densities`.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
     /// Likewise.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,

@@ -35,7 +35,7 @@ pub(super) struct ArchiveContents {
 }
 
 impl ArchiveContents {
-    /// Of a ground that has received nothing.
+    /// The contents of a ground that has received nothing.
     pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
         Self {
             collector: CollectorState::new(config.wait_bytes),
@@ -96,7 +96,7 @@ fn read_parts(
     whole.ok_or_else(|| GroundError::without_checkpoint(path))
 }
 
-/// What the reader's error means: data that end too early are damaged, what the system refuses may well hold.
+/// Translates a reader's error: data that end too early are damaged; a system's error says nothing of the data.
 fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
     match error {
         AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {

@@ -29,7 +29,7 @@ impl Ground {
     /// checkpoint may be one of other ranks, or of a process alone.
     ///
     /// # Errors
-    /// Likewise; a folder that ranks do not share.
+    /// As [`Ground::open`]; a folder that ranks do not share.
     #[doc(hidden)]
     pub fn open_with_ranks(
         folder: &Path,

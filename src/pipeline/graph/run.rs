@@ -240,7 +240,7 @@ pub(in crate::pipeline) fn simulate_sky(
 
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
-/// Of a ground that is one rank's ([`Ground::among`]), as [`run_with_ranks`].
+/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::among`]).
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
@@ -449,7 +449,7 @@ fn start(
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
-    // What these save is to be whole, however long it takes.
+    // These stages save data: they end in order, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
     Ok(graph.run(cancel, if ranks.are_many() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)

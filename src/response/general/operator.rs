@@ -505,7 +505,7 @@ fn add_to(sums: &mut [Alm], part: &[Alm]) {
     }
 }
 
-/// What the rows of a plan share.
+/// Tables that the rows of a plan share.
 struct Tables {
     /// The classes of the nodes.
     classes: Vec<CapClass>,
@@ -540,7 +540,7 @@ struct Batch {
     patterns: Vec<NodePatterns>,
 }
 
-/// What a task works with on one group of passes. It is kept for the next: tens of MB that come and go with each group
+/// Buffers of a task on one group of passes. They are kept for the next: tens of MB that come and go with each group
 /// cost up to two fifths of a product's time in page faults, where antennas multiply the skies.
 #[derive(Default)]
 struct Workspace {
