@@ -3,13 +3,11 @@
 use serde::Serialize;
 use serde_json::Value;
 
-use super::{Bench, Rate};
-
 /// A stage beside its earlier figures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageComparison {
     /// Name of the stage.
-    pub stage: &'static str,
+    pub stage: String,
     /// Median time of the earlier benchmark, s.
     pub before_s: f64,
     /// Median time now, s.
@@ -30,40 +28,37 @@ pub struct Comparison {
 }
 
 impl Comparison {
-    /// Compares with the JSON output of an earlier benchmark.
+    /// Compares the JSON output of a benchmark with that of an earlier one.
     ///
     /// # Errors
-    /// It is none, or of another size.
-    pub fn of(now: &Bench, before: &Value) -> Result<Self, String> {
-        let sizes = [
-            ("channels", now.channels as f64),
-            ("daughters", now.daughters as f64),
-            ("bits", f64::from(now.bits)),
-            ("block_samples", now.block_samples as f64),
-            ("sky_pixels", now.sky_pixels as f64),
-            ("mission_s", now.mission_s),
-        ];
-        for (key, size) in sizes {
-            match before[key].as_f64() {
-                Some(found) if found == size => {}
-                Some(found) => return Err(format!("{key} = {found}; expected {size}, as of this benchmark")),
-                None => {
+    /// The earlier one is none, or of another size.
+    pub fn of(now: &Value, before: &Value) -> Result<Self, String> {
+        for key in ["channels", "daughters", "bits", "block_samples", "sky_pixels", "mission_s"] {
+            match (&now[key], &before[key]) {
+                (now, found) if now == found => {}
+                (_, Value::Null) => {
                     return Err(format!("no number {key}; expected what `lunarray bench --json` prints"));
                 }
+                (now, found) => return Err(format!("{key} = {found}; expected {now}, as of this benchmark")),
             }
         }
-        let stages = now.rates.iter().filter_map(|rate| compare(rate, &before["rates"])).collect();
+        let rates = now["rates"].as_array().into_iter().flatten();
+        let stages = rates.filter_map(|rate| compare(rate, &before["rates"])).collect();
         let machine = &before["machine"];
         let text = |key: &str| machine[key].as_str().unwrap_or("unknown").to_owned();
         Ok(Self { before: ["version", "processor", "date"].map(text), stages })
     }
 }
 
-fn compare(now: &Rate, before: &Value) -> Option<StageComparison> {
-    let before = before.as_array()?.iter().find(|rate| rate["stage"] == now.stage)?;
-    let before_s = before["median_s"].as_f64()?;
-    let [low, high] = [0, 1].map(|k| before["quartiles_s"][k].as_f64());
-    let differs = now.quartiles_s[1] < low? || now.quartiles_s[0] > high?;
-    let (stage, now_s) = (now.stage, now.median_s);
+/// A stage beside its earlier figures, if both benchmarks have it.
+fn compare(now: &Value, before: &Value) -> Option<StageComparison> {
+    let before = before.as_array()?.iter().find(|rate| rate["stage"] == now["stage"])?;
+    let times = |rate: &Value| {
+        let [low, high] = [0, 1].map(|k| rate["quartiles_s"][k].as_f64());
+        Some((rate["median_s"].as_f64()?, low?, high?))
+    };
+    let ((before_s, low, high), (now_s, now_low, now_high)) = (times(before)?, times(now)?);
+    let differs = now_high < low || now_low > high;
+    let stage = now["stage"].as_str()?.to_owned();
     Some(StageComparison { stage, before_s, now_s, times_as_fast: before_s / now_s, differs })
 }

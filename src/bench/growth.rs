@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::chain;
-use super::timing::{median, seconds_of, timed};
+use super::timing::{median, samples_per_s as samples_in_a_second, seconds_of, timed};
 use crate::pipeline::{Config, PipelineError, Plan};
 use crate::sky::SkyMap;
 
@@ -74,7 +74,7 @@ fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Gro
         block_samples: sized.config.daughters.block_samples,
         samples_per_s,
         samples_per_s_range: [rates[0], rates[rates.len() - 1]],
-        times_real_time: samples_per_s / super::samples_per_s(&sized),
+        times_real_time: samples_per_s / samples_in_a_second(&sized),
         core_s_per_mission_s: (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s),
     })
 }

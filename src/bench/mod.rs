@@ -16,7 +16,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use self::machine::{machine_seconds, share_of_others};
-use self::timing::{Spent, core_seconds_used, median, quartiles, seconds_of, timed};
+use self::timing::{TimeSpent, core_seconds_used, median, quartiles, samples_per_s, seconds_of, timed};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
@@ -193,13 +193,6 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-/// Samples per second of mission time.
-fn samples_per_s(plan: &Plan) -> f64 {
-    let channels = &plan.instrument.channels;
-    let width_hz = channels.first().map_or(1.0, |channel| channel.width_hz);
-    (channels.len() * plan.array.satellites()) as f64 * width_hz
-}
-
 fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     while source.next(&mut out)? == Flow::Continue {}
@@ -257,7 +250,7 @@ fn time_stage(
     skies: &[SkyMap],
     material: &Material,
     name: &str,
-) -> Result<Spent, PipelineError> {
+) -> Result<TimeSpent, PipelineError> {
     let (sampler, link, correlator) =
         sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output is dropped after it stops.

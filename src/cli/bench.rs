@@ -58,7 +58,7 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
     let baseline = args.compare.as_deref().map(read_baseline).transpose()?;
     let mut measured = crate::bench::bench(&plan, &settings)?;
     if let Some((path, before)) = baseline {
-        let compared = Comparison::of(&measured, &before);
+        let compared = Comparison::of(&serde_json::to_value(&measured)?, &before);
         measured.comparison = Some(compared.map_err(|error| format!("{}: {error}", path.display()))?);
     }
     if args.json {

@@ -24,8 +24,10 @@ use super::output::{
 use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
 use crate::calibration::CalibrationHook;
-use crate::downlink::transport::socket::{HeldAnswers, ListenNote, ListenUrl, SocketSource, Stations, Until};
-use crate::downlink::{FileSource, Pace, Paced, Steps};
+use crate::downlink::transport::socket::{
+    HeldAnswers, ListenLimits, ListenNote, ListenUrl, SocketSource, Stations,
+};
+use crate::downlink::{FileSource, Pace, PacedSource, Steps};
 use crate::files::ProtectedInputs;
 use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
@@ -208,7 +210,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     };
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
-        Some(folder) => Ground::open_among(folder, &settings, args.checkpoint_every, job.ranks())?,
+        Some(folder) => Ground::open_with_ranks(folder, &settings, args.checkpoint_every, job.ranks())?,
         None => Ground::new(&settings)?.among(job.ranks()),
     };
     if job.is_first() {
@@ -389,7 +391,7 @@ impl Session<'_> {
         let [connections, datagrams] = args.listening_addresses()?;
         let settings = args.limited(config.ground(0));
         let (advised, own_config, limit) = (AtomicBool::new(false), (*config).clone(), args.limit());
-        let until = Until { idle_s: args.idle_s, connections: args.connections };
+        let until = ListenLimits { idle_s: args.idle_s, connections: args.connections };
         let listen = &config.downlink.listen;
         let mut source = SocketSource::bind(&connections, listen, until)?
             .knowing(ground.instrument().cloned())
@@ -444,7 +446,7 @@ impl Session<'_> {
             (None, Speed(Some(times))) => Pace::Speed(times),
             (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),
         };
-        Ok(self.watched(Paced::new(files, pace), ground, &|| {})?)
+        Ok(self.watched(PacedSource::new(files, pace), ground, &|| {})?)
     }
 
     /// Runs the ground; `begun` is called once signals end it in order.

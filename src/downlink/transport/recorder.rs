@@ -30,6 +30,7 @@ impl Recorder {
 
     /// A recorder to standard output.
     #[must_use]
+    #[doc(hidden)]
     pub fn to_standard_output() -> Self {
         Self { path: "standard output".into(), file: None, to_standard_output: true, bytes: 0 }
     }

@@ -3,13 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 
-use super::gaps::{GapReport, LostStream, VisibilityPacket, windows_of};
+use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
 use super::journal::Sent;
 use crate::downlink::Kind;
-use crate::units::{ChannelId, Pair};
 
-/// Channel and pair: each sends its packets in turn, pass by pass.
-pub(super) type Stream = (ChannelId, Pair);
+/// Windows are further apart than this, s, and packets of a window are not.
+const APART_S: f64 = 600.0;
 
 /// Packets of the same channel and pair on either side of one from which its share in the map is estimated.
 const NEAR: usize = 4;
@@ -260,6 +259,20 @@ fn sent_windows(readings: &[VisibilityPacket]) -> Vec<Range<usize>> {
             }
         }
         had_turn.insert(reading.stream());
+    }
+    windows
+}
+
+/// Readings in the order of time, by observing window.
+pub(super) fn windows_of(waiting: &[&VisibilityPacket]) -> Vec<Range<usize>> {
+    let mut windows: Vec<Range<usize>> = Vec::new();
+    let mut until = f64::NEG_INFINITY;
+    for (at, reading) in waiting.iter().enumerate() {
+        match windows.last_mut() {
+            Some(window) if reading.entry.start.seconds() <= until + APART_S => window.end = at + 1,
+            _ => windows.push(at..at + 1),
+        }
+        until = until.max(reading.entry.end.seconds());
     }
     windows
 }

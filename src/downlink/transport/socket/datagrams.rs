@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use serde::Serialize;
 use tokio::net::UdpSocket;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, timeout};
 
 use super::listener::{First, ListenContext, PacketBatch, first};
-use super::opening::Opening;
+use super::preamble::Preamble;
+use super::report::DatagramReport;
 use super::sender_intake::{Mission, SenderIntake};
 use crate::downlink::transport::packet_archive::Ticket;
 use crate::downlink::wire::cadu::SYNC_MARKER;
@@ -25,25 +25,6 @@ const SENDERS_MAX: usize = 64;
 /// Interval at which what came reaches the disk, and the system's count of lost datagrams is read.
 const TICK: Duration = Duration::from_secs(1);
 
-/// What came in datagrams.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
-pub struct DatagramReport {
-    /// Address on which the ground listens.
-    pub address: String,
-    /// Datagrams received.
-    pub received: u64,
-    /// Bytes in them.
-    pub bytes: u64,
-    /// Sound packets passed to the ground.
-    pub packets: u64,
-    /// Datagrams without a sound packet or frame.
-    pub malformed: u64,
-    /// Datagrams of another instrument than the ground's.
-    pub refused: u64,
-    /// Datagrams that the system dropped because they came faster than they were read; `None` if it does not say.
-    pub dropped_by_system: Option<u64>,
-}
-
 /// Packets and frames of one sender: a packet is whole in its datagram, and a frame goes on with the one before it.
 struct DatagramSender {
     peer: SocketAddr,
@@ -54,7 +35,7 @@ struct DatagramSender {
 
 impl DatagramSender {
     fn new(peer: SocketAddr, mission: &Mission) -> Self {
-        let intake = || SenderIntake::new(mission.clone(), Opening::new(None, false));
+        let intake = || SenderIntake::new(mission.clone(), Preamble::new(None, false));
         Self { peer, packets: intake(), frames: intake(), heard: Instant::now() }
     }
 

@@ -33,13 +33,13 @@
 //! is reported by its name.
 
 mod accept;
+mod answers;
 mod config;
 mod connection;
 mod datagrams;
 mod error;
-mod held;
 mod listener;
-mod opening;
+mod preamble;
 mod report;
 mod seats;
 mod sender_intake;
@@ -48,13 +48,13 @@ mod source;
 mod stations;
 mod url;
 
+pub use answers::HeldAnswers;
 pub use config::ListenConfig;
-pub use datagrams::DatagramReport;
 pub use error::SocketError;
-pub use held::HeldAnswers;
-pub use listener::{Teller, Until};
+pub use listener::{ListenLimits, NoteHandler};
 pub use report::{
-    ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport, StationCounts,
+    ConnectionEnd, DatagramReport, ListenNote, ListenReport, ListenStatus, Listening, SenderReport,
+    StationCounts,
 };
 pub use sender_intake::InstrumentCheck;
 pub use sink::{SendOptions, SocketSink};

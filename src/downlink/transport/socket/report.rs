@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::datagrams::DatagramReport;
 use crate::downlink::receive::Listing;
 use crate::downlink::receive::ReceptionCounters;
 use crate::downlink::transport::packet_archive::PacketArchive;
@@ -192,6 +191,25 @@ pub struct StationCounts {
     /// When a sound packet or frame came last.
     #[serde(skip)]
     pub heard: Option<Instant>,
+}
+
+/// What came in datagrams.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct DatagramReport {
+    /// Address on which the ground listens.
+    pub address: String,
+    /// Datagrams received.
+    pub received: u64,
+    /// Bytes in them.
+    pub bytes: u64,
+    /// Sound packets passed to the ground.
+    pub packets: u64,
+    /// Datagrams without a sound packet or frame.
+    pub malformed: u64,
+    /// Datagrams of another instrument than the ground's.
+    pub refused: u64,
+    /// Datagrams that the system dropped because they came faster than they were read; `None` if it does not say.
+    pub dropped_by_system: Option<u64>,
 }
 
 /// All connections of a run.

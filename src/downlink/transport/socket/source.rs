@@ -10,12 +10,11 @@ use crossbeam_channel::{Receiver, RecvTimeoutError, unbounded};
 use tokio::sync::{Semaphore, watch};
 
 use super::accept::listen;
+use super::answers::HeldAnswers;
 use super::config::ListenConfig;
-use super::datagrams::DatagramReport;
 use super::error::SocketError;
-use super::held::HeldAnswers;
-use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until};
-use super::report::Listening;
+use super::listener::{ListenContext, ListenLimits, NoteHandler, Notes, PacketBatch};
+use super::report::{DatagramReport, Listening};
 use super::seats::Seats;
 use super::sender_intake::{InstrumentCheck, Mission};
 use super::stations::Stations;
@@ -32,9 +31,9 @@ const POLL: Duration = Duration::from_millis(100);
 pub struct SocketSource {
     addresses: Vec<String>,
     config: ListenConfig,
-    until: Until,
+    until: ListenLimits,
     /// Set until the run starts.
-    waiting: Option<(Option<std::net::TcpListener>, Mission, Teller)>,
+    waiting: Option<(Option<std::net::TcpListener>, Mission, NoteHandler)>,
     datagrams: Option<std::net::UdpSocket>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
@@ -52,7 +51,11 @@ impl SocketSource {
     ///
     /// # Errors
     /// No address can be bound.
-    pub fn bind(addresses: &[SocketAddr], config: &ListenConfig, until: Until) -> Result<Self, SocketError> {
+    pub fn bind(
+        addresses: &[SocketAddr],
+        config: &ListenConfig,
+        until: ListenLimits,
+    ) -> Result<Self, SocketError> {
         let failed = |source| {
             let none = SocketAddr::from(([0, 0, 0, 0], 0));
             SocketError::Listen {
@@ -153,7 +156,7 @@ impl SocketSource {
 
     /// Reports what happens to connections, one note at a time.
     #[must_use]
-    pub fn telling(mut self, tell: Teller) -> Self {
+    pub fn telling(mut self, tell: NoteHandler) -> Self {
         if let Some((_, _, teller)) = &mut self.waiting {
             *teller = tell;
         }
