@@ -32,6 +32,7 @@ impl Comparison {
     ///
     /// # Errors
     /// The earlier one is none, or of another size.
+    #[doc(hidden)]
     pub fn of(now: &Value, before: &Value) -> Result<Self, String> {
         for key in ["channels", "daughters", "bits", "block_samples", "sky_pixels", "mission_s"] {
             match (&now[key], &before[key]) {
