@@ -81,9 +81,10 @@ impl SendingOrder {
         let count = |at: usize| readings[at].entry.count;
         let whole = |range: &Range<usize>| {
             let (first, last) = (range.start, range.end - 1);
-            count(last) - count(first) == (last - first) as u64
-                && (first == 0 || count(first - 1) + 1 == count(first))
-                && (range.end == readings.len() || count(last) + 1 == count(range.end))
+            let has_begin = if first == 0 { count(0) == 0 } else { count(first - 1) + 1 == count(first) };
+            // More of the last one may come.
+            let has_end = range.end < readings.len() && count(last) + 1 == count(range.end);
+            has_begin && has_end && count(last) - count(first) == (last - first) as u64
         };
         let windows: Vec<SentWindow> = sent_windows(&readings)
             .into_iter()
