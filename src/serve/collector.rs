@@ -318,7 +318,8 @@ impl Scrape {
                 ("refused", datagrams.refused),
                 ("dropped", datagrams.dropped_by_system.unwrap_or(0)),
             ];
-            let about = About("datagrams", "Datagrams by what became of them; dropped by the system", None);
+            let about =
+                MetricInfo("datagrams", "Datagrams by what became of them; dropped by the system", None);
             counters(out, about, counts.map(|(end, count)| ([("end", end.to_owned())], count)))?;
         }
         // From zero on: an increase from nothing to one is none for Prometheus.
