@@ -7,7 +7,7 @@ use super::bodies::{DatedEarth, Earth};
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::{KeplerOrbit, eccentric_anomaly};
-use super::oem::{self, Stretch, TableOrbit};
+use super::oem::{self, OrbitArc, TableOrbit};
 use super::propagate;
 use super::state::SatelliteState;
 use crate::units::constants::DAY_S;
@@ -224,7 +224,7 @@ impl Array {
     }
 
     /// The states through which the orbit of satellite `n` (from 0) goes, if it is given by a table.
-    pub(super) fn stretches(&self, n: usize) -> Option<Vec<Stretch>> {
+    pub(super) fn stretches(&self, n: usize) -> Option<Vec<OrbitArc>> {
         match self.own.get(n) {
             Some(OwnOrbit::Table(orbit)) => Some(orbit.stretches()),
             _ => None,

@@ -120,7 +120,7 @@ fn put_row(page: &mut String, name: &str, described: &KeyDescription) {
     page.push_str(&format!("| `{name}` | {default} | {about}{} |\n", condition_of(described)));
 }
 
-/// Its own condition, of which the last is.
+/// Its own condition: the last of the list.
 fn condition_of(described: &KeyDescription) -> String {
     described.only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."))
 }
@@ -160,7 +160,7 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 pub(super) struct ConfigArgs {
     /// Print a file instead of the everyday keys.
     #[arg(long, value_enum)]
-    print: Option<Printed>,
+    print: Option<PrintedConfig>,
     /// Print all keys.
     #[arg(long, conflicts_with_all = ["print", "schema"])]
     all: bool,
@@ -173,7 +173,7 @@ pub(super) struct ConfigArgs {
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum Printed {
+enum PrintedConfig {
     /// What `lunarray run` runs without a file.
     Quicklook,
     /// Every key with its default: those for experts as comments.
@@ -192,8 +192,8 @@ pub(super) fn config(args: &ConfigArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let text = match args.print {
-        Some(Printed::Quicklook) => QUICKLOOK.to_owned(),
-        Some(Printed::Reference) => reference(Shown::Folded),
+        Some(PrintedConfig::Quicklook) => QUICKLOOK.to_owned(),
+        Some(PrintedConfig::Reference) => reference(Shown::Folded),
         None => reference(if args.all { Shown::All } else { Shown::Everyday }),
     };
     if args.json {

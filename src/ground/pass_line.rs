@@ -53,7 +53,7 @@ pub struct PassLine {
     pub start_s: f64,
     /// Width of a bin, s.
     pub bin_s: f64,
-    /// The kinds of which anything came.
+    /// The kinds that were received.
     pub kinds: Vec<KindLine>,
     /// Missing packets, the latest first; at most a thousand ranges.
     pub ranges: Vec<MissingRange>,

@@ -7,7 +7,7 @@ use crate::downlink::transport::socket::HeldAnswers;
 pub(super) struct SenderPromises {
     /// Those who wait; `None` if nobody may.
     answers: Option<HeldAnswers>,
-    /// Bytes of the stream of which every packet has been applied, or is held.
+    /// Bytes of the stream whose packets have all been applied, or are held.
     pub(super) bytes: u64,
     /// Bytes that were applied before the stream began: from the raw archive.
     before: u64,

@@ -102,7 +102,7 @@ impl Dimension {
     /// The value of a text, in the unit that this dimension is kept in; a number alone is in that unit.
     ///
     /// # Errors
-    /// Text that is no finite number with one of the units: what is expected.
+    /// What was expected, if the text is not a finite number with one of the units.
     pub fn parse(self, text: &str) -> Result<f64, String> {
         let text = text.trim();
         let found = self.units().iter().find_map(|(unit, size)| Some((text.strip_suffix(unit)?, *size)));

@@ -1,6 +1,6 @@
 //! A journal record in the making.
 
-use super::journal::JournalEntry;
+use super::entry::JournalEntry;
 use crate::downlink::CucTime;
 use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, PlacedFrame, PlacedVisibilities};
 use crate::units::{ChannelId, MissionTime};

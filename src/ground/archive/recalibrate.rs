@@ -186,7 +186,7 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Adds the visibilities that were taken out, in the order of the files. A channel of which nothing is left begins anew.
+    /// Adds the visibilities that were taken out, in the order of the files. A channel without remaining data begins anew.
     fn add_again(&mut self, files: &[PathBuf], new: &GroundConfig) -> Result<(), GroundError> {
         let Self { ground, journal, removed, report, .. } = self;
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
@@ -229,7 +229,7 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Requires that channels of which something was left have the circle that they would have in a new archive.
+    /// Requires that channels with remaining data have the circle that they would have in a new archive.
     fn check_beginnings(&self, before: &BTreeMap<ChannelId, Sent>, moves: bool) -> Result<(), GroundError> {
         let kept = self.journal.visibilities.iter().filter(|(sent, _)| !self.removed.contains_key(*sent));
         let kept: BTreeSet<ChannelId> = kept.filter_map(|(_, record)| Some(record.used?.channel)).collect();

@@ -200,7 +200,7 @@ impl Retraction {
         Ok(())
     }
 
-    /// Removes payloads of other kinds of which all packets were found and that nothing else depends on.
+    /// Removes payloads of other kinds whose packets were all found, unless something depends on them.
     fn retract_others(&mut self) {
         let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {

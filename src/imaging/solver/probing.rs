@@ -84,7 +84,7 @@ pub fn regularisation(sums: &dyn NormalSums, epsilon: f64) -> f64 {
 }
 
 /// A Krylov space and its tridiagonal matrix's eigenvalues and first components.
-struct Space {
+struct ProbedSpace {
     krylov: Krylov,
     eigenvalues: Vec<f64>,
     vectors: Mat<f64>,
@@ -96,13 +96,13 @@ fn converged_space(
     start: Vec<f64>,
     task: &SolveTask<'_>,
     f: &dyn Fn(f64) -> f64,
-) -> Space {
+) -> ProbedSpace {
     let mut krylov = Krylov::new(start);
     let mut last = f64::NAN;
     for step in 1..=STEPS_MAX.min(sums.unknowns()) {
         let is_open = krylov.step(sums);
         if !is_open || step % STEPS_BETWEEN == 0 {
-            let value = Space::decompose(&krylov).map_or(f64::NAN, |(eigenvalues, vectors)| {
+            let value = ProbedSpace::decompose(&krylov).map_or(f64::NAN, |(eigenvalues, vectors)| {
                 eigenvalues.iter().enumerate().map(|(k, w)| f(*w) * vectors[(0, k)].powi(2)).sum::<f64>()
             });
             let change = ((value - last) / value).abs();
@@ -112,11 +112,11 @@ fn converged_space(
             }
         }
     }
-    let (eigenvalues, vectors) = Space::decompose(&krylov).unwrap_or_else(|| (Vec::new(), Mat::new()));
-    Space { krylov, eigenvalues, vectors }
+    let (eigenvalues, vectors) = ProbedSpace::decompose(&krylov).unwrap_or_else(|| (Vec::new(), Mat::new()));
+    ProbedSpace { krylov, eigenvalues, vectors }
 }
 
-impl Space {
+impl ProbedSpace {
     /// Eigenvalues and eigenvectors of the tridiagonal matrix.
     fn decompose(krylov: &Krylov) -> Option<(Vec<f64>, Mat<f64>)> {
         let (alphas, betas) = (&krylov.alphas, &krylov.betas);

@@ -117,9 +117,9 @@ pub fn probed_traces(
         return Err(unsupported);
     }
     match probe(sums, functions, probes, watch) {
-        Probed::Interrupted => Ok(None),
-        Probed::NoBounds => Err(unsupported),
-        Probed::Bounds(bounds) => functions.accept(functions.traces(&bounds), epsilon, w_max).map(Some),
+        ProbeOutcome::Interrupted => Ok(None),
+        ProbeOutcome::NoBounds => Err(unsupported),
+        ProbeOutcome::Bounds(bounds) => functions.accept(functions.traces(&bounds), epsilon, w_max).map(Some),
     }
 }
 
@@ -263,7 +263,7 @@ impl Bounds {
 }
 
 /// What random probes gave.
-enum Probed {
+enum ProbeOutcome {
     /// Bounds of each, if there are any.
     Bounds(Vec<Bounds>),
     /// Bounds that make no sense, as rounding has the last word.
@@ -271,7 +271,7 @@ enum Probed {
     Interrupted,
 }
 
-fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: NamedWatch<'_>) -> Probed {
+fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: NamedWatch<'_>) -> ProbeOutcome {
     let mut all = Vec::new();
     for probe in 0..probes {
         let task = watch.start(&format!("trace {} of {probes}", probe + 1), CLOSED);
@@ -288,17 +288,17 @@ fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: Name
             let wants = is_open && distance >= CLOSED;
             if !task.report_wanting(wants, step, distance.min(1.0)) {
                 if wants {
-                    return Probed::Interrupted;
+                    return ProbeOutcome::Interrupted;
                 }
                 break;
             }
         }
         match bounds {
             Some(bounds) => all.push(bounds),
-            None => return Probed::NoBounds,
+            None => return ProbeOutcome::NoBounds,
         }
     }
-    Probed::Bounds(all)
+    ProbeOutcome::Bounds(all)
 }
 
 /// Nodes and weights of a quadrature.

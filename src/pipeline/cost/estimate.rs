@@ -121,13 +121,13 @@ impl Plan {
     #[must_use]
     #[doc(hidden)]
     pub fn cost(&self) -> Cost {
-        self.cost_among(1)
+        self.cost_with_ranks(1)
     }
 
     /// As [`Plan::cost`], for one of some ranks that share the sums.
     #[must_use]
     #[doc(hidden)]
-    pub fn cost_among(&self, ranks: usize) -> Cost {
+    pub fn cost_with_ranks(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();

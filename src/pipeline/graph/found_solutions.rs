@@ -62,7 +62,7 @@ pub struct CalibrateSummary {
     pub conventions: Vec<String>,
     /// What may be wrong, and how to mend it.
     pub warnings: Vec<String>,
-    /// Whether it was ended early; nothing is written then.
+    /// Whether it was ended early: then nothing is written.
     pub cancelled: bool,
 }
 

@@ -171,7 +171,7 @@ impl Passes<'_> {
         Ok(summary)
     }
 
-    /// A number that calls share of which one can go on where the other was cancelled.
+    /// Calls with the same number can go on where one of them was cancelled.
     fn key(&self, group: &ChannelGroup) -> u64 {
         let Self { files, config, .. } = self;
         let file = |path: &PathBuf| {
