@@ -306,7 +306,7 @@ impl<'a> Posterior<'a> {
             }
         }
         let of_degree = |l: usize| {
-            let width = (l / 4).max(2);
+            let width = l / 4;
             let near = &sums[l.saturating_sub(width)..(l + width + 1).min(sums.len())];
             let [a, b] = near.iter().fold([0.0, 0.0], |[a, b], [c, d]| [a + c / d, b + 1.0]);
             if a > 0.0 { a / b } else { 1.0 }
