@@ -216,7 +216,7 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// What the dates of files give, and other keys do not.
+    /// Checks the keys of dates, which orbits of files bring themselves.
     fn check_dates(&self, checks: &mut Checks) {
         let epoch = &self.oem_epoch;
         // A second 60 is for the files' time system to judge.
@@ -232,7 +232,7 @@ impl ArrayConfig {
         checks.number("earth_longitude_deg", self.earth_longitude_deg, idle, expected);
     }
 
-    /// The Moon, and the circle or ellipse that satellite 1 flies.
+    /// Checks the Moon, the circular orbit and its breathing.
     fn check_orbit(&self, checks: &mut Checks) {
         let breathing = &self.breathing;
         let count = self.satellites as f64;
@@ -265,7 +265,7 @@ impl ArrayConfig {
         checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
     }
 
-    /// What makes an ellipse of the circle.
+    /// Checks the eccentricity and the distances across the track.
     fn check_ellipse(&self, checks: &mut Checks) {
         let eccentricity = self.eccentricity;
         checks.number("eccentricity", eccentricity, (0.0..1.0).contains(&eccentricity), "0 to less than 1");
@@ -282,7 +282,7 @@ impl ArrayConfig {
         checks.require("eccentricity", shape, one, "0 and 0 where array.kepler or array.oem is given");
     }
 
-    /// The arcs between satellites, of the breathing or given one by one.
+    /// Checks the arcs between satellites.
     fn check_arcs(&self, checks: &mut Checks) {
         let arcs = self.arcs_m.len();
         let fits = arcs == 0 || arcs + 1 == self.satellites;
@@ -296,7 +296,7 @@ impl ArrayConfig {
         checks.number("breathing.span_m_max", span_m, inside, expected);
     }
 
-    /// Orbits that are given one by one, by elements or in files.
+    /// Checks orbits that are given one by one, by elements or in files.
     fn check_own_orbits(&self, checks: &mut Checks) {
         let (arcs, orbits, files) = (self.arcs_m.len(), self.kepler.len(), self.oem.len());
         let given = format_args!("({orbits} orbits)");

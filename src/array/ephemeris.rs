@@ -75,7 +75,7 @@ fn segment(
     EphemerisSegment { start: first, step_ticks: step as u32, satellites: satellites as u8, positions_m }
 }
 
-/// What became of a segment that was offered to an [`Ephemeris`].
+/// Outcome of offering a segment to an [`Ephemeris`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Insertion {
     /// It is in the table.

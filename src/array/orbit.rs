@@ -112,7 +112,7 @@ impl Shape {
 pub struct Array {
     /// The formation on one orbit, if there is one.
     formation: Option<Formation>,
-    /// What makes it more than a circle.
+    /// Departure from a circle.
     shape: Option<Shape>,
     /// Orbits of their own; none for a formation.
     own: Vec<OwnOrbit>,
@@ -126,7 +126,7 @@ pub struct Array {
     earth: Earth,
     /// Epoch of orbits that have dates.
     epoch: Option<Tai>,
-    /// What files of orbits hold and is not used.
+    /// Content of orbit files that is not used.
     notes: Vec<String>,
 }
 
@@ -205,7 +205,7 @@ impl Array {
         self.epoch.map(Tai::from_1958)
     }
 
-    /// What files of orbits hold and is not used.
+    /// Content of orbit files that is not used.
     #[doc(hidden)]
     #[must_use]
     pub fn notes(&self) -> &[String] {

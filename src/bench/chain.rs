@@ -15,7 +15,7 @@ use crate::mother::Store;
 use crate::pipeline::Config;
 use crate::pipeline::PipelineError;
 use crate::pipeline::Plan;
-use crate::pipeline::graph::models;
+use crate::pipeline::graph::{SHUTDOWN, models};
 use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
@@ -64,7 +64,7 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
     let received = graph.stage("receive", capacity, packets, reception());
     graph.sink("drop", received, FrameSink(0));
-    watched(graph, plan.config.runtime.shutdown_s)
+    watched(graph)
 }
 
 /// Segments of positions that a stage alone knows.
@@ -83,11 +83,11 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
     let sums = graph.stage("ground", 1, bytes, Ground::new(&config.ground(WAIT_BYTES))?);
     graph.sink("drop", sums, SumsSink);
-    watched(graph, config.runtime.shutdown_s)
+    watched(graph)
 }
 
 /// Runs a graph, and samples its queue depths while it runs.
-fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
+fn watched(graph: Graph) -> Result<ChainRun, PipelineError> {
     let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
     let since = Instant::now();
     let (report, mut looks) = std::thread::scope(|scope| {
@@ -103,7 +103,7 @@ fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
             }
             looks
         });
-        let report = graph.run(&Cancel::new(), Duration::from_secs_f64(shutdown_s));
+        let report = graph.run(&Cancel::new(), SHUTDOWN);
         done.store(true, Ordering::Relaxed);
         (report, watcher.join().unwrap_or_default())
     });

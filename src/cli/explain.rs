@@ -79,7 +79,7 @@ fn page_of(all: &[KeyDescription]) -> String {
         .to_owned();
     page.push_str(TABLE);
     for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
-        put_row(&mut page, &described.key, described);
+        put_row(&mut page, &described.key, described, None);
     }
     page.push_str("\n## For experts\n");
     let mut told: Vec<(String, Vec<String>)> = Vec::new();
@@ -104,7 +104,7 @@ fn page_of(all: &[KeyDescription]) -> String {
             None if rows.is_empty() => {}
             None => {
                 page.push_str(TABLE);
-                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described));
+                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described, Some(section)));
                 told.push((section.key.clone(), names));
             }
         }
@@ -114,10 +114,13 @@ fn page_of(all: &[KeyDescription]) -> String {
 
 const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
 
-fn put_row(page: &mut String, name: &str, described: &KeyDescription) {
+/// A row of a table; what the heading of its section says of its condition is not said again.
+fn put_row(page: &mut String, name: &str, described: &KeyDescription, section: Option<&KeyDescription>) {
     let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
     let about = in_a_cell(&described.about);
-    page.push_str(&format!("| `{name}` | {default} | {about}{} |\n", condition_of(described)));
+    let said = section.is_some_and(|section| section.only_with == described.only_with);
+    let condition = if said { String::new() } else { condition_of(described) };
+    page.push_str(&format!("| `{name}` | {default} | {about}{condition} |\n"));
 }
 
 /// Its own condition: the last of the list.

@@ -31,7 +31,7 @@ pub struct CollectorView<'a> {
 }
 
 impl CollectorState {
-    /// Of a collector that has received nothing.
+    /// The state of a collector that has received nothing.
     #[must_use]
     pub(super) fn new(wait_bytes: u64) -> Self {
         Self { held: HoldBuffer::new(wait_bytes), decoder: DecoderState::default() }
@@ -76,7 +76,7 @@ pub struct DeliveredPacket {
     pub header: PacketHeader,
     /// Its checksum.
     pub check: u32,
-    /// What it added to the counters.
+    /// Its contribution to the counters.
     pub reading: PacketReading,
 }
 
@@ -98,7 +98,7 @@ pub struct Delivery {
     pub frame: Option<GroundFrame>,
 }
 
-/// What a collector did last.
+/// The last step of a collector.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CollectorStep {
     /// Packets are to be applied that have not waited.
@@ -506,7 +506,7 @@ impl Collector {
     }
 }
 
-/// What one event of a stream leads to.
+/// Outcome of one event of a stream.
 enum EventOutcome {
     /// No event.
     Nothing,

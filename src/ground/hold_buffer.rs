@@ -34,7 +34,7 @@ pub(super) type Sent = (CucTime, u64);
 pub struct HeldPacket {
     /// Its headers.
     pub header: PacketHeader,
-    /// What it carries.
+    /// Its content.
     pub payload: Vec<u8>,
     /// Its checksum, over headers and payload.
     pub check: u32,
@@ -60,7 +60,7 @@ impl HeldPacket {
         self.outline().map(|outline| outline.span)
     }
 
-    /// What visibilities it claims to hold; `None` if it does not say so.
+    /// Outline of the visibilities that it claims to hold; `None` if it has none.
     #[must_use]
     pub fn outline(&self) -> Option<VisibilitiesOutline> {
         visibilities_outline(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)

@@ -79,7 +79,7 @@ struct Shared {
     views: Mutex<Views>,
     /// By channel. The ground waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
-    /// Likewise.
+    /// Directions seen, by channel; copied like `densities`.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
     /// Likewise.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
@@ -195,7 +195,7 @@ impl LiveViewWriter {
     }
 
     /// Adds the calibrated powers of a block.
-    pub(super) fn see_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
+    pub(super) fn add_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
         let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
             let waterfall = powers.entry(channel).or_default();
@@ -206,7 +206,7 @@ impl LiveViewWriter {
     }
 
     /// Adds visibilities with positions.
-    pub(super) fn see(&mut self, frame: &PlacedFrame) {
+    pub(super) fn add(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
             && self.live_view.0.is_open.load(Ordering::Relaxed)
         {

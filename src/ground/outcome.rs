@@ -79,7 +79,7 @@ fn attempts(count: u64) -> String {
 #[derive(Clone, Debug, Default)]
 pub struct SharedSaving(Arc<Mutex<Option<Saving>>>);
 
-/// What a [`SavingReport`] is made of.
+/// Shared source of a [`SavingReport`].
 #[derive(Debug, Default)]
 struct Saving {
     report: SavingReport,

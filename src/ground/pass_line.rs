@@ -44,7 +44,7 @@ pub struct MissingRange {
     pub between_s: [f64; 2],
 }
 
-/// What has been received, and what has not, on the axis of mission time. Bounded, however long the mission.
+/// Received and missing packets over mission time, in a bounded number of bins.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PassLine {
     /// Mission epoch: TAI seconds since 1958-01-01.

@@ -54,7 +54,7 @@ struct RunEnd {
     up_s: f64,
 }
 
-/// What changes from one look to the next.
+/// State of the last update, to tell what has changed.
 #[derive(Debug, Default)]
 struct Memory {
     pulse: Pulse,
@@ -288,7 +288,7 @@ impl Memory {
         SolverStatus { what, iteration, residual, target, left_s }
     }
 
-    /// What has happened since the last look, and whether it needs attention.
+    /// Events since the last update, and whether they need attention.
     fn changes(&mut self, status: &Status) -> Vec<(bool, String)> {
         let mut found = Vec::new();
         self.ended.resize(status.stages.len(), false);
@@ -329,7 +329,7 @@ impl Memory {
     }
 }
 
-/// What is said when something begins to fail, or no longer does.
+/// The event when something begins to fail, or works again.
 fn change(what: &str, done: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
     match (before, now) {
         (None, Some(reason)) => Some((true, format!("{what} cannot be {done}: {reason}"))),

@@ -19,7 +19,7 @@ struct StageSample {
     stages: Vec<(u64, f64)>,
 }
 
-/// What a stage did over the last seconds, or in the whole run.
+/// Rates of a stage over the last seconds, or over the whole run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct StageRate {
     /// Share of the time in which it worked, 0 to 1.

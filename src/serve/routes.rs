@@ -330,7 +330,7 @@ async fn readyz(State(desk): State<PageState>) -> Response {
     }
 }
 
-/// What a reader of events has seen.
+/// State of one reader of events.
 struct Reader {
     desk: PageState,
     seen: u64,

@@ -129,7 +129,7 @@ struct ChannelShelf {
     made: SystemTime,
 }
 
-/// What the status says of a channel.
+/// A channel in the status.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ChannelStatus {
     /// Number of the channel.
@@ -261,7 +261,7 @@ impl Shelf {
         }
     }
 
-    /// What the status says.
+    /// The channels in the status.
     pub(super) fn status(&self) -> Vec<ChannelStatus> {
         let status = |(channel, shelf): (&ChannelId, &ChannelShelf)| ChannelStatus {
             channel: channel.0,

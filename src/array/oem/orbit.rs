@@ -72,7 +72,7 @@ pub(in crate::array) struct OemOrbits {
     pub(in crate::array) orbits: Vec<TableOrbit>,
     /// Epoch of the mission.
     pub(in crate::array) epoch: Tai,
-    /// What the files hold and is not used.
+    /// Content of the files that is not used.
     pub(in crate::array) notes: Vec<String>,
 }
 

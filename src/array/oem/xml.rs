@@ -114,7 +114,7 @@ impl Elements {
     }
 }
 
-/// What is around a value.
+/// The element in which a value stands.
 #[derive(Clone, Copy, Default, PartialEq)]
 enum XmlContext {
     #[default]

@@ -13,6 +13,9 @@ use super::sums::{ModelledBlock, PairSums};
 /// Change of a pair's spread below which a round settles.
 const SPREAD_SETTLED: f64 = 0.02;
 
+/// Most rounds of leaving out outliers.
+const OUTLIER_ROUNDS: u32 = 3;
+
 /// Most changes of who takes part.
 const CHANGES_MAX: usize = 3;
 
@@ -101,7 +104,7 @@ impl Interval<'_> {
         let most = config.iterations_max as usize;
         let mut found = layout.minimise(values, &used(sums), None, most);
         let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
-        for round in 0..=config.outlier_rounds {
+        for round in 0..=OUTLIER_ROUNDS {
             let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
                 if !takes_part(layout, dropped, sums) {
                     return ((0.0, 0.0), false);
@@ -116,7 +119,7 @@ impl Interval<'_> {
                 blocks.par_iter_mut().zip(&mut *spreads).zip(&*sums).map(judge).collect();
             let changed = judged.iter().any(|(_, changed)| *changed);
             chi_squares = judged.into_iter().map(|(chi_square, _)| chi_square).collect();
-            if !changed || round == config.outlier_rounds {
+            if !changed || round == OUTLIER_ROUNDS {
                 break;
             }
             *sums = sums_of(blocks, span_s, layout, spreads);

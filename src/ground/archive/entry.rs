@@ -7,7 +7,7 @@ use crate::frames::VisibilityBlock;
 use crate::ground::hold_buffer::Sent;
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// What one packet of visibilities held, as it was received.
+/// Content of one packet of visibilities, as received.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Encode, Decode)]
 pub struct JournalEntry {
     /// Count of the packet.

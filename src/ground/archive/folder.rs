@@ -27,7 +27,7 @@ pub(super) struct StateFolder {
     held: Vec<CheckpointSet>,
     /// The segments that checkpoints name, of those checkpoints that this process has read or written.
     segments: BTreeMap<u64, Vec<ArchiveSegment>>,
-    /// Of the first rank.
+    /// Only the first rank has it.
     lock: Option<FolderLock>,
     ranks: Ranks,
 }
@@ -89,7 +89,7 @@ impl StateFolder {
         self.held.iter().map(|held| held.number).collect()
     }
 
-    /// Those that share it.
+    /// The ranks that share it.
     pub(super) fn ranks(&self) -> &Ranks {
         &self.ranks
     }

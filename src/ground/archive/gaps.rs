@@ -231,7 +231,7 @@ fn windows_of(waiting: &[&VisibilityPacket]) -> Vec<Range<usize>> {
     windows
 }
 
-/// What part of each window's loss a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
+/// Share of each window's loss that a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
 /// the window over all missing ones of it.
 fn shares_of(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, windows: usize) -> Vec<f64> {
     let per_window = (hole.end - hole.start) as f64 / windows.max(1) as f64;
@@ -304,7 +304,7 @@ mod tests {
         VisibilityPacket { entry, waits: false, share: Some(1.0) }
     }
 
-    /// What is found when packets are left out, and what they held by channel and pair.
+    /// Gaps found when packets are left out, and their content by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
         let mut set = ReceivedSet::default();
         let mut held = BTreeMap::new();

@@ -39,7 +39,7 @@ pub(super) struct JournalRecord {
     pub(super) accumulated: u32,
     /// Visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
-    /// What was offered to an engine.
+    /// Visibilities that were offered to an engine.
     pub(super) used: Option<SumsSpan>,
 }
 

@@ -75,7 +75,7 @@ pub(super) fn number_of(path: &Path) -> Option<u64> {
     CheckpointSet::of_name(&name).map(|(found, _)| found.number)
 }
 
-/// What stands between the beginning and the end of a checkpoint's name.
+/// The middle of a checkpoint's name: number and part.
 fn inner(text: &str) -> Option<&str> {
     text.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)
 }

@@ -18,7 +18,7 @@ use crate::imaging::EngineKind;
 use crate::runtime::Outlet;
 use crate::units::ChannelId;
 
-/// What became of the visibilities of an archive.
+/// Counts of a recalibration.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Recalibrated {
     /// Packets whose visibilities were taken out under the old gains and added under the new ones.
@@ -41,7 +41,7 @@ struct Recalibration {
     journal: Journal,
     /// Packets that are to be taken out.
     due: BTreeSet<Sent>,
-    /// Those that are.
+    /// Records of packets that have been taken out.
     removed: BTreeMap<Sent, JournalRecord>,
     report: Recalibrated,
 }

@@ -29,7 +29,7 @@ impl Ground {
     /// checkpoint may be one of other ranks, or of a process alone.
     ///
     /// # Errors
-    /// Likewise; a folder that ranks do not share.
+    /// As [`Ground::open`]; a folder that ranks do not share.
     #[doc(hidden)]
     pub fn open_with_ranks(
         folder: &Path,
@@ -37,7 +37,8 @@ impl Ground {
         checkpoint_every: u64,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        let mut ground = OpenArchive::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
+        let mut ground =
+            OpenArchive::with_ranks(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
         // One of several ranks applies what there is, and leaves the archive to grounds that listen.
         ground.recover(folder, !ranks.are_many())?;
         let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());

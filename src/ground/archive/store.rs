@@ -31,7 +31,7 @@ pub(in crate::ground) struct Archive {
     pub(super) journal: Journal,
     /// Checkpoints that could not be used, in words.
     pub(super) notes: Vec<String>,
-    /// What applying the current packet posts.
+    /// Ledger entries of the current packet.
     pub(super) posts: Ledger<VisibilityReason>,
     /// Visibilities from one checkpoint to the next.
     pub(super) interval: u64,
@@ -94,7 +94,7 @@ impl Archive {
         self.since_attempt >= self.wait
     }
 
-    /// What was posted since this was called last.
+    /// Ledger entries since the last call.
     pub(in crate::ground) fn take_posts(&self) -> LedgerReport<VisibilityReason> {
         self.posts.take()
     }
@@ -165,7 +165,7 @@ impl Archive {
     }
 }
 
-/// What an archive adds to the head of a checkpoint.
+/// The archive's part of a checkpoint's head.
 struct ArchiveHeadRef<'a> {
     settings: &'a Vec<(String, String)>,
     journal: &'a Journal,
@@ -173,7 +173,7 @@ struct ArchiveHeadRef<'a> {
 }
 
 impl<'a> ArchiveHeadRef<'a> {
-    /// What a checkpoint has besides the sums.
+    /// The head of a checkpoint.
     fn view(
         &self,
         collector: &'a Collector,

@@ -14,7 +14,7 @@ use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 use thiserror::Error;
 
-use super::lanczos::Krylov;
+use super::lanczos::{Krylov, tridiagonal_eigen};
 use super::watch::NamedWatch;
 use crate::imaging::{Accuracy, NormalSums};
 use crate::units::{StreamKind, random_stream};
@@ -349,16 +349,8 @@ fn quadratures(krylov: &Krylov, functions: Functions, is_open: bool, length: f64
 
 /// The quadrature rule of a tridiagonal matrix: its eigenvalues, and squares of the first components of its eigenvectors.
 fn rule(alphas: &[f64], betas: &[f64]) -> Option<Rule> {
-    let scale = alphas.iter().fold(f64::MIN_POSITIVE, |a, b| a.max(b.abs()));
-    let size = alphas.len();
-    let matrix = Mat::from_fn(size, size, |i, j| match i.abs_diff(j) {
-        0 => alphas[i] / scale,
-        1 => betas[i.min(j)] / scale,
-        _ => 0.0,
-    });
-    let decomposed = matrix.self_adjoint_eigen(Side::Lower).ok()?;
-    let eigenvalues = decomposed.S().column_vector();
-    Some((0..size).map(|k| (eigenvalues[k] * scale, decomposed.U()[(0, k)].powi(2))).collect())
+    let (eigenvalues, vectors) = tridiagonal_eigen(alphas, betas)?;
+    Some(eigenvalues.iter().enumerate().map(|(k, w)| (*w, vectors[(0, k)].powi(2))).collect())
 }
 
 /// A probe of random signs, which gives traces the least spread.

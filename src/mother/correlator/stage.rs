@@ -30,7 +30,7 @@ const POWER_TIME_S: f64 = 10.0;
 /// Samples of a window after which powers are accurate enough for weights, whose mean bias is then 2 / n.
 const POWER_SAMPLES_MIN: u64 = 1024;
 
-/// What [`Correlator`] needs.
+/// Setup of [`Correlator`].
 #[derive(Clone)]
 pub struct CorrelatorSetup {
     /// The array, which gives the daughters' positions.
@@ -54,7 +54,7 @@ pub struct CorrelatorSetup {
 /// Counters of the correlator, and the mean auto-correlations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CorrelatorCounts {
-    /// What happened to blocks.
+    /// Counts of blocks.
     pub blocks: AlignerCounts,
     /// Blocks outside any window.
     pub stray: u64,

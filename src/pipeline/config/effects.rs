@@ -50,7 +50,7 @@ impl Config {
     }
 }
 
-/// What stands at a key with sections.
+/// The value of a key with sections.
 fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').map_or((path, None), |(first, rest)| (first, Some(rest)));
     let value = table.get(first)?;

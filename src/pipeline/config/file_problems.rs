@@ -36,7 +36,7 @@ impl Plan {
         for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
             let of_channels = files.iter().zip(&spacecraft.channels_hz);
             let of_channels = of_channels.filter(|_| files.len() == spacecraft.channels_hz.len());
-            // What cannot be read is told above and below.
+            // Unreadable files are reported elsewhere.
             let is_other = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
             let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
             checked.filter(is_other).for_each(|problem| found.push(|| problem));
@@ -65,7 +65,7 @@ impl Plan {
         SkyConfig::check_l_max(self.config.sky.l_max, least).err()
     }
 
-    /// What is understood of every map and catalogue that the configuration names, a line each. Files that cannot be read are told
+    /// A line of description for every map and catalogue that the configuration names. Files that cannot be read are told
     /// by [`Plan::file_problems`].
     #[must_use]
     #[doc(hidden)]

@@ -79,7 +79,7 @@ pub enum ReadProblem {
     },
 }
 
-/// What was read.
+/// A configuration as far as it could be read.
 pub(in crate::pipeline) struct Reading {
     /// The values that could be read; defaults for the others.
     pub(in crate::pipeline) config: Config,
@@ -258,7 +258,7 @@ fn plain(message: &str) -> String {
         })
 }
 
-/// What the key of a text, or of a list with texts, takes, by the unit in its name.
+/// The units that the key of a text, or of a list with texts, takes, by its name.
 fn units_of(key: &str, value: &Value) -> Option<&'static str> {
     let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
     Dimension::of_key(key).filter(|_| is_text).map(Dimension::expected)
@@ -283,7 +283,7 @@ pub(in crate::pipeline) struct Lines<'a> {
 }
 
 impl<'a> Lines<'a> {
-    /// Of a text that has been parsed.
+    /// The lines of a text that has been parsed.
     pub(in crate::pipeline) fn of(text: &'a str) -> Self {
         Self { text, table: DeTable::parse(text).ok(), overrides: HashMap::new() }
     }

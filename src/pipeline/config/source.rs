@@ -225,7 +225,7 @@ pub(in crate::pipeline) fn has_sections(table: &toml::Table) -> bool {
     ["array", "map", "sky", "spacecraft"].iter().any(|section| table.contains_key(*section))
 }
 
-/// What tells that a table is that of a study, which has axes, or other keys of its own, where a pipeline has sections.
+/// A key that shows a table to be a study's, which has axes where a pipeline has sections.
 pub(in crate::pipeline) fn study_key(table: &toml::Table) -> Option<&'static str> {
     if table.get("axis").is_some_and(toml::Value::is_array) {
         return Some("[[axis]]");

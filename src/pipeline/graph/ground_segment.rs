@@ -63,16 +63,16 @@ impl Config {
     }
 }
 
-/// What the ground segment leaves behind besides its files.
+/// Results of the ground segment besides its files.
 #[derive(Clone, Debug)]
 pub(in crate::pipeline) struct SegmentOutcome {
-    /// Of the ground.
+    /// The ground's outcome.
     pub(in crate::pipeline) ground: GroundOutcome,
     /// Final map of each channel, in figures.
     pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
 }
 
-/// What the ground segment makes of its sums.
+/// What the ground segment needs to make maps of its sums.
 pub(in crate::pipeline) struct MappingContext<'a> {
     /// Folder for the products.
     pub(in crate::pipeline) out: &'a Path,
@@ -101,7 +101,7 @@ pub(in crate::pipeline) fn add(
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
-    let setup = SolverSetup { passes, ..config.solver(watch.among(&ranks))? };
+    let setup = SolverSetup { passes, ..config.solver(watch.with_ranks(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
@@ -134,7 +134,7 @@ impl Sink for NullSink {
     }
 }
 
-/// What R is, by channel.
+/// R by channel.
 fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     Ok(match map.regulariser() {
         RegulariserChoice::Data => vec![Regulariser::Data],

@@ -172,7 +172,7 @@ pub fn run_with_ranks(
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground =
-        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).with_ranks(ranks);
     let maps = MapWatch::default();
     let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
@@ -240,7 +240,7 @@ pub(in crate::pipeline) fn simulate_sky(
 
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
-/// Of a ground that is one rank's ([`Ground::among`]), as [`run_with_ranks`].
+/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::with_ranks`]).
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
@@ -422,6 +422,9 @@ impl Grace {
     }
 }
 
+/// How long stages have to end after a failure.
+pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
+
 /// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
 const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
 
@@ -446,11 +449,10 @@ fn start(
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
-    // What these save is to be whole, however long it takes.
+    // These stages save data: they end in order, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
-    let shutdown = Duration::from_secs_f64(config.shutdown_s);
-    Ok(graph.run(cancel, if ranks.are_many() { shutdown.min(SHUTDOWN_OF_RANK) } else { shutdown })?)
+    Ok(graph.run(cancel, if ranks.are_many() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.

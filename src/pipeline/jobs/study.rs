@@ -31,7 +31,7 @@ use crate::sky::SkyMap;
 /// Visibilities between checkpoints of a case's state: a minute's work or more.
 const CHECKPOINT_EVERY: u64 = 20_000_000;
 
-/// What a study is doing for a case.
+/// The step of a study for a case.
 #[derive(Clone, Debug)]
 pub enum StudyStep {
     /// Simulating the downlink that it shares with others, with the handles of the graph.
@@ -69,7 +69,7 @@ pub struct StudySummary {
 /// Input of a case's maps: data, gains, and sums that it shares with others.
 struct CaseInputs<'a> {
     file: &'a Path,
-    /// That file, unless the state has taken it in.
+    /// The file as a list; empty if the state already holds it.
     files: &'a [PathBuf],
     gains: Option<&'a Path>,
     state: Option<&'a PathBuf>,

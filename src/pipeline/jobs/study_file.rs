@@ -95,7 +95,7 @@ struct CaseFile {
     set: Vec<String>,
 }
 
-/// What tells a case from the others, and the overrides that make it.
+/// Labels of a case, and the overrides that make it.
 #[derive(Clone, Default)]
 struct Draft {
     labels: Vec<String>,
@@ -134,7 +134,7 @@ impl StudyFile {
         })
     }
 
-    /// What is wrong with it, besides its cases.
+    /// Checks everything but its cases.
     fn check(&self, path: &Path, more: &[String]) -> Result<(), StudyError> {
         if self.axis.is_empty() && self.realisations.is_none() && !self.calibrated {
             let expected =
@@ -187,7 +187,7 @@ impl StudyFile {
     /// The realisations of a combination: one case, if they can share its sums, or a case each.
     fn realised(&self, combination: &Draft, source: &ConfigSource) -> Vec<Draft> {
         let realisations = self.realisations.unwrap_or(1);
-        // What is wrong is told with the case.
+        // Errors are reported with the case.
         let Some(base) = source.load().ok().filter(|_| realisations > 1) else {
             return vec![combination.clone(); realisations];
         };
@@ -263,7 +263,7 @@ pub struct Study {
 /// A case of a study.
 #[derive(Clone, Debug)]
 pub struct StudyCase {
-    /// What tells it from the others: a part for each axis.
+    /// Its labels, one for each axis.
     pub labels: Vec<String>,
     /// Its overrides of the pipeline.
     pub overrides: Vec<String>,

@@ -33,7 +33,7 @@ const PART: f64 = 0.5;
 /// Frames that are combined of others.
 #[derive(Clone, Debug)]
 pub(super) struct Frames {
-    /// Those that are turned to.
+    /// Frames to which the sky is turned.
     pub(super) chosen: Vec<RowNode>,
     /// All of them.
     count: usize,

@@ -15,7 +15,7 @@ use crate::units::vector::{norm, sub};
 /// The disc is what the sky's model takes as hidden: for a pair, from either daughter. So the disc is a uniform sky of T without
 /// a Moon, less the same with it, and with the sky's own visibility `V(sky) + T (V_whole - V(1)) = V(sky - T) + T V_whole`:
 /// one model of the sky less T, and V_whole in closed form. That depends on the length of the baseline only, so that it holds for
-/// averages over integrations, too. The disc does not reflect; [`WithReflection`](super::Reflected) adds the image of the sky.
+/// averages over integrations, too. The disc does not reflect; [`WithReflection`](super::WithReflection) adds the image of the sky.
 ///
 /// At 250 K and 300 km of altitude, with the generated sky (rms of visibilities by length of the baseline, wavelengths):
 ///

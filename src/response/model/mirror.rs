@@ -17,7 +17,7 @@ use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 /// The image is that which the pair's mid-point sees, a daughter's own for her power. A ray from there in direction n that
 /// hits the sphere at p goes on in direction `n - 2 (n . p) p` (p as a unit vector), from where the light comes: the image has in
 /// direction n the share times the sky's brightness there, with the fringe and antenna of n. It is summed over the directions of
-/// the sky's pixels, with the brightness of the pixel from which the light comes. As in [`WithReflection`](super::Reflected), image and
+/// the sky's pixels, with the brightness of the pixel from which the light comes. As in [`WithReflection`](super::WithReflection), image and
 /// sky do not interfere.
 pub struct WithSphereReflection {
     sky: Box<dyn VisibilityModel>,

@@ -73,7 +73,7 @@ pub enum ModelError {
     Geometry {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// What departs.
+        /// The quantity that departs.
         refusal: RowsRefusal,
     },
     /// The harmonic model failed.

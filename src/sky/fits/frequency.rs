@@ -22,7 +22,7 @@ pub struct SkyChannel {
     pub shares_file: bool,
 }
 
-/// What is understood of a map's file.
+/// Outline of a map's file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MapOutline {
     /// The file.
@@ -52,7 +52,7 @@ pub struct MapOutline {
 }
 
 impl MapOutline {
-    /// What is understood of the map of a channel, or of the first map without one.
+    /// The outline of a channel's map, or of the first map.
     ///
     /// # Errors
     /// As [`super::read_whole_map`].
