@@ -9,7 +9,7 @@ use super::spectrum::{Spectra, SpectralMaps};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
 use crate::imaging::circle::{HarmonicSums, NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
 use crate::imaging::power::{
-    Block, Covariance, Drawn, Factors, FoundPower, SAMPLE_SETTLED, SkyPower, Sought, value,
+    Block, Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, SkyPower, value,
 };
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{Convergence, NamedWatch, SolveError, SolveWatch, StoppingRule, System, dot};
@@ -177,8 +177,8 @@ impl Alone {
             return Err(SolveError::NoData);
         }
         let (right, numbers) = (sums.right_hand_side(), 2.0 * visibilities as f64);
-        let sought = Sought { sums, blocks, degrees: &degrees, right, power, numbers };
-        let FoundPower { solution, power, regularisation, .. } = sought.found(None, rule, watch)?;
+        let equations = PowerProblem { sums, blocks, degrees: &degrees, right, power, numbers };
+        let FoundPower { solution, power, regularisation, .. } = equations.found(None, rule, watch)?;
         let mut right = crate::imaging::power::multiply(blocks, &solution);
         for ((b, x), l) in right.iter_mut().zip(&solution).zip(&degrees) {
             *b = (*b + regularisation[*l] * x) / power.noise_factor.powi(2);
