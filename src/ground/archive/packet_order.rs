@@ -185,7 +185,7 @@ impl SendingOrder {
         let first = window[..].iter().find(|other| other.stream() == stream).unwrap_or(reading);
         let sent = (reading.entry.count - first.entry.count + 1) as usize;
         let mut of_stream = (0..like.len()).filter(|place| like[*place].stream() == stream);
-        match of_stream.clone().last() {
+        match of_stream.clone().next_back() {
             Some(last) => of_stream.nth(sent - 1).unwrap_or(last) + 1,
             None => like.iter().take_while(|other| other.stream() < stream).count(),
         }
