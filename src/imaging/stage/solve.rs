@@ -27,7 +27,7 @@ pub struct Solution {
     pub channel: ChannelId,
     /// Number of the snapshot in its channel, from 1.
     pub number: u32,
-    /// Whether it is from all data.
+    /// Whether it is from all data. Whether it may be called final is [`Solution::is_final_map`].
     pub is_final: bool,
     /// First and last mission time of its data, s.
     pub span_s: [f64; 2],
@@ -47,6 +47,20 @@ pub struct Solution {
     pub refinement: Option<Refinement>,
     /// Errors of the map, and the sky's power that R is from; only with R from the data.
     pub uncertainty: Option<Uncertainty>,
+}
+
+impl Solution {
+    /// Whether it may be called final: from all data and, where it was refined, converged.
+    #[must_use]
+    pub fn is_final_map(&self) -> bool {
+        self.is_final && self.has_converged()
+    }
+
+    /// Whether its refinement, if there was one, has converged: more passes would change the map.
+    #[must_use]
+    pub fn has_converged(&self) -> bool {
+        self.refinement.as_ref().is_none_or(|refinement| refinement.convergence.converged)
+    }
 }
 
 /// Numbers in which ranks agree before they solve.
@@ -238,7 +252,7 @@ impl Stage for Solver {
                 let request =
                     HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples: 0, probes: 0 };
                 let sums = archive.into_sums(&self.setup.belief)?;
-                let rule = self.setup.refine;
+                let rule = (self.setup.refine, &regulariser);
                 let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
                 let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));
                 // Not from a map on the way: that is the circle's, with which the iteration begins anyway.
