@@ -211,7 +211,7 @@ pub fn main() -> ExitCode {
 pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
     let words: Vec<OsString> = words.into_iter().collect();
     log::use_format(LogFormat::Text);
-    crate::array::tell_propagation(progress::say_propagation);
+    crate::array::report_propagation_to(progress::say_propagation);
     let command = match Cli::try_parse_from(&words) {
         Ok(Cli { log, command }) => {
             log::use_format(log);

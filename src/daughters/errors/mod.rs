@@ -52,7 +52,7 @@ pub struct PassErrors {
     clock_ns: Vec<Series>,
     /// By daughter: along, across, radial.
     offset_m: Vec<[Series; 3]>,
-    /// Of the formation; `None` if tags are true.
+    /// Errors of the formation's time tags; `None` if tags are true.
     time_tag_ms: Option<Series>,
     /// By daughter: tilt along the track, tilt away from the Moon (deg), distortion.
     antennas: Vec<[Series; 3]>,
@@ -248,7 +248,7 @@ impl PassErrors {
     }
 
     /// Replaces the positions flown of a segment by those that packets say.
-    pub fn mislead(&self, segment: &mut EphemerisSegment, array: &Array) {
+    pub fn add_errors(&self, segment: &mut EphemerisSegment, array: &Array) {
         let satellites = usize::from(segment.satellites);
         for (place, position_m) in segment.positions_m.iter_mut().enumerate() {
             let (node, daughter) = ((place / satellites) as i64, place % satellites);

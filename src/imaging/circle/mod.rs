@@ -90,7 +90,7 @@ impl HarmonicEngine {
     /// This engine, without data yet, as one rank's of several: it takes all visibilities, and holds its part of their sums. Every
     /// rank has such an engine of the same setup, and uses its sums as the others do.
     #[must_use]
-    pub fn among(mut self, ranks: &Ranks) -> Self {
+    pub fn with_ranks(mut self, ranks: &Ranks) -> Self {
         let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
         let HarmonicBasis { setup, quanta, .. } = *self.basis;
         let (grids, tables, ranks) = (Arc::new(grids), Arc::default(), ranks.clone());
@@ -116,7 +116,7 @@ impl HarmonicEngine {
             ExactTori::read(&basis.grids, &mut from, part, kept)
         })?;
         from.finish()?;
-        Ok(engine.among(ranks))
+        Ok(engine.with_ranks(ranks))
     }
 
     /// Takes in another part of the same sums: those of the same visibilities at other alphas.

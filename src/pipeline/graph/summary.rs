@@ -70,7 +70,7 @@ pub struct RunSummary {
     pub calibration: Option<CalibrateSummary>,
     /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
     pub report: Report,
-    /// Of the passes before it.
+    /// Counts of the passes before it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub earlier_reports: Vec<Report>,
 }
@@ -108,7 +108,7 @@ impl RunSummary {
     }
 
     /// The summary of this pass and an earlier one over the same downlink, for other channels.
-    pub(in crate::pipeline) fn after(self, earlier: PassRecord) -> Self {
+    pub(in crate::pipeline) fn after(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
         let ledger = earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
         Self {
@@ -154,9 +154,9 @@ impl RunSummary {
     }
 }
 
-/// What a summary says of a group that is mapped.
+/// Record of a mapped group.
 #[derive(bincode::Encode, bincode::Decode)]
-pub(in crate::pipeline) struct PassRecord {
+pub(in crate::pipeline) struct GroupRecord {
     /// Checksums of its products, in the order in which its channels name them.
     sums: Vec<u64>,
     pub(in crate::pipeline) ledger: LedgerReport<VisibilityReason>,
@@ -173,8 +173,8 @@ const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = binc
     .with_fixed_int_encoding()
     .with_limit::<RECORD_BYTES_MAX>();
 
-impl PassRecord {
-    /// What `summary` says of a group whose products are in `out`.
+impl GroupRecord {
+    /// The record of a group whose products are in `out`.
     ///
     /// # Errors
     /// A product that cannot be read.

@@ -2,7 +2,7 @@
 //!
 //! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
 //! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the
-//! two agree. Along a pass the rows of a pair change slowly, so that few are computed and the others interpolated
+//! two agree. Along a track the rows of a pair change slowly, so that few are computed and the others interpolated
 //! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
 //! computes each row, the reference for the other.
 //!
@@ -37,7 +37,7 @@ use crate::frames::AntennaResponse;
 use crate::units::Pair;
 use crate::units::vector::Vec3;
 
-/// What rows depend on besides positions.
+/// Setup of rows: everything but positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowsSetup {
     /// Greatest degree of the sky.
@@ -87,9 +87,9 @@ pub enum RowsRefusal {
          setup, {most}"
     )]
     Degree {
-        /// Of the response.
+        /// Degree of the response.
         degree: usize,
-        /// Of the rows.
+        /// Degree that the rows hold.
         most: usize,
     },
 }

@@ -1,6 +1,6 @@
 //! Sums over mu of interpolated amplitudes, `V = sum_k share_k sum_mu exp(-i mu gamma) g_{k mu}`, at many angles gamma.
 //!
-//! One transform a node gives its sum at equally spaced angles, of which a kernel about gamma interpolates (see
+//! One transform a node gives its sum at equally spaced angles, between which a kernel about gamma interpolates (see
 //! `response/harmonic/kernel.rs`): a dozen angles and as many multiply-adds each as there are nodes, where interpolated amplitudes
 //! would take one for each mu.
 
@@ -30,7 +30,7 @@ pub(super) struct PhaseGrid {
     inverse: Arc<dyn Fft<f64>>,
 }
 
-/// Values of the nodes of a pass at all angles: `[angle][sky][real or imaginary part][node]`, nodes filled up to whole vectors.
+/// Values of the nodes of a track at all angles: `[angle][sky][real or imaginary part][node]`, nodes filled up to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PhaseTable {
     values: Vec<f64>,
@@ -181,7 +181,7 @@ impl PhaseGrid {
     }
 }
 
-/// Shares of the nodes of a pass in a row, filled up to whole vectors.
+/// Shares of the nodes of a track in a row, filled up to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PaddedShares(Vec<f64>);
 
