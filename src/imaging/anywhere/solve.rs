@@ -109,7 +109,7 @@ pub fn solve_refined(
     if let Some(prior) = &prior {
         subtract_prediction(&sums.circle, prior, &mut circle_data);
     }
-    let problem = Refining { sums, regularisation, inner: request.rule, rule, watch };
+    let problem = RefinedProblem { sums, regularisation, inner: request.rule, rule, watch };
     let right = problem.right(prior.as_deref());
     let Refined { columns: [map, noise], convergence: [of_map, of_noise], residuals, direct } =
         problem.solve(right, circle_data, steps)?;
@@ -153,7 +153,7 @@ pub fn solve_refined(
 }
 
 /// The true normal equations and how they are solved.
-struct Refining<'a> {
+struct RefinedProblem<'a> {
     sums: &'a RefinedSums,
     regularisation: Diagonal,
     /// When inner iterations stop, besides their residual.
@@ -177,7 +177,7 @@ struct Shifted {
     factors: OrderFactors,
 }
 
-impl Refining<'_> {
+impl RefinedProblem<'_> {
     fn l_max(&self) -> usize {
         self.sums.circle.setup().l_max
     }

@@ -1,4 +1,4 @@
-//! Where rows of B are computed, and from which the others are interpolated.
+//! Plans which rows of B are computed, and which are interpolated from them.
 //!
 //! With P(t) the axes that follow the normal z(t) of the pair's plane without turning about it, and gamma(t) the angle from
 //! there to the pair's own x, the row of a pair at time t is
@@ -10,7 +10,7 @@
 //! where g depends on P, on the baseline's length and on the radii: slowly along an orbit, and smoothly however its plane,
 //! altitude, pitch and yaw change. So g is computed at Chebyshev's points of a track of one pair, where positions follow from
 //! those of the visibilities, and interpolated by the polynomial through them. Their number follows from how far the pattern's phases can
-//! move; where it would not be less than that of the visibilities, each is computed for itself.
+//! move; where that is no fewer than the visibilities, each row is computed for itself.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::ops::Range;
@@ -25,15 +25,15 @@ use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsRefusal, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
-/// A gap in a pair's data that ends a track, s: polynomials do not reach across what the array did not observe.
+/// A gap in a pair's data that ends a track, s: polynomials do not reach across times without data.
 const GAP_S: f64 = 900.0;
 
-/// Times from whose positions those of a node follow, and their greatest distance, s: 0.09 rad of a low orbit, so that positions err
+/// Number of times from whose positions a node's are interpolated, and their greatest distance, s: 0.09 rad of a low orbit, so that positions err
 /// by 0.1 mm.
 const POSITIONS: usize = 8;
 const POSITION_STEP_S_MAX: f64 = 120.0;
 
-/// Change of a velocity at an instant, m/s, that divides a track: what follows from positions is not smooth there. The turnarounds of a
+/// Sudden change of a velocity, m/s, that divides a track: rows are not smooth there. The turnarounds of a
 /// breathing formation change it by 0.2 m/s.
 const KINK_M_S: f64 = 1e-4;
 
@@ -42,10 +42,10 @@ const KINK_M_S: f64 = 1e-4;
 const KINK_STRIDE: usize = 4;
 const KINK_STEP_S_MAX: f64 = 20.0;
 
-/// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
+/// Most rows from which others are interpolated together: more take longer and are not more exact.
 const NODES_MAX: usize = 40;
 
-/// Error of the angles gamma of rows as those of a track's nodes tell them, rad, above which these do not tell how rows move.
+/// Error of the rows' angles gamma, interpolated from a track's nodes, rad, above which the nodes do not say how rows move.
 const GAMMA_ERROR_RAD: f64 = 1e-4;
 
 /// Rows that a task computes together, and whose patterns a product with `Bt W B` holds: 0.3 MB each at l = 191.
@@ -71,7 +71,7 @@ pub(super) struct Track {
     pub(super) weights: Vec<f64>,
     /// Angles gamma of the nodes, rad, without jumps; empty where rows are of instants.
     pub(super) gamma_rad: Vec<f64>,
-    /// How far phases move in a unit of tau, rad: of the fringe, and of the limb's highest degree. `None` where rows are of instants.
+    /// Motion of phases in a unit of tau, rad: of the fringe, and of the limb's highest degree. `None` where rows are of instants.
     pub(super) rate_rad: Option<[f64; 2]>,
 }
 
@@ -99,7 +99,7 @@ pub struct RowPlan {
     pub(super) reach: Vec<f32>,
     /// By row: coefficients of its response; empty if it is that of the setup.
     pub(super) coefficients: Vec<f32>,
-    /// Averages that are taken for instants in their middle, as the motion of their pair is not known.
+    /// Averages that are treated as instants in their middle, as the motion of their pair is not known.
     instants: usize,
     pub(super) classes: Vec<NodeClass>,
     /// Whether each row is computed for itself, with nothing in common with others.
@@ -172,8 +172,8 @@ impl RowPlan {
         self.nodes.len()
     }
 
-    /// Averages over integrations that are taken for instants in their middle: those without enough others of their pair about them to tell
-    /// how it moves.
+    /// Averages over integrations that are treated as instants in their middle: their pair has too few visibilities nearby to know its
+    /// motion.
     #[must_use]
     pub fn instants(&self) -> usize {
         self.instants
@@ -215,7 +215,7 @@ impl RowPlan {
         gamma_rad + interpolated(shares) - middle_rad
     }
 
-    /// Adds a row's values of skies to lists of them, from those of the skies' products.
+    /// Adds a row's values of all skies to their lists, from the values of the skies' products.
     pub(super) fn combine(&self, row: usize, products: &[Complex64], out: &mut [Vec<Complex64>]) {
         let count = products.len() / out.len().max(1);
         for (out, products) in out.iter_mut().zip(products.chunks_exact(count.max(1))) {
@@ -326,7 +326,7 @@ impl TrackBuilder<'_> {
                 let [from, to] = [at - 2, at + 3].map(|place| distinct[place]);
                 self.split(first..from, plan);
                 self.each(from..to, plan);
-                // What follows knows nothing of what was before.
+                // Rows after the change are independent of those before.
                 (first, begin, k) = (to, at + 3, at + 3 + POSITIONS / 2);
             } else {
                 k += KINK_STRIDE;
@@ -370,7 +370,7 @@ impl TrackBuilder<'_> {
         }
     }
 
-    /// Nodes that interpolate `exp(i h tau)` to far below 1e-4, h being what the pattern's phases move by.
+    /// Number of nodes that interpolate `exp(i h tau)` to far below 1e-4, with h the motion of the pattern's phases.
     ///
     /// Where the limb moves by an angle, the phase of a harmonic moves by up to l times that, and that of the fringe by the
     /// slope along the limb's normal: the baseline lies in the horizontal, the normal as much above it as the limb is below.
@@ -423,7 +423,7 @@ impl TrackBuilder<'_> {
         }
     }
 
-    /// Half of the integration of a row, s; 0 for an instant, and for what is too long to know the positions of.
+    /// Half of the integration of a row, s; 0 for an instant, and where it is too long to know its positions.
     fn half_s(&self, row: usize) -> f64 {
         let duration_s = self.duration_s.get(row).map_or(0.0, |duration_s| f64::from(*duration_s));
         if is_known(duration_s) { 0.5 * duration_s } else { 0.0 }
@@ -444,8 +444,8 @@ impl TrackBuilder<'_> {
         plan.tracks.push(Track { rows, nodes, tau, weights, gamma_rad, rate_rad: None });
     }
 
-    /// Tells a track how its rows move within their integrations, unless its nodes do not tell the angles of its rows: then these are of
-    /// instants.
+    /// Sets how the rows of a track move within their integrations. Where its nodes do not give the angles of its rows, rows are
+    /// treated as instants.
     fn move_through(&self, track: &mut Track, length_s: f64, plan: &mut RowPlan) {
         for k in 1..track.gamma_rad.len() {
             let turns = ((track.gamma_rad[k] - track.gamma_rad[k - 1]) / TAU).round();
