@@ -12,6 +12,7 @@ const THREE: &str = r#"
 name = "three"
 seed = 1
 [array]
+satellites = 3
 arcs_m = [400, 900]
 [spacecraft]
 channels_hz = [3e6]
@@ -21,6 +22,8 @@ sky_model = "direct"
 amplitude_sigma = 0.02
 phase_sigma_deg = 1e4
 "#;
+
+const BEACON: &str = "calibrate.beacon_k_sr=1e6";
 
 /// A sky of one source that the Moon never hides: towards the normal of the orbit.
 fn one_source(place: &Workplace) -> String {
@@ -73,7 +76,7 @@ fn bounds_without_a_sky_or_a_pass_say_what_is_missing() {
         (&["bound", pipeline, "--model", &source, "--pass", "99"], "--pass = 99: expected 0 to "),
         (&["bound", pipeline, "--model", &source, &source], "--model"),
         (
-            &["bound", pipeline, "--model", &source, "--set", "calibrate.mode=\"beacon\""],
+            &["bound", pipeline, "--model", &source, "--set", "calibrate.mode=\"beacon\"", "--set", BEACON],
             "calibrate.mode = beacon: expected \"sky\"",
         ),
     ] {

@@ -23,8 +23,7 @@ use lunarray::imaging::{
 use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
 use lunarray::runtime::Cancel;
-use lunarray::sky::fits::{ReadOptions, read_map};
-use lunarray::sky::harmonics::{Alm, AnalysisOptions, analysis};
+use lunarray::sky::harmonics::Alm;
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;

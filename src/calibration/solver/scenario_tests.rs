@@ -360,29 +360,6 @@ fn jumps_within_a_pass_are_placed_and_solved_on_both_sides() {
     }
 }
 
-/// Between the last two instants, of eight deviations of what one instant tells of the gain: a chi-square of 64, of which 40 are sure.
-#[test]
-fn jumps_before_the_last_instant_of_a_pass_are_found() {
-    let at_s = SPAN_S[1] * (1.0 - 1.0 / INSTANTS as f64);
-    let found = outcome("last instant", |seed| {
-        let gains = gains(seed);
-        let (channel, daughter) = (seed as usize % 3, 1 + seed as usize % 7);
-        let bound_deg = bounds_deg(&sky(3), FREQUENCIES_HZ[channel], &gains[channel])[daughter];
-        let turn = (8.0 * bound_deg * (INSTANTS as f64).sqrt()).to_radians();
-        let gain = |c: usize, n: usize, t_s: f64| {
-            let jumped = c == channel && n == daughter && t_s > at_s;
-            gains[c][n] * Complex64::cis(if jumped { turn } else { 0.0 })
-        };
-        solved(&plain(seed, &gain), seed)
-    });
-    assert_eq!(found.tally.wrong, 0);
-    let is_placed = |parts: &&Vec<PassSolution>| parts.len() == 2 && (parts[1].from_s - at_s).abs() < 45.0;
-    let placed = found.passes.iter().filter(is_placed).count();
-    eprintln!("{placed} of {PASSES} placed");
-    // What an instant tells varies from one to the next.
-    assert!(placed > PASSES as usize * 6 / 10, "{placed}");
-}
-
 #[test]
 fn a_jump_of_the_reference_is_told_from_one_of_all() {
     let solve = |seed: u64, all: bool| {

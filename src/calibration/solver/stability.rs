@@ -9,8 +9,8 @@ use num_complex::Complex64;
 use super::layout::{ParameterLayout, Values};
 use super::sums::ModelledBlock;
 
-/// Parts of an interval: a jump near its end shows if a part there has no data from before it.
-const PARTS: usize = 128;
+/// Parts of an interval.
+const PARTS: usize = 32;
 
 /// Parts that are taken together, from the slowest change to the fastest.
 const SCALES: [usize; 5] = [2, 4, 8, 16, 32];
@@ -304,7 +304,7 @@ const EXPLAINED: f64 = 0.6;
 const AT_ONCE: f64 = 0.7;
 
 /// Parts on either side of a jump at which it has to show.
-const NEAR: usize = 12;
+const NEAR: usize = 3;
 
 /// Chi-square of the largest jump between two parts, if the change is one.
 fn largest_jump(series: &Series) -> Option<f64> {
