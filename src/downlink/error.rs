@@ -139,7 +139,7 @@ impl DownlinkError {
     }
 }
 
-/// Requires that a file of `bytes` bytes held a packet; `name` says what it is if it did not.
+/// Requires that a file of `bytes` bytes held a packet; otherwise `name` gives its kind.
 pub(crate) fn require_packets(
     path: &std::path::Path,
     bytes: u64,

@@ -149,7 +149,7 @@ impl Solver {
     }
 }
 
-/// A map, and what is known of it.
+/// A map with its diagnostics.
 struct Solved {
     map_k: Vec<f64>,
     noise_k: Vec<f64>,
