@@ -16,6 +16,7 @@ mod first_contact;
 mod groups;
 mod harmonic;
 mod instrument;
+mod joint;
 mod live_gains;
 mod navigation;
 mod orbits;
