@@ -322,7 +322,12 @@ impl Refining<'_> {
         let on_the_circle = |right: &[&[f64]], residual_max: f64| {
             let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
             let rule = StoppingRule { residual_max, ..self.inner };
-            circle.solve(right, &mut z, rule, &watch.part("on the nearest circle", residual_max));
+            circle.solve(
+                right,
+                &mut z,
+                &vec![rule; right.len()],
+                &watch.part("on the nearest circle", residual_max),
+            );
             z
         };
         let precondition = |residuals: &[&[f64]]| on_the_circle(residuals, INNER_RESIDUAL).into_iter();
