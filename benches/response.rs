@@ -77,7 +77,7 @@ fn rows(nside: usize, method: PixelMethod, pixels_long: f64) {
     report(&name, pairs.len() * maker.pixels(), seconds);
 }
 
-/// `Bt W B x` for two maps, rows made for it and not kept (`map.matrix = "remade"`), and how much of the time making them once takes.
+/// `Bt W B x` for two maps, rows made for it and not kept (`map.matrix = "free"`), and how much of the time making them once takes.
 fn products(nside: usize, method: PixelMethod, pixels_long: f64) {
     let (maker, products) = (RowMaker::new(nside, method).unwrap(), RowProducts::new(nside, method).unwrap());
     let pairs = pairs(256, nside, pixels_long);

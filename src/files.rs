@@ -1,5 +1,5 @@
-//! Atomic files: complete under their name, or absent, and written by one process at a time. Everything that writes files
-//! uses them.
+//! Atomic files: complete under their name or absent, and written by one process at a time. All code that writes files
+//! uses this module.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -16,10 +16,10 @@ const WRITE_BYTES: usize = 1 << 20;
 /// What unfinished files end with.
 const PARTIAL: &str = ".partial";
 
-/// Unfinished files of one name that are tried before the folder counts as unusable.
+/// Names that are tried for an unfinished file before the folder counts as unusable.
 const NAMES_TRIED: usize = 100;
 
-/// How often, and how many times, a writer looks again whether another that began at the same time has gone.
+/// Interval and number of retries while another writer, which began at the same time, holds the name.
 const RIVAL_POLL: Duration = Duration::from_millis(20);
 const RIVAL_LOOKS: usize = 50;
 
@@ -32,10 +32,10 @@ pub enum IfUnfinished {
     Keep,
 }
 
-/// A file that has another name until [`AtomicFile::finish`] has put all of it on disk. Then it takes its own name and
+/// A file under a temporary name until [`AtomicFile::finish`] has put all of it on disk. Then it takes its own name and
 /// replaces an older file.
 ///
-/// The other name is new and cannot be foreseen, `.NAME.PROCESS-NUMBER.partial`, and the file is locked: a second writer
+/// The temporary name is new and unpredictable, `.NAME.PROCESS-NUMBER.partial`, and the file is locked: a second writer
 /// of the same name is refused, and unfinished files that nobody writes any more are removed.
 #[derive(Debug)]
 pub struct AtomicFile {
@@ -122,11 +122,11 @@ impl AtomicFile {
     }
 }
 
-/// Files that a command reads, which nothing in this process replaces while this lives.
+/// Protects the files that a command reads: nothing in this process replaces them while this value lives.
 #[derive(Debug, Default)]
 pub struct ProtectedInputs(Vec<FileKey>);
 
-/// A file by what the system knows it by, whatever names lead to it.
+/// Identity of a file on the system, whatever names lead to it.
 #[cfg(unix)]
 type FileKey = (u64, u64);
 #[cfg(not(unix))]
@@ -194,8 +194,8 @@ pub fn require_replaceable(path: &Path) -> io::Result<()> {
     }
 }
 
-/// A file that is written as it grows, for those who follow it. It takes the place of an older one at once, whole and empty; a pipe or
-/// a terminal is written to.
+/// Opens a file that grows while others follow it. It replaces an older file at once by an empty one; a pipe or terminal is
+/// written to directly.
 ///
 /// # Errors
 /// As [`AtomicFile::create`]; a folder that does not exist.
@@ -341,7 +341,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish().map(|_| ())
 }
 
-/// Reads a text of at most `bytes_max` bytes: what never ends, such as a device, is an error and no loss of memory.
+/// Reads a text of at most `bytes_max` bytes. An endless input, such as a device, is an error and takes no more memory.
 ///
 /// # Errors
 /// The system's error; [`io::ErrorKind::FileTooLarge`]; [`io::ErrorKind::InvalidData`] for what is not UTF-8.
@@ -355,7 +355,7 @@ pub fn read_text(path: &Path, bytes_max: u64) -> io::Result<String> {
     String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
 }
 
-/// A new file in a folder that has no name there: it is gone once it is closed, however the process ends.
+/// A new file without a name on the disk of a folder: it vanishes once it is closed, however the process ends.
 ///
 /// # Errors
 /// The system's error.
@@ -435,7 +435,7 @@ impl FolderLock {
         Ok(Self { folder: folder.to_owned(), lock_path, lock, locked, removes_lock, is_new })
     }
 
-    /// What has become of the folder, if it is no longer the one that was locked: moved, replaced, or without its lock.
+    /// Why the folder is no longer the one that was locked: moved, replaced, or without its lock; `None` if it still is.
     #[must_use]
     pub fn lost(&self) -> Option<&'static str> {
         match fs::metadata(&self.folder) {
@@ -477,14 +477,14 @@ pub fn is_at(file: &File, path: &Path) -> bool {
     found.is_ok_and(|(here, there)| is_same(&here, &there))
 }
 
-/// Whether both are of one file or folder.
+/// Whether both describe the same file or folder.
 #[cfg(unix)]
 fn is_same(here: &Metadata, there: &Metadata) -> bool {
     use std::os::unix::fs::MetadataExt;
     (here.dev(), here.ino()) == (there.dev(), there.ino())
 }
 
-/// Whether both are of one file or folder; unknown on this system.
+/// Whether both describe the same file or folder; unknown on this system.
 #[cfg(not(unix))]
 fn is_same(_: &Metadata, _: &Metadata) -> bool {
     true
@@ -533,7 +533,7 @@ mod tests {
             let left = fs::read(path.with_extension("partial")).ok();
             assert_eq!(left.map(|bytes| bytes.len()), remains.then_some(WRITE_BYTES + 8));
         }
-        // An empty file is nothing to keep.
+        // An empty file is not kept.
         drop(AtomicFile::create(&folder.path().join("empty"), IfUnfinished::Keep).unwrap());
         assert_eq!(names(folder.path()), ["Keep.partial"]);
     }

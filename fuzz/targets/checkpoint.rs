@@ -5,9 +5,9 @@ use std::sync::LazyLock;
 
 use crc_fast::CrcAlgorithm::{Crc32Iscsi, Crc64Nvme};
 use libfuzzer_sys::fuzz_target;
-use lunarray::accumulation::harmonic::HarmonicEngine;
-use lunarray::accumulation::{EngineKind, MapConfig, NormalEngine, PixelEngine};
 use lunarray::ground::archive::CoverageSurvey;
+use lunarray::imaging::circle::HarmonicEngine;
+use lunarray::imaging::{EngineKind, MapConfig, NormalEngine, PixelEngine};
 
 static MAPS: LazyLock<[MapConfig; 2]> = LazyLock::new(|| {
     let of = |engine| MapConfig { engine, ..MapConfig::default() };
@@ -17,7 +17,7 @@ static MAPS: LazyLock<[MapConfig; 2]> = LazyLock::new(|| {
 /// A state: length of the head, head, engines.
 fn state(data: &[u8], map: &MapConfig) {
     let Some((length, body)) = data.split_first_chunk::<2>() else { return };
-    let mut file = b"LNRSTA05".to_vec();
+    let mut file = b"LNRSTA06".to_vec();
     file.extend(u64::from(u16::from_le_bytes(*length)).to_le_bytes());
     file.extend(body);
     file.extend(crc_fast::checksum(Crc64Nvme, &file).to_le_bytes());

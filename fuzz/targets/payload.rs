@@ -2,7 +2,10 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::{CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, Packetizer, PacketReceiver, PacketSegment, TRAILER_BYTES};
+use lunarray::downlink::{
+    CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, PacketReceiver, PacketSegment,
+    Packetizer, TRAILER_BYTES,
+};
 use lunarray::frames::{AntennaResponse, Channel, GroundFrame, Instrument};
 
 fn packet(kind: Kind, count: u64, payload: &[u8]) -> Vec<u8> {

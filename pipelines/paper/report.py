@@ -552,14 +552,14 @@ def main():
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
          rows_of_b("rho", "no noise", "So it is here, at nside 16; its study has what data it is from. Many windows matter more "
                    "than many integrations of each: every 4th is half a wavelength from the last.")
-         + "\n### At nside 32\n\n`lunarray study pipelines/paper/fig16-nside32.toml` (`map.matrix = \"remade\"`)\n\n"
+         + "\n### At nside 32\n\n`lunarray study pipelines/paper/fig16-nside32.toml` (`map.matrix = \"free\"`)\n\n"
          + correlation("fig16-nside32", "rho", (8, 16, 20, 24, 32, 48, 64), "limit, rows",
                        "At this size, too, averaged rows are the same whatever the limit: 0.99 or more from l = 20 to 48 at b_p over "
                        "2, b_p and 2 b_p. Rows at centres are nearly as good below b_p over 2 up to l = 32, lose a tenth at b_p, half at 2 "
                        "b_p, and most at 4 b_p. Iterations end at a residual of 1e-4, averaged ones of b_p over 2 after 300 products at "
                        "5e-4. Averaged rows of 2 b_p took 3,392 s on one of two cores beside other work; those of 4 b_p were left "
                        "after 42 products.")
-         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig16-nside64.toml` (`map.matrix = \"remade\"`)\n\n"
+         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig16-nside64.toml` (`map.matrix = \"free\"`)\n\n"
          + correlation("fig16-nside64", "rho", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows",
                        "At the paper's size, too, averaged rows keep 0.98 and more from l = 24 to 80 below b_p over 2, where rows at centres end at "
                        "0.93; at b_p these lose 6 to 8 % at l = 24 to 48, a sixth at 64 and half at 128.")),

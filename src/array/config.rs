@@ -216,7 +216,7 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// What the dates of files give, and other keys do not.
+    /// Checks the keys of dates, which orbits of files bring themselves.
     fn check_dates(&self, checks: &mut Checks) {
         let epoch = &self.oem_epoch;
         // A second 60 is for the files' time system to judge.
@@ -232,14 +232,9 @@ impl ArrayConfig {
         checks.number("earth_longitude_deg", self.earth_longitude_deg, idle, expected);
     }
 
-    /// Everything that is wrong with the configuration; empty if it is good.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn problems(&self) -> Vec<InvalidValue> {
-        const POSITIVE: &str = "a positive number";
-        const FINITE: &str = "a finite number";
+    /// Checks the Moon, the circular orbit and its breathing.
+    fn check_orbit(&self, checks: &mut Checks) {
         let breathing = &self.breathing;
-        let mut checks = Checks::of("array");
         let count = self.satellites as f64;
         checks.number("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
         // As far away the Moon no longer holds them.
@@ -251,7 +246,7 @@ impl ArrayConfig {
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
             ("breathing.second_spacing_m_min", breathing.second_spacing_m_min),
         ] {
-            checks.number(key, value, value > 0.0, POSITIVE);
+            checks.number(key, value, value > 0.0, "a positive number");
         }
         for (key, value) in
             [("breathing.first_ratio", breathing.first_ratio), ("breathing.ratio", breathing.ratio)]
@@ -268,6 +263,10 @@ impl ArrayConfig {
         checks.number("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
         checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
+    }
+
+    /// Checks the eccentricity and the distances across the track.
+    fn check_ellipse(&self, checks: &mut Checks) {
         let eccentricity = self.eccentricity;
         checks.number("eccentricity", eccentricity, (0.0..1.0).contains(&eccentricity), "0 to less than 1");
         let least_m = (self.moon_radius_m + self.altitude_m) * (1.0 - eccentricity);
@@ -281,43 +280,47 @@ impl ArrayConfig {
         let shape = format_args!("{eccentricity}, array.cross_track_ratio = {ratio}");
         let one = !shaped || self.kepler.is_empty() && self.oem.is_empty();
         checks.require("eccentricity", shape, one, "0 and 0 where array.kepler or array.oem is given");
+    }
+
+    /// Checks the arcs between satellites.
+    fn check_arcs(&self, checks: &mut Checks) {
         let arcs = self.arcs_m.len();
-        let expected = "an arc for each daughter but the first, or none";
         let fits = arcs == 0 || arcs + 1 == self.satellites;
+        let expected = "an arc for each daughter but the first, or none";
         checks.require("arcs_m", format_args!("({arcs} values)"), fits, expected);
         let half_m = std::f64::consts::PI * (self.moon_radius_m + self.altitude_m);
-        checks.numbers(
-            "arcs_m",
-            &self.arcs_m,
-            |m| m > 0.0 && m <= half_m,
-            "m, above 0 and up to half of the orbit",
-        );
-        let (span_m, of_breathing) = (breathing.span_m_max, arcs == 0 && !self.has_own_orbits());
         let expected = "m, above 0 and up to half of the orbit";
+        checks.numbers("arcs_m", &self.arcs_m, |m| m > 0.0 && m <= half_m, expected);
+        let (span_m, of_breathing) = (self.breathing.span_m_max, arcs == 0 && !self.has_own_orbits());
         let inside = span_m > 0.0 && (!of_breathing || span_m <= half_m);
         checks.number("breathing.span_m_max", span_m, inside, expected);
-        let orbits = self.kepler.len();
+    }
+
+    /// Checks orbits that are given one by one, by elements or in files.
+    fn check_own_orbits(&self, checks: &mut Checks) {
+        let (arcs, orbits, files) = (self.arcs_m.len(), self.kepler.len(), self.oem.len());
+        let given = format_args!("({orbits} orbits)");
         let fits = orbits == 0 || orbits == self.satellites;
-        checks.require("kepler", format_args!("({orbits} orbits)"), fits, "one for each satellite, or none");
-        let one = orbits == 0 || arcs == 0;
-        checks.require("kepler", format_args!("({orbits} orbits)"), one, "none where array.arcs_m is given");
-        let files = self.oem.len();
+        checks.require("kepler", given, fits, "one for each satellite, or none");
+        checks.require("kepler", given, orbits == 0 || arcs == 0, "none where array.arcs_m is given");
+        let given = format_args!("({files} files)");
         let fits = files == 0 || files == self.satellites;
-        checks.require("oem", format_args!("({files} files)"), fits, "one for each satellite, or none");
+        checks.require("oem", given, fits, "one for each satellite, or none");
         let one = files == 0 || (orbits == 0 && arcs == 0);
-        checks.require(
-            "oem",
-            format_args!("({files} files)"),
-            one,
-            "none where array.kepler or array.arcs_m is given",
-        );
+        checks.require("oem", given, one, "none where array.kepler or array.arcs_m is given");
         let one = files == 0 || !self.propagate.is_on();
-        checks.require(
-            "oem",
-            format_args!("({files} files)"),
-            one,
-            "none where array.propagate.days is given",
-        );
+        checks.require("oem", given, one, "none where array.propagate.days is given");
+    }
+
+    /// Everything that is wrong with the configuration; empty if it is good.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn problems(&self) -> Vec<InvalidValue> {
+        let mut checks = Checks::of("array");
+        self.check_orbit(&mut checks);
+        self.check_ellipse(&mut checks);
+        self.check_arcs(&mut checks);
+        self.check_own_orbits(&mut checks);
         self.check_dates(&mut checks);
         for (key, value) in [
             ("orbital_phase_deg", self.orbital_phase_deg),
@@ -325,7 +328,7 @@ impl ArrayConfig {
             ("periapsis_deg", self.periapsis_deg),
             ("earth_longitude_deg", self.earth_longitude_deg),
         ] {
-            checks.number(key, value, true, FINITE);
+            checks.number(key, value, true, "a finite number");
         }
         let mut found = checks.finish();
         found.extend(self.propagate.problems(self.satellites, !self.kepler.is_empty()));

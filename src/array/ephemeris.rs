@@ -16,7 +16,7 @@ use crate::units::{MissionTime, TICKS_PER_SECOND};
 /// Nodes of one interpolation.
 const NODES: usize = 8;
 
-/// Segments examined for one time: the latest that start before it, a few of which may overlap.
+/// Segments examined for one time: the latest that start before it, as a few may overlap.
 const OVERLAPPING_MAX: usize = 8;
 
 /// The ephemeris of `array` from `start` to `end`, in segments without a turnaround of the formation inside, each of at
@@ -75,7 +75,7 @@ fn segment(
     EphemerisSegment { start: first, step_ticks: step as u32, satellites: satellites as u8, positions_m }
 }
 
-/// What became of a segment that was offered to an [`Ephemeris`].
+/// Outcome of offering a segment to an [`Ephemeris`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Insertion {
     /// It is in the table.
@@ -339,7 +339,7 @@ mod tests {
         table
     }
 
-    /// Greatest error over a window, m, at times that are no nodes.
+    /// Greatest error over a window between its nodes, m.
     fn worst_m(array: &Array, start_s: f64, end_s: f64) -> f64 {
         let table = table(array, start_s, end_s);
         let count = 20_011;

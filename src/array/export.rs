@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::oem::{Stretch, to_equatorial};
+use super::oem::{OrbitArc, to_equatorial};
 use super::orbit::Array;
 use super::state::SatelliteState;
 use crate::units::time_scales::{Tai, TimeScale};
@@ -97,14 +97,14 @@ impl OemExport {
     }
 
     /// States at equal steps between turnarounds of the formation.
-    fn sampled(&self, array: &Array, satellite: usize) -> Vec<Stretch> {
+    fn sampled(&self, array: &Array, satellite: usize) -> Vec<OrbitArc> {
         let mut stretches = Vec::new();
         let mut from_s = 0.0;
         while from_s < self.until_s {
             let turnaround_s = array.breathing().map(|formation| formation.next_turnaround_s(from_s));
             let to_s = turnaround_s.map_or(self.until_s, |turn_s| turn_s.min(self.until_s));
             let steps = ((to_s - from_s) / self.step_s).ceil().max(STATES_MIN - 1.0);
-            let mut stretch = Stretch::default();
+            let mut stretch = OrbitArc::default();
             for k in 0..=steps as usize {
                 let time_s =
                     if k as f64 == steps { to_s } else { from_s + (to_s - from_s) * k as f64 / steps };

@@ -7,7 +7,7 @@ use super::bodies::{DatedEarth, Earth};
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::{KeplerOrbit, eccentric_anomaly};
-use super::oem::{self, Stretch, TableOrbit};
+use super::oem::{self, OrbitArc, TableOrbit};
 use super::propagate;
 use super::state::SatelliteState;
 use crate::units::constants::DAY_S;
@@ -112,7 +112,7 @@ impl Shape {
 pub struct Array {
     /// The formation on one orbit, if there is one.
     formation: Option<Formation>,
-    /// What makes it more than a circle.
+    /// Departure from a circle.
     shape: Option<Shape>,
     /// Orbits of their own; none for a formation.
     own: Vec<OwnOrbit>,
@@ -126,7 +126,7 @@ pub struct Array {
     earth: Earth,
     /// Epoch of orbits that have dates.
     epoch: Option<Tai>,
-    /// What files of orbits hold and is not used.
+    /// Content of orbit files that is not used.
     notes: Vec<String>,
 }
 
@@ -205,7 +205,7 @@ impl Array {
         self.epoch.map(Tai::from_1958)
     }
 
-    /// What files of orbits hold and is not used.
+    /// Content of orbit files that is not used.
     #[doc(hidden)]
     #[must_use]
     pub fn notes(&self) -> &[String] {
@@ -224,7 +224,7 @@ impl Array {
     }
 
     /// The states through which the orbit of satellite `n` (from 0) goes, if it is given by a table.
-    pub(super) fn stretches(&self, n: usize) -> Option<Vec<Stretch>> {
+    pub(super) fn stretches(&self, n: usize) -> Option<Vec<OrbitArc>> {
         match self.own.get(n) {
             Some(OwnOrbit::Table(orbit)) => Some(orbit.stretches()),
             _ => None,

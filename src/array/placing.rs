@@ -106,7 +106,7 @@ impl Ephemeris {
     }
 }
 
-/// Appends the visibilities in `range`, for all of which `piece` is valid.
+/// Appends the visibilities in `range`; `piece` is valid for all of them.
 ///
 /// Plain loops compile for wide registers, which closures in iterators do not. No multiplication is fused with an
 /// addition, so that every target gives the same bits.

@@ -15,7 +15,7 @@ use crate::mother::Store;
 use crate::pipeline::Config;
 use crate::pipeline::PipelineError;
 use crate::pipeline::Plan;
-use crate::pipeline::graph::models;
+use crate::pipeline::graph::{SHUTDOWN, models};
 use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
@@ -63,8 +63,8 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let passes = graph.stage("store", capacity, visibilities, Store::new(&plan.config.spacecraft, None));
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
     let received = graph.stage("receive", capacity, packets, reception());
-    graph.sink("drop", received, Forget(0));
-    watched(graph, plan.config.runtime.shutdown_s)
+    graph.sink("drop", received, FrameSink(0));
+    watched(graph)
 }
 
 /// Segments of positions that a stage alone knows.
@@ -82,17 +82,17 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
     let sums = graph.stage("ground", 1, bytes, Ground::new(&config.ground(WAIT_BYTES))?);
-    graph.sink("drop", sums, Drop);
-    watched(graph, config.runtime.shutdown_s)
+    graph.sink("drop", sums, SumsSink);
+    watched(graph)
 }
 
 /// Runs a graph, and samples its queue depths while it runs.
-fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
+fn watched(graph: Graph) -> Result<ChainRun, PipelineError> {
     let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
     let since = Instant::now();
     let (report, mut looks) = std::thread::scope(|scope| {
         let watcher = scope.spawn(|| {
-            let mut looks = Looks { step: 1, times_s: Vec::new(), depths: Vec::new() };
+            let mut looks = QueueSamples { step: 1, times_s: Vec::new(), depths: Vec::new() };
             let mut tick = 0_usize;
             while !done.load(Ordering::Relaxed) {
                 if tick.is_multiple_of(looks.step) {
@@ -103,7 +103,7 @@ fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
             }
             looks
         });
-        let report = graph.run(&Cancel::new(), Duration::from_secs_f64(shutdown_s));
+        let report = graph.run(&Cancel::new(), SHUTDOWN);
         done.store(true, Ordering::Relaxed);
         (report, watcher.join().unwrap_or_default())
     });
@@ -121,7 +121,7 @@ fn watched(graph: Graph, shutdown_s: f64) -> Result<ChainRun, PipelineError> {
 
 /// Samples of all queue depths.
 #[derive(Default)]
-struct Looks {
+struct QueueSamples {
     /// Number of intervals from one sample to the next.
     step: usize,
     times_s: Vec<f64>,
@@ -129,7 +129,7 @@ struct Looks {
     depths: Vec<Vec<u64>>,
 }
 
-impl Looks {
+impl QueueSamples {
     fn add(&mut self, time_s: f64, metrics: &Metrics) {
         let stages = metrics.snapshot();
         // Stages are in chain order, so a queue holds what one stage has emitted and the next has not received. The counters
@@ -163,9 +163,9 @@ impl Source for Packets {
 }
 
 /// A sink that drops sums.
-struct Drop;
+struct SumsSink;
 
-impl Sink for Drop {
+impl Sink for SumsSink {
     type In = Snapshot;
     type Error = Infallible;
 
@@ -175,9 +175,9 @@ impl Sink for Drop {
 }
 
 /// A sink that counts visibilities and drops them.
-struct Forget(u64);
+struct FrameSink(u64);
 
-impl Sink for Forget {
+impl Sink for FrameSink {
     type In = GroundFrame;
     type Error = Infallible;
 

@@ -12,7 +12,7 @@ use std::convert::Infallible;
 
 use serde::Serialize;
 
-use self::timing::{Spent, median, seconds_of, timed};
+use self::timing::{TimeSpent, median, seconds_of, timed};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
@@ -238,7 +238,7 @@ fn time_stage(
     skies: &[SkyMap],
     material: &Material,
     name: &str,
-) -> Result<Spent, PipelineError> {
+) -> Result<TimeSpent, PipelineError> {
     let (sampler, link, correlator) =
         sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
     // Input is copied before the clock starts, and output is dropped after it stops.

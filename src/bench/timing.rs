@@ -5,7 +5,7 @@ use std::time::Instant;
 use crate::pipeline::Plan;
 
 /// Time spent on a piece of work.
-pub(super) struct Spent {
+pub(super) struct TimeSpent {
     pub(super) seconds: f64,
     /// Processor time of the whole process, s; `None` where the system does not report it.
     pub(super) core_seconds: Option<f64>,
@@ -31,10 +31,10 @@ pub(super) fn core_seconds_used() -> Option<f64> {
     Some((ticks()? + ticks()?) / 100.0)
 }
 
-pub(super) fn timed<T>(work: impl FnOnce() -> T) -> (Spent, T) {
+pub(super) fn timed<T>(work: impl FnOnce() -> T) -> (TimeSpent, T) {
     let (before_s, since) = (core_seconds_used(), Instant::now());
     let value = work();
     let seconds = since.elapsed().as_secs_f64();
     let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
-    (Spent { seconds, core_seconds }, value)
+    (TimeSpent { seconds, core_seconds }, value)
 }

@@ -64,7 +64,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let ranks = usize::from(args.ranks);
     plan.config.require_shareable(ranks)?;
     print_notes(sky_notes(&plan)?);
-    let cost = plan.cost_among(ranks).on_nodes(args.pipeline.memory_limit());
+    let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;
     let files = plan.files_understood();
     let limit = args.pipeline.memory_limit();

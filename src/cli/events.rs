@@ -315,7 +315,7 @@ impl Lines {
 
 /// What has been told of a run.
 #[derive(Default)]
-struct Told {
+struct EventsReported {
     ended: Vec<bool>,
     saving: SavingReport,
     instrument: usize,
@@ -330,13 +330,13 @@ fn write_events(
     untold: &AtomicU64,
 ) {
     let mut watched: Option<Watched> = None;
-    let mut told = Told::default();
+    let mut told = EventsReported::default();
     let mut write = || -> std::io::Result<()> {
         lines.write(Entry::Begin { version: env!("CARGO_PKG_VERSION"), name, segment })?;
         let mut next = Instant::now() + PROGRESS_EVERY;
         loop {
             match messages.recv_deadline(next) {
-                Ok(Message::Watch(new)) => (watched, told) = (Some(*new), Told::default()),
+                Ok(Message::Watch(new)) => (watched, told) = (Some(*new), EventsReported::default()),
                 Ok(Message::Map(map)) => lines.write(Entry::Map(map))?,
                 Ok(Message::End(end)) => {
                     if let Some(watched) = &watched {
@@ -363,7 +363,7 @@ fn write_events(
 fn progress(
     lines: &mut Lines,
     watched: &Watched,
-    told: &mut Told,
+    told: &mut EventsReported,
     untold: &AtomicU64,
 ) -> std::io::Result<()> {
     let stages = watched.metrics.snapshot();
@@ -413,13 +413,13 @@ fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<
 
 /// What the log has been told of a run.
 #[derive(Default)]
-pub(super) struct LogTold {
-    told: Told,
+pub(super) struct LogState {
+    told: EventsReported,
     products: Option<String>,
     archive: Option<String>,
 }
 
-impl LogTold {
+impl LogState {
     /// Says what has happened since the last time: troubles and their ends; for programs everything that `--events` has.
     pub(super) fn tell(&mut self, watched: &Watched) {
         let stages = watched.metrics.snapshot();

@@ -79,7 +79,7 @@ fn page_of(all: &[KeyDescription]) -> String {
         .to_owned();
     page.push_str(TABLE);
     for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
-        put_row(&mut page, &described.key, described);
+        put_row(&mut page, &described.key, described, None);
     }
     page.push_str("\n## For experts\n");
     let mut told: Vec<(String, Vec<String>)> = Vec::new();
@@ -104,7 +104,7 @@ fn page_of(all: &[KeyDescription]) -> String {
             None if rows.is_empty() => {}
             None => {
                 page.push_str(TABLE);
-                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described));
+                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described, Some(section)));
                 told.push((section.key.clone(), names));
             }
         }
@@ -114,13 +114,16 @@ fn page_of(all: &[KeyDescription]) -> String {
 
 const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
 
-fn put_row(page: &mut String, name: &str, described: &KeyDescription) {
+/// A row of a table; what the heading of its section says of its condition is not said again.
+fn put_row(page: &mut String, name: &str, described: &KeyDescription, section: Option<&KeyDescription>) {
     let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
     let about = in_a_cell(&described.about);
-    page.push_str(&format!("| `{name}` | {default} | {about}{} |\n", condition_of(described)));
+    let said = section.is_some_and(|section| section.only_with == described.only_with);
+    let condition = if said { String::new() } else { condition_of(described) };
+    page.push_str(&format!("| `{name}` | {default} | {about}{condition} |\n"));
 }
 
-/// Its own condition, of which the last is.
+/// Its own condition: the last of the list.
 fn condition_of(described: &KeyDescription) -> String {
     described.only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."))
 }
@@ -160,7 +163,7 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 pub(super) struct ConfigArgs {
     /// Print a file instead of the everyday keys.
     #[arg(long, value_enum)]
-    print: Option<Printed>,
+    print: Option<PrintedConfig>,
     /// Print all keys.
     #[arg(long, conflicts_with_all = ["print", "schema"])]
     all: bool,
@@ -173,7 +176,7 @@ pub(super) struct ConfigArgs {
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
-enum Printed {
+enum PrintedConfig {
     /// What `lunarray run` runs without a file.
     Quicklook,
     /// Every key with its default: those for experts as comments.
@@ -192,8 +195,8 @@ pub(super) fn config(args: &ConfigArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let text = match args.print {
-        Some(Printed::Quicklook) => QUICKLOOK.to_owned(),
-        Some(Printed::Reference) => reference(Shown::Folded),
+        Some(PrintedConfig::Quicklook) => QUICKLOOK.to_owned(),
+        Some(PrintedConfig::Reference) => reference(Shown::Folded),
         None => reference(if args.all { Shown::All } else { Shown::Everyday }),
     };
     if args.json {

@@ -30,11 +30,11 @@ use crate::units::time_scales::{Tai, TimeScale, utc_text};
 #[derive(Debug, Args)]
 pub(super) struct ExportArgs {
     #[command(subcommand)]
-    what: What,
+    what: ExportKind,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
+enum ExportKind {
     /// Visibilities of one channel of a downlink file as CSV: times, baselines and positions (m), values (K sr and Jy), weights.
     Visibilities(VisibilityArgs),
     /// C_l, rho_l and SNR_l of the maps of runs as CSV.
@@ -163,20 +163,20 @@ impl ExportArgs {
     /// The files that are read.
     fn inputs(&self) -> Vec<PathBuf> {
         match &self.what {
-            What::Visibilities(args) => vec![args.file.clone()],
-            What::Spectra(args) => args.runs.iter().map(|run| run.join("summary.json")).collect(),
-            What::Alm(args) => vec![args.map.clone()],
-            What::Hips(args) => vec![args.map.clone()],
-            What::Orbits(args) => args.array.inputs(),
+            ExportKind::Visibilities(args) => vec![args.file.clone()],
+            ExportKind::Spectra(args) => args.runs.iter().map(|run| run.join("summary.json")).collect(),
+            ExportKind::Alm(args) => vec![args.map.clone()],
+            ExportKind::Hips(args) => vec![args.map.clone()],
+            ExportKind::Orbits(args) => args.array.inputs(),
         }
     }
 
     fn refuse_misuse_of_standard_output(&self) -> Result<(), CommandError> {
         let (to, is_table) = match &self.what {
-            What::Visibilities(args) => (&args.to, true),
-            What::Spectra(args) => (&args.to, true),
-            What::Alm(args) => (&args.to, false),
-            What::Hips(_) | What::Orbits(_) => return Ok(()),
+            ExportKind::Visibilities(args) => (&args.to, true),
+            ExportKind::Spectra(args) => (&args.to, true),
+            ExportKind::Alm(args) => (&args.to, false),
+            ExportKind::Hips(_) | ExportKind::Orbits(_) => return Ok(()),
         };
         match is_standard(&to.out) {
             true if !is_table => Err("--out -: a FITS file needs a name; ./- is a file of that name".into()),
@@ -192,11 +192,11 @@ pub(super) fn execute(args: &ExportArgs) -> CommandResult {
     args.refuse_misuse_of_standard_output()?;
     let _inputs = ProtectedInputs::of(args.inputs());
     let (to, rows, of) = match &args.what {
-        What::Hips(args) => return hips(args),
-        What::Orbits(args) => return orbits(args),
-        What::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
-        What::Spectra(args) => (&args.to, spectra(args)?, "degrees"),
-        What::Alm(args) => (&args.to, alm(args)?, "coefficients"),
+        ExportKind::Hips(args) => return hips(args),
+        ExportKind::Orbits(args) => return orbits(args),
+        ExportKind::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
+        ExportKind::Spectra(args) => (&args.to, spectra(args)?, "degrees"),
+        ExportKind::Alm(args) => (&args.to, alm(args)?, "coefficients"),
     };
     if is_standard(&to.out) {
         // What is printed is the table.

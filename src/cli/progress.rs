@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use indicatif::{DecimalBytes, HumanCount, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use super::events::{LogTold, LogViewer, progress_of};
+use super::events::{LogState, LogViewer, progress_of};
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
@@ -264,7 +264,7 @@ struct ProgressView {
     since: Instant,
     /// Events of the instrument that were told.
     events_told: usize,
-    told: LogTold,
+    told: LogState,
     /// The solution being shown: its number, when it was first shown, and its residual then.
     solution: Option<(u64, Instant, f64)>,
 }
@@ -287,7 +287,7 @@ impl ProgressView {
             received: (0, now),
             since: now,
             events_told: 0,
-            told: LogTold::default(),
+            told: LogState::default(),
             solution: None,
         }
     }

@@ -24,9 +24,9 @@ use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
 use crate::calibration::CalibrationHook;
 use crate::downlink::transport::socket::{
-    HeldAnswers, ListenNote, SocketError, SocketSource, Stations, TcpUrl, Until,
+    HeldAnswers, ListenLimits, ListenNote, SocketError, SocketSource, Stations, TcpUrl,
 };
-use crate::downlink::{FileSource, Pace, Paced, Steps};
+use crate::downlink::{FileSource, Pace, PacedSource, Steps};
 use crate::files::ProtectedInputs;
 use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
@@ -208,7 +208,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     };
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
-        Some(folder) => Ground::open_among(folder, &settings, args.checkpoint_every, job.ranks())?,
+        Some(folder) => Ground::open_with_ranks(folder, &settings, args.checkpoint_every, job.ranks())?,
         None => Ground::new(&settings)?.among(job.ranks()),
     };
     if job.is_first() {
@@ -360,7 +360,7 @@ impl Session<'_> {
         let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
         let settings = args.limited(config.ground(0));
         let (advised, own_config, limit) = (AtomicBool::new(false), (*config).clone(), args.limit());
-        let until = Until { idle_s: args.idle_s, connections: args.connections };
+        let until = ListenLimits { idle_s: args.idle_s, connections: args.connections };
         let listen = &config.downlink.listen;
         let mut source = SocketSource::bind(&addresses, listen, until)
             .map_err(|error| match error {
@@ -415,7 +415,7 @@ impl Session<'_> {
             (None, Speed(Some(times))) => Pace::Speed(times),
             (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),
         };
-        Ok(self.watched(Paced::new(files, pace), ground, &|| {})?)
+        Ok(self.watched(PacedSource::new(files, pace), ground, &|| {})?)
     }
 
     /// Runs the ground; `begun` is called once signals end it in order.

@@ -15,7 +15,7 @@ use super::output::{
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::pipeline::{
-    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, run_among, run_in_groups,
+    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, run_in_groups, run_with_ranks,
     sky_notes, use_threads,
 };
 
@@ -75,14 +75,14 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     if let Some(size) = args.groups {
         return in_groups(args, &plan, size, &out);
     }
-    let cost = plan.cost_among(job.ranks().share().count);
+    let cost = plan.cost_with_ranks(job.ranks().share().count);
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None, None)?;
     let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
     let windows = plan.windows_watched();
-    let ended = run_among(job.ranks(), &plan, &out, interrupt.cancel(), &mut |watched| {
+    let ended = run_with_ranks(job.ranks(), &plan, &out, interrupt.cancel(), &mut |watched| {
         interrupt.arm_or_note();
         page.watch(&watched);
         events.watch(&watched);

@@ -43,7 +43,7 @@ pub(super) struct SampleArgs {
 
 /// What was drawn of a channel.
 #[derive(Debug, Serialize)]
-struct Sampled {
+struct SampledChannel {
     frequency_hz: f64,
     samples: usize,
     mean_k: f64,
@@ -78,7 +78,7 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
         print_json_line(&all)?;
         return Ok(Completion::Done);
     }
-    let line = |sampled: &Sampled| {
+    let line = |sampled: &SampledChannel| {
         format!(
             "{:>8.3} MHz  {} samples in {}: mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms",
             sampled.frequency_hz / 1e6,
@@ -96,7 +96,7 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
 fn write(
     args: &SampleArgs,
     solution: &Solution,
-) -> Result<Sampled, Box<dyn std::error::Error + Send + Sync>> {
+) -> Result<SampledChannel, Box<dyn std::error::Error + Send + Sync>> {
     let channel = usize::from(solution.channel.0);
     let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |channel| channel.frequency_hz);
     let errors = solution.uncertainty.as_ref().ok_or("this map has no posterior to draw from")?;
@@ -124,7 +124,7 @@ fn write(
     }
     let sigma_k: Vec<f64> = variance.iter().map(|variance| variance.sqrt()).collect();
     save("sigma.fits", &sigma_k)?;
-    Ok(Sampled {
+    Ok(SampledChannel {
         frequency_hz,
         samples: errors.samples_k.len(),
         mean_k,

@@ -106,7 +106,7 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let factor = (freq_hz / made_hz).powf(args.index);
     let values = generate(&sky.generated, made_hz, nside, seed)?.into_iter().map(|value| factor * value);
     let map = SkyMap::new(Frame::Ecliptic, values.collect())?;
-    let mut made = Made::write(args, &map, Some(freq_hz), &Dimension::Frequency.show(freq_hz))?;
+    let mut made = SkyReport::write(args, &map, Some(freq_hz), &Dimension::Frequency.show(freq_hz))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;
         made.lines.push(format!("{}: {count} sources", path.display()));
@@ -126,21 +126,21 @@ fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     let map = other.correlated(correlation, seed)?;
     // It is of the frequency of what it resembles.
     let what = format!("correlation {correlation} with {}", path.display());
-    let mut made = Made::write(args, &map, frequency_hz, &what)?;
+    let mut made = SkyReport::write(args, &map, frequency_hz, &what)?;
     let title = format!("A sky of correlation {correlation} with another");
     made.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
     made.print(args)
 }
 
 /// What was written, for programs and in words.
-struct Made {
+struct SkyReport {
     nside: usize,
     mean_k: f64,
     picture: Option<PathBuf>,
     lines: Vec<String>,
 }
 
-impl Made {
+impl SkyReport {
     /// Writes the sky, with its frequency if that is known.
     fn write(args: &SkyArgs, map: &SkyMap, freq_hz: Option<f64>, what: &str) -> Result<Self, CommandError> {
         let (nside, mean_k) = (map.nside(), map.values().iter().sum::<f64>() / map.values().len() as f64);

@@ -61,7 +61,7 @@ pub(super) fn execute(args: &TopArgs) -> CommandResult {
         print_json_line(&client.json("/api/status")?)?;
         return Ok(Completion::Done);
     }
-    let first = Look::of(&client, 0)?;
+    let first = ServerSnapshot::of(&client, 0)?;
     let mut screen = Screen { address: client.address(), ..Screen::default() };
     first.show(&mut screen);
     if args.once {
@@ -110,14 +110,14 @@ impl Drop for Restored {
     }
 }
 
-/// What a server says of a run at one time.
-struct Look {
+/// The state of a run, as its server tells it at one time.
+struct ServerSnapshot {
     status: Value,
     /// Of the channel at this place in the list.
     figures: Value,
 }
 
-impl Look {
+impl ServerSnapshot {
     fn of(client: &Client, place: usize) -> Result<Self, ClientError> {
         let status = client.json("/api/status")?;
         let channel = &status["channels"][place]["channel"];
@@ -135,7 +135,11 @@ impl Look {
 }
 
 /// Looks at the server again and again, at the channel that was asked for last.
-fn look_again(client: &Client, asked: &Receiver<usize>, answer: &Sender<Result<Look, ClientError>>) {
+fn look_again(
+    client: &Client,
+    asked: &Receiver<usize>,
+    answer: &Sender<Result<ServerSnapshot, ClientError>>,
+) {
     let mut place = 0;
     loop {
         match asked.recv_timeout(LOOK_EVERY) {
@@ -143,7 +147,7 @@ fn look_again(client: &Client, asked: &Receiver<usize>, answer: &Sender<Result<L
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }
-        if answer.send(Look::of(client, place)).is_err() {
+        if answer.send(ServerSnapshot::of(client, place)).is_err() {
             return;
         }
     }
@@ -155,7 +159,7 @@ fn watch(
     screen: &mut Screen,
     interrupt: &Interrupt,
     ask: &Sender<usize>,
-    answers: &Receiver<Result<Look, ClientError>>,
+    answers: &Receiver<Result<ServerSnapshot, ClientError>>,
 ) -> std::io::Result<()> {
     terminal.draw(|frame| screen.draw(frame))?;
     while !interrupt.cancel().is_cancelled() {

@@ -22,7 +22,7 @@ use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 /// a shorter sum over instants at each epoch.
 const CHUNK_SAMPLES: usize = 1 << 14;
 
-/// What the daughters receive, and where they are.
+/// The array, and the sky that the daughters receive.
 pub struct Scene {
     /// The array.
     pub array: Arc<Array>,

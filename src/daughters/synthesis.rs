@@ -48,7 +48,7 @@ pub struct Response {
 }
 
 impl Response {
-    /// Of a daughter without errors.
+    /// The response of a daughter without errors.
     pub const IDEAL: Self = Self { gain: Complex64::ONE, turns: 0.0 };
 }
 

@@ -38,12 +38,12 @@ pub(super) trait TileKernel {
 
 /// Runs `kernel` with the widest registers of the machine.
 pub(super) fn on_tile<K: TileKernel>(arch: Arch, kernel: K) -> K::Output {
-    arch.dispatch(Widest(kernel))
+    arch.dispatch(WidestSimd(kernel))
 }
 
-struct Widest<K>(K);
+struct WidestSimd<K>(K);
 
-impl<K: TileKernel> WithSimd for Widest<K> {
+impl<K: TileKernel> WithSimd for WidestSimd<K> {
     type Output = K::Output;
 
     #[inline(always)]

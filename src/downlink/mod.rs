@@ -75,7 +75,7 @@ pub use receive::inspect::Contents;
 pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceivedSet};
 pub use transport::{DownlinkReader, DownlinkWriter, FileSource};
 #[doc(hidden)]
-pub use transport::{Pace, Paced, Recorder, Steps, Transmitter};
+pub use transport::{Pace, PacedSource, Recorder, Steps, Transmitter};
 #[doc(hidden)]
 pub use wire::{
     CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,

@@ -68,7 +68,7 @@ struct Place {
     axes: [Vec3; 2],
 }
 
-/// What is counted of one channel, by direction.
+/// Counts of one channel by direction.
 #[derive(Clone)]
 struct ChannelMaps {
     limit_m: f64,

@@ -15,7 +15,7 @@ use crate::products::pictures::Picture;
 pub struct MadeFigure {
     /// Its name.
     pub figure: String,
-    /// What it shows, in numbers.
+    /// Its content in numbers.
     pub numbers: Value,
     /// Its files.
     pub files: Vec<PathBuf>,
@@ -23,7 +23,7 @@ pub struct MadeFigure {
 
 /// A figure before it is written.
 pub(super) struct FigureParts {
-    /// What it shows, in numbers.
+    /// Its content in numbers.
     pub numbers: Value,
     /// Its table (CSV).
     pub csv: String,
@@ -34,7 +34,7 @@ pub(super) struct FigureParts {
 }
 
 impl FigureParts {
-    /// Of numbers that have a JSON form, as all of ours do.
+    /// A figure of one picture and table; the numbers must have a JSON form.
     pub fn new(numbers: &impl Serialize, csv: String, picture: Picture) -> Self {
         Self { numbers: serde_json::to_value(numbers).unwrap_or_default(), csv, picture, more: Vec::new() }
     }

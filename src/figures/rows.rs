@@ -34,7 +34,7 @@ struct RowNumbers {
 }
 
 /// Where a pair is, at which the figure looks.
-pub(super) struct Look {
+pub(super) struct PairMoment {
     pub pair: Pair,
     pub t_s: f64,
     pub geometry: PairGeometry,
@@ -43,7 +43,7 @@ pub(super) struct Look {
     pub length_bp: f64,
 }
 
-impl Look {
+impl PairMoment {
     /// The pair and time asked for, at the frequency of the first channel; by default the middle of the first window, and
     /// the pair whose baseline is closest to 2 b_p.
     pub fn new(plan: &Plan, request: &FigureRequest) -> Result<Self, FigureError> {
@@ -83,7 +83,7 @@ impl Look {
 }
 
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
-    let look = Look::new(plan, request)?;
+    let look = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
     let row = |method: PixelMethod| -> Result<[Vec<f64>; 2], FigureError> {
         let maker = RowMaker::new(nside, method)?;

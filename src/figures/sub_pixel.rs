@@ -194,7 +194,7 @@ fn of_nside(plan: &Plan, nside: usize) -> Result<Vec<SubPixelCase>, FigureError>
         .map(|(name, method)| {
             let rows = rows(&sample, nside, method)?;
             let (epsilon, sample) = (epsilon(plan), &sample);
-            let seen = Seen { epsilon, sample, sigma_k_sr: &sigma_k_sr, skies: &skies, rows: &rows };
+            let seen = CaseInputs { epsilon, sample, sigma_k_sr: &sigma_k_sr, skies: &skies, rows: &rows };
             Ok(SubPixelCase { rows: name, nside, nside_fine, ..seen.case() })
         })
         .collect()
@@ -243,7 +243,7 @@ fn rows(sample: &Sample, nside: usize, method: PixelMethod) -> Result<Mat<f64>, 
 }
 
 /// What a case is made from.
-struct Seen<'a> {
+struct CaseInputs<'a> {
     epsilon: f64,
     sample: &'a Sample,
     sigma_k_sr: &'a [f64],
@@ -252,7 +252,7 @@ struct Seen<'a> {
     rows: &'a Mat<f64>,
 }
 
-impl Seen<'_> {
+impl CaseInputs<'_> {
     fn case(&self) -> SubPixelCase {
         let (pixels, parts) = (self.rows.nrows(), self.rows.ncols());
         // b of every sky, a column a sky.
@@ -420,7 +420,8 @@ mod tests {
                 ((0..6).map(|v| [part(2 * v), part(2 * v + 1)]).collect(), map)
             })
             .collect();
-        let seen = Seen { epsilon: 0.1, sample: &sample, sigma_k_sr: &[0.5; 6], skies: &skies, rows: &rows };
+        let seen =
+            CaseInputs { epsilon: 0.1, sample: &sample, sigma_k_sr: &[0.5; 6], skies: &skies, rows: &rows };
         let found = seen.case();
         // A = r / sigma^2 / (r^2 / sigma^2 + epsilon W_max), W_max = r_11^2 / sigma^2.
         for (k, found) in found.map_k.iter().enumerate() {

@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::error::FigureError;
 use super::output::FigureParts;
 use super::request::FigureRequest;
-use super::rows::Look;
+use super::rows::PairMoment;
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, ColourScale, Palette, Raster, Scaling, draw_rasters};
 use crate::response::pixel::{CHILDREN, Comb, Directions, PairGeometry, PixelMethod, RowMaker, comb_sums};
@@ -64,7 +64,7 @@ struct Cell {
 }
 
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
-    let look = Look::new(plan, request)?;
+    let look = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
     let nside_fine = (CHILDREN * nside).min(FINE_NSIDE_MAX).max(nside);
     let frequency_hz = look.geometry.frequency_hz;
@@ -100,7 +100,7 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
 /// The waterfall, frequency by frequency at each time.
 fn cells(
     plan: &Plan,
-    look: &Look,
+    look: &PairMoment,
     fine: &SkyMap,
     [start_s, end_s]: [f64; 2],
 ) -> Result<Vec<Cell>, FigureError> {

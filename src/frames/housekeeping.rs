@@ -12,7 +12,7 @@ pub struct Housekeeping {
     pub time: MissionTime,
     /// Visibilities the mother integrated.
     pub sampled: u64,
-    /// Those that it dropped before they were sent.
+    /// Visibilities that it dropped before they were sent.
     pub dropped: u64,
 }
 

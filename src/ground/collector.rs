@@ -5,7 +5,7 @@ use std::path::Path;
 
 use bincode::{Decode, Encode};
 
-use super::hold_buffer::{Due, HeldPacket, HoldBuffer, Sent};
+use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
     ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
@@ -31,7 +31,7 @@ pub struct CollectorView<'a> {
 }
 
 impl CollectorState {
-    /// Of a collector that has received nothing.
+    /// The state of a collector that has received nothing.
     #[must_use]
     pub(super) fn new(wait_bytes: u64) -> Self {
         Self { held: HoldBuffer::new(wait_bytes), decoder: DecoderState::default() }
@@ -76,7 +76,7 @@ pub struct DeliveredPacket {
     pub header: PacketHeader,
     /// Its checksum.
     pub check: u32,
-    /// What it added to the counters.
+    /// Its contribution to the counters.
     pub reading: PacketReading,
 }
 
@@ -98,7 +98,7 @@ pub struct Delivery {
     pub frame: Option<GroundFrame>,
 }
 
-/// What a collector did last.
+/// The last step of a collector.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CollectorStep {
     /// Packets are to be applied that have not waited.
@@ -221,7 +221,7 @@ impl Collector {
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
-    pub fn next_delivery(&mut self, is_due: Due<'_>) -> Result<Option<Delivery>, DownlinkError> {
+    pub fn next_delivery(&mut self, is_due: IsDue<'_>) -> Result<Option<Delivery>, DownlinkError> {
         loop {
             match self.next_step(is_due)? {
                 CollectorStep::Delivery(found) | CollectorStep::Waited(found) => return Ok(Some(found)),
@@ -235,7 +235,7 @@ impl Collector {
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
-    pub fn next_step(&mut self, is_due: Due<'_>) -> Result<CollectorStep, DownlinkError> {
+    pub fn next_step(&mut self, is_due: IsDue<'_>) -> Result<CollectorStep, DownlinkError> {
         loop {
             if self.knows_instrument() {
                 if let Some(found) = self.next_due(is_due) {
@@ -246,17 +246,17 @@ impl Collector {
             }
             match self.take_event(is_due)? {
                 // Once for all positions of a piece of the stream: much may be held.
-                Handled::Nothing if self.reconsider() => {}
-                Handled::Nothing => return Ok(CollectorStep::Nothing),
-                Handled::Event => {}
-                Handled::Held(header) => return Ok(CollectorStep::Held(header)),
-                Handled::Delivery(found) => return Ok(CollectorStep::Delivery(found)),
+                EventOutcome::Nothing if self.reconsider() => {}
+                EventOutcome::Nothing => return Ok(CollectorStep::Nothing),
+                EventOutcome::Event => {}
+                EventOutcome::Held(header) => return Ok(CollectorStep::Held(header)),
+                EventOutcome::Delivery(found) => return Ok(CollectorStep::Delivery(found)),
             }
         }
     }
 
     /// The next of the held packets that are due; takes nothing from the stream.
-    pub fn next_waiting(&mut self, is_due: Due<'_>) -> Option<Delivery> {
+    pub fn next_waiting(&mut self, is_due: IsDue<'_>) -> Option<Delivery> {
         if self.knows_instrument() { self.next_due(is_due) } else { None }
     }
 
@@ -381,7 +381,7 @@ impl Collector {
     }
 
     /// The next held packets that are due; the instrument is known.
-    fn next_due(&mut self, is_due: Due<'_>) -> Option<Delivery> {
+    fn next_due(&mut self, is_due: IsDue<'_>) -> Option<Delivery> {
         loop {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
@@ -445,11 +445,11 @@ impl Collector {
     }
 
     /// Takes one event of the stream.
-    fn take_event(&mut self, is_due: Due<'_>) -> Result<Handled, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(Handled::Nothing) };
+    fn take_event(&mut self, is_due: IsDue<'_>) -> Result<EventOutcome, DownlinkError> {
+        let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
-            return Ok(Handled::Event);
+            return Ok(EventOutcome::Event);
         };
         let (offset, header) = (packet.offset, packet.header);
         let describes = header.kind == Kind::Instrument;
@@ -466,11 +466,11 @@ impl Collector {
             PacketInsertion::New => self.packets += 1,
             PacketInsertion::Known => {
                 self.link.accept(&Event::Duplicate { offset, header });
-                return Ok(Handled::Event);
+                return Ok(EventOutcome::Event);
             }
             PacketInsertion::Full => {
                 self.beyond = [self.beyond[0] + 1, self.beyond[1] + header.bytes as u64];
-                return Ok(Handled::Event);
+                return Ok(EventOutcome::Event);
             }
         }
         // As nearly all are: never copied into the hold buffer.
@@ -481,17 +481,17 @@ impl Collector {
         {
             let (frame, reading) = self.decoder.decode(packet, false);
             let packets = vec![DeliveredPacket { header, check: packet.check, reading }];
-            return Ok(Handled::Delivery(Delivery { packets, frame }));
+            return Ok(EventOutcome::Delivery(Delivery { packets, frame }));
         }
         self.held.insert(HeldPacket::of(&packet));
         if !describes && !self.knows_instrument() {
-            return Ok(Handled::Event);
+            return Ok(EventOutcome::Event);
         }
         if header.kind == Kind::Visibilities {
             self.candidates.push_back(header);
-            return Ok(Handled::Held(header));
+            return Ok(EventOutcome::Held(header));
         }
-        let Some(payload) = self.held.take_payload(&header) else { return Ok(Handled::Event) };
+        let Some(payload) = self.held.take_payload(&header) else { return Ok(EventOutcome::Event) };
         if describes {
             let whole: Vec<u8> = payload.iter().flat_map(|packet| packet.payload.iter().copied()).collect();
             if self.decoder.contradicts(&whole) {
@@ -502,12 +502,12 @@ impl Collector {
             // Everything else is held until then.
             self.candidates = headers(&self.held);
         }
-        Ok(Handled::Delivery(self.deliver(&payload)))
+        Ok(EventOutcome::Delivery(self.deliver(&payload)))
     }
 }
 
-/// What one event of a stream leads to.
-enum Handled {
+/// Outcome of one event of a stream.
+enum EventOutcome {
     /// No event.
     Nothing,
     /// Nothing to deliver yet.

@@ -68,7 +68,7 @@ impl GroundConfig {
         Ok(self.calibration.build(Path::new(""))?.describe(instrument)?)
     }
 
-    /// What holds visibilities until their gains are known, if gains are to be found.
+    /// The gate that holds visibilities until their gains are known, if gains are to be found.
     pub(super) fn gate(&self) -> Result<Option<PassGate>, CalibrationError> {
         if self.calibration.hook != CalibrationHook::Solve {
             return Ok(None);

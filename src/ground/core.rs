@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
-use super::lookout::{Occasion, Spotter};
+use super::live_view::{Activity, LiveViewWriter};
 use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
 use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
@@ -47,7 +47,7 @@ pub struct Ground {
     /// To senders that wait for a checkpoint.
     pub(super) promises: SenderPromises,
     /// For those who look on.
-    pub(super) spotter: Spotter,
+    pub(super) live_view_writer: LiveViewWriter,
 }
 
 impl Ground {
@@ -64,7 +64,7 @@ impl Ground {
             calibrator: config.calibrator(gate.as_ref(), &outcome.ledger)?,
             gate,
             accumulator: config.accumulator(&outcome.ledger),
-            spotter: Spotter::of(&outcome.lookout),
+            live_view_writer: LiveViewWriter::of(&outcome.live_view),
             outcome,
             archive: None,
             cancel: Cancel::new(),
@@ -125,7 +125,7 @@ impl Ground {
         self
     }
 
-    /// Those that hold parts of the sums.
+    /// The ranks that hold parts of the sums.
     #[must_use]
     #[doc(hidden)]
     pub fn ranks(&self) -> &Ranks {
@@ -245,10 +245,10 @@ impl Ground {
             let bad = packets.iter().map(|packet| u64::from(packet.reading.visibilities_bad_value)).sum();
             self.calibrator.count_bad(block.start, bad);
         }
-        let autos = self.spotter.expect_powers(frame.as_ref());
+        let autos = self.live_view_writer.expect_powers(frame.as_ref());
         let used = self.use_frame(&packets, frame, out);
         if let Some((span, autos)) = autos.zip(self.calibrator.autos()) {
-            self.spotter.see_powers(span, autos);
+            self.live_view_writer.see_powers(span, autos);
         }
         used
     }
@@ -261,7 +261,7 @@ impl Ground {
     ) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else {
             if let Some(placed) = placed(&mut self.calibrator, frame)? {
-                self.spotter.see(&placed);
+                self.live_view_writer.see(&placed);
                 self.accumulator.accept(placed, out)?;
             }
             return Ok(());
@@ -269,7 +269,7 @@ impl Ground {
         let mut draft = RecordDraft::of(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
-            self.spotter.see(&placed);
+            self.live_view_writer.see(&placed);
             draft.used_s = self.accumulator.accept(placed, out)?;
         }
         let posted = archive.record(packets, draft, self.calibrator.ephemeris());
@@ -303,16 +303,16 @@ impl Ground {
     }
 
     /// Shows the counters of the reception, and what else visitors see.
-    fn show(&self, occasion: Occasion) {
+    fn show(&self, activity: Activity) {
         // First, so that nobody sees counters that are newer.
-        self.spotter.show(occasion, &self.collector, self.calibrator.ephemeris());
+        self.live_view_writer.show(activity, &self.collector, self.calibrator.ephemeris());
         fill(&self.outcome.reception, self.collector.counters());
         self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
     /// Shows what earlier sessions have received, before anything comes.
     pub(super) fn show_state(&mut self, latest_s: Option<f64>) {
-        self.spotter.resume(latest_s, &self.collector, self.calibrator.ephemeris());
+        self.live_view_writer.resume(latest_s, &self.collector, self.calibrator.ephemeris());
         fill(&self.outcome.reception, self.collector.counters());
         self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
@@ -416,14 +416,14 @@ impl Stage for Ground {
         }
         self.steps += 1;
         if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
-            self.show(Occasion::Work);
+            self.show(Activity::Working);
         }
         Ok(())
     }
 
-    /// Who watches a link that falls silent sees all that came.
+    /// Updates the view when the link falls silent.
     fn rest(&mut self) {
-        self.show(Occasion::Rest);
+        self.show(Activity::Idle);
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
@@ -436,7 +436,7 @@ impl Stage for Ground {
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }
-        self.show(Occasion::Rest);
+        self.show(Activity::Idle);
         fill(&self.outcome.autos, self.calibrator.auto_powers());
         Ok(self.accumulator.finish(out)?)
     }

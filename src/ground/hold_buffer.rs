@@ -24,7 +24,7 @@ const BEFORE_INSTRUMENT_BYTES: u64 = 1 << 26;
 const SEGMENTS_MAX: usize = 4096;
 
 /// Whether visibilities can be delivered: their positions are known, and what else is needed.
-pub type Due<'a> = &'a dyn Fn(&VisibilitiesOutline) -> bool;
+pub type IsDue<'a> = &'a dyn Fn(&VisibilitiesOutline) -> bool;
 
 /// Order of sending within a kind: creation time and count.
 pub(super) type Sent = (CucTime, u64);
@@ -34,7 +34,7 @@ pub(super) type Sent = (CucTime, u64);
 pub struct HeldPacket {
     /// Its headers.
     pub header: PacketHeader,
-    /// What it carries.
+    /// Its content.
     pub payload: Vec<u8>,
     /// Its checksum, over headers and payload.
     pub check: u32,
@@ -60,7 +60,7 @@ impl HeldPacket {
         self.outline().map(|outline| outline.span)
     }
 
-    /// What visibilities it claims to hold; `None` if it does not say so.
+    /// Outline of the visibilities that it claims to hold; `None` if it has none.
     #[must_use]
     pub fn outline(&self) -> Option<VisibilitiesOutline> {
         visibilities_outline(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
@@ -163,7 +163,7 @@ impl HoldBuffer {
     }
 
     /// Releases a packet of visibilities once `is_due` holds of what it claims to hold, or if it does not say that.
-    pub fn release(&mut self, header: &PacketHeader, is_due: Due<'_>) -> Option<HeldPacket> {
+    pub fn release(&mut self, header: &PacketHeader, is_due: IsDue<'_>) -> Option<HeldPacket> {
         if self.get(header)?.outline().as_ref().is_none_or(is_due) { self.remove(header) } else { None }
     }
 

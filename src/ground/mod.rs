@@ -13,7 +13,7 @@ mod config;
 mod core;
 mod error;
 mod hold_buffer;
-mod lookout;
+mod live_view;
 mod outcome;
 mod pass_gate;
 mod pass_line;
@@ -33,9 +33,9 @@ pub use config::GroundConfig;
 pub use config::WAIT_BYTES;
 pub use error::GroundError;
 #[doc(hidden)]
-pub use hold_buffer::{Due, HeldPacket, HoldBuffer};
+pub use hold_buffer::{HeldPacket, HoldBuffer, IsDue};
 #[doc(hidden)]
-pub use lookout::{ArrayNow, Lookout};
+pub use live_view::{ArrayNow, LiveView};
 #[doc(hidden)]
 pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 #[doc(hidden)]

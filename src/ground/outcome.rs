@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
-use super::{GroundError, Lookout};
+use super::{GroundError, LiveView};
 
 use crate::calibration::{Completeness, SolvedGains};
 use crate::downlink::ReceptionCounters;
@@ -32,7 +32,7 @@ pub struct GroundOutcome {
     /// How its checkpoints went, at any time.
     pub saving: SharedSaving,
     /// Where visitors see it at work.
-    pub lookout: Lookout,
+    pub live_view: LiveView,
 }
 
 /// A checkpoint is due once what came first after the last one is so old.
@@ -79,7 +79,7 @@ fn attempts(count: u64) -> String {
 #[derive(Clone, Debug, Default)]
 pub struct SharedSaving(Arc<Mutex<Option<Saving>>>);
 
-/// What a [`SavingReport`] is made of.
+/// Shared source of a [`SavingReport`].
 #[derive(Debug, Default)]
 struct Saving {
     report: SavingReport,
@@ -89,7 +89,7 @@ struct Saving {
     /// When the first packet came that no checkpoint holds.
     unsaved_since: Option<Instant>,
     written_at: Option<Instant>,
-    /// By age, none is due before.
+    /// Time before which no checkpoint is due by age.
     not_before: Option<Instant>,
 }
 

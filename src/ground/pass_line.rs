@@ -44,7 +44,7 @@ pub struct MissingRange {
     pub between_s: [f64; 2],
 }
 
-/// What has been received, and what has not, on the axis of mission time. Bounded, however long the mission.
+/// Received and missing packets over mission time, in a bounded number of bins.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PassLine {
     /// Mission epoch: TAI seconds since 1958-01-01.
@@ -53,7 +53,7 @@ pub struct PassLine {
     pub start_s: f64,
     /// Width of a bin, s.
     pub bin_s: f64,
-    /// The kinds of which anything came.
+    /// The kinds that were received.
     pub kinds: Vec<KindLine>,
     /// Missing packets, the latest first; at most a thousand ranges.
     pub ranges: Vec<MissingRange>,

@@ -5,9 +5,9 @@ use crate::downlink::transport::socket::HeldAnswers;
 /// Tells senders what is in a checkpoint.
 #[derive(Debug, Default)]
 pub(super) struct SenderPromises {
-    /// Those who wait; `None` if nobody may.
+    /// Senders that wait; `None` if none may.
     answers: Option<HeldAnswers>,
-    /// Bytes of the stream of which every packet has been applied, or is held.
+    /// Bytes of the stream whose packets have all been applied, or are held.
     pub(super) bytes: u64,
     /// Bytes that were applied before the stream began: from the raw archive.
     before: u64,
@@ -16,7 +16,7 @@ pub(super) struct SenderPromises {
 }
 
 impl SenderPromises {
-    /// Of a ground whose newest checkpoint has this number of packets.
+    /// The promises of a ground whose newest checkpoint has this number of packets.
     pub(super) fn since(packets: u64) -> Self {
         Self { packets, ..Self::default() }
     }

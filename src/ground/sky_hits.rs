@@ -7,7 +7,7 @@ use crate::frames::PlacedVisibilities;
 use crate::sky::healpix::{pixel_count, pixel_directions, pixel_of};
 use crate::units::vector::{Vec3, norm, scale};
 
-/// Of the directions of the sky, and of those in which pairs of satellites stood: pixels of 3.7 degrees.
+/// nside of the sky's directions and of the pairs' directions: pixels of 3.7 degrees.
 const NSIDE: usize = 16;
 
 /// One visibility of so many is counted.

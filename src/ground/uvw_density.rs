@@ -31,7 +31,7 @@ pub struct UvwDensity {
     pub visibilities: u64,
     /// One of so many is in the planes, the first included.
     pub every: u64,
-    /// Those that are in none: their baseline is longer than any plane.
+    /// Visibilities outside all planes: their baseline is too long.
     pub beyond: u64,
     /// Half side of a plane, wavelengths: cells go from minus this to this.
     pub extent_wavelengths: f64,

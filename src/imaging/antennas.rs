@@ -1,6 +1,6 @@
 //! Configuration of the daughters' antennas as maps take them to be.
 
-use crate::imaging::anywhere::AntennaBelief;
+use crate::imaging::anywhere::AssumedAntenna;
 use crate::response::PatternsByFrequency;
 use crate::units::{Checks, keys};
 
@@ -49,13 +49,13 @@ impl AntennasConfig {
     }
 
     /// What is believed of each antenna, without patterns by frequency; empty if all are ideal.
-    pub(super) fn beliefs(&self) -> Vec<AntennaBelief> {
+    pub(super) fn assumed(&self) -> Vec<AssumedAntenna> {
         if self.is_ideal() {
             return Vec::new();
         }
         let count = self.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
         let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
-        let antenna = |k: usize| AntennaBelief {
+        let antenna = |k: usize| AssumedAntenna {
             tilt_deg: [of(&self.tilt_along_deg, k), of(&self.tilt_radial_deg, k)],
             distortion: of(&self.pattern, k),
         };

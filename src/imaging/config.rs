@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::frames::Instrument;
 use crate::imaging::antennas::AntennasConfig;
-use crate::imaging::anywhere::RowBelief;
+use crate::imaging::anywhere::AssumedInstrument;
 use crate::imaging::circle::L_MAX;
 use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
@@ -23,7 +23,7 @@ use crate::units::{ChannelId, Checks, InvalidValue, PerChannel, keys};
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 
 /// Greatest nside of the pixel engine without its matrix: a pass over the rows of a million visibilities takes hours.
-pub const REMADE_NSIDE_MAX: usize = 256;
+pub const MATRIX_FREE_NSIDE_MAX: usize = 256;
 
 /// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
@@ -57,11 +57,11 @@ pub enum EngineKind {
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum MatrixKind {
-    /// It is summed and held, and factorised.
+    /// Forms the normal matrix in memory and factorises it (Cholesky).
     #[default]
-    Held,
-    /// Visibilities are held instead, and rows of B made again for each product of an iteration.
-    Remade,
+    Stored,
+    /// Keeps the visibilities instead, and computes rows of B again for each iteration.
+    Free,
 }
 
 /// What R is.
@@ -82,7 +82,7 @@ pub enum RegulariserChoice {
 keys! {
     /// Configuration of map making.
     pub struct MapConfig {
-        /// HEALPix nside of the maps: a power of two, up to 64 (engine "pixel"), 256 (with matrix = "remade") or 1024 (engine
+        /// HEALPix nside of the maps: a power of two, up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
         /// Basis of the normal equations: "pixel", exact on any orbit, or "harmonic", far cheaper, for satellites on one circle
@@ -95,11 +95,11 @@ keys! {
         /// Rows of B: "average" over pixels, or "centre" of pixels.
         #[only_with(r#"map.engine = "pixel""#)]
         expert rows: PixelMethod = PixelMethod::Average;
-        /// What the pixel engine does with its matrix: "held" in memory, or "remade": rows of B are made again for each product
+        /// What the pixel engine does with its matrix: "stored" in memory and factorised, or "free": rows of B are computed again for each product
         /// of an iteration.
         #[only_with(r#"map.engine = "pixel""#)]
         #[serde(skip_serializing_if = "is_usual")]
-        everyday matrix: MatrixKind = MatrixKind::Held;
+        everyday matrix: MatrixKind = MatrixKind::Stored;
         /// Highest degree of a map; 0 for 2.5 nside.
         #[only_with(r#"map.engine = "harmonic""#)]
         expert l_max: usize = 0;
@@ -110,7 +110,7 @@ keys! {
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
         /// Regulariser R: "data", 1 / C_l of the sky as the data have it, the default without epsilon, map.refine, matrix =
-        /// "remade" and pixels beyond nside 32; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
+        /// "free" and pixels beyond nside 32; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
         /// (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a channel.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
@@ -140,10 +140,10 @@ keys! {
         /// Seed of the noise-only companion map.
         expert companion_seed: u64 = 1;
         /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "remade""#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
         expert residual_max: f64 = 1e-4;
         /// Most iterations of a solution.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "remade""#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
         expert iterations_max: usize = 300;
         /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside
         /// 16, or l_max 54) are exact and need none: any number above 0 will do.
@@ -176,7 +176,7 @@ keys! {
         expert residual_max: f64 = 1e-3;
         /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further
         /// ones are left out and counted.
-        #[only_with(r#"map.refine.passes_max > 0 or map.matrix = "remade""#)]
+        #[only_with(r#"map.refine.passes_max > 0 or map.matrix = "free""#)]
         expert visibilities_max: u64 = 30_000_000;
         /// Whether visibilities are averages over their integrations, or instants in their middle.
         #[only_with("map.refine.passes_max > 0")]
@@ -201,7 +201,7 @@ fn is_off(value: &bool) -> bool {
 
 /// Likewise.
 fn is_usual(matrix: &MatrixKind) -> bool {
-    *matrix == MatrixKind::Held
+    *matrix == MatrixKind::Stored
 }
 
 impl MapConfig {
@@ -236,15 +236,15 @@ impl MapConfig {
     /// Whether rows of B are made again for each product over pixels.
     #[must_use]
     #[doc(hidden)]
-    pub fn is_remade(&self) -> bool {
-        self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Remade
+    pub fn is_matrix_free(&self) -> bool {
+        self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Free
     }
 
     /// Whether visibilities are held one by one instead of sums.
     #[must_use]
     #[doc(hidden)]
     pub fn holds_visibilities(&self) -> bool {
-        self.refine.is_on() || self.is_remade()
+        self.refine.is_on() || self.is_matrix_free()
     }
 
     /// All invalid settings; empty if there are none.
@@ -255,7 +255,7 @@ impl MapConfig {
         let is_harmonic = self.engine == EngineKind::Harmonic;
         let most = match self.engine {
             EngineKind::Harmonic => HARMONIC_ENGINE_NSIDE_MAX,
-            EngineKind::Pixel if self.is_remade() => REMADE_NSIDE_MAX,
+            EngineKind::Pixel if self.is_matrix_free() => MATRIX_FREE_NSIDE_MAX,
             EngineKind::Pixel => PIXEL_ENGINE_NSIDE_MAX,
         };
         let good = is_valid_nside(self.nside) && self.nside <= most;
@@ -314,9 +314,9 @@ impl MapConfig {
         );
         checks.require("refine.visibilities_max", visibilities_max, visibilities_max > 0, "at least 1");
         self.antennas.check(checks);
-        if self.is_remade() {
+        if self.is_matrix_free() {
             let probes = self.trace_probes;
-            let expected = "0 with map.matrix = \"remade\": traces need the matrix";
+            let expected = "0 with map.matrix = \"free\": traces need the matrix";
             checks.require("trace_probes", probes, probes == 0, expected);
         }
         if self.refine.is_on() {
@@ -351,7 +351,7 @@ impl MapConfig {
             "regulariser",
             found,
             is_identity || !self.holds_visibilities(),
-            "\"identity\", or no such key, with map.refine or map.matrix = \"remade\"",
+            "\"identity\", or no such key, with map.refine or map.matrix = \"free\"",
         );
         checks.require(
             "regulariser",
@@ -374,7 +374,7 @@ impl MapConfig {
             "beams_deg",
             format!("({beams} directions)"),
             few,
-            "at most 100, and none with map.refine or map.matrix = \"remade\"",
+            "at most 100, and none with map.refine or map.matrix = \"free\"",
         );
         for &[longitude_deg, latitude_deg] in &self.beams_deg {
             let good = longitude_deg.abs() <= 360.0 && latitude_deg.abs() <= 90.0;
@@ -439,7 +439,7 @@ impl MapConfig {
         match engine {
             EngineKind::Pixel => {
                 settings.push(("map.rows", format!("{rows:?}")));
-                if self.is_remade() {
+                if self.is_matrix_free() {
                     settings.push(("map.matrix", format!("{matrix:?}")));
                 }
             }
@@ -458,11 +458,11 @@ impl MapConfig {
     /// What the rows of a refined map are made with.
     #[must_use]
     #[doc(hidden)]
-    pub fn belief(&self) -> RowBelief {
+    pub fn assumed(&self) -> AssumedInstrument {
         let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
-        RowBelief {
+        AssumedInstrument {
             smear_integrations: self.refine.smear_integrations,
-            antennas: self.antennas.beliefs(),
+            antennas: self.antennas.assumed(),
             patterns: pattern_by_frequency.clone(),
         }
     }
@@ -485,7 +485,7 @@ impl MapConfig {
     }
 
     /// Requires that the sums of the channels of a group, of `channels` in all, take at most `limit_bytes`. Those of the
-    /// harmonic engine grow with the data, so nothing is known of them beforehand.
+    /// harmonic engine grow with the data, so they are not known beforehand.
     ///
     /// # Errors
     /// [`AccumulationError::Memory`].
@@ -497,7 +497,7 @@ impl MapConfig {
         group: Option<&ChannelGroup>,
     ) -> Result<(), AccumulationError> {
         let each = match self.engine {
-            EngineKind::Pixel if !self.is_remade() => PixelEngine::memory_bytes(self.nside),
+            EngineKind::Pixel if !self.is_matrix_free() => PixelEngine::memory_bytes(self.nside),
             EngineKind::Pixel | EngineKind::Harmonic => 0,
         };
         let is_summed =

@@ -130,7 +130,7 @@ impl EngineCost {
     /// The cost of the engine for a channel.
     pub(crate) fn of(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
-            EngineKind::Pixel if map.is_remade() => Self::remade(map, data),
+            EngineKind::Pixel if map.is_matrix_free() => Self::matrix_free(map, data),
             EngineKind::Pixel => Self::pixel(map),
             EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
             EngineKind::Harmonic => Self::harmonic(map, data),
@@ -159,7 +159,7 @@ impl EngineCost {
 
     /// Visibilities in memory, and as many products with their rows as there may be: each makes a row for each visibility, for the map
     /// and its noise map together.
-    fn remade(map: &MapConfig, data: ChannelData) -> Self {
+    fn matrix_free(map: &MapConfig, data: ChannelData) -> Self {
         let pixels = pixel_count(map.nside) as f64;
         let visibilities = data.visibilities.min(map.refine.visibilities_max as f64);
         let element_s = match map.rows {
@@ -267,7 +267,7 @@ mod tests {
         let data = ChannelData { frequency_hz: 1e7, visibilities: 25_000.0, windows: 100.0 };
         let of = |nside, iterations_max, rows| {
             let map =
-                MapConfig { nside, rows, matrix: MatrixKind::Remade, iterations_max, ..MapConfig::default() };
+                MapConfig { nside, rows, matrix: MatrixKind::Free, iterations_max, ..MapConfig::default() };
             EngineCost::of(&map, data)
         };
         let (few, many) = (of(64, 70, PixelMethod::Centre), of(64, 170, PixelMethod::Centre));

@@ -90,7 +90,7 @@ pub enum AccumulationError {
         "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \
          map.refine.visibilities_max = {most}: raise it"
     )]
-    TooManyHeld {
+    TooManyVisibilities {
         /// Channel.
         channel: ChannelId,
         /// Visibilities of all.

@@ -38,8 +38,8 @@ pub use exact::ExactEngine;
 pub use exact::automatic_weight_max;
 #[doc(hidden)]
 pub use pixel::{
-    Cholesky, ColumnBlock, NotPositive, PixelExtras, PointBeam, RemadeSums, RemadeVisibilities,
-    SymmetricTiles, TILE, solve_pixels_with, solve_pixels_with_power, solve_remade,
+    Cholesky, ColumnBlock, MatrixFreeSums, MatrixFreeVisibilities, NotPositive, PixelExtras, PointBeam,
+    SymmetricTiles, TILE, solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
 };
 pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]

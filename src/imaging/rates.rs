@@ -28,7 +28,7 @@ pub(crate) const HARMONIC_VISIBILITIES_PER_S: f64 = 4e5;
 /// l = 191 and u = 125 (bench `general`; half of it with AVX-512).
 pub(crate) const ROW_S: f64 = 1e-8;
 
-/// Visibilities of which one row is computed, the others being interpolated (bench `general`: 49; 41 of a mission; less where
+/// Visibilities for one computed row, the others being interpolated (bench `general`: 49; 41 of a mission; less where
 /// integrations are left out).
 pub(crate) const VISIBILITIES_PER_ROW: f64 = 40.0;
 

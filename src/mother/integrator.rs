@@ -77,11 +77,11 @@ struct QueuedWindow {
 struct QueuedChannel {
     visibilities: usize,
     /// The pairs that have integrations; none of a channel that is simulated elsewhere.
-    pairs: Vec<Scheduled>,
+    pairs: Vec<PairSchedule>,
 }
 
 /// The integrations of a pair in a window.
-struct Scheduled {
+struct PairSchedule {
     pair: Pair,
     integrations: Vec<Integration>,
 }
@@ -180,7 +180,7 @@ impl Integrator {
     fn schedule(&self, window: ObservingWindow) -> QueuedWindow {
         let pairs = all_pairs(self.array.satellites());
         let channel = |(schedule, model): (&Schedule, &ChannelModel)| {
-            let scheduled = |&pair: &Pair| Scheduled {
+            let scheduled = |&pair: &Pair| PairSchedule {
                 pair,
                 integrations: schedule.integrations(&self.array, window, pair),
             };
@@ -188,8 +188,8 @@ impl Integrator {
                 let count = |pair: &Pair| schedule.integrations(&self.array, window, *pair).len();
                 return QueuedChannel { visibilities: pairs.par_iter().map(count).sum(), pairs: Vec::new() };
             }
-            let all: Vec<Scheduled> = pairs.par_iter().map(scheduled).collect();
-            let pairs: Vec<Scheduled> =
+            let all: Vec<PairSchedule> = pairs.par_iter().map(scheduled).collect();
+            let pairs: Vec<PairSchedule> =
                 all.into_iter().filter(|pair| !pair.integrations.is_empty()).collect();
             QueuedChannel { visibilities: pairs.iter().map(|pair| pair.integrations.len()).sum(), pairs }
         };
@@ -266,7 +266,7 @@ impl Integrator {
         powers: &[SkyPowers],
         (shadows, passes): (&[EarthShadow], &[PassErrors]),
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
-        let scheduled: Vec<(WindowChannel, &Scheduled)> = queued
+        let scheduled: Vec<(WindowChannel, &PairSchedule)> = queued
             .iter()
             .zip(powers)
             .enumerate()
@@ -291,7 +291,7 @@ impl Integrator {
             parts.push(part);
             rest = after;
         }
-        let measure = |((context, pair), part): (&(WindowChannel, &Scheduled), &&[Complex64])| {
+        let measure = |((context, pair), part): (&(WindowChannel, &PairSchedule), &&[Complex64])| {
             self.measure(*context, pair, part)
         };
         let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
@@ -302,7 +302,7 @@ impl Integrator {
     }
 
     /// Positions of a pair at the middle of each of its integrations.
-    fn positions(&self, window: ObservingWindow, scheduled: &Scheduled) -> Vec<PairPosition> {
+    fn positions(&self, window: ObservingWindow, scheduled: &PairSchedule) -> Vec<PairPosition> {
         let Pair { i, j } = scheduled.pair;
         let position = |integration: &Integration| {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
@@ -323,7 +323,7 @@ impl Integrator {
     fn measure(
         &self,
         context: WindowChannel,
-        scheduled: &Scheduled,
+        scheduled: &PairSchedule,
         predictions: &[Complex64],
     ) -> VisibilityBlock {
         let WindowChannel { window, channel, powers, .. } = context;

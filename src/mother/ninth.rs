@@ -163,7 +163,7 @@ impl NinthSky {
     }
 }
 
-/// What [`Ninth`] needs.
+/// Setup of [`Ninth`].
 pub struct NinthSetup {
     /// The array whose orbit it shares.
     pub array: Arc<Array>,

@@ -150,7 +150,7 @@ pub struct SpoolReader {
 }
 
 impl SpoolReader {
-    /// Opens a file that was made from what `key` stands for; `None` if there is none, or if it was made from something else.
+    /// Opens a file whose key is `key`; `None` if there is no file, or if it has another key.
     ///
     /// # Errors
     /// A file that cannot be read.

@@ -20,9 +20,9 @@ pub struct PacedLink {
     pub bytes_per_s: f64,
 }
 
-/// A block in the store.
+/// A block that waits in the store.
 #[derive(Debug)]
-struct Held {
+struct HeldBlock {
     window: u64,
     value: Value,
     rank: Rank,
@@ -40,9 +40,9 @@ const PARTS: usize = 32;
 /// latest are dropped first.
 type Rank = (u64, u32);
 
-/// Either end of a block.
+/// End of a block from which visibilities are dropped.
 #[derive(Clone, Copy, Debug)]
-enum End {
+enum StoreEnd {
     Front,
     Back,
 }
@@ -67,7 +67,7 @@ pub struct Store {
     /// By window: the instrument and ephemeris frames that precede its visibilities.
     descriptions: BTreeMap<u64, Vec<GroundFrame>>,
     /// Blocks by arrival number.
-    held: BTreeMap<u64, Held>,
+    held: BTreeMap<u64, HeldBlock>,
     /// Blocks by rank; within a rank the latest arrival comes first.
     by_rank: BTreeSet<(Rank, Reverse<u64>)>,
     held_bytes: u64,
@@ -109,7 +109,7 @@ impl Store {
         self.kept += block.len() as u64;
         let rank = self.rank(self.window, value, &block);
         self.by_rank.insert((rank, Reverse(number)));
-        self.held.insert(number, Held { window: self.window, value, rank, block });
+        self.held.insert(number, HeldBlock { window: self.window, value, rank, block });
         while self.held_bytes > self.capacity_bytes {
             let too_many = (self.held_bytes - self.capacity_bytes).div_ceil(VISIBILITY_BYTES);
             let Some(gone) = self.drop_first(too_many) else { break };
@@ -140,13 +140,13 @@ impl Store {
         let least = offsets.len().div_ceil(PARTS);
         let (below_next, end) = match (self.drop, next) {
             (StoreDrop::Oldest, Some((window, ticks))) if window == held.window => {
-                (offsets.partition_point(|&offset| offset <= ticks), End::Front)
+                (offsets.partition_point(|&offset| offset <= ticks), StoreEnd::Front)
             }
             (StoreDrop::Newest, Some((window, ticks))) if !window == held.window => {
-                (offsets.len() - offsets.partition_point(|&offset| offset < !ticks), End::Back)
+                (offsets.len() - offsets.partition_point(|&offset| offset < !ticks), StoreEnd::Back)
             }
-            (StoreDrop::Oldest, _) => (offsets.len(), End::Front),
-            (StoreDrop::Newest | StoreDrop::LowestValue, _) => (offsets.len(), End::Back),
+            (StoreDrop::Oldest, _) => (offsets.len(), StoreEnd::Front),
+            (StoreDrop::Newest | StoreDrop::LowestValue, _) => (offsets.len(), StoreEnd::Back),
         };
         let gone = self.remove(number, count.min(below_next.max(least) as u64), end)?;
         Some(gone.len() as u64)
@@ -168,7 +168,7 @@ impl Store {
     }
 
     /// Removes `count` visibilities from one end of a block, or the whole block.
-    fn remove(&mut self, number: u64, count: u64, end: End) -> Option<VisibilityBlock> {
+    fn remove(&mut self, number: u64, count: u64, end: StoreEnd) -> Option<VisibilityBlock> {
         let held = self.held.get_mut(&number)?;
         let length = held.block.len();
         let count = usize::try_from(count).map_or(length, |count| count.min(length));
@@ -178,8 +178,8 @@ impl Store {
             return self.held.remove(&number).map(|held| held.block);
         }
         let taken = match end {
-            End::Back => held.block.split_off(length - count),
-            End::Front => {
+            StoreEnd::Back => held.block.split_off(length - count),
+            StoreEnd::Front => {
                 let rest = held.block.split_off(count);
                 std::mem::replace(&mut held.block, rest)
             }
@@ -218,7 +218,9 @@ impl Store {
                     self.descriptions.insert(window, descriptions);
                     return;
                 }
-                let Some(block) = self.remove(number, left / VISIBILITY_BYTES, End::Front) else { break };
+                let Some(block) = self.remove(number, left / VISIBILITY_BYTES, StoreEnd::Front) else {
+                    break;
+                };
                 left -= VISIBILITY_BYTES * block.len() as u64;
                 push_report(&mut report, out);
                 out.push(GroundFrame::Visibilities(block));

@@ -38,7 +38,7 @@ fn place(number: u64, of: u64) -> u64 {
     ((u128::from(mixed ^ (mixed >> 31)) * u128::from(of)) >> 64) as u64
 }
 
-/// How to keep one visibility in `thin`: the distance of windows and that of integrations. Many windows of which each gives few
+/// How to keep one visibility in `thin`: the distance of windows and that of integrations. Many windows that give few
 /// integrations cover the periods better than few whole ones.
 #[must_use]
 pub fn shares(thin: u64) -> (u64, u64) {

@@ -68,7 +68,7 @@ impl PairTroubles<'_> {
         self.errors.config().beacon.is_on(t_s - self.window.start.seconds())
     }
 
-    /// What is added to the next visibility, in units of its noise; nothing for most.
+    /// Outlier that is added to the next visibility, in units of its noise; zero for most.
     pub(super) fn outlier(&mut self) -> Complex64 {
         let config = self.errors.config();
         let Some(stream) = &mut self.outliers else { return Complex64::ZERO };

@@ -38,8 +38,8 @@ pub(crate) fn analysis(terms: usize) -> Vec<Vec<f64>> {
         .collect()
 }
 
-/// Lagrange's polynomials of the Chebyshev points at `tau`.
-pub(crate) fn lagrange(terms: usize, tau: f64) -> Vec<f64> {
+/// Weights of the values at the Chebyshev points for interpolation at `tau`.
+pub(crate) fn weights_at(terms: usize, tau: f64) -> Vec<f64> {
     let polynomials = polynomials(terms, tau);
     let analysis = analysis(terms);
     (0..terms).map(|k| (0..terms).map(|n| analysis[n][k] * polynomials[n]).sum()).collect()
@@ -71,7 +71,7 @@ mod tests {
                 let nodes = points(terms);
                 for k in 0..=20 {
                     let tau = 0.1 * f64::from(k) - 1.0;
-                    let weights = lagrange(terms, tau);
+                    let weights = weights_at(terms, tau);
                     let sum = |f: fn(f64) -> f64| -> f64 {
                         weights.iter().zip(&nodes).map(|(w, t)| w * f(h * t)).sum()
                     };

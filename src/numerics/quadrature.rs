@@ -32,7 +32,7 @@ impl GaussLegendre {
         }
         // From the middle outwards, each zero from the one before.
         let (value, slope) = legendre(n, 0.0);
-        let mut at = Around { n: n as f64, x: 0.0, value, slope };
+        let mut at = LegendreExpansion { n: n as f64, x: 0.0, value, slope };
         for k in (0..half).rev() {
             let is_middle = 2 * k + 1 == n;
             if !is_middle {
@@ -73,14 +73,14 @@ fn zero_by_recurrence(n: usize, k: usize) -> [f64; 2] {
 }
 
 /// P_n around a point.
-struct Around {
+struct LegendreExpansion {
     n: f64,
     x: f64,
     value: f64,
     slope: f64,
 }
 
-impl Around {
+impl LegendreExpansion {
     /// A neighbouring zero, by Newton's iteration on the Taylor series, whose terms follow from Legendre's equation:
     /// `(1 - x^2) (k + 1) (k + 2) a_{k+2} = 2 x (k + 1)^2 a_{k+1} + (k (k + 1) - n (n + 1)) a_k`.
     fn zero_near(&self, guess: f64) -> Self {

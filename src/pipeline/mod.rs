@@ -19,7 +19,7 @@ pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, R
 #[doc(hidden)]
 pub use graph::{
     BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, downlink_file,
-    run_among, sample_stages, sky_notes, use_threads,
+    run_with_ranks, sample_stages, sky_notes, use_threads,
 };
 pub use graph::{
     CalibrateSummary, Destination, GroundSource, RunSummary, Watched, Watcher, replay, run, simulate,

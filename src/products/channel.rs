@@ -22,14 +22,13 @@ use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
 use crate::units::constants::DAY_S;
 
-/// A ground that listens leaves this part of its disk free.
+/// Part of its disk that a listening ground leaves free.
 const KEPT_FREE: u64 = 20;
 
 /// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
 const SHEET_MAPS_MAX: usize = 6;
 
-/// The last map and its picture under names that stay. They are files of their own: a link breaks where a folder is copied, packed or
-/// moved to a system without links.
+/// Fixed names of the last map and its picture. They are files of their own, as links break where a folder is copied or packed.
 const LATEST_MAP: &str = "latest.fits";
 const LATEST_PICTURE: &str = "latest.png";
 
@@ -48,7 +47,7 @@ pub(super) struct ChannelFolder {
     files: Vec<String>,
     summary: Option<ChannelSummary>,
     beams: Vec<PointBeamSummary>,
-    /// Whether the last of the disk is left to others.
+    /// Whether it leaves a part of the disk free.
     leaves_room: bool,
 }
 
@@ -81,12 +80,12 @@ impl ChannelFolder {
         })
     }
 
-    /// Leaves the last of the disk to the state and the raw archive of a ground, which may be on the same one.
+    /// Leaves a part of the disk free for the state and the raw archive of a ground, which may be on the same one.
     pub(super) fn leaving_room(self) -> Self {
         Self { leaves_room: true, ..self }
     }
 
-    /// Final maps may take it: nothing comes after them.
+    /// Lets final maps take the rest of the disk: nothing comes after them.
     fn require_room(&self, solution: &Solution) -> Result<(), ProductsError> {
         let leaves = self.leaves_room && !solution.is_final;
         match disk_room(&self.root).filter(|_| leaves) {
@@ -99,8 +98,7 @@ impl ChannelFolder {
         }
     }
 
-    /// Writes the products of one solution; the complete set if the solution is final. If they cannot be written, it is as if there had
-    /// been none, but for viewers, who see the map.
+    /// Writes the products of one solution; the complete set if it is final. If they cannot be written, only viewers see the map.
     pub(super) fn publish(
         &mut self,
         solution: &Solution,
@@ -162,7 +160,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Shows the map to those who look on, as its file has it.
+    /// Shows the map to viewers, as its file has it.
     fn show(&self, comparison: Option<&Comparison>, origin: Origin<'_>, viewers: &MapWatch) {
         let Origin { provenance, solution } = origin;
         let Some(figures) = self.snapshots.last() else { return };
@@ -173,7 +171,7 @@ impl ChannelFolder {
         });
     }
 
-    /// The truth for maps that are shown.
+    /// The truth beside maps that are shown.
     fn input(&self, processing: Option<PostProcessing>) -> Option<&InputSky> {
         let truth = self.truth.as_ref()?;
         if processing.is_some() { truth.processed.as_ref() } else { Some(&truth.plain) }
@@ -181,7 +179,7 @@ impl ChannelFolder {
 
     fn compare(&self, solution: &Solution, shown: &ShownMaps) -> Result<Option<Comparison>, ProductsError> {
         let Some(input) = self.input(shown.processing) else { return Ok(None) };
-        // A map of harmonics has no power beyond its own degrees; pixels that were split have no more than before.
+        // A harmonic map has no power beyond its own degrees; split pixels have no more than before.
         let l_max = solution.diagnostics.l_max.unwrap_or(3 * solution.nside - 1);
         let comparison = compare_with(&shown.map, input, Some(&shown.noise), Some(l_max))?;
         let is_noisy = !solution.instrument.noiseless;
@@ -275,7 +273,7 @@ impl ChannelFolder {
         self.write_named(name, name.trim_end_matches(".fits"), map, processing, origin)
     }
 
-    /// Writes a map whose header says `what` it is.
+    /// Writes a map; `what` describes it in the header.
     fn write_named(
         &mut self,
         name: &str,
@@ -314,7 +312,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Maps of points, as solved and post-processed, and a table of their widths.
+    /// Beams as maps, solved and post-processed, and a table of their widths.
     fn write_beams(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         let Origin { solution, .. } = origin;
         for (number, beam) in solution.beams.iter().enumerate() {
@@ -358,7 +356,7 @@ impl ChannelFolder {
             Sheet { title, subtitle, width_px: 800, view: view(self.config.frame), ..Sheet::default() };
         let picture = draw_sheet(&[panel], &sheet)?;
         picture.write(&path)?;
-        // The picture of the final map is another.
+        // The final map has its own picture.
         if !solution.is_final {
             picture.write(&self.file(LATEST_PICTURE))?;
         }
@@ -417,7 +415,7 @@ impl ChannelFolder {
         self.write_picture("sharpening", &picture)
     }
 
-    /// Writes a final picture, as SVG, too, if that is wanted.
+    /// Writes a final picture, and the same as SVG if configured.
     fn write_picture(&mut self, name: &str, picture: &Picture) -> Result<(), ProductsError> {
         let path = self.file(&format!("{name}.png"));
         picture.write(&path)?;
@@ -440,7 +438,7 @@ struct Origin<'a> {
 struct ShownMaps {
     map: SkyMap,
     noise: SkyMap,
-    /// What was done with them.
+    /// How they were processed.
     processing: Option<PostProcessing>,
 }
 
@@ -450,7 +448,7 @@ impl ShownMaps {
         Ok(Self { map: apply(&self.map)?, noise: apply(&self.noise)?, processing: Some(processing) })
     }
 
-    /// In words.
+    /// The processing in words.
     fn resolution(&self) -> String {
         let nside = self.map.nside();
         match self.processing {
@@ -474,7 +472,7 @@ struct SheetMaps {
 }
 
 impl SheetMaps {
-    /// Offers a map; keeps it or not.
+    /// Offers a map, which is kept if its number is due.
     fn offer(&mut self, map: &[f64], caption: &str) {
         let is_kept = |offered: usize, halvings: u32| offered.is_multiple_of(1 << halvings);
         if is_kept(self.offered, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
@@ -534,7 +532,7 @@ fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
 /// Draws (map - truth) / truth over the sky, percent, in a celestial frame.
 ///
 /// # Errors
-/// None in practice: only a page that is too large, which one map is not.
+/// A page that is too large, which one map is not.
 pub fn draw_relative_error(
     title: &str,
     subtitle: &str,
@@ -557,7 +555,7 @@ pub fn draw_relative_error(
 /// Draws rho_l, the angular power spectra and SNR_l as curves.
 ///
 /// # Errors
-/// None in practice: only a page that is too large, which three plots are not.
+/// A page that is too large, which three plots are not.
 pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, PictureError> {
     let curve = |label: &str, values: &[f64], dashed: bool| Curve {
         label: label.to_owned(),

@@ -81,7 +81,7 @@ struct Tiles<'a> {
 }
 
 /// What a tile and those in it leave to the orders above.
-struct Written {
+struct TileSummary {
     tile: Tile,
     /// Tiles of order 3 with their numbers, reduced.
     previews: Vec<(usize, Tile)>,
@@ -131,7 +131,7 @@ impl Hips {
             width,
             folder,
         };
-        let faces: Vec<Written> =
+        let faces: Vec<TileSummary> =
             (0..12).into_par_iter().map(|face| tiles.write(0, face)).collect::<Result<_, _>>()?;
         let mut previews = Vec::new();
         let mut count = 0;
@@ -198,7 +198,7 @@ impl Hips {
 
 impl Tiles<'_> {
     /// Writes a tile and all that are in it.
-    fn write(&self, order: u8, number: usize) -> Result<Written, ProductsError> {
+    fn write(&self, order: u8, number: usize) -> Result<TileSummary, ProductsError> {
         let (mut previews, mut count) = (Vec::new(), 1);
         let tile = if order == self.order {
             self.sampled(number)
@@ -228,7 +228,7 @@ impl Tiles<'_> {
             Card::integer("NPIX", number as i64, "NESTED number of the tile"),
         ];
         self.write_both(&folder, &format!("Npix{number}"), self.width, &tile, &cards)?;
-        Ok(Written { tile, previews, count })
+        Ok(TileSummary { tile, previews, count })
     }
 
     /// The map's values at the centres of a tile's pixels.

@@ -12,10 +12,10 @@ use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 /// Most runs that are drawn over one another: more cannot be told apart.
 const DRAWN_MAX: usize = 14;
 
-/// What a run's `summary.json` says of its maps.
+/// The maps of a run, from its `summary.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunFigures {
-    /// What tells it from the others: its name, unless a study labels it.
+    /// Label: its name, or that of a study's case.
     #[serde(rename = "name")]
     pub label: String,
     /// Whether it was ended early.
@@ -24,7 +24,7 @@ pub struct RunFigures {
     pub channels: Vec<ChannelFigures>,
 }
 
-/// Figures of one channel's final map. Spectra run from l = 0; what is not known is `None`.
+/// Figures of one channel's final map. Spectra run from l = 0; unknown values are `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChannelFigures {
     /// Frequency, Hz.
@@ -43,7 +43,7 @@ pub struct ChannelFigures {
     pub diagnostics: DiagnosticFigures,
     /// rho_l.
     pub rho: Option<Vec<Option<f64>>>,
-    /// rho_l, the power of the noise subtracted.
+    /// rho_l with the noise's power subtracted.
     pub rho_noise_subtracted: Option<Vec<Option<f64>>>,
     /// SNR_l.
     pub snr: Option<Vec<Option<f64>>>,
@@ -53,7 +53,7 @@ pub struct ChannelFigures {
     pub beam: Option<BeamFigures>,
     /// Relative error by distance from the ecliptic.
     pub latitudes: Option<Vec<LatitudeError>>,
-    /// What an imperfect instrument leaves of the power, in a study of its errors.
+    /// Power relative to an ideal instrument, in a study of errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub power_kept: Option<PowerKept>,
 }
@@ -68,7 +68,7 @@ pub struct PowerKept {
 }
 
 impl PowerKept {
-    /// What `map` keeps of `ideal`; `None` if either has no power.
+    /// The power of `map` relative to `ideal`; `None` if either has none.
     fn of(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
         let (map, ideal) = (map.power.as_ref()?, ideal.power.as_ref()?);
         let ratios = |of: &[Option<f64>], to: &[Option<f64>], power: i32| {
@@ -94,7 +94,7 @@ pub struct DiagnosticFigures {
     pub w_max: Option<f64>,
     /// Traces, if they were asked for.
     pub traces: Option<TraceFigures>,
-    /// What the map leaves of the data, likewise.
+    /// Residuals of the data, if they were asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<FitFigures>,
 }
@@ -124,7 +124,7 @@ pub struct TraceFigures {
     pub measured: Option<EstimateFigures>,
 }
 
-/// A value with its error; `None` if nothing bounds it.
+/// A value with its error; `None` if it has no bound.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EstimateFigures {
     /// Value.
@@ -205,7 +205,7 @@ impl ChannelFigures {
 }
 
 impl RunFigures {
-    /// Notes what each channel's map keeps of the power of that of an instrument without errors.
+    /// Notes the power of each channel's map relative to that of an instrument without errors.
     pub fn against_ideal(&mut self, ideal: &Self) {
         for channel in &mut self.channels {
             let same = ideal.channels.iter().find(|ideal| ideal.frequency_hz == channel.frequency_hz);
@@ -214,7 +214,7 @@ impl RunFigures {
     }
 }
 
-/// Where thermal noise and imperfection are alike, as epsilon changes and nothing else (the paper, Fig. 15).
+/// Where thermal noise equals what the regulariser leaves out, as only epsilon changes (the paper, Fig. 15).
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Crossing {
     /// Label of the first of the runs.
@@ -353,7 +353,7 @@ pub fn spectra_csv(runs: &[&RunFigures]) -> String {
 /// Curves of runs over one another: rho_l, SNR_l, C_l of the maps, and the traces against epsilon where there are some.
 ///
 /// # Errors
-/// None in practice: only a page that is too large, which six plots are not.
+/// A page that is too large, which six plots are not.
 pub fn draw_runs(title: &str, runs: &[&RunFigures]) -> Result<Picture, PictureError> {
     let channels: Vec<(String, &ChannelFigures)> = runs
         .iter()

@@ -17,7 +17,7 @@ impl RankJob {
     /// MPI that was started before, or that does not work with threads.
     #[cfg(feature = "mpi")]
     pub fn start() -> Result<(Self, Ranks), RanksError> {
-        let super::world::Joined { universe, ranks, here } = super::world::join()?;
+        let super::world::MpiJob { universe, ranks, here } = super::world::join()?;
         Ok((Self { here, _universe: universe }, ranks))
     }
 

@@ -16,7 +16,7 @@ use super::{RankExchange, RankShare, Ranks, RanksError};
 const ABORT: Duration = Duration::from_secs(3);
 
 /// What joining a job yields.
-pub(super) struct Joined {
+pub(super) struct MpiJob {
     /// Finalises MPI when it is dropped.
     pub(super) universe: Universe,
     pub(super) ranks: Ranks,
@@ -25,7 +25,7 @@ pub(super) struct Joined {
 }
 
 /// Joins the job that the process was started in, which may be the process alone.
-pub(super) fn join() -> Result<Joined, RanksError> {
+pub(super) fn join() -> Result<MpiJob, RanksError> {
     let (universe, threading) =
         mpi::initialize_with_threading(Threading::Serialized).ok_or(RanksError::AlreadyStarted)?;
     if threading < Threading::Serialized {
@@ -35,7 +35,7 @@ pub(super) fn join() -> Result<Joined, RanksError> {
     let number = |of_c: i32| usize::try_from(of_c).unwrap_or(0);
     let share = RankShare { rank: number(world.rank()), count: number(world.size()).max(1) };
     let here = number(world.split_shared(world.rank()).size()).max(1);
-    Ok(Joined { universe, ranks: Ranks::new(share, Arc::new(World)), here })
+    Ok(MpiJob { universe, ranks: Ranks::new(share, Arc::new(World)), here })
 }
 
 /// Ends all ranks at once.

@@ -23,7 +23,7 @@ impl PatternsByFrequency {
         self.0.iter().all(|row| row.iter().skip(1).all(|q| *q == 0.0))
     }
 
-    /// That of a daughter, from 0, at a frequency; 0 for daughters that rows do not reach.
+    /// q of a daughter, from 0, at a frequency; 0 for daughters beyond the rows.
     #[must_use]
     pub fn q(&self, daughter: usize, frequency_hz: f64) -> f64 {
         let of = |row: &[f64]| match row {

@@ -9,8 +9,6 @@ keys! {
         expert queue_capacity: usize = 64;
         /// Threads for the work inside stages; 0 for one a core.
         everyday threads: usize = 0;
-        /// Time that stages have to end after a failure, s.
-        expert shutdown_s: f64 = 10.0;
         /// Time for maps of the data so far after Ctrl-C, s; solutions that take longer are cut off. What was received is saved
         /// first, and is not part of it.
         everyday grace_s: f64 = 2.5;
@@ -38,8 +36,6 @@ impl RuntimeConfig {
             self.threads <= 1024,
             "at most 1024, or 0 for one a core",
         );
-        let seconds = self.shutdown_s;
-        checks.number("shutdown_s", seconds, (0.0..=3600.0).contains(&seconds), "0 s to 3600 s");
         let grace = self.grace_s;
         checks.number("grace_s", grace, (0.0..=1e6).contains(&grace), "0 s to 1e6 s");
         let stall = self.stall_s;

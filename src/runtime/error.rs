@@ -29,14 +29,14 @@ impl fmt::Display for Moment {
 
 /// Stages that had not ended by the deadline; displayed as an empty string if there are none.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Laggards {
+pub struct UnfinishedStages {
     /// Their names, in the order in which they were added.
     pub stages: Vec<String>,
     /// How long the supervisor waited for them.
     pub waited: Duration,
 }
 
-impl fmt::Display for Laggards {
+impl fmt::Display for UnfinishedStages {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.stages.is_empty() {
             return Ok(());
@@ -60,7 +60,7 @@ pub enum RuntimeError {
         /// Its position.
         at: Moment,
         /// Stages that did not stop in time.
-        laggards: Laggards,
+        laggards: UnfinishedStages,
         /// The stage's error.
         source: BoxError,
     },
@@ -74,7 +74,7 @@ pub enum RuntimeError {
         /// The panic's message.
         message: String,
         /// Stages that did not stop in time.
-        laggards: Laggards,
+        laggards: UnfinishedStages,
     },
     /// No stage made progress any more.
     #[error("no stage made progress for {:.1} s; in a step: `{}`{laggards}", waited.as_secs_f64(), stages.join("`, `"))]
@@ -84,7 +84,7 @@ pub enum RuntimeError {
         /// How long there was no progress.
         waited: Duration,
         /// Stages that did not stop in time.
-        laggards: Laggards,
+        laggards: UnfinishedStages,
     },
     /// A thread could not be started.
     #[error("no thread for stage `{stage}`{laggards}; the system's limit on threads may be too low")]
@@ -92,7 +92,7 @@ pub enum RuntimeError {
         /// Name of the stage.
         stage: String,
         /// Stages that did not stop in time.
-        laggards: Laggards,
+        laggards: UnfinishedStages,
         /// The system's error.
         source: std::io::Error,
     },
@@ -102,7 +102,7 @@ pub enum RuntimeError {
         /// Name of the stage that fills the queue.
         stage: String,
     },
-    /// A name that is no name for a thread, or in use.
+    /// A name that is invalid for a thread, or in use.
     #[error("stage name `{stage}`: expected a unique name, not empty and without NUL")]
     Name {
         /// The name.

@@ -8,7 +8,7 @@ use crossbeam_channel::{Receiver, bounded};
 use super::cancel::{Cancel, Halt};
 use super::error::RuntimeError;
 use super::metrics::{Counters, Metrics};
-use super::outlet::{Outlet, Queue, Stamped};
+use super::outlet::{Outlet, Queue, StampedItem};
 use super::report::Report;
 use super::stage::{Sink, Source, Stage};
 use super::supervisor;
@@ -18,7 +18,7 @@ use super::worker::{Inlet, SinkWorker, SourceWorker, StageNode, StageWorker, Wor
 /// The output of a source or stage, not yet connected.
 #[must_use = "this output is not connected: end the chain with a sink"]
 pub struct Link<T> {
-    receiver: Receiver<Stamped<T>>,
+    receiver: Receiver<StampedItem<T>>,
     capacity: usize,
     from: usize,
     /// Which graph it belongs to.

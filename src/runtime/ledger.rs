@@ -59,20 +59,6 @@ impl<R: Reason> Ledger<R> {
         }
     }
 
-    /// Subtracts all counts of a report that was posted before; entries that reach zero go.
-    #[doc(hidden)]
-    pub fn withdraw(&self, report: &LedgerReport<R>) {
-        let mut counts = self.counts();
-        counts.sampled = counts.sampled.saturating_sub(report.sampled);
-        counts.accumulated = counts.accumulated.saturating_sub(report.accumulated);
-        for (reason, &count) in &report.left_out {
-            if let Some(entry) = counts.left_out.get_mut(reason) {
-                *entry = entry.saturating_sub(count);
-            }
-        }
-        counts.left_out.retain(|_, count| *count > 0);
-    }
-
     /// Returns all counts and resets them to zero.
     #[must_use]
     #[doc(hidden)]
@@ -345,21 +331,6 @@ mod tests {
                 }
             });
             prop_assert_eq!(forward.report(), together.report());
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn what_is_withdrawn_was_never_there(first in fates(), second in fates()) {
-            let (ledger, alone, part) = (Ledger::new(), Ledger::new(), Ledger::new());
-            for (fates, to) in [(&first, [&ledger, &alone]), (&second, [&ledger, &part])] {
-                for &(fate, count) in fates {
-                    to.iter().for_each(|ledger| post(ledger, fate, count));
-                }
-            }
-            ledger.withdraw(&part.take());
-            prop_assert_eq!(ledger.report(), alone.report());
-            prop_assert_eq!(part.report(), LedgerReport::default());
         }
     }
 

@@ -35,7 +35,7 @@ pub use cancel::Cancel;
 pub use config::RuntimeConfig;
 pub use error::RuntimeError;
 #[doc(hidden)]
-pub use error::{BoxError, Laggards, Moment};
+pub use error::{BoxError, Moment, UnfinishedStages};
 pub use graph::{Graph, Link};
 #[doc(hidden)]
 pub use ledger::LedgerImbalance;

@@ -12,7 +12,7 @@ use super::metrics::Counters;
 const ROOM_POLL: Duration = Duration::from_millis(10);
 
 /// An item, and the instant at which the source emitted the item that it was made from.
-pub(super) struct Stamped<T> {
+pub(super) struct StampedItem<T> {
     pub(super) item: T,
     pub(super) born: Instant,
 }
@@ -118,7 +118,7 @@ impl<T> Outlet<T> {
 
 /// The sending end of a link.
 pub(super) struct Queue<T> {
-    sender: Sender<Stamped<T>>,
+    sender: Sender<StampedItem<T>>,
     halt: Arc<Halt>,
     counters: Arc<Counters>,
     /// Source timestamp of pushed items; `None` in a source, which stamps them as it pushes.
@@ -128,7 +128,7 @@ pub(super) struct Queue<T> {
 }
 
 impl<T> Queue<T> {
-    pub(super) fn new(sender: Sender<Stamped<T>>, halt: Arc<Halt>, counters: Arc<Counters>) -> Self {
+    pub(super) fn new(sender: Sender<StampedItem<T>>, halt: Arc<Halt>, counters: Arc<Counters>) -> Self {
         Self { sender, halt, counters, born: None, waited: Duration::ZERO, closed: false }
     }
 
@@ -151,7 +151,7 @@ impl<T> Queue<T> {
             return;
         }
         let born = self.born.unwrap_or_else(Instant::now);
-        match self.sender.try_send(Stamped { item, born }) {
+        match self.sender.try_send(StampedItem { item, born }) {
             Ok(()) => {}
             Err(TrySendError::Full(stamped)) => self.wait_and_push(stamped),
             Err(TrySendError::Disconnected(_)) => self.closed = true,
@@ -161,7 +161,7 @@ impl<T> Queue<T> {
         }
     }
 
-    fn wait_and_push(&mut self, stamped: Stamped<T>) {
+    fn wait_and_push(&mut self, stamped: StampedItem<T>) {
         let since = Instant::now();
         self.counters.set_working(false);
         select! {

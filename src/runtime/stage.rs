@@ -10,7 +10,7 @@ use super::outlet::Outlet;
 pub enum Flow {
     /// Call `next` again.
     Continue,
-    /// There is no more; call `finish`.
+    /// The input has ended; call `finish`.
     Done,
 }
 

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, after, bounded, never, select, tick};
 
 use super::cancel::{Cancel, Halt, Wake};
-use super::error::{Laggards, RuntimeError};
+use super::error::{RuntimeError, UnfinishedStages};
 use super::metrics::Counters;
 use super::report::{Report, StageReport};
 use super::worker::{Ending, StageNode, Timings, Watch, Worker};
@@ -115,7 +115,8 @@ pub(super) fn run(
     let mut members = start(nodes, &verdict, cancel, &say);
     drop(say);
     let (cancelled, cut) = join(&mut members, &heard, &verdict, cancel, limits);
-    let laggards = Laggards { stages: names(members.iter().filter(|m| m.is_running())), waited: deadline };
+    let laggards =
+        UnfinishedStages { stages: names(members.iter().filter(|m| m.is_running())), waited: deadline };
     if let Some(error) = verdict.take() {
         return Err(with_laggards(error, laggards));
     }
@@ -159,7 +160,7 @@ fn start(
             }
             Err(source) => {
                 let stage = counters.name.clone();
-                verdict.fail(RuntimeError::Thread { stage, laggards: Laggards::default(), source });
+                verdict.fail(RuntimeError::Thread { stage, laggards: UnfinishedStages::default(), source });
                 break;
             }
         }
@@ -175,13 +176,13 @@ fn live(mut worker: Box<dyn Worker>, mut watch: Watch, verdict: &Verdict) -> (En
         stage: stage.clone(),
         at,
         message: panic_message(payload.as_ref()),
-        laggards: Laggards::default(),
+        laggards: UnfinishedStages::default(),
     };
     let ending = match worked {
         Ok(Ok(ending)) => ending,
         Ok(Err(source)) => {
             let stage = stage.clone();
-            verdict.fail(RuntimeError::Failed { stage, at, laggards: Laggards::default(), source });
+            verdict.fail(RuntimeError::Failed { stage, at, laggards: UnfinishedStages::default(), source });
             Ending::Halted
         }
         Err(payload) => {
@@ -303,7 +304,7 @@ fn join(
             }
             recv(look) -> _ => {
                 if let Some(stages) = watch.look(members) {
-                    verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: Laggards::default() });
+                    verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: UnfinishedStages::default() });
                 }
             }
             recv(clock) -> _ => cutter.look(members, cancel, &verdict.halt),
@@ -313,7 +314,7 @@ fn join(
     (cancelled || cutter.has_cut_input || cutter.is_over, cutter.cut)
 }
 
-fn with_laggards(mut error: RuntimeError, found: Laggards) -> RuntimeError {
+fn with_laggards(mut error: RuntimeError, found: UnfinishedStages) -> RuntimeError {
     if let RuntimeError::Failed { laggards, .. }
     | RuntimeError::Panicked { laggards, .. }
     | RuntimeError::Stalled { laggards, .. }

@@ -8,7 +8,7 @@ use crossbeam_channel::{Receiver, TryRecvError, select};
 use super::cancel::{Cancel, Halt, Wake};
 use super::error::{BoxError, Moment};
 use super::metrics::{Counters, Units};
-use super::outlet::{Outlet, Stamped};
+use super::outlet::{Outlet, StampedItem};
 use super::stage::{Flow, Sink, Source, Stage};
 use super::timing::Timing;
 
@@ -125,17 +125,17 @@ impl Watch {
 
 /// The receiving end of a link.
 pub(super) struct Inlet<T> {
-    receiver: Receiver<Stamped<T>>,
+    receiver: Receiver<StampedItem<T>>,
 }
 
 enum Input<T> {
-    Item(Stamped<T>),
+    Item(StampedItem<T>),
     End,
     Halt,
 }
 
 impl<T> Inlet<T> {
-    pub(super) fn new(receiver: Receiver<Stamped<T>>) -> Self {
+    pub(super) fn new(receiver: Receiver<StampedItem<T>>) -> Self {
         Self { receiver }
     }
 
@@ -163,7 +163,7 @@ impl<T> Inlet<T> {
         Input::Item(stamped)
     }
 
-    fn wait(&self, watch: &Watch) -> Option<Stamped<T>> {
+    fn wait(&self, watch: &Watch) -> Option<StampedItem<T>> {
         select! {
             recv(self.receiver) -> stamped => stamped.ok(),
             recv(watch.halt.stop()) -> _ => None,
@@ -214,7 +214,7 @@ impl<S: Stage> Worker for StageWorker<S> {
         let Self { stage, inlet, out } = self;
         loop {
             match inlet.receive(watch) {
-                Input::Item(Stamped { item, born }) => {
+                Input::Item(StampedItem { item, born }) => {
                     out.descend_from(born);
                     stage.step(item, out)?;
                     watch.worked_into(out, Some(born), stage.units());
@@ -244,7 +244,7 @@ impl<S: Sink> Worker for SinkWorker<S> {
         let Self { sink, inlet } = self;
         loop {
             match inlet.receive(watch) {
-                Input::Item(Stamped { item, born }) => {
+                Input::Item(StampedItem { item, born }) => {
                     sink.take(item)?;
                     watch.worked(Duration::ZERO, Some(born), sink.units());
                 }

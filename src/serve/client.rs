@@ -116,7 +116,7 @@ fn connect(address: &str) -> io::Result<TcpStream> {
     Err(last)
 }
 
-/// What follows the header of an answer 200, whole; or what is wrong.
+/// The complete body of an answer 200, or what is wrong.
 fn body_of(answer: &[u8]) -> Result<&[u8], String> {
     let end = answer.windows(4).position(|four| four == b"\r\n\r\n").ok_or("no HTTP header")?;
     let header = String::from_utf8_lossy(&answer[..end]);

@@ -54,7 +54,7 @@ fn resident_bytes() -> Option<u64> {
 type Sample<const N: usize, V> = ([(&'static str, String); N], V);
 
 /// Name and help of a metric, and its unit if it has one.
-struct About(&'static str, &'static str, Option<Unit>);
+struct MetricInfo(&'static str, &'static str, Option<Unit>);
 
 fn items() -> Option<Unit> {
     Some(Unit::Other("items".into()))
@@ -62,7 +62,7 @@ fn items() -> Option<Unit> {
 
 fn gauges<const N: usize>(
     out: &mut DescriptorEncoder<'_>,
-    About(name, help, unit): About,
+    MetricInfo(name, help, unit): MetricInfo,
     samples: impl IntoIterator<Item = Sample<N, f64>>,
 ) -> fmt::Result {
     let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?;
@@ -74,7 +74,7 @@ fn gauges<const N: usize>(
 
 fn counters<const N: usize>(
     out: &mut DescriptorEncoder<'_>,
-    About(name, help, unit): About,
+    MetricInfo(name, help, unit): MetricInfo,
     samples: impl IntoIterator<Item = Sample<N, u64>>,
 ) -> fmt::Result {
     let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Counter)?;
@@ -84,19 +84,19 @@ fn counters<const N: usize>(
     Ok(())
 }
 
-fn gauge(out: &mut DescriptorEncoder<'_>, about: About, value: f64) -> fmt::Result {
-    let About(name, help, unit) = about;
+fn gauge(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: f64) -> fmt::Result {
+    let MetricInfo(name, help, unit) = about;
     let value = ConstGauge::new(value);
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
-/// A gauge of which there may be no value.
-fn gauge_if(out: &mut DescriptorEncoder<'_>, about: About, value: Option<f64>) -> fmt::Result {
+/// A gauge, if it has a value.
+fn gauge_if(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: Option<f64>) -> fmt::Result {
     value.map_or(Ok(()), |value| gauge(out, about, value))
 }
 
-fn counter(out: &mut DescriptorEncoder<'_>, about: About, value: u64) -> fmt::Result {
-    let About(name, help, unit) = about;
+fn counter(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: u64) -> fmt::Result {
+    let MetricInfo(name, help, unit) = about;
     let value = ConstCounter::new(value);
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Counter)?)
 }
@@ -123,13 +123,13 @@ impl Scrape {
         ];
         gauges(
             out,
-            About("build_info", "Version, name of the pipeline, part of the chain", None),
+            MetricInfo("build_info", "Version, name of the pipeline, part of the chain", None),
             [(build, 1.0)],
         )?;
-        let uptime = About("uptime", "Time since the server started", Some(Unit::Seconds));
+        let uptime = MetricInfo("uptime", "Time since the server started", Some(Unit::Seconds));
         gauge(out, uptime, *up_s)?;
         let phases = Phase::ALL.map(|p| ([("phase", p.name().to_owned())], f64::from(u8::from(p == *phase))));
-        gauges(out, About("run_phase", "1 for the phase in which the run is", None), phases)
+        gauges(out, MetricInfo("run_phase", "1 for the phase in which the run is", None), phases)
     }
 
     fn stages(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
@@ -137,25 +137,29 @@ impl Scrape {
         let label = |name: &str| [("stage", name.to_owned())];
         let queued = stages.iter().filter_map(|s| Some((label(&s.name), s.queue?)));
         let depth = queued.clone().map(|(label, queue)| (label, queue.depth as f64));
-        gauges(out, About("stage_queue", "Items that wait before a stage", items()), depth)?;
+        gauges(out, MetricInfo("stage_queue", "Items that wait before a stage", items()), depth)?;
         let capacity = queued.map(|(label, queue)| (label, queue.capacity as f64));
-        gauges(out, About("stage_queue_capacity", "Items that can wait before a stage", items()), capacity)?;
+        gauges(
+            out,
+            MetricInfo("stage_queue_capacity", "Items that can wait before a stage", items()),
+            capacity,
+        )?;
         let busy = stages.iter().map(|s| (label(&s.name), s.busy));
         let about =
-            About("stage_busy", "Share of the last seconds in which a stage worked", Some(Unit::Ratios));
+            MetricInfo("stage_busy", "Share of the last seconds in which a stage worked", Some(Unit::Ratios));
         gauges(out, about, busy)?;
         let received = stages.iter().map(|s| (label(&s.name), s.items_in));
-        counters(out, About("stage_received", "Items that a stage has taken", items()), received)?;
+        counters(out, MetricInfo("stage_received", "Items that a stage has taken", items()), received)?;
         let sent = stages.iter().map(|s| (label(&s.name), s.items_out));
-        counters(out, About("stage_sent", "Items that a stage has passed on", items()), sent)?;
+        counters(out, MetricInfo("stage_sent", "Items that a stage has passed on", items()), sent)?;
         let units = stages.iter().filter(|s| !s.unit.is_empty());
         let units = units.map(|s| ([("stage", s.name.clone()), ("unit", s.unit.to_owned())], s.units));
-        counters(out, About("stage_units", "What a stage has processed, in its own unit", None), units)?;
+        counters(out, MetricInfo("stage_units", "What a stage has processed, in its own unit", None), units)?;
         let ended = stages.iter().map(|s| (label(&s.name), f64::from(u8::from(s.ended))));
-        gauges(out, About("stage_ended", "1 for a stage that has ended", None), ended)?;
-        let step = About("stage_step", "Work of a stage on one item", Some(Unit::Seconds));
+        gauges(out, MetricInfo("stage_ended", "1 for a stage that has ended", None), ended)?;
+        let step = MetricInfo("stage_step", "Work of a stage on one item", Some(Unit::Seconds));
         self.histogram(out, step, |stage| &stage.working)?;
-        let about = About(
+        let about = MetricInfo(
             "stage_latency",
             "From the source's push to the end of a stage's step",
             Some(Unit::Seconds),
@@ -166,7 +170,7 @@ impl Scrape {
     fn histogram(
         &self,
         out: &mut DescriptorEncoder<'_>,
-        About(name, help, unit): About,
+        MetricInfo(name, help, unit): MetricInfo,
         of: impl Fn(&StageProgress) -> &DurationCounts,
     ) -> fmt::Result {
         let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Histogram)?;
@@ -190,76 +194,72 @@ impl Scrape {
     }
 
     fn ground(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
-        let visibilities = || Some(Unit::Other("visibilities".into()));
-        if let Some(ledger) = &self.status.ledger {
-            // Not counters: what is retracted leaves them.
-            let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
-            let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
-            let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
-            gauges(out, About("ledger", "Visibilities by what became of them", visibilities()), entries)?;
-            let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
-                let stage = reason.lost_in().unwrap_or("");
-                ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
-            });
-            let about = About("ledger_left_out", "Visibilities flagged, or lost in a stage", visibilities());
-            gauges(out, about, left_out)?;
-            let about =
-                "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
-            let about = About("ledger_unaccounted", about, visibilities());
-            gauge_if(out, about, ledger.sampled.map(|(_, rest)| rest as f64))?;
-        }
-        if let Some(reception) = &self.status.reception {
-            let packets = || Some(Unit::Other("packets".into()));
-            let kinds = |of: &dyn Fn(Kind) -> u64| {
-                Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64))
-            };
-            let sound = kinds(&|kind| reception.kind(kind).packets);
-            gauges(out, About("reception", "Sound packets received, each once", packets()), sound)?;
-            let missing = kinds(&|kind| reception.kind(kind).missing);
-            gauges(
-                out,
-                About("reception_missing", "Packets missing between those received", packets()),
-                missing,
-            )?;
-            let damaged = kinds(&|kind| reception.kind(kind).damaged);
-            gauges(out, About("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
-            let again = kinds(&|kind| reception.kind(kind).duplicates);
-            gauges(out, About("reception_duplicate", "Packets received before", packets()), again)?;
-        }
+        self.ledger(out)?;
+        self.reception(out)?;
         if let Some(waiting) = self.status.waiting_bytes {
             let about = "Visibilities that wait for their positions";
-            gauge(out, About("waiting", about, Some(Unit::Bytes)), waiting as f64)?;
+            gauge(out, MetricInfo("waiting", about, Some(Unit::Bytes)), waiting as f64)?;
         }
-        if let Some(saving) = &self.status.saving {
-            let written = About("checkpoints_written", "Checkpoints written in this session", None);
-            counter(out, written, saving.written)?;
-            counter(
-                out,
-                About("checkpoints_failed", "Checkpoints that could not be written", None),
-                saving.failed,
-            )?;
-            let unsaved = f64::from(u8::from(saving.unsaved.is_some()));
-            gauge(
-                out,
-                About("state_unsaved", "1 if the last checkpoint could not be written", None),
-                unsaved,
-            )?;
-            let about = "Received since the newest checkpoint";
-            gauge(out, About("state_unsaved", about, Some(Unit::Bytes)), saving.unsaved_bytes as f64)?;
-            let about = "Age of the oldest packet that no checkpoint holds";
-            gauge(out, About("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
-            let about =
-                About("checkpoint_age", "Age of the newest checkpoint of this session", Some(Unit::Seconds));
-            gauge_if(out, about, saving.checkpoint_s)?;
-        }
-        if let Some(products) = &self.status.products {
-            let about = About("products_failed", "Attempts to write maps and pictures that failed", None);
-            counter(out, about, products.failed)?;
-            let about =
-                About("products_unwritten", "1 if the last attempt to write maps and pictures failed", None);
-            gauge(out, about, f64::from(u8::from(products.unwritten.is_some())))?;
-        }
-        Ok(())
+        self.saving(out)?;
+        let Some(products) = &self.status.products else { return Ok(()) };
+        let about = "Attempts to write maps and pictures that failed";
+        counter(out, MetricInfo("products_failed", about, None), products.failed)?;
+        let about = "1 if the last attempt to write maps and pictures failed";
+        let unwritten = f64::from(u8::from(products.unwritten.is_some()));
+        gauge(out, MetricInfo("products_unwritten", about, None), unwritten)
+    }
+
+    /// Gauges, not counters: what is retracted leaves the ledger.
+    fn ledger(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(ledger) = &self.status.ledger else { return Ok(()) };
+        let visibilities = || Some(Unit::Other("visibilities".into()));
+        let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
+        let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
+        let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
+        gauges(out, MetricInfo("ledger", "Visibilities by what became of them", visibilities()), entries)?;
+        let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
+            let stage = reason.lost_in().unwrap_or("");
+            ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
+        });
+        let about = "Visibilities flagged, or lost in a stage";
+        gauges(out, MetricInfo("ledger_left_out", about, visibilities()), left_out)?;
+        let about =
+            "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
+        let unaccounted = ledger.sampled.map(|(_, rest)| rest as f64);
+        gauge_if(out, MetricInfo("ledger_unaccounted", about, visibilities()), unaccounted)
+    }
+
+    fn reception(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(reception) = &self.status.reception else { return Ok(()) };
+        let packets = || Some(Unit::Other("packets".into()));
+        let kinds =
+            |of: &dyn Fn(Kind) -> u64| Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64));
+        let sound = kinds(&|kind| reception.kind(kind).packets);
+        gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
+        let missing = kinds(&|kind| reception.kind(kind).missing);
+        let about = "Packets missing between those received";
+        gauges(out, MetricInfo("reception_missing", about, packets()), missing)?;
+        let damaged = kinds(&|kind| reception.kind(kind).damaged);
+        gauges(out, MetricInfo("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
+        let again = kinds(&|kind| reception.kind(kind).duplicates);
+        gauges(out, MetricInfo("reception_duplicate", "Packets received before", packets()), again)
+    }
+
+    fn saving(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        let Some(saving) = &self.status.saving else { return Ok(()) };
+        let about = "Checkpoints written in this session";
+        counter(out, MetricInfo("checkpoints_written", about, None), saving.written)?;
+        let about = "Checkpoints that could not be written";
+        counter(out, MetricInfo("checkpoints_failed", about, None), saving.failed)?;
+        let about = "1 if the last checkpoint could not be written";
+        let unsaved = f64::from(u8::from(saving.unsaved.is_some()));
+        gauge(out, MetricInfo("state_unsaved", about, None), unsaved)?;
+        let about = "Received since the newest checkpoint";
+        gauge(out, MetricInfo("state_unsaved", about, Some(Unit::Bytes)), saving.unsaved_bytes as f64)?;
+        let about = "Age of the oldest packet that no checkpoint holds";
+        gauge(out, MetricInfo("state_unsaved_age", about, Some(Unit::Seconds)), saving.unsaved_s)?;
+        let about = "Age of the newest checkpoint of this session";
+        gauge_if(out, MetricInfo("checkpoint_age", about, Some(Unit::Seconds)), saving.checkpoint_s)
     }
 
     /// Room on disks, and memory.
@@ -268,64 +268,64 @@ impl Scrape {
             self.folders.iter().filter_map(|(name, path)| Some((*name, disk_room(path)?))).collect();
         let label = |name: &str| [("folder", name.to_owned())];
         let free = disks.iter().map(|(name, [free, _])| (label(name), *free as f64));
-        gauges(out, About("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;
+        gauges(out, MetricInfo("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;
         let size = disks.iter().map(|(name, [_, size])| (label(name), *size as f64));
-        gauges(out, About("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
+        gauges(out, MetricInfo("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
         let available = MemoryLimit::of_machine().map(|limit| limit.bytes as f64);
         let about = "Memory that this process can still have: of the machine, or below the limit of its control group";
-        gauge_if(out, About("memory_available", about, Some(Unit::Bytes)), available)?;
+        gauge_if(out, MetricInfo("memory_available", about, Some(Unit::Bytes)), available)?;
         let resident = resident_bytes().map(|bytes| bytes as f64);
-        gauge_if(out, About("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
+        gauge_if(out, MetricInfo("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
     }
 
     fn senders(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let Some(listening) = &self.status.listening else { return Ok(()) };
         let report = &listening.report;
-        gauge(out, About("senders_open", "Senders that are connected", None), listening.open as f64)?;
+        gauge(out, MetricInfo("senders_open", "Senders that are connected", None), listening.open as f64)?;
         counter(
             out,
-            About("senders_accepted", "Connections accepted from senders", None),
+            MetricInfo("senders_accepted", "Connections accepted from senders", None),
             report.connections,
         )?;
-        counter(out, About("senders_refused", "Connections of senders refused", None), report.refused)?;
-        counter(out, About("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
+        counter(out, MetricInfo("senders_refused", "Connections of senders refused", None), report.refused)?;
+        counter(out, MetricInfo("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
         let about = "Read from senders and not taken by the ground yet";
-        gauge(out, About("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
+        gauge(out, MetricInfo("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
         // Who has not been heard is silent since the ground began.
         let up_s = self.status.up_s;
         let silence_s = listening.silence_s.unwrap_or(up_s);
         let about = "Time since the last sound packet from anyone, or since the ground began";
-        gauge(out, About("senders_silence", about, Some(Unit::Seconds)), silence_s)?;
+        gauge(out, MetricInfo("senders_silence", about, Some(Unit::Seconds)), silence_s)?;
         if let Some(archive) = &listening.archive {
             gauge(
                 out,
-                About("archive", "Packets in the raw archive", Some(Unit::Bytes)),
+                MetricInfo("archive", "Packets in the raw archive", Some(Unit::Bytes)),
                 archive.bytes as f64,
             )?;
             let about =
-                About("archive_failed", "Pieces that could not be written into the raw archive", None);
+                MetricInfo("archive_failed", "Pieces that could not be written into the raw archive", None);
             counter(out, about, archive.failed)?;
             let about = "1 if the last piece could not be written into the raw archive";
             let unwritten = f64::from(u8::from(archive.unwritten.is_some()));
-            gauge(out, About("archive_unwritten", about, None), unwritten)?;
+            gauge(out, MetricInfo("archive_unwritten", about, None), unwritten)?;
             let about = "1 while the raw archive reaches back to the first packet";
-            gauge(out, About("archive_whole", about, None), f64::from(u8::from(archive.is_whole)))?;
+            gauge(out, MetricInfo("archive_whole", about, None), f64::from(u8::from(archive.is_whole)))?;
         }
         // From zero on: an increase from nothing to one is none for Prometheus.
         let ended = ConnectionEnd::ALL.iter().filter_map(|end| {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
             Some(([("end", name)], report.ended.get(end).copied().unwrap_or(0)))
         });
-        counters(out, About("senders_ended", "Connections of senders by how they ended", None), ended)?;
+        counters(out, MetricInfo("senders_ended", "Connections of senders by how they ended", None), ended)?;
         let stations = || report.stations.iter().map(|(name, counts)| ([("station", name.clone())], counts));
-        let about = About("station_read", "Read from a station known by its token", Some(Unit::Bytes));
+        let about = MetricInfo("station_read", "Read from a station known by its token", Some(Unit::Bytes));
         counters(out, about, stations().map(|(label, counts)| (label, counts.bytes)))?;
         let silences = stations()
             .map(|(label, counts)| (label, counts.heard.map_or(up_s, |heard| heard.elapsed().as_secs_f64())));
         let about = "Time since the last sound packet from a station, or since the ground began";
-        let about = About("station_silence", about, Some(Unit::Seconds));
+        let about = MetricInfo("station_silence", about, Some(Unit::Seconds));
         gauges(out, about, silences)?;
-        let about = About("station_connections", "Connections of a station that have ended", None);
+        let about = MetricInfo("station_connections", "Connections of a station that have ended", None);
         counters(out, about, stations().map(|(label, counts)| (label, counts.connections)))
     }
 
@@ -334,36 +334,40 @@ impl Scrape {
         let label = |frequency_hz: f64| [("frequency_mhz", format!("{:.3}", frequency_hz / 1e6))];
         let known = || channels.iter().filter_map(|c| Some((label(c.frequency_hz), c.figures.as_ref()?)));
         let numbers = known().map(|(label, figures)| (label, f64::from(figures.number)));
-        gauges(out, About("map_snapshot", "Number of the last map of a channel", None), numbers)?;
+        gauges(out, MetricInfo("map_snapshot", "Number of the last map of a channel", None), numbers)?;
         let counts = known().map(|(label, figures)| (label, figures.visibilities as f64));
         let unit = Some(Unit::Other("visibilities".into()));
-        gauges(out, About("map", "Visibilities in the last map of a channel", unit), counts)?;
+        gauges(out, MetricInfo("map", "Visibilities in the last map of a channel", unit), counts)?;
         let times = known().map(|(label, figures)| (label, figures.until_s));
         let about =
-            About("map_until", "Mission time of the last data in a channel's map", Some(Unit::Seconds));
+            MetricInfo("map_until", "Mission time of the last data in a channel's map", Some(Unit::Seconds));
         gauges(out, about, times)?;
         let ages = channels.iter().map(|channel| (label(channel.frequency_hz), channel.age_s));
         gauges(
             out,
-            About("map_age", "Time since the last map of a channel was made", Some(Unit::Seconds)),
+            MetricInfo("map_age", "Time since the last map of a channel was made", Some(Unit::Seconds)),
             ages,
         )?;
         let noise = channels.iter().map(|channel| (label(channel.frequency_hz), channel.noise_rms_k));
         let unit = Some(Unit::Other("kelvin".into()));
-        gauges(out, About("map_noise_rms", "RMS of the noise-only map of a channel", unit), noise)?;
+        gauges(out, MetricInfo("map_noise_rms", "RMS of the noise-only map of a channel", unit), noise)?;
         let solving = self.status.solving.as_ref();
         let is_solving = f64::from(u8::from(solving.is_some()));
-        gauge(out, About("solver_active", "1 while a map is being solved by iteration", None), is_solving)?;
+        gauge(
+            out,
+            MetricInfo("solver_active", "1 while a map is being solved by iteration", None),
+            is_solving,
+        )?;
         if let Some(solving) = solving {
             gauge(
                 out,
-                About("solver_iteration", "Iterations of the solution in progress", None),
+                MetricInfo("solver_iteration", "Iterations of the solution in progress", None),
                 solving.iteration as f64,
             )?;
-            gauge(out, About("solver_residual", "Its residual", Some(Unit::Ratios)), solving.residual)?;
+            gauge(out, MetricInfo("solver_residual", "Its residual", Some(Unit::Ratios)), solving.residual)?;
             gauge(
                 out,
-                About("solver_target", "The residual at which it ends", Some(Unit::Ratios)),
+                MetricInfo("solver_target", "The residual at which it ends", Some(Unit::Ratios)),
                 solving.target,
             )?;
         }
@@ -372,17 +376,21 @@ impl Scrape {
 
     fn visitors(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let visitors = self.status.visitors;
-        gauge(out, About("http_connections", "Open connections to this server", None), visitors.open as f64)?;
+        gauge(
+            out,
+            MetricInfo("http_connections", "Open connections to this server", None),
+            visitors.open as f64,
+        )?;
         counter(
             out,
-            About("http_refused", "Connections refused as too many were open", None),
+            MetricInfo("http_refused", "Connections refused as too many were open", None),
             visitors.refused,
         )?;
         counter(
             out,
-            About("http_cut", "Connections closed by the server: silent, slow or not HTTP", None),
+            MetricInfo("http_cut", "Connections closed by the server: silent, slow or not HTTP", None),
             visitors.cut,
         )?;
-        counter(out, About("http_requests", "Requests answered", None), visitors.requests)
+        counter(out, MetricInfo("http_requests", "Requests answered", None), visitors.requests)
     }
 }

@@ -37,7 +37,7 @@ const HEADERS_MAX: usize = 64;
 /// Wait after a connection could not be accepted, for example because too many files are open.
 const ACCEPT_WAIT: Duration = Duration::from_millis(50);
 
-/// What is said to those who come when all places are taken.
+/// Answer to visitors when all places are taken.
 const FULL: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 21\r\n\r\ntoo many connections\n";
 
 /// Accepts connections until `stop`.

@@ -47,14 +47,14 @@ impl VisitorCounts {
 
 /// How a run ended.
 #[derive(Clone, Debug)]
-struct Ending {
+struct RunEnd {
     error: Option<String>,
     cancelled: bool,
     /// When, since the server's start, s.
     up_s: f64,
 }
 
-/// What changes from one look to the next.
+/// State of the last update, to tell what has changed.
 #[derive(Debug, Default)]
 struct Memory {
     pulse: Pulse,
@@ -86,7 +86,7 @@ pub(super) struct Console {
     pub(super) log: Arc<EventLog>,
     pub(super) visitors: VisitorCounts,
     pub(super) watched: OnceLock<Watched>,
-    ending: Mutex<Option<Ending>>,
+    ending: Mutex<Option<RunEnd>>,
     /// Metrics were read since the run failed.
     pub(super) failure_told: AtomicBool,
     memory: Mutex<Memory>,
@@ -125,10 +125,10 @@ impl Console {
     /// The run begins.
     pub(super) fn begin(&self, watched: &Watched) {
         let viewer =
-            Onlooker { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
+            PageViewer { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
         watched.maps.join(Box::new(viewer));
         if let Some(ground) = &watched.ground {
-            ground.lookout.open();
+            ground.live_view.open();
         }
         if self.watched.set(watched.clone()).is_ok() {
             self.note(false, "the run begins");
@@ -137,11 +137,11 @@ impl Console {
 
     /// The run has ended.
     pub(super) fn end(&self, error: Option<String>, cancelled: bool) {
-        let ending = Ending { error, cancelled, up_s: self.up_s() };
+        let ending = RunEnd { error, cancelled, up_s: self.up_s() };
         match &ending {
-            Ending { error: Some(error), .. } => self.note(true, format!("the run failed: {error}")),
-            Ending { cancelled: true, .. } => self.note(true, "the run was ended early"),
-            Ending { .. } => self.note(false, "the run is complete"),
+            RunEnd { error: Some(error), .. } => self.note(true, format!("the run failed: {error}")),
+            RunEnd { cancelled: true, .. } => self.note(true, "the run was ended early"),
+            RunEnd { .. } => self.note(false, "the run is complete"),
         }
         *self.ending.lock().unwrap_or_else(PoisonError::into_inner) = Some(ending);
     }
@@ -149,7 +149,7 @@ impl Console {
     pub(super) fn phase(&self) -> Phase {
         let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner);
         match (&*ending, self.watched.get()) {
-            (Some(Ending { error: Some(_), .. }), _) => Phase::Failed,
+            (Some(RunEnd { error: Some(_), .. }), _) => Phase::Failed,
             (Some(_), _) => Phase::Ended,
             (None, Some(_)) => Phase::Running,
             (None, None) => Phase::Starting,
@@ -177,29 +177,29 @@ impl Console {
 
     /// Packets over the mission's time; `None` before the instrument is known.
     pub(super) fn passes(&self) -> Option<Arc<PassLine>> {
-        self.ground().and_then(|ground| ground.lookout.passes())
+        self.ground().and_then(|ground| ground.live_view.passes())
     }
 
     /// Where everything is; `None` before there are data with positions.
     pub(super) fn geometry(&self) -> Option<Geometry> {
-        let now = self.ground()?.lookout.array()?;
+        let now = self.ground()?.live_view.array()?;
         Some(Geometry::of(&now, self.earth))
     }
 
     /// Baselines of a channel; `None` if it has none.
     pub(super) fn uvw(&self, channel: ChannelId) -> Option<UvwDensity> {
-        self.ground()?.lookout.density(channel)
+        self.ground()?.live_view.density(channel)
     }
 
     /// Visibilities of a channel by direction; `None` if it has none. Takes a while.
     pub(super) fn hits(&self, channel: ChannelId) -> Option<HitsMap> {
-        let lookout = &self.ground()?.lookout;
-        Some(lookout.hits(channel)?.map(lookout.array()?.moon_radius_m))
+        let live_view = &self.ground()?.live_view;
+        Some(live_view.hits(channel)?.map(live_view.array()?.moon_radius_m))
     }
 
     /// Powers of the daughters in a channel; `None` if none came.
     pub(super) fn powers(&self, channel: ChannelId) -> Option<PowerWaterfall> {
-        self.ground()?.lookout.powers(channel)
+        self.ground()?.live_view.powers(channel)
     }
 
     /// Looks at the run, notes what has changed, and keeps the status.
@@ -210,7 +210,7 @@ impl Console {
         let watched = self.watched.get();
         let ground = self.ground();
         if let Some(ground) = ground {
-            ground.lookout.refresh();
+            ground.live_view.refresh();
         }
         let now = Instant::now();
         let mut memory = self.memory();
@@ -288,7 +288,7 @@ impl Memory {
         SolverStatus { what, iteration, residual, target, left_s }
     }
 
-    /// What has happened since the last look, and whether it needs attention.
+    /// Events since the last update, and whether they need attention.
     fn changes(&mut self, status: &Status) -> Vec<(bool, String)> {
         let mut found = Vec::new();
         self.ended.resize(status.stages.len(), false);
@@ -329,7 +329,7 @@ impl Memory {
     }
 }
 
-/// What is said when something begins to fail, or no longer does.
+/// The event when something begins to fail, or works again.
 fn change(what: &str, done: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
     match (before, now) {
         (None, Some(reason)) => Some((true, format!("{what} cannot be {done}: {reason}"))),
@@ -339,13 +339,13 @@ fn change(what: &str, done: &str, before: &Option<String>, now: &Option<String>)
 }
 
 /// Sees maps for the console.
-struct Onlooker {
+struct PageViewer {
     shelf: Arc<Shelf>,
     log: Arc<EventLog>,
     started: Instant,
 }
 
-impl MapViewer for Onlooker {
+impl MapViewer for PageViewer {
     fn view(&self, map: PublishedMap<'_>) {
         let said = self.shelf.put(map);
         self.log.push(self.started.elapsed().as_secs_f64(), false, said);

@@ -43,7 +43,7 @@ pub(super) struct Geometry {
 }
 
 impl Geometry {
-    /// Of an array, with the Earth as a model has it.
+    /// The geometry of an array, with the Earth of a model.
     pub(super) fn of(now: &ArrayNow, earth: EarthModel) -> Self {
         let ArrayNow { epoch_tai_s, time_s, moon_radius_m, positions_m, motion, known_s, track_m } = now;
         let is_hidden =

@@ -10,16 +10,16 @@ const LOOKS: usize = 6;
 
 /// The last looks at the stages.
 #[derive(Debug, Default)]
-pub(super) struct Pulse(VecDeque<Look>);
+pub(super) struct Pulse(VecDeque<StageSample>);
 
 #[derive(Debug)]
-struct Look {
+struct StageSample {
     at: Instant,
     /// Units, and time spent working, s.
     stages: Vec<(u64, f64)>,
 }
 
-/// What a stage did over the last seconds, or in the whole run.
+/// Rates of a stage over the last seconds, or over the whole run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct StageRate {
     /// Share of the time in which it worked, 0 to 1.
@@ -32,7 +32,7 @@ impl Pulse {
     /// Looks at the stages; returns their rates since the oldest look that is kept.
     pub(super) fn look(&mut self, stages: &[StageProgress], now: Instant) -> Vec<StageRate> {
         let seen: Vec<(u64, f64)> = stages.iter().map(|s| (s.units.count, s.working.total_s)).collect();
-        let rate = |k: usize, old: &Look| {
+        let rate = |k: usize, old: &StageSample| {
             let seconds = now.duration_since(old.at).as_secs_f64();
             let (&(units, worked_s), progress) = (old.stages.get(k)?, stages.get(k)?);
             let worked = (progress.working.total_s - worked_s) / seconds.max(1e-3);
@@ -47,7 +47,7 @@ impl Pulse {
             Some(old) => (0..seen.len()).map(|k| rate(k, old).unwrap_or_default()).collect(),
             None => vec![StageRate::default(); seen.len()],
         };
-        self.0.push_back(Look { at: now, stages: seen });
+        self.0.push_back(StageSample { at: now, stages: seen });
         while self.0.len() > LOOKS {
             self.0.pop_front();
         }

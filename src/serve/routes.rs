@@ -24,7 +24,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use super::address::is_own_host;
 use super::collector;
 use super::console::Console;
-use super::shelf::{HeldMap, Which};
+use super::shelf::{MapChoice, ShownMap};
 use super::status::Phase;
 use crate::downlink::transport::socket::Listening;
 use crate::ground::archive::CoverageSurvey;
@@ -39,9 +39,9 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; c
 /// Colours of a palette.
 const PALETTE_STEPS: u32 = 256;
 
-/// What requests are answered from.
+/// What all request handlers share.
 #[derive(Clone)]
-pub(super) struct Desk {
+pub(super) struct PageState {
     pub(super) console: Arc<Console>,
     /// The newest status in JSON; empty before the first.
     pub(super) news: watch::Receiver<Arc<str>>,
@@ -59,7 +59,7 @@ pub(super) struct Desk {
 pub(super) const READERS_MAX: usize = 96;
 
 /// All routes.
-pub(super) fn router(desk: Desk) -> Router {
+pub(super) fn router(desk: PageState) -> Router {
     Router::new()
         .route("/", get(|| asset("text/html; charset=utf-8", include_str!("page/index.html"))))
         .route("/page.css", get(|| asset("text/css; charset=utf-8", include_str!("page/page.css"))))
@@ -92,7 +92,7 @@ pub(super) fn router(desk: Desk) -> Router {
 }
 
 /// Refuses what is not meant for this server, and adds the headers that every answer has.
-async fn guard(State(desk): State<Desk>, request: Request, next: Next) -> Response {
+async fn guard(State(desk): State<PageState>, request: Request, next: Next) -> Response {
     desk.console.visitors.requests.fetch_add(1, Ordering::Relaxed);
     let mut response = match refused(&desk, request.method(), request.uri(), request.headers()) {
         Some(refusal) => refusal,
@@ -113,7 +113,7 @@ async fn guard(State(desk): State<Desk>, request: Request, next: Next) -> Respon
     response
 }
 
-fn refused(desk: &Desk, method: &Method, uri: &Uri, headers: &HeaderMap) -> Option<Response> {
+fn refused(desk: &PageState, method: &Method, uri: &Uri, headers: &HeaderMap) -> Option<Response> {
     if method != Method::GET && method != Method::HEAD {
         let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, "this server only tells; expected GET");
         response.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
@@ -185,17 +185,17 @@ async fn page_constants() -> Response {
     })
 }
 
-async fn status(State(desk): State<Desk>) -> Response {
+async fn status(State(desk): State<PageState>) -> Response {
     json(&desk.console.status())
 }
 
-async fn config(State(desk): State<Desk>) -> Response {
+async fn config(State(desk): State<PageState>) -> Response {
     answer("application/json", desk.console.config.clone())
 }
 
 /// Makes an answer that takes a while, away from the event loop and one at a time.
 async fn slowly<T: Send + 'static>(
-    desk: &Desk,
+    desk: &PageState,
     make: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, Response> {
     let closed = |_| refusal(StatusCode::SERVICE_UNAVAILABLE, "the server is ending");
@@ -224,7 +224,7 @@ fn no_channel() -> Response {
     refusal(StatusCode::NOT_FOUND, "no such channel; expected the number of one, from 0")
 }
 
-async fn figures(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+async fn figures(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
     let Some(channel) = channel_of(&channel) else { return no_map() };
     let shelf = Arc::clone(&desk.console.shelf);
     match slowly(&desk, move || shelf.figures(channel)).await {
@@ -234,15 +234,15 @@ async fn figures(State(desk): State<Desk>, Path(channel): Path<String>) -> Respo
     }
 }
 
-async fn map(State(desk): State<Desk>, Path((channel, file)): Path<(String, String)>) -> Response {
+async fn map(State(desk): State<PageState>, Path((channel, file)): Path<(String, String)>) -> Response {
     let found = || {
         let (name, kind) = file.split_once('.')?;
-        Some((desk.console.shelf.map(channel_of(&channel)?, Which::read(name)?)?, kind))
+        Some((desk.console.shelf.map(channel_of(&channel)?, MapChoice::read(name)?)?, kind))
     };
     let Some((map, kind)) = found() else { return no_map() };
-    let make: fn(&HeldMap) -> Result<Option<Bytes>, String> = match kind {
+    let make: fn(&ShownMap) -> Result<Option<Bytes>, String> = match kind {
         "f32" => return answer("application/octet-stream", map.pixels.clone()),
-        "fits" => HeldMap::fits,
+        "fits" => ShownMap::fits,
         "png" => |map| map.png().map(Some),
         _ => return no_map(),
     };
@@ -256,22 +256,22 @@ async fn map(State(desk): State<Desk>, Path((channel, file)): Path<(String, Stri
 }
 
 /// `null` before anything is known.
-async fn passes(State(desk): State<Desk>) -> Response {
+async fn passes(State(desk): State<PageState>) -> Response {
     json(&desk.console.passes().as_deref())
 }
 
 /// `null` before anything is known.
-async fn geometry(State(desk): State<Desk>) -> Response {
+async fn geometry(State(desk): State<PageState>) -> Response {
     json(&desk.console.geometry())
 }
 
 /// `null` before anything is known.
-async fn uvw(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+async fn uvw(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
     channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.uvw(channel)))
 }
 
 /// `null` before anything is known.
-async fn hits(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+async fn hits(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
     let Some(channel) = channel_of(&channel) else { return no_channel() };
     let console = Arc::clone(&desk.console);
     match slowly(&desk, move || console.hits(channel)).await {
@@ -281,11 +281,11 @@ async fn hits(State(desk): State<Desk>, Path(channel): Path<String>) -> Response
 }
 
 /// `null` before anything is known.
-async fn powers(State(desk): State<Desk>, Path(channel): Path<String>) -> Response {
+async fn powers(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
     channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.powers(channel)))
 }
 
-async fn gaps(State(desk): State<Desk>) -> Response {
+async fn gaps(State(desk): State<PageState>) -> Response {
     let Some(folder) = desk.console.state.clone() else {
         return refusal(StatusCode::NOT_FOUND, "gaps are known to a ground with a state: replay --state DIR");
     };
@@ -297,7 +297,7 @@ async fn gaps(State(desk): State<Desk>) -> Response {
     }
 }
 
-async fn metrics(State(desk): State<Desk>) -> Response {
+async fn metrics(State(desk): State<PageState>) -> Response {
     match collector::scrape(&desk.console) {
         Ok(text) => {
             if desk.console.phase() == Phase::Failed {
@@ -309,14 +309,14 @@ async fn metrics(State(desk): State<Desk>) -> Response {
     }
 }
 
-async fn healthz(State(desk): State<Desk>) -> Response {
+async fn healthz(State(desk): State<PageState>) -> Response {
     match desk.console.phase() {
         Phase::Failed => refusal(StatusCode::SERVICE_UNAVAILABLE, "failed"),
         phase => answer("text/plain; charset=utf-8", format!("{}\n", phase.name())),
     }
 }
 
-async fn readyz(State(desk): State<Desk>) -> Response {
+async fn readyz(State(desk): State<PageState>) -> Response {
     let is_unwritten = |listening: &Listening| {
         listening.archive.as_ref().is_some_and(|archive| archive.report().unwritten.is_some())
     };
@@ -330,15 +330,15 @@ async fn readyz(State(desk): State<Desk>) -> Response {
     }
 }
 
-/// What a reader of events has seen.
+/// State of one reader of events.
 struct Reader {
-    desk: Desk,
+    desk: PageState,
     seen: u64,
     queue: Vec<Event>,
     _place: OwnedSemaphorePermit,
 }
 
-async fn events(State(desk): State<Desk>) -> Response {
+async fn events(State(desk): State<PageState>) -> Response {
     match Arc::clone(&desk.readers).try_acquire_owned() {
         Ok(place) => events_for(desk, place).into_response(),
         Err(_) => {
@@ -347,7 +347,10 @@ async fn events(State(desk): State<Desk>) -> Response {
     }
 }
 
-fn events_for(desk: Desk, place: OwnedSemaphorePermit) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
+fn events_for(
+    desk: PageState,
+    place: OwnedSemaphorePermit,
+) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
     let mut reader = Reader { desk, seen: 0, queue: Vec::new(), _place: place };
     reader.desk.news.mark_changed();
     let next = |mut reader: Reader| async move {

@@ -1,4 +1,4 @@
-//! The page in a terminal: what `/api/status` and `/api/figures` tell, drawn with characters.
+//! The page in a terminal: draws `/api/status` and `/api/figures` with characters.
 
 use ratatui::Frame;
 use ratatui::layout::{Alignment, Constraint, Layout, Rect};
@@ -17,11 +17,11 @@ const KINDS: [&str; 4] = ["instrument", "ephemeris", "visibilities", "housekeepi
 /// Characters of a queue's bar.
 const QUEUE_WIDTH: usize = 10;
 
-/// Most characters of the panel of packets, and least: its counts have five characters then.
+/// Greatest and least width of the packets panel, characters; at the least, counts have five characters.
 const RECEPTION_WIDTH: u16 = 58;
 const RECEPTION_WIDTH_MIN: u16 = 40;
 
-/// Fewer characters than this are narrow: what does not fit is left out, or shown with a prefix; no number is cut off.
+/// Width below which a terminal counts as narrow: columns are left out and numbers get prefixes; no number is cut off.
 const NARROW: u16 = 72;
 
 const QUIET: Style = Style::new().fg(Color::DarkGray);
@@ -39,14 +39,14 @@ pub struct Screen {
     pub status: Value,
     /// The last `/api/figures` of the channel shown; null before the first.
     pub figures: Value,
-    /// Place of the channel of which the curve is shown, in the list of channels.
+    /// Index of the channel whose curve is shown, in the list of channels.
     pub place: usize,
     /// Why the state shown is not the newest.
     pub lost: Option<String>,
 }
 
 impl Screen {
-    /// Draws all of it.
+    /// Draws all panels.
     pub fn draw(&self, frame: &mut Frame<'_>) {
         let status = &self.status;
         let stages = list(&status["stages"]).len();
@@ -80,7 +80,7 @@ impl Screen {
         frame.render_widget(Line::styled("q quit   \u{2190} \u{2192} channel of the curve", QUIET), keys);
     }
 
-    /// As much of it as fits: the address and the segment may be left out.
+    /// The title, as far as it fits: the address and the segment may be left out.
     fn title(&self, width: usize) -> Line<'_> {
         let status = &self.status;
         let segment = match text(&status["segment"]).as_str() {
@@ -301,7 +301,7 @@ impl Screen {
         });
         let head = ["", "ch", "MHz", "map", "days", "visibilities", "noise, K", "error", "rho"];
         let lengths = [1_u16, 4, 8, 13, 8, 15, 10, 9, 9];
-        // What is left out first where there is no room.
+        // These are left out first where there is no room.
         let mut left_out = Vec::new();
         let mut needed = lengths.iter().map(|length| length + 1).sum::<u16>() + 1;
         for column in [8, 7, 3, 4] {
@@ -371,7 +371,7 @@ fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or(0.0)
 }
 
-/// A text, of which a terminal obeys nothing; empty if it is not there.
+/// A text without control characters; empty if it is absent.
 fn text(value: &Value) -> String {
     printable(value.as_str().unwrap_or_default()).into_owned()
 }
@@ -393,7 +393,7 @@ fn count(number: f64) -> String {
     grouped
 }
 
-/// A whole number in so many characters: with a prefix if all of its digits have no room.
+/// A whole number in at most `width` characters: with a prefix if its digits do not fit.
 fn fit(number: f64, characters: usize) -> String {
     let all = count(number);
     if all.chars().count() <= characters {
@@ -432,7 +432,7 @@ fn short(value: &Value) -> String {
     }
 }
 
-/// Of a rate: three digits and the prefix of its unit.
+/// A rate: three digits and the prefix of its unit.
 fn prefixed(value: f64) -> String {
     let scales = [(1e9, " G"), (1e6, " M"), (1e3, " k")];
     match scales.into_iter().find(|(size, _)| value >= *size) {
@@ -536,7 +536,7 @@ mod tests {
         let words: Vec<&str> =
             reception.trim_end_matches('\u{2502}').split_whitespace().rev().take(4).collect();
         assert_eq!(words, ["6", "0", "5", "1,234"], "{text}");
-        // The curve: dots that no other panel has.
+        // Only the curve has dots.
         assert!(text.chars().filter(|c| ('\u{2801}'..='\u{28ff}').contains(c)).count() > 20, "{text}");
         assert!(!text.contains('\u{1b}'));
     }

@@ -13,7 +13,7 @@ use super::address::ServeAddress;
 use super::connection::accept;
 use super::console::Console;
 use super::error::ServeError;
-use super::routes::{Desk, READERS_MAX, router};
+use super::routes::{PageState, READERS_MAX, router};
 use super::subject::Subject;
 use crate::pipeline::Watched;
 
@@ -47,8 +47,14 @@ impl Server {
         let (news, reader) = watch::channel(Arc::<str>::default());
         let (stop, stopped) = watch::channel(false);
         let (slow, readers) = (Arc::new(Semaphore::new(1)), Arc::new(Semaphore::new(READERS_MAX)));
-        let desk =
-            Desk { console: Arc::clone(&console), news: reader, own, any_host: allow_remote, slow, readers };
+        let desk = PageState {
+            console: Arc::clone(&console),
+            news: reader,
+            own,
+            any_host: allow_remote,
+            slow,
+            readers,
+        };
         let runtime =
             Builder::new_current_thread().enable_all().max_blocking_threads(1).build().map_err(start)?;
         let teller = news.clone();
@@ -107,7 +113,7 @@ fn tell(console: &Console, news: &watch::Sender<Arc<str>>) {
 fn work(
     runtime: Runtime,
     listener: TcpListener,
-    desk: Desk,
+    desk: PageState,
     news: &watch::Sender<Arc<str>>,
     mut stopped: watch::Receiver<bool>,
 ) {

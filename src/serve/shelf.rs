@@ -59,7 +59,7 @@ impl From<&Comparison> for SpectraOfMap {
 
 /// Pixels in RING order on ecliptic axes, K: little-endian 32-bit numbers, as its file rounds them.
 #[derive(Debug)]
-pub(super) struct HeldMap {
+pub(super) struct ShownMap {
     pub(super) pixels: Bytes,
     /// Header cards of its file; `None` for a companion, which has no file until the end.
     cards: Option<Vec<Card>>,
@@ -68,7 +68,7 @@ pub(super) struct HeldMap {
     picture: OnceLock<Bytes>,
 }
 
-impl HeldMap {
+impl ShownMap {
     fn new(values: &[f64], cards: Option<Vec<Card>>, title: String) -> Self {
         let pixels: Vec<u8> = values.iter().flat_map(|&value| (value as f32).to_le_bytes()).collect();
         Self { pixels: pixels.into(), cards, title, picture: OnceLock::new() }
@@ -108,7 +108,7 @@ impl HeldMap {
 #[derive(Clone, Debug)]
 struct Snapshot {
     number: u32,
-    map: Arc<HeldMap>,
+    map: Arc<ShownMap>,
 }
 
 #[derive(Debug)]
@@ -120,16 +120,16 @@ struct ChannelShelf {
     span_s: [f64; 2],
     diagnostics: Diagnostics,
     maps: Vec<Snapshot>,
-    noise: Arc<HeldMap>,
+    noise: Arc<ShownMap>,
     noise_rms_k: f64,
-    input: Option<Arc<HeldMap>>,
+    input: Option<Arc<ShownMap>>,
     figures: Vec<SnapshotSummary>,
     spectra: Option<SpectraOfMap>,
     /// When the last map was made.
     made: SystemTime,
 }
 
-/// What the status says of a channel.
+/// A channel in the status.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ChannelStatus {
     /// Number of the channel.
@@ -168,14 +168,14 @@ pub(super) struct ChannelFigures {
 
 /// Which map of a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Which {
+pub(super) enum MapChoice {
     Number(u32),
     Latest,
     Noise,
     Input,
 }
 
-impl Which {
+impl MapChoice {
     pub(super) fn read(text: &str) -> Option<Self> {
         match text {
             "latest" => Some(Self::Latest),
@@ -206,8 +206,8 @@ impl Shelf {
         let frequency_hz = solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let days = (solution.span_s[1] - solution.span_s[0]) / crate::units::constants::DAY_S;
         let title = |what: &str| format!("{what} at {} MHz, {days:.1} days", frequency_hz / 1e6);
-        let companion = |values: &[f64], what| Arc::new(HeldMap::new(values, None, title(what)));
-        let map = Arc::new(HeldMap::new(&solution.map_k, Some(cards.to_vec()), title("Map")));
+        let companion = |values: &[f64], what| Arc::new(ShownMap::new(values, None, title(what)));
+        let map = Arc::new(ShownMap::new(&solution.map_k, Some(cards.to_vec()), title("Map")));
         let noise = companion(&solution.noise_k, "Noise");
         let said = format!(
             "map {} at {:.3} MHz: {:.1} days, {} visibilities",
@@ -247,21 +247,21 @@ impl Shelf {
     }
 
     /// A map; `None` if it is not held.
-    pub(super) fn map(&self, channel: ChannelId, which: Which) -> Option<Arc<HeldMap>> {
+    pub(super) fn map(&self, channel: ChannelId, which: MapChoice) -> Option<Arc<ShownMap>> {
         let channels = self.channels();
         let shelf = channels.get(&channel)?;
         match which {
-            Which::Latest => shelf.maps.last().map(|snapshot| Arc::clone(&snapshot.map)),
-            Which::Number(number) => {
+            MapChoice::Latest => shelf.maps.last().map(|snapshot| Arc::clone(&snapshot.map)),
+            MapChoice::Number(number) => {
                 let found = shelf.maps.iter().find(|snapshot| snapshot.number == number);
                 found.map(|snapshot| Arc::clone(&snapshot.map))
             }
-            Which::Noise => Some(Arc::clone(&shelf.noise)),
-            Which::Input => shelf.input.clone(),
+            MapChoice::Noise => Some(Arc::clone(&shelf.noise)),
+            MapChoice::Input => shelf.input.clone(),
         }
     }
 
-    /// What the status says.
+    /// The channels in the status.
     pub(super) fn status(&self) -> Vec<ChannelStatus> {
         let status = |(channel, shelf): (&ChannelId, &ChannelShelf)| ChannelStatus {
             channel: channel.0,
@@ -306,7 +306,7 @@ impl Shelf {
     }
 }
 
-fn spectrum_of(map: &HeldMap, nside: usize) -> Result<SpectraOfMap, MapError> {
+fn spectrum_of(map: &ShownMap, nside: usize) -> Result<SpectraOfMap, MapError> {
     let map = SkyMap::new(Frame::Ecliptic, map.values())?;
     let alm = map.harmonics(3 * nside - 1, &AnalysisOptions::default())?;
     Ok(SpectraOfMap { cl_map: auto_cl(&alm), ..SpectraOfMap::default() })
@@ -362,10 +362,10 @@ mod tests {
 
     #[test]
     fn maps_have_one_name_each() {
-        assert_eq!(Which::read("latest"), Some(Which::Latest));
-        assert_eq!(Which::read("7"), Some(Which::Number(7)));
+        assert_eq!(MapChoice::read("latest"), Some(MapChoice::Latest));
+        assert_eq!(MapChoice::read("7"), Some(MapChoice::Number(7)));
         for text in ["", "0", "07", "+7", "-1", "7 ", "4294967296", "LATEST", "../7", "\u{664}"] {
-            assert_eq!(Which::read(text), None, "{text}");
+            assert_eq!(MapChoice::read(text), None, "{text}");
         }
     }
 }

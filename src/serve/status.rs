@@ -114,7 +114,7 @@ pub(super) struct LedgerStatus {
 }
 
 impl LedgerStatus {
-    /// Of a run that has ended, or goes on.
+    /// The status of a run that has ended, or goes on.
     pub(super) fn of(report: LedgerReport<VisibilityReason>, is_over: bool) -> Self {
         let sampled = is_over.then(|| (report.sampled, report.unaccounted()));
         Self { report, sampled }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::array::EarthModel;
 use crate::pipeline::Config;
 
-/// What the server tells about.
+/// The run that the server shows.
 #[derive(Clone, Debug)]
 pub struct Subject {
     /// Name of the pipeline.

@@ -78,7 +78,7 @@ pub fn ring(nside: usize, k: usize) -> Ring {
     Ring { first, len, z: if southern { -z } else { z }, sin_theta, phi0_rad }
 }
 
-/// What whole numbers say of a ring.
+/// The integers of a ring.
 struct RingPixels {
     first: usize,
     len: usize,

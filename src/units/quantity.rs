@@ -2,7 +2,7 @@
 
 use super::constants::DAY_S;
 
-/// What a number measures, and in what it is kept.
+/// The dimension of a number, and its unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Dimension {
     /// Hz.
@@ -36,7 +36,7 @@ const LENGTHS: [(&str, f64); 2] = [("km", 1e3), ("m", 1.0)];
 const ANGLES: [(&str, f64); 3] = [("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("deg", 1.0)];
 
 impl Dimension {
-    /// What a key measures, by the unit at the end of its name: `channels_hz`, `duration_s`, `clock_sigma_ns`, `altitude_m`,
+    /// The dimension of a key, by the unit at the end of its name: `channels_hz`, `duration_s`, `clock_sigma_ns`, `altitude_m`,
     /// `inclination_deg`, also before `_max` and `_min`. `None` for other units, and rates such as `_m_s`.
     #[must_use]
     pub fn of_key(key: &str) -> Option<Self> {
@@ -102,7 +102,7 @@ impl Dimension {
     /// The value of a text, in the unit that this dimension is kept in; a number alone is in that unit.
     ///
     /// # Errors
-    /// Text that is no finite number with one of the units: what is expected.
+    /// What was expected, if the text is not a finite number with one of the units.
     pub fn parse(self, text: &str) -> Result<f64, String> {
         let text = text.trim();
         let found = self.units().iter().find_map(|(unit, size)| Some((text.strip_suffix(unit)?, *size)));

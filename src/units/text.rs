@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-/// A line of text in which every character is shown and none is obeyed: control characters, line breaks, and those that
+/// A line of text with every character shown and none interpreted: control characters, line breaks, and those that
 /// reorder what is written are escaped.
 #[must_use]
 pub fn printable(line: &str) -> Cow<'_, str> {

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use lunarray::array::{Array, ArrayConfig, segments_for};
 use lunarray::calibration::CalibrationConfig;
-use lunarray::downlink::transport::socket::{ListenConfig, SocketSource, Until};
+use lunarray::downlink::transport::socket::{ListenConfig, ListenLimits, SocketSource};
 use lunarray::downlink::{DownlinkConfig, DownlinkError, FileSource, Kind, PacketHeader};
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
@@ -422,7 +422,7 @@ impl Sequence<'_> {
         self.tell("listen", at, given);
         let bytes = self.bench.mission.bytes(&order);
         let mut ground = self.bench.open(&self.states[at].folder, every);
-        let until = Until { idle_s: 0.0, connections: 1 };
+        let until = ListenLimits { idle_s: 0.0, connections: 1 };
         let any = SocketAddr::from(([127, 0, 0, 1], 0));
         let source = SocketSource::bind(&[any], &ListenConfig::default(), until).unwrap();
         let source = source.knowing(ground.instrument().cloned());

@@ -16,7 +16,7 @@ fn copy_of(segment: &Path) -> PathBuf {
 pub const REFINED: &str = "[map]\nengine = \"harmonic\"\nresidual_max = 1e-9\nrefine = { passes_max = 2 }";
 
 /// A dozen products show all that more would: they begin at nothing.
-const REMADE: &str = "[map]\nmatrix = \"remade\"\niterations_max = 12";
+const MATRIX_FREE: &str = "[map]\nmatrix = \"free\"\niterations_max = 12";
 
 fn segments(folder: &str) -> Vec<PathBuf> {
     let mut found: Vec<PathBuf> =
@@ -33,7 +33,7 @@ fn any_order_and_any_sessions_make_the_same_refined_map() {
 
 #[test]
 fn any_order_and_any_sessions_make_the_same_map_of_rows_made_again() {
-    any_order_and_any_sessions_make_the_same(REMADE);
+    any_order_and_any_sessions_make_the_same(MATRIX_FREE);
 }
 
 fn any_order_and_any_sessions_make_the_same(engine: &str) {
@@ -121,7 +121,7 @@ fn what_is_retracted_leaves_no_trace_in_a_refined_map() {
 
 #[test]
 fn what_is_retracted_leaves_no_trace_in_a_map_of_rows_made_again() {
-    what_is_retracted_leaves_no_trace(REMADE);
+    what_is_retracted_leaves_no_trace(MATRIX_FREE);
 }
 
 fn what_is_retracted_leaves_no_trace(engine: &str) {
@@ -150,7 +150,7 @@ fn more_than_may_be_held_is_left_out_and_counted() {
 
 #[test]
 fn more_rows_than_may_be_held_are_left_out_and_counted() {
-    more_than_may_be_held_is_left_out(REMADE);
+    more_than_may_be_held_is_left_out(MATRIX_FREE);
 }
 
 fn more_than_may_be_held_is_left_out(engine: &str) {

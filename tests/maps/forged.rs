@@ -6,8 +6,8 @@ use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{
     AntennaResponse, Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason,
 };
+use lunarray::imaging::anywhere::AssumedInstrument;
 use lunarray::imaging::anywhere::RefineRule;
-use lunarray::imaging::anywhere::RowBelief;
 use lunarray::imaging::{
     Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
     SnapshotSums, SumCounts,
@@ -151,7 +151,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             moon_reflection: 0.0,
             rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
             refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
-            belief: RowBelief::default(),
+            assumed: AssumedInstrument::default(),
             passes: None,
             trace_probes: 0,
             samples: 0,

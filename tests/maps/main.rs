@@ -10,7 +10,7 @@ mod epsilon;
 mod exact_sums;
 mod forged;
 mod lengths;
+mod matrix_free;
 mod refined;
-mod remade;
 mod tikhonov;
 mod traces;

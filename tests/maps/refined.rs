@@ -14,7 +14,7 @@ use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::anywhere::RefineSteps;
 use lunarray::imaging::anywhere::Refinement;
 use lunarray::imaging::anywhere::solve_refined;
-use lunarray::imaging::anywhere::{RefinedSetup, RefinedSums, RowBelief, VisibilityArchive};
+use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, VisibilityArchive};
 use lunarray::imaging::{
     HarmonicRequest, HarmonicSolution, SolveError, SolveWatch, StoppingRule, solve_harmonics,
 };
@@ -115,7 +115,7 @@ fn sums(l_max: usize, blocks: &[PlacedVisibilities]) -> RefinedSums {
         let added = archive.add(block).unwrap();
         assert!(added.refused.is_empty() && added.visibilities == block.len() as u64);
     }
-    archive.into_sums(&RowBelief::default()).unwrap()
+    archive.into_sums(&AssumedInstrument::default()).unwrap()
 }
 
 fn request(nside: usize) -> HarmonicRequest {

@@ -162,19 +162,19 @@ fn hostile_files_are_refused_with_a_reason() {
 }
 
 /// A file of a circular orbit 300 km above the Moon, in a plane that holds the pole; states at some times after a date of a time system.
-struct Made<'a> {
+struct FlownOrbit<'a> {
     frame: &'a str,
     scale: &'a str,
     metadata: &'a str,
 }
 
-const MADE: Made<'_> = Made {
+const MADE: FlownOrbit<'_> = FlownOrbit {
     frame: "ECLIPJ2000",
     scale: "UTC",
     metadata: "INTERPOLATION = HERMITE\nINTERPOLATION_DEGREE = 7\n",
 };
 
-impl Made<'_> {
+impl FlownOrbit<'_> {
     /// Metadata and states `(label, seconds after the first, velocity scaled)`.
     fn segment(&self, angle: f64, states: &[(String, f64)]) -> String {
         let Self { frame, scale, metadata } = self;
@@ -233,8 +233,9 @@ fn dates_of_files_are_those_of_the_mission_in_every_time_system() {
             ("GPS", 19.0, 1e-6),
         ]
     {
-        let array = array_of(folder.path(), |u| Made { scale, ..MADE }.file(u, &minutes(0..61)).into_bytes())
-            .unwrap();
+        let array =
+            array_of(folder.path(), |u| FlownOrbit { scale, ..MADE }.file(u, &minutes(0..61)).into_bytes())
+                .unwrap();
         let epoch_s = array.epoch_tai_s().unwrap();
         assert!((epoch_s - 24_166.0 * 86_400.0 - offset_s).abs() < tolerance_s, "{scale}: {epoch_s}");
         assert!(radius_off_m(&array, 1234.5) < 1e-2, "{scale}");
@@ -264,7 +265,7 @@ fn utc_goes_through_a_leap_second() {
     let known_s = array.known_s().unwrap();
     assert!((known_s[1] - 3600.0).abs() < 1e-6, "{known_s:?}");
     // The same labels have no second 60 on TAI.
-    let said = array_of(folder.path(), |u| Made { scale: "TAI", ..MADE }.file(u, &states).into_bytes());
+    let said = array_of(folder.path(), |u| FlownOrbit { scale: "TAI", ..MADE }.file(u, &states).into_bytes());
     assert!(said.unwrap_err().to_string().contains("2016-12-31T23:59:60"));
 }
 
@@ -279,7 +280,7 @@ fn useable_times_say_which_segment_holds() {
     };
     // Padding before and after: the mission begins with what is useable.
     let metadata = useable("00:10", "01:10");
-    let padded = Made { metadata: &metadata, ..MADE };
+    let padded = FlownOrbit { metadata: &metadata, ..MADE };
     let array = array_of(folder.path(), |u| padded.file(u, &minutes(0..81)).into_bytes()).unwrap();
     let known_s = array.known_s().unwrap();
     assert!(known_s[0].abs() < 1e-6 && (known_s[1] - 3600.0).abs() < 1e-6, "{known_s:?}");
@@ -289,8 +290,8 @@ fn useable_times_say_which_segment_holds() {
     // Segments that overlap: the second is of another orbit until it is useable.
     let (first, second) = (useable("00:00", "00:30"), useable("00:30", "01:00"));
     let two = |u: f64| {
-        let later = Made { metadata: &second, ..MADE }.segment(u, &minutes(25..61));
-        Made { metadata: &first, ..MADE }.file(u, &minutes(0..36)) + &later
+        let later = FlownOrbit { metadata: &second, ..MADE }.segment(u, &minutes(25..61));
+        FlownOrbit { metadata: &first, ..MADE }.file(u, &minutes(0..36)) + &later
     };
     let array = array_of(folder.path(), |u| two(u).into_bytes()).unwrap();
     assert!((array.known_s().unwrap()[1] - 3600.0).abs() < 1e-6);
@@ -302,7 +303,7 @@ fn useable_times_say_which_segment_holds() {
     let plain = MADE.file(1e-3, &minutes(0..36)) + &MADE.segment(1e-3, &minutes(25..61));
     assert!(told(plain).contains("begins 600.000 s before the one before ends"));
     let metadata = useable("00:00", "02:10");
-    let said = told(Made { metadata: &metadata, ..MADE }.file(1e-3, &minutes(0..81)));
+    let said = told(FlownOrbit { metadata: &metadata, ..MADE }.file(1e-3, &minutes(0..81)));
     assert!(said.contains("line 9: found a USEABLE time of 2024-03-01T02:10:00.000"), "{said}");
 }
 
@@ -340,7 +341,7 @@ fn states_that_do_not_fit_each_other_are_refused_with_time_and_error() {
             of(&some(&|k| !(60..120).contains(&k))),
             "a gap of 3660.000 s (the states beside it are 60.000 s apart) from 2024-03-01T00:59:00.000 UTC",
         ),
-        (Made { metadata: lagrange, ..MADE }.file(1e-3, &coarse), "3600.000 s from 2024-03-01T"),
+        (FlownOrbit { metadata: lagrange, ..MADE }.file(1e-3, &coarse), "3600.000 s from 2024-03-01T"),
         (
             of(&some(&|k| k % 30 == 0)),
             "1800.000 s from 2024-03-01T00:00:00.000 UTC to 2024-03-01T00:30:00.000 UTC, between which the interpolation errs by",
@@ -399,7 +400,7 @@ fn files_are_read_as_others_write_them() {
     // SANA's names of the axes of J2000: y and z of the equator are 23.439291 degrees from those of the ecliptic.
     for frame in ["EME2000", "J2000", "ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "GCRF3", "icrf3"] {
         let array =
-            array_of(folder.path(), |u| Made { frame, ..MADE }.file(u, &states).into_bytes()).unwrap();
+            array_of(folder.path(), |u| FlownOrbit { frame, ..MADE }.file(u, &states).into_bytes()).unwrap();
         let [_, y, z] = array.position_m(0, 1234.5);
         let off = y.atan2(z).to_degrees() - 23.439_291;
         assert!(off.abs() < 1e-6, "{frame}: {off}");

@@ -5,9 +5,9 @@ use std::io::Cursor;
 use std::path::Path;
 
 use lunarray::sky::fits::{
-    Card, CardValue, Column, FitsError, FitsProblem, MapFile, MapUnderstood, Ordering, Precision,
-    ReadOptions, SkyChannel, WriteOptions, read_map, read_map_file, read_map_from, read_notes, read_prior,
-    read_sky, read_whole_map, write_columns, write_map,
+    Card, CardValue, Column, FitsError, FitsProblem, MapFile, MapOutline, Ordering, Precision, ReadOptions,
+    SkyChannel, WriteOptions, read_map, read_map_file, read_map_from, read_notes, read_prior, read_sky,
+    read_whole_map, write_columns, write_map,
 };
 use lunarray::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
@@ -427,7 +427,7 @@ fn the_first_header_says_what_the_table_s_leaves_out() {
     let map = read_for(&path, 408e6, MapFrequency::MustMatch, false).unwrap();
     // At nside 1 both orders are the same.
     assert_eq!((map.frame(), map.values()[3]), (Frame::Galactic, 23.0));
-    let understood = MapUnderstood::of(&path, &ReadOptions::default()).unwrap().to_string();
+    let understood = MapOutline::of(&path, &ReadOptions::default()).unwrap().to_string();
     for part in ["408 MHz", "Galactic frame", "mK", "column `TEMPERATURE` of 2", "nside 1", "mean 2.55"] {
         assert!(understood.contains(part), "{part}: {understood}");
     }

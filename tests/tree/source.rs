@@ -193,6 +193,32 @@ fn tokens(text: &str) -> Vec<String> {
     tokens
 }
 
+/// A text without comments and without what is between quotes, line for line.
+pub fn code_alone(text: &str) -> String {
+    let (mut code, mut rest) = (String::with_capacity(text.len()), text);
+    let mut in_name = false;
+    while let Some(first) = rest.chars().next() {
+        let is_literal = !in_name && text_literal(rest).is_some();
+        let taken = if rest.starts_with("//") {
+            rest.find('\n').unwrap_or(rest.len())
+        } else if rest.starts_with("/*") {
+            block_comment(rest)
+        } else if is_literal {
+            code.push_str("\"\"");
+            text_literal(rest).unwrap_or(1)
+        } else {
+            first.len_utf8()
+        };
+        in_name = first.is_alphanumeric() || first == '_';
+        match taken == first.len_utf8() && !is_literal {
+            true => code.push(first),
+            false => code.extend(rest[..taken].chars().filter(|c| *c == '\n')),
+        }
+        rest = &rest[taken..];
+    }
+    code
+}
+
 /// The length of a comment that may hold others.
 fn block_comment(text: &str) -> usize {
     let (mut depth, mut at) = (0, 0);

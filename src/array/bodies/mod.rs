@@ -34,7 +34,7 @@ pub enum EarthModel {
 }
 
 impl EarthModel {
-    /// That of an array: orbits of files have dates.
+    /// The Earth of an array: orbits of files have dates.
     #[must_use]
     pub fn of(config: &ArrayConfig) -> Self {
         if config.oem.is_empty() { Self::Circle(config.earth_longitude_deg) } else { Self::Dated }

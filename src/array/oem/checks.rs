@@ -1,7 +1,7 @@
 //! What states have to be: above the surface, bound to the Moon, and near enough to each other for their interpolation.
 
+use super::interpolate::interpolated;
 use super::message::{Fault, OemSegment, Reading, TableMethod};
-use super::orbit::interpolated;
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{norm, sub};
 

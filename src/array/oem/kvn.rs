@@ -11,7 +11,7 @@ enum Place {
     Covariance,
 }
 
-/// Reads a message. Bytes that are no text may stand where nothing is read: in comments and names.
+/// Reads a message. Comments and names may hold any bytes, also such as are not text.
 ///
 /// # Errors
 /// The first thing that is wrong.

@@ -14,7 +14,7 @@ pub(super) const DEGREE_MAX: usize = 15;
 /// Most that a useable time may lie beyond the states, s: a rounded epoch.
 const ROUNDED_S: f64 = 1e-6;
 
-/// What a file may be wrong in: its line, from 1, what was found, and what was expected there.
+/// A fault of a file: its line, from 1, what was found, and what was expected there.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Fault {
     pub(super) line: usize,
@@ -65,7 +65,7 @@ impl OemSegment {
     }
 }
 
-/// What one file says.
+/// Content of one file.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct OemMessage {
     /// From which its seconds count: the second in which its first state is.

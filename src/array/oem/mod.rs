@@ -1,10 +1,11 @@
 //! Orbits from CCSDS Orbit Ephemeris Messages.
 
 mod checks;
+mod interpolate;
 mod kvn;
 mod message;
 mod orbit;
 mod xml;
 
 pub(super) use message::to_equatorial;
-pub(super) use orbit::{Stretch, TableOrbit, read};
+pub(super) use orbit::{OrbitArc, TableOrbit, read};

@@ -8,7 +8,8 @@ use flate2::read::MultiGzDecoder;
 use rayon::prelude::*;
 
 use super::checks::check;
-use super::message::{DEGREE_MAX, Fault, OemMessage, OemSegment, Reading, TableMethod};
+use super::interpolate::interpolated;
+use super::message::{Fault, OemMessage, OemSegment, Reading, TableMethod};
 use super::{kvn, xml};
 use crate::array::config::ArrayError;
 use crate::array::state::SatelliteState;
@@ -22,19 +23,19 @@ pub(in crate::array) struct TableOrbit {
     message: Arc<OemMessage>,
     /// Epoch of the mission in the message's seconds.
     epoch_s: f64,
-    /// Between which of them positions are known without a gap.
+    /// Interval in which positions are known without a gap, of the mission's time.
     span_s: [f64; 2],
 }
 
 /// States of one orbit, at rising times, without a jump.
 #[derive(Clone, Debug, Default)]
-pub(in crate::array) struct Stretch {
+pub(in crate::array) struct OrbitArc {
     time_s: Vec<f64>,
     position_m: Vec<Vec3>,
     velocity_m_s: Vec<Vec3>,
 }
 
-impl Stretch {
+impl OrbitArc {
     pub(in crate::array) fn times_s(&self) -> &[f64] {
         &self.time_s
     }
@@ -62,7 +63,7 @@ const APART_M: f64 = 1.0;
 /// How far beyond its states an orbit goes on, s: ticks of time tags. Farther out nothing is known, and states are not numbers.
 const BEYOND_S: f64 = 1.0;
 
-/// Greatest gap between segments that is none, s: rounded epochs.
+/// Gap between segments that still counts as continuous, s: rounded epochs.
 const SEAM_S: f64 = 1e-6;
 
 /// The orbits of all satellites.
@@ -71,7 +72,7 @@ pub(in crate::array) struct OemOrbits {
     pub(in crate::array) orbits: Vec<TableOrbit>,
     /// Epoch of the mission.
     pub(in crate::array) epoch: Tai,
-    /// What the files hold and is not used.
+    /// Content of the files that is not used.
     pub(in crate::array) notes: Vec<String>,
 }
 
@@ -221,8 +222,8 @@ impl OemMessage {
 impl TableOrbit {
     /// An orbit through states at times after the mission's epoch; each stretch, of four states or more, begins when the one
     /// before ends.
-    pub(in crate::array) fn of_stretches(stretches: Vec<Stretch>) -> Self {
-        let segment = |Stretch { time_s, position_m, velocity_m_s }| OemSegment {
+    pub(in crate::array) fn of_stretches(stretches: Vec<OrbitArc>) -> Self {
+        let segment = |OrbitArc { time_s, position_m, velocity_m_s }| OemSegment {
             method: TableMethod::Hermite,
             degree: 7,
             useable_s: [time_s.first(), time_s.last()].map(|s| s.copied().unwrap_or_default()),
@@ -238,7 +239,7 @@ impl TableOrbit {
 
     /// The states of the table that are to be used, at times since the mission's epoch; where useable times lie between states, also
     /// those then.
-    pub(in crate::array) fn stretches(&self) -> Vec<Stretch> {
+    pub(in crate::array) fn stretches(&self) -> Vec<OrbitArc> {
         let stretch = |segment: &OemSegment| {
             let [from_s, until_s] = segment.useable_s;
             let first = segment.time_s.partition_point(|t_s| *t_s < from_s);
@@ -247,7 +248,7 @@ impl TableOrbit {
             let own = |t_s: f64, k: usize| {
                 segment.time_s.get(k).is_none_or(|known_s| *known_s != t_s).then_some(t_s)
             };
-            let mut out = Stretch::default();
+            let mut out = OrbitArc::default();
             let mut add = |t_s: f64| out.push(t_s - self.epoch_s, segment.state(t_s));
             own(from_s, first).into_iter().for_each(&mut add);
             segment.time_s[first..end].iter().copied().for_each(&mut add);
@@ -323,44 +324,4 @@ impl OemSegment {
     fn state(&self, at_s: f64) -> SatelliteState {
         interpolated(self, self.method, self.points(), at_s)
     }
-}
-
-/// Newton's polynomial through some of a segment's states about a time, and its derivative.
-pub(super) fn interpolated(
-    segment: &OemSegment,
-    method: TableMethod,
-    points: usize,
-    at_s: f64,
-) -> SatelliteState {
-    let repeats = if method == TableMethod::Hermite { 2 } else { 1 };
-    let after = segment.time_s.partition_point(|t_s| *t_s <= at_s);
-    let first = after.saturating_sub(points.div_ceil(2)).min(segment.time_s.len() - points);
-    // Times from the middle, so that differences keep their digits.
-    let zero_s = segment.time_s[first];
-    let count = points * repeats;
-    let mut times = [0.0; 2 * DEGREE_MAX + 2];
-    let mut divided = [[0.0; 3]; 2 * DEGREE_MAX + 2];
-    for k in 0..count {
-        times[k] = segment.time_s[first + k / repeats] - zero_s;
-        divided[k] = segment.position_m[first + k / repeats];
-    }
-    for order in 1..count {
-        for k in (order..count).rev() {
-            let step = times[k] - times[k - order];
-            divided[k] = if step == 0.0 {
-                segment.velocity_m_s[first + k / repeats]
-            } else {
-                scale(1.0 / step, sub(divided[k], divided[k - 1]))
-            };
-        }
-    }
-    let tau = at_s - zero_s;
-    let (mut position_m, mut velocity_m_s) = (divided[count - 1], [0.0; 3]);
-    for k in (0..count - 1).rev() {
-        for axis in 0..3 {
-            velocity_m_s[axis] = velocity_m_s[axis] * (tau - times[k]) + position_m[axis];
-            position_m[axis] = position_m[axis] * (tau - times[k]) + divided[k][axis];
-        }
-    }
-    SatelliteState { position_m, velocity_m_s }
 }

@@ -51,7 +51,7 @@ struct Elements {
     collector: Collector,
     messages: usize,
     depth: usize,
-    around: Around,
+    around: XmlContext,
     state: State,
     /// Text of the latest element.
     value: String,
@@ -74,14 +74,14 @@ impl Elements {
             "metadata" => {
                 self.collector.end_segment(line)?;
                 self.collector.begin_metadata();
-                self.around = Around::Metadata;
+                self.around = XmlContext::Metadata;
             }
-            "stateVector" => (self.around, self.state) = (Around::State, State::default()),
+            "stateVector" => (self.around, self.state) = (XmlContext::State, State::default()),
             "covarianceMatrix" => {
                 self.collector.covariances += 1;
-                self.around = Around::Nothing;
+                self.around = XmlContext::Nothing;
             }
-            name if self.around == Around::State => require_unit(element, name, line)?,
+            name if self.around == XmlContext::State => require_unit(element, name, line)?,
             _ => {}
         }
         Ok(())
@@ -99,24 +99,24 @@ impl Elements {
         match (self.around, name) {
             (_, "metadata") => {
                 self.collector.end_metadata(line)?;
-                self.around = Around::Nothing;
+                self.around = XmlContext::Nothing;
             }
             (_, "stateVector") => {
                 self.state.add_to(&mut self.collector, line)?;
-                self.around = Around::Nothing;
+                self.around = XmlContext::Nothing;
             }
-            (Around::Metadata, _) => self.collector.set(name, value, line),
-            (Around::State, _) => self.state.set(name, value, line)?,
-            (Around::Nothing, _) => {}
+            (XmlContext::Metadata, _) => self.collector.set(name, value, line),
+            (XmlContext::State, _) => self.state.set(name, value, line)?,
+            (XmlContext::Nothing, _) => {}
         }
         self.value.clear();
         Ok(())
     }
 }
 
-/// What is around a value.
+/// The element in which a value stands.
 #[derive(Clone, Copy, Default, PartialEq)]
-enum Around {
+enum XmlContext {
     #[default]
     Nothing,
     Metadata,

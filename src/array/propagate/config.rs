@@ -11,7 +11,7 @@ const DAYS_MAX: f64 = 40_000.0;
 /// What station keeping restores.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Keeping {
+pub enum StationKeeping {
     /// The followers' places behind satellite 1, whose orbit goes on as it is.
     #[default]
     Formation,
@@ -36,7 +36,7 @@ keys! {
         expert keep_every_days: f64 = 0.0;
         /// What a correction restores: the "formation", or the "orbit": daughter 1's ellipse, too, with the node of that time.
         #[only_with("array.propagate.keep_every_days > 0")]
-        expert keep: Keeping = Keeping::Formation;
+        expert keep: StationKeeping = StationKeeping::Formation;
     }
 }
 

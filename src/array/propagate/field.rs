@@ -14,7 +14,7 @@ const EARTH_GM_M3_S2: f64 = 3.986_004_355e14;
 /// Distance of the Earth, m: the mean of its semi-major axis.
 const EARTH_DISTANCE_M: f64 = 384.4e6;
 
-/// What the harmonic function of one degree and order adds to an acceleration, by its part with the cosine and with the sine.
+/// Acceleration by one spherical harmonic, for its cosine and sine coefficients.
 #[derive(Clone, Copy, Debug, Default)]
 struct Term {
     /// From those of one and two degrees below.

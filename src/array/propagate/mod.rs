@@ -19,12 +19,12 @@ use std::sync::{Mutex, OnceLock};
 
 use rayon::prelude::*;
 
-pub use config::{Keeping, PropagateConfig};
+pub use config::{PropagateConfig, StationKeeping};
 
 use super::config::{ArrayConfig, ArrayError};
 use super::formation::Formation;
 use super::kepler::{KeplerElements, KeplerOrbit};
-use super::oem::{Stretch, TableOrbit};
+use super::oem::{OrbitArc, TableOrbit};
 use super::state::SatelliteState;
 use crate::units::constants::{DAY_S, SIDEREAL_MONTH_S};
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, unit};
@@ -46,12 +46,12 @@ const RADIUS_M_MAX: f64 = 6.6e7;
 const TELL_EVERY: usize = 4_000;
 
 /// Takes the days that are done, and those that there are.
-pub type PropagationTeller = fn(f64, f64);
+pub type PropagationProgress = fn(f64, f64);
 
-static TELLER: OnceLock<PropagationTeller> = OnceLock::new();
+static TELLER: OnceLock<PropagationProgress> = OnceLock::new();
 
 /// Has the progress of long propagations told; the first call of a process counts.
-pub fn tell_propagation(teller: PropagationTeller) {
+pub fn tell_propagation(teller: PropagationProgress) {
     let _ = TELLER.set(teller);
 }
 
@@ -85,7 +85,7 @@ fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
             all.chunks(LANES).map(<[usize]>::to_vec).collect()
         }
     };
-    let found: Result<Vec<Vec<Vec<Stretch>>>, ArrayError> =
+    let found: Result<Vec<Vec<Vec<OrbitArc>>>, ArrayError> =
         groups.par_iter().enumerate().map(|(index, group)| flight.fly(group, index == 0)).collect();
     let mut orbits: Vec<TableOrbit> = Vec::with_capacity(config.satellites);
     for (stretches, group) in found?.into_iter().zip(&groups) {
@@ -120,9 +120,9 @@ impl<'a> Flight<'a> {
     }
 
     /// The stretches of satellites that are computed together; satellite 1 is the first of them if there is a formation.
-    fn fly(&self, group: &[usize], tells: bool) -> Result<Vec<Vec<Stretch>>, ArrayError> {
+    fn fly(&self, group: &[usize], tells: bool) -> Result<Vec<Vec<OrbitArc>>, ArrayError> {
         let mut states = self.at_epoch(group);
-        let mut out: Vec<Vec<Stretch>> = vec![vec![Stretch::default()]; group.len()];
+        let mut out: Vec<Vec<OrbitArc>> = vec![vec![OrbitArc::default()]; group.len()];
         let every_s = self.config.propagate.keep_every_days * DAY_S;
         let mut due_s = if every_s > 0.0 { every_s } else { f64::INFINITY };
         // How high the Earth stood above satellite 1 at the last two states.
@@ -136,7 +136,7 @@ impl<'a> Flight<'a> {
             heights = [heights[1], height];
             if time_s >= due_s && culminates && node + NODES_MIN <= self.nodes {
                 states = self.kept(time_s, &states, group);
-                out.iter_mut().for_each(|stretches| stretches.push(Stretch::default()));
+                out.iter_mut().for_each(|stretches| stretches.push(OrbitArc::default()));
                 append(&mut out, time_s, &states);
                 due_s = every_s * ((time_s / every_s).floor() + 1.0);
             }
@@ -195,8 +195,8 @@ impl<'a> Flight<'a> {
     fn kept(&self, time_s: f64, states: &States, group: &[usize]) -> States {
         let leader = of_lane(states, 0);
         let leader = match self.config.propagate.keep {
-            Keeping::Formation => leader,
-            Keeping::Orbit => self.restored(leader),
+            StationKeeping::Formation => leader,
+            StationKeeping::Orbit => self.restored(leader),
         };
         self.released(time_s, leader, group)
     }
@@ -267,7 +267,7 @@ impl<'a> Flight<'a> {
     }
 }
 
-fn append(out: &mut [Vec<Stretch>], time_s: f64, states: &States) {
+fn append(out: &mut [Vec<OrbitArc>], time_s: f64, states: &States) {
     for (lane, stretches) in out.iter_mut().enumerate() {
         if let Some(stretch) = stretches.last_mut() {
             stretch.push(time_s, of_lane(states, lane));

@@ -203,7 +203,7 @@ fn followers_go_where_the_leader_went_and_station_keeping_puts_them_back() {
     let free = Array::new(&config).unwrap();
     config.propagate.keep_every_days = 2.0;
     let kept = Array::new(&config).unwrap();
-    config.propagate.keep = Keeping::Orbit;
+    config.propagate.keep = StationKeeping::Orbit;
     let held = Array::new(&config).unwrap();
     let formation = Formation::new(&config).unwrap();
     let apart =

@@ -7,7 +7,7 @@
 //! parameters - tr F C_all, as a chi-square of so many degrees of freedom.
 
 use super::layout::ParameterLayout;
-use super::newton::Found;
+use super::newton::NewtonFit;
 use super::sums::PairSums;
 
 /// Standard deviations of what is saved beyond which daughters contradict one another.
@@ -17,7 +17,7 @@ const SIGNIFICANT: f64 = 3.0;
 const ITERATIONS: usize = 20;
 
 /// Whether any daughter but the reference contradicts the others.
-pub(super) fn is_contradicted(layout: &ParameterLayout, found: &Found, sums: &[PairSums]) -> bool {
+pub(super) fn is_contradicted(layout: &ParameterLayout, found: &NewtonFit, sums: &[PairSums]) -> bool {
     let without = |daughter: usize| {
         let is_of = |sums: &PairSums| [sums.pair.i, sums.pair.j].map(usize::from).contains(&daughter);
         let (own, rest): (Vec<PairSums>, Vec<PairSums>) = sums.iter().partition(|sums| is_of(sums));

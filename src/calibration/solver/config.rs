@@ -78,8 +78,6 @@ keys! {
         expert pass_gap_s: f64 = 900.0;
         /// Residual beyond which a visibility is left out of a solution, in units of its spread.
         expert outlier_sigma: f64 = 6.0;
-        /// Most rounds of leaving out outliers.
-        expert outlier_rounds: u32 = 3;
         /// Most Gauss-Newton iterations of a round.
         expert iterations_max: u32 = 50;
         /// Most predictions of the model at positions found before.
@@ -233,7 +231,6 @@ impl SolverConfig {
         for (key, value, least, most) in [
             ("reference_daughter", self.reference_daughter, 1, 64),
             ("solutions_per_pass", self.solutions_per_pass, 1, 1000),
-            ("outlier_rounds", self.outlier_rounds, 0, 100),
             ("iterations_max", self.iterations_max, 1, 1000),
             ("position_rounds", self.position_rounds, 1, 20),
             ("map_rounds", self.map_rounds, 0, 100),

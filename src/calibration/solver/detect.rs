@@ -29,7 +29,7 @@ const SIGNIFICANT: f64 = 3.0;
 
 /// What the data say of a gain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Presence {
+pub(super) enum SignalPresence {
     /// No data.
     None,
     /// The known signal is there.
@@ -52,13 +52,13 @@ pub(super) struct OwnGain {
     ideal: f64,
     /// The same with all daughters, whether they take part or not, and noise alone.
     of_all: f64,
-    pub(super) presence: Presence,
+    pub(super) presence: SignalPresence,
 }
 
 impl OwnGain {
     /// What one is that is not seen, by what a receiver that works would deliver.
-    fn unseen(&self, config: &SolverConfig) -> Presence {
-        if self.is_visible(config) { Presence::Other } else { Presence::Weak }
+    fn unseen(&self, config: &SolverConfig) -> SignalPresence {
+        if self.is_visible(config) { SignalPresence::Other } else { SignalPresence::Weak }
     }
 
     /// Least square of the signal-to-noise ratio of a receiver that works.
@@ -79,7 +79,7 @@ impl OwnGain {
 }
 
 /// By channel, then daughter: which have no part in the solution.
-pub(super) type Dropped = Vec<bool>;
+pub(super) type DroppedDaughters = Vec<bool>;
 
 /// Whether a pair takes part.
 pub(super) fn takes_part(layout: &ParameterLayout, dropped: &[bool], sums: &PairSums) -> bool {
@@ -124,16 +124,16 @@ pub(super) fn own_gains(
     for (c, channel) in own.chunks_mut(n.max(1)).enumerate() {
         // Gains of all that are fitted to noise agree with it.
         let part = channel.iter().enumerate().filter(|(n_own, _)| !dropped[c * n + n_own]);
-        let part = part.filter(|(_, own)| own.presence != Presence::None).count();
+        let part = part.filter(|(_, own)| own.presence != SignalPresence::None).count();
         let least = SEEN + SEEN_MORE * part.saturating_sub(2) as f64;
         if signal_of(layout, values, sums, dropped, c) < least {
-            let seen = channel.iter_mut().filter(|own| own.presence == Presence::Seen);
+            let seen = channel.iter_mut().filter(|own| own.presence == SignalPresence::Seen);
             seen.for_each(|own| own.presence = own.unseen(config));
         }
         // Where nobody is seen it is not the daughters.
-        if channel.iter().all(|own| own.presence != Presence::Seen) {
-            let dead = channel.iter_mut().filter(|own| own.presence == Presence::Dead);
-            dead.for_each(|own| own.presence = Presence::Other);
+        if channel.iter().all(|own| own.presence != SignalPresence::Seen) {
+            let dead = channel.iter_mut().filter(|own| own.presence == SignalPresence::Dead);
+            dead.for_each(|own| own.presence = SignalPresence::Other);
         }
     }
     own
@@ -181,36 +181,36 @@ impl Sums {
     fn gain(self, config: &SolverConfig) -> OwnGain {
         let Self { above, below, ideal, power, count, has_data, of_all } = self;
         if below <= 0.0 || count == 0.0 {
-            let presence = if has_data { Presence::Weak } else { Presence::None };
+            let presence = if has_data { SignalPresence::Weak } else { SignalPresence::None };
             return OwnGain { gain: Complex64::ONE, information: 0.0, ideal: 0.0, of_all, presence };
         }
         let gain = above / below;
-        let own = OwnGain { gain, information: below, ideal, of_all, presence: Presence::Weak };
+        let own = OwnGain { gain, information: below, ideal, of_all, presence: SignalPresence::Weak };
         let expected = own.expected(config);
         // Of |V|^2 in units of its noise, beyond that of noise.
         let beyond = power - 2.0 * count;
         let presence = match () {
-            () if own.signal() >= SEEN && gain.norm() >= config.dead_amplitude => Presence::Seen,
-            () if own.signal() >= SEEN => Presence::Dead,
+            () if own.signal() >= SEEN && gain.norm() >= config.dead_amplitude => SignalPresence::Seen,
+            () if own.signal() >= SEEN => SignalPresence::Dead,
             () if expected < TOLD => own.unseen(config),
-            () if beyond > 0.5 * expected + SIGNIFICANT * 2.0 * count.sqrt() => Presence::Other,
-            () => Presence::Dead,
+            () if beyond > 0.5 * expected + SIGNIFICANT * 2.0 * count.sqrt() => SignalPresence::Other,
+            () => SignalPresence::Dead,
         };
         OwnGain { presence, ..own }
     }
 }
 
 /// Which daughters have no part in a solution: all that are not seen, but those that others of their channels tell of.
-pub(super) fn dropped(layout: &ParameterLayout, own: &[OwnGain]) -> Dropped {
+pub(super) fn dropped(layout: &ParameterLayout, own: &[OwnGain]) -> DroppedDaughters {
     // A clock or a position is found from all channels together.
     let is_joint = layout.channels() > 1 && layout.clock_sigma_ns > 0.0 || layout.terms() > 1;
     own.iter()
         .map(|own| match own.presence {
-            Presence::Seen | Presence::None => false,
-            Presence::Weak => !is_joint,
+            SignalPresence::Seen | SignalPresence::None => false,
+            SignalPresence::Weak => !is_joint,
             // With positions that are not known yet little of the signal is seen.
-            Presence::Other => layout.terms() == 1,
-            Presence::Dead => true,
+            SignalPresence::Other => layout.terms() == 1,
+            SignalPresence::Dead => true,
         })
         .collect()
 }
@@ -219,7 +219,7 @@ pub(super) fn dropped(layout: &ParameterLayout, own: &[OwnGain]) -> Dropped {
 pub(super) fn reference(layout: &ParameterLayout, own: &[OwnGain], wanted: usize) -> usize {
     let n = layout.satellites;
     let seen = |daughter: usize| {
-        (0..layout.channels()).filter(|c| own[c * n + daughter].presence == Presence::Seen).count()
+        (0..layout.channels()).filter(|c| own[c * n + daughter].presence == SignalPresence::Seen).count()
     };
     let best = (0..n).map(seen).max().unwrap_or(0);
     if seen(wanted) == best {

@@ -6,7 +6,7 @@
 //! what is left beyond the noise has to be significant, and a good part of the signal.
 
 use super::layout::ParameterLayout;
-use super::newton::Found;
+use super::newton::NewtonFit;
 use super::robust_fit::Fitted;
 use super::sums::ModelledBlock;
 
@@ -16,17 +16,17 @@ const SIGNIFICANT: f64 = 3.0;
 /// What is left of the signal of a pair in a channel, and the signal, in units of the variance of signal and noise together:
 /// beams, beacons and pairs of any strength count by the number of their visibilities.
 #[derive(Clone, Copy, Default)]
-struct Left {
+struct Residual {
     left: f64,
     signal: f64,
     /// Variance of `left` by noise.
     variance: f64,
 }
 
-impl Left {
+impl Residual {
     fn of(
         layout: &ParameterLayout,
-        found: &Found,
+        found: &NewtonFit,
         block: &ModelledBlock,
         [from_s, until_s]: [f64; 2],
     ) -> Self {
@@ -78,19 +78,19 @@ pub(super) fn unexplained(
     let n = layout.satellites;
     let mut parts = vec![0.0; n * layout.channels()];
     for (channel, parts) in parts.chunks_mut(n.max(1)).enumerate() {
-        let mut pairs: Vec<([usize; 2], Left)> = blocks
+        let mut pairs: Vec<([usize; 2], Residual)> = blocks
             .iter()
             .zip(takes_part)
             .filter(|(block, takes_part)| block.channel == channel && **takes_part)
             .map(|(block, _)| {
                 let pair = [block.pair.i, block.pair.j].map(usize::from);
-                (pair, Left::of(layout, found, block, span_s))
+                (pair, Residual::of(layout, found, block, span_s))
             })
             .collect();
         loop {
             let of = |daughter: usize| {
                 let own = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
-                own.fold(Left::default(), |sum, (_, left)| sum.with(*left)).part()
+                own.fold(Residual::default(), |sum, (_, left)| sum.with(*left)).part()
             };
             let open: Vec<(usize, f64)> = (0..n).filter(|k| parts[*k] == 0.0).map(|k| (k, of(k))).collect();
             // Of two that are equally bad the reference stays.

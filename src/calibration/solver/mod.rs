@@ -34,6 +34,7 @@ mod config;
 mod cramer_rao;
 mod dense;
 mod detect;
+mod estimates;
 mod expansion;
 mod fit;
 mod global;
@@ -63,12 +64,10 @@ mod verdict;
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
+pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierParts};
 pub use model::{KnownSignal, Offsets};
 pub use monitor::{InstrumentEvent, instrument_events};
 pub use passes::{PassBlocks, PassSolver, SolvedPass};
-pub use solution::{
-    DaughterEstimate, GainEstimate, GainState, OutlierParts, PassData, PassSolution, solve_pass,
-    solve_pass_in_parts,
-};
+pub use solution::{PassData, PassSolution, solve_pass, solve_pass_in_parts};
 pub use sums::{MODEL_TERMS, ModelTerms, ModelledBlock};
 pub use table::{gains_file, solutions_csv};

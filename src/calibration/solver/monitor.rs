@@ -18,7 +18,8 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::solution::{GainEstimate, GainState, PassSolution};
+use super::estimates::{GainEstimate, GainState};
+use super::solution::PassSolution;
 
 /// A change counts beyond this many times its standard deviation, and the usual change from pass to pass.
 const JUMP_SIGMAS: f64 = 6.0;

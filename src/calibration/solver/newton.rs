@@ -22,7 +22,7 @@ const CONVERGED: f64 = 1e-3;
 const PROMISED: f64 = 1e-4;
 
 /// What Gauss-Newton found.
-pub(super) struct Found {
+pub(super) struct NewtonFit {
     pub(super) values: Values,
     /// Inverse of the Fisher information with the priors, row after row.
     pub(super) covariance: Vec<f64>,
@@ -30,8 +30,8 @@ pub(super) struct Found {
     pub(super) converged: bool,
 }
 
-/// Holds positions near those about which the model is linear. It vanishes where they are, and is no part of what is known.
-pub(super) struct Near<'a> {
+/// Keeps positions near the point about which the model is linear. The term vanishes there, and is not part of the prior.
+pub(super) struct PositionPrior<'a> {
     pub(super) position_m: &'a [[f64; 3]],
     /// Along each axis.
     pub(super) sigma_m: f64,
@@ -39,7 +39,12 @@ pub(super) struct Near<'a> {
 
 impl ParameterLayout {
     /// Calls `each` with the place of each component of a position, its distance from the near one, and the deviation.
-    fn for_each_near(&self, values: &Values, near: Option<&Near<'_>>, mut each: impl FnMut(usize, f64, f64)) {
+    fn for_each_near(
+        &self,
+        values: &Values,
+        near: Option<&PositionPrior<'_>>,
+        mut each: impl FnMut(usize, f64, f64),
+    ) {
         let Some(near) = near else { return };
         for (n, (now_m, near_m)) in values.position_m.iter().zip(near.position_m).enumerate() {
             for axis in 0..3 {
@@ -51,7 +56,7 @@ impl ParameterLayout {
     }
 
     /// Sum of squared residuals in units of their noise, with priors.
-    pub(super) fn cost(&self, values: &Values, sums: &[PairSums], near: Option<&Near<'_>>) -> f64 {
+    pub(super) fn cost(&self, values: &Values, sums: &[PairSums], near: Option<&PositionPrior<'_>>) -> f64 {
         let mut cost = 0.0;
         for sums in sums {
             let (gain, u) = self.pair(values, sums.channel, sums.pair);
@@ -82,7 +87,7 @@ impl ParameterLayout {
         &self,
         values: &Values,
         sums: &[PairSums],
-        near: Option<&Near<'_>>,
+        near: Option<&PositionPrior<'_>>,
     ) -> (Vec<f64>, Vec<f64>) {
         let order = self.order();
         let (mut matrix, mut right) = (vec![0.0; order * order], vec![0.0; order]);
@@ -163,9 +168,9 @@ impl ParameterLayout {
         &self,
         mut values: Values,
         sums: &[PairSums],
-        near: Option<&Near<'_>>,
+        near: Option<&PositionPrior<'_>>,
         iterations_max: usize,
-    ) -> Found {
+    ) -> NewtonFit {
         let order = self.order();
         if self.phase_sigma <= 0.0 {
             values.phase.fill(0.0);
@@ -216,6 +221,6 @@ impl ParameterLayout {
             Some(factor) => covariance = factor.inverse(),
             None => converged = false,
         }
-        Found { values, covariance, iterations, converged }
+        NewtonFit { values, covariance, iterations, converged }
     }
 }

@@ -14,7 +14,7 @@ use super::config::SolverConfig;
 use super::global::{GlobalSearch, KEPT_COST};
 use super::layout::{ParameterLayout, Values};
 use super::model::{KnownSignal, Offsets};
-use super::newton::{Found, Near};
+use super::newton::{NewtonFit, PositionPrior};
 use super::reach::is_searched;
 use super::robust::{judge, misfit};
 use super::robust_fit::sums_of;
@@ -62,14 +62,14 @@ pub(super) struct Search<'a> {
 }
 
 /// Positions that were found.
-pub(super) struct Sought {
+pub(super) struct FoundPositions {
     /// Offsets of the daughters, m.
     pub(super) position_m: Vec<[f64; 3]>,
     /// Others that explain the data as well.
     others_m: Vec<Vec<[f64; 3]>>,
 }
 
-impl Sought {
+impl FoundPositions {
     /// Whether the position of a daughter may be another one, as far as a frequency can tell.
     pub(super) fn is_ambiguous(&self, daughter: usize, frequency_hz: f64) -> bool {
         let most_m = SAME_WAVELENGTHS * SPEED_OF_LIGHT_M_S / frequency_hz;
@@ -82,7 +82,7 @@ type Place = (Vec<[f64; 3]>, f64);
 
 impl Search<'_> {
     /// Finds the offsets of the daughters.
-    pub(super) fn find(&self, signal: &mut KnownSignal) -> Result<Sought, ModelError> {
+    pub(super) fn find(&self, signal: &mut KnownSignal) -> Result<FoundPositions, ModelError> {
         let ladder = ladder(self.frequencies_hz);
         let mut kept = self.start(&ladder, signal)?;
         for top in 1..=ladder.len() {
@@ -100,7 +100,7 @@ impl Search<'_> {
         }
         let mut kept = kept.into_iter();
         let position_m = kept.next().unwrap_or_else(|| vec![[0.0; 3]; self.normal_hat.len()]);
-        Ok(Sought { position_m, others_m: kept.collect() })
+        Ok(FoundPositions { position_m, others_m: kept.collect() })
     }
 
     /// Offsets to begin with: none, or the best of all where they are radians in the lowest channel.
@@ -229,7 +229,7 @@ impl<'a> Step<'a> {
     }
 
     /// Values of least cost with positions that stay within a distance.
-    fn step(&self, blocks: &mut [ModelledBlock], values: &Values, near: (&[[f64; 3]], f64)) -> Found {
+    fn step(&self, blocks: &mut [ModelledBlock], values: &Values, near: (&[[f64; 3]], f64)) -> NewtonFit {
         let (position_m, radius_m) = near;
         let mut spreads = vec![1.0; blocks.len()];
         let (span_s, cut) = (self.search.span_s, self.search.config.outlier_sigma);
@@ -246,7 +246,7 @@ impl<'a> Step<'a> {
             if moved_m <= 1.5 * radius_m {
                 break;
             }
-            let near = Near { position_m, sigma_m };
+            let near = PositionPrior { position_m, sigma_m };
             found = self.layout.minimise(values.clone(), &sums, Some(&near), ITERATIONS);
             sigma_m *= 0.5;
         }

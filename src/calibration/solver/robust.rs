@@ -3,6 +3,7 @@
 use num_complex::Complex64;
 
 use super::sums::{MODEL_TERMS, ModelledBlock};
+use crate::numerics::median;
 
 /// Median of the squared residual of a complex number, in units of the variance of a part: 2 ln 2.
 const MEDIAN: f64 = 2.0 * std::f64::consts::LN_2;
@@ -77,8 +78,5 @@ fn squares_of(
 
 /// Square above which a residual is an outlier; `None` without any.
 fn limit_of(squares: &[f64], cut: f64) -> Option<f64> {
-    let mut sorted = squares.to_vec();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let median = sorted.get(sorted.len() / 2)?;
-    Some(cut * cut * (median / MEDIAN).max(1.0))
+    Some(cut * cut * (median(squares.to_vec())? / MEDIAN).max(1.0))
 }

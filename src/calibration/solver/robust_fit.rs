@@ -3,15 +3,18 @@
 use rayon::prelude::*;
 
 use super::config::SolverConfig;
-use super::detect::{Dropped, OwnGain, Presence, dropped, own_gains, reference, takes_part};
+use super::detect::{DroppedDaughters, OwnGain, SignalPresence, dropped, own_gains, reference, takes_part};
 use super::layout::{ParameterLayout, Values};
-use super::newton::Found;
+use super::newton::NewtonFit;
 use super::robust::judge;
 use super::stability::Residuals;
 use super::sums::{ModelledBlock, PairSums};
 
 /// Change of a pair's spread below which a round settles.
 const SPREAD_SETTLED: f64 = 0.02;
+
+/// Most rounds of leaving out outliers.
+const OUTLIER_ROUNDS: u32 = 3;
 
 /// Most changes of who takes part.
 const CHANGES_MAX: usize = 3;
@@ -30,7 +33,7 @@ pub(super) struct Interval<'a> {
 /// A solution, and what it is judged by.
 pub(super) struct Fitted {
     pub(super) layout: ParameterLayout,
-    pub(super) found: Found,
+    pub(super) found: NewtonFit,
     /// Sums of all blocks.
     pub(super) sums: Vec<PairSums>,
     /// Mean squared residual of each block in units of its noise, where above one.
@@ -38,7 +41,7 @@ pub(super) struct Fitted {
     /// Blocks of two daughters that take part.
     pub(super) takes_part: Vec<bool>,
     /// By channel, then daughter.
-    pub(super) dropped: Dropped,
+    pub(super) dropped: DroppedDaughters,
     /// The gain of each as its own data have it.
     pub(super) own: Vec<OwnGain>,
     /// Sum of squared residuals, and number, by block.
@@ -93,7 +96,7 @@ impl Interval<'_> {
         values: Values,
         (blocks, sums, spreads): (&mut [ModelledBlock], &mut Vec<PairSums>, &mut Vec<f64>),
         dropped: &[bool],
-    ) -> (Found, Vec<(f64, f64)>) {
+    ) -> (NewtonFit, Vec<(f64, f64)>) {
         let Self { config, span_s, .. } = *self;
         let used = |sums: &[PairSums]| -> Vec<PairSums> {
             sums.iter().filter(|sums| takes_part(layout, dropped, sums)).copied().collect()
@@ -101,7 +104,7 @@ impl Interval<'_> {
         let most = config.iterations_max as usize;
         let mut found = layout.minimise(values, &used(sums), None, most);
         let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
-        for round in 0..=config.outlier_rounds {
+        for round in 0..=OUTLIER_ROUNDS {
             let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
                 if !takes_part(layout, dropped, sums) {
                     return ((0.0, 0.0), false);
@@ -116,7 +119,7 @@ impl Interval<'_> {
                 blocks.par_iter_mut().zip(&mut *spreads).zip(&*sums).map(judge).collect();
             let changed = judged.iter().any(|(_, changed)| *changed);
             chi_squares = judged.into_iter().map(|(chi_square, _)| chi_square).collect();
-            if !changed || round == config.outlier_rounds {
+            if !changed || round == OUTLIER_ROUNDS {
                 break;
             }
             *sums = sums_of(blocks, span_s, layout, spreads);
@@ -142,7 +145,7 @@ impl Fitted {
     /// Whether the gain of a daughter is seen in a channel, and is in the solution.
     pub(super) fn is_seen(&self, channel: usize, daughter: usize) -> bool {
         let k = channel * self.layout.satellites + daughter;
-        !self.dropped[k] && self.own[k].presence == Presence::Seen
+        !self.dropped[k] && self.own[k].presence == SignalPresence::Seen
     }
 }
 

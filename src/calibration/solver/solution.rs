@@ -5,115 +5,16 @@ use serde::Serialize;
 
 use super::agree::is_contradicted;
 use super::config::SolverConfig;
+use super::estimates::{Counts, DaughterEstimate, GainState, OutlierParts};
 use super::fit::unexplained;
-use super::layout::ParameterLayout;
 use super::robust_fit::{Fitted, Interval};
 use super::stability::{Excess, jump_s};
 use super::sums::ModelledBlock;
-use super::verdict::Judge;
+use super::verdict::VerdictInputs;
 use crate::units::vector::Vec3;
 
 /// Most parts that jumps divide an interval into.
 const PARTS_MAX: usize = 8;
-
-/// What became of the gain of a daughter in a channel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Encode, Decode)]
-#[serde(rename_all = "kebab-case")]
-pub enum GainState {
-    /// Known.
-    Good,
-    /// No data.
-    NoData,
-    /// Noise where a receiver that works would deliver signal, or an amplitude of almost nothing.
-    Dead,
-    /// Too little signal to tell, or a phase less well known than asked for.
-    Uncertain,
-    /// The iteration did not converge.
-    NotConverged,
-    /// The model is not that of the data: the solution leaves too much of the signal unexplained.
-    PoorFit,
-    /// Another position explains the data as well, or daughters contradict one another.
-    Ambiguous,
-    /// The gain changes within the interval by more than a phase may be uncertain.
-    Unstable,
-}
-
-impl GainState {
-    /// Its word in tables.
-    #[must_use]
-    pub fn word(self) -> &'static str {
-        match self {
-            Self::Good => "good",
-            Self::NoData => "no-data",
-            Self::Dead => "dead",
-            Self::Uncertain => "uncertain",
-            Self::NotConverged => "not-converged",
-            Self::PoorFit => "poor-fit",
-            Self::Ambiguous => "ambiguous",
-            Self::Unstable => "unstable",
-        }
-    }
-}
-
-/// Gain of one daughter in one channel.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Encode, Decode)]
-pub struct GainEstimate {
-    /// Centre of the channel, Hz.
-    pub frequency_hz: f64,
-    /// Amplitude of the voltage gain.
-    pub amplitude: f64,
-    /// Standard deviation of its natural logarithm, with what residuals show beyond noise.
-    pub amplitude_sigma: f64,
-    /// Phase against the reference daughter, clock included, deg, -180 to 180.
-    pub phase_deg: f64,
-    /// Its standard deviation, deg, with what residuals show beyond noise: changes within the interval and errors of the model.
-    pub phase_sigma_deg: f64,
-    /// Root mean square change of the phase within the interval, deg; 0 where it may be noise.
-    pub phase_scatter_deg: f64,
-    /// Part of the daughter's signal that the solution leaves; 0 where it may be noise.
-    pub unexplained: f64,
-    /// Visibilities used.
-    pub visibilities: u64,
-    /// Left out as outliers.
-    pub outliers: u64,
-    /// What became of it.
-    pub state: GainState,
-}
-
-/// What is known of one daughter.
-#[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
-pub struct DaughterEstimate {
-    /// From 1.
-    pub daughter: u32,
-    /// Offset of the clock against the reference's, ns; 0 where it is not solved for.
-    pub clock_ns: f64,
-    /// Its standard deviation, ns.
-    pub clock_sigma_ns: f64,
-    /// Error of the positions in packets against the reference's: along the track, across it, away from the Moon, m.
-    pub position_m: [f64; 3],
-    /// Its standard deviations, m.
-    pub position_sigma_m: [f64; 3],
-    /// Gains by channel.
-    pub gains: Vec<GainEstimate>,
-}
-
-/// Where outliers are.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Encode, Decode)]
-pub struct OutlierParts {
-    /// Part of the visibilities that are outliers, by channel and by sixtieth of the interval; not a number without any.
-    pub by_channel_and_time: Vec<Vec<f64>>,
-}
-
-impl OutlierParts {
-    /// Whether they are of so many channels.
-    pub(in crate::calibration) fn is_of(&self, channels: usize) -> bool {
-        let parts = &self.by_channel_and_time;
-        parts.len() == channels && parts.iter().all(|times| times.len() == TIME_PARTS)
-    }
-}
-
-/// Parts of an interval by which outliers are counted.
-const TIME_PARTS: usize = 60;
 
 /// The solution of a pass, or of a part of one.
 #[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
@@ -277,7 +178,7 @@ pub(super) fn solve_from(
 }
 
 /// A fit, and what its residuals show.
-struct Told {
+struct CheckedFit {
     fitted: Fitted,
     excess: Vec<Excess>,
     model_error: Vec<f64>,
@@ -291,7 +192,7 @@ fn told(
     mut fitted: Fitted,
     blocks: &mut [ModelledBlock],
     suspects: &[bool],
-) -> Told {
+) -> CheckedFit {
     let (mut excess, mut model_error) = interval.residuals(&fitted, blocks, None).excess(suspects);
     if let Some(steady) = steadier(interval.config, &fitted, &excess) {
         fitted = interval.fit(blocks, Some(steady));
@@ -299,7 +200,7 @@ fn told(
     }
     let unexplained = unexplained(&fitted, blocks, interval.span_s, interval.config.unexplained_max);
     let counts = Counts::of(blocks, interval.span_s, &fitted);
-    Told { fitted, excess, model_error, unexplained, counts }
+    CheckedFit { fitted, excess, model_error, unexplained, counts }
 }
 
 /// Another daughter to be the reference, seen and steady in all channels, if the one of a fit changes too much.
@@ -317,7 +218,7 @@ fn steadier(config: &SolverConfig, fitted: &Fitted, excess: &[Excess]) -> Option
     (0..n).find(|daughter| is_steady(*daughter) && channels(*daughter) == channels(reference))
 }
 
-impl Told {
+impl CheckedFit {
     fn solution(self, interval: &Interval<'_>, (pass, normal_hat): (u64, Vec<Vec3>)) -> PassSolution {
         let Self { fitted, excess, model_error, unexplained, counts } = &self;
         let (config, Fitted { layout, found, .. }) = (interval.config, fitted);
@@ -327,7 +228,7 @@ impl Told {
             && found.converged
             && config.unexplained_max < 1.0
             && is_contradicted(layout, found, &fitted.used());
-        let judge = Judge { config, fitted, counts, unexplained, excess };
+        let judge = VerdictInputs { config, fitted, counts, unexplained, excess };
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],
@@ -349,55 +250,5 @@ impl Told {
             solution.doubt(|n, _| n != layout.reference);
         }
         solution
-    }
-}
-
-/// Visibilities by channel and daughter.
-pub(super) struct Counts {
-    used: u64,
-    out: u64,
-    pub(super) by_gain: Vec<[u64; 2]>,
-    /// By channel and part of the interval: all, and outliers.
-    by_time: Vec<[[u64; 2]; TIME_PARTS]>,
-}
-
-impl Counts {
-    fn of(blocks: &[ModelledBlock], [from_s, until_s]: [f64; 2], fitted: &Fitted) -> Self {
-        let layout: &ParameterLayout = &fitted.layout;
-        let gains = layout.satellites * layout.frequencies_hz.len();
-        let by_time = vec![[[0; 2]; TIME_PARTS]; layout.frequencies_hz.len()];
-        let mut counts = Self { used: 0, out: 0, by_gain: vec![[0; 2]; gains], by_time };
-        for (block, takes_part) in blocks.iter().zip(&fitted.takes_part) {
-            let inside = (0..block.time_s.len()).filter(|&k| (from_s..until_s).contains(&block.time_s[k]));
-            if !takes_part {
-                // They count for who is left out alone.
-                let of = |n: u8| block.channel * layout.satellites + usize::from(n);
-                let left_out =
-                    [of(block.pair.i), of(block.pair.j)].into_iter().filter(|k| fitted.dropped[*k]);
-                let count = inside.count() as u64;
-                left_out.for_each(|k| counts.by_gain[k][0] += count);
-                continue;
-            }
-            for k in inside.clone() {
-                let part = (block.time_s[k] - from_s) / (until_s - from_s) * TIME_PARTS as f64;
-                let [all, out] = &mut counts.by_time[block.channel][(part as usize).min(TIME_PARTS - 1)];
-                (*all, *out) = (*all + 1, *out + u64::from(block.is_out[k]));
-            }
-            let (out, used): (Vec<usize>, Vec<usize>) = inside.partition(|&k| block.is_out[k]);
-            let (used, out) = (used.len() as u64, out.len() as u64);
-            (counts.used, counts.out) = (counts.used + used, counts.out + out);
-            for n in [block.pair.i, block.pair.j] {
-                let gain = &mut counts.by_gain[block.channel * layout.satellites + usize::from(n)];
-                *gain = [gain[0] + used, gain[1] + out];
-            }
-        }
-        counts
-    }
-
-    fn parts(&self) -> OutlierParts {
-        let row = |times: &[[u64; 2]; TIME_PARTS]| {
-            times.iter().map(|[all, out]| *out as f64 / *all as f64).collect::<Vec<f64>>()
-        };
-        OutlierParts { by_channel_and_time: self.by_time.iter().map(row).collect() }
     }
 }

@@ -2,7 +2,8 @@
 
 use std::fmt::Write;
 
-use super::solution::{GainState, PassSolution};
+use super::estimates::GainState;
+use super::solution::PassSolution;
 use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
 use crate::frames::Channel;
 

@@ -1,9 +1,9 @@
 //! What is told of each gain: its errors with what residuals show beyond noise, and whether it can be trusted.
 
 use super::config::{AmplitudeScale, SolverConfig};
-use super::detect::Presence;
+use super::detect::SignalPresence;
+use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::robust_fit::Fitted;
-use super::solution::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::stability::Excess;
 
 /// Standard deviations that have to hold errors: angles wrap, and noise turns a weak gain further than its bound says.
@@ -16,8 +16,8 @@ const MARGIN: f64 = 1.1;
 /// Signal-to-noise ratio at which channels that tell nothing alone tell of a daughter together.
 const SEEN_TOGETHER: f64 = 5.0;
 
-/// What gains are judged by.
-pub(super) struct Judge<'a> {
+/// Inputs of the verdict on gains.
+pub(super) struct VerdictInputs<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) fitted: &'a Fitted,
     pub(super) counts: &'a Counts,
@@ -31,7 +31,7 @@ fn with_wraps(sigma: f64) -> f64 {
     (MARGIN * sigma).max((COVERED * sigma).min(1.0).asin() / COVERED)
 }
 
-impl Judge<'_> {
+impl VerdictInputs<'_> {
     /// What is told of all daughters.
     pub(super) fn daughters(&self) -> Vec<DaughterEstimate> {
         let mut daughters: Vec<DaughterEstimate> =
@@ -115,7 +115,7 @@ impl Judge<'_> {
             false => self.excess[c * layout.satellites + layout.reference],
         };
         // One that has no part in the solution is told by its own data.
-        let is_alone = self.fitted.dropped[k] && own.presence != Presence::None;
+        let is_alone = self.fitted.dropped[k] && own.presence != SignalPresence::None;
         let (gain, noise) = match is_alone {
             true => {
                 let sigma = own.signal().sqrt().recip().min(layout.phase_sigma.max(1.0));
@@ -158,12 +158,12 @@ impl Judge<'_> {
         let most = config.phase_sigma_deg_max.to_radians().powi(2);
         let is_dropped = fitted.dropped[k];
         match fitted.own[k].presence {
-            Presence::None => GainState::NoData,
-            Presence::Dead => GainState::Dead,
-            Presence::Other if is_dropped => GainState::PoorFit,
-            Presence::Weak | Presence::Seen if is_dropped => GainState::Uncertain,
+            SignalPresence::None => GainState::NoData,
+            SignalPresence::Dead => GainState::Dead,
+            SignalPresence::Other if is_dropped => GainState::PoorFit,
+            SignalPresence::Weak | SignalPresence::Seen if is_dropped => GainState::Uncertain,
             _ if !fitted.found.converged => GainState::NotConverged,
-            Presence::Weak | Presence::Other if !self.is_seen_together(n) => GainState::Uncertain,
+            SignalPresence::Weak | SignalPresence::Other if !self.is_seen_together(n) => GainState::Uncertain,
             _ if amplitude < config.dead_amplitude => GainState::Dead,
             _ if noise * noise > most => GainState::Uncertain,
             _ if noise * noise + scatter > most => GainState::Unstable,
@@ -179,7 +179,7 @@ impl Judge<'_> {
         let (mut signal, mut expected) = (0.0, 0.0);
         for c in 0..fitted.layout.channels() {
             let own = &fitted.own[c * fitted.layout.satellites + n];
-            if !matches!(own.presence, Presence::Seen | Presence::None) {
+            if !matches!(own.presence, SignalPresence::Seen | SignalPresence::None) {
                 let gain = fitted.layout.gain(&fitted.found.values, c, n);
                 signal += (gain.conj() * own.gain).re * own.information;
                 expected += gain.norm_sqr() * own.information;

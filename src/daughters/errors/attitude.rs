@@ -17,7 +17,7 @@ pub struct OrbitAntennas {
 }
 
 impl OrbitAntennas {
-    /// Those of an array.
+    /// The ideal antennas of an array.
     #[must_use]
     pub fn new(array: Arc<Array>, elements: AntennaResponse) -> Self {
         Self { array, elements }
@@ -41,7 +41,7 @@ impl AntennaPatterns for OrbitAntennas {
 pub struct AntennaErrors {
     array: Arc<Array>,
     elements: AntennaResponse,
-    /// Of the daughters' patterns, beside what is wrong with them.
+    /// The daughters' patterns by frequency, without their errors.
     patterns: PatternsByFrequency,
     has_patterns: bool,
     /// Start and end, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
@@ -55,7 +55,7 @@ pub struct ChannelAntennas {
 }
 
 impl AntennaErrors {
-    /// Those of errors in these windows; `None` if all antennas are ideal.
+    /// The antennas with their errors in these windows; `None` if all are ideal.
     #[must_use]
     pub fn new(
         errors: &InstrumentErrors,
@@ -78,7 +78,7 @@ impl AntennaErrors {
         })
     }
 
-    /// Those of a channel.
+    /// The antennas in a channel.
     #[must_use]
     pub fn at(self: &Arc<Self>, frequency_hz: f64) -> ChannelAntennas {
         ChannelAntennas { antennas: Arc::clone(self), frequency_hz }

@@ -52,7 +52,7 @@ pub struct PassErrors {
     clock_ns: Vec<Series>,
     /// By daughter: along, across, radial.
     offset_m: Vec<[Series; 3]>,
-    /// Of the formation; `None` if tags are true.
+    /// Errors of the formation's time tags; `None` if tags are true.
     time_tag_ms: Option<Series>,
     /// By daughter: tilt along the track, tilt away from the Moon (deg), distortion.
     antennas: Vec<[Series; 3]>,

@@ -21,7 +21,7 @@ struct Partial {
 
 /// Whether the instrument is known, and whether the latest description agrees.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
-enum Standing {
+enum DescriptionState {
     #[default]
     Unknown,
     Known,
@@ -33,7 +33,7 @@ enum Standing {
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct DecoderState {
     instrument: Option<Instrument>,
-    standing: Standing,
+    standing: DescriptionState,
 }
 
 impl DecoderState {
@@ -62,7 +62,7 @@ impl DecoderState {
 #[derive(Debug, Default)]
 pub struct Decoder {
     instrument: Option<Instrument>,
-    standing: Standing,
+    standing: DescriptionState,
     partial: [Option<Partial>; Kind::ALL.len()],
     counters: ReceptionCounters,
     /// Of the packet that is being decoded, or was decoded last.
@@ -231,7 +231,7 @@ impl Decoder {
         let kind = packet.header.kind;
         let decoded = match kind {
             Kind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
-            _ if self.standing != Standing::Known => {
+            _ if self.standing != DescriptionState::Known => {
                 self.set_aside(kind, payload);
                 return None;
             }
@@ -255,12 +255,12 @@ impl Decoder {
             None => true,
             Some(known) if *known == found => false,
             Some(_) => {
-                self.standing = Standing::Contradicted;
+                self.standing = DescriptionState::Contradicted;
                 self.reading.payload = PayloadOutcome::Contradictory;
                 return None;
             }
         };
-        self.standing = Standing::Known;
+        self.standing = DescriptionState::Known;
         if !first {
             return None;
         }
@@ -286,7 +286,7 @@ impl Decoder {
         self.reading.visibilities_unread =
             if kind == Kind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
         self.reading.payload = match self.standing {
-            Standing::Unknown => PayloadOutcome::BeforeInstrument,
+            DescriptionState::Unknown => PayloadOutcome::BeforeInstrument,
             _ => PayloadOutcome::Foreign,
         };
     }

@@ -20,7 +20,7 @@ const POLL: Duration = Duration::from_millis(100);
 
 /// How long to wait for a followed file to grow.
 #[derive(Debug)]
-struct Patience {
+struct GrowthWait {
     /// Polls without growth after which the file counts as complete; `None` for no limit.
     polls_max: Option<u64>,
     polls: u64,
@@ -36,7 +36,7 @@ pub struct FileSource {
     /// The first file with a packet, and its format.
     format: Option<(PathBuf, Format)>,
     /// Set if the last file is followed.
-    patience: Option<Patience>,
+    patience: Option<GrowthWait>,
 }
 
 /// The file that is being read.
@@ -132,7 +132,7 @@ impl FileSource {
         let mut source = Self::open(others)?;
         source.files.push_back((last.clone(), Some(file)));
         let polls_max = (idle_s > 0.0).then(|| (idle_s / POLL.as_secs_f64()).ceil() as u64);
-        source.patience = Some(Patience { polls_max, polls: 0 });
+        source.patience = Some(GrowthWait { polls_max, polls: 0 });
         Ok(source)
     }
 

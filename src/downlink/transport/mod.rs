@@ -1,7 +1,7 @@
 //! How a downlink travels: stages, files, TCP sockets, and the pace of a replay.
 //!
 //! - [`Transmitter`] encodes ground frames as bytes; [`Recorder`] writes a byte stream to a file.
-//! - [`FileSource`] reads files as a byte stream; [`Paced`] releases one at the pace of its packets.
+//! - [`FileSource`] reads files as a byte stream; [`PacedSource`] releases one at the pace of its packets.
 //! - [`DownlinkWriter`] and [`DownlinkReader`] write and read frames outside a pipeline.
 //! - [`packet_archive`] keeps packets on disk before their sender is told that they are taken.
 //! - [`socket`] sends a byte stream over TCP, and listens to several senders.
@@ -19,7 +19,7 @@ mod transmitter;
 mod writer;
 
 pub use file_source::FileSource;
-pub use pace::{Pace, Paced, Steps};
+pub use pace::{Pace, PacedSource, Steps};
 pub use reader::DownlinkReader;
 pub use recorder::Recorder;
 pub use transmitter::Transmitter;

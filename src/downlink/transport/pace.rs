@@ -46,7 +46,7 @@ enum Gate {
 
 /// Passes on the bytes of a source unchanged, but no packet before its time. Times are the creation times in the
 /// packets' headers.
-pub struct Paced<S> {
+pub struct PacedSource<S> {
     source: S,
     pace: Pace,
     gate: Gate,
@@ -70,7 +70,7 @@ pub struct Paced<S> {
     ended: bool,
 }
 
-impl<S> Paced<S> {
+impl<S> PacedSource<S> {
     /// Paces a source.
     #[must_use]
     pub fn new(source: S, pace: Pace) -> Self {
@@ -201,7 +201,7 @@ fn gate_for(
     }
 }
 
-impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for Paced<S> {
+impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for PacedSource<S> {
     type Out = Vec<u8>;
     type Error = DownlinkError;
 

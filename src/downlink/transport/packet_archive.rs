@@ -27,7 +27,7 @@ const SEGMENT_BYTES: u64 = 64 << 20;
 /// Data reach the disk at least this often, even if no sender waits for it.
 const SYNC_EVERY: Duration = Duration::from_secs(5);
 
-/// Places in the stream between which none is remembered, bytes.
+/// Distance between remembered places in the stream, bytes.
 const BATCH_STEP: u64 = 1 << 20;
 
 /// Bytes of packets that are read at a time.
@@ -58,7 +58,7 @@ pub(super) struct Ticket {
     bytes: u64,
 }
 
-/// How an archive goes on.
+/// State of an archive, for status and metrics.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ArchiveReport {
     /// Bytes of packets in it.
@@ -85,7 +85,7 @@ impl std::fmt::Debug for PacketArchive {
 
 struct Shared {
     writer: Mutex<Writer>,
-    /// Of those who wait for the disk, one at a time asks for it, for all.
+    /// Held by the one waiter that synchronises the disk for all others.
     turn: Mutex<()>,
 }
 
@@ -102,12 +102,12 @@ struct Writer {
     seen: [ReceivedSet; Kind::ALL.len()],
     /// Packets that may not have reached the disk.
     recent: Vec<PacketName>,
-    /// Counts failures: what was not on disk by then may never be.
+    /// Counts failures: packets that were not on disk by then may never be.
     generation: u64,
     appended: u64,
     synced: u64,
     synced_at: Instant,
-    /// Bytes of the session's stream, and the place behind which there is only what came later.
+    /// Bytes of the session's stream, and the place where packets that arrive later begin.
     batches: VecDeque<(u64, ArchivePlace)>,
     /// By number of a checkpoint: the place before which it holds everything.
     marks: BTreeMap<u64, ArchivePlace>,
@@ -151,12 +151,12 @@ impl PacketArchive {
         })))
     }
 
-    /// From now on at most so many bytes, as far as checkpoints allow.
+    /// Sets the most bytes to keep, as far as checkpoints allow.
     pub fn limit(&self, bytes_max: u64) {
         self.writer().bytes_max = bytes_max;
     }
 
-    /// Does not keep packets that are known already.
+    /// Leaves out packets that are known already.
     pub fn know<'a>(&self, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) {
         let mut writer = self.writer();
         for (kind, set) in received {
@@ -178,7 +178,7 @@ impl PacketArchive {
         }
     }
 
-    /// Waits until what a ticket is of is on disk.
+    /// Waits until the packets of a ticket are on disk.
     pub(super) fn sync(&self, ticket: Ticket) -> Result<(), String> {
         let _turn = self.0.turn.lock().unwrap_or_else(PoisonError::into_inner);
         let (file, upto) = {
@@ -227,7 +227,7 @@ impl PacketArchive {
         Ok(())
     }
 
-    /// Packets that are retracted: what the archive has of them until now counts no more.
+    /// Notes retracted packets: copies that the archive holds by now are ignored.
     ///
     /// # Errors
     /// The system's.
@@ -245,7 +245,7 @@ impl PacketArchive {
         write_sealed(&writer.folder.join(RETRACTED), text)
     }
 
-    /// How it goes on.
+    /// Its state, for status and metrics.
     #[must_use]
     pub fn report(&self) -> ArchiveReport {
         let writer = self.writer();
@@ -300,7 +300,7 @@ impl Writer {
             self.close();
         }
         match self.write_here(bytes) {
-            // Older segments that checkpoints hold give way.
+            // Segments that all checkpoints hold are deleted first.
             Err(error) if is_full(&error) && self.make_room(SEGMENT_BYTES.max(bytes.len() as u64)) => {
                 self.write_here(bytes)
             }
@@ -312,7 +312,7 @@ impl Writer {
         if self.open.is_none() {
             let path = self.folder.join(segment_name(self.number));
             let file = File::options().write(true).create_new(true).open(path)?;
-            // Its name is to be on disk, too.
+            // Synchronises its name, too.
             File::open(&self.folder)?.sync_all()?;
             self.open = Some((file, 0));
         }
@@ -321,7 +321,7 @@ impl Writer {
         match written {
             Ok(()) => *length += bytes.len() as u64,
             Err(_) => {
-                // What was written of it would be read as a damaged packet.
+                // The part that was written would be read as a damaged packet.
                 file.set_len(*length)?;
                 file.seek(SeekFrom::Start(*length))?;
             }
@@ -345,7 +345,7 @@ impl Writer {
         }
     }
 
-    /// The next packets go into a new segment. One without any goes.
+    /// Closes the segment: the next packets go into a new one. An empty segment is deleted.
     fn close(&mut self) {
         let Some((_, bytes)) = self.open.take() else { return };
         if bytes == 0 && fs::remove_file(self.folder.join(segment_name(self.number))).is_ok() {
@@ -355,7 +355,7 @@ impl Writer {
         self.number += 1;
     }
 
-    /// What may not be on disk is taken again when it is sent again.
+    /// Packets that may not be on disk are accepted again when they are sent again.
     fn fail(&mut self, error: &io::Error) -> String {
         for (kind, count, time) in std::mem::take(&mut self.recent) {
             self.seen[kind.index()].remove(count, time);
@@ -410,7 +410,7 @@ pub struct ArchiveReading {
     pub first_segment: u64,
 }
 
-/// Gives `take` the packets of the archive in a folder, from the first on, but for those that were retracted. Nothing is locked or
+/// Gives `take` all packets of the archive in a folder that were not retracted. Nothing is locked or
 /// written.
 ///
 /// # Errors
@@ -423,7 +423,7 @@ pub fn read_archive<E: From<DownlinkError>>(
     read_segments(folder, ArchivePlace::default(), &retracted, take)
 }
 
-/// As [`read_archive`], of the packets behind the place up to which a checkpoint holds the archive; all without a checkpoint.
+/// As [`read_archive`], only packets that no checkpoint holds yet.
 ///
 /// # Errors
 /// Likewise.
@@ -436,7 +436,7 @@ pub fn read_behind<E: From<DownlinkError>>(
     read_segments(folder, place_in(&read_marks(folder), checkpoint), &retracted, take)
 }
 
-/// Bytes behind the place up to which a checkpoint holds the archive in a folder; nothing is locked or written.
+/// Bytes in the archive of a folder that no checkpoint holds yet. Nothing is locked or written.
 ///
 /// # Errors
 /// A folder that cannot be read.
@@ -523,7 +523,7 @@ fn segments(folder: &Path) -> Result<Vec<(u64, u64)>, DownlinkError> {
 
 /// Writes lines with their checksum as the last one.
 fn write_sealed(path: &Path, text: String) -> io::Result<()> {
-    // An archive that is gone is not begun anew: its disk may come back.
+    // A vanished archive is not replaced by a new one: its disk may come back.
     if path.parent().is_some_and(|folder| !folder.is_dir()) {
         return Err(io::ErrorKind::NotFound.into());
     }
@@ -531,7 +531,7 @@ fn write_sealed(path: &Path, text: String) -> io::Result<()> {
     write_atomically(path, format!("{text}checksum {sum:016x}\n").as_bytes())
 }
 
-/// The numbers in the lines of a file whose checksum holds; `None` of another.
+/// The numbers in the lines of a file; `None` if its checksum is wrong.
 fn read_sealed(path: &Path) -> io::Result<Option<Vec<Vec<u64>>>> {
     let text = match fs::read_to_string(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Some(Vec::new())),
@@ -546,7 +546,7 @@ fn read_sealed(path: &Path) -> io::Result<Option<Vec<Vec<u64>>>> {
     Ok(Some(body.lines().map(numbers).collect()))
 }
 
-/// Damaged marks are none: more is read than necessary.
+/// Ignores damaged marks: more is read than necessary.
 fn read_marks(folder: &Path) -> BTreeMap<u64, ArchivePlace> {
     let lines = read_sealed(&folder.join(MARKS)).ok().flatten().unwrap_or_default();
     let mark = |line: &Vec<u64>| match line[..] {
@@ -635,7 +635,7 @@ mod tests {
         assert_eq!([behind(place.path(), 7), behind(place.path(), 8)], [3, 0]);
         archive.append(&packets(8..9), 130).unwrap();
         assert_eq!([behind(place.path(), 8), archive.report().segments], [1, 2]);
-        // Marks that are damaged are none: everything is read.
+        // Damaged marks are ignored: everything is read.
         let marks = std::fs::read_to_string(place.path().join(MARKS)).unwrap();
         std::fs::write(place.path().join(MARKS), marks.replacen('8', "9", 1)).unwrap();
         assert_eq!(bytes_behind(place.path(), Some(8)).unwrap(), packets(0..9).len() as u64);

@@ -1,14 +1,14 @@
 //! A journal record in the making.
 
-use super::journal::JournalEntry;
+use super::entry::JournalEntry;
 use crate::downlink::CucTime;
 use crate::frames::{EphemerisSegment, GroundFrame, Housekeeping, PlacedFrame, PlacedVisibilities};
 use crate::units::{ChannelId, MissionTime};
 
-/// What is known of a delivery while it is being applied.
+/// A journal record of a delivery that is being applied.
 #[derive(Debug, Default)]
 pub(in crate::ground) struct RecordDraft {
-    /// What was received, but for the packet.
+    /// The entry, without the packet's count and time.
     pub(super) entry: JournalEntry,
     pub(super) window: MissionTime,
     pub(super) segment: Option<EphemerisSegment>,
@@ -22,7 +22,7 @@ pub(in crate::ground) struct RecordDraft {
 }
 
 impl RecordDraft {
-    /// What a frame holds.
+    /// The draft of a frame.
     pub(in crate::ground) fn of(frame: Option<&GroundFrame>) -> Self {
         let nothing = Self::default();
         match frame {

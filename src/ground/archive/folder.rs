@@ -1,4 +1,4 @@
-//! The folder of an archive: numbered checkpoints, of which the newest two are kept. Room for three lets both stay until
+//! The folder of an archive: numbered checkpoints; the newest two are kept. Room for three lets both stay until
 //! another is whole; room for two is enough.
 //!
 //! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream, and nobody waits for the
@@ -10,10 +10,10 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::checkpoint;
-use super::names::{NUMBER_MAX, Numbered, numbered};
+use super::names::{CheckpointSet, NUMBER_MAX, numbered};
 use crate::files::{AtomicFile, FolderLock, IfUnfinished, read_folder};
 use crate::ground::GroundError;
-use crate::imaging::anywhere::HeldSegment;
+use crate::imaging::anywhere::ArchiveSegment;
 use crate::ranks::Ranks;
 
 /// Checkpoints that are kept.
@@ -24,10 +24,10 @@ const KEPT: usize = 2;
 pub(super) struct StateFolder {
     path: PathBuf,
     /// Its checkpoints, oldest first.
-    held: Vec<Numbered>,
+    held: Vec<CheckpointSet>,
     /// The segments that checkpoints name, of those checkpoints that this process has read or written.
-    segments: BTreeMap<u64, Vec<HeldSegment>>,
-    /// Of the first rank.
+    segments: BTreeMap<u64, Vec<ArchiveSegment>>,
+    /// Only the first rank has it.
     lock: Option<FolderLock>,
     ranks: Ranks,
 }
@@ -35,11 +35,11 @@ pub(super) struct StateFolder {
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        Self::open_among(path, &Ranks::one())
+        Self::open_with_ranks(path, &Ranks::one())
     }
 
     /// As [`StateFolder::open`], together with the other ranks.
-    pub(super) fn open_among(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
+    pub(super) fn open_with_ranks(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
         let lock = ranks.is_first().then(|| FolderLock::acquire(path, LOCK, false)).transpose();
         let lock = lock.map_err(|error| match error.kind() {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
@@ -89,12 +89,12 @@ impl StateFolder {
         self.held.iter().map(|held| held.number).collect()
     }
 
-    /// Those that share it.
+    /// The ranks that share it.
     pub(super) fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// The newest checkpoint that holds, read by `read`, or `None` if there is no checkpoint; and notes on newer ones that
+    /// The newest usable checkpoint, read by `read`, or `None` if there is none; and notes on newer ones that
     /// are damaged, which are renamed if `sets_aside`. `read` gets the first of its files.
     ///
     /// A checkpoint that the system does not let us read may well hold: that is an error, and changes nothing.
@@ -103,7 +103,7 @@ impl StateFolder {
         sets_aside: bool,
         read: impl Fn(&Path) -> Result<T, GroundError>,
     ) -> Result<(Option<T>, Vec<String>), GroundError> {
-        let mut bad: Vec<(Numbered, GroundError)> = Vec::new();
+        let mut bad: Vec<(CheckpointSet, GroundError)> = Vec::new();
         let mut found = None;
         for (index, checkpoint) in self.held.iter().enumerate().rev() {
             match read(&checkpoint.path(&self.path, 0)) {
@@ -141,7 +141,7 @@ impl StateFolder {
         Ok((Some(read), bad.iter().map(|(_, error)| note(error, &path)).collect()))
     }
 
-    fn set_aside(&self, checkpoint: Numbered) -> Result<(), GroundError> {
+    fn set_aside(&self, checkpoint: CheckpointSet) -> Result<(), GroundError> {
         for path in checkpoint.paths(&self.path) {
             let mut aside = path.clone().into_os_string();
             aside.push(".damaged");
@@ -156,7 +156,7 @@ impl StateFolder {
     }
 
     /// Says which segments the newest checkpoint names.
-    pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a HeldSegment>) {
+    pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a ArchiveSegment>) {
         if let Some(newest) = self.held.last() {
             self.segments.insert(newest.number, segments.copied().collect());
         }
@@ -169,11 +169,11 @@ impl StateFolder {
         if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
             return;
         }
-        let named = || self.segments.values().flatten().flat_map(HeldSegment::file_names);
+        let named = || self.segments.values().flatten().flat_map(ArchiveSegment::file_names);
         for entry in read_folder(&self.path).into_iter().flatten().flatten() {
             let name = entry.file_name();
             let name = name.to_string_lossy();
-            if HeldSegment::is_name(&name) && !named().any(|other| other == name) {
+            if ArchiveSegment::is_name(&name) && !named().any(|other| other == name) {
                 let _ = fs::remove_file(entry.path());
             }
         }
@@ -196,10 +196,10 @@ impl StateFolder {
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
         let (_, number) = self.next();
-        let next = Numbered { number, parts: self.ranks.share().count };
+        let next = CheckpointSet { number, parts: self.ranks.share().count };
         let path = next.path(&self.path, self.ranks.share().rank);
         if number > NUMBER_MAX {
-            let greatest = Numbered { number: NUMBER_MAX, ..next };
+            let greatest = CheckpointSet { number: NUMBER_MAX, ..next };
             return Err(GroundError::CheckpointName { path: greatest.path(&self.path, 0) });
         }
         match self.write(&path, &mut write) {
@@ -229,7 +229,7 @@ impl StateFolder {
         file.finish().map_err(GroundError::io(path, "finish the file")).map(|_| ())
     }
 
-    /// Removes all checkpoints but the newest. That has to hold: otherwise an error, and nothing is removed.
+    /// Removes all checkpoints but the newest. If that is damaged, it is an error, and nothing is removed.
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
         if let Some(newest) = self.held.last().copied() {
             newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;
@@ -334,7 +334,7 @@ mod tests {
     }
 
     fn file_name(number: u64) -> String {
-        Numbered { number, parts: 1 }.file_name(0)
+        CheckpointSet { number, parts: 1 }.file_name(0)
     }
 
     fn name(folder: &StateFolder, number: u64) -> PathBuf {

@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use serde::Serialize;
 
-use super::journal::JournalEntry;
-use super::packet_order::{PacketStreams, SendingOrder, Stream};
+use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
+use super::packet_order::{PacketStreams, SendingOrder};
 use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
 
@@ -30,17 +30,6 @@ pub struct ReceivedPackets {
     pub frequencies_hz: Vec<f64>,
 }
 
-/// A packet of visibilities.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct VisibilityPacket {
-    /// What it held.
-    pub entry: JournalEntry,
-    /// Whether its positions are missing.
-    pub waits: bool,
-    /// Share of its placed visibilities that are in the map; `None` if it is not known.
-    pub share: Option<f64>,
-}
-
 /// A packet of positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PositionsPacket {
@@ -61,43 +50,6 @@ pub struct RestartReport {
     pub apid: u16,
     /// Count of the last packet received before it. What was sent after that one is not known.
     pub last: u64,
-}
-
-/// An estimate of what the missing packets of one channel and pair held; or held packets that wait for missing positions.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct LostStream {
-    /// Channel, from 0.
-    pub channel: u16,
-    /// Pair, as in "1-2".
-    pub pair: String,
-    /// Packets.
-    pub packets: u64,
-    /// Integration time in them, s.
-    pub integration_s: f64,
-    /// Sum of their weights in the map, (K sr)^-2.
-    pub weight: f64,
-}
-
-/// A run of missing packets, to be requested again.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct GapReport {
-    /// Kind.
-    pub kind: Kind,
-    /// Application process identifier.
-    pub apid: u16,
-    /// Count of the first missing packet.
-    pub from: u64,
-    /// Count of the last missing packet.
-    pub to: u64,
-    /// Mission time of the last visibility before it and the first after it, s, if there are any.
-    pub between_s: [Option<f64>; 2],
-    /// Integration time in it, s, over all channels and pairs.
-    pub integration_s: f64,
-    /// What it would add: its weight over that in the map of the same channel, summed over channels; 1 for a channel of
-    /// which the map has nothing.
-    pub gain: f64,
-    /// By channel and pair: missing visibilities, or those that wait for missing positions.
-    pub lost: Vec<LostStream>,
 }
 
 /// What has been received of one channel; of pairs of two daughters.
@@ -222,8 +174,8 @@ fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
 
 /// The visibilities that wait for positions in missing packets, of the windows that these packets are of.
 ///
-/// Between the last positions before and the next received there may be several windows, each of some packets, of which others may be
-/// missing too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
+/// There may be several windows between the last positions before and the next received, each of some packets; others of these may be
+/// missing, too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
 /// between in equal parts; what waits for a window counts for the missing packets of it, together once.
 fn positions_missing(
     readings: &[VisibilityPacket],
@@ -279,7 +231,7 @@ fn windows_of(waiting: &[&VisibilityPacket]) -> Vec<Range<usize>> {
     windows
 }
 
-/// What part of each window's loss a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
+/// Share of each window's loss that a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
 /// the window over all missing ones of it.
 fn shares_of(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, windows: usize) -> Vec<f64> {
     let per_window = (hole.end - hole.start) as f64 / windows.max(1) as f64;
@@ -295,41 +247,11 @@ fn shares_of(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, window
     (0..windows).map(share).collect()
 }
 
-impl VisibilityPacket {
-    pub(super) fn stream(&self) -> Stream {
-        (self.entry.channel, self.entry.pair)
-    }
-
-    /// Whether it holds auto-correlations, which are in no map.
-    fn is_auto(&self) -> bool {
-        self.entry.pair.i == self.entry.pair.j
-    }
-}
-
-impl LostStream {
-    pub(super) fn nothing((channel, pair): Stream) -> Self {
-        Self { channel: channel.0, pair: pair.to_string(), packets: 0, integration_s: 0.0, weight: 0.0 }
-    }
-}
-
-impl GapReport {
-    pub(super) fn new(
-        kind: Kind,
-        gap: &Range<u64>,
-        between_s: [Option<f64>; 2],
-        lost: Vec<LostStream>,
-    ) -> Self {
-        // An empty sum of floats is -0.
-        let integration_s = lost.iter().map(|lost| lost.integration_s).sum::<f64>() + 0.0;
-        let (from, to, apid) = (gap.start, gap.end - 1, kind.apid());
-        Self { kind, apid, from, to, between_s, integration_s, gain: 0.0, lost }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::downlink::CucTime;
+    use crate::ground::archive::entry::JournalEntry;
     use crate::units::{ChannelId, Pair};
 
     const PASSES: u64 = 6;
@@ -382,7 +304,7 @@ mod tests {
         VisibilityPacket { entry, waits: false, share: Some(1.0) }
     }
 
-    /// What is found when packets are left out, and what they held by channel and pair.
+    /// Gaps found when packets are left out, and their content by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
         let mut set = ReceivedSet::default();
         let mut held = BTreeMap::new();

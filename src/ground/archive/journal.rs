@@ -8,63 +8,15 @@ use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
 use super::draft::RecordDraft;
+use super::entry::JournalEntry;
 use crate::downlink::receive::PacketReading;
 use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
-use crate::downlink::{CucTime, Kind, PacketHeader};
-use crate::frames::{Housekeeping, VisibilityBlock, VisibilityReason};
+use crate::downlink::{Kind, PacketHeader};
+use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
 pub(super) use crate::ground::hold_buffer::Sent;
 use crate::runtime::LedgerReport;
-use crate::units::{ChannelId, MissionTime, Pair};
-
-/// What one packet of visibilities held, as it was received.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Encode, Decode)]
-pub struct JournalEntry {
-    /// Count of the packet.
-    pub count: u64,
-    /// Time at which the packet was made.
-    pub made: CucTime,
-    /// Channel.
-    pub channel: ChannelId,
-    /// Pair.
-    pub pair: Pair,
-    /// Beginning of the first integration.
-    pub start: MissionTime,
-    /// End of the last integration.
-    pub end: MissionTime,
-    /// Visibilities.
-    pub visibilities: u32,
-    /// Their integration time, s.
-    pub integration_s: f64,
-    /// Sum of the weights of the good ones, (K sr)^-2.
-    pub weight: f64,
-}
-
-impl JournalEntry {
-    /// Place in the order of sending.
-    pub(super) fn sent(&self) -> Sent {
-        (self.made, self.count)
-    }
-
-    /// The entry of a packet with a block of visibilities.
-    pub(super) fn of(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
-        let nothing = Self { count, made, ..Self::default() };
-        let Some(last) = block.len().checked_sub(1) else { return nothing };
-        let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
-        let ticks: u64 = block.duration_ticks.iter().map(|&ticks| u64::from(ticks)).sum();
-        let good = block.weight.iter().zip(&block.flags).filter(|(_, flags)| flags.is_good());
-        Self {
-            channel: block.channel,
-            pair: block.pair,
-            start: block.start.plus_ticks(i64::from(block.offset_ticks[0])),
-            end: block.start.plus_ticks(end),
-            visibilities: block.len() as u32,
-            integration_s: ticks as f64 * 1e-6,
-            weight: good.map(|(&weight, _)| f64::from(weight)).sum(),
-            ..nothing
-        }
-    }
-}
+use crate::units::{ChannelId, MissionTime};
 
 /// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
@@ -87,13 +39,13 @@ pub(super) struct JournalRecord {
     pub(super) accumulated: u32,
     /// Visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
-    /// What was offered to an engine.
-    pub(super) used: Option<Used>,
+    /// Visibilities that were offered to an engine.
+    pub(super) used: Option<SumsSpan>,
 }
 
 /// Channel of the sums, which sub-bands share, and first and last mission time, s, of what was offered to its engine.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct Used {
+pub(super) struct SumsSpan {
     pub(super) channel: ChannelId,
     pub(super) span_s: [f64; 2],
 }
@@ -166,7 +118,7 @@ impl Journal {
             offered: draft.offered,
             accumulated: posts.accumulated as u32,
             left_out,
-            used: draft.used_s.map(|span_s| Used { channel: draft.channel, span_s }),
+            used: draft.used_s.map(|span_s| SumsSpan { channel: draft.channel, span_s }),
         };
         self.visibilities.insert((header.time, header.count), record);
     }
@@ -210,7 +162,7 @@ bincode::impl_borrow_decode!(Journal);
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::downlink::{FORMAT_VERSION, PacketSegment};
+    use crate::downlink::{CucTime, FORMAT_VERSION, PacketSegment};
 
     fn packet(count: u64, check: u32) -> DeliveredPacket {
         let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));

@@ -21,13 +21,13 @@ const PARTS_MAX: usize = 1 << 20;
 
 /// A checkpoint of a folder.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Numbered {
+pub(super) struct CheckpointSet {
     pub(super) number: u64,
     /// Files that it consists of.
     pub(super) parts: usize,
 }
 
-impl Numbered {
+impl CheckpointSet {
     /// Name of one of its files.
     pub(super) fn file_name(self, part: usize) -> String {
         let Self { number, parts } = self;
@@ -47,7 +47,7 @@ impl Numbered {
         (0..self.parts).map(|part| self.path(folder, part)).collect()
     }
 
-    /// Removes its files; whether none is left.
+    /// Removes its files; returns whether all are gone.
     pub(super) fn remove(self, folder: &Path) -> bool {
         let stays =
             |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
@@ -72,10 +72,10 @@ impl Numbered {
 /// Number of the checkpoint that a file belongs to.
 pub(super) fn number_of(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_string_lossy().into_owned();
-    Numbered::of_name(&name).map(|(found, _)| found.number)
+    CheckpointSet::of_name(&name).map(|(found, _)| found.number)
 }
 
-/// What stands between the beginning and the end of a checkpoint's name.
+/// The middle of a checkpoint's name: number and part.
 fn inner(text: &str) -> Option<&str> {
     text.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)
 }
@@ -83,7 +83,7 @@ fn inner(text: &str) -> Option<&str> {
 /// The files of the checkpoint to which a file belongs, and which parts they hold; of other names the file alone, as a whole.
 pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    match (Numbered::of_name(&name), path.parent()) {
+    match (CheckpointSet::of_name(&name), path.parent()) {
         (Some((found, _)), Some(folder)) if found.parts > 1 => {
             let share = |rank| RankShare { rank, count: found.parts };
             found.paths(folder).into_iter().enumerate().map(|(rank, path)| (path, share(rank))).collect()
@@ -92,22 +92,22 @@ pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     }
 }
 
-/// The checkpoints in a folder, oldest first: those of which all parts are there, and the others. A name that is like theirs and that
+/// The checkpoints in a folder, oldest first: complete ones, and those that lack parts. A name that is like theirs and that
 /// none can have may hide one: it is refused.
-pub(super) fn numbered(folder: &Path) -> Result<[Vec<Numbered>; 2], GroundError> {
-    let mut found: BTreeMap<Numbered, BTreeSet<usize>> = BTreeMap::new();
+pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundError> {
+    let mut found: BTreeMap<CheckpointSet, BTreeSet<usize>> = BTreeMap::new();
     for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
         let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();
         let text = name.to_string_lossy();
         if inner(&text).is_none() {
             continue;
         }
-        let Some((checkpoint, part)) = Numbered::of_name(&text) else {
+        let Some((checkpoint, part)) = CheckpointSet::of_name(&text) else {
             return Err(GroundError::CheckpointName { path: folder.join(&name) });
         };
         found.entry(checkpoint).or_default().insert(part);
     }
-    let is_whole = |checkpoint: &Numbered| found[checkpoint].len() == checkpoint.parts;
+    let is_whole = |checkpoint: &CheckpointSet| found[checkpoint].len() == checkpoint.parts;
     let (whole, others) = found.keys().partition(|checkpoint| is_whole(checkpoint));
     Ok([whole, others])
 }
@@ -123,7 +123,7 @@ mod tests {
         put("checkpoint-00000001.lunarray");
         put("checkpoint-00000002.2-of-3.lunarray");
         put("checkpoint-00000002.3-of-3.lunarray");
-        let [one, set] = [(1, 1), (2, 3)].map(|(number, parts)| Numbered { number, parts });
+        let [one, set] = [(1, 1), (2, 3)].map(|(number, parts)| CheckpointSet { number, parts });
         assert_eq!(numbered(place.path()).unwrap(), [vec![one], vec![set]]);
         put("checkpoint-00000002.1-of-3.lunarray");
         assert_eq!(numbered(place.path()).unwrap(), [vec![one, set], vec![]]);

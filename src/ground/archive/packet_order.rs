@@ -3,27 +3,24 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-use super::gaps::{GapReport, LostStream, VisibilityPacket};
-use super::journal::{JournalEntry, Sent};
+use super::entry::JournalEntry;
+use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
+use super::journal::Sent;
 use crate::downlink::{CucTime, Kind};
-use crate::units::{ChannelId, Pair};
-
-/// Channel and pair: each sends its packets in turn, pass by pass.
-pub(super) type Stream = (ChannelId, Pair);
 
 /// Passes on either side of a gap from which the number of packets a pass is estimated.
 const PASSES: usize = 2;
 
 /// Means over packets of a channel and pair.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Usual {
+pub(super) struct PacketMeans {
     integration_s: f64,
     weight: f64,
     /// Share of the weight that is in the map, if it is known.
     share: Option<f64>,
 }
 
-impl Usual {
+impl PacketMeans {
     fn of(readings: &[VisibilityPacket]) -> Self {
         let packets = readings.len().max(1) as f64;
         let mean = |of: &dyn Fn(&VisibilityPacket) -> f64| readings.iter().map(of).sum::<f64>() / packets;
@@ -55,17 +52,18 @@ impl PacketStreams {
 
     /// Means over `packets` packets on either side of a place in the order of sending: the formation breathes, so farther
     /// ones are less alike.
-    pub(super) fn usual(&self, stream: Stream, place: Sent, packets: u64) -> Usual {
+    pub(super) fn usual(&self, stream: Stream, place: Sent, packets: u64) -> PacketMeans {
         let all = self.0.get(&stream).map_or(&[][..], Vec::as_slice);
         let at = all.partition_point(|reading| reading.entry.sent() < place);
         let packets = usize::try_from(packets).unwrap_or(usize::MAX);
-        let near = Usual::of(&all[at.saturating_sub(packets)..all.len().min(at.saturating_add(packets))]);
+        let near =
+            PacketMeans::of(&all[at.saturating_sub(packets)..all.len().min(at.saturating_add(packets))]);
         let share = match stream.1.i == stream.1.j {
             // Auto-correlations are in no map.
             true => Some(0.0),
-            false => near.share.or_else(|| Usual::of(all).share),
+            false => near.share.or_else(|| PacketMeans::of(all).share),
         };
-        Usual { share, ..near }
+        PacketMeans { share, ..near }
     }
 }
 

@@ -18,7 +18,7 @@ use crate::imaging::EngineKind;
 use crate::runtime::Outlet;
 use crate::units::ChannelId;
 
-/// What became of the visibilities of an archive.
+/// Counts of a recalibration.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Recalibrated {
     /// Packets whose visibilities were taken out under the old gains and added under the new ones.
@@ -41,7 +41,7 @@ struct Recalibration {
     journal: Journal,
     /// Packets that are to be taken out.
     due: BTreeSet<Sent>,
-    /// Those that are.
+    /// Records of packets that have been taken out.
     removed: BTreeMap<Sent, JournalRecord>,
     report: Recalibrated,
 }
@@ -186,7 +186,7 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Adds the visibilities that were taken out, in the order of the files. A channel of which nothing is left begins anew.
+    /// Adds the visibilities that were taken out, in the order of the files. A channel without remaining data begins anew.
     fn add_again(&mut self, files: &[PathBuf], new: &GroundConfig) -> Result<(), GroundError> {
         let Self { ground, journal, removed, report, .. } = self;
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
@@ -229,7 +229,7 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Requires that channels of which something was left have the circle that they would have in a new archive.
+    /// Requires that channels with remaining data have the circle that they would have in a new archive.
     fn check_beginnings(&self, before: &BTreeMap<ChannelId, Sent>, moves: bool) -> Result<(), GroundError> {
         let kept = self.journal.visibilities.iter().filter(|(sent, _)| !self.removed.contains_key(*sent));
         let kept: BTreeSet<ChannelId> = kept.filter_map(|(_, record)| Some(record.used?.channel)).collect();

@@ -169,7 +169,7 @@ fn link_to(folder: &Path, elsewhere: &Path) -> Result<(), GroundError> {
     }
 }
 
-/// What was removed from a state, for its raw archive.
+/// Tells the raw archive of a state which packets were removed from it.
 pub(super) fn forget(
     packets: Option<&PacketArchive>,
     names: &[PacketName],

@@ -29,7 +29,7 @@ pub struct RefusedPacket {
     pub reason: &'static str,
 }
 
-/// What became of the packets of the files.
+/// Counts of a retraction.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Retracted {
     /// Packets removed, held ones included.
@@ -38,7 +38,7 @@ pub struct Retracted {
     pub waited: u64,
     /// Visibilities in the packets removed that had been applied.
     pub visibilities: u64,
-    /// Those of them that were in the sums.
+    /// Of these, packets that were in the sums.
     pub accumulated: u64,
     /// Packets that are not in the archive.
     pub absent: u64,
@@ -200,7 +200,7 @@ impl Retraction {
         Ok(())
     }
 
-    /// Removes payloads of other kinds of which all packets were found and that nothing else depends on.
+    /// Removes payloads of other kinds whose packets were all found, unless something depends on them.
     fn retract_others(&mut self) {
         let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {

@@ -5,8 +5,9 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
+use super::open_archive::OpenArchive;
 use super::recovery::{kept_settings, require_saved};
-use super::store::{Archive, Opened};
+use super::store::Archive;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
@@ -21,22 +22,22 @@ impl Ground {
     /// A folder that cannot be used or is in use; an archive that was made with other settings, or without a usable
     /// checkpoint; calibration that cannot be read.
     pub fn open(folder: &Path, config: &GroundConfig, checkpoint_every: u64) -> Result<Self, GroundError> {
-        Self::open_among(folder, config, checkpoint_every, &Ranks::one())
+        Self::open_with_ranks(folder, config, checkpoint_every, &Ranks::one())
     }
 
     /// As [`Ground::open`], as one rank of several, all of which open the folder: each writes its part of every checkpoint. The
     /// checkpoint may be one of other ranks, or of a process alone.
     ///
     /// # Errors
-    /// Likewise; a folder that ranks do not share.
+    /// As [`Ground::open`]; a folder that ranks do not share.
     #[doc(hidden)]
-    pub fn open_among(
+    pub fn open_with_ranks(
         folder: &Path,
         config: &GroundConfig,
         checkpoint_every: u64,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        let mut ground = Opened::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
+        let mut ground = OpenArchive::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
         // One of several ranks applies what there is, and leaves the archive to grounds that listen.
         ground.recover(folder, !ranks.are_many())?;
         let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());
@@ -46,7 +47,7 @@ impl Ground {
 
     /// A new archive in `folder`; what may be in its raw archive stays out.
     pub(super) fn open_anew(folder: &Path, config: &GroundConfig) -> Result<Self, GroundError> {
-        Opened::new(folder, config, true)?.resume(config, u64::MAX)
+        OpenArchive::new(folder, config, true)?.resume(config, u64::MAX)
     }
 
     /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
@@ -55,7 +56,7 @@ impl Ground {
     /// A folder that holds another archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
     /// settings, or that hold the same visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
-        let mut whole: Option<Opened> = None;
+        let mut whole: Option<OpenArchive> = None;
         let mut seen = BTreeSet::new();
         let is_into = into.canonicalize().ok();
         for path in parts {
@@ -69,7 +70,7 @@ impl Ground {
             if checkpoints(path)?.is_empty() {
                 return Err(GroundError::without_checkpoint(path));
             }
-            let part = Opened::new(path, config, false)?;
+            let part = OpenArchive::new(path, config, false)?;
             require_saved(path, part.folder.newest())?;
             match &mut whole {
                 None => whole = Some(part),
@@ -134,7 +135,7 @@ impl Ground {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
         }
-        let mut ground = Opened::new(folder, config, false)?.resume(config, u64::MAX)?;
+        let mut ground = OpenArchive::new(folder, config, false)?.resume(config, u64::MAX)?;
         ground.recover(folder, false)?;
         let mut out = Outlet::collect();
         ground.advance(&mut out)?;

@@ -1,38 +1,25 @@
 //! The archive of a running ground, and what its checkpoints hold.
 
-use std::io::ErrorKind;
-use std::path::Path;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use super::calibration_state::CalibrationState;
-use super::checkpoint::{self, ArchiveHead, ArchiveHeadView};
+use super::checkpoint::{self, ArchiveHeadView};
 use super::draft::RecordDraft;
 use super::folder::{StateFolder, checkpoints};
 use super::journal::{Journal, OtherRecord};
-use super::names::parts_with;
-use super::settings::{compare, settings_of};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
+use crate::downlink::Kind;
 use crate::downlink::transport::packet_archive::PacketArchive;
-use crate::downlink::{DownlinkError, Kind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
-use crate::ground::lookout::Spotter;
 use crate::ground::pass_gate::PassGate;
-use crate::ground::promises::SenderPromises;
-use crate::ground::{
-    Collector, CollectorState, DeliveredPacket, Ground, GroundConfig, GroundError, GroundOutcome,
-    SharedSaving,
-};
+use crate::ground::{Collector, DeliveredPacket, GroundError, SharedSaving};
 use crate::imaging::anywhere::SegmentPlace;
 use crate::imaging::{AccumulationError, Accumulator};
-use crate::ranks::{RankShare, Ranks};
-use crate::runtime::{Cancel, Ledger, LedgerReport};
+use crate::runtime::{Ledger, LedgerReport};
 
 /// After a failure a checkpoint is tried again after this part of the interval, then after twice that, and so on.
 const RETRIES: u64 = 8;
-
-/// What is expected of a file that a checkpoint names.
-const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 
 /// Keeps a journal of what a ground applies, and writes checkpoints of the ground into a folder.
 pub(in crate::ground) struct Archive {
@@ -44,14 +31,14 @@ pub(in crate::ground) struct Archive {
     pub(super) journal: Journal,
     /// Checkpoints that could not be used, in words.
     pub(super) notes: Vec<String>,
-    /// What applying the current packet posts.
-    posts: Ledger<VisibilityReason>,
+    /// Ledger entries of the current packet.
+    pub(super) posts: Ledger<VisibilityReason>,
     /// Visibilities from one checkpoint to the next.
-    interval: u64,
+    pub(super) interval: u64,
     /// Visibilities from the last attempt to the next: fewer than the interval after one that failed, and more each time.
-    wait: u64,
-    since_attempt: u64,
-    saving: SharedSaving,
+    pub(super) wait: u64,
+    pub(super) since_attempt: u64,
+    pub(super) saving: SharedSaving,
     /// The raw archive beside the checkpoints, if there is one.
     pub(super) packets: Option<PacketArchive>,
 }
@@ -107,7 +94,7 @@ impl Archive {
         self.since_attempt >= self.wait
     }
 
-    /// What was posted since this was called last.
+    /// Ledger entries since the last call.
     pub(in crate::ground) fn take_posts(&self) -> LedgerReport<VisibilityReason> {
         self.posts.take()
     }
@@ -149,7 +136,7 @@ impl Archive {
         let found = checkpoints(self.folder.path())?;
         let [only] = &found[..] else { return Ok(false) };
         let no_autos = AutoTable::default();
-        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let of = ArchiveHeadRef { settings: &self.settings, journal: &self.journal, version: self.version };
         let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         checkpoint::is_of_head(only, &head)
     }
@@ -161,7 +148,7 @@ impl Archive {
         accumulator: &mut Accumulator,
     ) -> Result<(), GroundError> {
         let no_autos = AutoTable::default();
-        let of = HeadOf { settings: &self.settings, journal: &self.journal, version: self.version };
+        let of = ArchiveHeadRef { settings: &self.settings, journal: &self.journal, version: self.version };
         let head = of.view(collector, (calibrator, gate), accumulator, &no_autos);
         let (folder, number) = self.folder.next();
         let place = SegmentPlace { folder: &folder, number };
@@ -178,15 +165,15 @@ impl Archive {
     }
 }
 
-/// What an archive adds to the head of a checkpoint.
-struct HeadOf<'a> {
+/// The archive's part of a checkpoint's head.
+struct ArchiveHeadRef<'a> {
     settings: &'a Vec<(String, String)>,
     journal: &'a Journal,
     version: u32,
 }
 
-impl<'a> HeadOf<'a> {
-    /// What a checkpoint has besides the sums.
+impl<'a> ArchiveHeadRef<'a> {
+    /// The head of a checkpoint.
     fn view(
         &self,
         collector: &'a Collector,
@@ -206,210 +193,5 @@ impl<'a> HeadOf<'a> {
                 passes: gate.map(PassGate::state).unwrap_or_default(),
             },
         }
-    }
-}
-
-/// All that a checkpoint holds: data, and the journal.
-pub(super) struct ArchiveContents {
-    pub(super) collector: CollectorState,
-    pub(super) ephemeris: Vec<EphemerisSegment>,
-    pub(super) autos: AutoTable,
-    pub(super) accumulator: Accumulator,
-    pub(super) journal: Journal,
-    pub(super) calibration: CalibrationState,
-}
-
-impl ArchiveContents {
-    /// Of a ground that has received nothing.
-    pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
-        Self {
-            collector: CollectorState::new(config.wait_bytes),
-            ephemeris: Vec::new(),
-            autos: AutoTable::default(),
-            accumulator: config.accumulator(posts),
-            journal: Journal::default(),
-            calibration: CalibrationState::default(),
-        }
-    }
-
-    /// Adds what another ground has received: records, sums, and data that only it has.
-    ///
-    /// # Errors
-    /// Another instrument; a packet of visibilities that is in both journals.
-    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
-        if self.calibration.is_solved() || other.calibration.is_solved() {
-            return Err(GroundError::SolvedApart);
-        }
-        self.calibration.version = self.calibration.version.max(other.calibration.version);
-        self.journal.merge(other.journal).map_err(|count| {
-            let apid = Kind::Visibilities.apid();
-            DownlinkError::TakenTwice { apid, count }
-        })?;
-        self.collector.merge(other.collector, |header| self.journal.contains(header))?;
-        // Of segments that start at the same time the first is used.
-        self.ephemeris.extend(other.ephemeris);
-        self.autos.merge(other.autos);
-        Ok(self.accumulator.merge(other.accumulator)?)
-    }
-}
-
-/// Reads a checkpoint, of all parts that there are, into an accumulator without sums; `check` looks at its head first.
-fn read_parts(
-    path: &Path,
-    empty: &Accumulator,
-    check: impl Fn(&ArchiveHead) -> Result<(), GroundError>,
-) -> Result<(ArchiveHead, Accumulator), GroundError> {
-    let of_part = |path: &Path, part: RankShare, empty: Accumulator| {
-        checkpoint::read(path, |head, engines| {
-            check(&head)?;
-            let sums = empty.resume_part(head.accumulator.clone(), engines, path.parent(), part);
-            Ok((head, sums.map_err(|error| unreadable(path, error))?))
-        })
-    };
-    let mut whole: Option<(ArchiveHead, Accumulator)> = None;
-    for (path, part) in parts_with(path) {
-        let (head, sums) = of_part(&path, part, empty.without_sums())?;
-        match &mut whole {
-            None => whole = Some((head, sums)),
-            Some((first, _)) if first.checksum != head.checksum => {
-                let found = "another state than that of the first part".to_owned();
-                return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
-            }
-            Some((_, joined)) => joined.join(sums)?,
-        }
-    }
-    whole.ok_or_else(|| GroundError::without_checkpoint(path))
-}
-
-/// What the reader's error means: data that end too early are damaged, what the system refuses may well hold.
-fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
-    match error {
-        AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
-            GroundError::io(path, "read")(source)
-        }
-        AccumulationError::Segment { path, found } => GroundError::Damaged { path, found, expected: SEGMENT },
-        other => other.into(),
-    }
-}
-
-/// A folder that is open, and what its newest usable checkpoint holds.
-pub(super) struct Opened {
-    pub(super) folder: StateFolder,
-    contents: Option<ArchiveContents>,
-    notes: Vec<String>,
-    settings: Vec<(String, String)>,
-    posts: Ledger<VisibilityReason>,
-}
-
-impl Opened {
-    /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
-    pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
-        Self::among(folder, config, sets_aside, &Ranks::one())
-    }
-
-    /// As [`Opened::new`], as one rank of several.
-    pub(super) fn among(
-        folder: &Path,
-        config: &GroundConfig,
-        sets_aside: bool,
-        ranks: &Ranks,
-    ) -> Result<Self, GroundError> {
-        if config.map.holds_visibilities() && ranks.are_many() {
-            return Err(AccumulationError::HeldByRank.into());
-        }
-        let mut folder = match sets_aside || ranks.are_many() {
-            true => StateFolder::open_among(folder, ranks)?,
-            false => StateFolder::open_to_read(folder)?,
-        };
-        let settings = settings_of(config)?;
-        let posts = Ledger::new();
-        let (contents, notes) = folder.load(sets_aside, |path| {
-            let empty = config.accumulator(&posts).among(ranks);
-            let (head, accumulator) =
-                read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
-            let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
-            Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration })
-        })?;
-        if let Some(contents) = &contents {
-            folder.names(contents.accumulator.segments());
-        }
-        Ok(Self { folder, contents, notes, settings, posts })
-    }
-
-    /// From now on the contents belong into another folder, which is new.
-    pub(super) fn move_to(&mut self, folder: StateFolder) {
-        self.folder = folder;
-        if let Some(contents) = &mut self.contents {
-            contents.accumulator.leave_segments();
-        }
-    }
-
-    /// Merges the contents of another folder into these.
-    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
-        self.notes.extend(other.notes);
-        match (&mut self.contents, other.contents) {
-            (Some(ours), Some(theirs)) => return ours.merge(theirs),
-            (None, theirs) => self.contents = theirs,
-            _ => {}
-        }
-        Ok(())
-    }
-
-    /// A ground that resumes from these contents.
-    pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
-        let Self { folder, contents, notes, settings, posts } = self;
-        let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
-        let ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration } = contents;
-        // Also of a new archive.
-        let mut accumulator = accumulator.among(folder.ranks());
-        let mut outcome = GroundOutcome::default();
-        outcome.saving.begin();
-        outcome.ledger.post_report(&journal.ledger());
-        accumulator.set_spans(&journal.spans_s());
-        let instrument = collector.instrument().cloned();
-        let mut gate = config.gate()?;
-        if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {
-            config.map.check_priors(&config.described(instrument)?)?;
-        }
-        if let (Some(gate), Some(instrument)) = (&mut gate, &instrument) {
-            gate.describe(instrument)?;
-            gate.resume(calibration.passes);
-        }
-        outcome.gains = gate.as_ref().map(|gate| gate.gains().clone());
-        let calibrator = config.calibrator(gate.as_ref(), &posts)?;
-        let calibrator = calibrator.resume(instrument, ephemeris, autos, journal.blocks());
-        let collector = Collector::resume(collector, journal.delivered(), journal.reception());
-        let (interval, saving, version) = (interval.max(1), outcome.saving.clone(), calibration.version);
-        let (wait, since_attempt) = (interval, 0);
-        let archive = Archive {
-            folder,
-            settings,
-            version,
-            journal,
-            notes,
-            posts,
-            interval,
-            wait,
-            since_attempt,
-            saving,
-            packets: None,
-        };
-        let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
-        let promises = SenderPromises::since(collector.packets());
-        let spotter = Spotter::of(&outcome.lookout);
-        Ok(Ground {
-            collector,
-            calibrator,
-            gate,
-            accumulator,
-            outcome,
-            archive: Some(archive),
-            cancel,
-            linger,
-            begins_with_maps: false,
-            steps,
-            promises,
-            spotter,
-        })
     }
 }

@@ -5,9 +5,10 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint;
 use super::checkpoint::ArchiveHead;
+use super::entry::JournalEntry;
 use super::folder::{checkpoints, note};
-use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, VisibilityPacket, find_gaps};
-use super::journal::JournalEntry;
+use super::gap_report::VisibilityPacket;
+use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, find_gaps};
 use super::names::number_of;
 use super::recovery::unsaved_note;
 use crate::array::Ephemeris;

@@ -2,7 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use super::journal::{Journal, JournalEntry, JournalRecord, Sent, Used};
+use super::entry::JournalEntry;
+use super::journal::{Journal, JournalRecord, Sent, SumsSpan};
 use crate::calibration::{BlockKey, ReceivedBlocks};
 use crate::downlink::{Kind, ReceptionCounters};
 use crate::frames::VisibilityReason;
@@ -84,7 +85,7 @@ impl Journal {
     pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
         let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
         for record in self.visibilities.values() {
-            let Some(Used { channel, span_s: [first, last] }) = record.used else { continue };
+            let Some(SumsSpan { channel, span_s: [first, last] }) = record.used else { continue };
             let span = spans.entry(channel).or_insert([first, last]);
             *span = [span[0].min(first), span[1].max(last)];
         }
@@ -222,7 +223,7 @@ mod tests {
         let bytes = transmission();
         let first = &bytes[..bytes.len() / 2];
         let session_in = |folder: &Path, ranks: &Ranks, bytes: &[u8]| {
-            let mut ground = Ground::open_among(folder, &config, u64::MAX, ranks).unwrap();
+            let mut ground = Ground::open_with_ranks(folder, &config, u64::MAX, ranks).unwrap();
             assert_eq!(ground.ranks().share(), ranks.share());
             ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
             ground.finish(&mut Outlet::collect()).unwrap();

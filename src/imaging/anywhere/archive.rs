@@ -10,9 +10,9 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::belief::RowBelief;
-use super::held::{HeldHead, HeldVisibility, RefinedSetup};
-use super::segments::{HeldSegment, SEGMENTS_MAX, SegmentPlace};
+use super::archived::{ArchivedVisibility, RefinedSetup, VisibilitiesHead};
+use super::assumed_instrument::AssumedInstrument;
+use super::segments::{ArchiveSegment, SEGMENTS_MAX, SegmentPlace};
 use super::sums::{
     BLOCK, Departures, RefinedData, RefinedSums, circle_engine, nearest_circle, refined_sums, taken_apart,
 };
@@ -32,10 +32,10 @@ pub struct VisibilityArchive {
     setup: RefinedSetup,
     scale: WeightScale,
     totals: Totals,
-    held: Vec<HeldVisibility>,
+    held: Vec<ArchivedVisibility>,
     is_sorted: bool,
     /// Those on disk: the first of `held`, in their order.
-    segments: Vec<HeldSegment>,
+    segments: Vec<ArchiveSegment>,
     /// Places in `held`, which is sorted, of visibilities that are to go.
     removed: BTreeSet<usize>,
     /// For maps on the way.
@@ -131,7 +131,7 @@ impl VisibilityArchive {
         other.flush();
         let (found, most) = ((self.held.len() + other.held.len()) as u64, self.setup.visibilities_max);
         if found > most {
-            return Err(AccumulationError::TooManyHeld { channel: self.setup.channel, found, most });
+            return Err(AccumulationError::TooManyVisibilities { channel: self.setup.channel, found, most });
         }
         self.totals = self.totals.and(other.totals, Direction::In).ok_or(AccumulationError::Range)?;
         self.is_sorted = self.held.is_empty() && other.is_sorted;
@@ -147,11 +147,11 @@ impl VisibilityArchive {
 
     /// The segments on disk that hold what was written or read last.
     #[must_use]
-    pub fn segments(&self) -> &[HeldSegment] {
+    pub fn segments(&self) -> &[ArchiveSegment] {
         &self.segments
     }
 
-    /// From now on another folder is meant, which has none of the segments.
+    /// Forgets its segments: the next checkpoint goes into another folder.
     pub fn leave_segments(&mut self) {
         self.segments.clear();
     }
@@ -180,15 +180,15 @@ impl VisibilityArchive {
         (self.setup, parts.at, parts.data)
     }
 
-    /// Sorts the visibilities, plans their rows as `belief` has them, and sums them on the nearest circle.
+    /// Sorts the visibilities, plans their rows for the `assumed` instrument, and sums them on the nearest circle.
     ///
     /// # Errors
     /// A setup that an engine does not take; no data.
-    pub fn into_sums(mut self, belief: &RowBelief) -> Result<RefinedSums, AccumulationError> {
+    pub fn into_sums(mut self, assumed: &AssumedInstrument) -> Result<RefinedSums, AccumulationError> {
         self.circle = None;
         self.sort();
         self.flush();
-        refined_sums(&self.setup, self.held, belief)
+        refined_sums(&self.setup, self.held, assumed)
     }
 
     /// Sums on the circle that was nearest when this was first called, for a map on the way: it costs no pass, and has the errors of
@@ -233,9 +233,10 @@ impl VisibilityArchive {
     ) -> Result<(), AccumulationError> {
         self.flush();
         self.save(place)?;
-        let mut out = FrameWriter::new(out, BasisKind::Held, (HeldHead::new(&self.setup), self.totals))?;
+        let mut out =
+            FrameWriter::new(out, BasisKind::Archive, (VisibilitiesHead::new(&self.setup), self.totals))?;
         out.write(&(self.segments.len() as u32).to_le_bytes())?;
-        for HeldSegment { channel: _, number, visibilities, checksum } in &self.segments {
+        for ArchiveSegment { channel: _, number, visibilities, checksum } in &self.segments {
             for field in [number, visibilities, checksum] {
                 out.write(&field.to_le_bytes())?;
             }
@@ -258,7 +259,7 @@ impl VisibilityArchive {
             self.segments.pop();
         }
         let new = &self.held[saved as usize..];
-        self.segments.push(HeldSegment::write(place, self.setup.channel, new)?);
+        self.segments.push(ArchiveSegment::write(place, self.setup.channel, new)?);
         Ok(())
     }
 
@@ -271,8 +272,8 @@ impl VisibilityArchive {
         folder: Option<&Path>,
         visibilities_max: u64,
     ) -> Result<Self, AccumulationError> {
-        let (mut from, (head, totals)) = FrameReader::new(from, BasisKind::Held)?;
-        let setup = HeldHead::setup(&head, visibilities_max)?;
+        let (mut from, (head, totals)) = FrameReader::new(from, BasisKind::Archive)?;
+        let setup = VisibilitiesHead::setup(&head, visibilities_max)?;
         let mut archive = Self { totals, ..Self::new(setup)? };
         let mut count = [0; 4];
         from.read(&mut count)?;
@@ -284,7 +285,7 @@ impl VisibilityArchive {
             let mut fields = [[0; 8]; 3];
             fields.iter_mut().try_for_each(|field| from.read(field))?;
             let [number, visibilities, checksum] = fields.map(u64::from_le_bytes);
-            archive.segments.push(HeldSegment { channel: setup.channel, number, visibilities, checksum });
+            archive.segments.push(ArchiveSegment { channel: setup.channel, number, visibilities, checksum });
         }
         from.finish()?;
         if let Some(segment) = archive.segments.first()
@@ -313,14 +314,14 @@ impl VisibilityArchive {
         Ok(placed.check_lengths()?)
     }
 
-    fn checked(&self, placed: &PlacedVisibilities, k: usize) -> Result<HeldVisibility, Refusal> {
-        let held = HeldVisibility::of(placed, k, self.setup.moon_radius_m)?;
+    fn checked(&self, placed: &PlacedVisibilities, k: usize) -> Result<ArchivedVisibility, Refusal> {
+        let held = ArchivedVisibility::of(placed, k, self.setup.moon_radius_m)?;
         self.scale.check(held.value_k_sr, held.weight, self.setup.weight_max)?;
         Ok(held)
     }
 
     /// The totals with one more, if there is room.
-    fn with(&self, held: &HeldVisibility) -> Result<Totals, Refusal> {
+    fn with(&self, held: &ArchivedVisibility) -> Result<Totals, Refusal> {
         if self.held.len() as u64 >= self.setup.visibilities_max {
             return Err(Refusal::Full);
         }
@@ -342,7 +343,7 @@ impl VisibilityArchive {
     }
 
     /// The place of a visibility that is held and is not to go.
-    fn find(&self, held: &HeldVisibility) -> Option<usize> {
+    fn find(&self, held: &ArchivedVisibility) -> Option<usize> {
         let order = held.order();
         let first = self.held.partition_point(|other| other.order() < order);
         let equal = self.held[first..].iter().take_while(|other| other.order() == order);
@@ -366,7 +367,7 @@ impl VisibilityArchive {
 }
 
 /// A block of one pair and sub-band, as an engine takes it.
-fn placed(setup: &RefinedSetup, block: &[HeldVisibility]) -> PlacedVisibilities {
+fn placed(setup: &RefinedSetup, block: &[ArchivedVisibility]) -> PlacedVisibilities {
     PlacedVisibilities {
         channel: setup.channel,
         band: block.first().map_or(0, |held| held.band),

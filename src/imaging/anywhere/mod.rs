@@ -1,17 +1,17 @@
 //! Maps with rows at the true positions: visibilities are held one by one, and the circle's map is refined.
 
 mod archive;
-mod belief;
-mod held;
+mod archived;
+mod assumed_instrument;
 mod iterations;
 mod segments;
 mod solve;
 mod sums;
 
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
-pub use belief::{AntennaBelief, RowBelief};
-pub use held::RefinedSetup;
+pub use archived::RefinedSetup;
+pub use assumed_instrument::{AssumedAntenna, AssumedInstrument};
 pub(super) use iterations::PassFile;
-pub use segments::{HELD_BYTES, HeldSegment, SegmentPlace};
+pub use segments::{ArchiveSegment, HELD_BYTES, SegmentPlace};
 pub use solve::{ChiSquares, RefineRule, RefineSteps, Refinement, solve_refined};
 pub use sums::{Departures, RefinedData, RefinedSums, orbit_phase_deg};

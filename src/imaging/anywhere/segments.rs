@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 use crc_fast::{CrcAlgorithm, Digest};
 use num_complex::Complex64;
 
-use super::held::HeldVisibility;
+use super::archived::ArchivedVisibility;
 use crate::files::{AtomicFile, IfUnfinished};
 use crate::imaging::AccumulationError;
 use crate::response::general::PairAt;
@@ -49,7 +49,7 @@ pub struct SegmentPlace<'a> {
 
 /// A segment as a checkpoint names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct HeldSegment {
+pub struct ArchiveSegment {
     /// Channel.
     pub channel: ChannelId,
     /// Number of the checkpoint that it was written with.
@@ -60,7 +60,7 @@ pub struct HeldSegment {
     pub checksum: u64,
 }
 
-impl HeldSegment {
+impl ArchiveSegment {
     /// Its file's name.
     #[must_use]
     pub fn file_name(&self) -> String {
@@ -88,7 +88,7 @@ impl HeldSegment {
     pub(in crate::imaging) fn write(
         place: SegmentPlace<'_>,
         channel: ChannelId,
-        held: &[HeldVisibility],
+        held: &[ArchivedVisibility],
     ) -> Result<Self, AccumulationError> {
         let (visibilities, number) = (held.len() as u64, place.number);
         let mut segment = Self { channel, number, visibilities, checksum: 0 };
@@ -99,7 +99,7 @@ impl HeldSegment {
     }
 
     /// Writes one of the two files; returns its checksum.
-    fn write_file(&self, path: &Path, held: &[HeldVisibility]) -> Result<u64, AccumulationError> {
+    fn write_file(&self, path: &Path, held: &[ArchivedVisibility]) -> Result<u64, AccumulationError> {
         let mut file = AtomicFile::create(path, IfUnfinished::Remove)?;
         let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
         let mut put = |bytes: &[u8]| {
@@ -121,7 +121,7 @@ impl HeldSegment {
     pub(in crate::imaging) fn read(
         &self,
         folder: &Path,
-        take: &mut dyn FnMut(&mut dyn Iterator<Item = HeldVisibility>),
+        take: &mut dyn FnMut(&mut dyn Iterator<Item = ArchivedVisibility>),
     ) -> Result<(), AccumulationError> {
         // Nothing is handed over before it is known to hold.
         let path = self.sound_file(folder)?;
@@ -150,7 +150,7 @@ impl HeldSegment {
     fn read_file(
         &self,
         path: &Path,
-        take: &mut dyn FnMut(&mut dyn Iterator<Item = HeldVisibility>),
+        take: &mut dyn FnMut(&mut dyn Iterator<Item = ArchivedVisibility>),
     ) -> Result<(), AccumulationError> {
         let damaged = |found: String| AccumulationError::Segment { path: path.to_owned(), found };
         let mut file = File::open(path).map_err(|error| match error.kind() {
@@ -219,8 +219,8 @@ fn restore(from: &Path, to: &Path) -> std::io::Result<()> {
     file.finish().map(drop)
 }
 
-fn record(held: &HeldVisibility) -> [u8; HELD_BYTES as usize] {
-    let HeldVisibility { at, band, value_k_sr: value, weight, duration_s } = held;
+fn record(held: &ArchivedVisibility) -> [u8; HELD_BYTES as usize] {
+    let ArchivedVisibility { at, band, value_k_sr: value, weight, duration_s } = held;
     let ([a, b, c], [d, e, f]) = (at.r_i_m, at.r_j_m);
     let mut bytes = [0; HELD_BYTES as usize];
     (bytes[0], bytes[1]) = (at.pair.i, at.pair.j);
@@ -233,14 +233,14 @@ fn record(held: &HeldVisibility) -> [u8; HELD_BYTES as usize] {
     bytes
 }
 
-fn held(bytes: &[u8; HELD_BYTES as usize]) -> HeldVisibility {
+fn held(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
     let mut numbers = [0.0; 10];
     for (number, bytes) in numbers.iter_mut().zip(bytes[4..].as_chunks::<8>().0) {
         *number = f64::from_le_bytes(*bytes);
     }
     let [time_s, a, b, c, d, e, f, re, im, weight] = numbers;
     let pair = Pair { i: bytes[0], j: bytes[1] };
-    HeldVisibility {
+    ArchivedVisibility {
         at: PairAt { pair, time_s, r_i_m: [a, b, c], r_j_m: [d, e, f] },
         band: u16::from_le_bytes([bytes[2], bytes[3]]),
         value_k_sr: Complex64::new(re, im),
@@ -253,10 +253,10 @@ fn held(bytes: &[u8; HELD_BYTES as usize]) -> HeldVisibility {
 mod tests {
     use super::*;
 
-    fn visibilities(count: usize) -> Vec<HeldVisibility> {
+    fn visibilities(count: usize) -> Vec<ArchivedVisibility> {
         let one = |k: usize| {
             let x = k as f64 + 0.25;
-            HeldVisibility {
+            ArchivedVisibility {
                 at: PairAt {
                     pair: Pair { i: 1, j: 2 + (k % 5) as u8 },
                     time_s: x,
@@ -272,7 +272,7 @@ mod tests {
         (0..count).map(one).collect()
     }
 
-    fn read(segment: &HeldSegment, folder: &Path) -> Result<Vec<HeldVisibility>, AccumulationError> {
+    fn read(segment: &ArchiveSegment, folder: &Path) -> Result<Vec<ArchivedVisibility>, AccumulationError> {
         let mut found = Vec::new();
         segment.read(folder, &mut |piece| found.extend(piece)).map(|()| found)
     }
@@ -283,11 +283,11 @@ mod tests {
         let place = SegmentPlace { folder: folder.path(), number: 7 };
         for count in [1, 3, PIECE + 1] {
             let all = visibilities(count);
-            let segment = HeldSegment::write(place, ChannelId(2), &all).unwrap();
+            let segment = ArchiveSegment::write(place, ChannelId(2), &all).unwrap();
             assert_eq!(segment.file_name(), "visibilities-00000007-0002.segment");
             assert_eq!(read(&segment, folder.path()).unwrap(), all);
         }
-        let segment = HeldSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
+        let segment = ArchiveSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
         let path = segment.path(folder.path());
         let copy = folder.path().join(segment.copy_name());
         // While one file holds, nothing is lost, and the other is whole again.
@@ -326,15 +326,15 @@ mod tests {
         let said = segment.verify(folder.path()).unwrap_err().to_string();
         assert!(said.contains("replay their files into a new folder"), "{said}");
         // Another one of the same length, which holds in itself, is not the one that was named.
-        HeldSegment::write(place, ChannelId(2), &visibilities(4)[1..]).unwrap();
+        ArchiveSegment::write(place, ChannelId(2), &visibilities(4)[1..]).unwrap();
         is_told();
         std::fs::remove_file(&copy).unwrap();
         std::fs::remove_file(&path).unwrap();
         is_told();
         // A forged count costs nothing.
-        HeldSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
+        ArchiveSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
         for visibilities in [0, u64::MAX, u64::MAX / HELD_BYTES] {
-            assert!(HeldSegment { visibilities, ..segment }.verify(folder.path()).is_err());
+            assert!(ArchiveSegment { visibilities, ..segment }.verify(folder.path()).is_err());
         }
     }
 }

@@ -177,7 +177,7 @@ pub fn solve_refined(
     let regularisation = request.epsilon * w_max;
     let factors = blocks.factors(regularisation);
     drop(blocks);
-    let problem = Refining { sums, regularisation, inner: request.rule, factors };
+    let problem = RefinedProblem { sums, regularisation, inner: request.rule, factors };
     let mut data = sums.data.value_k_sr.clone();
     if let Some(prior) = &prior {
         let predicted = problem.forward(&[prior.as_slice()]);
@@ -233,7 +233,7 @@ pub fn solve_refined(
 }
 
 /// The true normal equations and their preconditioner.
-struct Refining<'a> {
+struct RefinedProblem<'a> {
     sums: &'a RefinedSums,
     regularisation: f64,
     /// When inner iterations stop, besides their residual.
@@ -286,7 +286,7 @@ impl Column {
     }
 }
 
-impl Refining<'_> {
+impl RefinedProblem<'_> {
     fn l_max(&self) -> usize {
         self.sums.circle.setup().l_max
     }
@@ -303,6 +303,24 @@ impl Refining<'_> {
         gradients.iter().map(unknowns_of_gradient).collect()
     }
 
+    /// Solves for several right-hand sides with the equations of the nearest circle.
+    fn on_the_circle(&self, right: &[&[f64]], residual_max: f64, watch: NamedWatch<'_>) -> Vec<Vec<f64>> {
+        let circle = System {
+            sums: &self.sums.circle,
+            regularisation: Diagonal::Uniform(self.regularisation),
+            precondition: &|v| self.factors.solve(v),
+        };
+        let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
+        let rule = StoppingRule { residual_max, ..self.inner };
+        circle.solve(
+            right,
+            &mut z,
+            &vec![rule; right.len()],
+            &watch.part("on the nearest circle", residual_max),
+        );
+        z
+    }
+
     /// Solves for two right-hand sides; `data` is what the first is made from, `circle_data` what it is by the circle's rows.
     fn solve(
         &self,
@@ -314,69 +332,23 @@ impl Refining<'_> {
         watch: NamedWatch<'_>,
     ) -> [Column; 2] {
         let task = watch.start("refined map", rule.residual_max);
-        let circle = System {
-            sums: &self.sums.circle,
-            regularisation: Diagonal::Uniform(self.regularisation),
-            precondition: &|v| self.factors.solve(v),
-        };
-        let on_the_circle = |right: &[&[f64]], residual_max: f64| {
-            let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
-            let rule = StoppingRule { residual_max, ..self.inner };
-            circle.solve(
-                right,
-                &mut z,
-                &vec![rule; right.len()],
-                &watch.part("on the nearest circle", residual_max),
-            );
-            z
-        };
-        let precondition = |residuals: &[&[f64]]| on_the_circle(residuals, INNER_RESIDUAL).into_iter();
+        let precondition = |residuals: &[&[f64]]| self.on_the_circle(residuals, INNER_RESIDUAL, watch);
         let start = steps.start.filter(|start| right.iter().zip(start).all(|(b, x)| b.len() == x.len()));
         // Where all is on the circle, its map may be all that is wanted.
         let is_circle = start.is_none() && self.sums.departures.by_refinement == 0;
         let start = if is_circle {
             let circle = [circle_data.as_slice(), self.sums.circle.noise_right_hand_side()];
-            on_the_circle(&circle, self.inner.residual_max).try_into().ok()
+            self.on_the_circle(&circle, self.inner.residual_max, watch).try_into().ok()
         } else {
             start
         };
-        let mut data = Some(data);
-        let mut directions = match &start {
-            Some(map) if is_circle => Vec::from(map.clone()).into_iter(),
+        let directions = match &start {
+            Some(map) if is_circle => Vec::from(map.clone()),
             _ => precondition(&right.iter().map(Vec::as_slice).collect::<Vec<_>>()),
         };
-        let mut right = right.into_iter();
-        let mut columns = [(); 2].map(|()| {
-            let b = right.next().unwrap_or_default();
-            let z = directions.next().unwrap_or_default();
-            let energy = dot(&b, &z);
-            Column {
-                x: vec![0.0; b.len()],
-                residual: b,
-                direction: z,
-                energy,
-                whole: energy,
-                data: data.take().unwrap_or_default(),
-                residuals: Vec::new(),
-                rule,
-                is_stuck: false,
-            }
-        });
+        let mut columns = columns(right, directions, data, rule);
         if let Some(start) = start {
-            let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
-            let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
-            let products = products.iter().map(unknowns_of_gradient);
-            for (((column, x), mut product), seen) in columns.iter_mut().zip(start).zip(products).zip(seen) {
-                product.iter_mut().zip(&x).for_each(|(y, x)| *y += self.regularisation * x);
-                subtract(&mut column.residual, 1.0, &product);
-                column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= seen);
-                column.x = x;
-            }
-            let z = precondition(&columns.each_ref().map(|column| column.residual.as_slice()));
-            for (column, z) in columns.iter_mut().zip(z) {
-                column.direction = z;
-                column.energy = dot(&column.residual, &column.direction);
-            }
+            self.begin_from(&mut columns, start, &precondition);
         }
         // As far as the slower of the two has come: noise has most of its power where little is measured.
         let passes = |columns: &[Column; 2]| columns.iter().map(|column| column.residuals.len()).max();
@@ -384,42 +356,93 @@ impl Refining<'_> {
         while columns.iter().any(Column::is_open)
             && task.report(passes(&columns).unwrap_or(0), residual(&columns))
         {
-            let open = columns.iter().filter(|column| column.is_open());
-            let directions: Vec<Alm> =
-                open.map(|column| coefficients(&column.direction, self.l_max())).collect();
-            let (seen, products) =
-                self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);
-            let products = products.iter().map(unknowns_of_gradient);
-            let open = columns.iter_mut().filter(|column| column.is_open());
-            let mut stepped = Vec::new();
-            for ((column, mut product), seen) in open.zip(products).zip(seen) {
-                product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);
-                let curvature = dot(&column.direction, &product);
-                if curvature.is_nan() || curvature <= 0.0 {
-                    column.is_stuck = true;
-                    continue;
-                }
-                let step = dot(&column.residual, &column.direction) / curvature;
-                column.x.iter_mut().zip(&column.direction).for_each(|(x, d)| *x += step * d);
-                column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= step * seen);
-                let before = column.residual.clone();
-                subtract(&mut column.residual, step, &product);
-                stepped.push((column, before));
-            }
-            let z = precondition(
-                &stepped.iter().map(|(column, _)| column.residual.as_slice()).collect::<Vec<_>>(),
-            );
-            for ((column, before), z) in stepped.into_iter().zip(z) {
-                let next = dot(&column.residual, &z);
-                let turn = (next - dot(&before, &z)) / column.energy;
-                column.energy = next;
-                column.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
-                column.residuals.push(column.relative());
-            }
+            self.advance(&mut columns, &precondition);
             (steps.passed)([&columns[0].x, &columns[1].x]);
         }
         columns
     }
+
+    /// Takes an earlier solution as the first step.
+    fn begin_from(
+        &self,
+        columns: &mut [Column; 2],
+        start: [Vec<f64>; 2],
+        precondition: &dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>,
+    ) {
+        let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
+        let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
+        let products = products.iter().map(unknowns_of_gradient);
+        for (((column, x), mut product), seen) in columns.iter_mut().zip(start).zip(products).zip(seen) {
+            product.iter_mut().zip(&x).for_each(|(y, x)| *y += self.regularisation * x);
+            subtract(&mut column.residual, 1.0, &product);
+            column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= seen);
+            column.x = x;
+        }
+        let z = precondition(&columns.each_ref().map(|column| column.residual.as_slice()));
+        for (column, z) in columns.iter_mut().zip(z) {
+            column.direction = z;
+            column.energy = dot(&column.residual, &column.direction);
+        }
+    }
+
+    /// One iteration of the flexible conjugate gradients for those columns that are open.
+    fn advance(&self, columns: &mut [Column; 2], precondition: &dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>) {
+        let open = columns.iter().filter(|column| column.is_open());
+        let directions: Vec<Alm> = open.map(|column| coefficients(&column.direction, self.l_max())).collect();
+        let (seen, products) = self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);
+        let products = products.iter().map(unknowns_of_gradient);
+        let open = columns.iter_mut().filter(|column| column.is_open());
+        let mut stepped = Vec::new();
+        for ((column, mut product), seen) in open.zip(products).zip(seen) {
+            product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);
+            let curvature = dot(&column.direction, &product);
+            if curvature.is_nan() || curvature <= 0.0 {
+                column.is_stuck = true;
+                continue;
+            }
+            let step = dot(&column.residual, &column.direction) / curvature;
+            column.x.iter_mut().zip(&column.direction).for_each(|(x, d)| *x += step * d);
+            column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= step * seen);
+            let before = column.residual.clone();
+            subtract(&mut column.residual, step, &product);
+            stepped.push((column, before));
+        }
+        let z =
+            precondition(&stepped.iter().map(|(column, _)| column.residual.as_slice()).collect::<Vec<_>>());
+        for ((column, before), z) in stepped.into_iter().zip(z) {
+            let next = dot(&column.residual, &z);
+            let turn = (next - dot(&before, &z)) / column.energy;
+            column.energy = next;
+            column.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+            column.residuals.push(column.relative());
+        }
+    }
+}
+
+/// The columns before the first iteration; `data` is what the first right-hand side is made from.
+fn columns(
+    right: Vec<Vec<f64>>,
+    directions: Vec<Vec<f64>>,
+    data: Vec<Complex64>,
+    rule: RefineRule,
+) -> [Column; 2] {
+    let (mut right, mut directions, mut data) = (right.into_iter(), directions.into_iter(), Some(data));
+    [(); 2].map(|()| {
+        let residual = right.next().unwrap_or_default();
+        let direction = directions.next().unwrap_or_default();
+        let energy = dot(&residual, &direction);
+        Column {
+            x: vec![0.0; residual.len()],
+            residual,
+            direction,
+            energy,
+            whole: energy,
+            data: data.take().unwrap_or_default(),
+            residuals: Vec::new(),
+            rule,
+            is_stuck: false,
+        }
+    })
 }
 
 /// Mean squares of residuals in units of their noise.

@@ -7,8 +7,8 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::belief::{PairAntennas, RowBelief, is_same_pass};
-use super::held::{HeldVisibility, RefinedSetup};
+use super::archived::{ArchivedVisibility, RefinedSetup};
+use super::assumed_instrument::{AssumedInstrument, PairAntennas, is_same_pass};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums};
 use crate::imaging::circle::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
@@ -22,13 +22,13 @@ use crate::units::vector::{Vec3, cross, dot};
 /// Plans the rows of sorted visibilities, and sums them on the nearest circle.
 pub(in crate::imaging) fn refined_sums(
     setup: &RefinedSetup,
-    held: Vec<HeldVisibility>,
-    belief: &RowBelief,
+    held: Vec<ArchivedVisibility>,
+    assumed: &AssumedInstrument,
 ) -> Result<RefinedSums, AccumulationError> {
-    let Apart { at, bands, data, duration_s } = taken_apart(setup, held);
+    let VisibilityColumns { at, bands, data, duration_s } = taken_apart(setup, held);
     let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
     let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
-    let antennas = belief.antennas_of(setup.response, setup.frequency_hz, &at);
+    let antennas = assumed.antennas_of(setup.response, setup.frequency_hz, &at);
     let rows = GeneralRows::new(RowsSetup {
         l_max: setup.l_max,
         wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,
@@ -38,7 +38,7 @@ pub(in crate::imaging) fn refined_sums(
     });
     let response = antennas.as_ref().map(|antennas| |k: usize| antennas.response(&at, k));
     let observed = Observed {
-        duration_s: if belief.smear_integrations { &duration_s } else { &[] },
+        duration_s: if assumed.smear_integrations { &duration_s } else { &[] },
         response: response.as_ref().map(|of| of as &(dyn Fn(usize) -> PairResponse + Sync)),
     };
     // Each visibility was checked when it came.
@@ -47,7 +47,7 @@ pub(in crate::imaging) fn refined_sums(
 }
 
 /// Visibilities as lists.
-pub(in crate::imaging) struct Apart {
+pub(in crate::imaging) struct VisibilityColumns {
     pub(in crate::imaging) at: Vec<PairAt>,
     bands: Vec<u16>,
     pub(in crate::imaging) data: RefinedData,
@@ -55,7 +55,10 @@ pub(in crate::imaging) struct Apart {
 }
 
 /// Positions, sub-bands, data and lengths of visibilities.
-pub(in crate::imaging) fn taken_apart(setup: &RefinedSetup, held: Vec<HeldVisibility>) -> Apart {
+pub(in crate::imaging) fn taken_apart(
+    setup: &RefinedSetup,
+    held: Vec<ArchivedVisibility>,
+) -> VisibilityColumns {
     let noise = noises(setup, &held);
     let data = RefinedData {
         value_k_sr: held.iter().map(|held| held.value_k_sr).collect(),
@@ -64,11 +67,11 @@ pub(in crate::imaging) fn taken_apart(setup: &RefinedSetup, held: Vec<HeldVisibi
     };
     let bands = held.iter().map(|held| held.band).collect();
     let duration_s = held.iter().map(|held| held.duration_s).collect();
-    Apart { at: held.into_iter().map(|held| held.at).collect(), bands, data, duration_s }
+    VisibilityColumns { at: held.into_iter().map(|held| held.at).collect(), bands, data, duration_s }
 }
 
 /// Noise of the companion, by visibility.
-fn noises(setup: &RefinedSetup, held: &[HeldVisibility]) -> Vec<Complex64> {
+fn noises(setup: &RefinedSetup, held: &[ArchivedVisibility]) -> Vec<Complex64> {
     held.par_iter()
         .map(|held| {
             let one = PlacedVisibilities {

@@ -19,9 +19,9 @@ use crate::imaging::exact::engine::SkyBasis;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::exact::noise::{NoiseKey, unit_noise};
 
-/// A visibility of which noises are to be summed.
+/// A visibility whose noise realisations are summed.
 #[derive(Clone, Copy, Debug)]
-struct Noisy {
+struct NoisyVisibility {
     place: TorusPoint,
     weight: f64,
     key: NoiseKey,
@@ -37,7 +37,7 @@ pub struct NoiseSums {
     grids: Arc<Grids>,
     quanta: Quanta,
     pairs: Vec<PairTori>,
-    pending: Vec<Noisy>,
+    pending: Vec<NoisyVisibility>,
 }
 
 impl NoiseSums {
@@ -63,7 +63,7 @@ impl NoiseSums {
         for k in 0..placed.len() {
             if let Ok(accepted) = engine.accept(placed, k) {
                 let (place, weight) = (accepted.place, accepted.weight);
-                self.pending.push(Noisy { place, weight, key: NoiseKey::of(placed, k) });
+                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::of(placed, k) });
             }
             if self.pending.len() >= HarmonicBasis::BATCH {
                 self.flush();
@@ -73,7 +73,7 @@ impl NoiseSums {
 
     fn flush(&mut self) {
         let Self { seeds, grids, quanta, pairs, pending } = self;
-        let locate = |one: &Noisy| {
+        let locate = |one: &NoisyVisibility| {
             let noise = |seed: &u64| unit_noise(*seed, one.key) * one.weight.sqrt();
             let two = |seeds: &[u64]| [noise(&seeds[0]), seeds.get(1).map(noise).unwrap_or_default()];
             LocatedNoise::new(grids, *quanta, &one.place, seeds.chunks(2).map(two))

@@ -33,7 +33,7 @@ pub(super) struct Operator {
     correction: Vec<f64>,
 }
 
-/// The tori of all ranks, of which each holds a part.
+/// The tori of all ranks; each rank holds a part.
 pub(super) struct SharedTori<'a> {
     pub(super) ranks: &'a Ranks,
     /// What this one holds.

@@ -20,7 +20,7 @@ use crate::imaging::{AccumulationError, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 
 impl StoredTori {
-    /// Writes the sums that `grids` says are held, of which there are none yet, and frees them node by node.
+    /// Writes the sums that `grids` holds, and frees them node by node; the file has none yet.
     fn append(&mut self, grids: &Grids, quanta: Quanta, exact: ExactTori) -> io::Result<()> {
         let is_filled = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
         let filled = exact.nodes.iter().enumerate().filter(|(_, node)| is_filled(node));
@@ -93,12 +93,12 @@ impl StoredTori {
 #[derive(Clone, Debug)]
 pub struct SumPart {
     share: RankShare,
-    made: Arc<Mutex<Made>>,
+    made: Arc<Mutex<FinishedParts>>,
 }
 
-/// What earlier parts have left.
+/// The parts that are finished.
 #[derive(Debug)]
-struct Made {
+struct FinishedParts {
     folder: PathBuf,
     tori: Option<StoredTori>,
     counts: Option<SumCounts>,
@@ -108,7 +108,7 @@ impl SumPart {
     /// The first of some parts, which are kept in a folder until the map is solved.
     #[must_use]
     pub fn first(count: usize, folder: &Path) -> Self {
-        let made = Made { folder: folder.to_owned(), tori: None, counts: None };
+        let made = FinishedParts { folder: folder.to_owned(), tori: None, counts: None };
         Self { share: RankShare { rank: 0, count: count.max(1) }, made: Arc::new(Mutex::new(made)) }
     }
 

@@ -132,7 +132,7 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize, at_once: usize) -> Harmo
 /// What ranks that share the sums of maps up to `l_max` divide and exchange.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SharedSize {
-    /// Blocks of alphas, each of which one rank holds.
+    /// Blocks of alphas; one rank holds each.
     pub blocks: usize,
     /// Bytes that each rank gives to one product with BtN^-1B, and gets.
     pub product_bytes: u64,

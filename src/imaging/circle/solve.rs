@@ -4,9 +4,11 @@ use super::sigma::pixel_sigma_k;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::power::{Covariance, Drawn, Factors, FoundPower, SAMPLE_SETTLED, Sought, Uncertainty};
+use crate::imaging::power::{
+    Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, Uncertainty,
+};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
-use crate::imaging::solver::Fitted;
+use crate::imaging::solver::FitInputs;
 use crate::imaging::solver::NamedWatch;
 use crate::imaging::solver::SolveError;
 use crate::imaging::solver::traces;
@@ -135,7 +137,7 @@ pub fn solve_regularised(
     if request.probes > 0 {
         let mut product = vec![0.0; whole.len()];
         sums.apply(&whole, &mut product);
-        let fitted = Fitted {
+        let fitted = FitInputs {
             counts: sums.counts(),
             accuracy: sums.accuracy(),
             w_max,
@@ -172,7 +174,7 @@ pub(super) fn power_of_data(
     let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let sought = Sought { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
+    let sought = PowerProblem { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
     Ok(Regulariser::Wiener(sought.found(None, rule, watch)?.power.over_noise_k2()))
 }
 
@@ -200,7 +202,7 @@ fn solve_with_power(
     let order_blocks = sums.order_blocks();
     let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
     let SumCounts { visibilities, power, .. } = sums.counts();
-    let sought = Sought {
+    let sought = PowerProblem {
         sums,
         blocks: &blocks,
         degrees: &degrees,

@@ -270,7 +270,7 @@ const GROUP: usize = 8;
 /// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
 struct Rows<'a, const K: usize> {
     rows: &'a mut [IntegerRow],
-    /// The blocks of alphas that are held; to others nothing is added.
+    /// The blocks of alphas that are held; others are left out.
     share: RankShare,
     stride: usize,
     first: [u32; 2],
@@ -291,7 +291,7 @@ impl<const K: usize> Rows<'_, K> {
         for (to, one) in terms.iter_mut().zip(group) {
             *to = term(one);
         }
-        arch.dispatch(Spreading { rows: self, terms: &terms[..group.len()] });
+        arch.dispatch(SpreadRows { rows: self, terms: &terms[..group.len()] });
     }
 }
 
@@ -342,12 +342,12 @@ fn bounds<const K: usize>(terms: &[Term<'_, K>]) -> [u32; LANES] {
 }
 
 /// Adds the outer products of values, alphas and gammas, each term rounded to a whole number.
-struct Spreading<'a, const K: usize> {
+struct SpreadRows<'a, const K: usize> {
     rows: Rows<'a, K>,
     terms: &'a [Term<'a, K>],
 }
 
-impl<const K: usize> WithSimd for Spreading<'_, K> {
+impl<const K: usize> WithSimd for SpreadRows<'_, K> {
     type Output = ();
 
     #[inline(always)]

@@ -71,7 +71,7 @@ impl HarmonicSums {
         self.operator().matrix_product_flops(&self.shared())
     }
 
-    /// Bytes of this process's weights, each of which one [`NormalSums::apply`] reads once.
+    /// Bytes of this process's weights; one [`NormalSums::apply`] reads each once.
     #[must_use]
     pub fn weight_bytes(&self) -> u64 {
         self.tori.weight_bytes(&self.grids)

@@ -34,7 +34,7 @@ pub enum BasisKind {
     /// Over spherical harmonics.
     Harmonic = 2,
     /// None: visibilities one by one.
-    Held = 3,
+    Archive = 3,
 }
 
 impl BasisKind {
@@ -42,7 +42,7 @@ impl BasisKind {
         match self {
             Self::Pixel => "sums over pixels (kind 1)",
             Self::Harmonic => "sums over harmonics (kind 2)",
-            Self::Held => "visibilities held for refinement (kind 3)",
+            Self::Archive => "visibilities held for refinement (kind 3)",
         }
     }
 }

@@ -109,7 +109,7 @@ impl ExactTiles {
         })
     }
 
-    /// A matrix of which `read` fills the columns, in the order of [`Self::columns`]. Memory follows what could be read,
+    /// A matrix whose columns are filled by `read`, in the order of [`Self::columns`]. Memory follows what could be read,
     /// but for a tile of two megabytes.
     pub(super) fn read<E>(
         order: usize,

@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::cholesky::{Cholesky, NotPositive};
 use crate::imaging::solver::Convergence;
 use crate::imaging::solver::SolveError;
-use crate::imaging::solver::{Fit, Fitted};
+use crate::imaging::solver::{Fit, FitInputs};
 use crate::imaging::solver::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 use crate::imaging::solver::{NamedWatch, SolveWatch};
 use crate::imaging::solver::{Traces, UnsupportedEpsilon, traces};
@@ -234,7 +234,7 @@ pub fn solve_pixels_with(
         let mut product = right.clone();
         subtract(&mut product, epsilon * w_max, &solved);
         let (right, whole, product, solved) = (&right, &map_k, &product, &solved);
-        Fitted { counts, accuracy, w_max, right, whole, product, solved }.fit(1.0)
+        FitInputs { counts, accuracy, w_max, right, whole, product, solved }.fit(1.0)
     });
     let diagnostics = Diagnostics {
         epsilon: Some(epsilon),

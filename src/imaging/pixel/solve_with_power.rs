@@ -7,7 +7,7 @@ use faer::{Accum, Mat, Par};
 
 use super::solve::{Diagnostics, PixelSolution, PointBeam, check_request, seen_point, subtract_prediction};
 use crate::imaging::circle::{coefficients, degrees, unknowns};
-use crate::imaging::power::{Block, Factors, FoundPower, Sought, Uncertainty};
+use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Uncertainty};
 use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
 use crate::sky::harmonics::Transform;
@@ -68,8 +68,14 @@ pub fn solve_pixels_with_power(
     let right = from_pixels(&right)?;
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let sought =
-        Sought { sums, blocks: &blocks, degrees: &degrees, right: &right, power: power - predicted, numbers };
+    let sought = PowerProblem {
+        sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: power - predicted,
+        numbers,
+    };
     let found = sought.found_in_blocks()?;
     let factor = found.noise_factor();
     let FoundPower { regularisation, solution, power, .. } = found;

@@ -26,7 +26,7 @@ pub(in crate::imaging) struct Drawn {
     pub(in crate::imaging) of_blocks: Vec<f64>,
 }
 
-/// The matrix of which draws have the inverse as covariance.
+/// The matrix whose inverse is the covariance of draws.
 #[derive(Clone, Copy)]
 pub(in crate::imaging) struct Covariance<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,

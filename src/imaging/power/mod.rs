@@ -30,7 +30,7 @@ use serde::Serialize;
 
 pub(super) use blocks::{Block, Factors};
 pub(super) use draws::{Covariance, Drawn, SAMPLE_SETTLED};
-pub(super) use rounds::{FoundPower, Sought};
+pub(super) use rounds::{FoundPower, PowerProblem};
 
 use self::blocks::{evidence, greatest, multiply, value};
 use self::knots::{FREE, Knots};
@@ -39,7 +39,7 @@ use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the least variance of noise.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
-/// Most steps of Newton's iteration, and the gain in evidence that is none.
+/// Most steps of Newton's iteration, and the gain in evidence below which it ends.
 const STEPS_MAX: usize = 20;
 const GAIN_MIN: f64 = 1e-4;
 /// Greatest change of ln C_l in one step.
@@ -50,7 +50,7 @@ const HALVINGS: usize = 8;
 /// The angular power of the sky (less its prior map) as the data have it, with its uncertainty: R = 1 / C_l of a map.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SkyPower {
-    /// C_l of the ensemble, K^2, from l = 0: a smooth curve. Those of l = 0 and 1 are no estimates, but so large that mean and dipole are free.
+    /// C_l of the ensemble, K^2, from l = 0: a smooth curve. Values at l = 0 and 1 are not estimates but so large that mean and dipole are free.
     pub power_k2: Vec<f64>,
     /// Standard deviation of ln C_l, from the curvature of the evidence; 0 for l = 0 and 1.
     pub sigma_ln: Vec<f64>,
@@ -187,7 +187,7 @@ impl PowerFit {
         self.power.iter().map(|power| power.recip()).collect()
     }
 
-    /// The data of which `solution` is the solution with this R if the blocks are the normal matrix.
+    /// The right-hand side for which `solution` solves the equations with this R and the blocks as normal matrix.
     pub(super) fn data_of(&self, blocks: &[Block<'_>], solution: &[f64], degrees: &[usize]) -> Vec<f64> {
         let mut data = multiply(blocks, solution);
         for ((data, x), l) in data.iter_mut().zip(solution).zip(degrees) {

@@ -26,8 +26,8 @@ const RATIO_MAX: f64 = 30.0;
 /// Change of the logarithm of the noise's factor at which it is found.
 const FACTOR_SETTLED: f64 = 0.03;
 
-/// Equations whose R is sought.
-pub(in crate::imaging) struct Sought<'a> {
+/// Normal equations for which R is to be found from the data.
+pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
     /// Blocks near the normal matrix, with which it is preconditioned.
     pub(in crate::imaging) blocks: &'a [Block<'a>],
@@ -58,7 +58,7 @@ impl FoundPower {
     }
 }
 
-impl Sought<'_> {
+impl PowerProblem<'_> {
     fn l_max(&self) -> usize {
         self.degrees.iter().copied().max().unwrap_or(0)
     }

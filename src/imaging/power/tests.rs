@@ -209,7 +209,7 @@ fn intervals_hold_as_often_as_they_say() {
         let (right, sky) = observed(&a, &truth, &mut normal);
         let blocks = block(&a);
         let sums = Dense { matrix: a.clone(), right: right.clone() };
-        let sought = Sought {
+        let sought = PowerProblem {
             sums: &sums,
             blocks: &blocks,
             degrees: &degrees,
@@ -250,8 +250,14 @@ fn without_data_the_power_is_what_is_expected_and_never_rises() {
     let a = Mat::from_fn(ORDER, ORDER, |i, j| if i == j { 1e-12 } else { 0.0 });
     let (right, degrees) = (vec![0.0; ORDER], degrees());
     let (blocks, sums) = (block(&a), Dense { matrix: a.clone(), right: right.clone() });
-    let sought =
-        Sought { sums: &sums, blocks: &blocks, degrees: &degrees, right: &right, power: 0.0, numbers: 1.0 };
+    let sought = PowerProblem {
+        sums: &sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: 0.0,
+        numbers: 1.0,
+    };
     let power = sought.found_in_blocks().unwrap().power;
     assert!(power.power_k2.iter().all(|power| power.is_finite() && *power > 0.0), "{power:?}");
     assert!(power.power_k2[2..].windows(2).all(|pair| pair[1] < pair[0]), "{power:?}");
@@ -261,8 +267,14 @@ fn without_data_the_power_is_what_is_expected_and_never_rises() {
     // The same from rounds with the true products.
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 200 };
     let watch = SolveWatch::default();
-    let rounds =
-        Sought { sums: &sums, blocks: &blocks, degrees: &degrees, right: &right, power: 0.0, numbers: 1.0 };
+    let rounds = PowerProblem {
+        sums: &sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: 0.0,
+        numbers: 1.0,
+    };
     assert!(rounds.found(None, rule, watch.named("test")).is_ok());
 }
 
@@ -274,8 +286,14 @@ fn rounds_with_products_find_what_the_matrix_itself_gives() {
     let degrees = degrees();
     let sums = Dense { matrix: a.clone(), right: right.clone() };
     let exact = block(&a);
-    let of =
-        |blocks| Sought { sums: &sums, blocks, degrees: &degrees, right: &right, power: 0.0, numbers: 1.0 };
+    let of = |blocks| PowerProblem {
+        sums: &sums,
+        blocks,
+        degrees: &degrees,
+        right: &right,
+        power: 0.0,
+        numbers: 1.0,
+    };
     let expected = of(&exact).found_in_blocks().unwrap();
     let near = pairs(&a);
     let rule = StoppingRule { residual_max: 1e-8, iterations_max: 400 };

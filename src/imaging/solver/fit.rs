@@ -27,7 +27,7 @@ pub struct Fit {
 }
 
 /// What is multiplied to tell the fit of a map.
-pub(in crate::imaging) struct Fitted<'a> {
+pub(in crate::imaging) struct FitInputs<'a> {
     pub(in crate::imaging) counts: SumCounts,
     pub(in crate::imaging) accuracy: Accuracy,
     /// Largest eigenvalue of `BtN^-1B`.
@@ -42,7 +42,7 @@ pub(in crate::imaging) struct Fitted<'a> {
     pub(in crate::imaging) solved: &'a [f64],
 }
 
-impl Fitted<'_> {
+impl FitInputs<'_> {
     /// Of a map whose unknowns have the area `per_area_sr` that those of a map of pixels are without.
     pub(in crate::imaging) fn fit(self, per_area_sr: f64) -> Fit {
         let Self { counts, accuracy, w_max, right, whole, product, solved } = self;

@@ -1,5 +1,6 @@
 //! The largest eigenvalue by Lanczos iteration.
 
+use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::vectors::{dot, norm, subtract};
@@ -111,6 +112,20 @@ pub(in crate::imaging) fn normalised(mut vector: Vec<f64>) -> Vec<f64> {
     let norm = norm(&vector);
     vector.iter_mut().for_each(|x| *x /= norm);
     vector
+}
+
+/// Eigenvalues and eigenvectors of a tridiagonal matrix.
+pub(super) fn tridiagonal_eigen(diagonal: &[f64], beside: &[f64]) -> Option<(Vec<f64>, Mat<f64>)> {
+    // The decomposition's thresholds are absolute: the matrix has to be of order one.
+    let scale = diagonal.iter().fold(f64::MIN_POSITIVE, |a, b| a.max(b.abs()));
+    let matrix = Mat::from_fn(diagonal.len(), diagonal.len(), |i, j| match i.abs_diff(j) {
+        0 => diagonal[i] / scale,
+        1 => beside[i.min(j)] / scale,
+        _ => 0.0,
+    });
+    let decomposed = matrix.self_adjoint_eigen(Side::Lower).ok()?;
+    let eigenvalues = decomposed.S().column_vector().iter().map(|w| w * scale).collect();
+    Some((eigenvalues, decomposed.U().to_owned()))
 }
 
 /// Largest eigenvalue of a symmetric tridiagonal matrix by bisection on Sturm counts.

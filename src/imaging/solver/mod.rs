@@ -15,7 +15,7 @@ pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use diagnostics::{Spectrum, spectrum};
 pub use error::SolveError;
 pub use fit::Fit;
-pub(super) use fit::Fitted;
+pub(super) use fit::FitInputs;
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 pub(super) use lanczos::{largest_eigenvalue_from, normalised, random_vector};
 pub use probing::{effective_beam, noise_variance, regularisation};

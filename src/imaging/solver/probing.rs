@@ -3,11 +3,11 @@
 //! From a vector v, k Lanczos steps give a tridiagonal T with `v.f(A)v = |v|^2 e1.f(T)e1` for all polynomials f up
 //! to degree 2 k - 1, and `f(A)v ~ |v| Q f(T) e1` (Golub & Meurant 2010).
 
-use faer::{Mat, Side};
+use faer::Mat;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::error::SolveError;
-use super::lanczos::{Krylov, W_MAX_EXACT, largest_eigenvalue};
+use super::lanczos::{Krylov, W_MAX_EXACT, largest_eigenvalue, tridiagonal_eigen};
 use super::vectors::norm;
 use super::watch::{NamedWatch, SolveTask};
 use crate::imaging::NormalSums;
@@ -84,7 +84,7 @@ pub fn regularisation(sums: &dyn NormalSums, epsilon: f64) -> f64 {
 }
 
 /// A Krylov space and its tridiagonal matrix's eigenvalues and first components.
-struct Space {
+struct ProbedSpace {
     krylov: Krylov,
     eigenvalues: Vec<f64>,
     vectors: Mat<f64>,
@@ -96,15 +96,18 @@ fn converged_space(
     start: Vec<f64>,
     task: &SolveTask<'_>,
     f: &dyn Fn(f64) -> f64,
-) -> Space {
+) -> ProbedSpace {
     let mut krylov = Krylov::new(start);
     let mut last = f64::NAN;
     for step in 1..=STEPS_MAX.min(sums.unknowns()) {
         let is_open = krylov.step(sums);
         if !is_open || step % STEPS_BETWEEN == 0 {
-            let value = Space::decompose(&krylov).map_or(f64::NAN, |(eigenvalues, vectors)| {
-                eigenvalues.iter().enumerate().map(|(k, w)| f(*w) * vectors[(0, k)].powi(2)).sum::<f64>()
-            });
+            let value = tridiagonal_eigen(&krylov.alphas, &krylov.betas).map_or(
+                f64::NAN,
+                |(eigenvalues, vectors)| {
+                    eigenvalues.iter().enumerate().map(|(k, w)| f(*w) * vectors[(0, k)].powi(2)).sum::<f64>()
+                },
+            );
             let change = ((value - last) / value).abs();
             last = value;
             if !is_open || change < CONVERGED || !task.report(step, change) {
@@ -112,27 +115,12 @@ fn converged_space(
             }
         }
     }
-    let (eigenvalues, vectors) = Space::decompose(&krylov).unwrap_or_else(|| (Vec::new(), Mat::new()));
-    Space { krylov, eigenvalues, vectors }
+    let (eigenvalues, vectors) =
+        tridiagonal_eigen(&krylov.alphas, &krylov.betas).unwrap_or_else(|| (Vec::new(), Mat::new()));
+    ProbedSpace { krylov, eigenvalues, vectors }
 }
 
-impl Space {
-    /// Eigenvalues and eigenvectors of the tridiagonal matrix.
-    fn decompose(krylov: &Krylov) -> Option<(Vec<f64>, Mat<f64>)> {
-        let (alphas, betas) = (&krylov.alphas, &krylov.betas);
-        let size = alphas.len();
-        // The decomposition's thresholds are absolute: the matrix has to be of order one.
-        let scale = alphas.iter().fold(f64::MIN_POSITIVE, |a, b| a.max(b.abs()));
-        let matrix = Mat::from_fn(size, size, |i, j| match i.abs_diff(j) {
-            0 => alphas[i] / scale,
-            1 => betas[i.min(j)] / scale,
-            _ => 0.0,
-        });
-        let decomposed = matrix.self_adjoint_eigen(Side::Lower).ok()?;
-        let eigenvalues = decomposed.S().column_vector().iter().map(|w| w * scale).collect();
-        Some((eigenvalues, decomposed.U().to_owned()))
-    }
-
+impl ProbedSpace {
     /// `f(A)v` for the vector of that length that it started from.
     fn function(&self, length: f64, f: impl Fn(f64) -> f64) -> Vec<f64> {
         let mut result = vec![0.0; self.krylov.basis.first().map_or(0, Vec::len)];

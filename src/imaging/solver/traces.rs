@@ -14,7 +14,7 @@ use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 use thiserror::Error;
 
-use super::lanczos::Krylov;
+use super::lanczos::{Krylov, tridiagonal_eigen};
 use super::watch::NamedWatch;
 use crate::imaging::{Accuracy, NormalSums};
 use crate::units::{StreamKind, random_stream};
@@ -117,9 +117,9 @@ pub fn probed_traces(
         return Err(unsupported);
     }
     match probe(sums, functions, probes, watch) {
-        Probed::Interrupted => Ok(None),
-        Probed::NoBounds => Err(unsupported),
-        Probed::Bounds(bounds) => functions.accept(functions.traces(&bounds), epsilon, w_max).map(Some),
+        ProbeOutcome::Interrupted => Ok(None),
+        ProbeOutcome::NoBounds => Err(unsupported),
+        ProbeOutcome::Bounds(bounds) => functions.accept(functions.traces(&bounds), epsilon, w_max).map(Some),
     }
 }
 
@@ -263,7 +263,7 @@ impl Bounds {
 }
 
 /// What random probes gave.
-enum Probed {
+enum ProbeOutcome {
     /// Bounds of each, if there are any.
     Bounds(Vec<Bounds>),
     /// Bounds that make no sense, as rounding has the last word.
@@ -271,7 +271,7 @@ enum Probed {
     Interrupted,
 }
 
-fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: NamedWatch<'_>) -> Probed {
+fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: NamedWatch<'_>) -> ProbeOutcome {
     let mut all = Vec::new();
     for probe in 0..probes {
         let task = watch.start(&format!("trace {} of {probes}", probe + 1), CLOSED);
@@ -288,17 +288,17 @@ fn probe(sums: &dyn NormalSums, functions: Functions, probes: usize, watch: Name
             let wants = is_open && distance >= CLOSED;
             if !task.report_wanting(wants, step, distance.min(1.0)) {
                 if wants {
-                    return Probed::Interrupted;
+                    return ProbeOutcome::Interrupted;
                 }
                 break;
             }
         }
         match bounds {
             Some(bounds) => all.push(bounds),
-            None => return Probed::NoBounds,
+            None => return ProbeOutcome::NoBounds,
         }
     }
-    Probed::Bounds(all)
+    ProbeOutcome::Bounds(all)
 }
 
 /// Nodes and weights of a quadrature.
@@ -349,16 +349,8 @@ fn quadratures(krylov: &Krylov, functions: Functions, is_open: bool, length: f64
 
 /// The quadrature rule of a tridiagonal matrix: its eigenvalues, and squares of the first components of its eigenvectors.
 fn rule(alphas: &[f64], betas: &[f64]) -> Option<Rule> {
-    let scale = alphas.iter().fold(f64::MIN_POSITIVE, |a, b| a.max(b.abs()));
-    let size = alphas.len();
-    let matrix = Mat::from_fn(size, size, |i, j| match i.abs_diff(j) {
-        0 => alphas[i] / scale,
-        1 => betas[i.min(j)] / scale,
-        _ => 0.0,
-    });
-    let decomposed = matrix.self_adjoint_eigen(Side::Lower).ok()?;
-    let eigenvalues = decomposed.S().column_vector();
-    Some((0..size).map(|k| (eigenvalues[k] * scale, decomposed.U()[(0, k)].powi(2))).collect())
+    let (eigenvalues, vectors) = tridiagonal_eigen(alphas, betas)?;
+    Some(eigenvalues.iter().enumerate().map(|(k, w)| (*w, vectors[(0, k)].powi(2))).collect())
 }
 
 /// A probe of random signs, which gives traces the least spread.

@@ -6,11 +6,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::imaging::anywhere::{HeldSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
+use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, orbit_of};
 use crate::imaging::{
-    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, NormalEngine, NormalSums, PixelEngine,
-    PixelSetup, PixelSums, RemadeVisibilities, SumCounts, automatic_weight_max,
+    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
+    NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
 };
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
@@ -44,7 +44,7 @@ pub enum SnapshotSums {
     /// Visibilities one by one, for a refined map.
     Refined(Box<VisibilityArchive>),
     /// Visibilities one by one, for a map of pixels.
-    Remade(Box<RemadeVisibilities>),
+    MatrixFree(Box<MatrixFreeVisibilities>),
 }
 
 impl SnapshotSums {
@@ -62,20 +62,20 @@ impl SnapshotSums {
             Self::Pixel(sums) => sums.counts(),
             Self::Harmonic(sums) => sums.counts(),
             Self::Refined(archive) => archive.counts(),
-            Self::Remade(visibilities) => visibilities.counts(),
+            Self::MatrixFree(visibilities) => visibilities.counts(),
         }
     }
 }
 
-/// Either engine, or visibilities that are held one by one.
+/// Sums of either engine, or an archive of single visibilities.
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
-    Held(Box<VisibilityArchive>),
+    Archive(Box<VisibilityArchive>),
 }
 
 impl Engine {
-    /// As one rank's of several. Other engines than the harmonic one hold all sums on every rank.
+    /// The part of one rank of several. Only the harmonic engine divides its sums; others hold all on every rank.
     fn among(self, ranks: &Ranks) -> Self {
         match self {
             Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.among(ranks))),
@@ -87,7 +87,7 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.add(placed),
             Self::Harmonic(engine) => engine.add(placed),
-            Self::Held(archive) => archive.add(placed),
+            Self::Archive(archive) => archive.add(placed),
         }
     }
 
@@ -95,43 +95,47 @@ impl Engine {
         match self {
             Self::Pixel(engine) => engine.remove(placed),
             Self::Harmonic(engine) => engine.remove(placed),
-            Self::Held(archive) => archive.remove(placed),
+            Self::Archive(archive) => archive.remove(placed),
         }
     }
 
-    /// Whether it holds nothing, so that there is no map to make.
+    /// Whether it is empty: then there is no map to make.
     fn is_empty(&self) -> bool {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
             Self::Harmonic(engine) => engine.counts(),
-            Self::Held(archive) => archive.counts(),
+            Self::Archive(archive) => archive.counts(),
         };
         counts.visibilities == 0
     }
 
-    /// A copy of the sums; of visibilities that are held for refinement, their sums on the nearest circle.
+    /// A copy of the sums; for an archive to be refined, its sums on the nearest circle.
     fn sums(&mut self, config: &MapConfig) -> Result<SnapshotSums, AccumulationError> {
         Ok(match self {
-            Self::Held(archive) if config.is_remade() => remade(config, archive.copy()),
+            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, archive.copy()),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
-            Self::Held(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
+            Self::Archive(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
         })
     }
 
     fn into_sums(self, config: &MapConfig) -> SnapshotSums {
         match self {
-            Self::Held(archive) if config.is_remade() => remade(config, *archive),
+            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, *archive),
             Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
             Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
-            Self::Held(archive) => SnapshotSums::Refined(archive),
+            Self::Archive(archive) => SnapshotSums::Refined(archive),
         }
     }
 }
 
 /// Visibilities for a map of pixels without its matrix.
-fn remade(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
-    SnapshotSums::Remade(Box::new(RemadeVisibilities { nside: config.nside, method: config.rows, archive }))
+fn matrix_free(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
+    SnapshotSums::MatrixFree(Box::new(MatrixFreeVisibilities {
+        nside: config.nside,
+        method: config.rows,
+        archive,
+    }))
 }
 
 /// State of an accumulator besides its engines, spans and ledger, from which another can resume. Snapshots are numbered
@@ -143,7 +147,7 @@ pub struct AccumulatorState {
     channels: Vec<bool>,
 }
 
-/// First and last time of no data.
+/// The span of no data.
 const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
 /// The engine of one channel, and the span of its data.
@@ -167,7 +171,7 @@ pub struct Accumulator {
     memory_max_bytes: Option<u64>,
     /// The channels of a group; `None` for all.
     group: Option<ChannelGroup>,
-    /// Those that hold the other parts of the sums.
+    /// The ranks that hold the other parts of the sums.
     ranks: Ranks,
     /// The part of the sums that is made now, where they are made one after the other.
     part: Option<SumPart>,
@@ -195,7 +199,7 @@ impl Accumulator {
         }
     }
 
-    /// As one rank's of several: it takes all visibilities, and holds its part of the sums of the harmonic engine.
+    /// Makes it one rank of several: it takes all visibilities and holds its part of the harmonic engine's sums.
     #[must_use]
     pub fn among(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
@@ -214,7 +218,7 @@ impl Accumulator {
         Self { noise_seeds: seeds.to_vec(), ..self }
     }
 
-    /// One with the same settings and ledger, without data.
+    /// A copy with the same settings and ledger, without data.
     #[must_use]
     pub fn without_sums(&self) -> Self {
         let (config, ledger) = (self.config.clone(), self.ledger.clone());
@@ -226,13 +230,13 @@ impl Accumulator {
             .cancelled_by(&self.cancel)
     }
 
-    /// Those that hold parts of the sums.
+    /// The ranks that hold parts of the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// Sums the channels of a group alone; `None` for all.
+    /// Restricts it to the channels of a group; `None` for all.
     #[must_use]
     pub fn of_group(self, group: Option<ChannelGroup>) -> Self {
         Self { group, ..self }
@@ -259,7 +263,7 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines one after another; visibilities that are held go into files of their own at `place`.
+    /// Writes its engines one after another; archives of visibilities go into files of their own at `place`.
     ///
     /// # Errors
     /// The writer's.
@@ -272,24 +276,24 @@ impl Accumulator {
             match &mut sums.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Held(archive) => archive.checkpoint(out, place)?,
+                Engine::Archive(archive) => archive.checkpoint(out, place)?,
             }
         }
         Ok(())
     }
 
-    /// The files that engines were written to or read from, besides the checkpoint.
-    pub fn segments(&self) -> impl Iterator<Item = &HeldSegment> {
+    /// The archive files beside the checkpoint.
+    pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
         self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
-            Engine::Held(archive) => archive.segments(),
+            Engine::Archive(archive) => archive.segments(),
             Engine::Pixel(_) | Engine::Harmonic(_) => &[],
         })
     }
 
-    /// From now on another folder is meant, which has none of those files.
+    /// Forgets the archive files: the next checkpoint goes into another folder.
     pub fn leave_segments(&mut self) {
         for sums in self.channels.iter_mut().flatten() {
-            if let Engine::Held(archive) = &mut sums.engine {
+            if let Engine::Archive(archive) = &mut sums.engine {
                 archive.leave_segments();
             }
         }
@@ -309,8 +313,8 @@ impl Accumulator {
         self.resume_part(state, from, folder, RankShare::WHOLE)
     }
 
-    /// As [`Accumulator::resume`], from engines of which the rank that wrote them holds `part`. What this one holds of it is kept; the
-    /// other parts are to be joined.
+    /// As [`Accumulator::resume`], from engines that were written by the rank of `part`. Only what this rank holds is kept; join the
+    /// other parts.
     ///
     /// # Errors
     /// Likewise.
@@ -331,7 +335,7 @@ impl Accumulator {
             let engine = match self.config.engine {
                 _ if self.config.holds_visibilities() => {
                     let most = refine.visibilities_max;
-                    Engine::Held(Box::new(VisibilityArchive::restore(from, folder, most)?))
+                    Engine::Archive(Box::new(VisibilityArchive::restore(from, folder, most)?))
                 }
                 EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
@@ -343,7 +347,7 @@ impl Accumulator {
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
 
-    /// Takes in another part of the same sums, channel by channel: of the same visibilities, at other alphas.
+    /// Joins another part of the same sums, channel by channel: the same visibilities at other alphas.
     ///
     /// # Errors
     /// Parts of different sums.
@@ -384,7 +388,7 @@ impl Accumulator {
                     match (&mut ours.engine, theirs.engine) {
                         (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
                         (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
-                        (Engine::Held(ours), Engine::Held(theirs)) => ours.merge(*theirs)?,
+                        (Engine::Archive(ours), Engine::Archive(theirs)) => ours.merge(*theirs)?,
                         _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
                     }
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
@@ -397,7 +401,7 @@ impl Accumulator {
 
     /// Subtracts visibilities from the sums of their channel; posts nothing to the ledger.
     ///
-    /// Those beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
+    /// Visibilities beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
     ///
     /// # Errors
     /// A channel that holds nothing, or as [`NormalEngine::remove`].
@@ -594,10 +598,10 @@ fn engine(
     };
     Ok(match config.engine {
         _ if config.holds_visibilities() => {
-            Ok(Engine::Held(Box::new(VisibilityArchive::new(RefinedSetup {
+            Ok(Engine::Archive(Box::new(VisibilityArchive::new(RefinedSetup {
                 channel: placed.channel,
                 // Pixels have no degrees.
-                l_max: if config.is_remade() { 0 } else { config.degree() },
+                l_max: if config.is_matrix_free() { 0 } else { config.degree() },
                 frequency_hz,
                 baseline_m_max: config.baseline_m_max(frequency_hz),
                 moon_radius_m,

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use crate::frames::Instrument;
-use crate::imaging::anywhere::PassFile;
-use crate::imaging::anywhere::RowBelief;
+use crate::imaging::anywhere::{AssumedInstrument, PassFile, RefinedSums};
 use crate::imaging::anywhere::{RefineRule, RefineSteps, Refinement, solve_refined};
-use crate::imaging::circle::harmonic_beams;
-use crate::imaging::circle::{HarmonicRequest, solve_regularised};
-use crate::imaging::pixel::solve_remade;
-use crate::imaging::pixel::{PixelExtras, PointBeam, solve_pixels_with, solve_pixels_with_power};
+use crate::imaging::circle::{
+    HarmonicRequest, HarmonicSolution, HarmonicSums, harmonic_beams, solve_regularised,
+};
+use crate::imaging::pixel::{MatrixFreeSums, PixelExtras, PixelSolution, PixelSums, PointBeam};
+use crate::imaging::pixel::{solve_matrix_free, solve_pixels_with, solve_pixels_with_power};
+use crate::imaging::solver::NamedWatch;
 use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule, Uncertainty};
 use crate::imaging::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::runtime::{Outlet, Stage, Units};
@@ -73,7 +74,7 @@ pub struct SolverSetup {
     /// When the refinement of a harmonic map stops.
     pub refine: RefineRule,
     /// What rows are made with in it.
-    pub belief: RowBelief,
+    pub assumed: AssumedInstrument,
     /// Folder in which the passes of a refinement leave their solution, so that one that was interrupted can go on; `None` for
     /// nowhere.
     pub passes: Option<PathBuf>,
@@ -106,8 +107,7 @@ impl SolverSetup {
 pub struct Solver {
     setup: SolverSetup,
     solved: u64,
-    /// The last iterative solution of each channel, from which the next starts.
-    last: HashMap<ChannelId, [Vec<f64>; 2]>,
+    last: LastSolutions,
 }
 
 impl Solver {
@@ -135,6 +135,163 @@ impl Solver {
     }
 }
 
+/// A map, and what is known of it.
+struct Solved {
+    map_k: Vec<f64>,
+    noise_k: Vec<f64>,
+    diagnostics: Diagnostics,
+    beams: Vec<PointBeam>,
+    refinement: Option<Refinement>,
+    uncertainty: Option<Uncertainty>,
+}
+
+impl Solved {
+    fn of_pixels(solved: PixelSolution, uncertainty: Option<Uncertainty>) -> Self {
+        let PixelSolution { map_k, noise_k, diagnostics, beams } = solved;
+        Self { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }
+    }
+}
+
+/// A snapshot of a channel that is to be solved.
+struct Request<'a> {
+    setup: &'a SolverSetup,
+    channel: ChannelId,
+    nside: usize,
+    is_final: bool,
+    epsilon: f64,
+    prior: Option<Vec<f64>>,
+    /// Pixels at which beams are wanted.
+    beam_pixels: Vec<usize>,
+    watch: NamedWatch<'a>,
+}
+
+/// The last iterative solution of each channel, from which the next starts.
+type LastSolutions = HashMap<ChannelId, [Vec<f64>; 2]>;
+
+/// Each method gives nothing for a map on the way that was interrupted, or that its data do not determine yet.
+impl Request<'_> {
+    /// Numbers that only a final map is worth.
+    fn if_final(&self, count: usize) -> usize {
+        if self.is_final { count } else { 0 }
+    }
+
+    fn is_stopped(&self) -> bool {
+        !self.watch.goes_on() && !self.is_final
+    }
+
+    fn harmonic_request(&self) -> HarmonicRequest {
+        let samples = self.if_final(self.setup.samples);
+        let probes = self.if_final(self.setup.trace_probes);
+        HarmonicRequest { epsilon: self.epsilon, nside: self.nside, rule: self.setup.rule, samples, probes }
+    }
+
+    fn pixels_with_power(&self, sums: &PixelSums) -> Result<Option<Solved>, SolveError> {
+        let samples = self.if_final(self.setup.samples);
+        let prior = self.prior.as_deref();
+        match solve_pixels_with_power(sums, prior, samples, &self.beam_pixels, self.watch) {
+            Err(SolveError::Interrupted) => Ok(None),
+            Err(SolveError::NoPower) if !self.is_final => Ok(None),
+            solved => solved.map(|(solved, errors)| Some(Solved::of_pixels(solved, Some(errors)))),
+        }
+    }
+
+    fn pixels(&self, sums: PixelSums) -> Result<Option<Solved>, SolveError> {
+        let probes = self.if_final(self.setup.trace_probes);
+        let extras = PixelExtras { probes, beams: &self.beam_pixels };
+        match solve_pixels_with(sums, self.epsilon, self.prior.as_deref(), extras, self.watch) {
+            Err(SolveError::Interrupted) => Ok(None),
+            // The first data alone, or what a stranger sent, may not determine a map. The next snapshot has more; that the
+            // last one fails is an error.
+            Err(SolveError::NotPositive { .. }) if !self.is_final => Ok(None),
+            solved => solved.map(|solved| Some(Solved::of_pixels(solved, None))),
+        }
+    }
+
+    fn harmonics(
+        &self,
+        sums: &HarmonicSums,
+        regulariser: Regulariser,
+        last: &mut LastSolutions,
+    ) -> Result<Option<Solved>, SolveError> {
+        let request = self.harmonic_request();
+        let (prior, start) = (self.prior.as_deref(), last.remove(&self.channel));
+        let solved = solve_regularised(sums, request, &regulariser, prior, start.as_ref(), self.watch);
+        if let Some(reason) = sums.failure() {
+            return Err(SolveError::Sums(reason.to_owned()));
+        }
+        let solved = match solved {
+            Err(SolveError::NoPower) if !self.is_final => return Ok(None),
+            solved => solved?,
+        };
+        if self.is_stopped() {
+            return Ok(None);
+        }
+        let HarmonicSolution { map_k, noise_k, unknowns, diagnostics, uncertainty } = solved;
+        let mut beams = Vec::new();
+        if !self.beam_pixels.is_empty() {
+            let w_max = diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(self.nside);
+            // One over the power that was found.
+            let found = uncertainty.as_ref().map(|errors| errors.power.over_noise_k2());
+            let epsilon = if found.is_some() { 1.0 } else { self.epsilon };
+            let regulariser = found.map_or(regulariser, Regulariser::Wiener);
+            let request = HarmonicRequest { epsilon, ..request };
+            beams = harmonic_beams(sums, request, (&regulariser, w_max), &self.beam_pixels, self.watch)?;
+        }
+        if !self.is_final {
+            last.insert(self.channel, unknowns);
+        }
+        Ok(Some(Solved { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }))
+    }
+
+    fn matrix_free(
+        &self,
+        sums: &MatrixFreeSums,
+        last: &mut LastSolutions,
+    ) -> Result<Option<Solved>, SolveError> {
+        // The final one begins at nothing: its bits are then those of the data, whatever maps there were on the way.
+        let start = last.remove(&self.channel).filter(|_| !self.is_final);
+        let (prior, rule) = (self.prior.as_deref(), self.setup.rule);
+        let (solved, unknowns) = match solve_matrix_free(sums, self.epsilon, prior, start, rule, self.watch) {
+            Err(SolveError::Interrupted) => return Ok(None),
+            solved => solved?,
+        };
+        if self.is_stopped() {
+            return Ok(None);
+        }
+        if !self.is_final {
+            last.insert(self.channel, unknowns);
+        }
+        Ok(Some(Solved::of_pixels(solved, None)))
+    }
+
+    /// `data` are numbers by which a solution on disk is known to be of these data.
+    fn refined(&self, sums: &RefinedSums, data: &[i64]) -> Result<Option<Solved>, SolveError> {
+        let request = HarmonicRequest { samples: 0, probes: 0, ..self.harmonic_request() };
+        let of = [data, &[self.epsilon.to_bits().cast_signed()]].concat();
+        let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, self.channel, &of));
+        // Not from a map on the way: that is the circle's, with which the iteration begins anyway.
+        let start = file.as_ref().and_then(PassFile::read);
+        let mut passed = |x: [&[f64]; 2]| {
+            if let Some(file) = &file {
+                file.write(x);
+            }
+        };
+        let steps = RefineSteps { start, passed: &mut passed };
+        let (rule, prior) = (self.setup.refine, self.prior.as_deref());
+        let (solved, found) = match solve_refined(sums, request, rule, prior, steps, self.watch) {
+            Err(SolveError::Interrupted) => return Ok(None),
+            solved => solved?,
+        };
+        // Whoever makes it again wants it from its beginning, unless it was interrupted.
+        if let Some(file) = file.filter(|_| self.watch.goes_on()) {
+            file.remove();
+        }
+        let HarmonicSolution { map_k, noise_k, diagnostics, .. } = solved;
+        let (beams, refinement) = (Vec::new(), Some(found));
+        Ok(Some(Solved { map_k, noise_k, diagnostics, beams, refinement, uncertainty: None }))
+    }
+}
+
 impl Stage for Solver {
     type In = Snapshot;
     type Out = Solution;
@@ -143,125 +300,35 @@ impl Stage for Solver {
     fn step(&mut self, snapshot: Snapshot, out: &mut Outlet<Solution>) -> Result<(), SolveError> {
         let Snapshot { instrument, channel, number, is_final, span_s, nside, sums } = snapshot;
         let SumCounts { visibilities, weight, .. } = sums.counts();
-        let data = [span_s[0], span_s[1], weight].map(|x| x.to_bits().cast_signed());
         let which = [i64::from(channel.0), i64::from(number), i64::from(is_final), visibilities as i64];
-        if !self.setup.watch.agrees(&[which.as_slice(), &data].concat()) {
+        let data = [span_s[0], span_s[1], weight].map(|x| x.to_bits().cast_signed());
+        let data = [which.as_slice(), &data].concat();
+        if !self.setup.watch.agrees(&data) {
             return Err(SolveError::Ranks);
         }
         let index = usize::from(channel.0);
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
         let prior = self.prior(index, pixel_count(nside));
-        let probes = if is_final { self.setup.trace_probes } else { 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
+        let (setup, last) = (&self.setup, &mut self.last);
         // Maps on the way are not worth the time that the final ones need.
-        let watch = self.setup.watch.named(&name).wanted(is_final);
+        let watch = setup.watch.named(&name).wanted(is_final);
         if !watch.goes_on() {
             return Ok(());
         }
-        let (mut refinement, mut beams, mut uncertainty) = (None, Vec::new(), None);
-        let samples = if is_final { self.setup.samples } else { 0 };
-        let regulariser = self.setup.regulariser(index);
-        let pixels: Vec<usize> = if is_final { self.setup.beam_pixels(nside) } else { Vec::new() };
-        let (map_k, noise_k, diagnostics) = match sums {
-            SnapshotSums::Pixel(sums) if regulariser == Regulariser::Data => {
-                let solved = match solve_pixels_with_power(&sums, prior.as_deref(), samples, &pixels, watch) {
-                    Err(SolveError::Interrupted) => return Ok(()),
-                    Err(SolveError::NoPower) if !is_final => return Ok(()),
-                    solved => solved?,
-                };
-                let (solved, errors) = solved;
-                (beams, uncertainty) = (solved.beams, Some(errors));
-                (solved.map_k, solved.noise_k, solved.diagnostics)
-            }
-            SnapshotSums::Pixel(sums) => {
-                let extras = PixelExtras { probes, beams: &pixels };
-                let solved = match solve_pixels_with(sums, epsilon, prior.as_deref(), extras, watch) {
-                    Err(SolveError::Interrupted) => return Ok(()),
-                    // The first data alone, or what a stranger sent, may not determine a map. The next snapshot has more; that the
-                    // last one fails is an error.
-                    Err(SolveError::NotPositive { .. }) if !is_final => return Ok(()),
-                    solved => solved?,
-                };
-                beams = solved.beams;
-                (solved.map_k, solved.noise_k, solved.diagnostics)
-            }
-            SnapshotSums::Harmonic(sums) => {
-                let request = HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples, probes };
-                let start = self.last.remove(&channel);
-                let (prior, start) = (prior.as_deref(), start.as_ref());
-                let solved = solve_regularised(&sums, request, &regulariser, prior, start, watch);
-                if let Some(reason) = sums.failure() {
-                    return Err(SolveError::Sums(reason.to_owned()));
-                }
-                let solved = match solved {
-                    Err(SolveError::NoPower) if !is_final => return Ok(()),
-                    solved => solved?,
-                };
-                if !watch.goes_on() && !is_final {
-                    return Ok(());
-                }
-                if !pixels.is_empty() {
-                    let w_max = solved.diagnostics.w_max.unwrap_or(0.0) / pixel_area_sr(nside);
-                    // One over the power that was found.
-                    let found = solved.uncertainty.as_ref().map(|errors| errors.power.over_noise_k2());
-                    let epsilon = if found.is_some() { 1.0 } else { epsilon };
-                    let regulariser = found.map_or(regulariser, Regulariser::Wiener);
-                    let request = HarmonicRequest { epsilon, ..request };
-                    beams = harmonic_beams(&sums, request, (&regulariser, w_max), &pixels, watch)?;
-                }
-                uncertainty = solved.uncertainty;
-                if !is_final {
-                    self.last.insert(channel, solved.unknowns);
-                }
-                (solved.map_k, solved.noise_k, solved.diagnostics)
-            }
-            SnapshotSums::Remade(visibilities) => {
-                let sums = visibilities.into_sums()?;
-                // The final one begins at nothing: its bits are then those of the data, whatever maps there were on the way.
-                let start = self.last.remove(&channel).filter(|_| !is_final);
-                let rule = self.setup.rule;
-                let (solved, unknowns) =
-                    match solve_remade(&sums, epsilon, prior.as_deref(), start, rule, watch) {
-                        Err(SolveError::Interrupted) => return Ok(()),
-                        solved => solved?,
-                    };
-                if !watch.goes_on() && !is_final {
-                    return Ok(());
-                }
-                if !is_final {
-                    self.last.insert(channel, unknowns);
-                }
-                (solved.map_k, solved.noise_k, solved.diagnostics)
-            }
-            SnapshotSums::Refined(archive) => {
-                let request =
-                    HarmonicRequest { epsilon, nside, rule: self.setup.rule, samples: 0, probes: 0 };
-                let sums = archive.into_sums(&self.setup.belief)?;
-                let rule = self.setup.refine;
-                let of = [which.as_slice(), &data, &[epsilon.to_bits().cast_signed()]].concat();
-                let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, channel, &of));
-                // Not from a map on the way: that is the circle's, with which the iteration begins anyway.
-                let start = file.as_ref().and_then(PassFile::read);
-                let mut passed = |x: [&[f64]; 2]| {
-                    if let Some(file) = &file {
-                        file.write(x);
-                    }
-                };
-                let steps = RefineSteps { start, passed: &mut passed };
-                let (solved, found) =
-                    match solve_refined(&sums, request, rule, prior.as_deref(), steps, watch) {
-                        Err(SolveError::Interrupted) => return Ok(()),
-                        solved => solved?,
-                    };
-                // Whoever makes it again wants it from its beginning, unless it was interrupted.
-                if let Some(file) = file.filter(|_| watch.goes_on()) {
-                    file.remove();
-                }
-                refinement = Some(found);
-                (solved.map_k, solved.noise_k, solved.diagnostics)
-            }
+        let beam_pixels = if is_final { setup.beam_pixels(nside) } else { Vec::new() };
+        let request = Request { setup, channel, nside, is_final, epsilon, prior, beam_pixels, watch };
+        let regulariser = setup.regulariser(index);
+        let solved = match sums {
+            SnapshotSums::Pixel(sums) if regulariser == Regulariser::Data => request.pixels_with_power(&sums),
+            SnapshotSums::Pixel(sums) => request.pixels(sums),
+            SnapshotSums::Harmonic(sums) => request.harmonics(&sums, regulariser, last),
+            SnapshotSums::MatrixFree(visibilities) => request.matrix_free(&visibilities.into_sums()?, last),
+            SnapshotSums::Refined(archive) => request.refined(&archive.into_sums(&setup.assumed)?, &data),
         };
+        let Some(solved) = solved? else { return Ok(()) };
+        let Solved { map_k, noise_k, diagnostics, beams, refinement, uncertainty } = solved;
         self.solved += 1;
         out.push(Solution {
             instrument,

@@ -30,7 +30,7 @@ const POWER_TIME_S: f64 = 10.0;
 /// Samples of a window after which powers are accurate enough for weights, whose mean bias is then 2 / n.
 const POWER_SAMPLES_MIN: u64 = 1024;
 
-/// What [`Correlator`] needs.
+/// Setup of [`Correlator`].
 #[derive(Clone)]
 pub struct CorrelatorSetup {
     /// The array, which gives the daughters' positions.
@@ -54,7 +54,7 @@ pub struct CorrelatorSetup {
 /// Counters of the correlator, and the mean auto-correlations.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CorrelatorCounts {
-    /// What happened to blocks.
+    /// Counts of blocks.
     pub blocks: AlignerCounts,
     /// Blocks outside any window.
     pub stray: u64,
@@ -78,7 +78,7 @@ pub struct Correlator {
     /// Present with delays or sub-bands.
     divider: Option<Divider>,
     arch: Arch,
-    running: Option<Running>,
+    running: Option<OpenWindow>,
     counts: Arc<Mutex<CorrelatorCounts>>,
     sampled: u64,
     samples: u64,
@@ -87,7 +87,7 @@ pub struct Correlator {
 }
 
 /// The window being correlated.
-struct Running {
+struct OpenWindow {
     window: ObservingWindow,
     /// Errors of the positions and times in packets.
     pass: Option<PassErrors>,
@@ -181,11 +181,11 @@ impl Correlator {
             samples: 0,
         };
         let groups = setup.schedules.chunks(LANES).enumerate().map(group).collect();
-        self.running = Some(Running { window, pass, aligner, groups, held: None });
+        self.running = Some(OpenWindow { window, pass, aligner, groups, held: None });
     }
 
     /// Accepts the next row of a window; with delays, processes the row before it.
-    fn accept(&mut self, running: &mut Running, row: BlockRow, out: &mut Outlet<GroundFrame>) {
+    fn accept(&mut self, running: &mut OpenWindow, row: BlockRow, out: &mut Outlet<GroundFrame>) {
         if self.setup.division.delay_centre.is_none() {
             self.process(running, &row, None, out);
         } else if let Some(held) = running.held.replace(row) {
@@ -197,7 +197,7 @@ impl Correlator {
 
     fn process(
         &mut self,
-        running: &mut Running,
+        running: &mut OpenWindow,
         row: &BlockRow,
         next: Option<&BlockRow>,
         out: &mut Outlet<GroundFrame>,

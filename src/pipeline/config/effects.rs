@@ -50,7 +50,7 @@ impl Config {
     }
 }
 
-/// What stands at a key with sections.
+/// The value of a key with sections.
 fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').map_or((path, None), |(first, rest)| (first, Some(rest)));
     let value = table.get(first)?;
@@ -105,12 +105,12 @@ mod tests {
                 "map.refine.passes_max = 3 has an effect only with map.engine = \"harmonic\"",
             ),
             (
-                "map.engine = \"harmonic\"\nmap.matrix = \"remade\"",
-                "map.matrix = \"remade\" has an effect only with map.engine = \"pixel\"",
+                "map.engine = \"harmonic\"\nmap.matrix = \"free\"",
+                "map.matrix = \"free\" has an effect only with map.engine = \"pixel\"",
             ),
             (
                 "map.iterations_max = 7",
-                "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"remade\"",
+                "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"free\"",
             ),
             (
                 "daughters.bits = 2",
@@ -134,7 +134,7 @@ mod tests {
         for text in [
             "",
             "map.l_max = 0",
-            "map.matrix = \"remade\"\nmap.iterations_max = 7",
+            "map.matrix = \"free\"\nmap.iterations_max = 7",
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
             // A strength of zero is a value like others.
             "instrument.clock_ns = { drift_rms = 0.0, drift_time_s = 60.0 }",

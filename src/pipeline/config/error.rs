@@ -156,7 +156,7 @@ pub enum PipelineError {
     /// Visibilities cannot be put aside, or read back.
     #[error(transparent)]
     Spool(#[from] crate::mother::SpoolError),
-    /// An estimate that is no number.
+    /// An estimate that is not a number.
     #[error(
         "the estimated {what} is {value}: nothing bounds this run; expected settings of which the work can be estimated: look for periods, \
          motions and times near 0, and for very large numbers"

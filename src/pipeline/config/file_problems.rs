@@ -8,7 +8,7 @@ use super::problems::Problems;
 use super::sections::Config;
 use crate::imaging::Regulariser;
 use crate::sky::fits::{
-    FitsError, FitsProblem, MapUnderstood, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
+    FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
 use crate::sky::{AddedSky, SkyConfig};
 use crate::units::InvalidValue;
@@ -36,7 +36,7 @@ impl Plan {
         for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
             let of_channels = files.iter().zip(&spacecraft.channels_hz);
             let of_channels = of_channels.filter(|_| files.len() == spacecraft.channels_hz.len());
-            // What cannot be read is told above and below.
+            // Unreadable files are reported elsewhere.
             let is_other = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
             let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
             checked.filter(is_other).for_each(|problem| found.push(|| problem));
@@ -65,7 +65,7 @@ impl Plan {
         SkyConfig::check_l_max(self.config.sky.l_max, least).err()
     }
 
-    /// What is understood of every map and catalogue that the configuration names, a line each. Files that cannot be read are told
+    /// A line of description for every map and catalogue that the configuration names. Files that cannot be read are told
     /// by [`Plan::file_problems`].
     #[must_use]
     #[doc(hidden)]
@@ -78,7 +78,7 @@ impl Plan {
         };
         for (channel, &hz) in spacecraft.channels_hz.iter().enumerate() {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let read = path.and_then(|path| MapUnderstood::of(&path, &sky_options(sky, hz)).ok());
+            let read = path.and_then(|path| MapOutline::of(&path, &sky_options(sky, hz)).ok());
             tell("sky.file", read.map(|read| read.to_string()));
         }
         for (key, files, frame) in [
@@ -87,7 +87,7 @@ impl Plan {
         ] {
             let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
             for path in files {
-                tell(key, MapUnderstood::of(path, &options).ok().map(|read| read.to_string()));
+                tell(key, MapOutline::of(path, &options).ok().map(|read| read.to_string()));
             }
         }
         let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());

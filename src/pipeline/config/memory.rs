@@ -42,7 +42,7 @@ impl MemoryLimit {
         Self { bytes, source: MemorySource::User }
     }
 
-    /// What this machine has available for this process; `None` where the system does not say.
+    /// Memory available to this process; `None` where the system does not say.
     #[must_use]
     pub fn of_machine() -> Option<Self> {
         Self::below(Path::new("/"))
@@ -70,7 +70,7 @@ fn group_bytes(root: &Path) -> Option<u64> {
     groups.lines().filter_map(|line| group_line_bytes(root, line)).min()
 }
 
-/// Of one line of `/proc/self/cgroup`: `0::PATH` of version 2, or `ID:CONTROLLERS:PATH` of version 1.
+/// The group in one line of `/proc/self/cgroup`: `0::PATH` of version 2, or `ID:CONTROLLERS:PATH` of version 1.
 fn group_line_bytes(root: &Path, line: &str) -> Option<u64> {
     let mut parts = line.splitn(3, ':').skip(1);
     let (controllers, path) = (parts.next()?, parts.next()?);
@@ -88,7 +88,7 @@ fn group_line_bytes(root: &Path, line: &str) -> Option<u64> {
     folders.filter_map(|folder| folder_bytes(folder, files)).min()
 }
 
-/// What one group has left of its limit: file pages that nobody uses can be freed, so they do not count.
+/// Memory that one group has left: file pages that nobody uses can be freed, so they do not count.
 fn folder_bytes(folder: &Path, [limit, usage, unused]: [&str; 3]) -> Option<u64> {
     let number = |name: &str| fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
     let stat = fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();

@@ -96,7 +96,7 @@ impl Config {
 }
 
 impl Plan {
-    /// Periods of which `spacecraft.every_nth_window` leaves parts out.
+    /// Periods that `spacecraft.every_nth_window` does not sample evenly.
     #[must_use]
     #[doc(hidden)]
     pub fn thinning_notes(&self) -> Vec<String> {

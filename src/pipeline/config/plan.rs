@@ -18,7 +18,7 @@ pub struct Plan {
     pub config: Config,
     /// The array.
     pub array: Arc<Array>,
-    /// What the spacecraft says of itself.
+    /// The description that the spacecraft sends.
     pub instrument: Instrument,
     /// One schedule a channel.
     pub schedules: Vec<Schedule>,

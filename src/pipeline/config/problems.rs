@@ -33,7 +33,7 @@ impl Problems {
         others.kept.into_iter().for_each(|problem| self.push(|| problem));
     }
 
-    /// Those of the kept problems of whose text `is_other` does not hold; the others are not counted.
+    /// Keeps problems whose text does not match `is_other`; those that do are not counted.
     pub(in crate::pipeline) fn without(self, is_other: impl Fn(&str) -> bool) -> Self {
         let mut left = Self { kept: Vec::new(), count: self.count - self.kept.len() };
         for problem in self.kept.into_iter().filter(|problem| !is_other(&problem.to_string())) {
@@ -42,13 +42,13 @@ impl Problems {
         left
     }
 
-    /// Number of problems, those that are not kept included.
+    /// Number of all problems, kept or only counted.
     #[must_use]
     pub fn len(&self) -> usize {
         self.count
     }
 
-    /// Whether there is none.
+    /// Whether there are no problems.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.count == 0

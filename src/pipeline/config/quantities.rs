@@ -4,7 +4,7 @@ use toml::{Table, Value};
 
 use crate::units::Dimension;
 
-/// Replaces texts at keys whose names end in a unit by the numbers that they stand for. What is no such text stays, and is then
+/// Replaces texts at keys whose names end in a unit by the numbers that they stand for. Any other text stays, and is then
 /// told as a value of the wrong type.
 pub(in crate::pipeline) fn read_units(table: &mut Table) {
     for (key, value) in table.iter_mut() {

@@ -36,6 +36,10 @@ const RENAMED_KEYS: [(&str, &str); 18] = [
     ("daughters.disturbances", "daughters.tones, and [instrument] for gains, phases and clocks"),
 ];
 
+/// Old names of values of keys, and the new ones.
+const RENAMED_VALUES: [(&str, &str, &str); 2] =
+    [("map.matrix", "held", "stored"), ("map.matrix", "remade", "free")];
+
 /// Most characters of a key, an override or the parser's message that are shown.
 pub(in crate::pipeline) const SHOWN_MAX: usize = 160;
 
@@ -75,7 +79,7 @@ pub enum ReadProblem {
     },
 }
 
-/// What was read.
+/// A configuration as far as it could be read.
 pub(in crate::pipeline) struct Reading {
     /// The values that could be read; defaults for the others.
     pub(in crate::pipeline) config: Config,
@@ -91,9 +95,9 @@ impl Reading {
         if let Ok(config) = table.clone().try_into() {
             return Self { config, problems: Problems::default(), unread: Vec::new() };
         }
-        let mut walk = Walk { lines, problems: Problems::default(), unread: Vec::new() };
+        let mut walk = SectionReader { lines, problems: Problems::default(), unread: Vec::new() };
         let good = walk.section(&[], table, &known_keys(Config::KEYS));
-        let Walk { mut problems, unread, .. } = walk;
+        let SectionReader { mut problems, unread, .. } = walk;
         let config = good.try_into().unwrap_or_else(|error: toml::de::Error| {
             // Good keys that are bad together: there are none today.
             problems.push(|| error);
@@ -127,13 +131,13 @@ impl Reading {
     }
 }
 
-struct Walk<'a> {
+struct SectionReader<'a> {
     lines: &'a Lines<'a>,
     problems: Problems,
     unread: Vec<String>,
 }
 
-impl Walk<'_> {
+impl SectionReader<'_> {
     /// The part of a section at `path` that can be read.
     fn section(&mut self, path: &[&str], table: Table, known: &Table) -> Table {
         let mut good = Table::new();
@@ -165,7 +169,10 @@ impl Walk<'_> {
                     Ok(_) => Some(value),
                     Err(error) => {
                         let units = units_of(&key, &value);
-                        self.refuse(&path, || with_units(&plain(error.message()), units));
+                        let renamed = renamed_value(&path, &value);
+                        self.refuse(&path, || {
+                            renamed.unwrap_or_else(|| with_units(&plain(error.message()), units))
+                        });
                         None
                     }
                 },
@@ -198,7 +205,14 @@ fn is_renamed_below(path: &[&str]) -> bool {
     RENAMED_KEYS.iter().any(|(before, _)| before.starts_with(&inside))
 }
 
-/// The keys of the section in which `path` is none, for a message; first the one that is spelled most like it.
+/// What to write in place of an old name of a value.
+fn renamed_value(path: &[&str], value: &Value) -> Option<String> {
+    let (path, value) = (path.join("."), value.as_str()?);
+    let (_, before, now) = RENAMED_VALUES.iter().find(|(key, before, _)| *key == path && *before == value)?;
+    Some(format!("\"{before}\" was renamed to \"{now}\""))
+}
+
+/// The keys of the section that lacks `path`, for a message; first the one that is spelled most like it.
 fn keys_of(path: &[&str], known: &Table) -> String {
     let Some((wrong, path)) = path.split_last() else { return String::new() };
     let whole = [path, &[*wrong]].concat().join(".");
@@ -244,7 +258,7 @@ fn plain(message: &str) -> String {
         })
 }
 
-/// What the key of a text, or of a list with texts, takes, by the unit in its name.
+/// The units that the key of a text, or of a list with texts, takes, by its name.
 fn units_of(key: &str, value: &Value) -> Option<&'static str> {
     let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
     Dimension::of_key(key).filter(|_| is_text).map(Dimension::expected)
@@ -269,7 +283,7 @@ pub(in crate::pipeline) struct Lines<'a> {
 }
 
 impl<'a> Lines<'a> {
-    /// Of a text that has been parsed.
+    /// The lines of a text that has been parsed.
     pub(in crate::pipeline) fn of(text: &'a str) -> Self {
         Self { text, table: DeTable::parse(text).ok(), overrides: HashMap::new() }
     }

@@ -142,7 +142,7 @@ fn put_key(text: &mut String, key: &FlatKey, shown: Shown) {
     };
 }
 
-/// What it means, and its own condition.
+/// Its meaning and its own condition.
 fn with_condition(key: &FlatKey) -> String {
     let about = text_of(key.key);
     match key.only_with.last().filter(|_| !key.key.only_with.is_empty()) {

@@ -44,7 +44,7 @@ keys! {
         section spacecraft: SpacecraftConfig = SpacecraftConfig::default();
         /// Packets or frames, and the link to the ground.
         section downlink: DownlinkConfig = DownlinkConfig::default();
-        /// What is corrected in visibilities before they are mapped.
+        /// Corrections of visibilities before they are mapped.
         section calibration: CalibrationConfig = CalibrationConfig::default();
         /// The solver of gains, for `lunarray calibrate` and `calibration.hook = "solve"`. Keys with `_sigma` are what is
         /// expected before the data are seen; what has 0 is not solved for.

@@ -158,7 +158,7 @@ impl ConfigSource {
         }
     }
 
-    /// Reads `text` and the overrides, and requires that there are no problems in reading and none of the values.
+    /// Reads `text` and the overrides, and requires that neither reading nor values have problems.
     fn checked(
         &self,
         text: &str,
@@ -225,7 +225,7 @@ pub(in crate::pipeline) fn has_sections(table: &toml::Table) -> bool {
     ["array", "map", "sky", "spacecraft"].iter().any(|section| table.contains_key(*section))
 }
 
-/// What tells that a table is that of a study, which has axes, or other keys of its own, where a pipeline has sections.
+/// A key that shows a table to be a study's, which has axes where a pipeline has sections.
 pub(in crate::pipeline) fn study_key(table: &toml::Table) -> Option<&'static str> {
     if table.get("axis").is_some_and(toml::Value::is_array) {
         return Some("[[axis]]");
@@ -316,6 +316,18 @@ mod tests {
         let source = ConfigSource { overrides, ..ConfigSource::default() };
         let error = source.checked(text, "here".to_owned(), Config::problems).unwrap_err().to_string();
         error.lines().map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn an_old_value_is_refused_with_its_new_name() {
+        for (before, now) in [("held", "stored"), ("remade", "free")] {
+            let told = told("", &[&format!("map.matrix={before}")]);
+            assert!(
+                told[1].ends_with(&format!("map.matrix: \"{before}\" was renamed to \"{now}\"")),
+                "{told:?}"
+            );
+            assert!(with(&[&format!("map.matrix={now}")]).is_ok());
+        }
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::imaging::MapConfig;
 use crate::imaging::cost::EngineCost;
 use crate::pipeline::config::{Config, MemoryLimit};
 
-/// What a ground should know before the sums of its channels grow beyond the memory that there is.
+/// Warning that the sums of all channels will outgrow memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MemoryAdvice {
     /// Channels that are mapped.

@@ -75,7 +75,7 @@ pub struct Cost {
     pub link_bits_per_s: Option<[f64; 2]>,
     /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with it alone.
     pub ninth_bits_per_s: Option<f64>,
-    /// What ranks exchange that share the sums; memory and time are then those of one of them. With several alone.
+    /// Bytes that ranks exchange; memory and time are then those of one rank. `None` for one rank.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ranks: Option<RankCost>,
     /// Estimated time to draw, quantise, send and correlate the samples, s; with samples alone.
@@ -117,17 +117,17 @@ impl ChannelCost {
 }
 
 impl Plan {
-    /// What the pipeline will cost. Nothing is measured: times are estimates at rates measured once.
+    /// Cost of a pipeline. Nothing is measured: times are estimates from the rates of a named machine.
     #[must_use]
     #[doc(hidden)]
     pub fn cost(&self) -> Cost {
-        self.cost_among(1)
+        self.cost_with_ranks(1)
     }
 
     /// As [`Plan::cost`], for one of some ranks that share the sums.
     #[must_use]
     #[doc(hidden)]
-    pub fn cost_among(&self, ranks: usize) -> Cost {
+    pub fn cost_with_ranks(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();

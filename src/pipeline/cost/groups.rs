@@ -34,9 +34,9 @@ pub struct MapGroup {
 /// Groups of channels in which a run is made.
 #[derive(Clone, Debug, Serialize)]
 pub struct RunGroups {
-    /// Those that are simulated together.
+    /// Groups of channels that are simulated together.
     pub simulated: Vec<ChannelGroup>,
-    /// Those that are mapped together.
+    /// Groups of channels that are mapped together.
     pub mapped: Vec<MapGroup>,
 }
 
@@ -127,7 +127,7 @@ pub(in crate::pipeline) fn groups_of(
     Ok(groups.into_iter().map(with_parts).collect())
 }
 
-/// What a channel's sums cost at the end of a mission of any length.
+/// Memory of a channel's sums at the end of a mission of any length.
 pub(in crate::pipeline) fn complete_costs(
     instrument: &Instrument,
     map: &MapConfig,

@@ -30,7 +30,7 @@ pub(in crate::pipeline) fn write_json(path: &Path, value: &impl Serialize) -> Re
     write_bytes(path, &text)
 }
 
-/// What `solutions.json` holds.
+/// Content of `solutions.json`.
 #[derive(Serialize)]
 struct SolutionsFile<'a> {
     summary: &'a CalibrateSummary,

@@ -9,6 +9,7 @@ use crate::calibration::solver::{
 };
 use crate::calibration::{GainsFile, SolvedGains};
 use crate::frames::Instrument;
+use crate::numerics::median;
 
 /// Most events that are printed.
 const EVENTS_SHOWN: usize = 20;
@@ -18,7 +19,7 @@ const EVENTS_SHOWN: usize = 20;
 pub struct CalibrateRound {
     /// Number; 0 with the given model.
     pub round: u32,
-    /// What was known: of the sky, of the artificial signal, or of both.
+    /// The known signal: the sky, the artificial signal, or both.
     pub mode: CalibrationMode,
     /// Root mean square change of the gains since the round before, relative to one.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -33,14 +34,14 @@ pub struct CalibrateRound {
     pub map_cl_k2: Vec<Vec<f64>>,
 }
 
-/// What `lunarray calibrate` found.
+/// Summary of `lunarray calibrate`.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CalibrateSummary {
     /// Passes.
     pub passes: u64,
     /// Solutions.
     pub solutions: u64,
-    /// Those that converged.
+    /// Solutions that converged.
     pub converged: u64,
     /// Visibilities used.
     pub visibilities: u64,
@@ -48,7 +49,7 @@ pub struct CalibrateSummary {
     pub outliers: u64,
     /// Left out because of a flag, or without positions.
     pub unused: u64,
-    /// Of passes that had been solved before they arrived.
+    /// Visibilities that arrived after their pass was solved.
     pub late: u64,
     /// Gains that are not good, of all.
     pub gains_not_good: [u64; 2],
@@ -56,13 +57,13 @@ pub struct CalibrateSummary {
     pub phase_sigma_deg: Vec<Vec<f64>>,
     /// Rounds.
     pub rounds: Vec<CalibrateRound>,
-    /// What happened to the instrument: jumps of clocks, steps of gains, interference, bursts.
+    /// Events of the instrument: jumps of clocks, steps of gains, interference, bursts.
     pub events: Vec<InstrumentEvent>,
-    /// What the data do not determine, and what decides it.
+    /// Conventions for what the data do not determine.
     pub conventions: Vec<String>,
-    /// What may be wrong, and how to mend it.
+    /// Warnings, and how to mend what is wrong.
     pub warnings: Vec<String>,
-    /// Whether it was ended early; nothing is written then.
+    /// Whether it was ended early: then nothing is written.
     pub cancelled: bool,
 }
 
@@ -102,7 +103,7 @@ pub(in crate::pipeline) struct FoundSolutions {
 }
 
 impl FoundSolutions {
-    /// What a ground has found so far.
+    /// Solutions that a ground has found so far.
     pub(in crate::pipeline) fn of(gains: &SolvedGains) -> Self {
         let passes = gains.passes();
         Self {
@@ -156,7 +157,7 @@ impl FoundSolutions {
         }
     }
 
-    /// What of the data is not in them, and why.
+    /// Warnings about data that are not in the solutions.
     fn warnings(&self, solver: &SolverConfig) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.late > 0 {
@@ -177,17 +178,15 @@ impl FoundSolutions {
         warnings
     }
 
-    /// What is told of them.
+    /// Their summary.
     pub(in crate::pipeline) fn summary(&self, solver: &SolverConfig) -> CalibrateSummary {
         let satellites = self.instrument.as_ref().map_or(0, |instrument| usize::from(instrument.satellites));
         let hz = |instrument: &Instrument| instrument.channels.iter().map(|one| one.frequency_hz).collect();
         let frequencies_hz: Vec<f64> = self.instrument.as_ref().map_or_else(Vec::new, hz);
         let channels = frequencies_hz.len();
-        let median = |c: usize, n: usize| {
-            let mut sigmas: Vec<f64> =
-                self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg).collect();
-            sigmas.sort_unstable_by(f64::total_cmp);
-            sigmas.get(sigmas.len() / 2).copied().unwrap_or(f64::NAN)
+        let sigma_deg = |c: usize, n: usize| {
+            let sigmas = self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg);
+            median(sigmas.collect()).unwrap_or(f64::NAN)
         };
         let gains = self.solutions.iter().flat_map(|one| &one.daughters).flat_map(|daughter| &daughter.gains);
         let (bad, all) =
@@ -201,7 +200,9 @@ impl FoundSolutions {
             unused: self.unused,
             late: self.late,
             gains_not_good: [bad, all],
-            phase_sigma_deg: (0..channels).map(|c| (0..satellites).map(|n| median(c, n)).collect()).collect(),
+            phase_sigma_deg: (0..channels)
+                .map(|c| (0..satellites).map(|n| sigma_deg(c, n)).collect())
+                .collect(),
             events: instrument_events(&self.solutions),
             conventions: solver.conventions(&frequencies_hz),
             warnings: self.warnings(solver),

@@ -54,7 +54,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
-            belief: map.belief(),
+            assumed: map.assumed(),
             passes: None,
             trace_probes: map.trace_probes,
             samples: 0,
@@ -63,17 +63,17 @@ impl Config {
     }
 }
 
-/// What the ground segment leaves behind besides its files.
+/// Results of the ground segment besides its files.
 #[derive(Clone, Debug)]
 pub(in crate::pipeline) struct SegmentOutcome {
-    /// Of the ground.
+    /// The ground's outcome.
     pub(in crate::pipeline) ground: GroundOutcome,
     /// Final map of each channel, in figures.
     pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
 }
 
-/// What the ground segment makes of its sums.
-pub(in crate::pipeline) struct Mapping<'a> {
+/// What the ground segment needs to make maps of its sums.
+pub(in crate::pipeline) struct MappingContext<'a> {
     /// Folder for the products.
     pub(in crate::pipeline) out: &'a Path,
     /// The true sky, to compare the maps with.
@@ -95,9 +95,9 @@ pub(in crate::pipeline) fn add(
     bytes: Link<Vec<u8>>,
     config: &Config,
     ground: Ground,
-    mapping: Mapping<'_>,
+    mapping: MappingContext<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let Mapping { out, truth, watch, viewers, trouble } = mapping;
+    let MappingContext { out, truth, watch, viewers, trouble } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
@@ -105,7 +105,7 @@ pub(in crate::pipeline) fn add(
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
-        graph.sink("publish", maps, Bystander);
+        graph.sink("publish", maps, NullSink);
         return Ok(outcome);
     }
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
@@ -123,9 +123,9 @@ pub(in crate::pipeline) fn add(
 }
 
 /// Takes the maps of a rank that are those of the first rank, which publishes them.
-struct Bystander;
+struct NullSink;
 
-impl Sink for Bystander {
+impl Sink for NullSink {
     type In = Solution;
     type Error = ProductsError;
 
@@ -134,7 +134,7 @@ impl Sink for Bystander {
     }
 }
 
-/// What R is, by channel.
+/// R by channel.
 fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     Ok(match map.regulariser() {
         RegulariserChoice::Data => vec![Regulariser::Data],

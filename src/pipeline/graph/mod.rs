@@ -12,8 +12,9 @@ pub(crate) mod space_segment;
 pub(super) mod summary;
 
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
+pub(crate) use run::SHUTDOWN;
 pub use run::{
-    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, run_among, simulate,
+    Destination, GroundSource, READ, Watched, Watcher, downlink_file, replay, run, run_with_ranks, simulate,
     use_threads,
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};

@@ -11,8 +11,8 @@ use crate::mother::{ChannelModel, MoonMirror, Schedule};
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
-    AntennaPatterns, AntennaSum, BandAverage, DirectSum, Emitting, GeneralSum, HarmonicSum, HarmonicSumSetup,
-    ModelKind, ModelPlan, Reflected, SphereMirrored, TimeAverage, VisibilityModel,
+    AntennaPatterns, AntennaSum, BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup,
+    ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithReflection, WithSphereReflection,
 };
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
@@ -139,7 +139,7 @@ fn with_moon(
     let moon_k = plan.config.spacecraft.moon_temperature_k;
     let mut sky = of(plan.array.moon_radius_m(), moon_k)?;
     if moon_k > 0.0 {
-        sky = Box::new(Emitting::new(sky, frequency_hz, plan.instrument.response, moon_k));
+        sky = Box::new(WithEmission::new(sky, frequency_hz, plan.instrument.response, moon_k));
     }
     let share = plan.config.spacecraft.moon_reflection;
     if share == 0.0 {
@@ -148,11 +148,11 @@ fn with_moon(
     if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
         let mirror = (plan.array.moon_radius_m(), share);
         let response = plan.instrument.response;
-        return Ok(Box::new(SphereMirrored::new(sky, map.clone(), frequency_hz, response, mirror)));
+        return Ok(Box::new(WithSphereReflection::new(sky, map.clone(), frequency_hz, response, mirror)));
     }
     // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
     let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
-    Ok(Box::new(Reflected::new(sky, above, share)))
+    Ok(Box::new(WithReflection::new(sky, above, share)))
 }
 
 /// The model, averaged over its channel if the configuration asks for it.

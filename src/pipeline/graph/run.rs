@@ -5,14 +5,14 @@ use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
-use super::ground_segment::{Mapping, SegmentOutcome};
+use super::ground_segment::{MappingContext, SegmentOutcome};
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
 use super::{ground_segment, space_segment};
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
-use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, Paced, Recorder};
+use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
 use crate::imaging::EngineKind;
@@ -67,7 +67,7 @@ impl GroundSource for FileSource {
     }
 }
 
-impl<S: GroundSource> GroundSource for Paced<S> {
+impl<S: GroundSource> GroundSource for PacedSource<S> {
     fn listening(&self) -> Option<Listening> {
         self.source().listening()
     }
@@ -126,7 +126,7 @@ pub fn run(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    run_among(&Ranks::one(), plan, out, cancel, watch)
+    run_with_ranks(&Ranks::one(), plan, out, cancel, watch)
 }
 
 /// As [`run`], as one rank of several that share the sums. Each simulates and receives everything; the first alone writes into
@@ -134,7 +134,7 @@ pub fn run(
 ///
 /// # Errors
 /// Those of a run; settings with which sums cannot be shared.
-pub fn run_among(
+pub fn run_with_ranks(
     ranks: &Ranks,
     plan: &Plan,
     out: &Path,
@@ -174,14 +174,14 @@ pub fn run_among(
     let ground =
         Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
     let maps = MapWatch::default();
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
+    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
     let watched =
         Watched { metrics: graph.metrics(), solving, listening: None, ground, maps, products: None };
     let report = start(graph, ranks, &plan.config.runtime, cancel, (watched, watch))?;
     let samples = close_samples(&counts, plan, &report)?;
-    let ended = Ended { report, outcome, listening: None, samples };
+    let ended = FinishedGraph { report, outcome, listening: None, samples };
     conclude(RunScope::Whole, ranks, &plan.config, out, ended)
 }
 
@@ -240,7 +240,7 @@ pub(in crate::pipeline) fn simulate_sky(
 
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
-/// Of a ground that is one rank's ([`Ground::among`]), as [`run_among`].
+/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::among`]).
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
@@ -282,7 +282,7 @@ pub(in crate::pipeline) fn ground_alone<S: GroundSource + 'static>(
     out: &Path,
     cancel: &Cancel,
     watch: Watcher<'_>,
-) -> Result<Ended, PipelineError> {
+) -> Result<FinishedGraph, PipelineError> {
     let mut graph = Graph::new();
     let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
@@ -293,13 +293,13 @@ pub(in crate::pipeline) fn ground_alone<S: GroundSource + 'static>(
     let maps = MapWatch::default();
     let trouble = is_service.then(ProductsWatch::default);
     let (viewers, products) = (maps.clone(), trouble.clone());
-    let mapping = Mapping { out, truth, watch: solving.clone(), viewers, trouble };
+    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, trouble };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let ground = Some(outcome.ground.clone());
     let watched =
         Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps, products };
     let report = start(graph, &ranks, &config.runtime, cancel, (watched, watch))?;
-    Ok(Ended { report, outcome, listening, samples: None })
+    Ok(FinishedGraph { report, outcome, listening, samples: None })
 }
 
 impl Config {
@@ -422,6 +422,9 @@ impl Grace {
     }
 }
 
+/// How long stages have to end after a failure.
+pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
+
 /// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
 const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
 
@@ -446,22 +449,21 @@ fn start(
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
-    // What these save is to be whole, however long it takes.
+    // These stages save data: they end in order, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
-    let shutdown = Duration::from_secs_f64(config.shutdown_s);
-    Ok(graph.run(cancel, if ranks.are_many() { shutdown.min(SHUTDOWN_OF_RANK) } else { shutdown })?)
+    Ok(graph.run(cancel, if ranks.are_many() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.
-pub(in crate::pipeline) struct Ended {
+pub(in crate::pipeline) struct FinishedGraph {
     report: Report,
     outcome: SegmentOutcome,
     listening: Option<Listening>,
     samples: Option<SampleSummary>,
 }
 
-impl Ended {
+impl FinishedGraph {
     /// Auto-correlations that were taken.
     pub(in crate::pipeline) fn powers(&self) -> u64 {
         self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
@@ -474,7 +476,7 @@ fn conclude(
     ranks: &Ranks,
     config: &Config,
     out: &Path,
-    ended: Ended,
+    ended: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
     if ranks.are_many() && ended.report.cancelled {
         return Err(PipelineError::RankInterrupted);
@@ -482,7 +484,7 @@ fn conclude(
     if ranks.is_first() {
         return finish(summarise(segment, config, out, ended)?, out);
     }
-    let Ended { report, outcome, .. } = ended;
+    let FinishedGraph { report, outcome, .. } = ended;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ground.ledger.close()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
@@ -493,9 +495,9 @@ pub(in crate::pipeline) fn summarise(
     segment: RunScope,
     config: &Config,
     out: &Path,
-    ended: Ended,
+    ended: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    let Ended { report, outcome, listening, samples } = ended;
+    let FinishedGraph { report, outcome, listening, samples } = ended;
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();

@@ -12,7 +12,7 @@ use crate::mother::correlator::CorrelatorCounts;
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
 
-/// What the stages of sample fidelity count while they run.
+/// Counters of the stages of sample fidelity.
 #[derive(Clone, Default)]
 pub struct SampleCounts {
     /// Sampling.
@@ -42,7 +42,7 @@ pub struct SampleSummary {
     pub repaired: u64,
     /// Greatest change of a correlation, as a part of the two daughters' powers.
     pub repair_max: f32,
-    /// What the links carried and dropped.
+    /// Blocks that the links carried and dropped.
     pub link: LinkCounts,
     /// Blocks at the mother.
     pub blocks: BlockSummary,

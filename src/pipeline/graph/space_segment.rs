@@ -30,7 +30,7 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     (0..).map(ChannelId).take(plan.schedules.len()).map(|channel| sky(plan, channel)).collect()
 }
 
-/// That of one channel.
+/// The sky of one channel.
 ///
 /// # Errors
 /// As [`skies`].
@@ -53,7 +53,7 @@ pub(in crate::pipeline) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap
     }
 }
 
-/// What is assumed about the map files of the sky, such as their unit, and whether the sky is too coarse for the baselines.
+/// Notes on the sky: assumptions about map files, such as their unit, and whether it is too coarse for the baselines.
 ///
 /// # Errors
 /// A map whose header cannot be read.

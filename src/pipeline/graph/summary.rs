@@ -70,7 +70,7 @@ pub struct RunSummary {
     pub calibration: Option<CalibrateSummary>,
     /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
     pub report: Report,
-    /// Of the passes before it.
+    /// Counts of the passes before it.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub earlier_reports: Vec<Report>,
 }
@@ -154,7 +154,7 @@ impl RunSummary {
     }
 }
 
-/// What a summary says of a group that is mapped.
+/// Record of a mapped group.
 #[derive(bincode::Encode, bincode::Decode)]
 pub(in crate::pipeline) struct PassRecord {
     /// Checksums of its products, in the order in which its channels name them.
@@ -174,7 +174,7 @@ const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = binc
     .with_limit::<RECORD_BYTES_MAX>();
 
 impl PassRecord {
-    /// What `summary` says of a group whose products are in `out`.
+    /// The record of a group whose products are in `out`.
     ///
     /// # Errors
     /// A product that cannot be read.

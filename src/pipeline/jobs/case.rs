@@ -18,7 +18,7 @@ pub struct CaseSummary {
     pub figures: RunFigures,
 }
 
-/// What decides whether a case has to be made again.
+/// Key of a case: if it changes, the case is made again.
 #[derive(PartialEq, Serialize, Deserialize)]
 pub(in crate::pipeline) struct CaseMarker {
     space_hash: u64,

@@ -25,7 +25,7 @@ impl fmt::Display for MapStep {
     }
 }
 
-/// What a run in groups is about to do.
+/// The next step of a run in groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GroupStep {
     /// Make the sky of a channel.

@@ -171,7 +171,7 @@ impl Passes<'_> {
         Ok(summary)
     }
 
-    /// A number that calls share of which one can go on where the other was cancelled.
+    /// Calls with the same number can go on where one of them was cancelled.
     fn key(&self, group: &ChannelGroup) -> u64 {
         let Self { files, config, .. } = self;
         let file = |path: &PathBuf| {
@@ -240,7 +240,7 @@ pub fn run_in_groups(
 /// Name of the file that says that the downlink of a run in groups is whole, and of what.
 const SIMULATED: &str = ".simulated";
 
-/// What a downlink was made of, and how long it is.
+/// Key and length of a downlink.
 fn downlink_key(plan: &Plan, file: &Path) -> String {
     let config = &plan.config;
     let bytes = fs::metadata(file).map_or(0, |found| found.len());

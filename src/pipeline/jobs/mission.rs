@@ -10,7 +10,7 @@ use crate::pipeline::cost::Segment;
 use crate::pipeline::graph::{RunSummary, replay, run, simulate, use_threads};
 use crate::runtime::{Cancel, Report};
 
-/// A mission that is simulated, mapped, or both: a pipeline file, of which some keys are changed.
+/// A mission that is simulated, mapped, or both: a pipeline file with some keys changed.
 ///
 /// Keys are those of `pipelines/reference.toml`. Whatever is wrong with them is told when the mission is planned, all at once.
 ///

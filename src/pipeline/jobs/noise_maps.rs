@@ -101,21 +101,21 @@ impl NoiseMaps<'_> {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let solving = SolveWatch::new(cancel.clone());
         let setup = config.solver(solving.clone())?;
-        graph.sink("noise maps", sums, Realiser { setup, out: self.out.to_owned(), first });
+        graph.sink("noise maps", sums, NoiseMapSolver { setup, out: self.out.to_owned(), first });
         let watched = Watched { solving, ..Watched::of_space(&graph) };
         Ok(!start_alone(graph, &config.runtime, cancel, watched, watch)?.cancelled)
     }
 }
 
 /// Solves for the realisations in sums, and writes their maps.
-struct Realiser {
+struct NoiseMapSolver {
     setup: SolverSetup,
     out: PathBuf,
     /// Number of the first.
     first: usize,
 }
 
-impl Sink for Realiser {
+impl Sink for NoiseMapSolver {
     type In = Snapshot;
     type Error = PipelineError;
 

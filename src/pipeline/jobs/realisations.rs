@@ -22,7 +22,7 @@ use crate::units::vector::direction;
 /// Realisations of one channel of one case.
 #[derive(Clone, Debug, Serialize)]
 pub struct RealisationSpread {
-    /// What tells the case from the others; empty if it is the only one.
+    /// Label of the case; empty if it is the only one.
     pub case: String,
     /// Frequency, Hz.
     pub frequency_hz: f64,
@@ -41,7 +41,7 @@ pub struct RealisationSpread {
     pub files: Vec<PathBuf>,
 }
 
-/// What a study's realisations leave.
+/// Products of a study's realisations.
 #[derive(Clone, Copy)]
 pub(in crate::pipeline) struct SpreadProducts<'a> {
     /// Where the noise's covariance with all pixels is wanted: longitude and latitude in the maps' frame, degrees.
@@ -104,7 +104,7 @@ pub struct PowerSpread {
 }
 
 impl PowerSpread {
-    /// Of at least two spectra of one length.
+    /// The spread of at least two spectra of one length.
     fn of(spectra: &[Vec<f64>]) -> Self {
         let (count, degrees) = (spectra.len() as f64, spectra.first().map_or(0, Vec::len));
         let mean = |l: usize| spectra.iter().map(|c| c[l]).sum::<f64>() / count;

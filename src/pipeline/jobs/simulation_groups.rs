@@ -23,7 +23,7 @@ const SPOOL: &str = "spool";
 pub const MERGE: &str = "merge";
 
 impl Plan {
-    /// What decides whether visibilities that were put aside are those of this plan.
+    /// Key by which stored visibilities are known to be of this plan.
     fn spool_key(&self) -> u64 {
         let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
         crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
@@ -54,7 +54,7 @@ pub fn simulate_in_groups(
 ) -> Result<Vec<Report>, PipelineError> {
     let key = plan.spool_key();
     run::write_instrument_truth(plan, file)?;
-    // What cannot be written shows before anything is computed.
+    // An unwritable place shows before anything is computed.
     let recorder = Recorder::create(file)?;
     let mut reports = Vec::new();
     for (number, group) in groups.iter().enumerate() {

@@ -46,7 +46,7 @@ impl ConfigSource {
     }
 }
 
-/// Requires that the files of which a state holds the checksums are named: without them it cannot be opened.
+/// Requires that files whose checksums a state holds are named: without them it cannot be opened.
 fn require_files(
     folder: &Path,
     settings: &[(String, String)],
@@ -89,7 +89,7 @@ const A_FILE: &str = "a file of";
 const PASSES_MAX: usize = 10;
 
 /// A setting as a checkpoint has it (Rust's debug form: `16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`) as a value of TOML;
-/// `None` for a file, of which only the checksum is known.
+/// `None` for a file: only its checksum is known.
 fn toml_of(value: &str) -> Option<String> {
     if value.starts_with(A_FILE) {
         return None;

@@ -31,7 +31,7 @@ use crate::sky::SkyMap;
 /// Visibilities between checkpoints of a case's state: a minute's work or more.
 const CHECKPOINT_EVERY: u64 = 20_000_000;
 
-/// What a study is doing for a case.
+/// The step of a study for a case.
 #[derive(Clone, Debug)]
 pub enum StudyStep {
     /// Simulating the downlink that it shares with others, with the handles of the graph.
@@ -61,22 +61,22 @@ pub struct StudySummary {
     /// epsilon as several rules choose it, for the same cases, where at least three have traces.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub epsilons: Vec<EpsilonChoices>,
-    /// What realisations scatter by.
+    /// Scatter of realisations.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spreads: Vec<RealisationSpread>,
 }
 
-/// What a case is mapped from: data, gains, and sums that it shares with others.
-struct Given<'a> {
+/// Input of a case's maps: data, gains, and sums that it shares with others.
+struct CaseInputs<'a> {
     file: &'a Path,
-    /// That file, unless the state has taken it in.
+    /// The file as a list; empty if the state already holds it.
     files: &'a [PathBuf],
     gains: Option<&'a Path>,
     state: Option<&'a PathBuf>,
 }
 
-/// Where a study stands.
-struct Making<'a> {
+/// What all steps of a study need.
+struct StudyContext<'a> {
     study: &'a Study,
     out: &'a Path,
     cancel: &'a Cancel,
@@ -103,7 +103,7 @@ pub fn run_study(
     };
     fs::create_dir_all(out).map_err(failed(out))?;
     let _lock = FolderLock::acquire(out, ".lock", true).map_err(failed(out))?;
-    let mut making = Making { study, out, cancel, watch };
+    let mut making = StudyContext { study, out, cancel, watch };
     let pending = |k: &usize| !is_done(&study.cases[*k], out);
     let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
     let mut is_cut = false;
@@ -159,7 +159,7 @@ struct LastTruth {
     truth: Truth,
 }
 
-impl Making<'_> {
+impl StudyContext<'_> {
     /// Makes the cases of one downlink; whether all of them were made.
     fn make(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
         let cases = &self.study.cases;
@@ -203,7 +203,7 @@ impl Making<'_> {
                 // The state has taken the file in once its first case is made.
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
                 let given =
-                    Given { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
+                    CaseInputs { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
                 if !self.map(k, given, &skies, &mut last)? {
                     return Ok(false);
                 }
@@ -242,11 +242,11 @@ impl Making<'_> {
     fn map(
         &mut self,
         number: usize,
-        given: Given<'_>,
+        given: CaseInputs<'_>,
         skies: &[SkyMap],
         last: &mut Option<LastTruth>,
     ) -> Result<bool, PipelineError> {
-        let Given { file, files, gains, state } = given;
+        let CaseInputs { file, files, gains, state } = given;
         let case = &self.study.cases[number];
         let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
         let config = with_gains.as_ref().unwrap_or(&case.plan.config);
@@ -277,7 +277,7 @@ impl Making<'_> {
     }
 }
 
-impl Making<'_> {
+impl StudyContext<'_> {
     /// Makes the further realisations of a case's noise-only map; whether all of them were made.
     fn map_noises(&mut self, number: usize, config: &Config, file: &Path) -> Result<bool, PipelineError> {
         let case = &self.study.cases[number];

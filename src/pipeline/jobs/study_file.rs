@@ -95,7 +95,132 @@ struct CaseFile {
     set: Vec<String>,
 }
 
+/// Labels of a case, and the overrides that make it.
+#[derive(Clone, Default)]
+struct Draft {
+    labels: Vec<String>,
+    sets: Vec<String>,
+    /// Seeds of further realisations that share its sums.
+    noise_seeds: Vec<u64>,
+}
+
+impl Draft {
+    fn with(&self, label: String, sets: &[String]) -> Self {
+        let mut draft = self.clone();
+        draft.labels.push(label);
+        draft.sets.extend_from_slice(sets);
+        draft
+    }
+}
+
+fn wrong(path: &Path, found: String, expected: &'static str) -> StudyError {
+    StudyError::File { path: path.to_owned(), found, expected }
+}
+
 impl StudyFile {
+    fn read(path: &Path) -> Result<Self, StudyError> {
+        let text = read_study(path)?;
+        toml::from_str(&text).map_err(|error| match is_pipeline(&text) {
+            true => wrong(
+                path,
+                "a pipeline".to_owned(),
+                "a study: pipeline = \"FILE\" and [[axis]] with key and values, or with cases; `lunarray run` runs a pipeline",
+            ),
+            false => wrong(
+                path,
+                error.to_string().trim_end().to_owned(),
+                "name, pipeline, set and [[axis]] with key and values, or with cases",
+            ),
+        })
+    }
+
+    /// Checks everything but its cases.
+    fn check(&self, path: &Path, more: &[String]) -> Result<(), StudyError> {
+        if self.axis.is_empty() && self.realisations.is_none() && !self.calibrated {
+            let expected =
+                "[[axis]] with key and values, or with cases; or realisations = N, or calibrated = true";
+            return Err(wrong(path, "nothing that makes cases".to_owned(), expected));
+        }
+        if let Some(found) = self.set_twice(more) {
+            let expected = "each key on one axis alone: what is set last would hold under both labels";
+            return Err(wrong(path, found, expected));
+        }
+        let directions = &self.covariance_at_deg;
+        let is_direction =
+            |[longitude, latitude]: &[f64; 2]| longitude.abs() <= 360.0 && latitude.abs() <= 90.0;
+        let names: BTreeSet<String> = directions.iter().map(|at_deg| direction_name(*at_deg)).collect();
+        let are_few = directions.len() <= COVARIANCES_MAX && names.len() == directions.len();
+        if !are_few || !directions.iter().all(is_direction) {
+            let expected = "at most 16 of [longitude, latitude], ecliptic, degrees, each once";
+            return Err(wrong(path, format!("covariance_at_deg = {directions:?}"), expected));
+        }
+        if self.realisations.unwrap_or(1) == 1 && !directions.is_empty() {
+            let found = "covariance_at_deg without realisations".to_owned();
+            return Err(wrong(path, found, "realisations = 2 or more with it"));
+        }
+        Ok(())
+    }
+
+    /// Every step of each axis with every step of the others.
+    fn combinations(&self, path: &Path) -> Result<Vec<Draft>, StudyError> {
+        let mut combinations = vec![Draft::default()];
+        for (number, axis) in self.axis.iter().enumerate() {
+            let expected = "key with values, or cases with label and set; at least one";
+            let steps = steps(axis).ok_or_else(|| wrong(path, format!("axis {}", number + 1), expected))?;
+            if combinations.len().saturating_mul(steps.len()) > CASES_MAX {
+                let found = format!("more than {CASES_MAX} combinations");
+                return Err(wrong(path, found, "at most 1000 cases"));
+            }
+            let with_steps = |draft: &Draft| {
+                steps.iter().map(|(label, sets)| draft.with(label.clone(), sets)).collect::<Vec<Draft>>()
+            };
+            combinations = combinations.iter().flat_map(with_steps).collect();
+        }
+        let realisations = self.realisations.unwrap_or(1);
+        if realisations == 0 || combinations.len().saturating_mul(realisations) > CASES_MAX {
+            let found = format!("realisations = {realisations} of {} cases", combinations.len());
+            return Err(wrong(path, found, "1 or more, at most 1000 cases in all"));
+        }
+        Ok(combinations)
+    }
+
+    /// The realisations of a combination: one case, if they can share its sums, or a case each.
+    fn realised(&self, combination: &Draft, source: &ConfigSource) -> Vec<Draft> {
+        let realisations = self.realisations.unwrap_or(1);
+        // Errors are reported with the case.
+        let Some(base) = source.load().ok().filter(|_| realisations > 1) else {
+            return vec![combination.clone(); realisations];
+        };
+        let seed = |number: usize| base.map.companion_seed.wrapping_add(number as u64);
+        let of_seed = |number| format!("map.companion_seed={}", seed(number));
+        if base.shares_realisations() && !self.calibrated {
+            let shared = combination.with(format!("realisations 1 to {realisations}"), &[of_seed(1)]);
+            return vec![Draft { noise_seeds: (2..=realisations).map(seed).collect(), ..shared }];
+        }
+        let of_errors = |number: usize| {
+            let realisation = base.instrument.realisation.saturating_add(number as u32);
+            base.has_errors().then(|| format!("instrument.realisation={realisation}"))
+        };
+        let case = |number| {
+            let sets: Vec<String> = [of_seed(number)].into_iter().chain(of_errors(number)).collect();
+            combination.with(format!("realisation {number}"), &sets)
+        };
+        (1..=realisations).map(case).collect()
+    }
+
+    /// Files of the maps to calibrate with.
+    fn model_files(&self, path: &Path, common: &ConfigSource) -> Result<Vec<PathBuf>, StudyError> {
+        if self.model.is_empty() && self.calibrated {
+            // As `lunarray calibrate`; what is wrong is told with the cases.
+            return Ok(common.load().map_or_else(|_| Vec::new(), |common| common.calibrate.model_files));
+        }
+        if !self.model.is_empty() && !self.calibrated {
+            let found = "model without calibration".to_owned();
+            return Err(wrong(path, found, "calibrated = true with a model"));
+        }
+        Ok(self.model.iter().map(|model| beside(path, model)).collect())
+    }
+
     /// A key that two axes set, or an axis and the overrides `more` of all cases, in words.
     fn set_twice(&self, more: &[String]) -> Option<String> {
         let key = |set: &String| set.split_once('=').map_or(set.as_str(), |(key, _)| key).trim().to_owned();
@@ -138,7 +263,7 @@ pub struct Study {
 /// A case of a study.
 #[derive(Clone, Debug)]
 pub struct StudyCase {
-    /// What tells it from the others: a part for each axis.
+    /// Its labels, one for each axis.
     pub labels: Vec<String>,
     /// Its overrides of the pipeline.
     pub overrides: Vec<String>,
@@ -177,162 +302,76 @@ impl Study {
     /// # Errors
     /// A file that cannot be read or is no study; a case whose settings are wrong.
     pub fn read(path: &Path, more: &[String]) -> Result<Self, StudyError> {
-        let text = read_study(path)?;
-        let wrong = |found: String, expected| StudyError::File { path: path.to_owned(), found, expected };
-        let file: StudyFile = toml::from_str(&text).map_err(|error| match is_pipeline(&text) {
-            true => wrong(
-                "a pipeline".to_owned(),
-                "a study: pipeline = \"FILE\" and [[axis]] with key and values, or with cases; `lunarray run` runs a pipeline",
-            ),
-            false => wrong(
-                error.to_string().trim_end().to_owned(),
-                "name, pipeline, set and [[axis]] with key and values, or with cases",
-            ),
-        })?;
-        if file.axis.is_empty() && file.realisations.is_none() && !file.calibrated {
-            let expected =
-                "[[axis]] with key and values, or with cases; or realisations = N, or calibrated = true";
-            return Err(wrong("nothing that makes cases".to_owned(), expected));
-        }
-        if let Some(found) = file.set_twice(more) {
-            return Err(wrong(
-                found,
-                "each key on one axis alone: what is set last would hold under both labels",
-            ));
-        }
-        let mut combinations = vec![(Vec::new(), Vec::new())];
-        for (number, axis) in file.axis.iter().enumerate() {
-            let steps = steps(axis).ok_or_else(|| {
-                wrong(
-                    format!("axis {}", number + 1),
-                    "key with values, or cases with label and set; at least one",
-                )
-            })?;
-            if combinations.len().saturating_mul(steps.len()) > CASES_MAX {
-                return Err(wrong(format!("more than {CASES_MAX} combinations"), "at most 1000 cases"));
-            }
-            combinations = combinations
-                .iter()
-                .flat_map(|(labels, sets)| {
-                    steps.iter().map(move |(label, set)| {
-                        let labels: Vec<String> = [labels.as_slice(), std::slice::from_ref(label)].concat();
-                        let sets: Vec<String> = [sets.as_slice(), set.as_slice()].concat();
-                        (labels, sets)
-                    })
-                })
-                .collect();
-        }
-        let realisations = file.realisations.unwrap_or(1);
-        if realisations == 0 || combinations.len().saturating_mul(realisations) > CASES_MAX {
-            let found = format!("realisations = {realisations} of {} cases", combinations.len());
-            return Err(wrong(found, "1 or more, at most 1000 cases in all"));
-        }
-        let directions = &file.covariance_at_deg;
-        let is_direction =
-            |[longitude, latitude]: &[f64; 2]| longitude.abs() <= 360.0 && latitude.abs() <= 90.0;
-        let names: BTreeSet<String> = directions.iter().map(|at_deg| direction_name(*at_deg)).collect();
-        let are_few = directions.len() <= COVARIANCES_MAX && names.len() == directions.len();
-        if !are_few || !directions.iter().all(is_direction) {
-            let expected = "at most 16 of [longitude, latitude], ecliptic, degrees, each once";
-            return Err(wrong(format!("covariance_at_deg = {directions:?}"), expected));
-        }
-        if realisations == 1 && !directions.is_empty() {
-            return Err(wrong(
-                "covariance_at_deg without realisations".to_owned(),
-                "realisations = 2 or more with it",
-            ));
-        }
-        let stem =
-            path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
-        let beside = |pipeline: &PathBuf| path.parent().unwrap_or(Path::new("")).join(pipeline);
-        let pipeline = file.pipeline.as_ref().map(beside);
-        let mut realised = Vec::new();
-        for (labels, sets) in combinations {
-            let overrides = [file.set.as_slice(), &sets, more].concat();
-            let source = ConfigSource { file: pipeline.clone(), overrides, seed: None };
-            // What is wrong is told with the case.
-            let base = source.load().ok();
-            let companion = base.as_ref().map_or(0, |base| base.map.companion_seed);
-            let seed = |number: usize| companion.wrapping_add(number as u64);
-            if base.as_ref().is_some_and(|base| realisations > 1 && base.shares_realisations())
-                && !file.calibrated
-            {
-                let (mut labels, mut sets) = (labels, sets);
-                labels.push(format!("realisations 1 to {realisations}"));
-                sets.push(format!("map.companion_seed={}", seed(1)));
-                realised.push(vec![(labels, sets, (2..=realisations).map(seed).collect())]);
-                continue;
-            }
-            let mut of_case = Vec::new();
-            for number in 1..=realisations {
-                let (mut labels, mut sets) = (labels.clone(), sets.clone());
-                if let Some(base) = base.as_ref().filter(|_| realisations > 1) {
-                    labels.push(format!("realisation {number}"));
-                    sets.push(format!("map.companion_seed={}", seed(number)));
-                    if base.has_errors() {
-                        let realisation = base.instrument.realisation.saturating_add(number as u32);
-                        sets.push(format!("instrument.realisation={realisation}"));
-                    }
-                }
-                of_case.push((labels, sets, Vec::new()));
-            }
-            realised.push(of_case);
-        }
-        let mut models: Vec<PathBuf> = file.model.iter().map(beside).collect();
-        if models.is_empty() && file.calibrated {
-            // As `lunarray calibrate`; what is wrong is told with the cases.
-            let overrides = [file.set.as_slice(), more].concat();
-            let common = ConfigSource { file: pipeline.clone(), overrides, seed: None }.load();
-            models = common.map_or_else(|_| Vec::new(), |common| common.calibrate.model_files);
-        }
-        if !models.is_empty() && !file.calibrated {
-            return Err(wrong("model without calibration".to_owned(), "calibrated = true with a model"));
-        }
-        let model_files = models;
+        let file = StudyFile::read(path)?;
+        file.check(path, more)?;
+        let pipeline = file.pipeline.as_ref().map(|pipeline| beside(path, pipeline));
+        let source = |sets: &[String]| {
+            let overrides = [file.set.as_slice(), sets, more].concat();
+            ConfigSource { file: pipeline.clone(), overrides, seed: None }
+        };
+        let combinations = file.combinations(path)?;
+        let realised = combinations.iter().map(|draft| file.realised(draft, &source(&draft.sets)));
+        let realised: Vec<Vec<Draft>> = realised.collect();
+        let model_files = file.model_files(path, &source(&[]))?;
         let (models, models_hash) = read_models(&model_files)?;
         let kinds: &[bool] = if file.calibrated { &[false, true] } else { &[false] };
+        let mut cases = Vec::new();
         // Realisations of a case stay together.
-        let realised = realised.iter().enumerate().flat_map(|(number, of_case)| {
-            kinds.iter().enumerate().flat_map(move |(kind, &calibrated)| {
+        for (number, of_case) in realised.iter().enumerate() {
+            for (kind, &calibrated) in kinds.iter().enumerate() {
                 let family = number * kinds.len() + kind;
-                of_case.iter().map(move |(labels, sets, noise_seeds)| {
-                    let mut labels = labels.clone();
+                for draft in of_case {
+                    let mut labels = draft.labels.clone();
                     if file.calibrated {
                         labels.insert(0, if calibrated { "calibrated" } else { "as sent" }.to_owned());
                     }
-                    (labels, sets, noise_seeds, family, calibrated)
-                })
-            })
-        });
-        let cases = realised.map(|(labels, sets, noise_seeds, family, calibrated)| {
-            let overrides = [file.set.as_slice(), sets, more].concat();
-            let source = ConfigSource { file: pipeline.clone(), overrides: overrides.clone(), seed: None };
-            let plan = source.load().map_err(PipelineError::from).and_then(Plan::new);
-            let of_case = |source| StudyError::Case { label: labels.join(", "), source: Box::new(source) };
-            let plan = plan.map_err(of_case)?;
-            if calibrated {
-                // Before anything is simulated.
-                let checked = check_frequencies(&model_files, &plan.config.spacecraft.channels_hz);
-                checked.map_err(|error| of_case(error.into()))?;
+                    let source = source(&draft.sets);
+                    let plan = planned(&source, calibrated.then_some(&model_files)).map_err(|source| {
+                        StudyError::Case { label: labels.join(", "), source: Box::new(source) }
+                    })?;
+                    let (overrides, noise_seeds) = (source.overrides, draft.noise_seeds.clone());
+                    cases.push(StudyCase {
+                        labels,
+                        overrides,
+                        plan,
+                        calibrated,
+                        noise_seeds,
+                        family,
+                        models_hash,
+                    });
+                }
             }
-            let noise_seeds: Vec<u64> = noise_seeds.clone();
-            Ok(StudyCase { labels, overrides, plan, calibrated, noise_seeds, family, models_hash })
-        });
-        let cases = cases.collect::<Result<Vec<StudyCase>, StudyError>>()?;
+        }
         let mut folders = BTreeSet::new();
         if let Some(twice) = cases.iter().find(|case| !folders.insert(case.folder())) {
             let found = format!("two cases with products in {}", twice.folder());
-            return Err(wrong(found, "labels that differ in letters or digits"));
+            return Err(wrong(path, found, "labels that differ in letters or digits"));
         }
-        let (name, covariance_at_deg) = (file.name.unwrap_or(stem), file.covariance_at_deg);
+        let stem =
+            path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
+        let name = file.name.unwrap_or(stem);
         if name.is_empty() || !is_folder_name(&name) {
-            return Err(wrong(
-                format!("name = {name:?}"),
-                "1 to 60 bytes, without slashes and control characters",
-            ));
+            let expected = "1 to 60 bytes, without slashes and control characters";
+            return Err(wrong(path, format!("name = {name:?}"), expected));
         }
+        let realisations = file.realisations.unwrap_or(1);
+        let covariance_at_deg = file.covariance_at_deg;
         Ok(Self { name, cases, realisations, covariance_at_deg, models, model_files })
     }
+}
+
+/// A path that a study names, which is relative to its folder.
+fn beside(study: &Path, named: &Path) -> PathBuf {
+    study.parent().unwrap_or(Path::new("")).join(named)
+}
+
+/// The plan of a case; with the maps that it is calibrated with, checked before anything is simulated.
+fn planned(source: &ConfigSource, model_files: Option<&Vec<PathBuf>>) -> Result<Plan, PipelineError> {
+    let plan = source.load().map_err(PipelineError::from).and_then(Plan::new)?;
+    if let Some(files) = model_files {
+        check_frequencies(files, &plan.config.spacecraft.channels_hz)?;
+    }
+    Ok(plan)
 }
 
 /// Whether a text has sections of a pipeline, and no axis.

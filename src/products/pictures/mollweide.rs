@@ -5,7 +5,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use rayon::prelude::*;
 
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
-use super::projection::{Parallel, forward};
+use super::projection::{LatitudeLine, forward};
 use super::scale::{ColourScale, is_seen};
 use super::text::{Align, Style};
 use crate::sky::Frame;
@@ -215,7 +215,7 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
     let mut sums = vec![([0.0_f32; 3], 0.0_f32); columns.min(line.len() - first)];
     for sub_row in 0..SUPERSAMPLING {
         let up = (ellipse.y - (y as f64 + inside(sub_row))) / ellipse.half_height;
-        let Some(parallel) = Parallel::at(up) else { continue };
+        let Some(parallel) = LatitudeLine::at(up) else { continue };
         for (x, (sum, hits)) in sums.iter_mut().enumerate() {
             for sub_column in 0..SUPERSAMPLING {
                 let right = ((first + x) as f64 + inside(sub_column) - ellipse.x) / ellipse.half_height;

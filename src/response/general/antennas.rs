@@ -68,13 +68,13 @@ impl PairResponse {
         Self { degree: 2, coefficients }
     }
 
-    /// Of two short dipoles along these unit vectors.
+    /// The response of two short dipoles along these unit vectors.
     #[must_use]
     pub fn of_dipoles(d: Vec3, e: Vec3) -> Self {
         Self::quadratic(dot(d, e), &[[d, e]])
     }
 
-    /// Of three dipoles across each other on each satellite, d and e being their unit vectors: the mean of the correlations of like
+    /// The response of three crossed dipoles on each satellite, d and e being their unit vectors: the mean of the correlations of like
     /// dipoles, times 3/2, so that satellites of one attitude have the response 1.
     #[must_use]
     pub fn of_triads(d: [Vec3; 3], e: [Vec3; 3]) -> Self {
@@ -91,7 +91,7 @@ impl PairResponse {
         self.times(&Self::quadratic(1.0 - 0.5 * q, &[[scaled, axis_hat]]))
     }
 
-    /// Of the antennas of two satellites: dipoles if both are.
+    /// The response of the antennas of two satellites: dipoles if both are.
     #[must_use]
     pub fn of_antennas([a, b]: [&SatelliteAntenna; 2]) -> Self {
         let ideal = match (a.elements, b.elements) {

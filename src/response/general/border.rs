@@ -125,7 +125,7 @@ impl Border {
         }
         let [re, im] = &mut buffers.sums;
         for (t, weight) in self.rule.abscissae.iter().zip(&self.rule.weights) {
-            let at = At {
+            let at = InnerPoint {
                 limb_rad: self.limb_rad,
                 inverse_width: 1.0 / self.width_rad,
                 t: *t,
@@ -190,7 +190,7 @@ fn limb(class_rad: f64, limb_rad: f64, nadir: [f64; 2], cos_psi: &[f64], depth: 
 }
 
 /// A point of the inner quadrature.
-struct At {
+struct InnerPoint {
     limb_rad: f64,
     inverse_width: f64,
     t: f64,
@@ -204,7 +204,13 @@ struct At {
 
 /// Adds a point of the inner quadrature to all terms at all psi.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn add_point(at: &At, [cos_psi, sin_psi]: [&[f64]; 2], depth: &[f64], re: &mut [f64], im: &mut [f64]) {
+fn add_point(
+    at: &InnerPoint,
+    [cos_psi, sin_psi]: [&[f64]; 2],
+    depth: &[f64],
+    re: &mut [f64],
+    im: &mut [f64],
+) {
     const BLOCK: usize = 16;
     let count = depth.len();
     let terms = re.len() / count.max(1);

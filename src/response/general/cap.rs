@@ -47,7 +47,7 @@ struct Ring {
     reach: usize,
 }
 
-/// What pairs with about the same limb share.
+/// Tables that pairs with about the same limb share.
 #[derive(Clone, Debug)]
 pub(super) struct CapClass {
     l_max: usize,
@@ -344,7 +344,7 @@ fn pitch_phases(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
     out
 }
 
-/// What is not hidden, of all pairs at one degree: writes `f_{l mu}` and `(-1)^mu f_{l,-mu}`.
+/// The visible part of all pairs at one degree: writes `f_{l mu}` and `(-1)^mu f_{l,-mu}`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn assemble(
     [even, odd]: [&[Value]; 2],

@@ -16,7 +16,7 @@ use num_complex::Complex64;
 
 use super::lanes::{LANES, Value};
 use super::plan::RowNode;
-use super::skies::{Turned, make_room};
+use super::skies::{TurnedSkies, make_room};
 use crate::numerics::trigonometry::sin_cos;
 use crate::response::harmonic::degrees;
 use crate::units::vector::{Vec3, dot};
@@ -33,7 +33,7 @@ const PART: f64 = 0.5;
 /// Frames that are combined of others.
 #[derive(Clone, Debug)]
 pub(super) struct Frames {
-    /// Those that are turned to.
+    /// Frames to which the sky is turned.
     pub(super) chosen: Vec<RowNode>,
     /// All of them.
     count: usize,
@@ -128,10 +128,10 @@ impl Frames {
     /// Writes skies in some frames from those in the chosen ones.
     pub(super) fn combined(
         &self,
-        turned: &Turned,
+        turned: &TurnedSkies,
         weights: &[Value],
         [l_max, skies]: [usize; 2],
-        out: &mut Turned,
+        out: &mut TurnedSkies,
     ) {
         let (chosen, lanes) = self.shape(weights);
         make_room(out, l_max, skies * lanes);
@@ -153,9 +153,9 @@ impl Frames {
     /// The transpose of [`Self::combined`], added to `out`.
     pub(super) fn shared(
         &self,
-        turned: &Turned,
+        turned: &TurnedSkies,
         weights: &[Value],
-        out: &mut Turned,
+        out: &mut TurnedSkies,
         [l_max, skies]: [usize; 2],
     ) {
         let (chosen, lanes) = self.shape(weights);

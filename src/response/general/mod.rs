@@ -37,7 +37,7 @@ use crate::frames::AntennaResponse;
 use crate::units::Pair;
 use crate::units::vector::Vec3;
 
-/// What rows depend on besides positions.
+/// Setup of rows: everything but positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowsSetup {
     /// Greatest degree of the sky.
@@ -87,9 +87,9 @@ pub enum RowsRefusal {
          setup, {most}"
     )]
     Degree {
-        /// Of the response.
+        /// Degree of the response.
         degree: usize,
-        /// Of the rows.
+        /// Degree that the rows hold.
         most: usize,
     },
 }

@@ -14,7 +14,7 @@ use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
 use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan};
-use super::skies::{TurnBuffers, Turned, lanes_of, make_room};
+use super::skies::{TurnBuffers, TurnedSkies, lanes_of, make_room};
 use super::turns::QuarterTurns;
 use super::{PairAt, RowsError, RowsSetup};
 use crate::sky::harmonics::Alm;
@@ -175,7 +175,7 @@ impl GeneralRows {
         (joined(plan, count, seen), self.products.back(out))
     }
 
-    /// How the frames of the passes' nodes are combined of some of them, if they are.
+    /// How the frames of the passes' nodes are combined from a chosen few, if they are.
     fn frames(&self, plan: &RowPlan, passes: &[Pass]) -> Option<Frames> {
         if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(passes)], self.setup.l_max) }
     }
@@ -202,7 +202,7 @@ impl GeneralRows {
         }
     }
 
-    /// Orders of an amplitude, mu = -l_max ..= l_max, and what fills the last vector.
+    /// Orders of an amplitude, mu = -l_max ..= l_max, padded to whole vectors.
     fn orders(&self) -> usize {
         (2 * self.setup.l_max + 1).next_multiple_of(LANES)
     }
@@ -226,7 +226,7 @@ impl GeneralRows {
             .collect()
     }
 
-    /// Makes the patterns of a batch, which gets this number.
+    /// Computes the patterns of batch `number`.
     fn batch(
         &self,
         plan: &RowPlan,
@@ -248,7 +248,7 @@ impl GeneralRows {
         self.patterns.of(&self.turns, class, &batch.nodes, &mut of.cap, &mut batch.patterns);
     }
 
-    /// Writes the amplitudes of a batch, from the skies in the frames of which its own are combined.
+    /// Writes the amplitudes of a batch, from the skies in the chosen frames.
     fn amplitudes(&self, number: usize, skies: &[Alm], frames: Option<&Frames>, of: &mut Workspace) {
         let (orders, l_max) = (self.orders(), self.setup.l_max);
         let Workspace { batches, basis, turned, weights, turning, amplitudes: out, .. } = of;
@@ -279,7 +279,7 @@ impl GeneralRows {
         }
     }
 
-    /// The transpose of [`Self::amplitudes`], added to the gradients of what it is combined of, or to `out`.
+    /// The transpose of [`Self::amplitudes`], added to the gradients in the chosen frames, or to `out`.
     fn gradients(&self, number: usize, frames: Option<&Frames>, of: &mut Workspace, out: &mut [Alm]) {
         let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
         let Workspace { batches, basis, turned, weights, turning, amplitudes, .. } = of;
@@ -505,11 +505,11 @@ fn add_to(sums: &mut [Alm], part: &[Alm]) {
     }
 }
 
-/// What the rows of a plan share.
+/// Tables that the rows of a plan share.
 struct Tables {
-    /// The classes that nodes are of.
+    /// The classes of the nodes.
     classes: Vec<CapClass>,
-    /// By number of a class: its place among them.
+    /// Index among `classes`, by the number of a class.
     places: Vec<usize>,
 }
 
@@ -540,17 +540,17 @@ struct Batch {
     patterns: Vec<NodePatterns>,
 }
 
-/// What a task works with on one group of passes. It is kept for the next: tens of MB that come and go with each group
+/// Buffers of a task on one group of passes. They are kept for the next: tens of MB that come and go with each group
 /// cost up to two fifths of a product's time in page faults, where antennas multiply the skies.
 #[derive(Default)]
 struct Workspace {
     cap: CapBuffers,
     batches: Vec<Batch>,
     turning: TurnBuffers,
-    /// Skies in the frames of which others are combined, then gradients there.
-    basis: Turned,
-    /// Those in the frames of a batch, and its weights.
-    turned: Turned,
+    /// Skies in the chosen frames, then gradients there.
+    basis: TurnedSkies,
+    /// Skies in the frames of a batch, and its weights.
+    turned: TurnedSkies,
     weights: Vec<Value>,
     /// `[node][sky][real or imaginary part][order]`.
     amplitudes: Vec<f64>,
@@ -559,7 +559,7 @@ struct Workspace {
     padded: PaddedShares,
 }
 
-/// Workspaces that no task has.
+/// Workspaces that no task uses now.
 #[derive(Default)]
 struct Memory(Mutex<Vec<Workspace>>);
 

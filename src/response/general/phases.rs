@@ -1,6 +1,6 @@
 //! Sums over mu of interpolated amplitudes, `V = sum_k share_k sum_mu exp(-i mu gamma) g_{k mu}`, at many angles gamma.
 //!
-//! One transform a node gives its sum at equally spaced angles, of which a kernel about gamma interpolates (see
+//! One transform a node gives its sum at equally spaced angles, between which a kernel about gamma interpolates (see
 //! `response/harmonic/kernel.rs`): a dozen angles and as many multiply-adds each as there are nodes, where interpolated amplitudes
 //! would take one for each mu.
 

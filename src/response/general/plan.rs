@@ -75,7 +75,7 @@ pub(super) struct Pass {
     pub(super) rate_rad: Option<[f64; 2]>,
 }
 
-/// What visibilities are of besides positions.
+/// Integration times and antenna responses.
 #[derive(Clone, Copy, Default)]
 pub struct Observed<'a> {
     /// Length of each integration, s, about the time of its positions; those beyond the list are instants.

@@ -10,10 +10,10 @@ use crate::response::harmonic::degrees;
 use crate::sky::harmonics::Alm;
 
 /// Skies turned into frames, by mu: real and imaginary parts of `t_{l mu}`, `[l = mu, mu + 2, ..][sky][lane]`.
-pub(super) type Turned = Vec<[Vec<Value>; 2]>;
+pub(super) type TurnedSkies = Vec<[Vec<Value>; 2]>;
 
 /// Gives turned skies room for these columns, skies times lanes; what was in it may be there still.
-pub(super) fn make_room(turned: &mut Turned, l_max: usize, columns: usize) {
+pub(super) fn make_room(turned: &mut TurnedSkies, l_max: usize, columns: usize) {
     turned.resize_with(l_max + 1, Default::default);
     for (mu, parts) in turned.iter_mut().enumerate() {
         parts.iter_mut().for_each(|part| part.resize(degrees(l_max, mu) * columns, 0.0));
@@ -49,7 +49,7 @@ impl QuarterTurns {
         nodes: &[RowNode],
         skies: &[Alm],
         buffers: &mut TurnBuffers,
-        out: &mut Turned,
+        out: &mut TurnedSkies,
     ) {
         let (l_max, lanes) = (self.l_max(), lanes_of(nodes));
         let columns = lanes * skies.len();
@@ -91,7 +91,7 @@ impl QuarterTurns {
     pub(super) fn turn_skies_back(
         &self,
         nodes: &[RowNode],
-        turned: &Turned,
+        turned: &TurnedSkies,
         buffers: &mut TurnBuffers,
         out: &mut [Alm],
     ) {

@@ -148,7 +148,7 @@ fn plan(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> R
         let kernel: Vec<f64> =
             (0..blocks * BLOCK_NODES).map(|n| model.u_kernel.value(n as f64 - u)).collect();
         let at = ((run_middle + run.node[1] * tau - middle) / half).clamp(-1.0, 1.0);
-        for (a, lagrange) in chebyshev::lagrange(alphas, at).into_iter().enumerate() {
+        for (a, lagrange) in chebyshev::weights_at(alphas, at).into_iter().enumerate() {
             for (n, row) in analysis.iter().enumerate() {
                 for (block, kernel) in kernel.chunks_exact(BLOCK_NODES).enumerate() {
                     let factor = row[k] * lagrange;

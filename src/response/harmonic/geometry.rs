@@ -377,7 +377,7 @@ mod tests {
         }
     }
 
-    /// Of all rotations with the nominal inclination none is nearer than the one that is taken.
+    /// The chosen rotation is the nearest of all with the nominal inclination.
     #[test]
     fn the_nearest_rotation_keeps_node_and_phase() {
         let (node, inclination, phase) = (1.1, 0.55, 2.2);

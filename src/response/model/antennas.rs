@@ -11,7 +11,7 @@ use crate::response::pixel::{SatelliteAntenna, antenna_powers, antenna_sums};
 
 /// The antenna of each daughter at any time.
 pub trait AntennaPatterns: Send + Sync {
-    /// That of a daughter, from 0, at a mission time, s.
+    /// The antenna of a daughter, from 0, at a mission time, s.
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna;
 
     /// Greatest degree of a pair's response as a polynomial in the direction.

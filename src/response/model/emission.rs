@@ -15,7 +15,7 @@ use crate::units::vector::{norm, sub};
 /// The disc is what the sky's model takes as hidden: for a pair, from either daughter. So the disc is a uniform sky of T without
 /// a Moon, less the same with it, and with the sky's own visibility `V(sky) + T (V_whole - V(1)) = V(sky - T) + T V_whole`:
 /// one model of the sky less T, and V_whole in closed form. That depends on the length of the baseline only, so that it holds for
-/// averages over integrations, too. The disc does not reflect; [`Reflected`](super::Reflected) adds the image of the sky.
+/// averages over integrations, too. The disc does not reflect; [`WithReflection`](super::WithReflection) adds the image of the sky.
 ///
 /// At 250 K and 300 km of altitude, with the generated sky (rms of visibilities by length of the baseline, wavelengths):
 ///
@@ -29,14 +29,14 @@ use crate::units::vector::{norm, sub};
 ///
 /// So it is 1e-6 of the sky, 1e-4 and 1e-3, and the ground does not correct for it. Direct sums alias where a baseline has more
 /// wavelengths than about half of nside, as of any sky: at nside 64 the disc then has 5 to 12 K sr, ten times too much. Harmonics do not.
-pub struct Emitting {
+pub struct WithEmission {
     less: Box<dyn VisibilityModel>,
     frequency_hz: f64,
     response: AntennaResponse,
     temperature_k: f64,
 }
 
-impl Emitting {
+impl WithEmission {
     /// A model of the sky `less` the Moon's `temperature_k` in all directions, for daughters of this response.
     #[must_use]
     pub fn new(
@@ -73,7 +73,7 @@ fn uniform_sr(response: AntennaResponse, u: f64) -> f64 {
     }
 }
 
-impl VisibilityModel for Emitting {
+impl VisibilityModel for WithEmission {
     fn batch(&self) -> usize {
         self.less.batch()
     }
@@ -235,7 +235,7 @@ mod tests {
         ));
         let positions = positions(&array);
         for (name, response, less) in models {
-            let mut model = Emitting::new(less, FREQUENCY_HZ, response, MOON_K);
+            let mut model = WithEmission::new(less, FREQUENCY_HZ, response, MOON_K);
             let normal_hat = array.orbit_normal_hat(9e5);
             let dipole =
                 |t_s| (response == AntennaResponse::DipoleNormal).then(|| array.orbit_normal_hat(t_s));
@@ -270,7 +270,7 @@ mod tests {
         let array = array();
         let response = AntennaResponse::Isotropic;
         let direct = DirectSum::new(&cold(NSIDE), FREQUENCY_HZ, array.moon_radius_m(), response);
-        let mut model = Emitting::new(Box::new(direct), FREQUENCY_HZ, response, MOON_K);
+        let mut model = WithEmission::new(Box::new(direct), FREQUENCY_HZ, response, MOON_K);
         let positions = positions(&array);
         let comb = Comb { first: -0.04, step: 0.04, count: 3 };
         let mut found = vec![Complex64::ZERO; 3 * positions.len()];

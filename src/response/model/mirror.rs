@@ -17,9 +17,9 @@ use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 /// The image is that which the pair's mid-point sees, a daughter's own for her power. A ray from there in direction n that
 /// hits the sphere at p goes on in direction `n - 2 (n . p) p` (p as a unit vector), from where the light comes: the image has in
 /// direction n the share times the sky's brightness there, with the fringe and antenna of n. It is summed over the directions of
-/// the sky's pixels, with the brightness of the pixel from which the light comes. As in [`Reflected`](super::Reflected), image and
+/// the sky's pixels, with the brightness of the pixel from which the light comes. As in [`WithReflection`](super::WithReflection), image and
 /// sky do not interfere.
-pub struct SphereMirrored {
+pub struct WithSphereReflection {
     sky: Box<dyn VisibilityModel>,
     frequency_hz: f64,
     response: AntennaResponse,
@@ -37,7 +37,7 @@ struct SphereImage {
     area_sr: f64,
 }
 
-impl SphereMirrored {
+impl WithSphereReflection {
     /// A model of the `sky` of a `map` (K, any frame), to which a Moon of `radius_m` adds a `share` of its power.
     #[must_use]
     pub fn new(
@@ -64,7 +64,7 @@ impl SphereMirrored {
         positions: &[PairPosition],
         each: usize,
         out: &mut [Complex64],
-        sums: impl Fn(&PairGeometry, &Seen) -> Result<Vec<Complex64>, ResponseError> + Sync,
+        sums: impl Fn(&PairGeometry, &MirrorImage) -> Result<Vec<Complex64>, ResponseError> + Sync,
     ) {
         if each == 0 {
             return;
@@ -87,13 +87,13 @@ impl SphereMirrored {
 }
 
 /// An image: directions, and brightness with the share, K.
-struct Seen {
+struct MirrorImage {
     directions: Directions,
     values_k: Vec<f32>,
 }
 
 impl SphereImage {
-    fn seen_from(&self, r_m: Vec3) -> Seen {
+    fn seen_from(&self, r_m: Vec3) -> MirrorImage {
         let hits = self.directions.iter().filter_map(|&n| Some((n, self.reflected(r_m, n)?)));
         let (seen, values_k) = hits
             .map(|(n, from)| {
@@ -101,7 +101,7 @@ impl SphereImage {
                 (n, (self.share * self.map.values()[pixel]) as f32)
             })
             .unzip::<Vec3, f32, Vec<Vec3>, Vec<f32>>();
-        Seen { directions: Directions::from(seen.as_slice()), values_k }
+        MirrorImage { directions: Directions::from(seen.as_slice()), values_k }
     }
 
     /// Where a ray from `r_m` in direction `n` goes on after the sphere; `None` if it misses.
@@ -118,7 +118,7 @@ impl SphereImage {
     }
 }
 
-impl VisibilityModel for SphereMirrored {
+impl VisibilityModel for WithSphereReflection {
     fn batch(&self) -> usize {
         self.sky.batch()
     }
@@ -186,11 +186,11 @@ mod tests {
     }
 
     /// The image alone: the sky of the model has 0 K.
-    fn image(frame: Frame, radius_m: f64) -> SphereMirrored {
+    fn image(frame: Frame, radius_m: f64) -> WithSphereReflection {
         let dark = SkyMap::constant(1, Frame::Ecliptic, 0.0).unwrap();
         let response = AntennaResponse::Isotropic;
         let sky = Box::new(DirectSum::new(&dark, FREQUENCY_HZ, radius_m, response));
-        SphereMirrored::new(sky, map(frame), FREQUENCY_HZ, response, (radius_m, SHARE))
+        WithSphereReflection::new(sky, map(frame), FREQUENCY_HZ, response, (radius_m, SHARE))
     }
 
     fn pair(r_i_m: Vec3, r_j_m: Vec3) -> PairPosition {
@@ -273,7 +273,7 @@ mod tests {
             let position = pair(at(400.0), at(-500.0));
             let mut found = [Complex64::ZERO];
             image(Frame::Ecliptic, radius_m).predict(&[position], &mut found).unwrap();
-            // As `Reflected`: the sky above the horizontal.
+            // As `WithReflection`: the sky above the horizontal.
             let above = scale(1.0 / (radius_m + 3e5), position.r_i_m);
             let mut flat = Complex64::ZERO;
             for n in pixel_directions(NSIDE) {

@@ -1,8 +1,8 @@
 //! Noise-free visibilities and auto-correlation powers of a given sky.
 //!
 //! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
-//! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`Reflected`] adds the image of the sky in
-//! a flat Moon, [`SphereMirrored`] in a round one, [`AntennaSum`] antennas that differ, [`Emitting`] the Moon's own emission, [`BandAverage`] averages over a channel,
+//! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`WithReflection`] adds the image of the sky in
+//! a flat Moon, [`WithSphereReflection`] in a round one, [`AntennaSum`] antennas that differ, [`WithEmission`] the Moon's own emission, [`BandAverage`] averages over a channel,
 //! [`TimeAverage`] over integrations, and [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
 
 mod antennas;
@@ -20,11 +20,11 @@ pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
 pub use choice::{Load, ModelChoice, ModelKind, ModelPlan, degrees_seen};
 pub use direct::{DirectMoments, DirectSum};
-pub use emission::Emitting;
+pub use emission::WithEmission;
 pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
-pub use mirror::SphereMirrored;
-pub use reflection::Reflected;
+pub use mirror::WithSphereReflection;
+pub use reflection::WithReflection;
 pub use time_average::TimeAverage;
 
 use num_complex::Complex64;
@@ -73,7 +73,7 @@ pub enum ModelError {
     Geometry {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// What departs.
+        /// The quantity that departs.
         refusal: RowsRefusal,
     },
     /// The harmonic model failed.

@@ -13,13 +13,13 @@ use crate::response::pixel::Comb;
 /// opposite height, `n - 2 (n . z) z`, and since a baseline is horizontal there, the image has the fringe of the direction
 /// itself. Only what stands above the horizontal is reflected. So the image is the share times the visibility of the sky above
 /// the horizontal, that is of a Moon as large as the orbit.
-pub struct Reflected {
+pub struct WithReflection {
     sky: Box<dyn VisibilityModel>,
     above: Box<dyn VisibilityModel>,
     share: f64,
 }
 
-impl Reflected {
+impl WithReflection {
     /// A `sky`, and the same sky as seen `above` the horizontal, of whose power a `share` is reflected.
     #[must_use]
     pub fn new(sky: Box<dyn VisibilityModel>, above: Box<dyn VisibilityModel>, share: f64) -> Self {
@@ -27,7 +27,7 @@ impl Reflected {
     }
 }
 
-impl VisibilityModel for Reflected {
+impl VisibilityModel for WithReflection {
     fn batch(&self) -> usize {
         self.sky.batch()
     }
@@ -88,7 +88,7 @@ mod tests {
             Box::new(DirectSum::new(&sky, frequency_hz, radius_m, AntennaResponse::Isotropic))
                 as Box<dyn VisibilityModel>
         };
-        let mut reflected = Reflected::new(model(moon_m), model(array.orbit_radius_m()), 0.07);
+        let mut reflected = WithReflection::new(model(moon_m), model(array.orbit_radius_m()), 0.07);
         for (i, j) in [(0, 1), (0, 2), (1, 3)] {
             let (r_i_m, r_j_m) = (array.position_m(i, 9e5), array.position_m(j, 9e5));
             let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None };

@@ -20,8 +20,7 @@ use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 use crate::units::vector::{Vec3, add, norm, scale, sub};
 
-/// Rows that are made together: their elements fit the cache of a core or what it has of a shared one, and tables are read an eighth as
-/// often.
+/// Rows that are computed together: their elements fit a core's share of the cache, and tables are read an eighth as often.
 const ROWS: usize = 8;
 
 /// Parts of a product, each with sums of its own.
@@ -46,13 +45,13 @@ struct Cap {
 
 /// How a pair sees a chunk of pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Sight {
+enum ChunkView {
     Hidden,
     Cut,
     Open,
 }
 
-/// Rows of B of any pairs, in products alone. Vectors are maps in RING order; rows are times the pixels' area.
+/// Products with rows of B of any pairs; rows are not kept. Vectors are maps in RING order; rows are times the pixels' area.
 #[derive(Debug)]
 pub struct RowProducts {
     rows: RowMaker,
@@ -69,20 +68,20 @@ struct Scaled {
 }
 
 /// Rows of a block, chunk by chunk.
-struct Made {
+struct ChunkedRows {
     pieces: Vec<[Piece; ROWS]>,
-    sights: Vec<[Sight; ROWS]>,
+    sights: Vec<[ChunkView; ROWS]>,
 }
 
-/// Rows that are made together: of one class of blocks.
+/// Rows that are computed together, of one class of blocks.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Together {
+struct RowGroup {
     first: usize,
     count: usize,
     class: Option<usize>,
 }
 
-/// What comes back from a block of rows: factors of the real and imaginary parts of each, by column.
+/// Factors of the real and imaginary parts of each row of a block, by column.
 type Factors = Vec<[[f32; 2]; ROWS]>;
 
 /// Sums over a map, chunk by chunk.
@@ -107,7 +106,7 @@ impl RowProducts {
             let centre = scale(1.0 / places.len() as f64, sum);
             let radius = places.iter().map(|&pixel| norm(sub(n[pixel], centre))).fold(0.0, f64::max);
             caps.push(Cap { centre, radius: radius + margin });
-            // The last one is filled with its last pixel, which then counts once.
+            // The last chunk is filled with its last pixel, which counts once.
             let mut chunk = [[0.0; CHUNK]; 3];
             for lane in 0..CHUNK {
                 let pixel = places[lane.min(places.len() - 1)];
@@ -190,13 +189,13 @@ impl RowProducts {
     pub fn forward(&self, pairs: &[PairGeometry], x: &[f64]) -> Vec<Complex64> {
         let scaled = [self.scaled(x)];
         let unit = pixel_area_sr(self.rows.nside()) * scaled[0].scale;
-        let of_block = |made: &mut Made, together: &Together| -> Vec<Complex64> {
+        let of_block = |made: &mut ChunkedRows, together: &RowGroup| -> Vec<Complex64> {
             self.make(pairs, together, made);
             let seen = made.forward(together.count, &scaled);
             seen[0][..together.count].iter().map(|[re, im]| Complex64::new(re * unit, im * unit)).collect()
         };
         let blocks = self.blocks(pairs);
-        blocks.par_iter().map_init(|| Made::new(self.chunks.len()), of_block).flatten_iter().collect()
+        blocks.par_iter().map_init(|| ChunkedRows::new(self.chunks.len()), of_block).flatten_iter().collect()
     }
 
     /// Chunks of a map, scaled.
@@ -213,15 +212,15 @@ impl RowProducts {
         Scaled { chunks: self.ring.chunks(CHUNK).map(chunk).collect(), scale }
     }
 
-    /// Pairs in blocks, each of neighbours of one class. Tables that they need are made.
-    fn blocks(&self, pairs: &[PairGeometry]) -> Vec<Together> {
+    /// Divides pairs into blocks of neighbours of one class, and makes their tables.
+    fn blocks(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
         let is_average = self.rows.method() == PixelMethod::Average;
-        let mut blocks: Vec<Together> = Vec::new();
+        let mut blocks: Vec<RowGroup> = Vec::new();
         for (k, pair) in pairs.iter().enumerate() {
             let class = self.rows.class_of(pair.baseline_wavelengths()).filter(|_| is_average);
             match blocks.last_mut() {
                 Some(last) if last.class == class && last.count < ROWS => last.count += 1,
-                _ => blocks.push(Together { first: k, count: 1, class }),
+                _ => blocks.push(RowGroup { first: k, count: 1, class }),
             }
         }
         for class in blocks.iter().filter_map(|block| block.class) {
@@ -235,12 +234,12 @@ impl RowProducts {
         &self,
         pairs: &[PairGeometry],
         columns: usize,
-        add: &(dyn Fn(&Together, &Made, &mut [ChunkSums]) + Sync),
+        add: &(dyn Fn(&RowGroup, &ChunkedRows, &mut [ChunkSums]) + Sync),
     ) -> Vec<Vec<f64>> {
         let blocks = self.blocks(pairs);
-        let part = |blocks: &[Together]| -> Vec<ChunkSums> {
+        let part = |blocks: &[RowGroup]| -> Vec<ChunkSums> {
             let mut sums = vec![vec![[0.0; CHUNK]; self.chunks.len()]; columns];
-            let mut made = Made::new(self.chunks.len());
+            let mut made = ChunkedRows::new(self.chunks.len());
             for together in blocks {
                 self.make(pairs, together, &mut made);
                 add(together, &made, &mut sums);
@@ -261,7 +260,7 @@ impl RowProducts {
     }
 
     /// Makes the rows of a block.
-    fn make(&self, pairs: &[PairGeometry], together: &Together, made: &mut Made) {
+    fn make(&self, pairs: &[PairGeometry], together: &RowGroup, made: &mut ChunkedRows) {
         let pairs = &pairs[together.first..][..together.count];
         let prepared: Vec<Prepared> = pairs.iter().map(Prepared::pair).collect();
         for (cap, sights) in self.caps.iter().zip(&mut made.sights) {
@@ -277,12 +276,12 @@ impl RowProducts {
             (PixelMethod::Average, Some(class)) => {
                 averages(&prepared, self.rows.class(class), made);
             }
-            // For verification, and baselines of no use: one by one.
+            // For verification, and for baselines that no map uses: one by one.
             _ => self.fill(pairs, made),
         }
     }
 
-    fn fill(&self, pairs: &[PairGeometry], made: &mut Made) {
+    fn fill(&self, pairs: &[PairGeometry], made: &mut ChunkedRows) {
         let mut row = [vec![0.0_f32; self.pixels()], vec![0.0_f32; self.pixels()]];
         for (k, pair) in pairs.iter().enumerate() {
             let [re, im] = &mut row;
@@ -298,20 +297,23 @@ impl RowProducts {
 }
 
 impl Cap {
-    fn seen_by(&self, pair: &Prepared) -> Sight {
+    fn seen_by(&self, pair: &Prepared) -> ChunkView {
         let [x, y, z] = self.centre;
         let (depth_i, depth_j) = pair.depths::<false>(x, y, z);
         match depth_i.min(depth_j) {
-            depth if depth < -self.radius => Sight::Hidden,
-            depth if depth > self.radius => Sight::Open,
-            _ => Sight::Cut,
+            depth if depth < -self.radius => ChunkView::Hidden,
+            depth if depth > self.radius => ChunkView::Open,
+            _ => ChunkView::Cut,
         }
     }
 }
 
-impl Made {
+impl ChunkedRows {
     fn new(chunks: usize) -> Self {
-        Self { pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks], sights: vec![[Sight::Hidden; ROWS]; chunks] }
+        Self {
+            pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks],
+            sights: vec![[ChunkView::Hidden; ROWS]; chunks],
+        }
     }
 
     /// The first `count` rows times vectors.
@@ -338,12 +340,12 @@ impl Made {
 
 /// A S_i S_j exp(-2 pi i u . n) at the centres of a chunk, for each pair that sees some of it.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn fringes(pairs: &[Prepared], sights: &[Sight; ROWS], n: &[[f64; CHUNK]; 3], out: &mut [Piece; ROWS]) {
+fn fringes(pairs: &[Prepared], sights: &[ChunkView; ROWS], n: &[[f64; CHUNK]; 3], out: &mut [Piece; ROWS]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let [x, y, z] = n;
     for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(out) {
-        if *sight == Sight::Hidden {
+        if *sight == ChunkView::Hidden {
             continue;
         }
         let mut turns = [0.0_f32; CHUNK];
@@ -354,7 +356,7 @@ fn fringes(pairs: &[Prepared], sights: &[Sight; ROWS], n: &[[f64; CHUNK]; 3], ou
             let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
             (re[k], im[k]) = (cos, -sin);
         }
-        if *sight == Sight::Cut || pair.dipole.is_some() {
+        if *sight == ChunkView::Cut || pair.dipole.is_some() {
             let mut seen = [1.0_f32; CHUNK];
             for k in 0..CHUNK {
                 seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { 1.0 } else { 0.0 };
@@ -368,14 +370,14 @@ fn fringes(pairs: &[Prepared], sights: &[Sight; ROWS], n: &[[f64; CHUNK]; 3], ou
 }
 
 /// Averages over the pixels of all chunks that each pair sees some of.
-fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut Made) {
+fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut ChunkedRows) {
     let mut means = Means::default();
     let per_pixel = class.per_side * class.per_side;
     let pixels = GROUP / per_pixel;
     let chunks = class.whole.groups.chunks(per_pixel).zip(&made.sights).zip(&mut made.pieces);
     for ((groups, sights), pieces) in chunks {
         for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(pieces) {
-            if *sight == Sight::Hidden {
+            if *sight == ChunkView::Hidden {
                 continue;
             }
             let parts = re.chunks_exact_mut(pixels).zip(im.chunks_exact_mut(pixels));
@@ -405,14 +407,14 @@ fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut Made) {
 /// Adds a chunk of rows times a chunk of a vector to lanes of partial sums: in f32 within a chunk, in f64 beyond.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply(
-    (pieces, sights): (&[Piece], &[Sight; ROWS]),
+    (pieces, sights): (&[Piece], &[ChunkView; ROWS]),
     x: &[f32; CHUNK],
     lanes: &mut [[[f64; LANES]; 2]; ROWS],
 ) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     for ((piece, sight), lanes) in pieces.iter().zip(sights).zip(lanes) {
-        if *sight == Sight::Hidden {
+        if *sight == ChunkView::Hidden {
             continue;
         }
         for (values, lanes) in piece.iter().zip(lanes) {
@@ -432,7 +434,7 @@ fn multiply(
 /// Adds a chunk of rows times factors to sums: in f32 within a block of rows, in f64 beyond.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn accumulate(
-    (pieces, sights): (&[Piece], &[Sight; ROWS]),
+    (pieces, sights): (&[Piece], &[ChunkView; ROWS]),
     factors: &[[f32; 2]; ROWS],
     sums: &mut [f64; CHUNK],
 ) {
@@ -440,7 +442,7 @@ fn accumulate(
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let mut block = [0.0_f32; CHUNK];
     for (([re, im], sight), [a, b]) in pieces.iter().zip(sights).zip(factors) {
-        if *sight == Sight::Hidden {
+        if *sight == ChunkView::Hidden {
             continue;
         }
         for k in 0..CHUNK {
@@ -552,7 +554,7 @@ mod tests {
                 }
                 let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
                 assert!(error < tolerance, "{what}, adjoint: {error:e}");
-                // A column has the bits that it has alone.
+                // Each column has the same bits as alone.
                 assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
             }
         }

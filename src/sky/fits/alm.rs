@@ -6,7 +6,7 @@ use std::path::Path;
 use super::card::Card;
 use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
-use super::write::{end_header, primary_cards, write_whole};
+use super::write::{binary_table_cards, end_header, primary_cards, write_whole};
 use crate::sky::harmonics::Alm;
 
 /// Bytes of a row: an index of 32 bits and two doubles.
@@ -36,25 +36,8 @@ pub fn write_alm(path: &Path, alm: &Alm, cards: &[Card]) -> Result<(), FitsError
 }
 
 fn structure(alm: &Alm) -> Vec<Card> {
-    let mut cards = vec![
-        Card::text("XTENSION", "BINTABLE", "binary table extension"),
-        Card::integer("BITPIX", 8, "array data type"),
-        Card::integer("NAXIS", 2, "number of array dimensions"),
-        Card::integer("NAXIS1", ROW_BYTES as i64, "length of dimension 1"),
-        Card::integer("NAXIS2", alm.values().len() as i64, "length of dimension 2"),
-        Card::integer("PCOUNT", 0, "number of group parameters"),
-        Card::integer("GCOUNT", 1, "number of groups"),
-        Card::integer("TFIELDS", 3, "number of table fields"),
-    ];
-    for (number, (name, form, unit)) in
-        (1..).zip([("INDEX", "J", ""), ("REAL", "D", "K"), ("IMAG", "D", "K")])
-    {
-        cards.push(Card::text(&format!("TTYPE{number}"), name, ""));
-        cards.push(Card::text(&format!("TFORM{number}"), form, ""));
-        if !unit.is_empty() {
-            cards.push(Card::text(&format!("TUNIT{number}"), unit, ""));
-        }
-    }
+    let fields = [("INDEX", "J", ""), ("REAL", "D", "K"), ("IMAG", "D", "K")];
+    let mut cards = binary_table_cards(ROW_BYTES, alm.values().len(), &fields);
     let l_max = alm.l_max() as i64;
     cards.push(Card::text("EXTNAME", "ALM", "harmonic coefficients of a real field, m >= 0"));
     cards.push(Card::integer("MAX-LPOL", l_max, "greatest degree l"));

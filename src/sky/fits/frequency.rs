@@ -22,9 +22,9 @@ pub struct SkyChannel {
     pub shares_file: bool,
 }
 
-/// What is understood of a map's file.
+/// Outline of a map's file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct MapUnderstood {
+pub struct MapOutline {
     /// The file.
     pub file: PathBuf,
     /// Its frame.
@@ -51,8 +51,8 @@ pub struct MapUnderstood {
     pub mean_min_max_k: [f64; 3],
 }
 
-impl MapUnderstood {
-    /// What is understood of the map of a channel, or of the first map without one.
+impl MapOutline {
+    /// The outline of a channel's map, or of the first map.
     ///
     /// # Errors
     /// As [`super::read_whole_map`].
@@ -80,7 +80,7 @@ impl MapUnderstood {
     }
 }
 
-impl fmt::Display for MapUnderstood {
+impl fmt::Display for MapOutline {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let frequency = match self.frequency_hz {
             Some(hz) => Dimension::Frequency.show(hz),

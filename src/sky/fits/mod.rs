@@ -25,7 +25,7 @@ pub use error::FitsError;
 pub use error::FitsProblem;
 #[doc(hidden)]
 pub use frequency::{
-    MapUnderstood, SkyChannel, check_frequencies, check_frequency, read_known_sky, read_prior, read_sky,
+    MapOutline, SkyChannel, check_frequencies, check_frequency, read_known_sky, read_prior, read_sky,
     sky_options,
 };
 #[doc(hidden)]

@@ -27,7 +27,7 @@ pub struct ReadOptions {
     pub column: usize,
     /// Frame of files without COORDSYS; `None` makes such files an error.
     pub frame_if_missing: Option<Frame>,
-    /// Of columns that say their frequencies, the one of this frequency, Hz, or the nearest is read, in place of `column`.
+    /// Frequency, Hz, whose column is read in place of `column`, or the nearest, where columns say their frequencies.
     pub frequency_hz: Option<f64>,
 }
 
@@ -86,7 +86,7 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
     Ok(file)
 }
 
-/// What is assumed of a map that its file does not say: its unit, its frequency, which of its columns is meant. Reads only headers.
+/// Notes on assumptions about a map: unit, frequency, column. Reads only headers.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.

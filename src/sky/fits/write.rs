@@ -107,6 +107,28 @@ pub fn map_bytes(map: &SkyMap, options: &WriteOptions) -> Result<Vec<u8>, FitsEr
     write().map_err(|problem| FitsError::new(Path::new("memory"), problem))
 }
 
+/// The cards that describe a table of binary fields, given by name, format and unit.
+pub(super) fn binary_table_cards(row_bytes: usize, rows: usize, fields: &[(&str, &str, &str)]) -> Vec<Card> {
+    let mut cards = vec![
+        Card::text("XTENSION", "BINTABLE", "binary table extension"),
+        Card::integer("BITPIX", 8, "array data type"),
+        Card::integer("NAXIS", 2, "number of array dimensions"),
+        Card::integer("NAXIS1", row_bytes as i64, "length of dimension 1"),
+        Card::integer("NAXIS2", rows as i64, "length of dimension 2"),
+        Card::integer("PCOUNT", 0, "number of group parameters"),
+        Card::integer("GCOUNT", 1, "number of groups"),
+        Card::integer("TFIELDS", fields.len() as i64, "number of table fields"),
+    ];
+    for (number, (name, form, unit)) in (1..).zip(fields) {
+        cards.push(Card::text(&format!("TTYPE{number}"), name, ""));
+        cards.push(Card::text(&format!("TFORM{number}"), form, ""));
+        if !unit.is_empty() {
+            cards.push(Card::text(&format!("TUNIT{number}"), unit, ""));
+        }
+    }
+    cards
+}
+
 struct Table<'a> {
     columns: &'a [Column<'a>],
     options: &'a WriteOptions,
@@ -194,17 +216,6 @@ impl<'a> Table<'a> {
         let number_bytes = self.number_bytes();
         let row_bytes = number_bytes + self.columns.len() * self.row_values * value_bytes;
         let rows = self.pixels.len() / self.row_values;
-        let fields = self.columns.len() + usize::from(number_bytes > 0);
-        let mut cards = vec![
-            Card::text("XTENSION", "BINTABLE", "binary table extension"),
-            Card::integer("BITPIX", 8, "array data type"),
-            Card::integer("NAXIS", 2, "number of array dimensions"),
-            Card::integer("NAXIS1", row_bytes as i64, "length of dimension 1"),
-            Card::integer("NAXIS2", rows as i64, "length of dimension 2"),
-            Card::integer("PCOUNT", 0, "number of group parameters"),
-            Card::integer("GCOUNT", 1, "number of groups"),
-            Card::integer("TFIELDS", fields as i64, "number of table fields"),
-        ];
         let number_form = match number_bytes {
             0 => None,
             2 => Some("I"),
@@ -215,14 +226,7 @@ impl<'a> Table<'a> {
         let form = format!("{repeat}{letter}");
         let maps = self.columns.iter().map(|column| (column.name, form.as_str(), column.unit));
         let fields = number_form.map(|form| ("PIXEL", form, "")).into_iter().chain(maps);
-        for (number, (name, form, unit)) in (1..).zip(fields) {
-            cards.push(Card::text(&format!("TTYPE{number}"), name, ""));
-            cards.push(Card::text(&format!("TFORM{number}"), form, ""));
-            if !unit.is_empty() {
-                cards.push(Card::text(&format!("TUNIT{number}"), unit, ""));
-            }
-        }
-        cards
+        binary_table_cards(row_bytes, rows, &fields.collect::<Vec<_>>())
     }
 
     fn map_cards(&self, frame: Frame) -> Vec<Card> {

@@ -36,7 +36,7 @@ impl AddedSky {
         self.catalogue_understood().map(drop)
     }
 
-    /// What is understood of the catalogue, if there is one.
+    /// The outline of the catalogue, if there is one.
     ///
     /// # Errors
     /// One that cannot be read.

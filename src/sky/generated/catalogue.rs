@@ -257,7 +257,7 @@ fn shown(cell: &str) -> String {
     cell.chars().take(40).collect::<String>().escape_debug().to_string()
 }
 
-/// What divides the cells of a line: the first of these that occurs, or blanks.
+/// The separator of a line's cells: the first of these that occurs, or blanks.
 fn mark_of(line: &str) -> char {
     ['\t', ';', '|', ','].into_iter().find(|mark| line.contains(*mark)).unwrap_or(' ')
 }

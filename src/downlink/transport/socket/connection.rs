@@ -11,9 +11,9 @@ use tokio::sync::Notify;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until, timeout};
 
-use super::held::WaitingSender;
-use super::listener::{First, ListenContext, PacketBatch, Passed, first};
-use super::opening::Opening;
+use super::answers::WaitingSender;
+use super::listener::{First, ListenContext, PacketBatch, PassedBatch, first};
+use super::preamble::Preamble;
 use super::report::{BUSY, CLOSED, ConnectionEnd, ListenEvent, SenderReport};
 use super::sender_intake::{SenderIntake, Signs};
 use crate::downlink::receive::ReceptionCounters;
@@ -44,14 +44,14 @@ struct ConnectionState {
 }
 
 /// A connection's place.
-struct SeatTaken<'a> {
+struct SeatGuard<'a> {
     shared: &'a Arc<ListenContext>,
     number: u64,
     /// Tells the connection to give way.
     leave: Arc<Notify>,
 }
 
-impl Drop for SeatTaken<'_> {
+impl Drop for SeatGuard<'_> {
     fn drop(&mut self) {
         self.shared.seats.release(self.number);
     }
@@ -63,7 +63,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     status.open.fetch_add(1, Ordering::Relaxed);
     shared.listening.write().connections += 1;
     let (number, leave) = shared.seats.take(peer.ip(), Instant::now());
-    let seat = SeatTaken { shared: &shared, number, leave };
+    let seat = SeatGuard { shared: &shared, number, leave };
     let mut bytes = 0;
     let (state, mut ended) = exchange(&mut stream, &seat, &mut bytes).await;
     let (mut packets, mut refused, mut format) = (0, 0, None);
@@ -88,12 +88,12 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         }
         (packets, refused) = state.intake.packets();
         format = state.intake.format();
-        let opening = state.intake.opening();
-        sent = bytes - opening.bytes();
-        mark = opening.asks_held().then_some(state.mark);
+        let preamble = state.intake.preamble();
+        sent = bytes - preamble.bytes();
+        mark = preamble.asks_held().then_some(state.mark);
         passed = state.mark;
         ticket = state.ticket;
-        station = opening.station().map(str::to_owned);
+        station = preamble.station().map(str::to_owned);
         counters = state.intake.stream();
         status.done.fetch_add(u64::from(state.intake.is_alive()), Ordering::Relaxed);
     }
@@ -129,7 +129,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
 /// Reads until either side ends the connection. Returns no state if the receiver failed.
 async fn exchange(
     stream: &mut TcpStream,
-    seat: &SeatTaken<'_>,
+    seat: &SeatGuard<'_>,
     bytes: &mut u64,
 ) -> (Option<ConnectionState>, ConnectionEnd) {
     let shared = seat.shared;
@@ -138,8 +138,8 @@ async fn exchange(
         true => ((rate / READS_PER_S) as usize).clamp(READ_BYTES_MIN, READ_BYTES),
         false => READ_BYTES,
     };
-    let opening = Opening::new(shared.stations.clone(), shared.held.is_some());
-    let intake = SenderIntake::new(shared.mission.clone(), opening);
+    let preamble = Preamble::new(shared.stations.clone(), shared.held.is_some());
+    let intake = SenderIntake::new(shared.mission.clone(), preamble);
     let mut state = ConnectionState {
         intake,
         chunk: vec![0; read_bytes],
@@ -167,7 +167,7 @@ async fn exchange(
         let Ok((back, found)) = found.await else { return (None, ConnectionEnd::Failed) };
         state = back;
         let Signs { is_alive, is_new } = found.unwrap_or_default();
-        if let Some(station) = state.intake.opening().station() {
+        if let Some(station) = state.intake.preamble().station() {
             shared.listening.write().hear(station, read as u64, is_alive);
         }
         if is_alive {
@@ -194,7 +194,7 @@ async fn exchange(
 /// Reads the next bytes into the chunk, or returns why there are none.
 async fn read(
     stream: &mut TcpStream,
-    seat: &SeatTaken<'_>,
+    seat: &SeatGuard<'_>,
     state: &mut ConnectionState,
     silence: &mut Duration,
 ) -> Result<usize, ConnectionEnd> {
@@ -229,12 +229,12 @@ fn within_limits(intake: &SenderIntake, shared: &ListenContext) -> Result<(), Co
 }
 
 /// Passes the packets found to the ground once there is room. Returns whether the ground still accepts any.
-async fn hand_on(state: &mut ConnectionState, seat: &SeatTaken<'_>) -> bool {
+async fn hand_on(state: &mut ConnectionState, seat: &SeatGuard<'_>) -> bool {
     let bytes = std::mem::take(&mut state.packets);
     if bytes.is_empty() {
         return true;
     }
-    let SeatTaken { shared, number, .. } = seat;
+    let SeatGuard { shared, number, .. } = seat;
     let status = &shared.listening.status;
     let all = ListenContext::room_bytes(&shared.config);
     let needed = u32::try_from(bytes.len().min(all)).unwrap_or(u32::MAX);
@@ -260,7 +260,7 @@ async fn hand_on(state: &mut ConnectionState, seat: &SeatTaken<'_>) -> bool {
             spawn_blocking(move || shared.pass(batch)).await.ok().flatten()
         }
     };
-    let Some(Passed { mark, ticket }) = passed else { return false };
+    let Some(PassedBatch { mark, ticket }) = passed else { return false };
     state.mark = mark;
     // One piece that is not on disk is enough for the sender to send again.
     if state.ticket.is_ok() {

@@ -11,8 +11,8 @@ use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::Instant;
 
+use super::answers::HeldAnswers;
 use super::config::ListenConfig;
-use super::held::HeldAnswers;
 use super::report::{BUSY, ListenEvent, ListenNote, Listening};
 use super::seats::Seats;
 use super::sender_intake::Mission;
@@ -23,11 +23,11 @@ use crate::downlink::transport::packet_archive::{PacketArchive, Ticket};
 const NOTES_AT_ONCE: f64 = 20.0;
 
 /// Receives notes about connections.
-pub type Teller = Box<dyn Fn(&ListenNote<'_>) + Send + Sync>;
+pub type NoteHandler = Box<dyn Fn(&ListenNote<'_>) + Send + Sync>;
 
 /// When listening ends, apart from the end of the run.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Until {
+pub struct ListenLimits {
     /// After this time without a sound packet or frame from anyone, s; 0 for never.
     pub idle_s: f64,
     /// After this number of connections that delivered packets have ended; 0 for never.
@@ -43,7 +43,7 @@ pub(super) struct PacketBatch {
 }
 
 /// What became of a batch that was passed on.
-pub(super) struct Passed {
+pub(super) struct PassedBatch {
     /// Bytes in all batches up to its end.
     pub(super) mark: u64,
     /// What has to reach the disk; why it cannot; or `None` without an archive.
@@ -53,7 +53,7 @@ pub(super) struct Passed {
 /// What all connections share.
 pub(super) struct ListenContext {
     pub(super) config: ListenConfig,
-    pub(super) until: Until,
+    pub(super) until: ListenLimits,
     pub(super) mission: Mission,
     pub(super) listening: Listening,
     pub(super) seats: Seats,
@@ -81,12 +81,12 @@ impl ListenContext {
     }
 
     /// Keeps a batch in the archive, if there is one, and passes it on, also if it could not be kept. `None` if nobody takes it.
-    pub(super) fn pass(&self, batch: PacketBatch) -> Option<Passed> {
+    pub(super) fn pass(&self, batch: PacketBatch) -> Option<PassedBatch> {
         let mut passed = self.passed.lock().unwrap_or_else(PoisonError::into_inner);
         *passed += batch.bytes.len() as u64;
         let mark = *passed;
         let ticket = self.archive.as_ref().map(|archive| archive.append(&batch.bytes, mark));
-        self.batches.send(batch).ok().map(|()| Passed { mark, ticket: ticket.transpose() })
+        self.batches.send(batch).ok().map(|()| PassedBatch { mark, ticket: ticket.transpose() })
     }
 
     pub(super) fn note_sign(&self) {
@@ -101,7 +101,7 @@ impl ListenContext {
 
     pub(super) fn is_over(&self) -> bool {
         let status = &self.listening.status;
-        let Until { idle_s, connections } = self.until;
+        let ListenLimits { idle_s, connections } = self.until;
         if connections > 0 && status.done.load(Ordering::Relaxed) >= connections {
             return true;
         }
@@ -140,13 +140,13 @@ pub(super) async fn first<A, B>(a: impl Future<Output = A>, b: impl Future<Outpu
 
 /// Reports events, but no faster than people can read.
 pub(super) struct Notes {
-    tell: Teller,
+    tell: NoteHandler,
     /// Notes allowed, as of when; and notes suppressed.
     budget: Mutex<(f64, Instant, u64)>,
 }
 
 impl Notes {
-    pub(super) fn new(tell: Teller) -> Self {
+    pub(super) fn new(tell: NoteHandler) -> Self {
         Self { tell, budget: Mutex::new((NOTES_AT_ONCE, Instant::now(), 0)) }
     }
 

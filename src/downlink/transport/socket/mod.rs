@@ -30,12 +30,12 @@
 //! is reported by its name.
 
 mod accept;
+mod answers;
 mod config;
 mod connection;
 mod error;
-mod held;
 mod listener;
-mod opening;
+mod preamble;
 mod report;
 mod seats;
 mod sender_intake;
@@ -44,10 +44,10 @@ mod source;
 mod stations;
 mod url;
 
+pub use answers::HeldAnswers;
 pub use config::ListenConfig;
 pub use error::SocketError;
-pub use held::HeldAnswers;
-pub use listener::{Teller, Until};
+pub use listener::{ListenLimits, NoteHandler};
 pub use report::{
     ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport, StationCounts,
 };

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::opening::Opening;
+use super::preamble::Preamble;
 use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
 use crate::downlink::receive::{Decoder, Event, Intake, ReceivedSet, ReceptionCounters};
@@ -47,7 +47,7 @@ impl Mission {
         Self { fits, ..self }
     }
 
-    /// Whether an instrument is the ground's. The first one becomes the ground's.
+    /// Whether an instrument is the ground's. The ground adopts the first one.
     pub(super) fn confirm(&self, found: &Instrument) -> bool {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         known.get_or_insert_with(|| found.clone()) == found
@@ -65,8 +65,8 @@ impl Mission {
 
 /// What is known of a sender's instrument.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Standing {
-    /// It has not described one, or the ground knows none and nothing has confirmed it.
+enum SenderStanding {
+    /// It has not described its instrument, or the ground knows none and nothing has confirmed this one.
     Open,
     /// It is the ground's.
     Ours,
@@ -75,39 +75,39 @@ enum Standing {
 }
 
 /// Judges a sender by its instrument.
-struct Judge {
+struct SenderCheck {
     mission: Mission,
-    standing: Standing,
+    standing: SenderStanding,
     decoder: Decoder,
     /// Spans of the positions received.
     positions: Vec<[MissionTime; 2]>,
 }
 
-impl Judge {
+impl SenderCheck {
     fn new(mission: Mission) -> Self {
-        Self { mission, standing: Standing::Open, decoder: Decoder::new(), positions: Vec::new() }
+        Self { mission, standing: SenderStanding::Open, decoder: Decoder::new(), positions: Vec::new() }
     }
 
-    /// Whether packets may be passed on: all that came before may be, or none of them.
+    /// Whether packets may be passed on; if so, all that came before may be, too.
     fn passes(&mut self) -> bool {
-        if self.standing == Standing::Open {
+        if self.standing == SenderStanding::Open {
             let known = self.mission.known.lock().unwrap_or_else(PoisonError::into_inner);
             match (&*known, self.decoder.instrument()) {
                 (Some(known), Some(found)) if known != found => {
-                    self.standing = Standing::Refused(ConnectionEnd::OtherInstrument);
+                    self.standing = SenderStanding::Refused(ConnectionEnd::OtherInstrument);
                 }
-                (Some(_), Some(_)) => self.standing = Standing::Ours,
-                // It may not say.
+                (Some(_), Some(_)) => self.standing = SenderStanding::Ours,
+                // Headers may lack it.
                 (Some(_), None) => return true,
                 (None, _) => {}
             }
         }
-        self.standing == Standing::Ours
+        self.standing == SenderStanding::Ours
     }
 
     fn refused(&self) -> Option<ConnectionEnd> {
         match self.standing {
-            Standing::Refused(end) => Some(end),
+            SenderStanding::Refused(end) => Some(end),
             _ => None,
         }
     }
@@ -115,19 +115,19 @@ impl Judge {
     /// Takes a sound packet.
     fn see(&mut self, event: &Event<'_>, kind: Kind) {
         let describes = kind == Kind::Instrument;
-        if self.refused().is_some() || (self.standing == Standing::Ours && !describes) {
+        if self.refused().is_some() || (self.standing == SenderStanding::Ours && !describes) {
             return;
         }
         let found = self.decoder.accept(event);
         if self.decoder.counters().instruments_contradictory > 0 {
-            self.standing = Standing::Refused(ConnectionEnd::OtherInstrument);
+            self.standing = SenderStanding::Refused(ConnectionEnd::OtherInstrument);
             return;
         }
         match found {
             Some(GroundFrame::Instrument(found)) => {
                 self.passes();
-                if self.standing == Standing::Open && !(self.mission.fits)(&found) {
-                    self.standing = Standing::Refused(ConnectionEnd::UnfitInstrument);
+                if self.standing == SenderStanding::Open && !(self.mission.fits)(&found) {
+                    self.standing = SenderStanding::Refused(ConnectionEnd::UnfitInstrument);
                 }
             }
             Some(GroundFrame::Ephemeris(segment)) if self.positions.len() < POSITIONS_MAX => {
@@ -145,8 +145,8 @@ impl Judge {
         let has_positions = self.positions.iter().any(|[from, to]| (*from..=*to).contains(&first));
         if let Some(found) = self.decoder.instrument().filter(|_| has_positions) {
             self.standing = match self.mission.confirm(found) {
-                true => Standing::Ours,
-                false => Standing::Refused(ConnectionEnd::OtherInstrument),
+                true => SenderStanding::Ours,
+                false => SenderStanding::Refused(ConnectionEnd::OtherInstrument),
             };
             self.positions = Vec::new();
         }
@@ -164,14 +164,14 @@ pub(super) struct Signs {
 
 /// The receiver of one connection. It counts everything but packets, which the ground counts.
 pub(super) struct SenderIntake {
-    opening: Opening,
+    preamble: Preamble,
     intake: Intake,
     stream: Decoder,
-    judge: Judge,
+    judge: SenderCheck,
     /// Packets of a payload that lacks its last segment.
     group: Vec<u8>,
     grouped: u64,
-    /// Whole payloads that may not be passed on yet.
+    /// Whole payloads that wait until the instrument is confirmed.
     held: Vec<u8>,
     held_packets: u64,
     packets: u64,
@@ -183,12 +183,12 @@ pub(super) struct SenderIntake {
 }
 
 impl SenderIntake {
-    pub(super) fn new(mission: Mission, opening: Opening) -> Self {
+    pub(super) fn new(mission: Mission, preamble: Preamble) -> Self {
         Self {
-            opening,
+            preamble,
             intake: Intake::unfiltered(),
             stream: Decoder::new(),
-            judge: Judge::new(mission),
+            judge: SenderCheck::new(mission),
             group: Vec::new(),
             grouped: 0,
             held: Vec::new(),
@@ -204,9 +204,9 @@ impl SenderIntake {
     /// Takes the next bytes and appends the packets that they complete and that may be passed on to `out`.
     ///
     /// # Errors
-    /// The instrument is refused, or not confirmed in time, or the opening is: from then on no packet is appended.
+    /// The instrument is refused, or not confirmed in time, or the preamble is: from then on no packet is appended.
     pub(super) fn take(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
-        let (before, bytes) = self.opening.take(bytes)?;
+        let (before, bytes) = self.preamble.take(bytes)?;
         self.intake.push(&before);
         self.intake.push(bytes);
         self.hand_out(out);
@@ -222,9 +222,9 @@ impl SenderIntake {
     /// Ends the stream; appends the remaining packets.
     ///
     /// # Errors
-    /// The instrument is refused, or was not confirmed; or the opening is refused.
+    /// The instrument is refused, or was not confirmed; or the preamble is refused.
     pub(super) fn finish(&mut self, out: &mut Vec<u8>) -> Result<(), ConnectionEnd> {
-        let before = self.opening.finish()?;
+        let before = self.preamble.finish()?;
         self.intake.push(&before);
         self.intake.finish();
         self.hand_out(out);
@@ -241,8 +241,8 @@ impl SenderIntake {
     }
 
     /// What came before the packets.
-    pub(super) fn opening(&self) -> &Opening {
-        &self.opening
+    pub(super) fn preamble(&self) -> &Preamble {
+        &self.preamble
     }
 
     /// Whether a sound packet or frame has arrived since the last check.
@@ -313,7 +313,7 @@ impl SenderIntake {
         }
     }
 
-    /// Passes whole payloads on if they may be.
+    /// Passes whole payloads on, if the instrument allows.
     fn pass_on(&mut self, out: &mut Vec<u8>) {
         if self.judge.passes() {
             out.append(&mut self.held);
@@ -336,7 +336,7 @@ impl SenderIntake {
 mod tests {
     use proptest::prelude::*;
 
-    use super::super::held::ASKS_HELD;
+    use super::super::answers::ASKS_HELD;
     use super::*;
     use crate::downlink::{DownlinkConfig, Transmission};
     use crate::frames::{AntennaResponse, Channel, EphemerisSegment, Housekeeping};
@@ -357,8 +357,8 @@ mod tests {
     }
 
     /// Anyone may send, and ask.
-    fn anyone() -> Opening {
-        Opening::new(None, true)
+    fn anyone() -> Preamble {
+        Preamble::new(None, true)
     }
 
     /// A ground whose instrument is known.
@@ -515,27 +515,27 @@ mod tests {
         for piece in [1, 5, ASKS_HELD.len(), 1000] {
             let mut sender = SenderIntake::new(ours(), anyone());
             let (pieces, _) = through(&mut sender, &asking, piece);
-            assert!(sender.opening.asks_held() && sender.opening.bytes() == ASKS_HELD.len() as u64);
+            assert!(sender.preamble.asks_held() && sender.preamble.bytes() == ASKS_HELD.len() as u64);
             // The line is no part of the stream.
             assert!(pieces.concat() == bytes && sender.intake.bytes() == bytes.len() as u64);
             // Whoever begins in another way sends packets, and what is not a packet is counted.
             for start in [&ASKS_HELD[..7], b"answer hold\n", b"\nanswer held\n"] {
                 let mut sender = SenderIntake::new(ours(), anyone());
                 let (pieces, _) = through(&mut sender, &[start, &bytes].concat(), piece);
-                assert!(!sender.opening.asks_held() && pieces.concat() == bytes);
+                assert!(!sender.preamble.asks_held() && pieces.concat() == bytes);
                 assert_eq!(sender.stream().bytes_garbage, start.len() as u64);
             }
         }
         // The beginning of the line alone.
         let mut sender = SenderIntake::new(ours(), anyone());
         through(&mut sender, &ASKS_HELD[..4], 4);
-        assert!(!sender.opening.asks_held() && sender.intake.bytes() == 4);
+        assert!(!sender.preamble.asks_held() && sender.intake.bytes() == 4);
     }
 
     #[test]
     fn without_checkpoints_nothing_is_taken_of_a_sender_that_asks_for_them() {
         let asking = [ASKS_HELD, &sent("ours", Format::Packets)].concat();
-        let (mut sender, mut out) = (SenderIntake::new(ours(), Opening::new(None, false)), Vec::new());
+        let (mut sender, mut out) = (SenderIntake::new(ours(), Preamble::new(None, false)), Vec::new());
         assert_eq!(sender.take(&asking, &mut out), Err(ConnectionEnd::NoState));
         let _ = sender.finish(&mut out);
         assert!(out.is_empty() && sender.packets() == (0, 0));

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use super::answers::ASKS_HELD;
 use super::error::SocketError;
-use super::held::ASKS_HELD;
-use super::opening::TOKEN;
+use super::preamble::TOKEN;
 use super::report::{BUSY, CLOSED};
 use super::url::TcpUrl;
 use crate::downlink::error::DownlinkError;

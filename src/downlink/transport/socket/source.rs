@@ -10,10 +10,10 @@ use crossbeam_channel::{Receiver, RecvTimeoutError, unbounded};
 use tokio::sync::{Semaphore, watch};
 
 use super::accept::listen;
+use super::answers::HeldAnswers;
 use super::config::ListenConfig;
 use super::error::SocketError;
-use super::held::HeldAnswers;
-use super::listener::{ListenContext, Notes, PacketBatch, Teller, Until};
+use super::listener::{ListenContext, ListenLimits, NoteHandler, Notes, PacketBatch};
 use super::report::Listening;
 use super::seats::Seats;
 use super::sender_intake::{InstrumentCheck, Mission};
@@ -31,9 +31,9 @@ const POLL: Duration = Duration::from_millis(100);
 pub struct SocketSource {
     address: SocketAddr,
     config: ListenConfig,
-    until: Until,
+    until: ListenLimits,
     /// Set until the run starts.
-    waiting: Option<(std::net::TcpListener, Mission, Teller)>,
+    waiting: Option<(std::net::TcpListener, Mission, NoteHandler)>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     held: Option<HeldAnswers>,
@@ -49,7 +49,11 @@ impl SocketSource {
     ///
     /// # Errors
     /// No address can be bound.
-    pub fn bind(addresses: &[SocketAddr], config: &ListenConfig, until: Until) -> Result<Self, SocketError> {
+    pub fn bind(
+        addresses: &[SocketAddr],
+        config: &ListenConfig,
+        until: ListenLimits,
+    ) -> Result<Self, SocketError> {
         let failed = |source| {
             let none = SocketAddr::from(([0, 0, 0, 0], 0));
             SocketError::Listen {
@@ -125,7 +129,7 @@ impl SocketSource {
 
     /// Reports what happens to connections, one note at a time.
     #[must_use]
-    pub fn telling(mut self, tell: Teller) -> Self {
+    pub fn telling(mut self, tell: NoteHandler) -> Self {
         if let Some((_, _, teller)) = &mut self.waiting {
             *teller = tell;
         }

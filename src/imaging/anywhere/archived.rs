@@ -37,7 +37,7 @@ pub struct RefinedSetup {
 
 /// The setup of an archive in a checkpoint. The most visibilities are not part of it: a later session may hold more.
 #[derive(bincode::Encode, bincode::Decode)]
-pub(in crate::imaging) struct HeldHead {
+pub(in crate::imaging) struct VisibilitiesHead {
     channel: u16,
     l_max: u32,
     frequency_hz: f64,
@@ -49,7 +49,7 @@ pub(in crate::imaging) struct HeldHead {
     limits: [f64; 4],
 }
 
-impl HeldHead {
+impl VisibilitiesHead {
     pub(in crate::imaging) fn new(setup: &RefinedSetup) -> Self {
         let limits = setup.limits;
         Self {
@@ -96,7 +96,7 @@ impl HeldHead {
 
 /// A visibility that is held.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(in crate::imaging) struct HeldVisibility {
+pub(in crate::imaging) struct ArchivedVisibility {
     pub(in crate::imaging) at: PairAt,
     pub(in crate::imaging) band: u16,
     pub(in crate::imaging) value_k_sr: Complex64,
@@ -106,9 +106,9 @@ pub(in crate::imaging) struct HeldVisibility {
 }
 
 /// What visibilities are sorted by.
-type HeldOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
+type ArchiveOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
 
-impl HeldVisibility {
+impl ArchivedVisibility {
     /// Visibility `k`; refused if it has no row of B.
     pub(in crate::imaging) fn of(
         placed: &PlacedVisibilities,
@@ -125,7 +125,7 @@ impl HeldVisibility {
     }
 
     /// What visibilities are sorted by: all that they are, and nothing of how they arrived.
-    pub(in crate::imaging) fn order(&self) -> HeldOrder {
+    pub(in crate::imaging) fn order(&self) -> ArchiveOrder {
         let Self { at, band, value_k_sr: value, weight, duration_s } = self;
         let PairAt { pair, time_s, r_i_m, r_j_m } = *at;
         (pair.i, pair.j, time_s, *band, value.re, value.im, *weight, r_i_m, r_j_m, *duration_s)

@@ -16,7 +16,7 @@ const ACCURACY: Accuracy = Accuracy { relative: 1e-6, absolute: 1e-7 };
 
 /// Visibilities for a map of pixels.
 #[derive(Debug)]
-pub struct RemadeVisibilities {
+pub struct MatrixFreeVisibilities {
     /// HEALPix nside of the map.
     pub nside: usize,
     /// How rows of B are made.
@@ -27,7 +27,7 @@ pub struct RemadeVisibilities {
 
 /// Normal equations whose matrix is made again, row by row, for each product.
 #[derive(Debug)]
-pub struct RemadeSums {
+pub struct MatrixFreeSums {
     products: RowProducts,
     pairs: Vec<PairGeometry>,
     weights: Vec<f64>,
@@ -36,7 +36,7 @@ pub struct RemadeSums {
     counts: SumCounts,
 }
 
-impl RemadeVisibilities {
+impl MatrixFreeVisibilities {
     /// Number and weight of the visibilities.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
@@ -47,7 +47,7 @@ impl RemadeVisibilities {
     ///
     /// # Errors
     /// An nside that rows cannot have.
-    pub fn into_sums(self) -> Result<RemadeSums, AccumulationError> {
+    pub fn into_sums(self) -> Result<MatrixFreeSums, AccumulationError> {
         let products = RowProducts::new(self.nside, self.method)?;
         let counts = self.archive.counts();
         let (setup, at, data) = self.archive.into_data();
@@ -66,11 +66,11 @@ impl RemadeVisibilities {
         let mut sides = products.adjoint(&pairs, &[&weighted, &noise]).into_iter();
         let mut side = || sides.next().unwrap_or_default();
         let (right, noise) = (side(), side());
-        Ok(RemadeSums { products, pairs, weights: data.weight, right, noise, counts })
+        Ok(MatrixFreeSums { products, pairs, weights: data.weight, right, noise, counts })
     }
 }
 
-impl NormalSums for RemadeSums {
+impl NormalSums for MatrixFreeSums {
     fn unknowns(&self) -> usize {
         self.products.pixels()
     }

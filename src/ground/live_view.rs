@@ -1,5 +1,5 @@
-//! What visitors may see of a ground at work beyond its counters. Nothing is gathered unless somebody may look, and nothing of
-//! it enters a result.
+//! What visitors of the page see of a ground besides its counters. Nothing is gathered unless the page is served, and no
+//! result depends on it.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +19,7 @@ use crate::units::{ChannelId, MissionTime, Pair};
 /// Most channels of which baselines are counted.
 const CHANNELS_MAX: usize = 256;
 
-/// Most places of a track.
+/// Most points of a track.
 const TRACK_MAX: usize = 64;
 
 /// Where the satellites were at the time of the latest data.
@@ -33,7 +33,7 @@ pub struct ArrayNow {
     pub moon_radius_m: f64,
     /// Positions of the satellites, m, Moon-centred ecliptic axes.
     pub positions_m: Vec<Vec3>,
-    /// Satellite 1 at that time, or as near to it as its velocity is known.
+    /// Satellite 1 at that time, or at the nearest time with a known velocity.
     pub motion: SatelliteState,
     /// First and last time of the positions that came with the latest, s.
     pub known_s: [f64; 2],
@@ -72,31 +72,31 @@ struct Views {
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// Visitors may come at any time.
+    /// Whether visitors may come.
     is_open: AtomicBool,
-    /// Something new is due, even from a ground that never rests.
+    /// Whether visitors expect an update, even from a ground that never rests.
     is_due: AtomicBool,
     views: Mutex<Views>,
-    /// By channel; the ground waits for a copy of one at most, some microseconds.
+    /// By channel. The ground waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
-    /// Likewise.
+    /// Directions seen, by channel; copied like `densities`.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
     /// Likewise.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
 
-/// Where visitors see passes, positions and baselines; clones share it. The ground puts the newest there when it rests, and at
-/// times while it works.
+/// Passes, positions and baselines for visitors of the page; clones share it. The ground updates it when it is idle, and from time to time
+/// while it works.
 #[derive(Clone, Debug, Default)]
-pub struct Lookout(Arc<Shared>);
+pub struct LiveView(Arc<Shared>);
 
-impl Lookout {
-    /// From now on visitors may come. To be called before the ground begins: what went before is not counted.
+impl LiveView {
+    /// Opens it to visitors. Call it before the ground begins: earlier data are not counted.
     pub fn open(&self) {
         self.0.is_open.store(true, Ordering::Relaxed);
     }
 
-    /// Something new is due from a ground that never rests. To be called at the intervals at which visitors expect that.
+    /// Asks a busy ground for an update. Call it at the intervals at which visitors expect one.
     pub fn refresh(&self) {
         self.0.is_due.store(true, Ordering::Relaxed);
     }
@@ -119,7 +119,7 @@ impl Lookout {
         self.densities().get(&channel).cloned()
     }
 
-    /// Where the pairs of a channel stood, of this session.
+    /// Visibilities of this session by direction, for a channel.
     #[must_use]
     pub fn hits(&self, channel: ChannelId) -> Option<SkyHits> {
         self.all_hits().get(&channel).cloned()
@@ -148,13 +148,13 @@ impl Lookout {
     }
 }
 
-/// When a ground shows itself.
+/// What a ground is doing when it updates the view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Occasion {
+pub(super) enum Activity {
     /// Between two steps of many.
-    Work,
+    Working,
     /// Nothing waits to be done, or it has finished.
-    Rest,
+    Idle,
 }
 
 /// Which auto-correlations a block holds.
@@ -165,38 +165,38 @@ pub(super) struct AutoSpan {
     span: [MissionTime; 2],
 }
 
-/// The ground's side of a [`Lookout`].
+/// The ground's side of a [`LiveView`].
 #[derive(Debug, Default)]
-pub(super) struct Spotter {
-    lookout: Lookout,
+pub(super) struct LiveViewWriter {
+    live_view: LiveView,
     latest_s: Option<f64>,
 }
 
-impl Spotter {
-    /// That of a lookout.
-    pub(super) fn of(lookout: &Lookout) -> Self {
-        Self { lookout: lookout.clone(), ..Self::default() }
+impl LiveViewWriter {
+    /// The writer of a live view.
+    pub(super) fn of(live_view: &LiveView) -> Self {
+        Self { live_view: live_view.clone(), ..Self::default() }
     }
 
-    /// Puts what earlier sessions received into the lookout, of which the latest visibilities were made at a time.
+    /// Shows what earlier sessions received; `latest_s` is the time of their latest visibilities.
     pub(super) fn resume(&mut self, latest_s: Option<f64>, collector: &Collector, ephemeris: &Ephemeris) {
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
         self.put(collector, ephemeris);
     }
 
-    /// A block of auto-correlations that is about to be calibrated, if somebody may look.
+    /// The span of a block of auto-correlations that is about to be calibrated, if the page is served.
     pub(super) fn expect_powers(&self, frame: Option<&GroundFrame>) -> Option<AutoSpan> {
         let Some(GroundFrame::Visibilities(block)) = frame else { return None };
         let (Pair { i, j }, last) = (block.pair, block.len().checked_sub(1)?);
         let length = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
         let span = [i64::from(block.offset_ticks[0]), length].map(|ticks| block.start.plus_ticks(ticks));
-        let is_wanted = i == j && self.lookout.0.is_open.load(Ordering::Relaxed);
+        let is_wanted = i == j && self.live_view.0.is_open.load(Ordering::Relaxed);
         is_wanted.then_some(AutoSpan { channel: block.channel, daughter: i, span })
     }
 
-    /// Notes the powers that a block has become.
+    /// Adds the calibrated powers of a block.
     pub(super) fn see_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
-        let mut powers = self.lookout.all_powers();
+        let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
             let waterfall = powers.entry(channel).or_default();
             autos
@@ -205,10 +205,10 @@ impl Spotter {
         }
     }
 
-    /// Notes visibilities that have got their positions.
+    /// Adds visibilities with positions.
     pub(super) fn see(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
-            && self.lookout.0.is_open.load(Ordering::Relaxed)
+            && self.live_view.0.is_open.load(Ordering::Relaxed)
         {
             self.note(placed);
         }
@@ -217,20 +217,20 @@ impl Spotter {
     fn note(&mut self, placed: &PlacedVisibilities) {
         let latest_s = placed.time_s.last().copied();
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
-        let mut densities = self.lookout.densities();
+        let mut densities = self.live_view.densities();
         if densities.len() < CHANNELS_MAX || densities.contains_key(&placed.channel) {
             let density = densities.entry(placed.channel);
             density.or_insert_with(|| UvwDensity::new(placed.frequency_hz)).add(placed);
-            let mut hits = self.lookout.all_hits();
+            let mut hits = self.live_view.all_hits();
             hits.entry(placed.channel).or_insert_with(|| SkyHits::new(placed.frequency_hz)).add(placed);
         }
     }
 
-    /// Puts the newest into the lookout, if it is time for that.
-    pub(super) fn show(&self, occasion: Occasion, collector: &Collector, ephemeris: &Ephemeris) {
-        let Shared { is_open, is_due, .. } = &*self.lookout.0;
+    /// Updates the live view, if an update is due.
+    pub(super) fn show(&self, activity: Activity, collector: &Collector, ephemeris: &Ephemeris) {
+        let Shared { is_open, is_due, .. } = &*self.live_view.0;
         let is_open = is_open.load(Ordering::Relaxed);
-        let is_time = is_open && (occasion == Occasion::Rest || is_due.swap(false, Ordering::Relaxed));
+        let is_time = is_open && (activity == Activity::Idle || is_due.swap(false, Ordering::Relaxed));
         if is_time {
             self.put(collector, ephemeris);
         }
@@ -240,6 +240,6 @@ impl Spotter {
         let Some(instrument) = collector.instrument() else { return };
         let passes = PassLine::of(instrument.epoch_tai_s, collector.received());
         let array = self.latest_s.and_then(|latest_s| ArrayNow::at(ephemeris, instrument, latest_s));
-        *self.lookout.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
+        *self.live_view.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
     }
 }

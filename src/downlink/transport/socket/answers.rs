@@ -23,7 +23,7 @@ const REST: u32 = 9;
 /// The source counts the bytes that it passes on; the ground says how many of them its newest checkpoint holds. Nothing here
 /// waits: answers are a few bytes, on connections that do not block.
 #[derive(Clone, Debug)]
-pub struct HeldAnswers(Arc<Mutex<HeldState>>);
+pub struct HeldAnswers(Arc<Mutex<AnswersState>>);
 
 /// A sender of which everything has been passed on.
 #[derive(Debug)]
@@ -37,7 +37,7 @@ pub(super) struct WaitingSender {
 }
 
 #[derive(Debug)]
-struct HeldState {
+struct AnswersState {
     waiting: VecDeque<WaitingSender>,
     /// Bytes of all senders that the newest checkpoint holds.
     held: u64,
@@ -63,7 +63,7 @@ impl HeldAnswers {
     #[must_use]
     pub fn new(pause: Duration) -> Self {
         let waiting = VecDeque::new();
-        let state = HeldState {
+        let state = AnswersState {
             waiting,
             held: 0,
             given: 0,
@@ -103,7 +103,7 @@ impl HeldAnswers {
     pub(super) fn ask(&self, given: u64) -> bool {
         let mut state = self.state();
         let now = Instant::now();
-        state.note_given(given, now);
+        state.note_passed_on(given, now);
         let is_time = state.not_before.is_none_or(|instant| now >= instant);
         let has_ended = (state.held + 1..=given).contains(&state.ended);
         let is_idle = now.saturating_duration_since(state.given_at) >= IDLE;
@@ -153,14 +153,14 @@ impl HeldAnswers {
         self.state().end();
     }
 
-    fn state(&self) -> MutexGuard<'_, HeldState> {
+    fn state(&self) -> MutexGuard<'_, AnswersState> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl HeldState {
+impl AnswersState {
     /// The ground has got so many bytes.
-    fn note_given(&mut self, given: u64, now: Instant) {
+    fn note_passed_on(&mut self, given: u64, now: Instant) {
         if given > self.given {
             (self.given, self.given_at) = (given, now);
             if given > self.held {
@@ -178,7 +178,7 @@ impl HeldState {
     }
 }
 
-impl Drop for HeldState {
+impl Drop for AnswersState {
     fn drop(&mut self) {
         for sender in self.waiting.drain(..) {
             sender.say_not("the ground ended before a checkpoint held them");

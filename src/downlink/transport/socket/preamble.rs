@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::held::ASKS_HELD;
+use super::answers::ASKS_HELD;
 use super::report::ConnectionEnd;
 use super::stations::{Stations, TOKEN_BYTES_MAX};
 
@@ -12,7 +12,7 @@ pub(super) const TOKEN: &[u8] = b"token ";
 
 /// The lines before the packets: `token TOKEN`, then `answer held`, or either, or none. Whatever differs from them belongs to the
 /// packets.
-pub(super) struct Opening {
+pub(super) struct Preamble {
     /// Who may send; `None` for everyone.
     stations: Option<Arc<Stations>>,
     /// Whether a sender may ask what checkpoints hold.
@@ -27,7 +27,7 @@ pub(super) struct Opening {
 }
 
 /// What a beginning of a line may become.
-enum Becoming {
+enum LineStart {
     /// One of the two lines.
     Line,
     /// The line with a token, which is here.
@@ -38,7 +38,7 @@ enum Becoming {
     Packets,
 }
 
-impl Opening {
+impl Preamble {
     pub(super) fn new(stations: Option<Arc<Stations>>, may_ask: bool) -> Self {
         Self {
             stations,
@@ -63,18 +63,18 @@ impl Opening {
             rest = after;
             self.line.push(octet);
             match self.becoming() {
-                Becoming::Line => {}
-                Becoming::Token => {
+                LineStart::Line => {}
+                LineStart::Token => {
                     self.has_token = true;
                     self.know()?;
                     self.end_line();
                 }
-                Becoming::Question => {
+                LineStart::Question => {
                     self.asks_held = true;
                     self.end_line();
                     self.end()?;
                 }
-                Becoming::Packets => self.end()?,
+                LineStart::Packets => self.end()?,
             }
         }
         Ok((std::mem::take(&mut self.line), rest))
@@ -83,7 +83,7 @@ impl Opening {
     /// The connection has ended; returns what belongs to the packets after all.
     ///
     /// # Errors
-    /// As [`Opening::take`]. A connection without a byte needs no token.
+    /// As [`Preamble::take`]. A connection without a byte needs no token.
     pub(super) fn finish(&mut self) -> Result<Vec<u8>, ConnectionEnd> {
         let is_empty = self.line.is_empty() && self.bytes == 0;
         if !self.is_over && !is_empty {
@@ -92,10 +92,10 @@ impl Opening {
         Ok(std::mem::take(&mut self.line))
     }
 
-    fn becoming(&self) -> Becoming {
+    fn becoming(&self) -> LineStart {
         let Self { line, .. } = self;
         if line == ASKS_HELD {
-            return Becoming::Question;
+            return LineStart::Question;
         }
         let may_be_token = !self.has_token
             && match line.strip_prefix(TOKEN) {
@@ -106,10 +106,10 @@ impl Opening {
                 None => TOKEN.starts_with(line),
             };
         match may_be_token {
-            true if line.ends_with(b"\n") => Becoming::Token,
-            true => Becoming::Line,
-            false if ASKS_HELD.starts_with(line) => Becoming::Line,
-            false => Becoming::Packets,
+            true if line.ends_with(b"\n") => LineStart::Token,
+            true => LineStart::Line,
+            false if ASKS_HELD.starts_with(line) => LineStart::Line,
+            false => LineStart::Packets,
         }
     }
 
@@ -165,14 +165,14 @@ mod tests {
     }
 
     /// Everything that belongs to the packets, or why the connection ends, in pieces of `piece` bytes.
-    fn through(opening: &mut Opening, bytes: &[u8], piece: usize) -> Result<Vec<u8>, ConnectionEnd> {
+    fn through(preamble: &mut Preamble, bytes: &[u8], piece: usize) -> Result<Vec<u8>, ConnectionEnd> {
         let mut packets = Vec::new();
         for bytes in bytes.chunks(piece) {
-            let (held, rest) = opening.take(bytes)?;
+            let (held, rest) = preamble.take(bytes)?;
             packets.extend_from_slice(&held);
             packets.extend_from_slice(rest);
         }
-        packets.extend(opening.finish()?);
+        packets.extend(preamble.finish()?);
         Ok(packets)
     }
 
@@ -181,18 +181,18 @@ mod tests {
         let packets = b"token and answer are only read before the packets\nanswer held\n";
         for piece in [1, 3, 7, 1000] {
             for (question, asks) in [(b"".as_slice(), false), (ASKS_HELD, true)] {
-                let mut opening = Opening::new(stations(), true);
+                let mut preamble = Preamble::new(stations(), true);
                 let sent = [TOKEN, SECRET, b"\n", question, &packets[..]].concat();
-                assert_eq!(through(&mut opening, &sent, piece).as_deref(), Ok(packets.as_slice()));
-                assert_eq!((opening.station(), opening.asks_held()), (Some("urumqi"), asks));
-                assert_eq!(opening.bytes() as usize, sent.len() - packets.len());
+                assert_eq!(through(&mut preamble, &sent, piece).as_deref(), Ok(packets.as_slice()));
+                assert_eq!((preamble.station(), preamble.asks_held()), (Some("urumqi"), asks));
+                assert_eq!(preamble.bytes() as usize, sent.len() - packets.len());
             }
         }
     }
 
     #[test]
     fn without_the_token_of_a_station_nothing_is_taken() {
-        let ends = |sent: &[u8]| through(&mut Opening::new(stations(), true), sent, 5).unwrap_err();
+        let ends = |sent: &[u8]| through(&mut Preamble::new(stations(), true), sent, 5).unwrap_err();
         for wrong in [b"0123456789abcdeg".as_slice(), b"0123456789abcde", b"", b"urumqi"] {
             assert_eq!(ends(&[TOKEN, wrong, b"\npackets"].concat()), ConnectionEnd::UnknownToken);
         }
@@ -205,14 +205,14 @@ mod tests {
             assert_eq!(ends(sent), ConnectionEnd::NoToken, "{}", String::from_utf8_lossy(sent));
         }
         // Nothing at all, as who looks whether somebody listens: no harm.
-        assert_eq!(through(&mut Opening::new(stations(), true), b"", 5), Ok(Vec::new()));
+        assert_eq!(through(&mut Preamble::new(stations(), true), b"", 5), Ok(Vec::new()));
     }
 
     #[test]
     fn a_ground_that_asks_for_no_token_skips_it() {
         let sent = [TOKEN, b"whatever-it-is\n", ASKS_HELD, b"packets"].concat();
-        let mut opening = Opening::new(None, true);
-        assert_eq!(through(&mut opening, &sent, 4).as_deref(), Ok(b"packets".as_slice()));
-        assert!(opening.station().is_none() && opening.asks_held());
+        let mut preamble = Preamble::new(None, true);
+        assert_eq!(through(&mut preamble, &sent, 4).as_deref(), Ok(b"packets".as_slice()));
+        assert!(preamble.station().is_none() && preamble.asks_held());
     }
 }

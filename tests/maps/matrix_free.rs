@@ -5,10 +5,12 @@ use crate::common;
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::anywhere::{RefinedSetup, VisibilityArchive};
 use lunarray::imaging::{
-    EngineKind, MapConfig, MatrixKind, NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums,
-    RefineConfig, RemadeSums, RemadeVisibilities,
+    EngineKind, MapConfig, MatrixFreeSums, MatrixFreeVisibilities, MatrixKind, NormalEngine, NormalSums,
+    PixelEngine, PixelSetup, PixelSums, RefineConfig,
 };
-use lunarray::imaging::{PixelSolution, SolveError, SolveWatch, StoppingRule, solve_pixels, solve_remade};
+use lunarray::imaging::{
+    PixelSolution, SolveError, SolveWatch, StoppingRule, solve_matrix_free, solve_pixels,
+};
 use lunarray::pipeline::Config;
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::response::pixel::PixelMethod;
@@ -69,8 +71,8 @@ fn archive(blocks: &[PlacedVisibilities]) -> VisibilityArchive {
     archive
 }
 
-fn remade(archive: VisibilityArchive, method: PixelMethod) -> RemadeSums {
-    RemadeVisibilities { nside: NSIDE, method, archive }.into_sums().unwrap()
+fn matrix_free(archive: VisibilityArchive, method: PixelMethod) -> MatrixFreeSums {
+    MatrixFreeVisibilities { nside: NSIDE, method, archive }.into_sums().unwrap()
 }
 
 fn held(blocks: &[PlacedVisibilities], method: PixelMethod) -> PixelSums {
@@ -90,8 +92,8 @@ fn held(blocks: &[PlacedVisibilities], method: PixelMethod) -> PixelSums {
     engine.into_sums()
 }
 
-fn solve(sums: &RemadeSums, epsilon: f64, prior_k: Option<&[f64]>) -> PixelSolution {
-    solve_remade(sums, epsilon, prior_k, None, RULE, SolveWatch::default().named("test")).unwrap().0
+fn solve(sums: &MatrixFreeSums, epsilon: f64, prior_k: Option<&[f64]>) -> PixelSolution {
+    solve_matrix_free(sums, epsilon, prior_k, None, RULE, SolveWatch::default().named("test")).unwrap().0
 }
 
 /// Euclidean, relative.
@@ -109,16 +111,16 @@ fn maps_are_those_of_the_held_matrix() {
     for noisy in [false, true] {
         let blocks = data(noisy);
         for method in [PixelMethod::Centre, PixelMethod::Average] {
-            let (held, remade) = (held(&blocks, method), remade(archive(&blocks), method));
-            assert_eq!(remade.counts().visibilities, held.counts().visibilities);
+            let (held, matrix_free) = (held(&blocks, method), matrix_free(archive(&blocks), method));
+            assert_eq!(matrix_free.counts().visibilities, held.counts().visibilities);
             // The sums of the power are of the same exact integers.
-            assert_eq!(remade.counts(), held.counts());
+            assert_eq!(matrix_free.counts(), held.counts());
             let prior: Vec<f64> =
-                (0..remade.unknowns()).map(|p| 2e6 + 1e6 * (0.1 * p as f64).sin()).collect();
+                (0..matrix_free.unknowns()).map(|p| 2e6 + 1e6 * (0.1 * p as f64).sin()).collect();
             for prior in [None, Some(prior.as_slice())] {
                 let what = format!("{method:?}, noise {noisy}, prior {}", prior.is_some());
                 let expected = solve_pixels(held.clone(), epsilon, prior).unwrap();
-                let found = solve(&remade, epsilon, prior);
+                let found = solve(&matrix_free, epsilon, prior);
                 let of_w_max = found.diagnostics.w_max.unwrap() / expected.diagnostics.w_max.unwrap() - 1.0;
                 // Lanczos ends when a product changes it by less than 1e-6.
                 assert!(of_w_max.abs() < 1e-5, "{what}: {of_w_max:e}");
@@ -137,7 +139,7 @@ fn maps_are_those_of_the_held_matrix() {
 fn products_are_those_of_the_held_matrix() {
     let blocks = data(true);
     for method in [PixelMethod::Centre, PixelMethod::Average] {
-        let (held, remade) = (held(&blocks, method), remade(archive(&blocks), method));
+        let (held, matrix_free) = (held(&blocks, method), matrix_free(archive(&blocks), method));
         let pixels = held.unknowns();
         for x in [
             (0..pixels).map(|p| (1.7 * p as f64).sin()).collect::<Vec<f64>>(),
@@ -145,13 +147,13 @@ fn products_are_those_of_the_held_matrix() {
         ] {
             let mut product = [vec![0.0; pixels], vec![0.0; pixels]];
             held.apply(&x, &mut product[0]);
-            remade.apply(&x, &mut product[1]);
+            matrix_free.apply(&x, &mut product[1]);
             // The rows are the same numbers; their sums in f32 are good to some 1e-7 of the greatest eigenvalue.
             assert!(difference(&product[1], &product[0]) < 1e-6, "{method:?}");
         }
         for (found, expected) in [
-            (remade.right_hand_side(), held.right_hand_side()),
-            (remade.noise_right_hand_side(), held.noise_right_hand_side()),
+            (matrix_free.right_hand_side(), held.right_hand_side()),
+            (matrix_free.noise_right_hand_side(), held.noise_right_hand_side()),
         ] {
             assert!(difference(found, expected) < 1e-6, "{method:?}");
         }
@@ -172,7 +174,8 @@ fn products_agree_with_other_code() {
     for block in &blocks {
         assert_eq!(archive.add(block).unwrap().visibilities, 1);
     }
-    let sums = RemadeVisibilities { nside: setup.nside, method: setup.method, archive }.into_sums().unwrap();
+    let sums =
+        MatrixFreeVisibilities { nside: setup.nside, method: setup.method, archive }.into_sums().unwrap();
     // Rows in f32.
     assert!(difference(sums.right_hand_side(), &numbers(&reference["dirty_map"])) < 1e-6);
     let expected = numbers(&reference["solutions"]["0.01"]["map_k"]);
@@ -195,8 +198,12 @@ fn bits_are_those_of_the_visibilities_alone() {
     let map = |archive: VisibilityArchive, threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| {
-            let sums = remade(archive, PixelMethod::Average);
-            bits(&solve_remade(&sums, 1e-2, None, None, rule, SolveWatch::default().named("test")).unwrap().0)
+            let sums = matrix_free(archive, PixelMethod::Average);
+            bits(
+                &solve_matrix_free(&sums, 1e-2, None, None, rule, SolveWatch::default().named("test"))
+                    .unwrap()
+                    .0,
+            )
         })
     };
     let once = map(archive(&blocks), 1);
@@ -228,10 +235,10 @@ fn bits_are_those_of_the_visibilities_alone() {
 #[test]
 fn an_iteration_says_how_it_ended() {
     let blocks = data(false);
-    let sums = remade(archive(&blocks), PixelMethod::Centre);
+    let sums = matrix_free(archive(&blocks), PixelMethod::Centre);
     let few = StoppingRule { residual_max: 1e-6, iterations_max: 3 };
     let solve = |prior: Option<&[f64]>, rule, watch: &SolveWatch| {
-        solve_remade(&sums, 1e-4, prior, None, rule, watch.named("test"))
+        solve_matrix_free(&sums, 1e-4, prior, None, rule, watch.named("test"))
     };
     let found = solve(None, few, &SolveWatch::default()).unwrap().0.diagnostics.convergence.unwrap();
     assert!(!found.converged && found.iterations == 3 && found.residual > 1e-6, "{found:?}");
@@ -243,30 +250,34 @@ fn an_iteration_says_how_it_ended() {
     cancel.cancel();
     let watch = SolveWatch::new(cancel).within(std::time::Duration::ZERO);
     assert_eq!(solve(None, few, &watch).unwrap_err(), SolveError::Interrupted);
-    let empty = remade(archive(&[]), PixelMethod::Centre);
-    let nothing = solve_remade(&empty, 1e-4, None, None, few, SolveWatch::default().named("test"));
+    let empty = matrix_free(archive(&[]), PixelMethod::Centre);
+    let nothing = solve_matrix_free(&empty, 1e-4, None, None, few, SolveWatch::default().named("test"));
     assert_eq!(nothing.unwrap_err(), SolveError::NoData);
 }
 
 #[test]
 fn the_key_is_refused_where_it_has_no_effect() {
-    let remade = MapConfig { matrix: MatrixKind::Remade, ..MapConfig::default() };
+    let matrix_free = MapConfig { matrix: MatrixKind::Free, ..MapConfig::default() };
     let problems = |map: &MapConfig| -> Vec<String> {
         let config = Config { map: map.clone(), ..Config::default() };
         config.ground_problems().iter().map(ToString::to_string).collect()
     };
-    assert_eq!(problems(&remade), Vec::<String>::new());
+    assert_eq!(problems(&matrix_free), Vec::<String>::new());
     let refine = RefineConfig { visibilities_max: 5, ..RefineConfig::default() };
-    let large = MapConfig { nside: 256, residual_max: 1e-3, iterations_max: 900, refine, ..remade.clone() };
+    let large =
+        MapConfig { nside: 256, residual_max: 1e-3, iterations_max: 900, refine, ..matrix_free.clone() };
     assert_eq!(problems(&large), Vec::<String>::new());
     for (config, key) in [
-        (MapConfig { engine: EngineKind::Harmonic, ..remade.clone() }, "map.matrix"),
-        (MapConfig { trace_probes: 3, ..remade.clone() }, "map.trace_probes"),
-        (MapConfig { beams_deg: vec![[0.0, 0.0]], ..remade.clone() }, "map.beams_deg"),
-        (MapConfig { nside: 512, ..remade.clone() }, "map.nside"),
-        (MapConfig { l_max: 5, ..remade.clone() }, "map.l_max"),
+        (MapConfig { engine: EngineKind::Harmonic, ..matrix_free.clone() }, "map.matrix"),
+        (MapConfig { trace_probes: 3, ..matrix_free.clone() }, "map.trace_probes"),
+        (MapConfig { beams_deg: vec![[0.0, 0.0]], ..matrix_free.clone() }, "map.beams_deg"),
+        (MapConfig { nside: 512, ..matrix_free.clone() }, "map.nside"),
+        (MapConfig { l_max: 5, ..matrix_free.clone() }, "map.l_max"),
         (
-            MapConfig { refine: RefineConfig { passes_max: 2, ..RefineConfig::default() }, ..remade.clone() },
+            MapConfig {
+                refine: RefineConfig { passes_max: 2, ..RefineConfig::default() },
+                ..matrix_free.clone()
+            },
             "map.refine",
         ),
         // Without it what only an iteration has is refused, as before.

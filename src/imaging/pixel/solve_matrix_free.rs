@@ -7,7 +7,7 @@ use crate::imaging::solver::SolveError;
 use crate::imaging::solver::add;
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, random_vector};
 use crate::imaging::solver::{StoppingRule, System};
-use crate::imaging::{NormalSums, RemadeSums};
+use crate::imaging::{MatrixFreeSums, NormalSums};
 
 /// Change of W_max from product to product, relative, at which it is found. Products are good to some 1e-7; and W_max only scales R,
 /// so that it changes the map by less than the iteration leaves.
@@ -18,8 +18,8 @@ const W_MAX_TOLERANCE: f64 = 1e-6;
 ///
 /// # Errors
 /// No data; a prior of another size; [`SolveError::Interrupted`].
-pub fn solve_remade(
-    sums: &RemadeSums,
+pub fn solve_matrix_free(
+    sums: &MatrixFreeSums,
     epsilon: f64,
     prior_k: Option<&[f64]>,
     start: Option<[Vec<f64>; 2]>,

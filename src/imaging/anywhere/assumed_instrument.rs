@@ -1,4 +1,4 @@
-//! What the ground believes of visibilities besides their positions: that they are averages, and how antennas point and see.
+//! Integration times and antenna responses that the ground assumes.
 
 use crate::array::{orbit_normal_hat, tilted_axes};
 use crate::frames::AntennaResponse;
@@ -7,7 +7,7 @@ use crate::response::general::{PairAt, PairResponse};
 use crate::response::pixel::SatelliteAntenna;
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
-/// A satellite's positions further apart in time than this say nothing of its plane, s: a quarter of a low orbit.
+/// Positions of a satellite further apart in time than this do not define its plane, s: a quarter of a low orbit.
 const SAME_PASS_S: f64 = 1500.0;
 
 /// Whether one visibility follows another of the same pair soon after.
@@ -16,45 +16,45 @@ pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool 
     before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
 }
 
-/// Angle between the normals of two satellites' orbits and that of their plane, rad, up to which dipoles along either are the same: rows
+/// Greatest angle between a satellite's orbit normal and that of the pair's plane at which their dipoles count as parallel, rad: rows
 /// err by it.
 const SAME_NORMAL_RAD: f64 = 1e-5;
 
-/// Angle between the attitudes of two satellites, rad, up to which three dipoles on each are taken to see all directions alike: rows err by half
-/// its square.
+/// Greatest angle between the attitudes of two satellites at which three dipoles on each count as isotropic, rad: rows err by half its
+/// square.
 const SAME_ATTITUDE_RAD: f64 = 3e-3;
 
 /// The antenna of a daughter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct AntennaBelief {
+pub struct AssumedAntenna {
     /// Tilt of its axis from the orbit's normal towards the track's direction, and away from the Moon, degrees.
     pub tilt_deg: [f64; 2],
     /// q of a factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
     pub distortion: f64,
 }
 
-/// What rows of the true positions are made with.
+/// Integration times and antenna responses in the rows at true positions.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct RowBelief {
+pub struct AssumedInstrument {
     /// Whether visibilities are averages over their integrations, or instants in their middle.
     pub smear_integrations: bool,
     /// Antennas by daughter; those beyond the list are ideal.
-    pub antennas: Vec<AntennaBelief>,
+    pub antennas: Vec<AssumedAntenna>,
     /// Distortions of their patterns by frequency, which are added to theirs.
     pub patterns: PatternsByFrequency,
 }
 
-/// Antennas of pairs whose response is not that of rows.
+/// Antennas of pairs that differ from the response of the rows.
 #[derive(Clone, Debug)]
 pub(in crate::imaging) struct PairAntennas {
-    antennas: Vec<AntennaBelief>,
+    antennas: Vec<AssumedAntenna>,
     patterns: PatternsByFrequency,
     frequency_hz: f64,
     elements: AntennaResponse,
 }
 
-impl RowBelief {
-    /// The antennas of the pairs of sorted visibilities, where rows of a response alone do not have them.
+impl AssumedInstrument {
+    /// Antennas of the pairs of sorted visibilities, where they differ from the response of the rows.
     pub(in crate::imaging) fn antennas_of(
         &self,
         elements: AntennaResponse,
@@ -78,7 +78,7 @@ impl PairAntennas {
         !self.patterns.is_ideal() || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
     }
 
-    /// Degree of their responses as polynomials.
+    /// Degree of their responses, which are polynomials.
     pub(in crate::imaging) fn degree(&self) -> usize {
         self.elements.degree() + 4 * usize::from(self.is_distorted())
     }

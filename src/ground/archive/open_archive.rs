@@ -1,0 +1,230 @@
+//! A folder of checkpoints that is open, and the ground that goes on from it.
+
+use std::io::ErrorKind;
+use std::path::Path;
+use std::time::Duration;
+
+use super::calibration_state::CalibrationState;
+use super::checkpoint::{self, ArchiveHead};
+use super::folder::StateFolder;
+use super::journal::Journal;
+use super::names::parts_with;
+use super::settings::{compare, settings_of};
+use super::store::Archive;
+use crate::calibration::AutoTable;
+use crate::downlink::{DownlinkError, Kind};
+use crate::frames::{EphemerisSegment, VisibilityReason};
+use crate::ground::live_view::LiveViewWriter;
+use crate::ground::promises::SenderPromises;
+use crate::ground::{Collector, CollectorState, Ground, GroundConfig, GroundError, GroundOutcome};
+use crate::imaging::{AccumulationError, Accumulator};
+use crate::ranks::{RankShare, Ranks};
+use crate::runtime::{Cancel, Ledger};
+
+/// What is expected of a file that a checkpoint names.
+const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
+
+/// All that a checkpoint holds: data, and the journal.
+pub(super) struct ArchiveContents {
+    pub(super) collector: CollectorState,
+    pub(super) ephemeris: Vec<EphemerisSegment>,
+    pub(super) autos: AutoTable,
+    pub(super) accumulator: Accumulator,
+    pub(super) journal: Journal,
+    pub(super) calibration: CalibrationState,
+}
+
+impl ArchiveContents {
+    /// The contents of a ground that has received nothing.
+    pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
+        Self {
+            collector: CollectorState::new(config.wait_bytes),
+            ephemeris: Vec::new(),
+            autos: AutoTable::default(),
+            accumulator: config.accumulator(posts),
+            journal: Journal::default(),
+            calibration: CalibrationState::default(),
+        }
+    }
+
+    /// Adds what another ground has received: records, sums, and data that only it has.
+    ///
+    /// # Errors
+    /// Another instrument; a packet of visibilities that is in both journals.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
+        if self.calibration.is_solved() || other.calibration.is_solved() {
+            return Err(GroundError::SolvedApart);
+        }
+        self.calibration.version = self.calibration.version.max(other.calibration.version);
+        self.journal.merge(other.journal).map_err(|count| {
+            let apid = Kind::Visibilities.apid();
+            DownlinkError::TakenTwice { apid, count }
+        })?;
+        self.collector.merge(other.collector, |header| self.journal.contains(header))?;
+        // Of segments that start at the same time the first is used.
+        self.ephemeris.extend(other.ephemeris);
+        self.autos.merge(other.autos);
+        Ok(self.accumulator.merge(other.accumulator)?)
+    }
+}
+
+/// Reads a checkpoint, of all parts that there are, into an accumulator without sums; `check` looks at its head first.
+fn read_parts(
+    path: &Path,
+    empty: &Accumulator,
+    check: impl Fn(&ArchiveHead) -> Result<(), GroundError>,
+) -> Result<(ArchiveHead, Accumulator), GroundError> {
+    let of_part = |path: &Path, part: RankShare, empty: Accumulator| {
+        checkpoint::read(path, |head, engines| {
+            check(&head)?;
+            let sums = empty.resume_part(head.accumulator.clone(), engines, path.parent(), part);
+            Ok((head, sums.map_err(|error| unreadable(path, error))?))
+        })
+    };
+    let mut whole: Option<(ArchiveHead, Accumulator)> = None;
+    for (path, part) in parts_with(path) {
+        let (head, sums) = of_part(&path, part, empty.without_sums())?;
+        match &mut whole {
+            None => whole = Some((head, sums)),
+            Some((first, _)) if first.checksum != head.checksum => {
+                let found = "another state than that of the first part".to_owned();
+                return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
+            }
+            Some((_, joined)) => joined.join(sums)?,
+        }
+    }
+    whole.ok_or_else(|| GroundError::without_checkpoint(path))
+}
+
+/// Translates a reader's error: data that end too early are damaged; a system's error says nothing of the data.
+fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
+    match error {
+        AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
+            GroundError::io(path, "read")(source)
+        }
+        AccumulationError::Segment { path, found } => GroundError::Damaged { path, found, expected: SEGMENT },
+        other => other.into(),
+    }
+}
+
+/// A folder that is open, and what its newest usable checkpoint holds.
+pub(super) struct OpenArchive {
+    pub(super) folder: StateFolder,
+    contents: Option<ArchiveContents>,
+    notes: Vec<String>,
+    settings: Vec<(String, String)>,
+    posts: Ledger<VisibilityReason>,
+}
+
+impl OpenArchive {
+    /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
+    pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
+        Self::among(folder, config, sets_aside, &Ranks::one())
+    }
+
+    /// As [`OpenArchive::new`], as one rank of several.
+    pub(super) fn among(
+        folder: &Path,
+        config: &GroundConfig,
+        sets_aside: bool,
+        ranks: &Ranks,
+    ) -> Result<Self, GroundError> {
+        if config.map.holds_visibilities() && ranks.are_many() {
+            return Err(AccumulationError::HeldByRank.into());
+        }
+        let mut folder = match sets_aside || ranks.are_many() {
+            true => StateFolder::open_with_ranks(folder, ranks)?,
+            false => StateFolder::open_to_read(folder)?,
+        };
+        let settings = settings_of(config)?;
+        let posts = Ledger::new();
+        let (contents, notes) = folder.load(sets_aside, |path| {
+            let empty = config.accumulator(&posts).among(ranks);
+            let (head, accumulator) =
+                read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
+            let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
+            Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration })
+        })?;
+        if let Some(contents) = &contents {
+            folder.names(contents.accumulator.segments());
+        }
+        Ok(Self { folder, contents, notes, settings, posts })
+    }
+
+    /// From now on the contents belong into another folder, which is new.
+    pub(super) fn move_to(&mut self, folder: StateFolder) {
+        self.folder = folder;
+        if let Some(contents) = &mut self.contents {
+            contents.accumulator.leave_segments();
+        }
+    }
+
+    /// Merges the contents of another folder into these.
+    pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
+        self.notes.extend(other.notes);
+        match (&mut self.contents, other.contents) {
+            (Some(ours), Some(theirs)) => return ours.merge(theirs),
+            (None, theirs) => self.contents = theirs,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// A ground that resumes from these contents.
+    pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
+        let Self { folder, contents, notes, settings, posts } = self;
+        let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
+        let ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration } = contents;
+        // Also of a new archive.
+        let mut accumulator = accumulator.among(folder.ranks());
+        let mut outcome = GroundOutcome::default();
+        outcome.saving.begin();
+        outcome.ledger.post_report(&journal.ledger());
+        accumulator.set_spans(&journal.spans_s());
+        let instrument = collector.instrument().cloned();
+        let mut gate = config.gate()?;
+        if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {
+            config.map.check_priors(&config.described(instrument)?)?;
+        }
+        if let (Some(gate), Some(instrument)) = (&mut gate, &instrument) {
+            gate.describe(instrument)?;
+            gate.resume(calibration.passes);
+        }
+        outcome.gains = gate.as_ref().map(|gate| gate.gains().clone());
+        let calibrator = config.calibrator(gate.as_ref(), &posts)?;
+        let calibrator = calibrator.resume(instrument, ephemeris, autos, journal.blocks());
+        let collector = Collector::resume(collector, journal.delivered(), journal.reception());
+        let (interval, saving, version) = (interval.max(1), outcome.saving.clone(), calibration.version);
+        let (wait, since_attempt) = (interval, 0);
+        let archive = Archive {
+            folder,
+            settings,
+            version,
+            journal,
+            notes,
+            posts,
+            interval,
+            wait,
+            since_attempt,
+            saving,
+            packets: None,
+        };
+        let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
+        let promises = SenderPromises::since(collector.packets());
+        let live_view_writer = LiveViewWriter::of(&outcome.live_view);
+        Ok(Ground {
+            collector,
+            calibrator,
+            gate,
+            accumulator,
+            outcome,
+            archive: Some(archive),
+            cancel,
+            linger,
+            begins_with_maps: false,
+            steps,
+            promises,
+            live_view_writer,
+        })
+    }
+}
