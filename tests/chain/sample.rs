@@ -73,9 +73,11 @@ fn samples_scatter_around_the_map_by_its_errors() {
             // Files hold single precision.
             assert!((drawn[pixel] / variance(pixel).sqrt() - 1.0).abs() < 1e-3, "{engine}, {pixel}");
         }
-        // The mean over 192 pixels, of which some 100 are independent, of the ratio of variances: to 1 %, and R differs by a tenth.
+        // Of harmonics sigma is that of the blocks scaled by few draws of 121 numbers, to some 10 %: twice that. Of pixels it also has the
+        // degrees beyond the map's, which samples have not.
         let ratio = mean((0..around.len()).map(|pixel| variance(pixel) / sigma[pixel].powi(2)));
-        assert!((ratio - 1.0).abs() < 0.1, "{engine}: {ratio}");
+        let least = if engine == "pixel" { 0.2 } else { 0.8 };
+        assert!((least..1.2).contains(&ratio), "{engine}: {ratio}");
         // A standard deviation of 200 samples is known to 5 %: four of that, and the tenth of R.
         let mean_sigma_k = channel["mean_sigma_k"].as_f64().unwrap();
         let found = said[0]["mean_sigma_k"].as_f64().unwrap() / mean_sigma_k;
