@@ -7,7 +7,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::super::sigma::pixel_sigma_k;
 use super::*;
-use crate::imaging::power::{Block, Factors, Sought};
+use crate::imaging::power::{Block, Factors, PowerProblem};
 use crate::sky::harmonics::synthesis;
 use crate::units::{StreamKind, random_stream};
 
@@ -79,7 +79,7 @@ fn coverage(skies: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
         data.iter_mut().zip(&sky).for_each(|(noise, sky)| *noise += sky);
         wide.multiply(&mut data);
         let right = lower(&data);
-        let sought = Sought {
+        let sought = PowerProblem {
             sums: &sums,
             blocks: &blocks,
             degrees: &map_degrees,
