@@ -234,15 +234,15 @@ def basis():
     head = ["nside 8, 10 MHz", "Tr Sigma_n, K², at 1e-4", "Tr Sigma_s", "T² Tr Sigma_s, K²", "at 2e-3", "Tr Sigma_s",
             "T² Tr Sigma_s, K²", "crossing"]
     return (
-        "\n**Why they do not cross here.** The study's map is one of harmonics. Traces depend on the basis: a harmonic of l < 18 that "
-        "no baseline reaches stays all but unmeasured, so Tr Sigma_s falls slowly (to 10 at 1e-4 here). A mode of pixels is a step "
-        "function and has power at high l, which baselines up to 2 b_p do measure; no such mode is lost, and Tr Sigma_s falls as epsilon². "
-        "The paper solves for pixels. At nside 8, by `pipelines/paper/dense.py 8 10 6000` in numpy, and by both engines from the same "
+        "\n**Why they do not cross here.** Traces depend on the basis. A harmonic of l < 18 that no baseline reaches "
+         "stays unmeasured, so Tr Sigma_s falls slowly (to 10 at 1e-4). A mode of pixels is a step function with power "
+         "at high l, which baselines up to 2 b_p measure; no such mode is lost, and Tr Sigma_s falls as epsilon². The "
+         "paper solves for pixels. At nside 8, by `pipelines/paper/dense.py 8 10 6000` in numpy, and by both engines from the same "
         "downlink (scaled to all windows; T = 3.80e5 K):\n\n" + table(head, rows)
-        + "\nSo with the paper's basis they do cross in our range, at 1e-4 for T². The place moves with the noise, "
-        "and with how data are thinned, as Tr Sigma_s is a matter of which modes are measured: at nside 8 and epsilon 1e-4 it is 0.0410 from every "
-        "40th window, 0.0204 from every 40th integration and 0.0120 from every 10th. T² is what units ask for; with the first power, as "
-        "the paper writes it, numbers of K² and K are compared, and these do not cross below 0.1.\n"
+        + "\nWith the paper's basis they cross in our range, at 1e-4 for T². The crossing moves with the noise and with "
+         "the thinning, which decides which modes are measured: at nside 8 and epsilon 1e-4 Tr Sigma_s is 0.0410 from every "
+        "40th window, 0.0204 from every 40th integration and 0.0120 from every 10th. Units require T²; with the first power, as the paper writes it, numbers of K² and K are compared, which do "
+         "not cross below 0.1.\n"
     )
 
 
@@ -319,11 +319,11 @@ def uniformity():
                      *[f"{np.sqrt(x):.3f}" for x in inside]])
     head = ["noise at", "rms, K", "scatter, %", "its own, %", *[f"{low} to {high} deg" for low, high in bands]]
     return f"`{command}`\n\n" + table(head, rows) + (
-        f"\nThe standard deviation of each pixel over {len(noises)} realisations at 10 MHz, nside {nside}, every 10th window: how much it "
-        "scatters over the sphere, what of this is not the scatter of so few realisations, and its rms by distance from the ecliptic over "
-        "that of all. The paper (Sect. 5.4) finds fluctuations of some 10 %, without saying for which epsilon. It depends on it: at "
-        "nside 16 38, 19 and 13 % at epsilon 1e-4, 1e-3 and 2e-3. At 1e-4 noise is uniform where the array measures; beyond 60 degrees from the "
-        "ecliptic the scales above l = 18, which no baseline reaches there, add as much again.\n"
+        f"\nThe standard deviation of each pixel over {len(noises)} realisations at 10 MHz, nside {nside}, every 10th window: its "
+        "scatter over the sphere, the part of this that is not due to so few realisations, and its rms by distance from the ecliptic over "
+        "that of all. The paper (Sect. 5.4) finds fluctuations of some 10 %, for an epsilon that it does not give: at nside 16 they are "
+        "38, 19 and 13 % at epsilon 1e-4, 1e-3 and 2e-3. At 1e-4 noise is uniform where the array measures; beyond 60 degrees from the "
+        "ecliptic the scales that no baseline reaches (l < 18) add as much again.\n"
     )
 
 
@@ -396,8 +396,8 @@ def point_beams(name, said):
 
 def thinned_crossing():
     return (
-        "\nFrom every 40th window. That this crossing lies near the paper's is an accident of the thinning: Tr Sigma_s falls when data are "
-        "added, and Tr Sigma_n in proportion to them. A crossing from all data at this nside has not been measured.\n"
+        "\nFrom every 40th window. This crossing lies near the paper's only by its thinning: both traces fall when data are added. A crossing "
+         "from all data at this nside has not been measured.\n"
     )
 
 
@@ -508,10 +508,9 @@ def pair_sensitivity():
             ["MHz", "5 sigma, Jy a pixel", "radiometer, Jy", "ratio"],
             [[f, f"{jy:,}", f"{rad:g}", f"{jy / rad:.1f}"] for f, (jy, rad) in dense.items()],
         )
-        + "\nIt rises by 3.8 from 5 to 30 MHz, as the study does by 3.2: in pixels of a fixed nside the few pairs that are left at high "
-        "frequencies measure modes less evenly, and a map has the noise of the worst of them. So the formula gives the rise "
-        "for small maps, and T_sys is not its cause. At nside 64 the radiometer alone falls by a fifth from "
-        "5 to 30 MHz; whether the map's noise is then flat is the study at that size, below.\n"
+        + "\nIt rises by 3.8 from 5 to 30 MHz, the study by 3.2: at a fixed nside the few pairs that are left at high "
+         "frequencies measure modes less evenly, and the worst of them dominate the noise. T_sys is not the cause. At "
+         "nside 64 the radiometer alone falls by a fifth from 5 to 30 MHz.\n"
     )
 
 
@@ -550,8 +549,8 @@ def main():
            "ask for as little regularisation as the study has.\n"),
         ("Fig. 16: rows at centres and averaged, rho_l without noise",
          "`lunarray study pipelines/paper/fig16-17-rows.toml`",
-         rows_of_b("rho", "no noise", "So it is here, at nside 16; its study has what data it is from. Many windows matter more "
-                   "than many integrations of each: every 4th is half a wavelength from the last.")
+         rows_of_b("rho", "no noise", "Ours agrees at nside 16. Many windows matter more than many integrations of each: every 4th is half a "
+         "wavelength from the last.")
          + "\n### At nside 32\n\n`lunarray study pipelines/paper/fig16-nside32.toml` (`map.matrix = \"free\"`)\n\n"
          + correlation("fig16-nside32", "rho", (8, 16, 20, 24, 32, 48, 64), "limit, rows",
                        "At this size, too, averaged rows are the same whatever the limit: 0.99 or more from l = 20 to 48 at b_p over "
@@ -564,9 +563,9 @@ def main():
                        "At the paper's size, too, averaged rows keep 0.98 and more from l = 24 to 80 below b_p over 2, where rows at centres end at "
                        "0.93; at b_p these lose 6 to 8 % at l = 24 to 48, a sixth at 64 and half at 128.")),
         ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
-         rows_of_b("snr", "thermal noise", "As for rho_l: averaged rows gain with baselines up to 2 b_p and keep it up to 4 b_p (2.5, 3.2, 3.4 at l = 24), "
-                   "rows at centres lose from b_p on (2.8, 1.5, 1.1). They are not made smaller by the pixel and take long baselines for better "
-                   "measured than they are, so that single degrees of a wrong map have a high SNR_l (15.9 at l = 8).")),
+         rows_of_b("snr", "thermal noise", "Averaged rows gain with baselines up to 2 b_p and keep it up to 4 b_p (2.5, 3.2, 3.4 at l = 24); rows at "
+         "centres lose from b_p on (2.8, 1.5, 1.1). These take long baselines for better measured than they are, so "
+         "that single degrees of a wrong map have a high SNR_l (15.9 at l = 8).")),
         ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", "`lunarray study pipelines/paper/fig18-epsilon.toml`",
          correlation("fig18-epsilon", "rho", (8, 16, 32, 64, 96, 128), "epsilon",
                      "")),
@@ -585,8 +584,8 @@ def main():
     print("# The paper, figure by figure\n")
     print("What arXiv:2511.18494 says (in our words, with its section), the command, our numbers, and where and why they differ. All "
           "maps are with R = epsilon W_max I (`regulariser identity`), as the paper's. Written by "
-          f"`pipelines/paper/report.py` from results on {machine}; each study leaves its curves in `study.png`. Sizes are in "
-          "the study files; where they are smaller than the paper's the file says so. The sky is generated, with the paper's "
+          f"`pipelines/paper/report.py` from results on {machine}; Fig. 19 at full size was added by hand. Sizes are in "
+          "the study files, which say where they are smaller than the paper's; each study draws `study.png`. The sky is generated, with the paper's "
           "small scales and sources; the paper's is ULSA.\n")
     said = notes()
     for title, command, text in parts:

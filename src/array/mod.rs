@@ -45,7 +45,7 @@ pub use orbit::{Array, hidden_by_moon};
 #[doc(hidden)]
 pub use placing::PlacingCounts;
 #[doc(hidden)]
-pub use propagate::{PropagateConfig, StationKeeping, tell_propagation};
+pub use propagate::{PropagateConfig, StationKeeping, report_propagation_to};
 pub use state::SatelliteState;
 #[doc(hidden)]
 pub use track::{orbit_normal_hat, tilted_axes, track_axes, track_offset_m};

@@ -80,11 +80,11 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
     interrupt.completion(summary.cancelled).after(if args.json {
         print_json_line(&summary)
     } else {
-        print_text(&told(&summary, args))
+        print_text(&summary_text(&summary, args))
     })
 }
 
-fn told(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
+fn summary_text(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
     let mut lines = vec![summary.to_string()];
     for round in &summary.rounds {
         let number = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));

@@ -24,6 +24,7 @@ mod geometry;
 mod inspect;
 mod interrupt;
 mod job;
+mod joint;
 mod lines;
 mod log;
 mod merge;
@@ -111,6 +112,7 @@ enum Command {
     Recalibrate(recalibrate::RecalibrateArgs),
     Retract(retract::RetractArgs),
     Sample(sample::SampleArgs),
+    Joint(joint::JointArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Figure(figure::FigureArgs),
@@ -211,7 +213,7 @@ pub fn main() -> ExitCode {
 pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
     let words: Vec<OsString> = words.into_iter().collect();
     log::use_format(LogFormat::Text);
-    crate::array::tell_propagation(progress::say_propagation);
+    crate::array::report_propagation_to(progress::say_propagation);
     let command = match Cli::try_parse_from(&words) {
         Ok(Cli { log, command }) => {
             log::use_format(log);
@@ -242,6 +244,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Recalibrate(args) => recalibrate::execute(&args),
         Command::Retract(args) => retract::execute(&args),
         Command::Sample(args) => sample::execute(&args),
+        Command::Joint(args) => joint::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Figure(args) => figure::execute(&args),

@@ -209,7 +209,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
         Some(folder) => Ground::open_with_ranks(folder, &settings, args.checkpoint_every, job.ranks())?,
-        None => Ground::new(&settings)?.among(job.ranks()),
+        None => Ground::new(&settings)?.with_ranks(job.ranks()),
     };
     if job.is_first() {
         print_notes(ground.notes());

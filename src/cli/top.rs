@@ -78,7 +78,7 @@ pub(super) fn execute(args: &TopArgs) -> CommandResult {
     let (ask, asked) = channel();
     let (answer, answers) = channel();
     // It ends with the channels, or with the process: a server that does not answer holds up nothing.
-    std::thread::spawn(move || look_again(&client, &asked, &answer));
+    std::thread::spawn(move || poll(&client, &asked, &answer));
     end_with_terminal(&interrupt);
     let watched = {
         let mut terminal = Restored(ratatui::try_init()?);
@@ -135,11 +135,7 @@ impl ServerSnapshot {
 }
 
 /// Looks at the server again and again, at the channel that was asked for last.
-fn look_again(
-    client: &Client,
-    asked: &Receiver<usize>,
-    answer: &Sender<Result<ServerSnapshot, ClientError>>,
-) {
+fn poll(client: &Client, asked: &Receiver<usize>, answer: &Sender<Result<ServerSnapshot, ClientError>>) {
     let mut place = 0;
     loop {
         match asked.recv_timeout(LOOK_EVERY) {

@@ -88,8 +88,8 @@ impl Ground {
     /// As one rank's of several: it receives everything, and holds its part of the sums.
     #[must_use]
     #[doc(hidden)]
-    pub fn among(self, ranks: &Ranks) -> Self {
-        Self { accumulator: self.accumulator.among(ranks), ..self }
+    pub fn with_ranks(self, ranks: &Ranks) -> Self {
+        Self { accumulator: self.accumulator.with_ranks(ranks), ..self }
     }
 
     /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
@@ -248,7 +248,7 @@ impl Ground {
         let autos = self.live_view_writer.expect_powers(frame.as_ref());
         let used = self.use_frame(&packets, frame, out);
         if let Some((span, autos)) = autos.zip(self.calibrator.autos()) {
-            self.live_view_writer.see_powers(span, autos);
+            self.live_view_writer.add_powers(span, autos);
         }
         used
     }
@@ -261,7 +261,7 @@ impl Ground {
     ) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else {
             if let Some(placed) = placed(&mut self.calibrator, frame)? {
-                self.live_view_writer.see(&placed);
+                self.live_view_writer.add(&placed);
                 self.accumulator.accept(placed, out)?;
             }
             return Ok(());
@@ -269,7 +269,7 @@ impl Ground {
         let mut draft = RecordDraft::of(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
-            self.live_view_writer.see(&placed);
+            self.live_view_writer.add(&placed);
             draft.used_s = self.accumulator.accept(placed, out)?;
         }
         let posted = archive.record(packets, draft, self.calibrator.ephemeris());

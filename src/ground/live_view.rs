@@ -195,7 +195,7 @@ impl LiveViewWriter {
     }
 
     /// Adds the calibrated powers of a block.
-    pub(super) fn see_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
+    pub(super) fn add_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
         let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
             let waterfall = powers.entry(channel).or_default();
@@ -206,7 +206,7 @@ impl LiveViewWriter {
     }
 
     /// Adds visibilities with positions.
-    pub(super) fn see(&mut self, frame: &PlacedFrame) {
+    pub(super) fn add(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
             && self.live_view.0.is_open.load(Ordering::Relaxed)
         {

@@ -77,7 +77,7 @@ pub(crate) struct ChannelData {
 
 impl EngineCost {
     /// The cost for one of some ranks that share the sums of the harmonic engine: for the one that has most of them.
-    pub(crate) fn among(self, ranks: usize, map: &MapConfig) -> Self {
+    pub(crate) fn with_ranks(self, ranks: usize, map: &MapConfig) -> Self {
         let blocks = shared_size(map.degree()).blocks;
         let share = blocks.div_ceil(ranks.max(1)) as f64 / blocks as f64;
         Self {

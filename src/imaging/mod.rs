@@ -17,6 +17,8 @@ mod config;
 pub(crate) mod cost;
 mod error;
 mod exact;
+#[doc(hidden)]
+pub mod joint;
 mod pixel;
 mod power;
 pub(crate) mod rates;

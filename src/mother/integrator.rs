@@ -471,7 +471,7 @@ pub(super) fn positions_said(
     }
     let mut segments = segments_for(array, from, until, EPHEMERIS_STEP_S);
     if let Some(pass) = pass {
-        segments.iter_mut().for_each(|segment| pass.mislead(segment, array));
+        segments.iter_mut().for_each(|segment| pass.add_errors(segment, array));
     }
     segments
 }

@@ -29,6 +29,6 @@ pub use jobs::{
     BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, GroupStep, GroupStepWatcher,
     GroupWatcher, MERGE, MapStep, PowerSpread, RealisationSpread, Study, StudyCase, StudyError, StudyStep,
     StudySummary, StudyWatcher, bound, channel_groups, replay_in_groups, run_in_groups, run_study,
-    sample_state, simulate_in_groups, solve_state, with_gains,
+    sample_state, simulate_in_groups, solve_state, solve_states_jointly, with_gains,
 };
 pub use jobs::{CalibrateJob, Mission, calibrate};

@@ -76,9 +76,10 @@ fn a_failure_is_served_until_it_is_seen() {
     let place = Place::new();
     let bytes = std::fs::read(place.downlink("packets")).unwrap();
     let mut served = place.served(&["--connections", "1"]);
+    let address = served.listening();
     // The last checkpoint will not find its folder, so that the run fails.
     std::fs::rename(place.path("state"), place.path("gone")).unwrap();
-    finish(TcpStream::connect(served.listening()).unwrap(), &bytes);
+    finish(TcpStream::connect(address).unwrap(), &bytes);
     wait_until("the failure", || served.json("/api/status")["phase"] == "failed");
     let text = String::from_utf8(served.get("/metrics").body).unwrap();
     assert!(text.contains("lunarray_run_phase{phase=\"failed\"} 1"), "{text}");

@@ -98,7 +98,7 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
     assert!(finish(TcpStream::connect(served.listening()).unwrap(), &sent).starts_with("taken "));
     served.wait_for_phase("ended");
     let text = served.get("/metrics").text();
-    // An alert counts increases, and from nothing to one is none: what has not happened yet stands as zero.
+    // Zeros are exported, too: Prometheus needs a starting value to see an increase.
     for (end, count) in [("whole", 1), ("no-token", 0), ("unknown-token", 0)] {
         assert!(
             text.contains(&format!("lunarray_senders_ended_total{{end=\"{end}\"}} {count}\n")),

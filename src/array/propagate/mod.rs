@@ -51,7 +51,7 @@ pub type PropagationProgress = fn(f64, f64);
 static TELLER: OnceLock<PropagationProgress> = OnceLock::new();
 
 /// Has the progress of long propagations told; the first call of a process counts.
-pub fn tell_propagation(teller: PropagationProgress) {
+pub fn report_propagation_to(teller: PropagationProgress) {
     let _ = TELLER.set(teller);
 }
 

@@ -173,7 +173,9 @@ impl Task<'_> {
             }
         }
         if let Some(sought) = sought {
-            solutions.iter_mut().for_each(|solution| solution.doubt(|n, hz| sought.is_ambiguous(n, hz)));
+            solutions
+                .iter_mut()
+                .for_each(|solution| solution.mark_ambiguous(|n, hz| sought.is_ambiguous(n, hz)));
         }
         Ok(solutions)
     }

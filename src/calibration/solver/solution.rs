@@ -55,7 +55,7 @@ pub struct PassSolution {
 
 impl PassSolution {
     /// Marks good gains of daughters and frequencies whose position may be another one.
-    pub(super) fn doubt(&mut self, is_ambiguous: impl Fn(usize, f64) -> bool) {
+    pub(super) fn mark_ambiguous(&mut self, is_ambiguous: impl Fn(usize, f64) -> bool) {
         for (n, daughter) in self.daughters.iter_mut().enumerate() {
             for gain in &mut daughter.gains {
                 if gain.state == GainState::Good && is_ambiguous(n, gain.frequency_hz) {
@@ -111,7 +111,7 @@ pub fn solve_pass_in_parts(
         let interval = Interval { span_s, ..whole };
         let fitted = interval.fit(blocks, None);
         let solution =
-            told(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat.clone()));
+            check_fit(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat.clone()));
         PassSolution { begins_with_jump: k > 0, ..solution }
     };
     parts.into_iter().enumerate().map(solution).collect()
@@ -174,7 +174,7 @@ pub(super) fn solve_from(
     let interval = interval_of(config, frequencies_hz, span_s, position_m);
     let fitted = interval.fit(blocks, None);
     let suspects = vec![false; fitted.dropped.len()];
-    told(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat))
+    check_fit(&interval, fitted, blocks, &suspects).solution(&interval, (pass, normal_hat))
 }
 
 /// A fit, and what its residuals show.
@@ -187,7 +187,7 @@ struct CheckedFit {
 }
 
 /// Judges a fit; with a reference that is not steady, phases are solved for once more against another daughter.
-fn told(
+fn check_fit(
     interval: &Interval<'_>,
     mut fitted: Fitted,
     blocks: &mut [ModelledBlock],
@@ -247,7 +247,7 @@ impl CheckedFit {
             normal_hat,
         };
         if doubted {
-            solution.doubt(|n, _| n != layout.reference);
+            solution.mark_ambiguous(|n, _| n != layout.reference);
         }
         solution
     }

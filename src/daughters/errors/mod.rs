@@ -248,7 +248,7 @@ impl PassErrors {
     }
 
     /// Replaces the positions flown of a segment by those that packets say.
-    pub fn mislead(&self, segment: &mut EphemerisSegment, array: &Array) {
+    pub fn add_errors(&self, segment: &mut EphemerisSegment, array: &Array) {
         let satellites = usize::from(segment.satellites);
         for (place, position_m) in segment.positions_m.iter_mut().enumerate() {
             let (node, daughter) = ((place / satellites) as i64, place % satellites);

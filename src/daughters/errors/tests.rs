@@ -144,7 +144,7 @@ fn packets_say_positions_that_are_off_along_the_named_axes() {
     let pass = led_astray(&config).pass(window);
     for flown in crate::array::segments_for(&array, window.start, window.end, 60.0) {
         let mut said = flown.clone();
-        pass.mislead(&mut said, &array);
+        pass.add_errors(&mut said, &array);
         for (k, (said, flown_m)) in said.positions_m.iter().zip(&flown.positions_m).enumerate() {
             let (node, n) = (k / 8, k % 8);
             let t_s = flown.start.plus_ticks(node as i64 * i64::from(flown.step_ticks)).seconds();
@@ -258,7 +258,7 @@ fn once_per_orbit_is_a_sine_of_the_given_strength() {
         let pass = errors_of(&instrument, &config).pass(window);
         for segment in crate::array::segments_for(&array, window.start, window.end, 60.0) {
             let mut said = segment.clone();
-            pass.mislead(&mut said, &array);
+            pass.add_errors(&mut said, &array);
             let radial_m = |node: usize| {
                 let flown_m = segment.positions_m[node * 8 + 2];
                 dot(sub(said.positions_m[node * 8 + 2], flown_m), unit(flown_m))

@@ -119,11 +119,11 @@ pub(super) struct OpenArchive {
 impl OpenArchive {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
-        Self::among(folder, config, sets_aside, &Ranks::one())
+        Self::with_ranks(folder, config, sets_aside, &Ranks::one())
     }
 
     /// As [`OpenArchive::new`], as one rank of several.
-    pub(super) fn among(
+    pub(super) fn with_ranks(
         folder: &Path,
         config: &GroundConfig,
         sets_aside: bool,
@@ -139,7 +139,7 @@ impl OpenArchive {
         let settings = settings_of(config)?;
         let posts = Ledger::new();
         let (contents, notes) = folder.load(sets_aside, |path| {
-            let empty = config.accumulator(&posts).among(ranks);
+            let empty = config.accumulator(&posts).with_ranks(ranks);
             let (head, accumulator) =
                 read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
             let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
@@ -176,7 +176,7 @@ impl OpenArchive {
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
         let ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration } = contents;
         // Also of a new archive.
-        let mut accumulator = accumulator.among(folder.ranks());
+        let mut accumulator = accumulator.with_ranks(folder.ranks());
         let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());

@@ -37,7 +37,8 @@ impl Ground {
         checkpoint_every: u64,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        let mut ground = OpenArchive::among(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
+        let mut ground =
+            OpenArchive::with_ranks(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
         // One of several ranks applies what there is, and leaves the archive to grounds that listen.
         ground.recover(folder, !ranks.are_many())?;
         let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());

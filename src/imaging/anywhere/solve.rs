@@ -242,6 +242,9 @@ struct RefinedProblem<'a> {
     factors: OrderFactors,
 }
 
+/// Solves several right-hand sides with the preconditioner.
+type Precondition<'a> = &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>;
+
 /// One right-hand side on its way.
 struct Column {
     x: Vec<f64>,
@@ -363,12 +366,7 @@ impl RefinedProblem<'_> {
     }
 
     /// Takes an earlier solution as the first step.
-    fn begin_from(
-        &self,
-        columns: &mut [Column; 2],
-        start: [Vec<f64>; 2],
-        precondition: &dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>,
-    ) {
+    fn begin_from(&self, columns: &mut [Column; 2], start: [Vec<f64>; 2], precondition: Precondition<'_>) {
         let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
         let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
         let products = products.iter().map(unknowns_of_gradient);
@@ -386,7 +384,7 @@ impl RefinedProblem<'_> {
     }
 
     /// One iteration of the flexible conjugate gradients for those columns that are open.
-    fn advance(&self, columns: &mut [Column; 2], precondition: &dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>) {
+    fn advance(&self, columns: &mut [Column; 2], precondition: Precondition<'_>) {
         let open = columns.iter().filter(|column| column.is_open());
         let directions: Vec<Alm> = open.map(|column| coefficients(&column.direction, self.l_max())).collect();
         let (seen, products) = self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);

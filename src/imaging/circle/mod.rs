@@ -55,6 +55,7 @@ pub use setup::{
     shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
+pub(super) use sigma::view_sigma_k;
 pub use solve::{HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, solve_harmonics, solve_regularised};
 pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
@@ -90,7 +91,7 @@ impl HarmonicEngine {
     /// This engine, without data yet, as one rank's of several: it takes all visibilities, and holds its part of their sums. Every
     /// rank has such an engine of the same setup, and uses its sums as the others do.
     #[must_use]
-    pub fn among(mut self, ranks: &Ranks) -> Self {
+    pub fn with_ranks(mut self, ranks: &Ranks) -> Self {
         let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
         let HarmonicBasis { setup, quanta, .. } = *self.basis;
         let (grids, tables, ranks) = (Arc::new(grids), Arc::default(), ranks.clone());
@@ -116,7 +117,7 @@ impl HarmonicEngine {
             ExactTori::read(&basis.grids, &mut from, part, kept)
         })?;
         from.finish()?;
-        Ok(engine.among(ranks))
+        Ok(engine.with_ranks(ranks))
     }
 
     /// Takes in another part of the same sums: those of the same visibilities at other alphas.

@@ -17,17 +17,38 @@ pub(super) fn pixel_sigma_k(
     ratio: &[f64],
     nside: usize,
 ) -> Vec<f64> {
+    view_sigma_k(blocks, factors, &|_, l| ratio[l].sqrt(), &[], nside)
+}
+
+/// Standard deviations, K, of the pixels of a map that is a sum of several sets of unknowns of the same blocks: `weight(set, l)` times each,
+/// and a variance by degree that none decides, `open`. The degrees of a set rise within a block.
+pub(in crate::imaging) fn view_sigma_k(
+    blocks: &[Block<'_>],
+    factors: &Factors<'_>,
+    weight: &(dyn Fn(usize, usize) -> f64 + Sync),
+    open: &[f64],
+    nside: usize,
+) -> Vec<f64> {
     let z: Vec<f64> = pixel_directions(nside).iter().map(|direction| direction[2]).collect();
     let rings: Vec<&[f64]> = z.chunk_by(|a, b| a == b).collect();
-    let orders = orders_of(ratio.len().saturating_sub(1));
+    let l_max = blocks.iter().flat_map(|block| &block.degrees).copied().max().unwrap_or(0);
+    let orders = orders_of(l_max);
     let of_block = |(index, block): (usize, &Block<'_>)| -> Vec<f64> {
         let m = orders[index];
+        let sets: Vec<usize> = block
+            .degrees
+            .iter()
+            .scan((0, None), |(set, before), l| {
+                *set += usize::from(before.replace(*l).is_some_and(|before| *l <= before));
+                Some(*set)
+            })
+            .collect();
         let mut values = Mat::zeros(block.degrees.len(), rings.len());
-        let l_max = block.degrees.last().copied().unwrap_or(m);
+        let highest = block.degrees.iter().copied().max().unwrap_or(m);
         for (column, ring) in rings.iter().enumerate() {
-            let lambda = legendre(m, l_max, ring[0]);
-            for (row, l) in block.degrees.iter().enumerate() {
-                values[(row, column)] = ratio[*l].sqrt() * lambda[l - m];
+            let lambda = legendre(m, highest, ring[0]);
+            for ((row, l), set) in block.degrees.iter().enumerate().zip(&sets) {
+                values[(row, column)] = weight(*set, *l) * lambda[l - m];
             }
         }
         let mut variances = factors.quadratic_forms(index, values);
@@ -36,7 +57,9 @@ pub(super) fn pixel_sigma_k(
         variances
     };
     let parts: Vec<Vec<f64>> = blocks.par_iter().enumerate().map(of_block).collect();
-    let mut variances = vec![0.0; rings.len()];
+    let of_degree =
+        |(l, variance): (usize, &f64)| (2 * l + 1) as f64 / (4.0 * std::f64::consts::PI) * variance;
+    let mut variances = vec![open.iter().enumerate().map(of_degree).sum::<f64>(); rings.len()];
     for part in parts {
         variances.iter_mut().zip(part).for_each(|(sum, variance)| *sum += variance);
     }

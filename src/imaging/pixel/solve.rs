@@ -144,7 +144,7 @@ pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f6
 /// let pair = |k: u32| {
 ///     let (sin, cos) = (0.1 * f64::from(k)).sin_cos();
 ///     let r_i_m = [2.04e6 * cos, 2.04e6 * sin, 0.0];
-///     let r_j_m = [r_i_m[0], r_i_m[1] + f64::from(k % 7), 0.3 * f64::from(k % 5)];
+///     let r_j_m = [r_i_m[0], r_i_m[1] + f64::from(1 + k % 7), 0.3 * f64::from(k % 5)];
 ///     PairGeometry { r_i_m, r_j_m, frequency_hz, moon_radius_m: MOON_RADIUS_M, response: AntennaResponse::Isotropic }
 /// };
 /// let pairs: Vec<PairGeometry> = (0..500).map(pair).collect();

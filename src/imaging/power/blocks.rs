@@ -72,7 +72,7 @@ fn regularisation(power: &[f64]) -> Vec<f64> {
 }
 
 /// The evidence alone; `None` where a block is not positive definite.
-pub(super) fn value(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
+pub(in crate::imaging) fn value(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
     let r = regularisation(power);
     let of = |block: &Block<'_>| {
         let factor = block.factor(&r)?;
@@ -210,7 +210,7 @@ impl<'a> Factors<'a> {
 }
 
 /// Blocks times a vector of unknowns.
-pub(super) fn multiply(blocks: &[Block<'_>], unknowns: &[f64]) -> Vec<f64> {
+pub(in crate::imaging) fn multiply(blocks: &[Block<'_>], unknowns: &[f64]) -> Vec<f64> {
     let mut products = vec![0.0; unknowns.len()];
     for block in blocks {
         let product = &*block.matrix * block.gather(unknowns);

@@ -28,11 +28,11 @@ use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, Side};
 use serde::Serialize;
 
-pub(super) use blocks::{Block, Factors};
+pub(super) use blocks::{Block, Factors, multiply, value};
 pub(super) use draws::{Covariance, Drawn, SAMPLE_SETTLED};
 pub(super) use rounds::{FoundPower, PowerProblem};
 
-use self::blocks::{evidence, greatest, multiply, value};
+use self::blocks::{evidence, greatest};
 use self::knots::{FREE, Knots};
 use crate::imaging::solver::SolveError;
 use crate::sky::healpix::pixel_count;

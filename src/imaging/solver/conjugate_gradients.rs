@@ -272,7 +272,7 @@ mod tests {
         let b = [wave(0.7), wave(1.1)];
         let found = on_threads(3, |ranks| {
             let known = Known::default();
-            let watch = SolveWatch::default().among(ranks);
+            let watch = SolveWatch::default().with_ranks(ranks);
             let residual_max = [1e-3, 1e-6, 1e-9][ranks.share().rank];
             let mut x = [vec![0.0; ORDER], vec![0.0; ORDER]];
             let b: Vec<&[f64]> = b.iter().map(Vec::as_slice).collect();

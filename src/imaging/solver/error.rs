@@ -60,6 +60,39 @@ pub enum SolveError {
          map.regulariser = \"identity\" takes R = epsilon W_max I instead"
     )]
     NoPower,
+    /// Channels that cannot be solved for together.
+    #[error(
+        "a joint map of {channels} channels at {frequencies} frequencies; expected two or more, each at its own frequency"
+    )]
+    FewChannels {
+        /// Channels given.
+        channels: usize,
+        /// Frequencies among them.
+        frequencies: usize,
+    },
+    /// A frequency that channels do not enclose.
+    #[error(
+        "{:.3} MHz: expected a frequency between {:.3} and {:.3} MHz, those of the channels; beyond them the sky is not known",
+        frequency_hz / 1e6, ends_hz[0] / 1e6, ends_hz[1] / 1e6
+    )]
+    BeyondChannels {
+        /// Frequency asked for, Hz.
+        frequency_hz: f64,
+        /// Lowest and highest channel, Hz.
+        ends_hz: [f64; 2],
+    },
+    /// Sums of which no joint map can be made.
+    #[error(
+        "{:.3} MHz: a state of {found}; expected sums over harmonics (map.engine = \"harmonic\", without refinement), of which joint maps \
+         are made",
+        frequency_hz / 1e6
+    )]
+    NotHarmonic {
+        /// Frequency, Hz.
+        frequency_hz: f64,
+        /// What it holds.
+        found: &'static str,
+    },
     /// A pixel that is not on the map.
     #[error("there is no pixel {pixel} on a map of {pixels}")]
     NoPixel {

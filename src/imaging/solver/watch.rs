@@ -82,7 +82,7 @@ impl SolveWatch {
 
     /// The watch of one rank, whose solutions end when any of the ranks ends its own.
     #[must_use]
-    pub fn among(self, ranks: &Ranks) -> Self {
+    pub fn with_ranks(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
     }
 

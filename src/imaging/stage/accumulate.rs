@@ -76,9 +76,9 @@ enum Engine {
 
 impl Engine {
     /// The part of one rank of several. Only the harmonic engine divides its sums; others hold all on every rank.
-    fn among(self, ranks: &Ranks) -> Self {
+    fn with_ranks(self, ranks: &Ranks) -> Self {
         match self {
-            Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.among(ranks))),
+            Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.with_ranks(ranks))),
             other => other,
         }
     }
@@ -201,7 +201,7 @@ impl Accumulator {
 
     /// Makes it one rank of several: it takes all visibilities and holds its part of the harmonic engine's sums.
     #[must_use]
-    pub fn among(self, ranks: &Ranks) -> Self {
+    pub fn with_ranks(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
     }
 
@@ -223,7 +223,7 @@ impl Accumulator {
     pub fn without_sums(&self) -> Self {
         let (config, ledger) = (self.config.clone(), self.ledger.clone());
         Self::new(config, ledger)
-            .among(&self.ranks)
+            .with_ranks(&self.ranks)
             .of_group(self.group.clone())
             .in_part(self.part.clone())
             .within_memory(self.memory_max_bytes)
@@ -479,8 +479,8 @@ impl Accumulator {
             empty => match engine(&self.config, instrument, placed)? {
                 Ok(engine) => {
                     let engine = match &self.part {
-                        Some(part) => engine.among(&part.ranks()),
-                        None => engine.among(&self.ranks),
+                        Some(part) => engine.with_ranks(&part.ranks()),
+                        None => engine.with_ranks(&self.ranks),
                     };
                     let noises = match &engine {
                         Engine::Harmonic(engine) if !self.noise_seeds.is_empty() => {

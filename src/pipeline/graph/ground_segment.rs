@@ -101,7 +101,7 @@ pub(in crate::pipeline) fn add(
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let passes = config.map.refine.is_on().then(|| out.to_owned());
-    let setup = SolverSetup { passes, ..config.solver(watch.among(&ranks))? };
+    let setup = SolverSetup { passes, ..config.solver(watch.with_ranks(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

@@ -172,7 +172,7 @@ pub fn run_with_ranks(
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground =
-        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).among(ranks);
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).with_ranks(ranks);
     let maps = MapWatch::default();
     let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
@@ -240,7 +240,7 @@ pub(in crate::pipeline) fn simulate_sky(
 
 /// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
 ///
-/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::among`]).
+/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::with_ranks`]).
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no

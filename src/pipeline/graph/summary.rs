@@ -108,7 +108,7 @@ impl RunSummary {
     }
 
     /// The summary of this pass and an earlier one over the same downlink, for other channels.
-    pub(in crate::pipeline) fn after(self, earlier: PassRecord) -> Self {
+    pub(in crate::pipeline) fn after(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
         let ledger = earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
         Self {
@@ -156,7 +156,7 @@ impl RunSummary {
 
 /// Record of a mapped group.
 #[derive(bincode::Encode, bincode::Decode)]
-pub(in crate::pipeline) struct PassRecord {
+pub(in crate::pipeline) struct GroupRecord {
     /// Checksums of its products, in the order in which its channels name them.
     sums: Vec<u64>,
     pub(in crate::pipeline) ledger: LedgerReport<VisibilityReason>,
@@ -173,7 +173,7 @@ const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = binc
     .with_fixed_int_encoding()
     .with_limit::<RECORD_BYTES_MAX>();
 
-impl PassRecord {
+impl GroupRecord {
     /// The record of a group whose products are in `out`.
     ///
     /// # Errors

@@ -161,7 +161,7 @@ struct Passes<'a> {
     cancel: &'a Cancel,
 }
 
-/// The file that is being read.
+/// The pass that is being read.
 #[derive(Default)]
 struct OpenPass {
     blocks: Vec<VisibilityBlock>,

@@ -17,7 +17,7 @@ use crate::imaging::circle::SumPart;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, groups_of};
 use crate::pipeline::graph::run::{finish, ground_alone, lock_products, summarise, write_settings};
-use crate::pipeline::graph::summary::PassRecord;
+use crate::pipeline::graph::summary::GroupRecord;
 use crate::pipeline::graph::{RunScope, RunSummary, Watched, downlink_file, space_segment};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::Cancel;
@@ -71,13 +71,13 @@ pub fn replay_in_groups(
     watch: GroupWatcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let _lock = lock_products(config, out)?;
-    let passes = Passes { scope: RunScope::Ground, files, config, groups, out };
-    let summary = passes.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
+    let readings = GroupReadings { scope: RunScope::Ground, files, config, groups, out };
+    let summary = readings.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
     finish(summary, out)
 }
 
 /// Settings for maps, group by group, of the same files.
-struct Passes<'a> {
+struct GroupReadings<'a> {
     scope: RunScope,
     files: &'a [PathBuf],
     config: &'a Config,
@@ -85,7 +85,7 @@ struct Passes<'a> {
     out: &'a Path,
 }
 
-impl Passes<'_> {
+impl GroupReadings<'_> {
     /// Maps the groups that no earlier call has.
     fn run(
         &self,
@@ -94,13 +94,13 @@ impl Passes<'_> {
         watch: GroupWatcher<'_>,
     ) -> Result<RunSummary, PipelineError> {
         let Self { scope, files, config, groups, out } = *self;
-        let mut done: Vec<PassRecord> = Vec::new();
+        let mut done: Vec<GroupRecord> = Vec::new();
         let mut last: Option<RunSummary> = None;
         for (number, MapGroup { channels: group, parts }) in groups.iter().enumerate() {
             let (path, key) = (out.join(record_name(group)), self.key(group));
             let is_last = number + 1 == groups.len();
             // The summary is that of the last pass, which is always made.
-            if let Some(record) = PassRecord::read(&path, key, out).filter(|_| !is_last) {
+            if let Some(record) = GroupRecord::read(&path, key, out).filter(|_| !is_last) {
                 done.push(record);
                 continue;
             }
@@ -147,7 +147,7 @@ impl Passes<'_> {
                 pass.earlier_reports.push(before.report);
             }
             if !is_cut && !is_last {
-                let record = PassRecord::of(&pass, out)?;
+                let record = GroupRecord::of(&pass, out)?;
                 record.write(&path, key)?;
                 done.push(record);
             }
@@ -226,8 +226,8 @@ pub fn run_in_groups(
         })
     };
     let files = [file];
-    let passes = Passes { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
-    let summary = passes.run(&truth, cancel, &mut |step, watched| {
+    let readings = GroupReadings { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
+    let summary = readings.run(&truth, cancel, &mut |step, watched| {
         (watch.borrow_mut())(GroupStep::Mapped(step), Some(watched));
     })?;
     let summary = finish(summary, out)?;

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
-use crate::imaging::{REFINED, Regulariser, RegulariserChoice};
+use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, solve_jointly};
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice, SnapshotSums, SolveError, StoppingRule};
 use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
@@ -156,6 +157,37 @@ pub fn sample_state(
 ) -> Result<(), PipelineError> {
     let setup = SolverSetup { samples: count, ..config.solver(watch.clone())? };
     solve_sums(folder, config, setup, found)
+}
+
+/// Maps of several channels together, of the sums in one state or several; `request` makes of the first state's stopping rule what is asked
+/// for. The states stay as they are.
+///
+/// # Errors
+/// As [`solve_state`]; sums that are not over harmonics; as [`solve_jointly`].
+pub fn solve_states_jointly(
+    states: &[(&Path, Config)],
+    request: &dyn Fn(StoppingRule) -> JointRequest,
+    watch: &SolveWatch,
+) -> Result<JointSolution, PipelineError> {
+    let (mut channels, mut rule) = (Vec::new(), None);
+    for (folder, config) in states {
+        rule.get_or_insert(config.solver(watch.clone())?.rule);
+        for snapshot in Ground::sums_in(folder, &config.ground(WAIT_BYTES))? {
+            let channel = snapshot.instrument.channels.get(usize::from(snapshot.channel.0));
+            let frequency_hz = channel.map_or(0.0, |channel| channel.frequency_hz);
+            let found = match snapshot.sums {
+                SnapshotSums::Harmonic(sums) => {
+                    channels.push(JointChannel { frequency_hz, nside: snapshot.nside, sums });
+                    continue;
+                }
+                SnapshotSums::Pixel(_) => "sums over pixels",
+                _ => "visibilities one by one",
+            };
+            return Err(SolveError::NotHarmonic { frequency_hz, found }.into());
+        }
+    }
+    let rule = rule.ok_or(SolveError::NoData)?;
+    Ok(solve_jointly(channels, &request(rule), watch)?)
 }
 
 fn solve_sums(

@@ -1,4 +1,4 @@
-//! Patterns of pairs: what both satellites would see without the Moon, less the cap that it hides.
+//! Patterns of pairs: the view of both satellites without the Moon, less the cap that it hides.
 //!
 //! From the mean nadir of the pair as the pole the hidden cap is made of whole rings, whose Fourier coefficients are Bessel
 //! functions, but for the zone between the class's limb and the pair's (see `border.rs`):
@@ -68,7 +68,7 @@ fn reach(l_max: usize, sin: f64) -> usize {
     l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
 }
 
-/// Memory of what a task works with besides patterns, bytes.
+/// Memory of a task's buffers besides patterns, bytes.
 pub(super) fn batch_bytes(l_max: usize, u_max: f64, batch: usize) -> f64 {
     let orders = (l_max + 1) as f64;
     let rings = (rings_for(l_max, FRAC_PI_2, u_max) + 16) as f64;
@@ -116,7 +116,7 @@ impl CapClass {
         let columns = groups * COMPLEX;
         let (l_max, terms) = (self.l_max, self.border.terms);
         let height = terms + self.rings.len();
-        // What is read of it has been written: the orders that reach a ring.
+        // Only written elements are read: the orders that reach a ring.
         buffers.rings.resize((l_max + 1) * height * columns, 0.0);
         for (group, nodes) in nodes.chunks(LANES).enumerate() {
             self.ring_coefficients(nodes, wavelength_m, group, columns, buffers);
@@ -278,7 +278,7 @@ pub(super) struct CapBuffers {
 #[derive(Clone, Debug)]
 pub(super) struct Patterns {
     setup: RowsSetup,
-    /// By mu, for l = mu, mu + 2, ..: what multiplies `j_l`, `j_{l+2}` and `j_{l-2}`.
+    /// By mu, for l = mu, mu + 2, ..: factors of `j_l`, `j_{l+2}` and `j_{l-2}`.
     whole: Vec<Vec<[f64; 3]>>,
 }
 
@@ -380,7 +380,7 @@ fn assemble(
     }
 }
 
-/// Coefficients of a fringe over the whole sky, by mu and l: what multiplies `j_l`, `j_{l+2}` and `j_{l-2}`. A dipole's response
+/// Coefficients of a fringe over the whole sky, by mu and l: factors of `j_l`, `j_{l+2}` and `j_{l-2}`. A dipole's response
 /// is `1 - z^2`, and z takes degree l to its neighbours.
 fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
     let l_max = setup.l_max;

@@ -2,7 +2,7 @@
 //!
 //! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
 //! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the
-//! two agree. Along a pass the rows of a pair change slowly, so that few are computed and the others interpolated
+//! two agree. Along a track the rows of a pair change slowly, so that few are computed and the others interpolated
 //! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
 //! computes each row, the reference for the other.
 //!

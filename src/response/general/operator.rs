@@ -13,7 +13,7 @@ use super::frames::Frames;
 use super::instants::Instants;
 use super::lanes::{LANES, Lanes, VALUES, Value};
 use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
-use super::plan::{GROUP_NODES, Observed, Pass, RowNode, RowPlan};
+use super::plan::{GROUP_NODES, Observed, RowNode, RowPlan, Track};
 use super::skies::{TurnBuffers, TurnedSkies, lanes_of, make_room};
 use super::turns::QuarterTurns;
 use super::{PairAt, RowsError, RowsSetup};
@@ -79,16 +79,16 @@ impl GeneralRows {
         let (count, skies) = (skies.len(), self.products.of(skies));
         let skies = skies.as_slice();
         let values = plan.groups.par_iter().map(|group| {
-            memory.lend(|of| {
-                let passes = &plan.passes[group.clone()];
-                self.no_amplitudes(passes, skies.len(), &mut of.amplitudes);
-                let frames = self.frames(plan, passes);
+            memory.with_workspace(|of| {
+                let tracks = &plan.tracks[group.clone()];
+                self.no_amplitudes(tracks, skies.len(), &mut of.amplitudes);
+                let frames = self.frames(plan, tracks);
                 self.turn(frames.as_ref(), skies, of);
-                for places in Self::batches(plan, passes) {
-                    self.batch(plan, passes, &tables, places, 0, of);
+                for places in Self::batches(plan, tracks) {
+                    self.batch(plan, tracks, &tables, places, 0, of);
                     self.amplitudes(0, skies, frames.as_ref(), of);
                 }
-                self.interpolate(plan, passes, count, of)
+                self.interpolate(plan, tracks, count, of)
             })
         });
         joined(plan, count, values.collect())
@@ -104,17 +104,17 @@ impl GeneralRows {
         // The order of sums is that of the groups, whatever the threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                memory.lend(|of| {
-                    let passes = &plan.passes[group.clone()];
-                    let rows = rows_of(passes);
+                memory.with_workspace(|of| {
+                    let tracks = &plan.tracks[group.clone()];
+                    let rows = rows_of(tracks);
                     let values: Vec<&[Complex64]> =
                         values.iter().map(|values| &values[rows.clone()]).collect();
-                    self.spread(plan, passes, &values, of);
+                    self.spread(plan, tracks, &values, of);
                     let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
-                    let frames = self.frames(plan, passes);
+                    let frames = self.frames(plan, tracks);
                     self.no_gradients(frames.as_ref(), skies, of);
-                    for places in Self::batches(plan, passes) {
-                        self.batch(plan, passes, &tables, places, 0, of);
+                    for places in Self::batches(plan, tracks) {
+                        self.batch(plan, tracks, &tables, places, 0, of);
                         self.gradients(0, frames.as_ref(), of, &mut gradients);
                     }
                     self.turn_back(frames.as_ref(), of, &mut gradients);
@@ -138,25 +138,25 @@ impl GeneralRows {
         let mut seen = Vec::with_capacity(plan.groups.len());
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                memory.lend(|of| {
-                    let passes = &plan.passes[group.clone()];
-                    self.no_amplitudes(passes, skies.len(), &mut of.amplitudes);
-                    let frames = self.frames(plan, passes);
+                memory.with_workspace(|of| {
+                    let tracks = &plan.tracks[group.clone()];
+                    self.no_amplitudes(tracks, skies.len(), &mut of.amplitudes);
+                    let frames = self.frames(plan, tracks);
                     self.turn(frames.as_ref(), skies, of);
-                    let batches = Self::batches(plan, passes);
+                    let batches = Self::batches(plan, tracks);
                     let made = batches.len();
                     for (number, places) in batches.into_iter().enumerate() {
-                        self.batch(plan, passes, &tables, places, number, of);
+                        self.batch(plan, tracks, &tables, places, number, of);
                         self.amplitudes(number, skies, frames.as_ref(), of);
                     }
-                    let seen = self.interpolate(plan, passes, count, of);
-                    let weight = &weight[rows_of(passes)];
+                    let seen = self.interpolate(plan, tracks, count, of);
+                    let weight = &weight[rows_of(tracks)];
                     let weighted = |seen: &Vec<Complex64>| -> Vec<Complex64> {
                         seen.iter().zip(weight).map(|(v, w)| v * *w).collect()
                     };
                     let weighted: Vec<Vec<Complex64>> = seen.iter().map(weighted).collect();
                     let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
-                    self.spread(plan, passes, &weighted, of);
+                    self.spread(plan, tracks, &weighted, of);
                     let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
                     self.no_gradients(frames.as_ref(), skies.len(), of);
                     for number in 0..made {
@@ -175,9 +175,9 @@ impl GeneralRows {
         (joined(plan, count, seen), self.products.back(out))
     }
 
-    /// How the frames of the passes' nodes are combined from a chosen few, if they are.
-    fn frames(&self, plan: &RowPlan, passes: &[Pass]) -> Option<Frames> {
-        if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(passes)], self.setup.l_max) }
+    /// How the frames of the tracks' nodes are combined from a chosen few, if they are.
+    fn frames(&self, plan: &RowPlan, tracks: &[Track]) -> Option<Frames> {
+        if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(tracks)], self.setup.l_max) }
     }
 
     /// Turns skies into the chosen frames, if there are any.
@@ -207,15 +207,15 @@ impl GeneralRows {
         (2 * self.setup.l_max + 1).next_multiple_of(LANES)
     }
 
-    /// Zero amplitudes g of the passes' nodes: `[node][sky][real or imaginary part][order]`.
-    fn no_amplitudes(&self, passes: &[Pass], skies: usize, out: &mut Vec<f64>) {
+    /// Zero amplitudes g of the tracks' nodes: `[node][sky][real or imaginary part][order]`.
+    fn no_amplitudes(&self, tracks: &[Track], skies: usize, out: &mut Vec<f64>) {
         out.clear();
-        out.resize(nodes_of(passes).len() * skies * 2 * self.orders(), 0.0);
+        out.resize(nodes_of(tracks).len() * skies * 2 * self.orders(), 0.0);
     }
 
-    /// Nodes of passes, in batches of one class: places among the passes' nodes.
-    fn batches(plan: &RowPlan, passes: &[Pass]) -> Vec<Vec<usize>> {
-        let nodes = &plan.nodes[nodes_of(passes)];
+    /// Nodes of tracks, in batches of one class: places among the tracks' nodes.
+    fn batches(plan: &RowPlan, tracks: &[Track]) -> Vec<Vec<usize>> {
+        let nodes = &plan.nodes[nodes_of(tracks)];
         let mut order: Vec<usize> = (0..nodes.len()).collect();
         // Pairs of one batch should need about as many quadrature points.
         let length = |k: usize| nodes[k].view.baseline_m;
@@ -230,13 +230,13 @@ impl GeneralRows {
     fn batch(
         &self,
         plan: &RowPlan,
-        passes: &[Pass],
+        tracks: &[Track],
         tables: &Tables,
         places: Vec<usize>,
         number: usize,
         of: &mut Workspace,
     ) {
-        let first = nodes_of(passes).start;
+        let first = nodes_of(tracks).start;
         if of.batches.len() <= number {
             of.batches.resize_with(number + 1, Batch::default);
         }
@@ -313,25 +313,25 @@ impl GeneralRows {
         }
     }
 
-    /// Values at all rows of passes, one vector a sky, from the amplitudes of the skies' products.
+    /// Values at all rows of tracks, one vector a sky, from the amplitudes of the skies' products.
     fn interpolate(
         &self,
         plan: &RowPlan,
-        passes: &[Pass],
+        tracks: &[Track],
         skies: usize,
         of: &mut Workspace,
     ) -> Vec<Vec<Complex64>> {
-        let first = nodes_of(passes).start;
+        let first = nodes_of(tracks).start;
         let products = skies * self.products.count();
         let width = 2 * self.orders();
-        let mut out = vec![Vec::with_capacity(rows_of(passes).len()); skies];
+        let mut out = vec![Vec::with_capacity(rows_of(tracks).len()); skies];
         let Workspace { amplitudes, table, shares, padded, .. } = of;
         let [mut values, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; products]);
-        for pass in passes {
-            let amplitudes = &amplitudes[(pass.nodes.start - first) * products * width..];
-            let amplitudes = &amplitudes[..pass.nodes.len() * products * width];
-            if pass.tau.is_empty() {
-                for (row, node) in pass.rows.clone().zip(amplitudes.chunks_exact(products * width)) {
+        for track in tracks {
+            let amplitudes = &amplitudes[(track.nodes.start - first) * products * width..];
+            let amplitudes = &amplitudes[..track.nodes.len() * products * width];
+            if track.tau.is_empty() {
+                for (row, node) in track.rows.clone().zip(amplitudes.chunks_exact(products * width)) {
                     for (value, g) in values.iter_mut().zip(node.chunks_exact(width)) {
                         *value = self.at_phase(g, plan.gamma_rad[row]);
                     }
@@ -339,11 +339,11 @@ impl GeneralRows {
                 }
                 continue;
             }
-            self.phases.fill(amplitudes, width / 2, [pass.nodes.len(), products], table);
-            for row in pass.rows.clone() {
+            self.phases.fill(amplitudes, width / 2, [track.nodes.len(), products], table);
+            for row in track.rows.clone() {
                 values.fill(Complex64::ZERO);
-                for instant in plan.instants_of(pass, row, &self.instants) {
-                    let gamma_rad = plan.shares(pass, row, instant, shares);
+                for instant in plan.instants_of(track, row, &self.instants) {
+                    let gamma_rad = plan.shares(track, row, instant, shares);
                     padded.set(table, shares);
                     self.phases.at(table, gamma_rad, padded, &mut at);
                     values.iter_mut().zip(&at).for_each(|(value, at)| *value += instant.weight * at);
@@ -360,18 +360,18 @@ impl GeneralRows {
         phase_sum(re, im, gamma_rad) * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
     }
 
-    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the passes: writes amplitudes.
-    fn spread(&self, plan: &RowPlan, passes: &[Pass], values: &[&[Complex64]], of: &mut Workspace) {
-        let (first, first_row) = (nodes_of(passes).start, rows_of(passes).start);
+    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the tracks: writes amplitudes.
+    fn spread(&self, plan: &RowPlan, tracks: &[Track], values: &[&[Complex64]], of: &mut Workspace) {
+        let (first, first_row) = (nodes_of(tracks).start, rows_of(tracks).start);
         let (width, skies) = (2 * self.orders(), values.len() * self.products.count());
         let Workspace { amplitudes: out, table, shares, padded, .. } = of;
-        self.no_amplitudes(passes, skies, out);
+        self.no_amplitudes(tracks, skies, out);
         let [mut of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
-        for pass in passes {
-            let out = &mut out[(pass.nodes.start - first) * skies * width..];
-            let out = &mut out[..pass.nodes.len() * skies * width];
-            if pass.tau.is_empty() {
-                for (row, to) in pass.rows.clone().zip(out.chunks_exact_mut(skies * width)) {
+        for track in tracks {
+            let out = &mut out[(track.nodes.start - first) * skies * width..];
+            let out = &mut out[..track.nodes.len() * skies * width];
+            if track.tau.is_empty() {
+                for (row, to) in track.rows.clone().zip(out.chunks_exact_mut(skies * width)) {
                     let gamma_rad = plan.gamma_rad[row];
                     plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
                     for (value, to) in of_row.iter().zip(to.chunks_exact_mut(width)) {
@@ -382,11 +382,11 @@ impl GeneralRows {
                 }
                 continue;
             }
-            self.phases.clear(table, [pass.nodes.len(), skies]);
-            for row in pass.rows.clone() {
+            self.phases.clear(table, [track.nodes.len(), skies]);
+            for row in track.rows.clone() {
                 plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
-                for instant in plan.instants_of(pass, row, &self.instants) {
-                    let gamma_rad = plan.shares(pass, row, instant, shares);
+                for instant in plan.instants_of(track, row, &self.instants) {
+                    let gamma_rad = plan.shares(track, row, instant, shares);
                     padded.set(table, shares);
                     at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);
                     self.phases.add(table, gamma_rad, padded, &at);
@@ -478,14 +478,14 @@ fn phase_terms(first: Complex64, angle_rad: f64, re: &mut [f64], im: &mut [f64])
     }
 }
 
-/// Nodes of consecutive passes.
-fn nodes_of(passes: &[Pass]) -> Range<usize> {
-    passes.first().map_or(0, |pass| pass.nodes.start)..passes.last().map_or(0, |pass| pass.nodes.end)
+/// Nodes of consecutive tracks.
+fn nodes_of(tracks: &[Track]) -> Range<usize> {
+    tracks.first().map_or(0, |track| track.nodes.start)..tracks.last().map_or(0, |track| track.nodes.end)
 }
 
-/// Rows of consecutive passes.
-fn rows_of(passes: &[Pass]) -> Range<usize> {
-    passes.first().map_or(0, |pass| pass.rows.start)..passes.last().map_or(0, |pass| pass.rows.end)
+/// Rows of consecutive tracks.
+fn rows_of(tracks: &[Track]) -> Range<usize> {
+    tracks.first().map_or(0, |track| track.rows.start)..tracks.last().map_or(0, |track| track.rows.end)
 }
 
 /// Values of groups one after the other, by sky.
@@ -533,14 +533,14 @@ impl Tables {
 /// Nodes of one class, and their patterns.
 #[derive(Default)]
 struct Batch {
-    /// Places among the nodes of the group's passes.
+    /// Places among the nodes of the group's tracks.
     places: Vec<usize>,
     nodes: Vec<RowNode>,
     /// By mu.
     patterns: Vec<NodePatterns>,
 }
 
-/// Buffers of a task on one group of passes. They are kept for the next: tens of MB that come and go with each group
+/// Buffers of a task on one group of tracks. They are kept for the next: tens of MB that come and go with each group
 /// cost up to two fifths of a product's time in page faults, where antennas multiply the skies.
 #[derive(Default)]
 struct Workspace {
@@ -564,7 +564,7 @@ struct Workspace {
 struct Memory(Mutex<Vec<Workspace>>);
 
 impl Memory {
-    fn lend<T>(&self, to: impl FnOnce(&mut Workspace) -> T) -> T {
+    fn with_workspace<T>(&self, to: impl FnOnce(&mut Workspace) -> T) -> T {
         let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut workspace = free().pop().unwrap_or_default();
         let out = to(&mut workspace);

@@ -30,7 +30,7 @@ pub(super) struct PhaseGrid {
     inverse: Arc<dyn Fft<f64>>,
 }
 
-/// Values of the nodes of a pass at all angles: `[angle][sky][real or imaginary part][node]`, nodes filled up to whole vectors.
+/// Values of the nodes of a track at all angles: `[angle][sky][real or imaginary part][node]`, nodes filled up to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PhaseTable {
     values: Vec<f64>,
@@ -181,7 +181,7 @@ impl PhaseGrid {
     }
 }
 
-/// Shares of the nodes of a pass in a row, filled up to whole vectors.
+/// Shares of the nodes of a track in a row, filled up to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PaddedShares(Vec<f64>);
 

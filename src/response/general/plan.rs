@@ -1,4 +1,4 @@
-//! Where rows of B are computed, and from which the others are interpolated.
+//! Plans which rows of B are computed, and which are interpolated from them.
 //!
 //! With P(t) the axes that follow the normal z(t) of the pair's plane without turning about it, and gamma(t) the angle from
 //! there to the pair's own x, the row of a pair at time t is
@@ -8,9 +8,9 @@
 //! ```
 //!
 //! where g depends on P, on the baseline's length and on the radii: slowly along an orbit, and smoothly however its plane,
-//! altitude, pitch and yaw change. So g is computed at Chebyshev's points of a pass of one pair, where positions follow from
+//! altitude, pitch and yaw change. So g is computed at Chebyshev's points of a track of one pair, where positions follow from
 //! those of the visibilities, and interpolated by the polynomial through them. Their number follows from how far the pattern's phases can
-//! move; where it would not be less than that of the visibilities, each is computed for itself.
+//! move; where that is no fewer than the visibilities, each row is computed for itself.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::ops::Range;
@@ -25,15 +25,15 @@ use super::view::{Axes, PairView, euler, transported};
 use super::{PairAt, RowsError, RowsRefusal, RowsSetup};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
-/// A gap in a pair's data that ends a pass, s: polynomials do not reach across what the array did not observe.
+/// A gap in a pair's data that ends a track, s: polynomials do not reach across times without data.
 const GAP_S: f64 = 900.0;
 
-/// Times from whose positions those of a node follow, and their greatest distance, s: 0.09 rad of a low orbit, so that positions err
+/// Number of times from whose positions a node's are interpolated, and their greatest distance, s: 0.09 rad of a low orbit, so that positions err
 /// by 0.1 mm.
 const POSITIONS: usize = 8;
 const POSITION_STEP_S_MAX: f64 = 120.0;
 
-/// Change of a velocity at an instant, m/s, that divides a pass: what follows from positions is not smooth there. The turnarounds of a
+/// Sudden change of a velocity, m/s, that divides a track: rows are not smooth there. The turnarounds of a
 /// breathing formation change it by 0.2 m/s.
 const KINK_M_S: f64 = 1e-4;
 
@@ -42,10 +42,10 @@ const KINK_M_S: f64 = 1e-4;
 const KINK_STRIDE: usize = 4;
 const KINK_STEP_S_MAX: f64 = 20.0;
 
-/// Most rows from which others are interpolated together: more are longer to interpolate from, not more exact.
+/// Most rows from which others are interpolated together: more take longer and are not more exact.
 const NODES_MAX: usize = 40;
 
-/// Error of the angles gamma of rows as those of a pass's nodes tell them, rad, above which these do not tell how rows move.
+/// Error of the rows' angles gamma, interpolated from a track's nodes, rad, above which the nodes do not say how rows move.
 const GAMMA_ERROR_RAD: f64 = 1e-4;
 
 /// Rows that a task computes together, and whose patterns a product with `Bt W B` holds: 0.3 MB each at l = 191.
@@ -63,7 +63,7 @@ pub(super) struct RowNode {
 
 /// Consecutive visibilities of a pair, and the nodes of their rows.
 #[derive(Clone, Debug)]
-pub(super) struct Pass {
+pub(super) struct Track {
     pub(super) rows: Range<usize>,
     pub(super) nodes: Range<usize>,
     /// Times of the nodes, -1 to 1, and their barycentric weights; empty if each row has its node.
@@ -71,7 +71,7 @@ pub(super) struct Pass {
     pub(super) weights: Vec<f64>,
     /// Angles gamma of the nodes, rad, without jumps; empty where rows are of instants.
     pub(super) gamma_rad: Vec<f64>,
-    /// How far phases move in a unit of tau, rad: of the fringe, and of the limb's highest degree. `None` where rows are of instants.
+    /// Motion of phases in a unit of tau, rad: of the fringe, and of the limb's highest degree. `None` where rows are of instants.
     pub(super) rate_rad: Option<[f64; 2]>,
 }
 
@@ -88,18 +88,18 @@ pub struct Observed<'a> {
 #[derive(Clone, Debug)]
 pub struct RowPlan {
     pub(super) nodes: Vec<RowNode>,
-    pub(super) passes: Vec<Pass>,
-    /// Passes that a task takes together.
+    pub(super) tracks: Vec<Track>,
+    /// Tracks that a task takes together.
     pub(super) groups: Vec<Range<usize>>,
     /// By row: angle gamma, rad.
     pub(super) gamma_rad: Vec<f64>,
-    /// By row: its time within the pass, -1 to 1.
+    /// By row: its time within the track, -1 to 1.
     pub(super) tau: Vec<f64>,
     /// By row: half of its integration in units of tau; empty for instants.
     pub(super) reach: Vec<f32>,
     /// By row: coefficients of its response; empty if it is that of the setup.
     pub(super) coefficients: Vec<f32>,
-    /// Averages that are taken for instants in their middle, as the motion of their pair is not known.
+    /// Averages that are treated as instants in their middle, as the motion of their pair is not known.
     instants: usize,
     pub(super) classes: Vec<NodeClass>,
     /// Whether each row is computed for itself, with nothing in common with others.
@@ -130,7 +130,7 @@ impl RowPlan {
         let classes = Classes::new(setup.l_max, &views, u_max);
         let mut plan = Self {
             nodes: Vec::new(),
-            passes: Vec::new(),
+            tracks: Vec::new(),
             groups: Vec::new(),
             gamma_rad: vec![0.0; pairs.len()],
             tau: vec![0.0; pairs.len()],
@@ -148,11 +148,11 @@ impl RowPlan {
             };
             let end = (first + 1..pairs.len()).take_while(together).last().map_or(first + 1, |k| k + 1);
             let duration_s = observed.duration_s;
-            let pass = PassBuilder { setup, pairs, duration_s, views: &views, classes: &classes, direct };
+            let track = TrackBuilder { setup, pairs, duration_s, views: &views, classes: &classes, direct };
             if direct {
-                pass.each(first..end, &mut plan);
+                track.each(first..end, &mut plan);
             } else {
-                pass.smooth(first..end, &mut plan);
+                track.smooth(first..end, &mut plan);
             }
             first = end;
         }
@@ -172,8 +172,8 @@ impl RowPlan {
         self.nodes.len()
     }
 
-    /// Averages over integrations that are taken for instants in their middle: those without enough others of their pair about them to tell
-    /// how it moves.
+    /// Averages over integrations that are treated as instants in their middle: their pair has too few visibilities nearby to know its
+    /// motion.
     #[must_use]
     pub fn instants(&self) -> usize {
         self.instants
@@ -182,40 +182,40 @@ impl RowPlan {
     fn group(&mut self) {
         let mut start = 0;
         let mut nodes = 0;
-        for (k, pass) in self.passes.iter().enumerate() {
-            nodes += pass.nodes.len();
-            if nodes >= GROUP_NODES || k + 1 == self.passes.len() {
+        for (k, track) in self.tracks.iter().enumerate() {
+            nodes += track.nodes.len();
+            if nodes >= GROUP_NODES || k + 1 == self.tracks.len() {
                 self.groups.push(start..k + 1);
                 (start, nodes) = (k + 1, 0);
             }
         }
     }
 
-    /// The instants of a row of a pass.
-    pub(super) fn instants_of<'a>(&self, pass: &Pass, row: usize, all: &'a Instants) -> &'a [Instant] {
+    /// The instants of a row of a track.
+    pub(super) fn instants_of<'a>(&self, track: &Track, row: usize, all: &'a Instants) -> &'a [Instant] {
         let reach = self.reach.get(row).map_or(0.0, |reach| f64::from(*reach));
-        match pass.rate_rad {
+        match track.rate_rad {
             Some(rates_rad) => all.for_phases(rates_rad.map(|rate_rad| rate_rad * reach)),
             None => all.middle(),
         }
     }
 
-    /// The share of each node of a pass in a row at an instant; returns the angle gamma.
-    pub(super) fn shares(&self, pass: &Pass, row: usize, instant: &Instant, shares: &mut Vec<f64>) -> f64 {
+    /// The share of each node of a track in a row at an instant; returns the angle gamma.
+    pub(super) fn shares(&self, track: &Track, row: usize, instant: &Instant, shares: &mut Vec<f64>) -> f64 {
         let (tau, gamma_rad) = (self.tau[row], self.gamma_rad[row]);
         if instant.offset == 0.0 {
-            pass.shares(tau, shares);
+            track.shares(tau, shares);
             return gamma_rad;
         }
         let interpolated =
-            |shares: &[f64]| -> f64 { shares.iter().zip(&pass.gamma_rad).map(|(a, b)| a * b).sum() };
-        pass.shares(tau, shares);
+            |shares: &[f64]| -> f64 { shares.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum() };
+        track.shares(tau, shares);
         let middle_rad = interpolated(shares);
-        pass.shares(tau + f64::from(self.reach[row]) * instant.offset, shares);
+        track.shares(tau + f64::from(self.reach[row]) * instant.offset, shares);
         gamma_rad + interpolated(shares) - middle_rad
     }
 
-    /// Adds a row's values of skies to lists of them, from those of the skies' products.
+    /// Adds a row's values of all skies to their lists, from the values of the skies' products.
     pub(super) fn combine(&self, row: usize, products: &[Complex64], out: &mut [Vec<Complex64>]) {
         let count = products.len() / out.len().max(1);
         for (out, products) in out.iter_mut().zip(products.chunks_exact(count.max(1))) {
@@ -280,7 +280,7 @@ fn coefficients(most: usize, rows: usize, observed: &Observed<'_>) -> Result<Vec
     Ok(parts.collect::<Result<Vec<_>, _>>()?.concat())
 }
 
-impl Pass {
+impl Track {
     /// The share of each node at a time.
     fn shares(&self, tau: f64, shares: &mut Vec<f64>) {
         shares.clear();
@@ -294,8 +294,8 @@ impl Pass {
     }
 }
 
-/// Divides passes.
-struct PassBuilder<'a> {
+/// Divides tracks.
+struct TrackBuilder<'a> {
     setup: &'a RowsSetup,
     pairs: &'a [PairAt],
     duration_s: &'a [f32],
@@ -304,7 +304,7 @@ struct PassBuilder<'a> {
     direct: bool,
 }
 
-impl PassBuilder<'_> {
+impl TrackBuilder<'_> {
     /// Plans these rows, divided where a satellite changes its velocity; a few about such a place each for itself.
     fn smooth(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let is_new =
@@ -326,7 +326,7 @@ impl PassBuilder<'_> {
                 let [from, to] = [at - 2, at + 3].map(|place| distinct[place]);
                 self.split(first..from, plan);
                 self.each(from..to, plan);
-                // What follows knows nothing of what was before.
+                // Rows after the change are independent of those before.
                 (first, begin, k) = (to, at + 3, at + 3 + POSITIONS / 2);
             } else {
                 k += KINK_STRIDE;
@@ -352,7 +352,7 @@ impl PassBuilder<'_> {
         off.into_iter().map(norm).fold(0.0, f64::max) * 3.5 / step_s
     }
 
-    /// Plans these rows, as one pass or divided in two.
+    /// Plans these rows, as one track or divided in two.
     fn split(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let count = rows.len();
         if count == 0 {
@@ -370,7 +370,7 @@ impl PassBuilder<'_> {
         }
     }
 
-    /// Nodes that interpolate `exp(i h tau)` to far below 1e-4, h being what the pattern's phases move by.
+    /// Number of nodes that interpolate `exp(i h tau)` to far below 1e-4, with h the motion of the pattern's phases.
     ///
     /// Where the limb moves by an angle, the phase of a harmonic moves by up to l times that, and that of the fringe by the
     /// slope along the limb's normal: the baseline lies in the horizontal, the normal as much above it as the limb is below.
@@ -423,7 +423,7 @@ impl PassBuilder<'_> {
         }
     }
 
-    /// Half of the integration of a row, s; 0 for an instant, and for what is too long to know the positions of.
+    /// Half of the integration of a row, s; 0 for an instant, and where it is too long to know its positions.
     fn half_s(&self, row: usize) -> f64 {
         let duration_s = self.duration_s.get(row).map_or(0.0, |duration_s| f64::from(*duration_s));
         if is_known(duration_s) { 0.5 * duration_s } else { 0.0 }
@@ -441,36 +441,36 @@ impl PassBuilder<'_> {
         let nodes = first..plan.nodes.len();
         plan.instants += rows.clone().filter(|row| self.half_s(*row) > 0.0).count();
         let [tau, weights, gamma_rad] = [const { Vec::new() }; 3];
-        plan.passes.push(Pass { rows, nodes, tau, weights, gamma_rad, rate_rad: None });
+        plan.tracks.push(Track { rows, nodes, tau, weights, gamma_rad, rate_rad: None });
     }
 
-    /// Tells a pass how its rows move within their integrations, unless its nodes do not tell the angles of its rows: then these are of
-    /// instants.
-    fn move_through(&self, pass: &mut Pass, length_s: f64, plan: &mut RowPlan) {
-        for k in 1..pass.gamma_rad.len() {
-            let turns = ((pass.gamma_rad[k] - pass.gamma_rad[k - 1]) / TAU).round();
-            pass.gamma_rad[k] -= turns * TAU;
+    /// Sets how the rows of a track move within their integrations. Where its nodes do not give the angles of its rows, rows are
+    /// treated as instants.
+    fn move_through(&self, track: &mut Track, length_s: f64, plan: &mut RowPlan) {
+        for k in 1..track.gamma_rad.len() {
+            let turns = ((track.gamma_rad[k] - track.gamma_rad[k - 1]) / TAU).round();
+            track.gamma_rad[k] -= turns * TAU;
         }
         let mut shares = Vec::new();
         let is_told = |row: usize| {
-            pass.shares(plan.tau[row], &mut shares);
-            let told: f64 = shares.iter().zip(&pass.gamma_rad).map(|(a, b)| a * b).sum();
+            track.shares(plan.tau[row], &mut shares);
+            let told: f64 = shares.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum();
             let off = (told - plan.gamma_rad[row]) / TAU;
             (off - off.round()).abs() * TAU < GAMMA_ERROR_RAD
         };
-        if !pass.rows.clone().all(is_told) {
-            plan.instants += pass.rows.clone().filter(|row| self.half_s(*row) > 0.0).count();
+        if !track.rows.clone().all(is_told) {
+            plan.instants += track.rows.clone().filter(|row| self.half_s(*row) > 0.0).count();
             return;
         }
-        for row in pass.rows.clone() {
+        for row in track.rows.clone() {
             plan.reach[row] = (2.0 * self.half_s(row) / length_s) as f32;
         }
-        let steps = pass.tau.windows(2).zip(pass.gamma_rad.windows(2));
+        let steps = track.tau.windows(2).zip(track.gamma_rad.windows(2));
         let turn =
             steps.map(|(tau, gamma)| ((gamma[1] - gamma[0]) / (tau[1] - tau[0])).abs()).fold(0.0, f64::max);
-        let lengths = pass.rows.clone().map(|row| self.wavelengths(&self.views[row]));
+        let lengths = track.rows.clone().map(|row| self.wavelengths(&self.views[row]));
         let (low, high) = lengths.fold((f64::INFINITY, 0.0_f64), |(a, b), u| (a.min(u), b.max(u)));
-        pass.rate_rad = Some([TAU * (high * turn + 0.5 * (high - low)), self.setup.l_max as f64 * turn]);
+        track.rate_rad = Some([TAU * (high * turn + 0.5 * (high - low)), self.setup.l_max as f64 * turn]);
     }
 
     /// `count` nodes for all rows, at Chebyshev's points. Returns whether the positions allow it.
@@ -516,11 +516,11 @@ impl PassBuilder<'_> {
             })
             .collect();
         let nodes = first..plan.nodes.len();
-        let mut pass = Pass { rows, nodes, tau, weights, gamma_rad, rate_rad: None };
+        let mut track = Track { rows, nodes, tau, weights, gamma_rad, rate_rad: None };
         if half_s > 0.0 {
-            self.move_through(&mut pass, to_s - from_s, plan);
+            self.move_through(&mut track, to_s - from_s, plan);
         }
-        plan.passes.push(pass);
+        plan.tracks.push(track);
         true
     }
 }

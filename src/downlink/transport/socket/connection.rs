@@ -83,7 +83,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         if let (ConnectionEnd::Whole, Err(refused)) = (ended, finished) {
             ended = refused;
         }
-        if !hand_on(&mut state, &seat).await {
+        if !forward_batch(&mut state, &seat).await {
             ended = ConnectionEnd::Stopped;
         }
         (packets, refused) = state.intake.packets();
@@ -178,7 +178,7 @@ async fn exchange(
         if is_new {
             shared.seats.note_new(seat.number, Instant::now());
         }
-        if !hand_on(&mut state, seat).await {
+        if !forward_batch(&mut state, seat).await {
             return (Some(state), ConnectionEnd::Stopped);
         }
         if let Err(ended) = found.and(within_limits(&state.intake, shared)) {
@@ -229,7 +229,7 @@ fn within_limits(intake: &SenderIntake, shared: &ListenContext) -> Result<(), Co
 }
 
 /// Passes the packets found to the ground once there is room. Returns whether the ground still accepts any.
-async fn hand_on(state: &mut ConnectionState, seat: &SeatGuard<'_>) -> bool {
+async fn forward_batch(state: &mut ConnectionState, seat: &SeatGuard<'_>) -> bool {
     let bytes = std::mem::take(&mut state.packets);
     if bytes.is_empty() {
         return true;

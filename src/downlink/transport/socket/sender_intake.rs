@@ -209,7 +209,7 @@ impl SenderIntake {
         let (before, bytes) = self.preamble.take(bytes)?;
         self.intake.push(&before);
         self.intake.push(bytes);
-        self.hand_out(out);
+        self.release(out);
         let is_alive = self.look_for_signs();
         let is_new = std::mem::take(&mut self.has_new);
         match self.judge.refused() {
@@ -227,7 +227,7 @@ impl SenderIntake {
         let before = self.preamble.finish()?;
         self.intake.push(&before);
         self.intake.finish();
-        self.hand_out(out);
+        self.release(out);
         self.end_group();
         self.pass_on(out);
         self.look_for_signs();
@@ -287,7 +287,7 @@ impl SenderIntake {
         ReceptionCounters { frames: self.intake.frames(), ..self.stream.counters().clone() }
     }
 
-    fn hand_out(&mut self, out: &mut Vec<u8>) {
+    fn release(&mut self, out: &mut Vec<u8>) {
         while let Some(event) = self.intake.next_event() {
             let Event::Packet(packet) = event else {
                 self.stream.accept(&event);

@@ -11,7 +11,7 @@ fn in_parts(
     let folder = tempfile::tempdir().unwrap();
     let mut part = SumPart::first(count, folder.path());
     for number in 0.. {
-        let mut engine = HarmonicEngine::new(setup()).unwrap().among(&part.ranks());
+        let mut engine = HarmonicEngine::new(setup()).unwrap().with_ranks(&part.ranks());
         for block in blocks(number) {
             let _ = engine.add(&block).unwrap();
         }
@@ -109,7 +109,7 @@ fn ranks_hold_parts_and_answer_as_one() {
         // 112 alphas in seven blocks, and 56 of data in four.
         for count in [1, 2, 3, 4, 9] {
             let found = on_threads(count, |ranks| {
-                let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+                let mut engine = HarmonicEngine::new(setup()).unwrap().with_ranks(ranks);
                 for block in blocks {
                     assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
                 }
@@ -134,7 +134,7 @@ fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
     let share = |rank, count| RankShare { rank, count };
     for written in [1, 2, 3, 9] {
         let parts: Vec<Vec<u8>> = on_threads(written, |ranks| {
-            let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+            let mut engine = HarmonicEngine::new(setup()).unwrap().with_ranks(ranks);
             before.iter().for_each(|block| drop(engine.add(block).unwrap()));
             let mut part = Vec::new();
             engine.checkpoint(&mut part).unwrap();
@@ -168,7 +168,7 @@ fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
 fn what_are_no_parts_of_the_same_sums_is_refused() {
     let blocks = blocks(0, 4);
     let parts: Vec<Vec<u8>> = on_threads(2, |ranks| {
-        let mut engine = HarmonicEngine::new(setup()).unwrap().among(ranks);
+        let mut engine = HarmonicEngine::new(setup()).unwrap().with_ranks(ranks);
         blocks.iter().for_each(|block| drop(engine.add(block).unwrap()));
         let mut part = Vec::new();
         engine.checkpoint(&mut part).unwrap();

@@ -1,0 +1,231 @@
+//! The normal equations of several channels in the unknowns of their prior: `T' A T` and `T' b`.
+
+use std::borrow::Cow;
+
+use faer::Mat;
+use rayon::prelude::*;
+
+use super::prior::{Prior, place_of};
+use crate::imaging::power::Block;
+use crate::imaging::{Accuracy, NormalSums, SumCounts};
+
+/// Sums of all channels. What a channel's data scatter more than their noise counts as noise.
+pub(super) struct JointSums<'a> {
+    pub(super) prior: &'a Prior,
+    pub(super) channels: Vec<&'a (dyn NormalSums + Sync)>,
+    /// s of each channel: weights are divided by s^2.
+    pub(super) noise_factors: Vec<f64>,
+    right: Vec<f64>,
+    noise_right: Vec<f64>,
+}
+
+impl<'a> JointSums<'a> {
+    pub(super) fn new(
+        prior: &'a Prior,
+        channels: Vec<&'a (dyn NormalSums + Sync)>,
+        noise_factors: Vec<f64>,
+    ) -> Self {
+        let of = |right: &dyn Fn(&(dyn NormalSums + Sync)) -> Vec<f64>, exponent: i32| {
+            let scaled = |(sums, factor): (&&'a (dyn NormalSums + Sync), &f64)| {
+                right(*sums).into_iter().map(|b| b / factor.powi(exponent)).collect::<Vec<f64>>()
+            };
+            prior.transposed(&channels.iter().zip(&noise_factors).map(scaled).collect::<Vec<_>>())
+        };
+        let right = of(&|sums| sums.right_hand_side().to_vec(), 2);
+        // Noise that is s times as large.
+        let noise_right = of(&|sums| sums.noise_right_hand_side().to_vec(), 1);
+        Self { prior, channels, noise_factors, right, noise_right }
+    }
+}
+
+impl NormalSums for JointSums<'_> {
+    fn unknowns(&self) -> usize {
+        self.right.len()
+    }
+
+    fn apply(&self, x: &[f64], y: &mut [f64]) {
+        for product in self.apply_all(&[x]) {
+            y.copy_from_slice(&product);
+        }
+    }
+
+    fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
+        // [vector][channel]
+        let skies: Vec<Vec<Vec<f64>>> = x.iter().map(|x| self.prior.skies(x)).collect();
+        let mut products: Vec<Vec<Vec<f64>>> = vec![Vec::new(); x.len()];
+        for (channel, (sums, factor)) in self.channels.iter().zip(&self.noise_factors).enumerate() {
+            let of: Vec<&[f64]> = skies.iter().map(|skies| skies[channel].as_slice()).collect();
+            for (product, all) in sums.apply_all(&of).into_iter().zip(&mut products) {
+                all.push(product.into_iter().map(|y| y / factor.powi(2)).collect());
+            }
+        }
+        products.iter().map(|products| self.prior.transposed(products)).collect()
+    }
+
+    fn right_hand_side(&self) -> &[f64] {
+        &self.right
+    }
+
+    fn noise_right_hand_side(&self) -> &[f64] {
+        &self.noise_right
+    }
+
+    fn counts(&self) -> SumCounts {
+        let mut all = SumCounts::default();
+        for counts in self.channels.iter().map(|sums| sums.counts()) {
+            all.visibilities += counts.visibilities;
+            all.weight += counts.weight;
+            all.power += counts.power;
+        }
+        all
+    }
+
+    fn accuracy(&self) -> Accuracy {
+        let each = self.channels.iter().map(|sums| sums.accuracy());
+        each.fold(Accuracy { relative: 0.0, absolute: 0.0 }, |a, b| Accuracy {
+            relative: a.relative.max(b.relative),
+            absolute: a.absolute.max(b.absolute),
+        })
+    }
+
+    fn failure(&self) -> Option<&str> {
+        self.channels.iter().find_map(|sums| sums.failure())
+    }
+}
+
+/// Order and parity of each block of a channel, in their order.
+fn orders(l_max: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..=l_max).flat_map(move |m| [(m, 0), (m, 1)]).filter(move |(m, parity)| m + parity <= l_max)
+}
+
+/// The blocks of one order and parity that channels have, scaled by what they are divided by: `s_l A s_l' / s^2`.
+pub(super) struct ScaledBlocks {
+    m: usize,
+    parity: usize,
+    /// Of the channels that reach this order.
+    of_channel: Vec<Mat<f64>>,
+}
+
+/// Of all channels; `blocks` are those of each.
+pub(super) fn scaled_blocks(
+    prior: &Prior,
+    blocks: &[Vec<Block<'_>>],
+    noise_factors: &[f64],
+) -> Vec<ScaledBlocks> {
+    let scaled = |(index, (m, parity)): (usize, (usize, usize))| {
+        // Channels of lesser degree have no fewer blocks before this one, order by order.
+        let of_channel = (0..prior.of_degree(m + parity)).map(|channel| {
+            let block = &blocks[channel][index_in(prior.l_max[channel], m, parity)];
+            let scale = |k: usize| prior.scale[channel][block.degrees[k]] / noise_factors[channel];
+            Mat::from_fn(block.degrees.len(), block.degrees.len(), |i, j| {
+                scale(i) * block.matrix[(i, j)] * scale(j)
+            })
+        });
+        debug_assert_eq!(index_in(prior.l_max[0], m, parity), index);
+        ScaledBlocks { m, parity, of_channel: of_channel.collect() }
+    };
+    let all: Vec<_> = orders(prior.l_max.first().copied().unwrap_or(0)).enumerate().collect();
+    all.into_par_iter().map(scaled).collect()
+}
+
+/// Number of the block of an order and parity: two an order, but one where the other parity has no degree.
+fn index_in(l_max: usize, m: usize, parity: usize) -> usize {
+    debug_assert!(m + parity <= l_max);
+    2 * m + parity
+}
+
+/// The blocks of `T' A T`.
+pub(super) fn joint_blocks(prior: &Prior, scaled: &[ScaledBlocks]) -> Vec<Block<'static>> {
+    let (offsets, _) = prior.offsets();
+    scaled.par_iter().map(|scaled| joint_block(prior, scaled, &offsets)).collect()
+}
+
+fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block<'static> {
+    let ScaledBlocks { m, parity, of_channel } = scaled;
+    let sizes: Vec<usize> = of_channel.iter().map(Mat::nrows).collect();
+    let first: Vec<usize> =
+        sizes.iter().scan(0, |sum, size| Some(std::mem::replace(sum, *sum + size))).collect();
+    let count = sizes.iter().sum();
+    let mut matrix = Mat::<f64>::zeros(count, count);
+    for a in 0..sizes.len() {
+        for b in 0..=a {
+            // Channel c sees unknowns of channels up to c, at its own degrees.
+            for c in a..sizes.len() {
+                let share = prior.share(c, a) * prior.share(c, b);
+                for j in 0..sizes[c] {
+                    for i in 0..sizes[c] {
+                        matrix[(first[a] + i, first[b] + j)] += share * of_channel[c][(i, j)];
+                    }
+                }
+            }
+            if a != b {
+                for j in 0..sizes[b] {
+                    for i in 0..sizes[a] {
+                        matrix[(first[b] + j, first[a] + i)] = matrix[(first[a] + i, first[b] + j)];
+                    }
+                }
+            }
+        }
+    }
+    let rows: Vec<(usize, usize)> = (0..sizes.len())
+        .flat_map(|channel| (0..sizes[channel]).map(move |k| (channel, m + parity + 2 * k)))
+        .collect();
+    let parts = if *m == 0 { 1 } else { 2 };
+    let places = |part: usize| {
+        let place =
+            |(channel, l): &(usize, usize)| offsets[*channel] + place_of(prior.l_max[*channel], *l, *m, part);
+        rows.iter().map(place).collect()
+    };
+    Block {
+        matrix: Cow::Owned(matrix),
+        degrees: rows.iter().map(|(_, l)| *l).collect(),
+        places: (0..parts).map(places).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::imaging::joint::prior::Likeness;
+
+    /// The blocks times unknowns are what `T'`, the channels' own blocks and T give one after the other.
+    #[test]
+    fn blocks_are_the_channels_blocks_between_t_and_its_transpose() {
+        let scale = vec![vec![1.0, 0.5, 0.3, 0.2], vec![2.0, 1.5, 0.7], vec![1.2, 0.9, 0.4]];
+        let likeness = Likeness { length: 2.0, own_share: 0.05 };
+        let prior = Prior::new(vec![3e6, 10e6, 5e6], scale, likeness).unwrap();
+        let factors = [1.0, 1.5, 1.2];
+        let of = |channel: usize| -> Vec<Block<'static>> {
+            let l_max = prior.l_max[channel];
+            let of_order = |(m, parity): (usize, usize)| {
+                let degrees: Vec<usize> = (m + parity..=l_max).step_by(2).collect();
+                let n = degrees.len();
+                let element = |i: usize, j: usize| {
+                    ((1 + channel) * (m + 1)) as f64 / (1.0 + (i + j) as f64) + f64::from(u8::from(i == j))
+                };
+                let parts = if m == 0 { 1 } else { 2 };
+                let place = |part| degrees.iter().map(|l| place_of(l_max, *l, m, part)).collect();
+                let places = (0..parts).map(place).collect();
+                Block { matrix: Cow::Owned(Mat::from_fn(n, n, element)), degrees, places }
+            };
+            orders(l_max).map(of_order).collect()
+        };
+        let blocks: Vec<Vec<Block<'_>>> = (0..3).map(of).collect();
+        let joint = joint_blocks(&prior, &scaled_blocks(&prior, &blocks, &factors));
+        let (_, count) = prior.offsets();
+        let u: Vec<f64> = (0..count).map(|k| (0.9 * k as f64).sin()).collect();
+        let products: Vec<Vec<f64>> = prior
+            .skies(&u)
+            .iter()
+            .enumerate()
+            .map(|(channel, sky)| {
+                let product = crate::imaging::power::multiply(&blocks[channel], sky);
+                product.iter().map(|y| y / factors[channel] / factors[channel]).collect()
+            })
+            .collect();
+        let (found, expected) = (crate::imaging::power::multiply(&joint, &u), prior.transposed(&products));
+        for (a, b) in found.iter().zip(&expected) {
+            assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "{a} {b}");
+        }
+    }
+}
