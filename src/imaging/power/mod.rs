@@ -83,8 +83,9 @@ impl SkyPower {
         let term = |l: usize| {
             let l = l as f64;
             let power_k2 = last * ((l + 1.0) / first as f64).powf(fall);
-            // The window of a disc of a pixel's area, as a Gaussian of the same width: w_l^2 = exp(-l^2 / N_pix).
-            (2.0 * l + 1.0) / (4.0 * PI) * power_k2 * (-l * l / pixel_count(nside) as f64).exp()
+            // The window of a disc of a pixel's area, 2 J_1(x) / x with x = 2 l / sqrt(N_pix): ln w_l^2 = -x^2 / 4 - x^4 / 192 - ..
+            let q = l * l / pixel_count(nside) as f64;
+            (2.0 * l + 1.0) / (4.0 * PI) * power_k2 * (-q - q * q / 12.0).exp()
         };
         // Of w_l^2 a hundredth is left at 8 nside.
         (first..=8 * nside).map(term).sum()

@@ -13,9 +13,7 @@ use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 const ROUNDS_MAX: usize = 6;
 const SETTLED: f64 = 0.1;
 const SETTLED_ON_THE_WAY: f64 = 0.5;
-/// Change of ln C_l at a knot since the last draws at which traces are drawn again: their ratio to those of the blocks changes by much less.
-const DRAWN_AGAIN: f64 = 0.5;
-/// Error of a round's solution in units of what the data leave open of it: its square adds a hundredth to the powers' traces.
+/// Error of a map on the way in units of what the data leave open of it.
 const SOLVED: f64 = 0.1;
 /// The draws for the traces, always the same; samples have others. One is enough where the blocks are near: it tells what traces differ by.
 const TRACES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
@@ -120,7 +118,6 @@ impl PowerProblem<'_> {
             _ => vec![0.0; self.right.len()],
         }];
         let mut ratio = vec![1.0; l_max + 1];
-        let mut drawn_at: Option<PowerFit> = None;
         let mut factor = 1.0;
         // Maps on the way do without draws. The blocks know more than data of a short time do, so that the power comes out too small, and
         // the map too smooth: on the safe side.
@@ -130,15 +127,14 @@ impl PowerProblem<'_> {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
-            // The first power is a guess, of which draws say little.
-            let is_far = drawn_at.as_ref().is_none_or(|at| fit.change(at) > DRAWN_AGAIN);
-            if is_wanted && round > 1 && watch.all(is_far) {
-                ratio = self.drawn_ratio(&regularisation, &factors, watch);
-                drawn_at = Some(fit.clone());
+            let mut rule = rule;
+            if is_wanted {
+                ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
+            } else {
+                rule = self.rule(&factors, factor, rule);
             }
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
-                let rule = self.rule(&factors, factor, rule);
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
                 system.solve(&[self.right], &mut x, &[rule], &task);
             }
@@ -154,8 +150,7 @@ impl PowerProblem<'_> {
             let change = next.change(&fit).max((factor / before).ln().abs());
             fit = next;
             let task = watch.start("the sky's power", settled);
-            let is_open = change > settled || (is_wanted && drawn_at.is_none());
-            if !task.report_wanting(is_open && round < ROUNDS_MAX, round, change) {
+            if !task.report_wanting(change > settled && round < ROUNDS_MAX, round, change) {
                 let factors = Factors::new(self.blocks, &fit.regularisation());
                 let mut traces = factors.traces(l_max);
                 traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
@@ -167,7 +162,7 @@ impl PowerProblem<'_> {
         Err(SolveError::NoPower)
     }
 
-    /// When a solution is good enough beside what the data leave open, or as good as `rule` asks.
+    /// When a map on the way is good enough beside what the data leave open, or as good as `rule` asks.
     pub(in crate::imaging) fn rule(
         &self,
         factors: &Factors<'_>,
@@ -182,26 +177,19 @@ impl PowerProblem<'_> {
         StoppingRule { residual_max: rule.residual_max.max(SOLVED * open.min(1.0)), ..rule }
     }
 
-    /// The ratio of traces by draws: by one where it says that the blocks are near.
+    /// The ratio of traces by draws: few where the last ones said that the blocks are near.
     fn drawn_ratio(
         &self,
         regularisation: &Diagonal,
         factors: &Factors<'_>,
+        last: &[f64],
         watch: NamedWatch<'_>,
     ) -> Vec<f64> {
-        let covariance = Covariance { sums: self.sums, regularisation, factors };
-        let traces = factors.traces(self.l_max());
-        let mut drawn = Vec::new();
-        let mut ratio = Vec::new();
-        for which in [&TRACES[..1], &TRACES[1..]] {
-            let task = watch.start("draws for the sky's power", TRACE_SETTLED);
-            drawn.extend(covariance.draw(which, TRACE_SETTLED, &task));
-            ratio = self.ratio(&drawn, &traces);
-            if !watch.all(ratio.iter().any(|ratio| ratio.ln().abs() > NEAR)) {
-                break;
-            }
-        }
-        ratio
+        let is_near = watch.all(last.iter().all(|ratio| ratio.ln().abs() < NEAR));
+        let which = if is_near { &TRACES[..1] } else { &TRACES };
+        let task = watch.start("draws for the sky's power", TRACE_SETTLED);
+        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, TRACE_SETTLED, &task);
+        self.ratio(&drawn, &factors.traces(self.l_max()))
     }
 
     /// Traces of the true covariance over those of the blocks, means over neighbouring degrees: a draw has few numbers of each.
