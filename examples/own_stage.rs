@@ -7,7 +7,6 @@ mod common;
 
 use std::convert::Infallible;
 use std::error::Error;
-use std::fs::File;
 use std::time::Duration;
 
 use lunarray::downlink::{DownlinkError, DownlinkReader};
@@ -16,7 +15,7 @@ use lunarray::runtime::{Cancel, Flow, Graph, Outlet, Sink, Source, Stage, Units}
 use num_complex::Complex32;
 
 /// Gives the visibility blocks of a downlink file.
-struct Blocks(DownlinkReader<File>);
+struct Blocks(DownlinkReader);
 
 impl Source for Blocks {
     type Out = VisibilityBlock;

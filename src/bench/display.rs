@@ -2,12 +2,24 @@
 
 use std::fmt;
 
-use super::{Bench, ChainRun, Machine, QueueDepths};
+use super::machine::is_doubtful;
+use super::{Bench, ChainRun, Comparison, Machine, QueueDepths, StageComparison};
 
 impl fmt::Display for Bench {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Machine { processor, threads } = &self.machine;
-        writeln!(f, "{processor}, {threads} worker threads")?;
+        let Machine { processor, vector_units, threads, version, commit, date } = &self.machine;
+        let commit = commit.map_or(String::new(), |commit| format!(" ({commit})"));
+        writeln!(f, "lunarray {version}{commit}, {date}")?;
+        let units =
+            if vector_units.is_empty() { String::new() } else { format!(" ({})", vector_units.join(", ")) };
+        writeln!(f, "{processor}{units}, {threads} worker threads")?;
+        if let Some(share) = self.others.filter(|share| is_doubtful(*share)) {
+            let percent = 100.0 * share;
+            writeln!(
+                f,
+                "warning: others used {percent:.0} % of the processors meanwhile; repeat it on a machine at rest"
+            )?;
+        }
         writeln!(
             f,
             "{:.1} s of {} channels x {} daughters, {} bits, blocks of {}, {} sky pixels\n",
@@ -31,6 +43,16 @@ impl fmt::Display for Bench {
         if let Some(stage) = &self.saturates_first {
             write!(f, "\nsaturates first: {stage}")?;
         }
+        if let Some(Comparison { before: [version, processor, date], stages }) = &self.comparison {
+            write!(f, "\n\nbeside lunarray {version} of {date} on {processor}:")?;
+            for StageComparison { stage, before_s, now_s, times_as_fast, differs } in stages {
+                let verdict = if *differs { "" } else { ", within the spread" };
+                write!(
+                    f,
+                    "\n{stage:<10} {now_s:.4} s, was {before_s:.4} s: {times_as_fast:.2} times as fast{verdict}"
+                )?;
+            }
+        }
         Ok(())
     }
 }
@@ -39,8 +61,9 @@ impl Bench {
     fn write_rates(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let columns = [
             ("stage     ", 10),
+            ("median s", 9),
+            ("quartiles s", 17),
             ("samples/s", 11),
-            ("slowest .. fastest", 23),
             ("visibilities/s", 15),
             ("bytes/s", 12),
             ("times real time", 16),
@@ -49,8 +72,9 @@ impl Bench {
         let rows = self.rates.iter().map(|rate| {
             [
                 format!("{:<10}", rate.stage),
+                format!("{:.4}", rate.median_s),
+                format!("{:.4} .. {:.4}", rate.quartiles_s[0], rate.quartiles_s[1]),
                 format!("{:.3e}", rate.samples_per_s),
-                range(rate.samples_per_s_range),
                 format!("{:.3e}", rate.visibilities_per_s),
                 format!("{:.3e}", rate.bytes_per_s),
                 format!("{:.1}", rate.times_real_time),

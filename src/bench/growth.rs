@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::chain;
-use super::timing::{median, seconds_of, timed};
+use super::timing::{median, samples_per_s as samples_in_a_second, seconds_of, timed};
 use crate::pipeline::{Config, PipelineError, Plan};
 use crate::sky::SkyMap;
 
@@ -20,7 +20,7 @@ pub struct GrowthRow {
     pub samples_per_s: f64,
     /// Rates of the slowest and of the fastest run.
     pub samples_per_s_range: [f64; 2],
-    /// Rate relative to real time at this size.
+    /// Mission time over median time.
     pub times_real_time: f64,
     /// Processor time per second of mission time at this size, s, median over runs.
     pub core_s_per_mission_s: Option<f64>,
@@ -68,14 +68,13 @@ fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Gro
     }
     let samples_per_s = median(&mut rates);
     let (channels, daughters) = (sized.instrument.channels.len(), sized.array.satellites());
-    let width_hz = sized.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
     Ok(GrowthRow {
         channels,
         daughters,
         block_samples: sized.config.daughters.block_samples,
         samples_per_s,
         samples_per_s_range: [rates[0], rates[rates.len() - 1]],
-        times_real_time: samples_per_s / ((channels * daughters) as f64 * width_hz),
+        times_real_time: samples_per_s / samples_in_a_second(&sized),
         core_s_per_mission_s: (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s),
     })
 }

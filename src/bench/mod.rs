@@ -4,15 +4,19 @@
 //! them all with their queues, `growth` repeats that at other sizes. May use every folder but [`crate::cli`].
 
 mod chain;
+mod compare;
 mod display;
 mod growth;
+mod machine;
 mod timing;
 
 use std::convert::Infallible;
+use std::time::Instant;
 
 use serde::Serialize;
 
-use self::timing::{TimeSpent, median, seconds_of, timed};
+use self::machine::{machine_seconds, share_of_others};
+use self::timing::{TimeSpent, core_seconds_used, median, quartiles, samples_per_s, seconds_of, timed};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
@@ -25,13 +29,12 @@ use crate::runtime::{Flow, Outlet, Report, Source, Stage};
 use crate::sky::SkyMap;
 
 pub use chain::{ChainRun, QueueDepths};
+pub use compare::{Comparison, StageComparison};
 pub use growth::GrowthRow;
+pub use machine::Machine;
 
 /// The stages that can be measured alone, and the chain.
 pub const BENCH_STAGES: [&str; 6] = ["sample", "link", "correlate", "transmit", "receive", "chain"];
-
-/// Samples per second of the design: eight daughters, 30 channels of 8 kHz.
-const DESIGN_SAMPLES_PER_S: f64 = 8.0 * 30.0 * 8000.0;
 
 /// What to measure.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,6 +52,12 @@ pub struct BenchSettings {
 pub struct Rate {
     /// Name of the stage.
     pub stage: &'static str,
+    /// Time of every run, s.
+    pub runs_s: Vec<f64>,
+    /// Their median, s.
+    pub median_s: f64,
+    /// Their quartiles, s.
+    pub quartiles_s: [f64; 2],
     /// Complex samples per second, median over runs.
     pub samples_per_s: f64,
     /// Rates of the slowest and of the fastest run.
@@ -57,27 +66,20 @@ pub struct Rate {
     pub visibilities_per_s: f64,
     /// Bytes per second that the stage passes: samples on the links, packets on the downlink.
     pub bytes_per_s: f64,
-    /// Median rate relative to that of eight daughters with 30 channels of 8 kHz.
+    /// Mission time over median time: how much faster than the daughters it would have to be.
     pub times_real_time: f64,
     /// Processor time per second of mission time, s, median over runs; it hardly depends on the other load of the machine.
     /// `None` where the system does not report it.
     pub core_s_per_mission_s: Option<f64>,
 }
 
-/// The machine.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct Machine {
-    /// Name of the processor as reported by the system.
-    pub processor: String,
-    /// Number of worker threads.
-    pub threads: usize,
-}
-
 /// The results of a benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct Bench {
-    /// The machine.
+    /// The machine, and the program.
     pub machine: Machine,
+    /// Share of the processors that others used meanwhile; `None` where the system does not report it.
+    pub others: Option<f64>,
     /// Mission time of one run, s.
     pub mission_s: f64,
     /// Number of channels.
@@ -100,6 +102,9 @@ pub struct Bench {
     pub saturates_first: Option<String>,
     /// The chain at other sizes; empty unless requested.
     pub growth: Vec<GrowthRow>,
+    /// The stages beside an earlier benchmark, if one was given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub comparison: Option<Comparison>,
 }
 
 /// The default pipeline: the design's 30 channels, 8 bits, a small sky.
@@ -139,6 +144,7 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     let material = material(&plan, &skies)?;
     let wanted = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
     let mission_s = seconds_of(&plan);
+    let (since, before_s) = (Instant::now(), machine_seconds().zip(core_seconds_used()));
     let mut rates = Vec::new();
     let (mut chain, mut ground) = (None, None);
     for stage in BENCH_STAGES.into_iter().filter(|stage| wanted(stage)) {
@@ -155,18 +161,23 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
             core_seconds.extend(spent.core_seconds);
         }
         let spent_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
-        rates.push(material.rate(stage, seconds, spent_s));
+        rates.push(material.rate(stage, seconds, spent_s, samples_per_s(&plan)));
         if stage == "chain" {
             ground = Some(chain::run_ground(config, &material.packets)?);
         }
     }
     let growth = if settings.growth { growth::rows(&plan, &skies, settings.runs)? } else { Vec::new() };
+    let spent = machine_seconds().zip(core_seconds_used()).zip(before_s);
+    let others = spent.map(|((all_s, own_s), (all_before_s, own_before_s))| {
+        share_of_others(since.elapsed().as_secs_f64(), all_s - all_before_s, own_s - own_before_s)
+    });
     let busiest = |report: &Report| {
         let stages = report.stages.iter();
         stages.max_by(|a, b| a.working.total_s.total_cmp(&b.working.total_s)).map(|s| s.name.clone())
     };
     Ok(Bench {
-        machine: Machine { processor: processor(), threads: rayon::current_num_threads() },
+        machine: Machine::new(),
+        others,
         mission_s,
         channels: plan.instrument.channels.len(),
         daughters: plan.array.satellites(),
@@ -178,6 +189,7 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
         chain,
         ground,
         growth,
+        comparison: None,
     })
 }
 
@@ -273,7 +285,14 @@ fn time_stage(
 }
 
 impl Material {
-    fn rate(&self, stage: &'static str, mut seconds: Vec<f64>, core_s_per_mission_s: Option<f64>) -> Rate {
+    fn rate(
+        &self,
+        stage: &'static str,
+        runs_s: Vec<f64>,
+        core_s_per_mission_s: Option<f64>,
+        real_time: f64,
+    ) -> Rate {
+        let mut seconds = runs_s.clone();
         let median_s = median(&mut seconds);
         let (least_s, most_s) = (seconds[0], seconds[seconds.len() - 1]);
         let bytes = match stage {
@@ -284,19 +303,15 @@ impl Material {
         let samples_per_s = self.sample_count / median_s;
         Rate {
             stage,
+            runs_s,
+            median_s,
+            quartiles_s: quartiles(&seconds),
             samples_per_s,
             samples_per_s_range: [self.sample_count / most_s, self.sample_count / least_s],
             visibilities_per_s: visibilities / median_s,
             bytes_per_s: bytes / median_s,
-            times_real_time: samples_per_s / DESIGN_SAMPLES_PER_S,
+            times_real_time: samples_per_s / real_time,
             core_s_per_mission_s,
         }
     }
-}
-
-/// Name of the processor, or else its architecture.
-fn processor() -> String {
-    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let named = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-    named.map_or_else(|| std::env::consts::ARCH.to_owned(), |(_, name)| name.trim().to_owned())
 }

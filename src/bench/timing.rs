@@ -16,9 +16,22 @@ pub(super) fn seconds_of(plan: &Plan) -> f64 {
     plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
 }
 
+/// Samples per second of mission time.
+pub(super) fn samples_per_s(plan: &Plan) -> f64 {
+    let channels = &plan.instrument.channels;
+    let width_hz = channels.first().map_or(1.0, |channel| channel.width_hz);
+    (channels.len() * plan.array.satellites()) as f64 * width_hz
+}
+
 pub(super) fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
+}
+
+/// The quartiles of sorted values, nearest ranks.
+pub(super) fn quartiles(sorted: &[f64]) -> [f64; 2] {
+    let last = sorted.len() - 1;
+    [last / 4, last - last / 4].map(|at| sorted[at])
 }
 
 /// Processor time of all threads of this process, s. Linux reports it in ticks of 10 ms (proc(5), fields 14 and 15 of

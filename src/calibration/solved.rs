@@ -151,13 +151,13 @@ impl SolvedGains {
         self.len() == 0
     }
 
-    /// From now on passes are those of a new session.
+    /// Begins a new session of passes.
     pub fn begin_session(&self) {
         let mut table = self.table();
         table.told_before = table.events.len();
     }
 
-    /// Events of this session but for the first `told`. Each is judged by what was known when its pass was closed.
+    /// Events of this session after the first `told`, each as it was judged when its pass was closed.
     #[must_use]
     pub fn events_since(&self, told: usize) -> Vec<InstrumentEvent> {
         let table = self.table();

@@ -72,7 +72,7 @@ pub(super) fn input_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().map(|path| if is_standard(&path) { PathBuf::from("/dev/stdin") } else { path })
 }
 
-/// Refuses what cannot be read as often as a command reads it: a pipe, or standard input. What is not there is told by whoever opens it.
+/// Refuses inputs that cannot be read twice: a pipe, or standard input. A missing file is reported where it is opened.
 pub(super) fn require_repeatable(path: &Path, reason: &str) -> Result<(), String> {
     match std::fs::metadata(path) {
         Ok(found) if !found.is_file() => {

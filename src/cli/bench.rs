@@ -1,20 +1,20 @@
 //! `lunarray bench`: measure the speed of the chain on this machine.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
 use super::arguments::input_path;
-use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::bench::{BENCH_STAGES, BenchSettings, bench_config};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
+use crate::bench::{BENCH_STAGES, BenchSettings, Comparison, bench_config};
 use crate::pipeline::{ConfigSource, Plan, use_threads};
 
 /// Measure the speed of each stage of sample fidelity, and of the chain from samples to received visibilities.
 ///
 /// Without a pipeline file it measures 16 s of the design: 30 channels, eight daughters, 8 bits, with a generated sky of
-/// nside 8. Prints samples, visibilities and bytes per second, the ratio to real time of the design, the spread over
-/// runs, processor time, latencies from sample to packet and from packet to sums, queue depths, and the stage that
-/// saturates first.
+/// nside 8. Prints median and quartiles of the time of a run, samples, visibilities and bytes per second, times real time
+/// (mission time over time), processor time, latencies from sample to packet and from packet to sums, queue depths, and the
+/// stage that saturates first; with version, processor and date, and a warning if others used the processors meanwhile.
 ///
 /// Every run starts cold: its times include the first tables of the sampler and the predictions of the sky.
 ///
@@ -36,7 +36,10 @@ pub(super) struct BenchArgs {
     /// Also run the chain with other numbers of channels and daughters, and other block sizes.
     #[arg(long)]
     growth: bool,
-    /// Print one JSON object instead of tables; includes the queue depths over time.
+    /// Compare with an earlier benchmark of the same size: a file with what --json printed.
+    #[arg(long, value_name = "FILE.json", value_parser = input_path())]
+    compare: Option<PathBuf>,
+    /// Print one JSON object instead of tables; includes every run, and the queue depths over time.
     #[arg(long)]
     json: bool,
 }
@@ -52,11 +55,25 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
     let plan = Plan::new(config)?;
     use_threads(&plan.config.runtime)?;
     let settings = BenchSettings { stage: args.stage.clone(), runs: args.runs.into(), growth: args.growth };
-    let measured = crate::bench::bench(&plan, &settings)?;
+    let baseline = args.compare.as_deref().map(read_baseline).transpose()?;
+    let mut measured = crate::bench::bench(&plan, &settings)?;
+    if let Some((path, before)) = baseline {
+        let compared = Comparison::of(&serde_json::to_value(&measured)?, &before);
+        measured.comparison = Some(compared.map_err(|error| format!("{}: {error}", path.display()))?);
+    }
     if args.json {
         print_json_line(&measured)?;
     } else {
         print_text(&measured.to_string())?;
     }
     Ok(Completion::Done)
+}
+
+fn read_baseline(path: &Path) -> Result<(&Path, serde_json::Value), CommandError> {
+    let text =
+        std::fs::read_to_string(path).map_err(|error| format!("{}: cannot read: {error}", path.display()))?;
+    let expected = "expected what `lunarray bench --json` prints";
+    let value =
+        serde_json::from_str(&text).map_err(|error| format!("{}: {error}; {expected}", path.display()))?;
+    Ok((path, value))
 }

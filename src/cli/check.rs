@@ -22,7 +22,7 @@ use crate::units::time_scales::utc_text;
 pub(super) struct CheckArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// As one of so many ranks that share the sums of each map (run --mpi): prints memory a rank, bytes exchanged, and the nodes
+    /// Estimate for one of this many ranks that share the sums of each map (run --mpi): prints memory a rank, bytes exchanged, and the nodes
     /// needed, each with the memory of --memory-max or of this machine. Fails if not even one rank fits a node.
     #[arg(long, value_name = "NUMBER", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     ranks: u16,

@@ -15,10 +15,9 @@ use crate::products::draw_coverage;
 /// List missing packets, and what they would add to the map.
 ///
 /// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what
-/// their recovery would add: their weight relative to that in the map of the same channel, summed over channels. Request
+/// their recovery would add: their weight relative to that in the map of the same channel, in the mean over channels. Request
 /// the given range of packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap
-/// is estimated from the order of channels and pairs in the downlink and from the packets that arrived, and, for a
-/// state, from the fraction of those that entered the map. Missing positions count as the visibilities that need them.
+/// is estimated from that of a whole window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities that need them.
 /// Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
 ///
 /// Example: lunarray gaps state/ --most 5 --picture coverage.png
@@ -30,7 +29,8 @@ pub(super) struct GapsArgs {
     /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]
     most: usize,
-    /// Fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many percent; for scripts.
+    /// Fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many percent, of which 0 is for
+    /// any visibilities or positions; for scripts.
     #[arg(long, value_name = "any|PERCENT", value_parser = fail_if)]
     fail_if: Option<FailIf>,
     /// Write a picture (PNG) of integration time over mission time, channel by channel.
@@ -56,11 +56,13 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     }
     let packets: u64 = gaps.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
     let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>();
+    let lacks_data = gaps.gaps.iter().any(|gap| matches!(gap.kind, Kind::Visibilities | Kind::Ephemeris));
     match args.fail_if {
         Some(FailIf::Any) if packets > 0 => {
             Err(format!("{packets} packets are missing; expected none").into())
         }
-        Some(FailIf::Above(most)) if adds > most => {
+        // Nothing is only estimated to be added.
+        Some(FailIf::Above(most)) if adds > most || (most == 0.0 && lacks_data) => {
             Err(format!("the {packets} missing packets would add {adds:.4} %; expected at most {most} %")
                 .into())
         }

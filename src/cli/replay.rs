@@ -1,5 +1,6 @@
 //! `lunarray replay`: run the ground segment on downlink files or live senders.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,7 +25,7 @@ use super::progress::{Parts, Progress, time_left};
 use super::serving::{Page, ServeArgs};
 use crate::calibration::CalibrationHook;
 use crate::downlink::transport::socket::{
-    HeldAnswers, ListenLimits, ListenNote, SocketError, SocketSource, Stations, TcpUrl,
+    HeldAnswers, ListenLimits, ListenNote, ListenUrl, SocketSource, Stations,
 };
 use crate::downlink::{FileSource, Pace, PacedSource, Steps};
 use crate::files::ProtectedInputs;
@@ -91,9 +92,10 @@ pub(super) struct ReplayArgs {
     #[arg(long, requires = "files")]
     follow: bool,
     /// Receive the downlink from senders that connect to this address, instead of files, until Ctrl-C or SIGTERM (exit
-    /// code 0). Port 0 chooses a free port; standard error prints `listening on tcp://HOST:PORT`.
+    /// code 0). Port 0 chooses a free port; standard error prints `listening on tcp://HOST:PORT`. With udp://HOST:PORT, or with both,
+    /// take datagrams, each a packet or a frame; they are not answered.
     #[arg(long, value_name = "tcp://HOST:PORT", conflicts_with_all = ["files", "pace"])]
-    listen: Option<TcpUrl>,
+    listen: Vec<ListenUrl>,
     /// Allow an address that other machines can reach. Anyone who connects can add data to the maps.
     #[arg(long, requires = "listen")]
     allow_remote: bool,
@@ -200,10 +202,10 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     if let Some(size) = args.groups {
         return in_groups(args, &config, size);
     }
-    let wait_bytes = match (&args.state, &args.listen) {
+    let wait_bytes = match (&args.state, args.listens()) {
         // A pass waits until its gains are known.
         _ if config.calibration.hook == CalibrationHook::Solve => WAIT_BYTES,
-        (None, Some(_)) => WAIT_BYTES_LIVE,
+        (None, true) => WAIT_BYTES_LIVE,
         _ => WAIT_BYTES,
     };
     let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
@@ -219,16 +221,16 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
     let events = args.events.start(&config, "ground")?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
-    let ended = match &args.listen {
-        Some(url) => session.hear_senders(url, ground),
-        None => session.read_files(ground),
+    let ended = match args.listens() {
+        true => session.hear_senders(ground),
+        false => session.read_files(ground),
     };
     if let Some(completion) = job.interrupted(&ended, &interrupt) {
         return Ok(completion);
     }
     let ended = page.conclude(ended, |summary| summary.cancelled);
     events.conclude(&ended, |summary| summary.cancelled);
-    if ended.is_err() && (args.listen.is_some() || args.follow) {
+    if ended.is_err() && (args.listens() || args.follow) {
         page.tell_failure(&interrupt);
     }
     let summary = ended.inspect_err(|error| {
@@ -238,7 +240,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
             note("checkpoint", &serde_json::to_value(&saving).unwrap_or_default(), saving);
         }
     })?;
-    let completion = match args.follow || args.listen.is_some() {
+    let completion = match args.follow || args.listens() {
         true => {
             let is_saved = args.state.is_some() || !summary.lacks_maps();
             interrupt.completion_of_service(summary.cancelled, is_saved)
@@ -354,19 +356,44 @@ struct Session<'a> {
     events: &'a Events,
 }
 
+impl ReplayArgs {
+    /// Whether packets come from sockets.
+    fn listens(&self) -> bool {
+        !self.listen.is_empty()
+    }
+
+    /// Where it listens for connections, and where for datagrams.
+    fn listening_addresses(&self) -> Result<[Vec<SocketAddr>; 2], CommandError> {
+        let mut found = [Vec::new(), Vec::new()];
+        for url in &self.listen {
+            let (at, url) = match url {
+                ListenUrl::Tcp(url) => (0, url),
+                ListenUrl::Udp(_) if self.stations.is_some() => {
+                    return Err(
+                        "--listen udp:// with --stations: datagrams have no token; expected tcp:// alone"
+                            .into(),
+                    );
+                }
+                ListenUrl::Udp(url) => (1, url),
+            };
+            if !found[at].is_empty() {
+                return Err("--listen is given twice; expected at most one tcp:// and one udp://".into());
+            }
+            found[at] = if self.allow_remote { url.addresses()? } else { url.own_addresses()? };
+        }
+        Ok(found)
+    }
+}
+
 impl Session<'_> {
-    fn hear_senders(&self, url: &TcpUrl, mut ground: Ground) -> Result<RunSummary, CommandError> {
+    fn hear_senders(&self, mut ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
-        let addresses = if args.allow_remote { url.addresses()? } else { url.own_addresses()? };
+        let [connections, datagrams] = args.listening_addresses()?;
         let settings = args.limited(config.ground(0));
         let (advised, own_config, limit) = (AtomicBool::new(false), (*config).clone(), args.limit());
         let until = ListenLimits { idle_s: args.idle_s, connections: args.connections };
         let listen = &config.downlink.listen;
-        let mut source = SocketSource::bind(&addresses, listen, until)
-            .map_err(|error| match error {
-                SocketError::Listen { source, .. } => SocketError::Listen { url: url.to_string(), source },
-                other => other,
-            })?
+        let mut source = SocketSource::bind(&connections, listen, until)?
             .knowing(ground.instrument().cloned())
             .accepting(Arc::new(move |instrument| {
                 let fits = settings.fits(instrument).is_ok();
@@ -376,6 +403,9 @@ impl Session<'_> {
                 fits
             }))
             .telling(Box::new(print_listen_note));
+        if !datagrams.is_empty() {
+            source = source.with_datagrams(&datagrams)?;
+        }
         if let Some(path) = &args.stations {
             source = source.of_stations(Stations::read(path)?);
         }
@@ -388,10 +418,11 @@ impl Session<'_> {
                 source = kept.iter().fold(source, |source, archive| source.keeping(archive));
             }
         }
-        let address = source.url();
-        let fields = json!({ "url": address.to_string() });
+        let addresses = source.addresses().to_vec();
         Ok(self.watched(source, ground, &|| {
-            say("listening", &fields, format_args!("listening on {address}"));
+            for address in &addresses {
+                say("listening", &json!({ "url": address }), format_args!("listening on {address}"));
+            }
         })?)
     }
 
@@ -434,7 +465,7 @@ impl Session<'_> {
             interrupt.arm_or_note();
             begun();
             #[cfg(unix)]
-            if args.follow || args.listen.is_some() {
+            if args.follow || args.listens() {
                 notifier = super::notify::Notifier::start(&watched, cancel);
             }
             page.watch(&watched);

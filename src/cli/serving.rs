@@ -81,7 +81,7 @@ impl Page {
         result
     }
 
-    /// After a failure: serves for a while that the run has failed, so that whoever watches it learns it; a signal ends that.
+    /// After a failure, serves the failed status for a while, so that monitoring sees it; a signal ends that.
     pub(super) fn tell_failure(&self, interrupt: &Interrupt) {
         let Some(server) = &self.server else { return };
         let since = Instant::now();

@@ -1,14 +1,17 @@
 //! `lunarray simulate`: run the space segment alone.
 
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, group_size, not_negative_s, output_path};
+use super::arguments::{PipelineArgs, group_size, is_standard, not_negative_s};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
-use super::output::{CommandResult, print_config_notes, print_json_line, print_notes, print_text};
+use super::output::{
+    CommandError, CommandResult, print_config_notes, print_json_line, print_notes, print_text,
+};
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
@@ -29,8 +32,8 @@ use crate::pipeline::{
 pub(super) struct SimulateArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Downlink file to write.
-    #[arg(short, long, value_name = "FILE", required_unless_present = "send", value_parser = output_path())]
+    /// Downlink file to write; - for standard output, as input of another program. True values of errors are then written nowhere.
+    #[arg(short, long, value_name = "FILE|-", required_unless_present = "send")]
     out: Option<PathBuf>,
     /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
     /// (auto), or this many. The downlink has the same bytes. When interrupted, repeat the command to go on with the next group.
@@ -71,6 +74,10 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
+    let to_standard_output = args.out.as_deref().is_some_and(is_standard);
+    if to_standard_output {
+        args.require_standard_output()?;
+    }
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let _inputs = args.pipeline.protect(&config);
@@ -93,7 +100,8 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let events = args.events.start(&plan.config, "space")?;
     let mut progress = None;
     let windows = plan.windows_watched();
-    let to = Destination { file: args.out.clone(), socket };
+    let file = args.out.clone().filter(|_| !to_standard_output);
+    let to = Destination { file, standard_output: to_standard_output, socket };
     let ended = simulate(&plan, to, cancel, &mut |watched| {
         interrupt.arm_or_note();
         page.watch(&watched);
@@ -108,6 +116,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let mut places: Vec<String> = args
         .out
         .iter()
+        .filter(|_| !to_standard_output)
         .map(|out| match is_written {
             true => format!("Wrote the downlink to {}", out.display()),
             false => format!("There is nothing to write to {}", out.display()),
@@ -122,11 +131,28 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     }
     let printed = match args.json {
         _ if args.events.take_stdout() => Ok(()),
+        _ if to_standard_output => {
+            print_notes(places);
+            Ok(())
+        }
         true => print_json_line(&report),
         false => print_text(&format!("{report}\n{}", places.join("\n"))),
     };
     page.stay(&interrupt);
     interrupt.completion(report.cancelled).after(printed)
+}
+
+impl SimulateArgs {
+    /// Requires that standard output is for the downlink alone.
+    fn require_standard_output(&self) -> Result<(), CommandError> {
+        if self.json || self.groups.is_some() || self.events.take_stdout() {
+            return Err("--out - writes the downlink to standard output; expected none of --json, --groups and --events -".into());
+        }
+        match std::io::stdout().is_terminal() {
+            true => Err("--out - writes the downlink to standard output, which is a terminal; expected a pipe or a file".into()),
+            false => Ok(()),
+        }
+    }
 }
 
 /// Simulates the channels in groups.

@@ -111,7 +111,7 @@ impl Basis {
         Self { nodes, rows }
     }
 
-    /// Number of nodes, which is that of functions and of coefficients.
+    /// Number of nodes, functions and coefficients.
     pub(super) fn nodes(&self) -> usize {
         self.nodes
     }

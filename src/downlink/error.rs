@@ -89,7 +89,8 @@ pub enum DownlinkError {
     },
     /// The files differ in format.
     #[error(
-        "{} and {} are of different formats (packets, and coded frames of packets); replay them apart",
+        "{} and {} are of different formats (packets, and coded frames of packets), and one is no file that can be read twice; expected \
+         files, or one format",
         other.display(), path.display()
     )]
     Mixed {
@@ -109,6 +110,12 @@ pub enum DownlinkError {
         path: PathBuf,
         /// Bytes that had been read.
         read: u64,
+    },
+    /// A followed file is packed.
+    #[error("{}: a packed file (gzip, zstd) cannot be followed as it grows; expected one that is complete, without --follow", path.display())]
+    Packed {
+        /// The file.
+        path: PathBuf,
     },
     /// Input and output are the same file.
     #[error("{}: input and output are the same file; expected another output file", path.display())]
@@ -139,7 +146,7 @@ impl DownlinkError {
     }
 }
 
-/// Requires that a file of `bytes` bytes held a packet; `name` says what it is if it did not.
+/// Requires that a file of `bytes` bytes held a packet; otherwise `name` gives its kind.
 pub(crate) fn require_packets(
     path: &std::path::Path,
     bytes: u64,

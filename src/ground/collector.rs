@@ -42,7 +42,7 @@ impl CollectorState {
         self.decoder.instrument()
     }
 
-    /// Adds what another collector holds, but for packets that were delivered.
+    /// Adds the packets that another collector holds, without those already delivered.
     pub(super) fn merge(
         &mut self,
         other: Self,
@@ -275,7 +275,7 @@ impl Collector {
         Some(self.give_up(packet))
     }
 
-    /// Delivers all of a file to `take`; what is held at its end too.
+    /// Delivers all of a file to `take`, and finally the held packets.
     ///
     /// # Errors
     /// A file that cannot be read, is empty, or does not hold a packet of ours.
@@ -312,7 +312,7 @@ impl Collector {
         Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
     }
 
-    /// Packets received so far, of all kinds, but for those that came again.
+    /// Packets of all kinds received so far, without duplicates.
     #[must_use]
     pub fn packets(&self) -> u64 {
         self.packets

@@ -277,7 +277,7 @@ impl Ground {
         Ok(())
     }
 
-    /// Ends the passes that are open, and applies what is held, without its positions.
+    /// Closes open passes, and applies held packets without their positions.
     pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         if !(self.archive.is_some() && self.cancel.is_cancelled()) {
             self.catch_up();

@@ -54,7 +54,7 @@ impl SenderPromises {
         is_new
     }
 
-    /// A checkpoint of so many packets was written, or was not.
+    /// Notes whether a checkpoint of this many packets was written.
     pub(super) fn keep(&mut self, packets: u64, is_written: bool) {
         if is_written {
             self.packets = packets;

@@ -10,7 +10,7 @@ use crate::units::vector::{Vec3, norm, scale};
 /// nside of the sky's directions and of the pairs' directions: pixels of 3.7 degrees.
 const NSIDE: usize = 16;
 
-/// One visibility of so many is counted.
+/// Every n-th visibility is counted.
 const EVERY: u64 = 8;
 
 /// Where the middles of pairs stood, seen from the Moon, at the visibilities of one channel. That costs little per visibility; what
@@ -33,7 +33,7 @@ pub struct HitsMap {
     pub frequency_hz: f64,
     /// Visibilities so far.
     pub visibilities: u64,
-    /// One of so many is counted, the first included.
+    /// Every n-th is counted, beginning with the first.
     pub every: u64,
     /// nside of the map.
     pub nside: usize,

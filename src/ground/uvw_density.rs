@@ -9,7 +9,7 @@ use crate::units::vector::{Vec3, scale, sub};
 /// Cells along a side of a plane; a multiple of four.
 const CELLS: usize = 64;
 
-/// One visibility of so many is counted. A baseline moves by an eighth of a wavelength from one to the next, so that a cell is
+/// Every n-th visibility is counted. A baseline moves by an eighth of a wavelength from one to the next, so that a cell is
 /// passed in many times as many.
 const EVERY: u64 = 8;
 
@@ -29,7 +29,7 @@ pub struct UvwDensity {
     pub frequency_hz: f64,
     /// Visibilities so far.
     pub visibilities: u64,
-    /// One of so many is in the planes, the first included.
+    /// Every n-th is in the planes, beginning with the first.
     pub every: u64,
     /// Visibilities outside all planes: their baseline is too long.
     pub beyond: u64,

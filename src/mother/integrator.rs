@@ -135,7 +135,7 @@ impl NoiseModel {
         (p_i * p_j / (2.0 * self.samples(width_hz, dt_s))).sqrt()
     }
 
-    /// Independent samples of an integration, of all receivers of a daughter.
+    /// Independent samples of an integration in all receivers of a daughter.
     fn samples(&self, width_hz: f64, dt_s: f64) -> f64 {
         f64::from(self.response.receivers()) * width_hz * dt_s
     }

@@ -70,7 +70,7 @@ pub struct SpoolWriter {
 }
 
 impl SpoolWriter {
-    /// A file of the visibilities of so many windows, made from what `key` stands for. It takes its name once it has all of them.
+    /// A file of the visibilities of `windows` windows, with this key. It takes its name once it is complete.
     ///
     /// # Errors
     /// A file that cannot be created.

@@ -32,7 +32,7 @@ const PREVIEW_WIDTH: usize = 64;
 /// Tiles of order 3, and how many of them stand in a row of the picture of the whole sky.
 const PREVIEW_TILES: usize = 768;
 const PREVIEW_COLUMNS: usize = 27;
-/// Name of the lock of a folder that is being written; what is left of it by an export that was broken off says whose the tiles are.
+/// Name of the lock of a folder that is being written; one that an interrupted export left marks tiles that may be replaced.
 const UNFINISHED: &str = ".lunarray-hips";
 
 /// How a map is written as HiPS.

@@ -34,6 +34,9 @@ pub struct Publisher {
     unwritten: BTreeMap<ChannelId, Solution>,
 }
 
+/// Time after which files that could not be written are tried again.
+const AGAIN: Duration = Duration::from_secs(5);
+
 /// Waits before files that could not be written are tried a last time.
 const LAST_WAITS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1)];
 
@@ -100,7 +103,7 @@ impl Publisher {
         Self { viewers, ..self }
     }
 
-    /// Goes on if files cannot be written, says so to `watch`, and tries again with the next map and at the end.
+    /// Goes on if files cannot be written, says so to `watch`, and tries again after a while, with the next map, and at the end.
     #[must_use]
     pub fn persisting(self, watch: &ProductsWatch) -> Self {
         Self { trouble: Some(watch.clone()), ..self }
@@ -122,7 +125,7 @@ impl Publisher {
     }
 
     /// Tries to write what could not be written.
-    fn try_again(&mut self) -> Result<(), ProductsError> {
+    fn write_again(&mut self) -> Result<(), ProductsError> {
         while let Some((channel, solution)) = self.unwritten.pop_first() {
             if let Err(error) = self.publish(&solution, &MapWatch::default()) {
                 self.unwritten.insert(channel, solution);
@@ -148,7 +151,7 @@ impl Sink for Publisher {
                 self.unwritten.insert(solution.channel, solution);
                 Some(error)
             }
-            Ok(()) => self.try_again().err(),
+            Ok(()) => self.write_again().err(),
         };
         trouble.update(failure.as_ref());
         Ok(())
@@ -158,7 +161,7 @@ impl Sink for Publisher {
         let mut last = Ok(());
         for wait in LAST_WAITS {
             std::thread::sleep(wait);
-            last = self.try_again();
+            last = self.write_again();
             if last.is_ok() {
                 break;
             }
@@ -168,6 +171,17 @@ impl Sink for Publisher {
         let finished: Vec<ChannelSummary> = channels.filter_map(ChannelFolder::into_summary).collect();
         *self.summaries.lock().unwrap_or_else(PoisonError::into_inner) = finished;
         Ok(())
+    }
+
+    fn tries_again_after(&self) -> Option<Duration> {
+        (!self.unwritten.is_empty()).then_some(AGAIN)
+    }
+
+    fn try_again(&mut self) {
+        let failure = self.write_again().err();
+        if let Some(trouble) = &self.trouble {
+            trouble.update(failure.as_ref());
+        }
     }
 
     fn units(&self) -> Units {

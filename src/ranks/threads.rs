@@ -51,7 +51,7 @@ fn ranks_of_threads(count: usize) -> Vec<Ranks> {
     (0..count).map(ranks).collect()
 }
 
-/// What `work` returns on each of so many threads, in their order.
+/// Results of `work` on each of `count` threads, in order.
 pub(crate) fn on_threads<T: Send>(count: usize, work: impl Fn(&Ranks) -> T + Sync) -> Vec<T> {
     let work = &work;
     thread::scope(|scope| {

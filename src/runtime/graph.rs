@@ -151,7 +151,7 @@ impl Graph {
         self.stall = Some(stall);
     }
 
-    /// Limits how long a cancelled run waits for its stages, but for those named in `kept`.
+    /// Limits how long a cancelled run waits for its stages, except those named in `kept`.
     ///
     /// Kept stages are those that save data. After three tenths of `grace` a stage before the first of them that is in a
     /// long step is left behind: what follows it takes what is in the queues, and runs `finish`. When all of `grace` is

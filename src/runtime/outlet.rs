@@ -66,6 +66,17 @@ impl<T> Outlet<T> {
         }
     }
 
+    /// Lets a source wait for input from outside. The time counts as waiting for input, and not as work.
+    #[doc(hidden)]
+    pub fn await_input<R>(&mut self, wait: impl FnOnce() -> R) -> R {
+        let since = Instant::now();
+        let found = wait();
+        if let Target::Queue(queue) = &mut self.0 {
+            queue.starved += since.elapsed();
+        }
+        found
+    }
+
     /// Whether pushed items are discarded, as the run has failed or was cut short.
     #[must_use]
     #[doc(hidden)]
@@ -107,11 +118,11 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Time spent waiting for room since the last call.
-    pub(super) fn lap(&mut self) -> Duration {
+    /// Time spent waiting for room, and for input from outside, since the last call.
+    pub(super) fn lap(&mut self) -> [Duration; 2] {
         match &mut self.0 {
-            Target::Queue(queue) => std::mem::take(&mut queue.waited),
-            Target::List(_) => Duration::ZERO,
+            Target::Queue(queue) => [&mut queue.waited, &mut queue.starved].map(std::mem::take),
+            Target::List(_) => [Duration::ZERO; 2],
         }
     }
 }
@@ -124,12 +135,14 @@ pub(super) struct Queue<T> {
     /// Source timestamp of pushed items; `None` in a source, which stamps them as it pushes.
     born: Option<Instant>,
     waited: Duration,
+    starved: Duration,
     closed: bool,
 }
 
 impl<T> Queue<T> {
     pub(super) fn new(sender: Sender<StampedItem<T>>, halt: Arc<Halt>, counters: Arc<Counters>) -> Self {
-        Self { sender, halt, counters, born: None, waited: Duration::ZERO, closed: false }
+        let (waited, starved) = (Duration::ZERO, Duration::ZERO);
+        Self { sender, halt, counters, born: None, waited, starved, closed: false }
     }
 
     fn push_unless(&mut self, item: T, cancel: &Cancel) {

@@ -143,7 +143,7 @@ impl Report {
             stage.items_out.to_string(),
             rate,
             share(&stage.working),
-            if has_queue { share(&stage.waiting_in) } else { "-".to_owned() },
+            if stage.waiting_in.count > 0 { share(&stage.waiting_in) } else { "-".to_owned() },
             if stage.waiting_out.count > 0 { share(&stage.waiting_out) } else { "-".to_owned() },
             stage.queue.map_or("-".to_owned(), |queue| format!("{}/{}", queue.depth_max, queue.capacity)),
             percentiles(&stage.working),

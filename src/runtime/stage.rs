@@ -1,6 +1,7 @@
 //! The three parts of a chain: sources, stages and sinks.
 
 use std::error::Error;
+use std::time::Duration;
 
 use super::metrics::Units;
 use super::outlet::Outlet;
@@ -128,6 +129,16 @@ pub trait Sink: Send {
     fn finish(&mut self) -> Result<(), Self::Error> {
         Ok(())
     }
+
+    /// After which time without input [`Sink::try_again`] is due, if it has something left to do.
+    #[doc(hidden)]
+    fn tries_again_after(&self) -> Option<Duration> {
+        None
+    }
+
+    /// Tries again what it could not do with an input.
+    #[doc(hidden)]
+    fn try_again(&mut self) {}
 
     /// Units consumed so far; the name of the unit must not change.
     fn units(&self) -> Units {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, TryRecvError, select};
+use crossbeam_channel::{Receiver, Select, TryRecvError, select};
 
 use super::cancel::{Cancel, Halt, Wake};
 use super::error::{BoxError, Moment};
@@ -99,7 +99,7 @@ impl Watch {
         self.mark = now;
     }
 
-    /// A step is over, of which `waited` was spent waiting for room.
+    /// A step is over, of which `waited` was spent waiting.
     fn worked(&mut self, waited: Duration, born: Option<Instant>, units: Units) {
         let now = Instant::now();
         let working = (now - self.mark).saturating_sub(waited);
@@ -117,9 +117,12 @@ impl Watch {
 
     /// As [`Watch::worked`], for a worker with an outlet.
     fn worked_into<T>(&mut self, out: &mut Outlet<T>, born: Option<Instant>, units: Units) {
-        let waited = out.lap();
-        self.worked(waited, born, units);
+        let [waited, starved] = out.lap();
+        self.worked(waited + starved, born, units);
         self.timings.waiting_out.record(waited);
+        if starved > Duration::ZERO {
+            self.timings.waiting_in.record(starved);
+        }
     }
 }
 
@@ -161,6 +164,16 @@ impl<T> Inlet<T> {
         watch.counters.note_depth(depth.max(1));
         watch.counters.count_in();
         Input::Item(stamped)
+    }
+
+    /// Whether something comes within a time: an item, the end, or a halt.
+    fn comes_within(&self, time: Duration, watch: &Watch) -> bool {
+        watch.counters.set_working(false);
+        let mut select = Select::new();
+        select.recv(&self.receiver);
+        select.recv(watch.halt.stop());
+        select.recv(watch.last_input.stop());
+        select.ready_timeout(time).is_ok()
     }
 
     fn wait(&self, watch: &Watch) -> Option<StampedItem<T>> {
@@ -243,6 +256,11 @@ impl<S: Sink> Worker for SinkWorker<S> {
     fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
         let Self { sink, inlet } = self;
         loop {
+            while let Some(after) = sink.tries_again_after()
+                && !inlet.comes_within(after, watch)
+            {
+                sink.try_again();
+            }
             match inlet.receive(watch) {
                 Input::Item(StampedItem { item, born }) => {
                     sink.take(item)?;

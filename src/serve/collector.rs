@@ -311,6 +311,17 @@ impl Scrape {
             let about = "1 while the raw archive reaches back to the first packet";
             gauge(out, MetricInfo("archive_whole", about, None), f64::from(u8::from(archive.is_whole)))?;
         }
+        if let Some(datagrams) = &report.datagrams {
+            let counts = [
+                ("taken", datagrams.received - datagrams.malformed - datagrams.refused),
+                ("malformed", datagrams.malformed),
+                ("refused", datagrams.refused),
+                ("dropped", datagrams.dropped_by_system.unwrap_or(0)),
+            ];
+            let about =
+                MetricInfo("datagrams", "Datagrams by what became of them; dropped by the system", None);
+            counters(out, about, counts.map(|(end, count)| ([("end", end.to_owned())], count)))?;
+        }
         // From zero on: an increase from nothing to one is none for Prometheus.
         let ended = ConnectionEnd::ALL.iter().filter_map(|end| {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();

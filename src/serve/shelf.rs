@@ -199,7 +199,7 @@ impl Shelf {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes a copy of a map that was published; says what it is.
+    /// Keeps a copy of a published map; returns its description.
     pub(super) fn put(&self, published: PublishedMap<'_>) -> String {
         let PublishedMap { solution, figures, cards, comparison, input } = published;
         let index = usize::from(solution.channel.0);
@@ -230,7 +230,7 @@ impl Shelf {
             frequency_hz,
             nside: solution.nside,
             is_noiseless: solution.instrument.noiseless,
-            is_final: solution.is_final,
+            is_final: solution.is_final_map(),
             span_s: solution.span_s,
             diagnostics: solution.diagnostics,
             maps,

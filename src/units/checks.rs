@@ -83,13 +83,13 @@ impl Checks {
         key: impl fmt::Display,
         values: &[f64],
         ok: impl Fn(f64) -> bool,
-        expected: &'static str,
+        expected: impl fmt::Display,
     ) {
         let mut bad = values.iter().enumerate().filter(|(_, value)| !(value.is_finite() && ok(**value)));
         let Some((index, &value)) = bad.next() else { return };
         let place = if values.len() == 1 { String::new() } else { format!("[{index}]") };
         match bad.count() {
-            0 => self.number(format_args!("{key}{place}"), value, false, expected),
+            0 => self.number(format_args!("{key}{place}"), value, false, expected.to_string()),
             more => {
                 let expected = format!("{expected}, as of {more} more of its values");
                 self.number(format_args!("{key}{place}"), value, false, expected);

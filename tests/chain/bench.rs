@@ -46,6 +46,8 @@ fn every_stage_is_measured_in_consistent_units() {
     let found = json(&["--runs", "3"]);
     assert!(!found["machine"]["processor"].as_str().unwrap().is_empty());
     assert!(number(&found["machine"]["threads"]) >= 1.0);
+    assert_eq!(found["machine"]["version"], env!("CARGO_PKG_VERSION"));
+    assert!(found["machine"]["date"].as_str().unwrap().ends_with('Z'));
     for (key, expected) in [("channels", 2.0), ("daughters", 8.0), ("bits", 8.0), ("sky_pixels", 192.0)] {
         assert_eq!(number(&found[key]), expected, "{key}");
     }
@@ -58,8 +60,13 @@ fn every_stage_is_measured_in_consistent_units() {
         let samples_per_s = number(&rate["samples_per_s"]);
         let [slow, fast] = [0, 1].map(|k| number(&rate["samples_per_s_range"][k]));
         assert!(0.0 < slow && slow <= samples_per_s && samples_per_s <= fast, "{rate}");
-        // Real time is that of the design: eight daughters, 30 channels of 8 kHz.
-        assert!(close(number(&rate["times_real_time"]), samples_per_s / (8.0 * 30.0 * 8e3)), "{rate}");
+        // Real time is that of what is measured: eight daughters, two channels of 8 kHz.
+        assert!(close(number(&rate["times_real_time"]), samples_per_s / (8.0 * 2.0 * 8e3)), "{rate}");
+        let mut runs: Vec<f64> = rate["runs_s"].as_array().unwrap().iter().map(number).collect();
+        runs.sort_by(f64::total_cmp);
+        // Of three runs the quartiles are the ends.
+        let told = [&rate["quartiles_s"][0], &rate["median_s"], &rate["quartiles_s"][1]].map(number);
+        assert_eq!(runs, told);
         let stage = rate["stage"].as_str().unwrap();
         assert_eq!(number(&rate["visibilities_per_s"]) > 0.0, !["sample", "link"].contains(&stage), "{rate}");
         let bytes_a_sample = number(&rate["bytes_per_s"]) / samples_per_s;
@@ -99,8 +106,22 @@ fn one_stage_is_measured_alone_and_unknown_ones_are_refused() {
     let output = bench(&["--runs", "1", "--stage", "correlate"]);
     assert!(output.status.success());
     let text = String::from_utf8(output.stdout).unwrap();
-    let first = text.lines().next().unwrap();
-    assert!(first.ends_with("worker threads") && text.contains("\ncorrelate "), "{text}");
+    let mut lines = text.lines();
+    assert!(lines.next().unwrap().starts_with(concat!("lunarray ", env!("CARGO_PKG_VERSION"))), "{text}");
+    assert!(lines.next().unwrap().ends_with("worker threads") && text.contains("\ncorrelate "), "{text}");
+
+    // Beside itself, and beside something else.
+    let folder = tempfile::tempdir().unwrap();
+    let baseline = folder.path().join("baseline.json");
+    std::fs::write(&baseline, found.to_string()).unwrap();
+    let baseline = baseline.to_str().unwrap();
+    let compared = json(&["--runs", "1", "--stage", "link", "--compare", baseline]);
+    let stage = &compared["comparison"]["stages"][0];
+    assert_eq!((&stage["stage"], &stage["before_s"]), (&Value::from("link"), &found["rates"][0]["median_s"]));
+    assert_eq!(stage["now_s"], compared["rates"][0]["median_s"]);
+    let output =
+        bench(&["--runs", "1", "--stage", "link", "--set", "daughters.bits=4", "--compare", baseline]);
+    assert!(String::from_utf8(output.stderr).unwrap().contains("bits = 8; expected 4"));
 
     for (wrong, word) in [(["--stage", "sky"], "sample"), (["--runs", "0"], "1..=1000")] {
         let output = bench(&wrong);

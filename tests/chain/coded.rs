@@ -65,7 +65,13 @@ fn coded_frames_give_the_maps_that_packets_give() {
     assert!(maps == replay(&place, &noisy).1);
     assert!(json(&["inspect", &noisy])["reception"]["frames"]["bytes_corrected"].as_u64().unwrap() > 100);
 
-    assert!(fail(&["replay", &plain, &coded, "--out", &place.path("both")]).contains("different formats"));
+    // Both in one command: what is in the second has come, in either order.
+    for files in [[&plain, &coded], [&coded, &plain]] {
+        let out = place.path("both");
+        let both = json(&["replay", files[0], files[1], "--map", &place.pipeline, "--out", &out]);
+        assert_eq!(both["ledger"], replay(&place, &plain).0["ledger"]);
+        assert!(maps == common::workplace::maps(&out));
+    }
 }
 
 #[test]

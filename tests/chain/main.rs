@@ -5,6 +5,7 @@
 mod common;
 
 mod bench;
+mod bound;
 mod calibrate;
 mod coded;
 mod command_line;

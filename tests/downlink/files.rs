@@ -217,13 +217,20 @@ fn empty_foreign_and_missing_files_are_named() {
     assert!(said(&path).to_string().contains("expected CCSDS space packets"));
     for (bytes, name) in [
         (&b"SIMPLE  =                    T"[..], "a FITS file"),
-        (b"\x1f\x8b\x08\x00\x00\x00", "a gzip file: expand it first"),
-        (b"\x28\xb5\x2f\xfd\x24\x01", "a zstd file: expand it first"),
+        (b"\xfd7zXZ\x00\x00", "an xz file: expand it first"),
         (b"\x89HDF\r\n\x1a\n\0\0", "an HDF5 file"),
         (b"<?xml version=\"1.0\"?><ndm></ndm>", "an XML document (<ndm>)"),
     ] {
         fs::write(&path, bytes).unwrap();
         assert!(said(&path).to_string().contains(name), "{name}: {}", said(&path));
+    }
+    for bytes in [&b"\x1f\x8b\x08\x00\x00\x00"[..], b"\x28\xb5\x2f\xfd\x24\x01"] {
+        fs::write(&path, bytes).unwrap();
+        assert!(
+            said(&path).to_string().contains("file is damaged behind 0 unpacked bytes"),
+            "{}",
+            said(&path)
+        );
     }
 }
 

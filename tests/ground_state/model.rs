@@ -426,7 +426,7 @@ impl Sequence<'_> {
         let any = SocketAddr::from(([127, 0, 0, 1], 0));
         let source = SocketSource::bind(&[any], &ListenConfig::default(), until).unwrap();
         let source = source.knowing(ground.instrument().cloned());
-        let address = source.url().to_string().strip_prefix("tcp://").unwrap().to_owned();
+        let address = source.addresses()[0].strip_prefix("tcp://").unwrap().to_owned();
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 let mut stream = TcpStream::connect(address).unwrap();

@@ -1,13 +1,16 @@
 //! A listening ground, a sending spacecraft, and paced replays: the same bits as through a file.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // Also in the helpers.
 
+mod alerts;
 mod archive;
 mod broker;
 #[path = "../common/mod.rs"]
 mod common;
 mod crowd;
+mod datagrams;
 mod durable;
 mod events;
+mod kills;
 mod log;
 mod pace;
 mod page;

@@ -304,7 +304,7 @@ fn a_ground_that_is_slower_slows_the_sender_and_keeps_its_memory() {
     let limits = ListenConfig { backlog_bytes_max: backlog, bytes_per_s_max: 0.0, ..ListenConfig::default() };
     let until = ListenLimits { connections: 1, ..ListenLimits::default() };
     let mut source = SocketSource::bind(&["127.0.0.1:0".parse().unwrap()], &limits, until).unwrap();
-    let address = source.url().to_string();
+    let address = source.addresses()[0].clone();
     let address = address.strip_prefix("tcp://").unwrap().to_owned();
     let bytes = transmit(&mission(20, 2000), &DownlinkConfig::default());
     let length = bytes.len();

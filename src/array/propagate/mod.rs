@@ -177,7 +177,7 @@ impl<'a> Flight<'a> {
         states
     }
 
-    /// The elements that satellite 1 has at the epoch, but for its node and mean anomaly, degrees.
+    /// The elements that satellite 1 has at the epoch, without node and mean anomaly, degrees.
     fn leader(&self, node_longitude_deg: f64, mean_anomaly_deg: f64) -> KeplerElements {
         KeplerElements {
             semi_major_axis_m: self.config.moon_radius_m + self.config.altitude_m,

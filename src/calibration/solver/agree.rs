@@ -34,7 +34,7 @@ pub(super) fn is_contradicted(layout: &ParameterLayout, found: &NewtonFit, sums:
     (0..layout.satellites).filter(|daughter| *daughter != layout.reference).any(without)
 }
 
-/// Chi-square of so many degrees of freedom that lies as far out as a Gaussian's significant deviation (Wilson & Hilferty 1931).
+/// Chi-square, for these degrees of freedom, as unlikely as a Gaussian's significant deviation (Wilson & Hilferty 1931).
 fn limit(freedom: f64) -> f64 {
     // Below one the approximation fails.
     let freedom = freedom.max(1.0);

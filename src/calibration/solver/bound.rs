@@ -29,7 +29,7 @@ pub struct GainBound {
     pub visibilities: u64,
 }
 
-/// Least standard deviations of what is known of a daughter after a pass.
+/// Least standard deviations of a daughter's gains, clock and position after a pass.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DaughterBound {
     /// From 1.

@@ -61,7 +61,7 @@ impl Circle {
         })
     }
 
-    /// Whether a pair is on it, but for a phase that does not matter.
+    /// Whether a pair is on it, to within a negligible phase.
     fn holds(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
         let tilt_rad = (prograde_rad(pair) - self.inclination_rad()).abs();
         let off_rad = tilt_rad + pair.radius_difference_m.abs() / pair.baseline_m;

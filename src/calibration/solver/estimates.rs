@@ -96,7 +96,7 @@ pub struct OutlierParts {
 }
 
 impl OutlierParts {
-    /// Whether they are of so many channels.
+    /// Whether they have this number of channels.
     pub(in crate::calibration) fn is_of(&self, channels: usize) -> bool {
         let parts = &self.by_channel_and_time;
         parts.len() == channels && parts.iter().all(|times| times.len() == TIME_PARTS)

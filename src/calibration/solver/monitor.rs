@@ -436,7 +436,7 @@ fn clock_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     (cost(late_s) < FIT).then_some(1e9 * late_s)
 }
 
-/// Whether most of a list is spoilt, of what is known.
+/// Whether most known values of a list are spoilt.
 fn most(list: &[f64]) -> bool {
     let known: Vec<&f64> = list.iter().filter(|part| part.is_finite()).collect();
     known.iter().filter(|part| ***part > SPOILT).count() * 2 > known.len()

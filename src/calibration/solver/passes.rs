@@ -129,7 +129,7 @@ impl SolverConfig {
     }
 }
 
-/// One pass, and what it is solved with.
+/// One pass and the solver's inputs.
 pub(super) struct Task<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) frequencies: &'a [f64],

@@ -30,7 +30,7 @@ pub(super) struct Interval<'a> {
     pub(super) position_m: &'a [[f64; 3]],
 }
 
-/// A solution, and what it is judged by.
+/// A solution with its residuals and counts.
 pub(super) struct Fitted {
     pub(super) layout: ParameterLayout,
     pub(super) found: NewtonFit,

@@ -2,7 +2,7 @@
 //!
 //! The residuals of a pair in a channel, projected on what the solution predicts, are summed over parts of the interval: `score`, whose
 //! variance is the `information` of the part. A gain of daughter n that is off by a factor `1 + d` during a part adds `information * d`
-//! to all of its pairs, so that the sum over them says how the gain changes; what is left then is no gain's: the model's.
+//! to all of its pairs, so that the sum over them says how the gain changes; the rest comes from the model, not from gains.
 
 use num_complex::Complex64;
 

@@ -131,15 +131,30 @@ impl ErrorTerms {
         rms.iter().chain(&self.rate_per_day).any(|value| *value != 0.0)
     }
 
-    /// Requires what terms can be; `of` says how many have values of their own, and what they are.
-    pub(super) fn check(&self, name: &str, of: (usize, &str), smooth: bool, checks: &mut Checks) {
+    /// Requires what terms can be; `of` says how many have values of their own, and what they are; `[most, most_per_day]` bounds
+    /// values and rates.
+    pub(super) fn check(
+        &self,
+        name: &str,
+        of: (usize, &str),
+        [most, most_per_day]: [f64; 2],
+        smooth: bool,
+        checks: &mut Checks,
+    ) {
         let (values, each) = of;
-        for (key, list) in [("constant", &self.constant), ("rate_per_day", &self.rate_per_day)] {
+        for (key, list, most) in
+            [("constant", &self.constant, most), ("rate_per_day", &self.rate_per_day, most_per_day)]
+        {
             let (key, count) = (format!("{name}.{key}"), list.len());
             let fits = count == 0 || count == values;
             let expected = format!("none, or {values}: one {each}");
             checks.require(&key, format!("({count} values)"), fits, expected);
-            checks.numbers(&key, list, |_| true, "finite numbers");
+            checks.numbers(
+                &key,
+                list,
+                |value| value.abs() <= most,
+                format!("numbers from -{most} to {most}"),
+            );
         }
         for (key, rms) in [
             ("constant_rms", self.constant_rms),
@@ -148,7 +163,8 @@ impl ErrorTerms {
             ("drift_rms", self.drift_rms),
             ("step_rms", self.step_rms),
         ] {
-            checks.number(format!("{name}.{key}"), rms, rms >= 0.0, "a standard deviation, not negative");
+            let expected = format!("a standard deviation, 0 to {most}");
+            checks.number(format!("{name}.{key}"), rms, (0.0..=most).contains(&rms), expected);
         }
         if smooth {
             let expected = "0: positions in packets are interpolated, and antennas turn slowly, so that their errors have to be smooth";
@@ -170,6 +186,17 @@ impl ErrorTerms {
             (1.0..=1e9).contains(&every_s),
             "1 s to 1e9 s",
         );
+    }
+}
+
+/// Greatest values of an error, and greatest rates a day: receivers and clocks that would still be used, over years.
+fn most_of(name: &str) -> [f64; 2] {
+    match name {
+        "amplitude" => [5.0, 0.01],
+        "pattern" => [10.0, 0.01],
+        "phase_deg" => [1e6, 1e7],
+        "clock_ns" => [1e9, 1e9],
+        _ => [45.0, 45.0],
     }
 }
 
@@ -252,7 +279,7 @@ impl InstrumentConfig {
         let mut checks = Checks::of("instrument");
         for (name, terms) in self.terms() {
             let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
-            terms.check(name, (satellites, "a daughter"), smooth, &mut checks);
+            terms.check(name, (satellites, "a daughter"), most_of(name), smooth, &mut checks);
         }
         self.pattern_by_frequency.check("pattern_by_frequency", Some(satellites), &mut checks);
         self.check_rest(&mut checks);

@@ -6,6 +6,9 @@ use crate::units::{Checks, InvalidValue, keys};
 /// Greatest error of a time tag, s. Ephemeris packets reach as far beyond a pass, so that tags find positions.
 pub(super) const TIME_TAG_S_MAX: f64 = 10.0;
 
+/// Greatest errors, m or ms, and greatest rates a day: farther satellites are not where a formation is.
+const MOST: f64 = 1e6;
+
 keys! {
     /// The `[navigation]` section: what the packets say less what is true. Without any of it, data are as they are without the
     /// section.
@@ -56,7 +59,7 @@ impl NavigationConfig {
         for (name, terms) in self.terms() {
             let of_tags = name == "time_tag_ms";
             let of = if of_tags { (1, "for the formation") } else { (satellites, "a daughter") };
-            terms.check(name, of, !of_tags, &mut checks);
+            terms.check(name, of, [MOST; 2], !of_tags, &mut checks);
         }
         let terms = &self.time_tag_ms;
         let rms = [terms.constant_rms, terms.pass_rms, terms.orbit_rms, terms.drift_rms, terms.step_rms];

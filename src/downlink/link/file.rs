@@ -1,6 +1,5 @@
 //! The link as a stage and between files. The truth is written beside the damaged file.
 
-use std::fs::File;
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
@@ -9,7 +8,7 @@ use super::simulator::LinkSimulator;
 use super::truth::LinkTruth;
 use crate::downlink::config::DownlinkConfig;
 use crate::downlink::error::{DownlinkError, io_error};
-use crate::downlink::receive::EventReader;
+use crate::downlink::receive::{DownlinkFile, EventReader};
 use crate::downlink::wire::cadu::ReedSolomon;
 use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
@@ -97,7 +96,7 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
     }
     let _input = ProtectedInputs::of([from]);
     let mut simulator = LinkSimulator::new(config, seed, code_of(from)?)?;
-    let mut source = File::open(from).map_err(io_error(from, "open the file"))?;
+    let mut source = DownlinkFile::open(from)?;
     let mut file = AtomicFile::create(to, IfUnfinished::Remove).map_err(io_error(to, "create the file"))?;
     let (mut bytes, mut arrived) = (Vec::new(), Vec::new());
     let at = |error: DownlinkError| error.at(from);

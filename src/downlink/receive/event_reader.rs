@@ -1,27 +1,26 @@
 //! The bytes of a file, or of any reader, to events.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::{Event, Intake};
+use super::{DownlinkFile, Event, Intake};
 use crate::downlink::error::{DownlinkError, io_error, require_packets};
 
 /// Feeds a source to an intake, chunk by chunk, and names the source in errors.
 #[derive(Debug)]
-pub struct ByteFeed<R = File> {
+pub struct ByteFeed<R = DownlinkFile> {
     path: PathBuf,
     source: R,
     at_end: bool,
 }
 
-impl ByteFeed<File> {
+impl ByteFeed<DownlinkFile> {
     /// Opens a file.
     ///
     /// # Errors
     /// The file cannot be opened.
     pub fn open(path: &Path) -> Result<Self, DownlinkError> {
-        Ok(Self::new(File::open(path).map_err(io_error(path, "open the file"))?, path))
+        Ok(Self::new(DownlinkFile::open(path)?, path))
     }
 }
 
@@ -50,7 +49,7 @@ impl<R: Read> ByteFeed<R> {
 
 /// Reads the events of one source, in bounded memory.
 #[derive(Debug)]
-pub struct EventReader<R = File> {
+pub struct EventReader<R = DownlinkFile> {
     feed: ByteFeed<R>,
     intake: Intake,
     packets: u64,
@@ -58,7 +57,7 @@ pub struct EventReader<R = File> {
     looked: bool,
 }
 
-impl EventReader<File> {
+impl EventReader<DownlinkFile> {
     /// Opens a file.
     ///
     /// # Errors

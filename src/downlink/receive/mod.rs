@@ -7,6 +7,7 @@
 //! | bytes to packets, gaps and damage | [`PacketReceiver`] |
 //! | either format, detected | [`Intake`], [`EventReader`] |
 //! | packets to ground frames | [`Decoder`] |
+//! | a file, packed or not, to bytes | [`DownlinkFile`] |
 //! | a whole file for people | [`inspect`] |
 //!
 //! Uses `wire` and `frames`. Receivers accept any bytes in chunks of any size, in bounded memory and linear time, and
@@ -15,6 +16,7 @@
 pub mod cadu;
 mod counters;
 mod decoder;
+mod downlink_file;
 mod event_reader;
 mod foreign;
 pub mod inspect;
@@ -26,6 +28,7 @@ mod sequence;
 
 pub use counters::{FaultCounts, FaultKind, KindCounts, PacketReading, PayloadOutcome, ReceptionCounters};
 pub use decoder::{Decoder, DecoderState};
+pub use downlink_file::DownlinkFile;
 pub use event_reader::{ByteFeed, EventReader};
 pub use intake::Intake;
 pub use listing::{LISTED_MAX, Listing};

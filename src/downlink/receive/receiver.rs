@@ -123,7 +123,7 @@ enum PacketMatch {
     Good(PacketHeader),
     /// Sound headers of a damaged packet; bytes to skip.
     Bad(PacketHeader, usize),
-    /// An idle packet, of so many bytes.
+    /// An idle packet, with its bytes.
     Idle(usize),
     /// Headers of a packet in which the stream ends.
     Cut,

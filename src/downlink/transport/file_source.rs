@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::downlink::error::{DownlinkError, io_error};
-use crate::downlink::receive::{Event, EventReader, Intake};
+use crate::downlink::receive::{DownlinkFile, Event, EventReader, Intake};
 use crate::downlink::wire::Format;
 use crate::files::is_at;
 use crate::runtime::{Flow, Outlet, Source, Units};
@@ -26,47 +26,63 @@ struct GrowthWait {
     polls: u64,
 }
 
-/// Reads downlink files one after the other. All must have the same format.
+/// Reads downlink files one after the other. If some are of packets and some of coded frames, packets are taken out of the frames.
 #[derive(Debug)]
 pub struct FileSource {
-    /// Files still to read; already open if they can be opened only once.
-    files: VecDeque<(PathBuf, Option<File>)>,
+    /// Files still to read.
+    files: VecDeque<NextFile>,
     current: Option<OpenFile>,
     bytes: u64,
-    /// The first file with a packet, and its format.
+    /// The first file with a packet, and the format of the stream.
     format: Option<(PathBuf, Format)>,
     /// Set if the last file is followed.
     patience: Option<GrowthWait>,
+}
+
+/// A file still to read.
+#[derive(Debug)]
+struct NextFile {
+    path: PathBuf,
+    /// Already open if it can be opened only once.
+    file: Option<File>,
+    /// Its format, if it could be probed.
+    format: Option<Format>,
 }
 
 /// The file that is being read.
 #[derive(Debug)]
 struct OpenFile {
     path: PathBuf,
-    file: File,
+    file: DownlinkFile,
     /// Bytes read so far.
     bytes: u64,
     /// Searches for the first packet in a file that could not be probed when the source was opened.
     probe: Option<Box<Intake>>,
+    /// Takes packets out of coded frames, for a stream of packets.
+    unframing: Option<Box<Intake>>,
 }
 
 impl FileSource {
     /// Opens the files. Probes each regular file for a packet at once, and a pipe as it is read.
     ///
     /// # Errors
-    /// A file cannot be opened, is empty, holds no packet, or differs in format from the first.
+    /// A file cannot be opened, is empty, or holds no packet.
     pub fn open(paths: &[PathBuf]) -> Result<Self, DownlinkError> {
         let mut source =
             Self { files: VecDeque::new(), current: None, bytes: 0, format: None, patience: None };
         for path in paths {
             let file = File::open(path).map_err(io_error(path, "open the file"))?;
-            if is_regular(&file) {
-                source.note_format(path, format_of(path, file)?)?;
-                source.files.push_back((path.clone(), None));
+            let path = path.clone();
+            source.files.push_back(if is_regular(&file) {
+                let format = format_of(&path, file)?;
+                NextFile { path, file: None, format: Some(format) }
             } else {
-                source.files.push_back((path.clone(), Some(file)));
-            }
+                NextFile { path, file: Some(file), format: None }
+            });
         }
+        let known = source.files.iter().filter_map(|next| Some((next.path.clone(), next.format?)));
+        // One with packets makes it a stream of packets.
+        source.format = known.min_by_key(|(_, format)| *format != Format::Packets);
         Ok(source)
     }
 
@@ -93,14 +109,21 @@ impl FileSource {
 
     /// Opens the next file.
     fn begin(&mut self) -> Result<Option<OpenFile>, DownlinkError> {
-        let Some((path, file)) = self.files.pop_front() else { return Ok(None) };
+        let Some(NextFile { path, file, format }) = self.files.pop_front() else { return Ok(None) };
         let is_followed = self.patience.is_some() && self.files.is_empty();
         let probe = (is_followed || file.is_some()).then(Box::default);
+        let is_coded_among_packets = format == Some(Format::Cadu)
+            && self.format.as_ref().is_some_and(|(_, format)| *format == Format::Packets);
+        let unframing = is_coded_among_packets.then(|| Box::new(Intake::unfiltered()));
         let file = match file {
             Some(file) => file,
             None => File::open(&path).map_err(io_error(&path, "open the file"))?,
         };
-        Ok(Some(OpenFile { path, file, bytes: 0, probe }))
+        let file = DownlinkFile::of(file).map_err(io_error(&path, "read"))?;
+        if is_followed && file.file().is_none() {
+            return Err(DownlinkError::Packed { path });
+        }
+        Ok(Some(OpenFile { path, file, bytes: 0, probe, unframing }))
     }
 
     /// Searches the bytes just read for the first packet of the file, until one is found.
@@ -130,14 +153,14 @@ impl FileSource {
         let Some((last, others)) = paths.split_last() else { return Self::open(paths) };
         let file = File::open(last).map_err(io_error(last, "open the file"))?;
         let mut source = Self::open(others)?;
-        source.files.push_back((last.clone(), Some(file)));
+        source.files.push_back(NextFile { path: last.clone(), file: Some(file), format: None });
         let polls_max = (idle_s > 0.0).then(|| (idle_s / POLL.as_secs_f64()).ceil() as u64);
         source.patience = Some(GrowthWait { polls_max, polls: 0 });
         Ok(source)
     }
 
     /// Waits one poll interval for the followed file to grow. Returns whether to read again.
-    fn wait(&mut self, open: &OpenFile) -> Result<bool, DownlinkError> {
+    fn wait(&mut self, open: &OpenFile, out: &mut Outlet<Vec<u8>>) -> Result<bool, DownlinkError> {
         let Some(patience) = self.patience.as_mut().filter(|_| self.files.is_empty()) else {
             return Ok(false);
         };
@@ -146,7 +169,7 @@ impl FileSource {
         if patience.polls_max.is_some_and(|most| patience.polls > most) {
             return Ok(false);
         }
-        std::thread::sleep(POLL);
+        out.await_input(|| std::thread::sleep(POLL));
         Ok(true)
     }
 }
@@ -167,10 +190,25 @@ impl OpenFile {
         let Ok(there) = std::fs::metadata(path) else {
             return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
         };
-        if there.is_file() && (there.len() < self.bytes || !is_at(&self.file, path)) {
+        if there.is_file()
+            && (there.len() < self.bytes || !self.file.file().is_some_and(|file| is_at(file, path)))
+        {
             return Err(DownlinkError::Replaced { path: path.clone(), read: self.bytes });
         }
         Ok(())
+    }
+}
+
+/// Passes on the packets that have been found.
+fn push_packets(intake: &mut Intake, out: &mut Outlet<Vec<u8>>) {
+    let mut packets = Vec::new();
+    while let Some(event) = intake.next_event() {
+        if let Event::Packet(packet) = event {
+            packet.append_to(&mut packets);
+        }
+    }
+    if !packets.is_empty() {
+        out.push(packets);
     }
 }
 
@@ -181,6 +219,7 @@ fn is_regular(file: &File) -> bool {
 
 /// The format of a file, by its first packet. Reads all of a foreign file, in bounded memory.
 fn format_of(path: &Path, file: File) -> Result<Format, DownlinkError> {
+    let file = DownlinkFile::of(file).map_err(io_error(path, "read"))?;
     let mut events = EventReader::new(file, path);
     if events.find(|event| matches!(event, Event::Packet(_)).then_some(()))?.is_none() {
         events.require_packets()?;
@@ -204,15 +243,25 @@ impl Source for FileSource {
             self.bytes += bytes.len() as u64;
             open.bytes += bytes.len() as u64;
             self.probe(&mut open, &bytes)?;
-            out.push(bytes);
+            match &mut open.unframing {
+                Some(intake) => {
+                    intake.push(&bytes);
+                    push_packets(intake, out);
+                }
+                None => out.push(bytes),
+            }
             self.current = Some(open);
             if let Some(patience) = &mut self.patience {
                 patience.polls = 0;
             }
-        } else if self.wait(&open)? {
+        } else if self.wait(&open, out)? {
             self.current = Some(open);
         } else {
             open.refuse_foreign()?;
+            if let Some(intake) = &mut open.unframing {
+                intake.finish();
+                push_packets(intake, out);
+            }
         }
         Ok(Flow::Continue)
     }

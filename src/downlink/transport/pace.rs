@@ -207,7 +207,7 @@ impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for PacedSource<S> 
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
         if !matches!(self.gate, Gate::Open) {
-            self.wait();
+            out.await_input(|| self.wait());
             return Ok(if self.ended { Flow::Done } else { Flow::Continue });
         }
         let Some(mut bytes) = self.pending.pop_front() else {

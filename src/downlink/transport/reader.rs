@@ -1,12 +1,11 @@
 //! Reads downlink files of either format.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
 use crate::downlink::error::DownlinkError;
 use crate::downlink::receive::cadu::FrameCounters;
-use crate::downlink::receive::{Decoder, EventReader, ReceptionCounters};
+use crate::downlink::receive::{Decoder, DownlinkFile, EventReader, ReceptionCounters};
 use crate::frames::GroundFrame;
 
 /// Reads ground frames from a file of either format, in bounded memory.
@@ -32,12 +31,12 @@ use crate::frames::GroundFrame;
 /// # }
 /// ```
 #[derive(Debug)]
-pub struct DownlinkReader<R = File> {
+pub struct DownlinkReader<R = DownlinkFile> {
     events: EventReader<R>,
     decoder: Decoder,
 }
 
-impl DownlinkReader<File> {
+impl DownlinkReader<DownlinkFile> {
     /// Opens a file.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Writes the bytes that pass through it to a file.
+//! Writes the bytes that pass through it to a file, or to standard output.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ pub struct Recorder {
     path: PathBuf,
     /// `None` before the first bytes, and once finished: there are no empty files.
     file: Option<AtomicFile>,
+    to_standard_output: bool,
     bytes: u64,
 }
 
@@ -24,19 +25,29 @@ impl Recorder {
     pub fn create(path: &Path) -> Result<Self, DownlinkError> {
         // What can go wrong is told before anything is computed.
         drop(create(path)?);
-        Ok(Self { path: path.to_owned(), file: None, bytes: 0 })
+        Ok(Self { path: path.to_owned(), file: None, to_standard_output: false, bytes: 0 })
+    }
+
+    /// A recorder to standard output.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn to_standard_output() -> Self {
+        Self { path: "standard output".into(), file: None, to_standard_output: true, bytes: 0 }
     }
 
     fn record(&mut self, bytes: &[u8]) -> Result<(), DownlinkError> {
         if bytes.is_empty() {
             return Ok(());
         }
-        if self.bytes == 0 {
+        if self.bytes == 0 && !self.to_standard_output {
             self.file = Some(create(&self.path)?);
         }
         self.bytes += bytes.len() as u64;
         match &mut self.file {
             Some(file) => file.write_all(bytes).map_err(io_error(&self.path, "write")),
+            None if self.to_standard_output => {
+                std::io::stdout().lock().write_all(bytes).map_err(io_error(&self.path, "write"))
+            }
             None => Ok(()),
         }
     }
@@ -44,6 +55,9 @@ impl Recorder {
     fn close(&mut self) -> Result<(), DownlinkError> {
         match self.file.take() {
             Some(file) => file.finish().map(|_| ()).map_err(io_error(&self.path, "finish the file")),
+            None if self.to_standard_output => {
+                std::io::stdout().flush().map_err(io_error(&self.path, "write"))
+            }
             None => Ok(()),
         }
     }

@@ -242,7 +242,7 @@ impl StateFolder {
         Ok(())
     }
 
-    /// Checks that the path still leads to the folder that was locked: another process may use what is there now.
+    /// Checks that the path still leads to the folder that was locked: another process may use the folder that is there now.
     fn check_place(&self) -> Result<(), GroundError> {
         match self.lock.as_ref().and_then(FolderLock::lost) {
             None => Ok(()),

@@ -69,7 +69,7 @@ pub struct GapReport {
     pub between_s: [Option<f64>; 2],
     /// Integration time in it, s, over all channels and pairs.
     pub integration_s: f64,
-    /// Its weight over that in the map of the same channel, summed over channels; 1 for a channel of
+    /// Its weight over that in the map of the same channel, in the mean over all channels; 1 for a channel of
     /// which the map has nothing.
     pub gain: f64,
     /// By channel and pair: missing visibilities, or those that wait for missing positions.

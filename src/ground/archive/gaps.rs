@@ -6,16 +6,9 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
-use super::packet_order::{PacketStreams, SendingOrder};
+use super::packet_order::{PacketStreams, SendingOrder, windows_of};
 use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
-
-/// Packets of the same channel and pair, before and after a missing one, from which its accumulated fraction is
-/// estimated.
-const NEAR: u64 = 4;
-
-/// Windows are further apart than this, s, and packets of a window are not.
-const APART_S: f64 = 600.0;
 
 /// What has been received, as input to [`find_gaps`].
 #[derive(Clone, Debug, Default)]
@@ -84,9 +77,9 @@ pub struct Gaps {
 
 /// Finds what is missing between the packets received.
 ///
-/// Every pass sends channel after channel and pair after pair, each in as many packets as it takes. The order and the
-/// usual number of packets are inferred from what was received. A gap is filled in that order, starting from the packet
-/// before it, with packets like those that the same channel and pair sent about that time. Missing positions are worth
+/// Of every window, channel after channel and pair after pair is sent, each in as many packets as it takes. A gap is filled with
+/// packets like those of a whole window near it that fits the gap's number of packets best, from the place of the packet before it to
+/// that of the packet after it. Missing positions are worth
 /// the visibilities that wait between the positions on either side. What was sent after the last packet received is not
 /// known to be missing.
 #[must_use]
@@ -119,6 +112,7 @@ pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
             let in_map = channels.get(&channel).map_or(0.0, |coverage| coverage.weight);
             gap.gain += if in_map > 0.0 { weight / in_map } else { 1.0 };
         }
+        gap.gain /= channels.len().max(1) as f64;
     }
     found.gaps.sort_by(|a, b| b.gain.total_cmp(&a.gain).then((a.kind, a.from).cmp(&(b.kind, b.from))));
     found.channels = channels.into_values().collect();
@@ -208,27 +202,12 @@ fn positions_missing(
             let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
             sum.packets += 1;
             sum.integration_s += share * reading.entry.integration_s;
-            sum.weight +=
-                share * reading.entry.weight * streams.usual(stream, reading.entry.sent(), NEAR).share();
+            sum.weight += share * reading.entry.weight * streams.share(stream, reading.entry.sent());
         }
     }
     let [before_s, after_s] = [before.map(|before| before.span[1]), after.map(|after| after.span[0])];
     let between_s = [before_s, after_s].map(|time| time.map(MissionTime::seconds));
     GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
-}
-
-/// Readings in the order of time, by observing window.
-fn windows_of(waiting: &[&VisibilityPacket]) -> Vec<Range<usize>> {
-    let mut windows: Vec<Range<usize>> = Vec::new();
-    let mut until = f64::NEG_INFINITY;
-    for (at, reading) in waiting.iter().enumerate() {
-        match windows.last_mut() {
-            Some(window) if reading.entry.start.seconds() <= until + APART_S => window.end = at + 1,
-            _ => windows.push(at..at + 1),
-        }
-        until = until.max(reading.entry.end.seconds());
-    }
-    windows
 }
 
 /// Share of each window's loss that a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
@@ -361,8 +340,8 @@ mod tests {
         // Three packets of channel 0, of 18 in all; two of channel 1, of 54.
         let (found, _) = without(&[15..17, 36..39]);
         assert_eq!((found.gaps[0].from, found.gaps[1].from), (36, 15));
-        assert!((found.gaps[0].gain - 3.0 / 15.0).abs() < 1e-12, "{}", found.gaps[0].gain);
-        assert!((found.gaps[1].gain - 2.0 / 52.0).abs() < 1e-12);
+        assert!((found.gaps[0].gain - 0.5 * 3.0 / 15.0).abs() < 1e-12, "{}", found.gaps[0].gain);
+        assert!((found.gaps[1].gain - 0.5 * 2.0 / 52.0).abs() < 1e-12);
         assert_eq!(found.channels[0].missing_integration_s, 1500.0);
         assert_eq!(found.channels[1].missing_weight, 4.0);
     }

@@ -68,7 +68,7 @@ impl ArchiveContents {
     }
 }
 
-/// Reads a checkpoint, of all parts that there are, into an accumulator without sums; `check` looks at its head first.
+/// Reads all parts of a checkpoint into an accumulator without sums; `check` looks at its head first.
 fn read_parts(
     path: &Path,
     empty: &Accumulator,

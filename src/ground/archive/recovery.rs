@@ -45,7 +45,7 @@ impl Ground {
         Ok(())
     }
 
-    /// From now on keeps what it is sent in the raw archive of its state, which is `elsewhere` if that is given, and has at most
+    /// Keeps received packets in the raw archive of its state from now on, which is `elsewhere` if that is given, and has at most
     /// `bytes_max` as far as checkpoints allow. `None` without a state.
     ///
     /// # Errors

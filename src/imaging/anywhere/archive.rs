@@ -156,7 +156,7 @@ impl VisibilityArchive {
         self.segments.clear();
     }
 
-    /// A copy of what is held, without the files that it stands in.
+    /// A copy of the visibilities, without their files.
     pub(in crate::imaging) fn copy(&mut self) -> Self {
         self.flush();
         Self {

@@ -82,7 +82,7 @@ impl Grids {
         alpha / ALPHAS / self.share.count * ALPHAS + alpha % ALPHAS
     }
 
-    /// Rows that this process holds of a grid of so many alphas.
+    /// Rows that this process holds of a grid with this many alphas.
     pub(super) fn rows(&self, points: usize) -> usize {
         let blocks = points.div_ceil(ALPHAS);
         let missing = if self.share.holds(blocks - 1) { blocks * ALPHAS - points } else { 0 };

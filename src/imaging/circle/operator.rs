@@ -224,7 +224,7 @@ impl Operator {
         (0..skies).map(sum).collect()
     }
 
-    /// Where each order mu of so many columns of turned skies starts.
+    /// Start of each order mu in `columns` columns of turned skies.
     fn turned_starts(&self, columns: usize) -> Vec<usize> {
         let lengths = (0..=self.l_max).map(|mu| 2 * columns * degrees(self.l_max, mu));
         lengths.scan(0, |end, length| Some(std::mem::replace(end, *end + length))).collect()

@@ -128,7 +128,7 @@ impl StoredTori {
         &self.parts[part as usize].alphas
     }
 
-    /// Bytes of the weights with rows of so many floats.
+    /// Bytes of the weights with rows of this many floats.
     pub(super) fn weight_bytes(&self, row: usize) -> u64 {
         let rows = |block: &StoredBlock| block.nodes.len() * block.alphas;
         let [weights, _] = &self.parts;

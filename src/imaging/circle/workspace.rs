@@ -1,4 +1,4 @@
-//! Memory in which a thread applies the operator to a block of alphas, of one sky or several.
+//! Buffers with which a thread applies the operator to a block of alphas, for one sky or several.
 
 use std::sync::Arc;
 

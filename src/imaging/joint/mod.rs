@@ -8,6 +8,8 @@ mod prior;
 mod solve;
 mod spectrum;
 mod sums;
+#[cfg(test)]
+mod tests;
 
 pub use prior::Likeness;
 pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};

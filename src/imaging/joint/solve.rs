@@ -244,18 +244,18 @@ fn most_likely(
 }
 
 /// Map and samples in the unknowns of the prior.
-struct Posterior<'a> {
+pub(super) struct Posterior<'a> {
     sums: &'a JointSums<'a>,
     blocks: Vec<Block<'static>>,
     offsets: Vec<usize>,
-    solution: Vec<f64>,
+    pub(super) solution: Vec<f64>,
     /// Draws less the solution, of the true matrix and of its blocks with the same numbers.
     draws: Vec<Drawn>,
-    convergence: Convergence,
+    pub(super) convergence: Convergence,
 }
 
 impl<'a> Posterior<'a> {
-    fn of(
+    pub(super) fn of(
         sums: &'a JointSums<'a>,
         scaled: &[ScaledBlocks],
         request: &JointRequest,
@@ -292,7 +292,7 @@ impl<'a> Posterior<'a> {
         self.sums.prior
     }
 
-    fn seen(&self, view: &View, unknowns: &[f64]) -> Vec<f64> {
+    pub(super) fn seen(&self, view: &View, unknowns: &[f64]) -> Vec<f64> {
         view.coefficients(self.prior(), &self.offsets, unknowns)
     }
 
@@ -315,7 +315,7 @@ impl<'a> Posterior<'a> {
     }
 
     /// A sample of a view: what no channel decides is drawn, too.
-    fn sample(&self, view: &View, number: usize) -> Vec<f64> {
+    pub(super) fn sample(&self, view: &View, number: usize) -> Vec<f64> {
         let mut sky = self.seen(view, &self.draws[number].whole);
         crate::imaging::solver::add(&mut sky, &self.seen(view, &self.solution));
         if view.open.iter().any(|open| *open > 0.0) {
@@ -329,7 +329,7 @@ impl<'a> Posterior<'a> {
         sky
     }
 
-    fn map(&self, view: &View, nside: usize) -> Result<JointMap, SolveError> {
+    pub(super) fn map(&self, view: &View, nside: usize) -> Result<JointMap, SolveError> {
         let sky = self.seen(view, &self.solution);
         let ratio = self.ratio(view);
         let map_k = synthesis(&coefficients(&sky, view.l_max), nside)?;
@@ -386,176 +386,4 @@ impl<'a> Posterior<'a> {
 
 fn unit_regularisation(prior: &Prior) -> Vec<f64> {
     vec![1.0; prior.l_max.first().map_or(1, |l_max| l_max + 1)]
-}
-
-#[cfg(test)]
-mod tests {
-    use std::borrow::Cow;
-
-    use faer::linalg::solvers::{DenseSolveCore, Solve};
-    use faer::{Mat, Side};
-
-    use super::*;
-    use crate::imaging::Accuracy;
-    use crate::imaging::joint::prior::place_of;
-
-    /// Sums that are a matrix.
-    struct Dense {
-        matrix: Mat<f64>,
-        right: Vec<f64>,
-    }
-
-    impl NormalSums for Dense {
-        fn unknowns(&self) -> usize {
-            self.right.len()
-        }
-
-        fn apply(&self, x: &[f64], y: &mut [f64]) {
-            for (i, y) in y.iter_mut().enumerate() {
-                *y = x.iter().enumerate().map(|(j, x)| self.matrix[(i, j)] * x).sum();
-            }
-        }
-
-        fn right_hand_side(&self) -> &[f64] {
-            &self.right
-        }
-
-        fn noise_right_hand_side(&self) -> &[f64] {
-            &self.right
-        }
-
-        fn counts(&self) -> SumCounts {
-            SumCounts { visibilities: 100, ..SumCounts::default() }
-        }
-
-        fn accuracy(&self) -> Accuracy {
-            Accuracy { relative: 0.0, absolute: 0.0 }
-        }
-    }
-
-    fn normal(seed: u64) -> impl FnMut() -> f64 {
-        let mut stream = random_stream(seed, StreamKind::Probe, [0, 0]);
-        move || StandardNormal.sample(&mut stream)
-    }
-
-    /// Random sums of a channel, some combinations of which see nearly nothing.
-    fn dense(l_max: usize, seed: u64) -> Dense {
-        let mut normal = normal(seed);
-        let order = (l_max + 1).pow(2);
-        let b = Mat::from_fn(2 * order, order, |row, _| {
-            normal() * 10.0_f64.powf(-1.5 * row as f64 / order as f64)
-        });
-        Dense { matrix: b.transpose() * &b, right: (0..order).map(|_| normal()).collect() }
-    }
-
-    /// The blocks of one order and parity in a matrix, cosine and sine alike.
-    fn order_blocks(dense: &Dense, l_max: usize) -> Vec<Block<'static>> {
-        let of = |(m, parity): (usize, usize)| {
-            let degrees: Vec<usize> = (m + parity..=l_max).step_by(2).collect();
-            let at = |k: usize, part| place_of(l_max, degrees[k], m, part);
-            let matrix =
-                Mat::from_fn(degrees.len(), degrees.len(), |i, j| dense.matrix[(at(i, 0), at(j, 0))]);
-            let parts = if m == 0 { 1 } else { 2 };
-            let places = (0..parts).map(|part| (0..degrees.len()).map(|k| at(k, part)).collect()).collect();
-            Block { matrix: Cow::Owned(matrix), degrees, places }
-        };
-        let orders = (0..=l_max).flat_map(|m| [(m, 0), (m, 1)]);
-        orders.filter(|(m, parity)| m + parity <= l_max).map(of).collect()
-    }
-
-    /// Against `(A + C^-1)^-1 b` with all matrices written out, by other formulas than T: solution, errors of pixels and of a frequency
-    /// between.
-    #[test]
-    fn the_joint_map_is_that_of_the_dense_matrices() {
-        let (l_max, likeness) = ([4, 3], Likeness { length: 0.8, own_share: 0.02 });
-        let channels = [dense(4, 1), dense(3, 2)];
-        let scale = vec![vec![3.0, 2.0, 1.0, 0.7, 0.5], vec![5.0, 4.0, 2.0, 1.0]];
-        let prior = Prior::new(vec![10e6, 5e6], scale.clone(), likeness).unwrap();
-        let factors = vec![1.0, 1.3];
-        let blocks: Vec<Vec<Block<'_>>> =
-            channels.iter().zip(l_max).map(|(dense, l_max)| order_blocks(dense, l_max)).collect();
-        let sums: Vec<&(dyn NormalSums + Sync)> =
-            channels.iter().map(|dense| dense as &(dyn NormalSums + Sync)).collect();
-        let joint = JointSums::new(&prior, sums, factors.clone());
-        let scaled = scaled_blocks(&prior, &blocks, &factors);
-        let rule = StoppingRule { residual_max: 1e-11, iterations_max: 500 };
-        let request = JointRequest { rule, samples: 400, at_hz: Vec::new() };
-        let watch = SolveWatch::default();
-        let found = Posterior::of(&joint, &scaled, &request, watch.named("test")).unwrap();
-        assert!(found.convergence.converged);
-
-        // Coefficients of 10 MHz, then 5 MHz, then 7 MHz, which no data see.
-        let hz = [10e6, 5e6, 7e6];
-        let at_seven = prior.view_at(7e6).unwrap();
-        let scales = [&scale[0], &scale[1], &at_seven.scale];
-        let rows: Vec<(usize, usize, usize)> = [4, 3, 3]
-            .iter()
-            .enumerate()
-            .flat_map(|(k, l_max)| {
-                (0..=*l_max).flat_map(move |m| {
-                    (m..=*l_max).flat_map(move |l| {
-                        (0..if m == 0 { 1 } else { 2 }).map(move |part| (k, l, 1000 * m + part))
-                    })
-                })
-            })
-            .collect();
-        let count = rows.len();
-        let c = Mat::from_fn(count, count, |i, j| {
-            let ((a, l, m), (b, k, n)) = (rows[i], rows[j]);
-            if (l, m) != (k, n) {
-                return 0.0;
-            }
-            let x = f64::ln(hz[a] / hz[b]) / 0.8;
-            scales[a][l] * scales[b][l] * (0.98 * (-0.5 * x * x).exp() + if a == b { 0.02 } else { 0.0 })
-        });
-        let (first, second) = (25, 16);
-        let a = Mat::from_fn(count, count, |i, j| {
-            if i < first && j < first {
-                channels[0].matrix[(i, j)]
-            } else if (first..first + second).contains(&i) && (first..first + second).contains(&j) {
-                channels[1].matrix[(i - first, j - first)] / 1.69
-            } else {
-                0.0
-            }
-        });
-        let b = Mat::from_fn(count, 1, |i, _| match i {
-            i if i < first => channels[0].right[i],
-            i if i < first + second => channels[1].right[i - first] / 1.69,
-            _ => 0.0,
-        });
-        let whole = &a + c.llt(Side::Lower).unwrap().inverse();
-        let factor = whole.llt(Side::Lower).unwrap();
-        let (expected, covariance) = (factor.solve(&b), factor.inverse());
-        let views = [prior.view_of(0), prior.view_of(1), at_seven];
-        let solved: Vec<f64> = views.iter().flat_map(|view| found.seen(view, &found.solution)).collect();
-        for (i, value) in solved.iter().enumerate() {
-            // The iteration ends at 1e-11; C^-1 loses some digits.
-            assert!(
-                (value - expected[(i, 0)]).abs() < 1e-7 * (1.0 + value.abs()),
-                "{i}: {value} {}",
-                expected[(i, 0)]
-            );
-        }
-        let samples: Vec<Vec<f64>> = (0..request.samples)
-            .map(|number| views.iter().flat_map(|view| found.sample(view, number)).collect())
-            .collect();
-        for i in 0..count {
-            let variance: f64 = samples.iter().map(|sample| (sample[i] - solved[i]).powi(2)).sum::<f64>()
-                / samples.len() as f64;
-            // Five standard errors of a variance of 400.
-            assert!(
-                (variance / covariance[(i, i)] - 1.0).abs() < 0.36,
-                "{i}: {variance} {}",
-                covariance[(i, i)]
-            );
-        }
-        // Pixels: the variance of Y' x, mean over a map; blocks alone leave out coupling, which the draws' ratio puts back by degree.
-        for (view, at) in views.iter().zip([0..25, 25..41, 41..57]) {
-            let map = found.map(view, 4).unwrap();
-            let found: f64 = map.sigma_k.iter().map(|sigma| sigma * sigma).sum::<f64>() / 192.0;
-            let trace: f64 = at.map(|i| covariance[(i, i)]).sum();
-            let expected = trace / (4.0 * std::f64::consts::PI);
-            assert!((found / expected - 1.0).abs() < 0.15, "{}: {found} {expected}", view.frequency_hz);
-        }
-    }
 }

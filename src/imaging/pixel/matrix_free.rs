@@ -11,7 +11,7 @@ use crate::imaging::{AccumulationError, Accuracy, NormalSums, SumCounts};
 use crate::response::general::PairAt;
 use crate::response::pixel::{PairGeometry, PixelMethod, RowProducts};
 
-/// Rows are good to 1e-6 as those of the held matrix, which are the same; sums of them in f32 to 1e-7 of the greatest.
+/// Rows are those of the stored matrix, good to 1e-6; their sums in f32 are good to 1e-7 of the greatest.
 const ACCURACY: Accuracy = Accuracy { relative: 1e-6, absolute: 1e-7 };
 
 /// Visibilities for a map of pixels.

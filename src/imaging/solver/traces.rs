@@ -5,7 +5,7 @@
 //! the mean of `v.f(A)v` over vectors v of random signs (Hutchinson), and k Lanczos steps from v bound each of these.
 //! With `g1 = 1 / (x + eps)` and `g2 = 1 / (x + eps)^2`, whose derivatives alternate in sign, Gauss quadrature is below
 //! `v.g(A)v` and Gauss-Radau quadrature with a node below the spectrum above it (Golub & Meurant 2010). Steps go on until
-//! these bounds meet, and what is left between them is part of the error.
+//! these bounds meet, and the remaining distance is part of the error.
 //!
 //! The engine's eigenvalues differ from those of `BtN^-1B` by what [`Accuracy`] says, and each moves its term of a trace by
 //! what f changes over that distance. That is part of the error too, and an epsilon that it makes meaningless is refused.

@@ -289,7 +289,7 @@ pub(in crate::pipeline) fn memory_bytes(
 }
 
 impl Cost {
-    /// With the number of nodes of so much memory that hold all ranks, unless not even one rank fits.
+    /// Adds the number of nodes with this memory that hold all ranks, if a node holds at least one.
     #[must_use]
     pub fn on_nodes(mut self, limit: Option<MemoryLimit>) -> Self {
         if let (Some(limit), Some(cost)) = (limit, &mut self.ranks) {

@@ -51,7 +51,7 @@ pub struct CalibrateSummary {
     pub unused: u64,
     /// Visibilities that arrived after their pass was solved.
     pub late: u64,
-    /// Gains that are not good, of all.
+    /// Gains that are not good, and all gains.
     pub gains_not_good: [u64; 2],
     /// Median standard deviation of a daughter's phase, deg, by channel and daughter.
     pub phase_sigma_deg: Vec<Vec<f64>>,

@@ -122,7 +122,7 @@ pub(in crate::pipeline) fn add(
     Ok(outcome)
 }
 
-/// Takes the maps of a rank that are those of the first rank, which publishes them.
+/// Drops the maps of a rank: the first rank publishes the same.
 struct NullSink;
 
 impl Sink for NullSink {

@@ -88,13 +88,15 @@ impl GroundSource for SocketSource {
 pub struct Destination {
     /// A file.
     pub file: Option<PathBuf>,
+    /// Standard output, in place of a file.
+    pub standard_output: bool,
     /// A listening ground.
     pub socket: Option<SocketSink>,
 }
 
 impl<P: AsRef<Path>> From<&P> for Destination {
     fn from(file: &P) -> Self {
-        Self { file: Some(file.as_ref().to_owned()), socket: None }
+        Self { file: Some(file.as_ref().to_owned()), ..Self::default() }
     }
 }
 
@@ -202,7 +204,10 @@ pub fn simulate(
     if let Some(file) = &to.file {
         write_instrument_truth(plan, file)?;
     }
-    let recorder = to.file.as_deref().map(Recorder::create).transpose()?;
+    let recorder = match &to.file {
+        Some(file) => Some(Recorder::create(file)?),
+        None => to.standard_output.then(Recorder::to_standard_output),
+    };
     let skies = space_segment::skies(plan)?;
     simulate_sky(plan, &skies, (to, recorder), cancel, watch)
 }
@@ -215,7 +220,7 @@ pub(in crate::pipeline) fn simulate_sky(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    let Destination { file, socket } = to;
+    let Destination { file, socket, .. } = to;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
     let mut bytes = space_segment::add(&mut graph, plan, skies, &counts)?;

@@ -1,4 +1,4 @@
-//! What a run in groups of channels is about to do, for whoever watches it.
+//! Steps of a run in groups of channels, for progress.
 
 use std::fmt;
 

@@ -191,7 +191,7 @@ impl GroupReadings<'_> {
 
 /// Simulates the channels and maps them in `out`, group by group: first all visibilities, then the maps.
 ///
-/// What [`run`](crate::pipeline::run()) leaves, byte for byte but for times and the number of passes in the summary; `None` if it was cancelled
+/// Leaves the products of [`run`](crate::pipeline::run()), byte for byte but for times and the number of readings in the summary; `None` if it was cancelled
 /// before there was a downlink. After a cancellation the same call goes on: groups that are simulated or mapped stay as they are.
 ///
 /// # Errors

@@ -12,7 +12,7 @@ use crate::runtime::{Cancel, Report};
 
 /// A mission that is simulated, mapped, or both: a pipeline file with some keys changed.
 ///
-/// Keys are those of `pipelines/reference.toml`. Whatever is wrong with them is told when the mission is planned, all at once.
+/// Keys are those of `pipelines/reference.toml`. All errors are reported together when the mission is planned.
 ///
 /// ```
 /// use lunarray::prelude::*;

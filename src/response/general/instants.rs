@@ -68,7 +68,7 @@ impl Instants {
         &self.rules[0]
     }
 
-    /// The instants of an integration in half of which phases move by so much, rad: those of the fringe, and those of the limb's highest
+    /// The instants of an integration, as many as the motion of phases in half of it needs, rad: of the fringe, and of the limb's highest
     /// degree.
     #[must_use]
     pub fn for_phases(&self, [fringe_rad, limb_rad]: [f64; 2]) -> &[Instant] {

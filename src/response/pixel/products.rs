@@ -123,7 +123,7 @@ impl RowProducts {
         self.ring.len()
     }
 
-    /// Memory of products of so many vectors at once on so many threads, bytes: the rows of a block for each thread, and the sums of all
+    /// Memory of products of `columns` vectors at once on `threads` threads, bytes: the rows of a block for each thread, and the sums of all
     /// parts.
     #[must_use]
     pub fn memory_bytes(nside: usize, columns: usize, threads: usize) -> u64 {

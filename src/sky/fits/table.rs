@@ -76,7 +76,7 @@ impl TableLayout {
         Ok(Self { rows, row_bytes, columns })
     }
 
-    /// Number of columns, besides pixel numbers, of numbers as many as those of `column`.
+    /// Number of columns, besides pixel numbers, that are as long as `column`.
     pub(super) fn maps_like(&self, column: &ColumnLayout, explicit: bool) -> usize {
         let others = self.columns.iter().skip(usize::from(explicit));
         others.filter(|other| other.cell != CellType::Other && other.repeat == column.repeat).count()

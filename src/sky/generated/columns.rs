@@ -62,7 +62,7 @@ pub(super) struct Columns {
     pub index: Option<usize>,
 }
 
-/// A name without case and punctuation, but for the point of a number.
+/// A name in lower case without punctuation, except the point of a number.
 pub(super) fn plain(name: &str) -> String {
     let name = name.split(['(', '[']).next().unwrap_or(name);
     let kept: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '.').collect();

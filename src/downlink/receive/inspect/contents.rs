@@ -250,7 +250,7 @@ impl Contents {
         self.is_undamaged() && self.found_less_reported() == Some(0)
     }
 
-    /// Whether nothing is missing between what is there, nothing is damaged, and every payload was decoded.
+    /// Whether it has no gaps and no damage, and every payload was decoded.
     #[must_use]
     #[doc(hidden)]
     pub fn is_undamaged(&self) -> bool {

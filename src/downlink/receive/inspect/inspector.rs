@@ -1,7 +1,6 @@
 //! Reads a downlink file and gathers its contents.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -10,8 +9,10 @@ use super::contents::{
     HousekeepingSummary, InstrumentSummary, KindSummary, PairSummary, TimeSpan, VisibilityCounts,
 };
 use crate::array::{earth_is_hidden_by_date, interpolation_error_m};
-use crate::downlink::error::{DownlinkError, io_error};
-use crate::downlink::receive::{Decoder, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters};
+use crate::downlink::error::DownlinkError;
+use crate::downlink::receive::{
+    Decoder, DownlinkFile, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters,
+};
 use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
@@ -43,7 +44,7 @@ impl Contents {
     /// Those of [`Contents::read`].
     #[doc(hidden)]
     pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
-        Self::read_from(File::open(path).map_err(io_error(path, "open the file"))?, path, see)
+        Self::read_from(DownlinkFile::open(path)?, path, see)
     }
 
     /// Inspects any source, which `path` names, and gives every frame to `see`.

@@ -4,11 +4,12 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::net::{TcpListener, TcpStream};
+use tokio::net::{TcpListener, TcpStream, UdpSocket};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep, timeout};
 
 use super::connection::serve;
+use super::datagrams::receive;
 use super::listener::{First, ListenContext, first};
 use super::report::ListenEvent;
 use super::seats::Room;
@@ -17,7 +18,13 @@ use super::seats::Room;
 const TICK: Duration = Duration::from_millis(50);
 
 /// Listens until the end condition holds, then waits for all connections to end.
-pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
+///
+/// Without a listener only datagrams come.
+pub(super) async fn listen(
+    (listener, datagrams): (Option<TcpListener>, Option<UdpSocket>),
+    shared: Arc<ListenContext>,
+) {
+    let datagrams = datagrams.map(|socket| tokio::spawn(receive(socket, Arc::clone(&shared))));
     let mut connections = JoinSet::new();
     // Accepted, and without a place yet. Others wait in the system's queue, in the order in which they came.
     let mut newcomer: Option<(TcpStream, SocketAddr)> = None;
@@ -41,7 +48,13 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
             }
             continue;
         }
-        match first(shared.stopped(), timeout(TICK, listener.accept())).await {
+        let accepted = async {
+            match &listener {
+                Some(listener) => listener.accept().await,
+                None => std::future::pending().await,
+            }
+        };
+        match first(shared.stopped(), timeout(TICK, accepted)).await {
             First::A(()) => break,
             First::B(Err(_)) => {}
             First::B(Ok(Ok(accepted))) => newcomer = Some(accepted),
@@ -55,4 +68,7 @@ pub(super) async fn listen(listener: TcpListener, shared: Arc<ListenContext>) {
     drop((listener, newcomer));
     shared.stop.send_replace(true);
     while connections.join_next().await.is_some() {}
+    if let Some(datagrams) = datagrams {
+        let _ = datagrams.await;
+    }
 }

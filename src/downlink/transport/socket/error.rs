@@ -9,8 +9,10 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// The text is not a TCP URL.
-    #[error("{text:?}: expected tcp://HOST:PORT, such as tcp://127.0.0.1:4711 or tcp://[::1]:4711")]
+    /// The text is no URL of a socket.
+    #[error(
+        "{text:?}: expected tcp://HOST:PORT, such as tcp://127.0.0.1:4711 or tcp://[::1]:4711; `replay --listen` also takes udp://HOST:PORT"
+    )]
     Url {
         /// The text.
         text: String,

@@ -25,6 +25,9 @@
 //! ([`HeldAnswers`]). The source asks the ground for a checkpoint with an empty piece of the stream. The connection's place is
 //! free while it waits; the last checkpoint of the run, which comes after the listener has ended, answers too.
 //!
+//! Datagrams over UDP, each a packet or a frame, come in beside connections (`datagrams`): nothing answers them, so what is lost shows as
+//! missing packets, and in counters of their own.
+//!
 //! Packets carry no signature: whoever can connect can add to the maps. Therefore addresses other than those of this
 //! machine require an explicit option. With [`Stations`] a connection has to begin with the line `token TOKEN` of one of them, and
 //! is reported by its name.
@@ -33,6 +36,7 @@ mod accept;
 mod answers;
 mod config;
 mod connection;
+mod datagrams;
 mod error;
 mod listener;
 mod preamble;
@@ -49,10 +53,11 @@ pub use config::ListenConfig;
 pub use error::SocketError;
 pub use listener::{ListenLimits, NoteHandler};
 pub use report::{
-    ConnectionEnd, ListenNote, ListenReport, ListenStatus, Listening, SenderReport, StationCounts,
+    ConnectionEnd, DatagramReport, ListenNote, ListenReport, ListenStatus, Listening, SenderReport,
+    StationCounts,
 };
 pub use sender_intake::InstrumentCheck;
 pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;
 pub use stations::Stations;
-pub use url::TcpUrl;
+pub use url::{ListenUrl, TcpUrl};

@@ -193,6 +193,25 @@ pub struct StationCounts {
     pub heard: Option<Instant>,
 }
 
+/// What came in datagrams.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct DatagramReport {
+    /// Address on which the ground listens.
+    pub address: String,
+    /// Datagrams received.
+    pub received: u64,
+    /// Bytes in them.
+    pub bytes: u64,
+    /// Sound packets passed to the ground.
+    pub packets: u64,
+    /// Datagrams without a sound packet or frame.
+    pub malformed: u64,
+    /// Datagrams of another instrument than the ground's.
+    pub refused: u64,
+    /// Datagrams that the system dropped because they came faster than they were read; `None` if it does not say.
+    pub dropped_by_system: Option<u64>,
+}
+
 /// All connections of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ListenReport {
@@ -212,6 +231,9 @@ pub struct ListenReport {
     pub backlog_bytes_max: u64,
     /// Connections by end.
     pub ended: BTreeMap<ConnectionEnd, u64>,
+    /// What came in datagrams, if the ground listens for them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub datagrams: Option<DatagramReport>,
     /// What came from each station that is known by its token.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub stations: BTreeMap<String, StationCounts>,
@@ -267,6 +289,23 @@ impl fmt::Display for ListenReport {
              {packets_refused} refused; backlog at most {} bytes",
             self.backlog_bytes_max
         )?;
+        if let Some(DatagramReport {
+            address,
+            received,
+            packets,
+            malformed,
+            refused,
+            dropped_by_system,
+            ..
+        }) = &self.datagrams
+        {
+            let dropped = dropped_by_system.map_or("unknown".to_owned(), |count| count.to_string());
+            write!(
+                f,
+                "\n  {address}: {received} datagrams, {packets} packets; {malformed} malformed, {refused} refused, {dropped} dropped \
+                 by the system"
+            )?;
+        }
         for (ended, count) in &self.ended {
             write!(f, "\n  {count:>6}  {ended}")?;
         }

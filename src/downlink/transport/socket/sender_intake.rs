@@ -209,6 +209,10 @@ impl SenderIntake {
         let (before, bytes) = self.preamble.take(bytes)?;
         self.intake.push(&before);
         self.intake.push(bytes);
+        self.judge_taken(out)
+    }
+
+    fn judge_taken(&mut self, out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
         self.release(out);
         let is_alive = self.look_for_signs();
         let is_new = std::mem::take(&mut self.has_new);
@@ -217,6 +221,26 @@ impl SenderIntake {
             None if self.held.len() > UNCONFIRMED_BYTES_MAX => Err(ConnectionEnd::Unconfirmed),
             None => Ok(Signs { is_alive, is_new }),
         }
+    }
+
+    /// As [`SenderIntake::take`], for a datagram that holds whole packets.
+    ///
+    /// # Errors
+    /// The instrument is refused, or not confirmed in time.
+    pub(super) fn take_packet(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
+        self.intake = Intake::unfiltered();
+        self.intake.push(bytes);
+        self.intake.finish();
+        self.judge_taken(out)
+    }
+
+    /// As [`SenderIntake::take`], for a datagram that goes on where the one before it ended.
+    ///
+    /// # Errors
+    /// The instrument is refused, or not confirmed in time.
+    pub(super) fn take_frame(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
+        self.intake.push(bytes);
+        self.judge_taken(out)
     }
 
     /// Ends the stream; appends the remaining packets.

@@ -14,11 +14,11 @@ use super::answers::HeldAnswers;
 use super::config::ListenConfig;
 use super::error::SocketError;
 use super::listener::{ListenContext, ListenLimits, NoteHandler, Notes, PacketBatch};
-use super::report::Listening;
+use super::report::{DatagramReport, Listening};
 use super::seats::Seats;
 use super::sender_intake::{InstrumentCheck, Mission};
 use super::stations::Stations;
-use super::url::TcpUrl;
+use super::url::{TcpUrl, udp_name};
 use crate::downlink::error::DownlinkError;
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::Instrument;
@@ -29,11 +29,12 @@ const POLL: Duration = Duration::from_millis(100);
 
 /// Listens, and passes on whole packets of all senders in the order in which they are found.
 pub struct SocketSource {
-    address: SocketAddr,
+    addresses: Vec<String>,
     config: ListenConfig,
     until: ListenLimits,
     /// Set until the run starts.
-    waiting: Option<(std::net::TcpListener, Mission, NoteHandler)>,
+    waiting: Option<(Option<std::net::TcpListener>, Mission, NoteHandler)>,
+    datagrams: Option<std::net::UdpSocket>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
     room: Arc<Semaphore>,
     held: Option<HeldAnswers>,
@@ -45,7 +46,8 @@ pub struct SocketSource {
 }
 
 impl SocketSource {
-    /// Binds one of the addresses. Senders may connect from now on; they are served when the run starts.
+    /// Binds one of the addresses; without any, only datagrams come. Senders may connect from now on; they are served when the run
+    /// starts.
     ///
     /// # Errors
     /// No address can be bound.
@@ -61,18 +63,21 @@ impl SocketSource {
                 source,
             }
         };
-        let bound = std::net::TcpListener::bind(addresses).and_then(|listener| {
+        let bind = || {
+            let listener = std::net::TcpListener::bind(addresses)?;
             listener.set_nonblocking(true)?;
-            Ok((listener.local_addr()?, listener))
-        });
-        let (address, listener) = bound.map_err(failed)?;
+            Ok((TcpUrl::from(listener.local_addr()?).to_string(), listener))
+        };
+        let bound = (!addresses.is_empty()).then(bind).transpose().map_err(failed)?;
+        let (addresses, listener) = bound.map_or((Vec::new(), None), |(url, it)| (vec![url], Some(it)));
         let listening = Listening::default();
-        listening.write().address = TcpUrl::from(address).to_string();
+        listening.write().address = addresses.concat();
         Ok(Self {
-            address,
+            addresses,
             config: config.clone(),
             until,
             waiting: Some((listener, Mission::default(), Box::new(|_| {}))),
+            datagrams: None,
             running: None,
             room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
             held: None,
@@ -82,6 +87,28 @@ impl SocketSource {
             listening,
             bytes: 0,
         })
+    }
+
+    /// Listens for datagrams too, each a packet or a frame, at one of the addresses.
+    ///
+    /// # Errors
+    /// No address can be bound.
+    pub fn with_datagrams(mut self, addresses: &[SocketAddr]) -> Result<Self, SocketError> {
+        let bind = || {
+            let socket = std::net::UdpSocket::bind(addresses)?;
+            socket.set_nonblocking(true)?;
+            Ok((udp_name(socket.local_addr()?), socket))
+        };
+        let failed = |source| SocketError::Listen {
+            url: addresses.first().map_or(String::new(), |first| udp_name(*first)),
+            source,
+        };
+        let (address, socket) = bind().map_err(failed)?;
+        let report = DatagramReport { address: address.clone(), ..DatagramReport::default() };
+        self.listening.write().datagrams = Some(report);
+        self.addresses.push(address);
+        self.datagrams = Some(socket);
+        Ok(self)
     }
 
     /// Accepts packets of this instrument only; with `None`, of the first whose visibilities come with positions.
@@ -136,10 +163,10 @@ impl SocketSource {
         self
     }
 
-    /// The address bound, with the port that the system chose for port 0.
+    /// The addresses bound, with the ports that the system chose for port 0.
     #[must_use]
-    pub fn url(&self) -> TcpUrl {
-        TcpUrl::from(self.address)
+    pub fn addresses(&self) -> &[String] {
+        &self.addresses
     }
 
     /// Status and report of its connections.
@@ -155,14 +182,16 @@ impl SocketSource {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
-            // One more, as packets of a connection that ends reach the disk while another takes its place.
-            .max_blocking_threads(self.config.connections_max + 1)
+            // Two more: packets of a connection that ends reach the disk while another takes its place, and datagrams.
+            .max_blocking_threads(self.config.connections_max + 2)
             .thread_name("listen-work")
             .build()
             .map_err(failed)?;
-        let listener = {
+        let sockets = {
             let _inside = runtime.enter();
-            tokio::net::TcpListener::from_std(listener).map_err(failed)?
+            let listener = listener.map(tokio::net::TcpListener::from_std).transpose().map_err(failed)?;
+            let datagrams = self.datagrams.take().map(tokio::net::UdpSocket::from_std);
+            (listener, datagrams.transpose().map_err(failed)?)
         };
         // Bounded by the room that batches occupy.
         let (batches, receiver) = unbounded();
@@ -182,7 +211,7 @@ impl SocketSource {
             notes: Notes::new(tell),
             sign: Mutex::new(tokio::time::Instant::now()),
         });
-        let run = move || runtime.block_on(listen(listener, shared));
+        let run = move || runtime.block_on(listen(sockets, shared));
         let thread = std::thread::Builder::new().name("listen-net".to_owned()).spawn(run).map_err(failed)?;
         self.running = Some((receiver, thread));
         Ok(())
@@ -214,7 +243,7 @@ impl Source for SocketSource {
         }
         self.start()?;
         let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
-        match receiver.recv_timeout(POLL) {
+        match out.await_input(|| receiver.recv_timeout(POLL)) {
             Ok(batch) => self.give(batch, out),
             Err(RecvTimeoutError::Timeout) => self.listening.status.clear_backlog(),
             Err(RecvTimeoutError::Disconnected) => {

@@ -6,6 +6,34 @@ use std::str::FromStr;
 
 use super::error::SocketError;
 
+/// Where a ground listens: for connections (`tcp://`), or for datagrams (`udp://`).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ListenUrl {
+    /// For connections.
+    Tcp(TcpUrl),
+    /// For datagrams.
+    Udp(TcpUrl),
+}
+
+impl FromStr for ListenUrl {
+    type Err = SocketError;
+
+    fn from_str(text: &str) -> Result<Self, SocketError> {
+        match text.strip_prefix("udp://") {
+            Some(rest) => match format!("tcp://{rest}").parse() {
+                Ok(url) => Ok(Self::Udp(url)),
+                Err(_) => Err(SocketError::Url { text: text.to_owned() }),
+            },
+            None => text.parse().map(Self::Tcp),
+        }
+    }
+}
+
+/// The address of a socket for datagrams.
+pub(super) fn udp_name(address: SocketAddr) -> String {
+    TcpUrl::from(address).to_string().replacen("tcp", "udp", 1)
+}
+
 /// A TCP host and port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TcpUrl {
