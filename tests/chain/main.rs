@@ -26,6 +26,7 @@ mod ranks;
 mod receiver;
 mod reflection;
 mod run;
+mod sample;
 mod schema;
 mod start_up;
 mod study;

@@ -225,7 +225,12 @@ impl RefinedProblem<'_> {
         };
         let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
         let rule = StoppingRule { residual_max, ..self.inner };
-        circle.solve(right, &mut z, rule, &self.watch.part("on the nearest circle", residual_max));
+        circle.solve(
+            right,
+            &mut z,
+            &vec![rule; right.len()],
+            &self.watch.part("on the nearest circle", residual_max),
+        );
         z
     }
 
