@@ -27,6 +27,7 @@ mod ranks;
 mod receiver;
 mod reflection;
 mod run;
+mod sample;
 mod schema;
 mod start_up;
 mod study;

@@ -225,7 +225,12 @@ impl RefinedProblem<'_> {
         };
         let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
         let rule = StoppingRule { residual_max, ..self.inner };
-        circle.solve(right, &mut z, rule, &self.watch.part("on the nearest circle", residual_max));
+        circle.solve(
+            right,
+            &mut z,
+            &vec![rule; right.len()],
+            &self.watch.part("on the nearest circle", residual_max),
+        );
         z
     }
 
@@ -281,15 +286,15 @@ impl RefinedProblem<'_> {
         if residuals.is_empty() {
             return Err(SolveError::Interrupted);
         }
-        if worst(&relative) > residual_max && self.can_be_formed() {
-            if let Some(exact) = self.solve_directly(&right, &task, residuals.len()) {
-                (columns, direct) = (exact, true);
-                let left = columns.each_ref().map(|column| column.residual.as_slice());
-                let z = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
-                relative = [0, 1].map(|k| relative_residual(&columns[k], &z[k], wholes[k]));
-                residuals.push(relative[0]);
-                (steps.passed)([&columns[0].x, &columns[1].x]);
-            }
+        let is_formed = worst(&relative) > residual_max && self.can_be_formed();
+        let solved = is_formed.then(|| self.solve_directly(&right, &task, residuals.len())).flatten();
+        if let Some(solved) = solved {
+            (columns, direct) = (solved, true);
+            let left = columns.each_ref().map(|column| column.residual.as_slice());
+            let z = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
+            relative = [0, 1].map(|k| relative_residual(&columns[k], &z[k], wholes[k]));
+            residuals.push(relative[0]);
+            (steps.passed)([&columns[0].x, &columns[1].x]);
         }
         let convergence = relative.map(|residual| Convergence {
             iterations: residuals.len(),

@@ -273,7 +273,7 @@ impl<'a> Posterior<'a> {
         let mut columns = [vec![0.0; count]];
         let convergence = {
             let task = watch.start("maps", request.rule.residual_max);
-            system.solve(&[sums.right_hand_side()], &mut columns, request.rule, &task)
+            system.solve(&[sums.right_hand_side()], &mut columns, &[request.rule], &task)
         };
         let [solution] = columns;
         let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
