@@ -19,6 +19,7 @@ SMALL = {
     "spacecraft.every_nth_integration": 2,
     "spacecraft.baseline_wavelengths_max": 16.0,
     "map.nside": 4,
+    "map.engine": "pixel",
     "map.epsilon": 1e-4,
     "products.pictures": False,
 }

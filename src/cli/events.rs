@@ -182,7 +182,7 @@ impl MapEntry {
         Self {
             channel: solution.channel.0,
             frequency_hz: solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz),
-            is_final: solution.is_final,
+            is_final: solution.is_final_map(),
             figures: figures.clone(),
         }
     }

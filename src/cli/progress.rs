@@ -13,7 +13,7 @@ use super::events::{LogState, LogViewer, progress_of};
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
-use crate::imaging::{Solving, SolvingPart};
+use crate::imaging::{SolveWatch, Solving, SolvingPart};
 use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, Watched};
 use crate::runtime::Cancel;
 use crate::units::ChannelId;
@@ -93,6 +93,27 @@ impl Drop for Progress {
             let _ = thread.join();
         }
     }
+}
+
+/// Says every few seconds what is being solved for, while `work` lasts.
+pub(super) fn while_solving<T>(watch: &SolveWatch, work: impl FnOnce() -> T) -> T {
+    let (stop, stopped) = channel::<()>();
+    std::thread::scope(|scope| {
+        scope.spawn(move || {
+            let mut shown = ProgressView::new(0);
+            while matches!(stopped.recv_timeout(LINE_EVERY), Err(RecvTimeoutError::Timeout)) {
+                if let Some(solving) = watch.now() {
+                    let Solving { what, iteration, residual, target, .. } = &solving;
+                    let fields =
+                        json!({ "what": what, "iteration": iteration, "residual": residual, "target": target });
+                    say("solving", &fields, shown.solution(&solving));
+                }
+            }
+        });
+        let done = work();
+        drop(stop);
+        done
+    })
 }
 
 /// Lines of how far a calibration is.

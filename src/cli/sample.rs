@@ -7,7 +7,8 @@ use serde::Serialize;
 
 use super::arguments::{StateMapArgs, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::imaging::{Solution, SolveWatch};
+use super::progress::while_solving;
+use crate::imaging::{RegulariserChoice, Solution, SolveWatch};
 use crate::pipeline::{sample_state, use_threads};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
@@ -55,10 +56,20 @@ struct SampledChannel {
 
 pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let config = args.map.source(&args.state)?.load_ground()?;
+    let regulariser = config.map.regulariser();
+    if regulariser != RegulariserChoice::Data {
+        return Err(format!(
+            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.refine, \
+             map.matrix, or pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
+            args.state.display()
+        )
+        .into());
+    }
     use_threads(&config.runtime)?;
     let mut written = Vec::new();
     let mut take = |solution: Solution| written.push(write(args, &solution));
-    sample_state(&args.state, &config, args.count as usize, &SolveWatch::default(), &mut take)?;
+    let watch = SolveWatch::default();
+    while_solving(&watch, || sample_state(&args.state, &config, args.count as usize, &watch, &mut take))?;
     let mut all = Vec::new();
     for sampled in written {
         all.push(sampled?);
@@ -88,13 +99,7 @@ fn write(
 ) -> Result<SampledChannel, Box<dyn std::error::Error + Send + Sync>> {
     let channel = usize::from(solution.channel.0);
     let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |channel| channel.frequency_hz);
-    let Some(errors) = &solution.uncertainty else {
-        return Err(format!(
-            "{:.3} MHz: R is not from the data; expected map.regulariser = \"data\", whose maps have a posterior to draw from",
-            frequency_hz / 1e6
-        )
-        .into());
-    };
+    let errors = solution.uncertainty.as_ref().ok_or("this map has no posterior to draw from")?;
     let folder = args.out.join(format!("{:.3}MHz", frequency_hz / 1e6));
     std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let save = |name: &str, map_k: &[f64]| {

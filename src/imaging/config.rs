@@ -350,8 +350,8 @@ impl MapConfig {
         checks.require(
             "regulariser",
             found,
-            is_identity || !self.holds_visibilities(),
-            "\"identity\", or no such key, with map.refine or map.matrix = \"free\"",
+            is_identity || !self.holds_visibilities() || (by_degree && self.refine.is_on()),
+            "\"identity\", or no such key, with map.matrix = \"free\"; not \"data\" with map.refine",
         );
         checks.require(
             "regulariser",

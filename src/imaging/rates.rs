@@ -5,7 +5,7 @@
 //! whether it is minutes or days.
 
 /// Multiply-adds of the pixel engine's rank-k updates in a second, rows of B included (`lunarray run` of the embedded
-/// quicklook, which takes 75 s).
+/// quicklook with its maps in pixels).
 pub(crate) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
 
 /// Time of an element of a row at pixel centres in a product of two vectors, s: made, and used there and back. 1.1 ns with AVX-512 (first

@@ -49,6 +49,16 @@ impl Diagonal {
         }
     }
 
+    /// `factor R`.
+    pub(in crate::imaging) fn times(&self, factor: f64) -> Self {
+        match self {
+            Self::Uniform(level) => Self::Uniform(factor * level),
+            Self::ByDegree(of_degree) => {
+                Self::ByDegree(of_degree.iter().map(|level| factor * level).collect())
+            }
+        }
+    }
+
     /// Of degree `l`.
     pub(in crate::imaging) fn at(&self, l: usize) -> f64 {
         match self {

@@ -129,6 +129,7 @@ impl Provenance {
         vec![
             Card::integer("PASSES", passes, "over visibilities, rows of true positions"),
             Card::real("RESIDUAL", refinement.convergence.residual, "of the equations, relative"),
+            Card::logical("CONVERGD", refinement.convergence.converged, "no more passes are needed"),
             Card::logical("SMEARED", self.map.refine.smear_integrations, "rows averaged over integrations"),
             Card::text("ANTROWS", &antennas, ""),
         ]
@@ -157,8 +158,9 @@ impl Provenance {
             RegulariserChoice::File(_) => format!("epsilon {epsilon:e} / C_{{l}}"),
             _ => format!("epsilon {epsilon:e}"),
         };
+        let ended = if solution.has_converged() { "" } else { "NOT CONVERGED, " };
         format!(
-            "{regulariser}, b < {} b_p, prior: {prior}, thermal noise {}",
+            "{ended}{regulariser}, b < {} b_p, prior: {prior}, thermal noise {}",
             map.baseline_bp_max,
             noise(&solution.instrument)
         )

@@ -230,7 +230,7 @@ impl Shelf {
             frequency_hz,
             nside: solution.nside,
             is_noiseless: solution.instrument.noiseless,
-            is_final: solution.is_final,
+            is_final: solution.is_final_map(),
             span_s: solution.span_s,
             diagnostics: solution.diagnostics,
             maps,

@@ -5,6 +5,7 @@
 mod common;
 
 mod bench;
+mod bound;
 mod calibrate;
 mod coded;
 mod command_line;
@@ -15,6 +16,7 @@ mod first_contact;
 mod groups;
 mod harmonic;
 mod instrument;
+mod joint;
 mod live_gains;
 mod navigation;
 mod orbits;
@@ -25,6 +27,7 @@ mod ranks;
 mod receiver;
 mod reflection;
 mod run;
+mod sample;
 mod schema;
 mod start_up;
 mod study;

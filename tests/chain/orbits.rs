@@ -228,10 +228,10 @@ fn refinement_hardly_changes_the_map_of_a_circle() {
     let error = (apart / square(&mut refined.iter().copied())).sqrt();
     // 8e-5 of a fringe between nodes in the mean, and some ten times as much where epsilon has little to add to what is measured.
     assert!(error < 1e-3, "{error:e}");
-    // As usual: the fast sums' map is what refinement begins with.
+    // As usual: the fast sums' map is what refinement begins with. A pass finds its residual, and one may be for the noise map.
     let (fast, _) = map("fast-usual", &[]);
     let (refined, passes) = map("refined-usual", &["map.refine.passes_max=12"]);
-    assert!(none.is_none() && passes.unwrap() <= 1, "{passes:?}");
+    assert!(none.is_none() && passes.unwrap() <= 2, "{passes:?}");
     let apart = square(&mut fast.iter().zip(&refined).map(|(a, b)| a - b));
     assert!((apart / square(&mut refined.iter().copied())).sqrt() < 1e-3);
 }

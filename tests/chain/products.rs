@@ -102,7 +102,7 @@ fn correlations_are_of_the_sky_at_its_own_resolution() {
 #[test]
 fn headers_and_summaries_say_how_a_map_was_made() {
     let folder = tempfile::tempdir().unwrap();
-    let noisy = run(folder.path(), "noisy", &["map.prior_k=2e6"]);
+    let noisy = run(folder.path(), "noisy", &["map.engine=pixel", "map.prior_k=2e6"]);
     let cards = header(&noisy, "map.fits");
     for (key, text) in [
         ("NOISE", "on"),
@@ -128,7 +128,7 @@ fn headers_and_summaries_say_how_a_map_was_made() {
     assert!(noisy.printed.contains("noise power subtracted"), "{}", noisy.printed);
     assert!(!noisy.printed.contains("mostly noise"), "{}", noisy.printed);
     // A receiver a thousand times louder than the sky.
-    let loud = run(folder.path(), "loud", &["spacecraft.receiver_noise_k_sr=1e10"]);
+    let loud = run(folder.path(), "loud", &["map.engine=pixel", "spacecraft.receiver_noise_k_sr=1e10"]);
     assert!(loud.printed.contains("mostly noise"), "{}", loud.printed);
 
     let keys = ["spacecraft.thermal_noise=false", "map.engine=harmonic", "spacecraft.antenna=dipole-normal"];
@@ -149,7 +149,7 @@ fn headers_and_summaries_say_how_a_map_was_made() {
 #[ignore = "needs LUNARRAY_PYTHON"]
 fn post_processing_is_of_map_noise_input_and_curves() {
     let folder = tempfile::tempdir().unwrap();
-    let ran = run(folder.path(), "smooth", &["products.smooth_fwhm_deg=8.0"]);
+    let ran = run(folder.path(), "smooth", &["map.engine=pixel", "products.smooth_fwhm_deg=8.0"]);
     let path = |file: &str| ran.out.join(file).to_str().unwrap().to_owned();
     for kind in ["map", "noise"] {
         let smooth = format!("{kind}-smooth.fits");

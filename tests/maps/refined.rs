@@ -8,6 +8,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
+use faer::linalg::solvers::Solve;
+use faer::{Mat, Side};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::Refusal;
 use lunarray::imaging::anywhere::RefineRule;
@@ -16,13 +18,12 @@ use lunarray::imaging::anywhere::Refinement;
 use lunarray::imaging::anywhere::solve_refined;
 use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, VisibilityArchive};
 use lunarray::imaging::{
-    HarmonicRequest, HarmonicSolution, SolveError, SolveWatch, StoppingRule, solve_harmonics,
+    HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule, solve_harmonics,
 };
 use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
 use lunarray::runtime::Cancel;
-use lunarray::sky::fits::{ReadOptions, read_map};
-use lunarray::sky::harmonics::{Alm, AnalysisOptions, analysis};
+use lunarray::sky::harmonics::Alm;
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;
@@ -41,13 +42,25 @@ const BASELINES_M: [f64; 5] = [30.0, 55.0, 95.0, 160.0, 290.0];
 
 /// Thirds of orbits, all nodes of the plane: one satellite of a pair trails the other and swings out of its plane.
 fn geometry(altitude_m: f64, cross: f64, step_s: f64, orbits: usize, baselines_m: &[f64]) -> Vec<PairAt> {
+    geometry_over(altitude_m, cross, step_s, orbits, baselines_m, TAU)
+}
+
+/// As [`geometry`], while the plane turns by an angle.
+fn geometry_over(
+    altitude_m: f64,
+    cross: f64,
+    step_s: f64,
+    orbits: usize,
+    baselines_m: &[f64],
+    turn_rad: f64,
+) -> Vec<PairAt> {
     let eccentricity = altitude_m / RADIUS_M;
     let mut all = Vec::new();
     for (k, baseline_m) in baselines_m.iter().enumerate() {
         let pair = Pair { i: 0, j: k as u8 + 1 };
         let lag_s = baseline_m / (TAU * RADIUS_M / PERIOD_S);
         for orbit in 0..orbits {
-            let node = TAU * (orbit as f64 + 0.1 * k as f64) / orbits as f64;
+            let node = turn_rad * (orbit as f64 + 0.1 * k as f64) / orbits as f64;
             let at = |t_s: f64, tilt: f64| -> Vec3 {
                 let mean = TAU * t_s / PERIOD_S;
                 let anomaly = (0..30).fold(mean, |e, _| mean + eccentricity * e.sin());
@@ -76,7 +89,11 @@ fn weight(at: &PairAt) -> f64 {
 
 /// Blocks of up to `size` visibilities of one pair.
 fn blocks(at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
-    let frequency_hz = SPEED_OF_LIGHT_M_S / WAVELENGTH_M;
+    blocks_at(WAVELENGTH_M, at, values, size)
+}
+
+fn blocks_at(wavelength_m: f64, at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
+    let frequency_hz = SPEED_OF_LIGHT_M_S / wavelength_m;
     let mut blocks: Vec<PlacedVisibilities> = Vec::new();
     for (at, value) in at.iter().zip(values) {
         if blocks.last().is_none_or(|block| block.pair != at.pair || block.len() == size) {
@@ -94,11 +111,15 @@ fn blocks(at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibil
 }
 
 fn archive(l_max: usize, visibilities_max: u64) -> VisibilityArchive {
+    archive_at(WAVELENGTH_M, l_max, visibilities_max)
+}
+
+fn archive_at(wavelength_m: f64, l_max: usize, visibilities_max: u64) -> VisibilityArchive {
     VisibilityArchive::new(RefinedSetup {
         channel: ChannelId(0),
         l_max,
-        frequency_hz: SPEED_OF_LIGHT_M_S / WAVELENGTH_M,
-        baseline_m_max: 2000.0,
+        frequency_hz: SPEED_OF_LIGHT_M_S / wavelength_m,
+        baseline_m_max: 5000.0,
         moon_radius_m: MOON_RADIUS_M,
         response: AntennaResponse::Isotropic,
         companion_seed: 3,
@@ -110,7 +131,10 @@ fn archive(l_max: usize, visibilities_max: u64) -> VisibilityArchive {
 }
 
 fn sums(l_max: usize, blocks: &[PlacedVisibilities]) -> RefinedSums {
-    let mut archive = archive(l_max, 1 << 30);
+    sums_of(archive(l_max, 1 << 30), blocks)
+}
+
+fn sums_of(mut archive: VisibilityArchive, blocks: &[PlacedVisibilities]) -> RefinedSums {
     for block in blocks {
         let added = archive.add(block).unwrap();
         assert!(added.refused.is_empty() && added.visibilities == block.len() as u64);
@@ -131,11 +155,11 @@ fn solve(
     watch: &SolveWatch,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
     let steps = RefineSteps { start: None, passed: &mut |_| {} };
-    solve_refined(sums, request, rule, None, steps, watch.named("test"))
+    solve_refined(sums, request, (rule, &Regulariser::default()), None, steps, watch.named("test"))
 }
 
-fn refined(sums: &RefinedSums, nside: usize, passes_max: usize) -> (HarmonicSolution, Refinement) {
-    let rule = RefineRule { passes_max, residual_max: 1e-12 };
+fn refined(sums: &RefinedSums, nside: usize, residual_max: f64) -> (HarmonicSolution, Refinement) {
+    let rule = RefineRule { passes_max: 20, residual_max };
     solve(sums, request(nside), rule, &SolveWatch::default()).unwrap()
 }
 
@@ -154,6 +178,166 @@ fn degree_change(found: &[f64], expected: &[f64], l: usize) -> f64 {
     difference(&of(found), &of(expected))
 }
 
+fn rows(wavelength_m: f64, l_max: usize) -> GeneralRows {
+    GeneralRows::new(RowsSetup {
+        l_max,
+        wavelength_m,
+        moon_radius_m: MOON_RADIUS_M,
+        response: AntennaResponse::Isotropic,
+        polynomial_degree: 0,
+    })
+}
+
+/// A month of orbits: the plane turns by 23 deg.
+const MONTH_RAD: f64 = 0.4;
+
+/// Data of a sky with degrees beyond the map's, which no map fits.
+fn seen_sky(wavelength_m: f64, at: &[PairAt], l_max: usize) -> Vec<Complex64> {
+    let l_max = l_max + 8;
+    let mut sky = Alm::zeros(l_max);
+    for l in 0..=l_max {
+        for m in 0..=l {
+            let angle = (l * l + 3 * m) as f64;
+            let im = if m == 0 { 0.0 } else { angle.sin() };
+            *sky.get_mut(l, m) = Complex64::new(angle.cos(), im) * (1e6 / (l as f64 + 1.0).powf(1.35));
+        }
+    }
+    let rows = rows(wavelength_m, l_max);
+    rows.forward(&rows.plan(at).unwrap(), &[sky]).remove(0)
+}
+
+/// The solution of `(Bt N^-1 B + R) x = Bt N^-1 V` with the matrix in memory: of the same rows, which other tests hold against other code.
+fn dense_solution(sums: &RefinedSums, l_max: usize, w_max: f64) -> Vec<f64> {
+    let unknowns = (l_max + 1) * (l_max + 1);
+    let unit = |k: usize| {
+        let x: Vec<f64> = (0..unknowns).map(|n| f64::from(u8::from(n == k))).collect();
+        lunarray::imaging::circle::coefficients(&x, l_max)
+    };
+    let mut columns: Vec<Vec<Complex64>> = Vec::new();
+    for first in (0..unknowns).step_by(32) {
+        let skies: Vec<Alm> = (first..unknowns.min(first + 32)).map(unit).collect();
+        columns.extend(sums.rows.forward(&sums.plan, &skies));
+    }
+    // Real and imaginary parts are numbers of their own.
+    let part = |v: Complex64, row: usize| if row % 2 == 0 { v.re } else { v.im };
+    let root = |row: usize| sums.data.weight[row / 2].sqrt();
+    let count = 2 * sums.at.len();
+    let b = Mat::from_fn(count, unknowns, |row, k| root(row) * part(columns[k][row / 2], row));
+    let v = Mat::from_fn(count, 1, |row, _| root(row) * part(sums.data.value_k_sr[row / 2], row));
+    let mut matrix = b.transpose() * &b;
+    (0..unknowns).for_each(|k| matrix[(k, k)] += EPSILON * w_max);
+    let solved = matrix.llt(Side::Lower).unwrap().solve(b.transpose() * &v);
+    (0..unknowns).map(|k| solved[(k, 0)]).collect()
+}
+
+/// Errors of the circle's map and of the refined one against the dense solution, without the mean.
+fn errors_of(sums: &RefinedSums, nside: usize, l_max: usize, rule: RefineRule) -> ([f64; 2], Refinement) {
+    let watch = SolveWatch::default();
+    let (found, refinement) = solve(sums, request(nside), rule, &watch).unwrap();
+    let circle = solve_harmonics(&sums.circle, request(nside), None, None, watch.named("test")).unwrap();
+    let dense = dense_solution(sums, l_max, found.diagnostics.w_max.unwrap() / pixel_area_sr(nside));
+    let error = |x: &[f64]| difference(&x[1..], &dense[1..]);
+    ([error(&circle.unknowns[0]), error(&found.unknowns[0])], refinement)
+}
+
+#[test]
+fn a_month_of_any_orbit_is_refined_to_the_dense_solution() {
+    for (altitude_m, cross) in [(1e3, 0.02), (60e3, 0.2)] {
+        let at = geometry_over(altitude_m, cross, 75.0, 9, &BASELINES_M, MONTH_RAD);
+        let sums = sums(L_MAX, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, L_MAX), 1000));
+        let rule = RefineRule { passes_max: 20, residual_max: 1e-5 };
+        let ([circle, error], refinement) = errors_of(&sums, NSIDE, L_MAX, rule);
+        eprintln!(
+            "+-{} km, {cross}: circle {circle:.2}, refined {error:.1e}; {refinement}",
+            altitude_m / 1e3
+        );
+        assert!(refinement.convergence.converged, "{refinement}");
+        // A residual of 1e-5 in the norm of the inverse, times the root of W_max / R = 1e4 at most.
+        assert!(error < 1e-3 && error < 0.01 * circle, "{error} {circle}");
+    }
+}
+
+#[test]
+fn a_map_that_has_not_converged_says_so() {
+    let at = geometry_over(60e3, 0.2, 150.0, 6, &BASELINES_M, MONTH_RAD);
+    let sums = sums(L_MAX, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, L_MAX), 1000));
+    // No number is solved to this.
+    let rule = RefineRule { passes_max: 2, residual_max: 1e-60 };
+    let (_, refinement) = solve(&sums, request(NSIDE), rule, &SolveWatch::default()).unwrap();
+    assert!(!refinement.convergence.converged);
+    assert!(refinement.to_string().contains(": not converged, more passes"), "{refinement}");
+}
+
+/// R may depend on the degree: of one that stops degrees above 4 nothing is left of them.
+#[test]
+fn a_refined_map_takes_an_r_of_the_degree() {
+    let at = geometry_over(20e3, 0.05, 120.0, 8, &BASELINES_M[..3], TAU);
+    let sums = sums(10, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, 10), 1000));
+    let rule = RefineRule { passes_max: 20, residual_max: 1e-6 };
+    let solved = |regulariser: &Regulariser| {
+        let steps = RefineSteps { start: None, passed: &mut |_| {} };
+        let (rule, watch) = ((rule, regulariser), SolveWatch::default());
+        solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap().0
+    };
+    let plain = solved(&Regulariser::default());
+    let level = EPSILON * plain.diagnostics.w_max.unwrap() / pixel_area_sr(4);
+    // epsilon / C_l, equal to the plain R up to l = 4.
+    let power: Vec<f64> = (0..=10).map(|l| EPSILON / level * if l > 4 { 1e-12 } else { 1.0 }).collect();
+    let stopped = solved(&Regulariser::Wiener(power));
+    let size = |x: &[f64], l: usize| {
+        let alm = lunarray::imaging::circle::coefficients(x, 10);
+        (0..=l).map(|m| alm.get(l, m).norm_sqr()).sum::<f64>().sqrt()
+    };
+    for l in 0..=10 {
+        let ratio = size(&stopped.unknowns[0], l) / size(&plain.unknowns[0], l);
+        assert!(if l > 4 { ratio < 1e-3 } else { ratio > 0.1 }, "{l}: {ratio}");
+    }
+}
+
+/// Errors over coverage, orbits and frequencies. Takes long: only by its name.
+#[test]
+#[ignore = "takes long: a table for people"]
+fn long_the_table_of_refined_maps() {
+    // By wavelength: as many fringes, from baselines and shadows of another size.
+    let lengths = [0.7, 1.3, 2.3, 4.0, 6.7, 10.0, 14.7];
+    let orbits = [(1e3, 0.02), (20e3, 0.02), (20e3, 0.2), (60e3, 0.2)];
+    let coverage = [
+        ("month", 0.4, 12, 75.0),
+        ("quarter", 1.2, 36, 75.0),
+        ("whole", TAU, 64, 75.0),
+        ("thinned", TAU, 8, 150.0),
+    ];
+    for (nside, mhz) in [(8, 10.0), (8, 3.0), (16, 10.0)] {
+        let wavelength_m = SPEED_OF_LIGHT_M_S / (1e6 * mhz);
+        let l_max = 5 * nside / 2;
+        let lengths = lengths.map(|u| u * wavelength_m * nside as f64 / 8.0);
+        for (altitude_m, cross) in orbits {
+            for (name, turn_rad, orbits, step_s) in coverage {
+                if nside > 8 && name != "month" {
+                    continue;
+                }
+                let at = geometry_over(altitude_m, cross, step_s, orbits, &lengths, turn_rad);
+                let values = seen_sky(wavelength_m, &at, l_max);
+                let archive = archive_at(wavelength_m, l_max, 1 << 30);
+                let sums = sums_of(archive, &blocks_at(wavelength_m, &at, &values, 1000));
+                let rule = RefineRule { passes_max: 20, residual_max: 1e-3 };
+                let begun = std::time::Instant::now();
+                let ([circle, error], refinement) = errors_of(&sums, nside, l_max, rule);
+                eprintln!(
+                    "| {nside} | {mhz} | {:.0} | {:.0} | {name} | {} | {circle:.3} | {error:.1e} | {} | {} | {:.1e} | {:.0} s",
+                    altitude_m / 1e3,
+                    100.0 * cross,
+                    at.len(),
+                    refinement.convergence.iterations,
+                    refinement.direct,
+                    refinement.convergence.residual,
+                    begun.elapsed().as_secs_f64()
+                );
+            }
+        }
+    }
+}
+
 fn write(path: &Path, values: impl Iterator<Item = f64>) {
     fs::write(path, values.flat_map(f64::to_le_bytes).collect::<Vec<u8>>()).unwrap();
 }
@@ -167,12 +351,14 @@ fn read(path: &Path) -> Vec<f64> {
 #[ignore = "needs LUNARRAY_PYTHON"]
 fn refined_maps_are_the_dense_solution_of_other_code() {
     let python = common::python();
-    // Few passes where planes hardly turn, more where the baseline swings by 11 deg; the rows' own error is 4e-7.
-    for (cross, passes, error_max) in [(0.02, [1, 4, 8], 1e-5), (0.2, [2, 8, 14], 2e-3)] {
+    // Where planes hardly turn passes converge; where the baseline swings by 11 deg the matrix is formed. The rows' own error is 4e-7.
+    let residuals_max = [0.2, 1e-3, 1e-8];
+    for (cross, error_max) in [(0.02, 1e-5), (0.2, 1e-4)] {
         let altitude_m = 20e3;
         let at = geometry(altitude_m, cross, 130.0, 9, &BASELINES_M);
         let nothing = vec![Complex64::ZERO; at.len()];
-        let w_max = refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 1).0.diagnostics.w_max.unwrap();
+        let w_max =
+            refined(&sums(L_MAX, &blocks(&at, &nothing, 50)), NSIDE, 0.9).0.diagnostics.w_max.unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = |name: &str| folder.path().join(name);
         write(&path("positions"), at.iter().flat_map(|at| [at.r_i_m, at.r_j_m]).flatten());
@@ -219,11 +405,11 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             solve_harmonics(&sums.circle, request(NSIDE), None, None, SolveWatch::default().named("test"))
                 .unwrap();
         let first = difference(&circle.unknowns[0][1..], &dense[1..]);
-        let found = passes.map(|passes| refined(&sums, NSIDE, passes));
+        let found = residuals_max.map(|residual_max| refined(&sums, NSIDE, residual_max));
         let errors = found.each_ref().map(|found| difference(&found.0.unknowns[0], &dense));
         let shown = errors.map(|error| format!("{error:.1e}")).join(" ");
-        eprintln!("circle {first:.2}; after {passes:?} passes {shown}");
-        assert!(errors[2] < error_max && errors[2] < errors[1] && errors[1] < errors[0], "{errors:?}");
+        eprintln!("circle {first:.2}; residuals {residuals_max:?}: {shown}");
+        assert!(errors[2] < error_max && errors[2] <= errors[1] && errors[1] < errors[0], "{errors:?}");
         assert!(first > 0.1 && errors[2] < 0.01 * first, "{first} {errors:?}");
         let refinement = &found[2].1;
         assert_eq!(refinement.chi_square.by_pair.len(), BASELINES_M.len());
@@ -277,7 +463,7 @@ fn maps_do_not_depend_on_the_order_of_arrival_or_on_threads() {
     let values: Vec<Complex64> = (0..at.len()).map(|k| Complex64::cis(k as f64) * 1e4).collect();
     let map = |blocks: &[PlacedVisibilities], threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| refined(&sums(10, blocks), 4, 3))
+        pool.install(|| refined(&sums(10, blocks), 4, 1e-3))
     };
     let in_order = map(&blocks(&at, &values, 40), 1);
     let mut mixed = blocks(&at, &values, 7);
@@ -315,14 +501,16 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     let mut keep = |x: [&[f64]; 2]| passes.push(x.map(<[f64]>::to_vec));
     let steps = RefineSteps { start: None, passed: &mut keep };
     let (whole, refinement) =
-        solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap();
+        solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
+            .unwrap();
     let count = refinement.convergence.iterations;
     assert!(count >= 4 && passes.len() >= count, "{count}");
     assert_eq!(passes.last(), Some(&whole.unknowns));
     // The matrix tells errors in x from residuals by its condition, as far as that is measured: a prior of 1e-4 of W_max.
     let go_on = |start: [Vec<f64>; 2]| {
         let steps = RefineSteps { start: Some(start), passed: &mut |_| {} };
-        solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap()
+        solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
+            .unwrap()
     };
     let (again, refinement) = go_on(passes[count - 3].clone());
     // Conjugate gradients forget their directions, so that a pass more may be needed.
@@ -356,76 +544,4 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
     cancel.cancel();
     let found = solve(&sums, request(2), rule, &watch);
     assert!(matches!(found, Err(SolveError::Interrupted)));
-}
-
-/// rho_l of two vectors of unknowns.
-fn rho(found: &[f64], expected: &[f64], l_max: usize, l: usize) -> f64 {
-    let of = |x: &[f64]| lunarray::imaging::circle::coefficients(x, l_max);
-    let (a, b) = (of(found), of(expected));
-    let sum = |a: &Alm, b: &Alm| {
-        (0..=l).map(|m| if m == 0 { 1.0 } else { 2.0 } * (a.get(l, m).conj() * b.get(l, m)).re).sum::<f64>()
-    };
-    sum(&a, &b) / (sum(&a, &a) * sum(&b, &b)).sqrt()
-}
-
-/// The error after each pass at nside 16 and 10 MHz, with the real sky's degrees. Takes long: only by its name.
-#[test]
-#[ignore = "takes long and needs LUNARRAY_SHARED: a table for people"]
-fn long_the_table_of_errors_by_pass_at_nside_16() {
-    const NSIDE: usize = 16;
-    const L_MAX: usize = 40;
-    let path = common::shared("sky/ulsa_10mhz_ecliptic_nside64.fits");
-    let sky = read_map(&path, &ReadOptions::default()).unwrap().values().to_vec();
-    let sky = analysis(&sky, L_MAX, &AnalysisOptions::default()).unwrap().alm;
-    let baselines_m = [100.0, 230.0, 470.0, 930.0];
-    let rows = GeneralRows::new(RowsSetup {
-        l_max: L_MAX,
-        wavelength_m: WAVELENGTH_M,
-        moon_radius_m: MOON_RADIUS_M,
-        response: AntennaResponse::Isotropic,
-        polynomial_degree: 0,
-    });
-    for (altitude_m, cross) in [(20e3, 0.02), (20e3, 0.2)] {
-        let at = geometry(altitude_m, cross, 12.0, 16, &baselines_m);
-        let plan = rows.plan(&at).unwrap();
-        let begun = std::time::Instant::now();
-        let values = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
-        let forward_s = begun.elapsed().as_secs_f64();
-        let begun = std::time::Instant::now();
-        let _ = rows.adjoint(&plan, &[&values]);
-        let adjoint_s = begun.elapsed().as_secs_f64();
-        // Some rows by themselves.
-        let few: Vec<PairAt> = at.iter().step_by(101).copied().collect();
-        let begun = std::time::Instant::now();
-        let direct = rows.forward(&rows.plan_direct(&few).unwrap(), std::slice::from_ref(&sky)).remove(0);
-        let direct_s = begun.elapsed().as_secs_f64() * 101.0;
-        let parts =
-            |v: &mut dyn Iterator<Item = Complex64>| v.flat_map(|v| [v.re, v.im]).collect::<Vec<f64>>();
-        let fast = parts(&mut values.iter().step_by(101).copied());
-        eprintln!(
-            "+-{} km, {} %: {} visibilities, {} rows; forward {forward_s:.1} s, adjoint {adjoint_s:.1} s, row by row \
-             {direct_s:.0} s; interpolation errs by {:.1e}",
-            altitude_m / 1e3,
-            cross * 100.0,
-            plan.rows(),
-            plan.computed(),
-            difference(&fast, &parts(&mut direct.iter().copied()))
-        );
-        let sums = sums(L_MAX, &blocks(&at, &values, 1000));
-        let watch = SolveWatch::default();
-        let circle = solve_harmonics(&sums.circle, request(NSIDE), None, None, watch.named("test")).unwrap();
-        // As far as it goes.
-        let truth = refined(&sums, NSIDE, 12);
-        eprintln!("{}", truth.1);
-        let exact = &truth.0.unknowns[0];
-        let of_circle: Vec<String> =
-            [4, 12, 24].map(|l| format!("{:.2}", rho(&circle.unknowns[0], exact, L_MAX, l))).to_vec();
-        eprintln!("circle alone: rho_l at 4, 12, 24: {}", of_circle.join(" / "));
-        for passes in [1, 2, 4, 8] {
-            let map = refined(&sums, NSIDE, passes).0;
-            let least =
-                (1..=L_MAX).map(|l| rho(&map.unknowns[0], exact, L_MAX, l)).fold(f64::INFINITY, f64::min);
-            eprintln!("{passes}: {:.1e}, least rho_l {least:.4}", difference(&map.unknowns[0], exact));
-        }
-    }
 }

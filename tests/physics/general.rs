@@ -322,8 +322,7 @@ fn the_adjoint_is_the_transpose() {
         // Both at once are the same operations.
         let weight: Vec<f64> = pairs.iter().map(|_| random.next().abs()).collect();
         let weighted: Vec<Complex64> = seen[0].iter().zip(&weight).map(|(v, w)| v * *w).collect();
-        let (again, product) = rows.normal(&plan, &[alm], &weight);
-        assert_eq!(again[0], seen[0]);
+        let product = rows.normal(&plan, &[alm], &weight);
         assert_eq!(product[0], rows.adjoint(&plan, &[&weighted])[0]);
     }
 }
@@ -514,8 +513,7 @@ fn adjoint_and_normal_products_of_averages_with_antennas_are_the_transposes() {
     assert!((of_data - of_sky).abs() < 1e-5 * of_data.abs(), "{of_data} {of_sky}");
 
     let weight: Vec<f64> = (0..pairs.len()).map(|k| 1.0 + 0.5 * (k as f64).sin()).collect();
-    let (again, products) = rows.normal(&plan, &skies, &weight);
-    assert_eq!(again, seen);
+    let products = rows.normal(&plan, &skies, &weight);
     for (sky, seen) in products.iter().zip(&seen) {
         let weighted: Vec<Complex64> = seen.iter().zip(&weight).map(|(v, w)| v * w).collect();
         let expected = rows.adjoint(&plan, &[&weighted]).remove(0);

@@ -1,140 +1,68 @@
-//! Maps from positions as they are: conjugate gradients on the true normal equations, preconditioned by a circle's.
+//! Maps from positions as they are: the true normal equations, with search directions from a circle's.
 //!
 //! A circle's rows are of no use for data from another orbit, but its normal matrix tells which modes are measured nearly as
 //! well as the true one does. So
 //!
 //! ```text
-//! (Bt N^-1 B + R) x = Bt N^-1 V,   preconditioned by   M = Bc^t N^-1 Bc + R
+//! (Bt N^-1 B + R) x = Bt N^-1 V,   with directions   z = (Bc^t N^-1 Bc + s R)^-1 r,   r what x leaves of the true equations
 //! ```
 //!
-//! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the former. M
-//! is solved by inner conjugate gradients, so that the outer ones are flexible (Notay 2000, SIAM J. Sci. Comput. 22, 1444).
-//! R is that of the circle's greatest eigenvalue. The map and the noise-only map share passes over the visibilities. An earlier
-//! solution, of less data or of an iteration that was interrupted, costs one pass as a beginning and saves those that led to it.
-//! Where all data are on the circle, within its limits, the beginning is the map of the circle's own sums: a pass says what the true rows
-//! leave of it.
+//! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the former. The first
+//! directions are the map of the circle's own sums (or an earlier solution) and its solution of the true right-hand side. Each pass over the
+//! visibilities multiplies the directions of the map and of the noise-only map by the true matrix, makes them conjugate, and takes both maps
+//! to the nearest solution in the span of all: inexact inner solutions cost passes, not exactness, and no map moves away from the solution,
+//! in the norm of the equations.
+//!
+//! s is 1 while that converges. Where a short time or a wide orbit leaves the circle's matrix without modes that the true one has, its
+//! inverse exaggerates them; directions with larger s, which are nearer to plain conjugate gradients, are then added: products decide which
+//! of them help. Where unknowns are few and that is not enough, the matrix is formed, column by column, and the equations are solved directly.
 
-use std::collections::BTreeMap;
-use std::fmt;
-
+use faer::linalg::solvers::Solve;
+use faer::{Mat, Side};
 use num_complex::Complex64;
-use serde::Serialize;
 
-use crate::imaging::SolveError;
-use crate::imaging::anywhere::{Departures, RefinedSums, orbit_phase_deg};
+use super::refinement::{Refinement, chi_squares};
+use super::subspace::{Column, Subspace};
+use crate::imaging::anywhere::RefinedSums;
 use crate::imaging::circle::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, lifted, prior_unknowns};
 use crate::imaging::circle::{OrderFactors, coefficients, unknowns_of_gradient};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::NamedWatch;
+use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::{Convergence, StoppingRule, System};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from};
-use crate::imaging::solver::{add, dot, subtract};
-use crate::imaging::{AccumulationError, NormalSums};
-use crate::sky::harmonics::{Alm, synthesis};
+use crate::imaging::solver::{NamedWatch, SolveTask};
+use crate::imaging::solver::{add, dot};
+use crate::imaging::{AccumulationError, NormalSums, SolveError};
+use crate::sky::harmonics::synthesis;
 use crate::sky::healpix::pixel_area_sr;
-use crate::units::constants::DAY_S;
 
 /// Residual of the inner iterations: well below the third to tenth that one outer step leaves. More exact ones save no outer step, and
 /// cost more than a pass over the visibilities.
 const INNER_RESIDUAL: f64 = 1e-2;
 
+/// Factors of R in the circle's matrix, whose solutions are directions: the first alone while a pass halves the residual.
+const SHIFTS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
+
+/// Residual per pass above which convergence is slow.
+const SLOW: f64 = 0.5;
+
+/// Passes after which slow convergence is given up where the matrix can be formed.
+const SLOW_PASSES: usize = 5;
+
+/// Most unknowns (those of nside 16), rows times unknowns, and visibilities for which the matrix is formed: minutes.
+const DIRECT_UNKNOWNS_MAX: usize = 41 * 41;
+const DIRECT_PRODUCTS_MAX: usize = 50_000_000;
+
+/// Columns of the matrix that are formed together: rows of B are made once for all of them.
+const COLUMNS: usize = 16;
+
 /// When a refinement stops.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RefineRule {
-    /// Most products with the true matrix.
+    /// Most passes over the visibilities.
     pub passes_max: usize,
     /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-}
-
-/// How a map was refined, and what remains of the data.
-#[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
-pub struct Refinement {
-    /// How the iteration for the map ended; its iterations are products with the true matrix.
-    pub convergence: Convergence,
-    /// Residual after each product.
-    pub residuals: Vec<f64>,
-    /// How far the positions are from the circle of the preconditioner.
-    pub departures: Departures,
-    /// Rows of B that were computed; the others were interpolated between them.
-    pub rows_computed: u64,
-    /// Averages over integrations that were taken for instants in their middle, as too few others of their pair are near.
-    pub taken_as_instants: u64,
-    /// Mean squares of what the map leaves of the data, in units of their noise.
-    pub chi_square: ChiSquares,
-}
-
-/// `|V - B x|^2 w / 2`, the mean over visibilities: 1 for noise alone that the map does not fit.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
-pub struct ChiSquares {
-    /// Of all.
-    pub all: f64,
-    /// By pair, `1-2`, counted from 1.
-    pub by_pair: BTreeMap<String, f64>,
-    /// By daughter, from 1: of all pairs that it is part of.
-    pub by_daughter: BTreeMap<u16, f64>,
-    /// By day of mission time, from 0.
-    pub by_day: BTreeMap<i64, f64>,
-    /// By phase of the orbit from its ascending node, in bins of 15 degrees named by their beginning. Visibilities without a neighbour,
-    /// whose plane is not known, are in none.
-    pub by_phase_deg: BTreeMap<u16, f64>,
-}
-
-/// Width of a bin of phase, degrees.
-const PHASE_BIN_DEG: u16 = 15;
-
-impl ChiSquares {
-    /// A table: a line for all, and for each pair, daughter, phase and day.
-    #[must_use]
-    pub fn csv(&self) -> String {
-        let mut table = String::from(
-            "# Mean of |V - B x|^2 w / 2: what the map leaves of the data, in units of their noise; 1 for noise alone.\n\
-             # by: all; pair; daughter, from 1; phase: beginning of 15 deg from the ascending node; day of the mission, from 0.\n\
-             by,which,chi_square\n",
-        );
-        let mut line = |by: &str, which: &dyn fmt::Display, value: f64| {
-            table.push_str(&format!("{by},{which},{value:.6e}\n"));
-        };
-        line("all", &"all", self.all);
-        self.by_pair.iter().for_each(|(pair, value)| line("pair", pair, *value));
-        self.by_daughter.iter().for_each(|(daughter, value)| line("daughter", daughter, *value));
-        self.by_phase_deg.iter().for_each(|(phase_deg, value)| line("phase", phase_deg, *value));
-        self.by_day.iter().for_each(|(day, value)| line("day", day, *value));
-        table
-    }
-}
-
-impl fmt::Display for Refinement {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { convergence, departures, chi_square, .. } = self;
-        match convergence.iterations {
-            0 => write!(f, "the map that refinement begins with has a residual of")?,
-            1 => write!(f, "refined in 1 pass to a residual of")?,
-            passes => write!(f, "refined in {passes} passes to a residual of")?,
-        }
-        write!(
-            f,
-            " {:.1e}{}; {} visibilities on the circle of {:.1} km and {:.2} deg, {} up to \
-             {:.2} km, {:.2} deg off its plane and {:.2} deg off the horizontal; chi-square {:.4}",
-            convergence.residual,
-            if convergence.converged { "" } else { " (not converged)" },
-            departures.on_the_circle,
-            departures.circle_radius_m / 1e3,
-            departures.circle_inclination_deg,
-            departures.by_refinement,
-            departures.altitude_m_max / 1e3,
-            departures.tilt_deg_max,
-            departures.radial_deg_max,
-            chi_square.all,
-        )?;
-        match self.taken_as_instants {
-            0 => Ok(()),
-            count => {
-                write!(f, "; {count} averages over integrations taken for instants: too few others near them")
-            }
-        }
-    }
 }
 
 impl From<AccumulationError> for SolveError {
@@ -154,11 +82,12 @@ pub struct RefineSteps<'a> {
 /// Solves for the map and the noise-only map with the rows of the true positions.
 ///
 /// # Errors
-/// No data, or a prior whose size is not a map's; [`SolveError::Interrupted`] before the first pass is done.
+/// No data, a prior whose size is not a map's, or an R that needs a table that ends before the map's degrees or the data themselves;
+/// [`SolveError::Interrupted`] before the first pass is done.
 pub fn solve_refined(
     sums: &RefinedSums,
     request: HarmonicRequest,
-    rule: RefineRule,
+    (rule, regulariser): (RefineRule, &Regulariser),
     prior_k: Option<&[f64]>,
     steps: RefineSteps<'_>,
     watch: NamedWatch<'_>,
@@ -174,29 +103,16 @@ pub fn solve_refined(
         });
         largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
     };
-    let regularisation = request.epsilon * w_max;
-    let factors = blocks.factors(regularisation);
     drop(blocks);
-    let problem = RefinedProblem { sums, regularisation, inner: request.rule, factors };
-    let mut data = sums.data.value_k_sr.clone();
-    if let Some(prior) = &prior {
-        let predicted = problem.forward(&[prior.as_slice()]);
-        data.iter_mut().zip(&predicted[0]).for_each(|(value, predicted)| *value -= predicted);
-    }
-    let weighted: Vec<Complex64> =
-        data.iter().zip(&sums.data.weight).map(|(value, weight)| value * *weight).collect();
-    let noise: Vec<Complex64> =
-        sums.data.noise.iter().zip(&sums.data.weight).map(|(noise, weight)| noise * weight.sqrt()).collect();
-    let right = problem.adjoint(&[&weighted, &noise]);
-    drop((weighted, noise));
+    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
     let mut circle_data = sums.circle.right_hand_side().to_vec();
     if let Some(prior) = &prior {
         subtract_prediction(&sums.circle, prior, &mut circle_data);
     }
-    let [map, noise] = problem.solve(right, circle_data, data, rule, steps, watch);
-    if map.was_left() {
-        return Err(SolveError::Interrupted);
-    }
+    let problem = RefinedProblem { sums, regularisation, inner: request.rule, rule, watch };
+    let right = problem.right(prior.as_deref());
+    let Refined { columns: [map, noise], convergence: [of_map, of_noise], residuals, direct } =
+        problem.solve(right, circle_data, steps)?;
     let area_sr = pixel_area_sr(request.nside);
     let synthesised = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = map.x.clone();
@@ -208,19 +124,23 @@ pub fn solve_refined(
         w_max: Some(w_max * area_sr),
         w_max_iterations: iterations,
         l_max: Some(l_max),
-        convergence: Some(map.convergence()),
-        noise_convergence: Some(noise.convergence()),
+        convergence: Some(of_map),
+        noise_convergence: Some(of_noise),
         traces: None,
         traces_refused: None,
         fit: None,
     };
+    let mut left = sums.data.value_k_sr.clone();
+    let seen = sums.rows.forward(&sums.plan, &[coefficients(&whole, l_max)]);
+    left.iter_mut().zip(seen.iter().flatten()).for_each(|(left, seen)| *left -= seen);
     let refinement = Refinement {
-        convergence: map.convergence(),
-        residuals: map.residuals.clone(),
+        convergence: of_map,
+        residuals,
+        direct,
         departures: sums.departures,
         rows_computed: sums.plan.computed() as u64,
         taken_as_instants: sums.plan.instants() as u64,
-        chi_square: chi_squares(sums, &map.data),
+        chi_square: chi_squares(sums, &left),
     };
     let solution = HarmonicSolution {
         map_k: synthesised(&whole)?,
@@ -232,61 +152,29 @@ pub fn solve_refined(
     Ok((solution, refinement))
 }
 
-/// The true normal equations and their preconditioner.
+/// The true normal equations and how they are solved.
 struct RefinedProblem<'a> {
     sums: &'a RefinedSums,
-    regularisation: f64,
+    regularisation: Diagonal,
     /// When inner iterations stop, besides their residual.
     inner: StoppingRule,
-    /// The circle's blocks of one order, plus R.
-    factors: OrderFactors,
-}
-
-/// Solves several right-hand sides with the preconditioner.
-type Precondition<'a> = &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>;
-
-/// One right-hand side on its way.
-struct Column {
-    x: Vec<f64>,
-    residual: Vec<f64>,
-    direction: Vec<f64>,
-    /// `r.Mr` now and `b.Mb`.
-    energy: f64,
-    whole: f64,
-    /// What x leaves of the data; empty where nobody asks.
-    data: Vec<Complex64>,
-    residuals: Vec<f64>,
     rule: RefineRule,
-    /// Whether rounding errors dominate.
-    is_stuck: bool,
+    watch: NamedWatch<'a>,
 }
 
-impl Column {
-    fn relative(&self) -> f64 {
-        if self.whole > 0.0 { (self.energy.max(0.0) / self.whole).sqrt() } else { 0.0 }
-    }
+/// The map, the noise-only map, and how they were found.
+struct Refined {
+    columns: [Column; 2],
+    convergence: [Convergence; 2],
+    /// Of the map, after each pass.
+    residuals: Vec<f64>,
+    direct: bool,
+}
 
-    fn is_open(&self) -> bool {
-        !self.is_stuck
-            && self.relative() > self.rule.residual_max
-            && self.residuals.len() < self.rule.passes_max
-    }
-
-    /// Whether nothing was done about it, although there was something to do.
-    fn was_left(&self) -> bool {
-        // The circle's solution, too, may have been interrupted, so that its energy says nothing.
-        let is_new = self.x.iter().all(|x| *x == 0.0);
-        is_new && self.residuals.is_empty() && !self.is_stuck && self.residual.iter().any(|r| *r != 0.0)
-    }
-
-    fn convergence(&self) -> Convergence {
-        let residual = self.relative();
-        Convergence {
-            iterations: self.residuals.len(),
-            residual,
-            converged: residual <= self.rule.residual_max,
-        }
-    }
+/// The circle's matrix with a multiple of R.
+struct Shifted {
+    regularisation: Diagonal,
+    factors: OrderFactors,
 }
 
 impl RefinedProblem<'_> {
@@ -294,190 +182,167 @@ impl RefinedProblem<'_> {
         self.sums.circle.setup().l_max
     }
 
-    /// `B x` for several x.
-    fn forward(&self, x: &[&[f64]]) -> Vec<Vec<Complex64>> {
+    /// The right-hand sides of the map less its prior and of the noise-only map.
+    fn right(&self, prior: Option<&[f64]>) -> [Vec<f64>; 2] {
+        let RefinedSums { rows, plan, data, .. } = self.sums;
+        let predicted = prior.map(|prior| rows.forward(plan, &[coefficients(prior, self.l_max())]));
+        let predicted = predicted.iter().flatten().flatten();
+        let predicted = predicted.copied().chain(std::iter::repeat(Complex64::ZERO));
+        let values = data.value_k_sr.iter().zip(predicted).zip(&data.weight);
+        let weighted: Vec<Complex64> =
+            values.map(|((value, known), weight)| (value - known) * *weight).collect();
+        let noise = data.noise.iter().zip(&data.weight);
+        let noise: Vec<Complex64> = noise.map(|(noise, weight)| noise * weight.sqrt()).collect();
+        let mut gradients = rows.adjoint(plan, &[&weighted, &noise]).into_iter();
+        [(); 2].map(|()| gradients.next().as_ref().map(unknowns_of_gradient).unwrap_or_default())
+    }
+
+    /// Products of the true matrix and R with several vectors, in one pass.
+    fn products(&self, x: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let RefinedSums { rows, plan, data, .. } = self.sums;
         let skies: Vec<_> = x.iter().map(|x| coefficients(x, self.l_max())).collect();
-        self.sums.rows.forward(&self.sums.plan, &skies)
+        let products = rows.normal(plan, &skies, &data.weight);
+        let with_r = |(product, x): (_, &Vec<f64>)| {
+            let mut product = unknowns_of_gradient(product);
+            self.regularisation.add_product(x, &mut product);
+            product
+        };
+        products.iter().zip(x).map(with_r).collect()
     }
 
-    /// `Bt v` for several v.
-    fn adjoint(&self, values: &[&[Complex64]]) -> Vec<Vec<f64>> {
-        let gradients = self.sums.rows.adjoint(&self.sums.plan, values);
-        gradients.iter().map(unknowns_of_gradient).collect()
+    fn shifted(&self, shift: f64) -> Shifted {
+        let regularisation = self.regularisation.times(shift);
+        let factors = self.sums.circle.order_blocks().factors_with(&|l| regularisation.at(l));
+        Shifted { regularisation, factors }
     }
 
-    /// Solves for several right-hand sides with the equations of the nearest circle.
-    fn on_the_circle(&self, right: &[&[f64]], residual_max: f64, watch: NamedWatch<'_>) -> Vec<Vec<f64>> {
+    /// Solutions of the circle's equations.
+    fn on_the_circle(&self, with: &Shifted, right: &[&[f64]], residual_max: f64) -> Vec<Vec<f64>> {
         let circle = System {
             sums: &self.sums.circle,
-            regularisation: Diagonal::Uniform(self.regularisation),
-            precondition: &|v| self.factors.solve(v),
+            regularisation: with.regularisation.clone(),
+            precondition: &|v| with.factors.solve(v),
         };
         let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
         let rule = StoppingRule { residual_max, ..self.inner };
-        circle.solve(right, &mut z, rule, &watch.part("on the nearest circle", residual_max));
+        circle.solve(
+            right,
+            &mut z,
+            &vec![rule; right.len()],
+            &self.watch.part("on the nearest circle", residual_max),
+        );
         z
     }
 
-    /// Solves for two right-hand sides; `data` is what the first is made from, `circle_data` what it is by the circle's rows.
+    /// Solves for two right-hand sides; `circle_data` is what the first is by the circle's rows.
     fn solve(
         &self,
-        right: Vec<Vec<f64>>,
+        right: [Vec<f64>; 2],
         circle_data: Vec<f64>,
-        data: Vec<Complex64>,
-        rule: RefineRule,
         steps: RefineSteps<'_>,
-        watch: NamedWatch<'_>,
-    ) -> [Column; 2] {
-        let task = watch.start("refined map", rule.residual_max);
-        let precondition = |residuals: &[&[f64]]| self.on_the_circle(residuals, INNER_RESIDUAL, watch);
+    ) -> Result<Refined, SolveError> {
+        let RefineRule { passes_max, residual_max } = self.rule;
+        let task = self.watch.start("refined map", residual_max);
+        let mut shifts = vec![self.shifted(SHIFTS[0])];
+        let both = right.each_ref().map(Vec::as_slice);
+        let mut directions = self.on_the_circle(&shifts[0], &both, INNER_RESIDUAL);
+        let wholes = [0, 1].map(|k| dot(&right[k], &directions[k]));
         let start = steps.start.filter(|start| right.iter().zip(start).all(|(b, x)| b.len() == x.len()));
-        // Where all is on the circle, its map may be all that is wanted.
-        let is_circle = start.is_none() && self.sums.departures.by_refinement == 0;
-        let start = if is_circle {
-            let circle = [circle_data.as_slice(), self.sums.circle.noise_right_hand_side()];
-            self.on_the_circle(&circle, self.inner.residual_max, watch).try_into().ok()
-        } else {
-            start
-        };
-        let directions = match &start {
-            Some(map) if is_circle => Vec::from(map.clone()),
-            _ => precondition(&right.iter().map(Vec::as_slice).collect::<Vec<_>>()),
-        };
-        let mut columns = columns(right, directions, data, rule);
-        if let Some(start) = start {
-            self.begin_from(&mut columns, start, &precondition);
+        directions.extend(start.map_or_else(
+            || {
+                let circle = [circle_data.as_slice(), self.sums.circle.noise_right_hand_side()];
+                self.on_the_circle(&shifts[0], &circle, self.inner.residual_max)
+            },
+            Vec::from,
+        ));
+        let mut columns = right.clone().map(|residual| Column { x: vec![0.0; residual.len()], residual });
+        let (mut subspace, mut relative, mut residuals) = (Subspace::default(), [1.0; 2], Vec::new());
+        let mut direct = false;
+        let worst = |relative: &[f64; 2]| relative[0].max(relative[1]);
+        while residuals.len() < passes_max.max(1) && task.report(residuals.len(), worst(&relative)) {
+            let products = self.products(&directions);
+            let added = subspace.extend(directions.into_iter().zip(products), &mut columns);
+            let left = columns.each_ref().map(|column| column.residual.as_slice());
+            directions = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
+            relative = [0, 1].map(|k| relative_residual(&columns[k], &directions[k], wholes[k]));
+            residuals.push(relative[0]);
+            (steps.passed)([&columns[0].x, &columns[1].x]);
+            if added == 0 || worst(&relative) <= residual_max {
+                break;
+            }
+            if worst(&relative) > SLOW.powi(residuals.len() as i32) {
+                if residuals.len() >= SLOW_PASSES && self.can_be_formed() {
+                    break;
+                }
+                for shift in &SHIFTS[shifts.len()..] {
+                    shifts.push(self.shifted(*shift));
+                }
+            }
+            let left = columns.each_ref().map(|column| column.residual.as_slice());
+            for shift in &shifts[1..] {
+                directions.extend(self.on_the_circle(shift, &left, INNER_RESIDUAL));
+            }
         }
-        // As far as the slower of the two has come: noise has most of its power where little is measured.
-        let passes = |columns: &[Column; 2]| columns.iter().map(|column| column.residuals.len()).max();
-        let residual = |columns: &[Column; 2]| columns.iter().map(Column::relative).fold(0.0, f64::max);
-        while columns.iter().any(Column::is_open)
-            && task.report(passes(&columns).unwrap_or(0), residual(&columns))
-        {
-            self.advance(&mut columns, &precondition);
+        if residuals.is_empty() {
+            return Err(SolveError::Interrupted);
+        }
+        let is_formed = worst(&relative) > residual_max && self.can_be_formed();
+        let solved = is_formed.then(|| self.solve_directly(&right, &task, residuals.len())).flatten();
+        if let Some(solved) = solved {
+            (columns, direct) = (solved, true);
+            let left = columns.each_ref().map(|column| column.residual.as_slice());
+            let z = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
+            relative = [0, 1].map(|k| relative_residual(&columns[k], &z[k], wholes[k]));
+            residuals.push(relative[0]);
             (steps.passed)([&columns[0].x, &columns[1].x]);
         }
-        columns
-    }
-
-    /// Takes an earlier solution as the first step.
-    fn begin_from(&self, columns: &mut [Column; 2], start: [Vec<f64>; 2], precondition: Precondition<'_>) {
-        let skies = start.each_ref().map(|x| coefficients(x, self.l_max()));
-        let (seen, products) = self.sums.rows.normal(&self.sums.plan, &skies, &self.sums.data.weight);
-        let products = products.iter().map(unknowns_of_gradient);
-        for (((column, x), mut product), seen) in columns.iter_mut().zip(start).zip(products).zip(seen) {
-            product.iter_mut().zip(&x).for_each(|(y, x)| *y += self.regularisation * x);
-            subtract(&mut column.residual, 1.0, &product);
-            column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= seen);
-            column.x = x;
-        }
-        let z = precondition(&columns.each_ref().map(|column| column.residual.as_slice()));
-        for (column, z) in columns.iter_mut().zip(z) {
-            column.direction = z;
-            column.energy = dot(&column.residual, &column.direction);
-        }
-    }
-
-    /// One iteration of the flexible conjugate gradients for those columns that are open.
-    fn advance(&self, columns: &mut [Column; 2], precondition: Precondition<'_>) {
-        let open = columns.iter().filter(|column| column.is_open());
-        let directions: Vec<Alm> = open.map(|column| coefficients(&column.direction, self.l_max())).collect();
-        let (seen, products) = self.sums.rows.normal(&self.sums.plan, &directions, &self.sums.data.weight);
-        let products = products.iter().map(unknowns_of_gradient);
-        let open = columns.iter_mut().filter(|column| column.is_open());
-        let mut stepped = Vec::new();
-        for ((column, mut product), seen) in open.zip(products).zip(seen) {
-            product.iter_mut().zip(&column.direction).for_each(|(y, d)| *y += self.regularisation * d);
-            let curvature = dot(&column.direction, &product);
-            if curvature.is_nan() || curvature <= 0.0 {
-                column.is_stuck = true;
-                continue;
-            }
-            let step = dot(&column.residual, &column.direction) / curvature;
-            column.x.iter_mut().zip(&column.direction).for_each(|(x, d)| *x += step * d);
-            column.data.iter_mut().zip(&seen).for_each(|(left, seen)| *left -= step * seen);
-            let before = column.residual.clone();
-            subtract(&mut column.residual, step, &product);
-            stepped.push((column, before));
-        }
-        let z =
-            precondition(&stepped.iter().map(|(column, _)| column.residual.as_slice()).collect::<Vec<_>>());
-        for ((column, before), z) in stepped.into_iter().zip(z) {
-            let next = dot(&column.residual, &z);
-            let turn = (next - dot(&before, &z)) / column.energy;
-            column.energy = next;
-            column.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
-            column.residuals.push(column.relative());
-        }
-    }
-}
-
-/// The columns before the first iteration; `data` is what the first right-hand side is made from.
-fn columns(
-    right: Vec<Vec<f64>>,
-    directions: Vec<Vec<f64>>,
-    data: Vec<Complex64>,
-    rule: RefineRule,
-) -> [Column; 2] {
-    let (mut right, mut directions, mut data) = (right.into_iter(), directions.into_iter(), Some(data));
-    [(); 2].map(|()| {
-        let residual = right.next().unwrap_or_default();
-        let direction = directions.next().unwrap_or_default();
-        let energy = dot(&residual, &direction);
-        Column {
-            x: vec![0.0; residual.len()],
+        let convergence = relative.map(|residual| Convergence {
+            iterations: residuals.len(),
             residual,
-            direction,
-            energy,
-            whole: energy,
-            data: data.take().unwrap_or_default(),
-            residuals: Vec::new(),
-            rule,
-            is_stuck: false,
+            converged: residual <= residual_max,
+        });
+        Ok(Refined { columns, convergence, residuals, direct })
+    }
+
+    fn can_be_formed(&self) -> bool {
+        let (unknowns, rows) = (self.sums.circle.unknowns(), self.sums.plan.computed());
+        unknowns <= DIRECT_UNKNOWNS_MAX && rows.saturating_mul(unknowns) <= DIRECT_PRODUCTS_MAX
+    }
+
+    /// Forms the matrix and solves by Cholesky's factors; `None` if it is interrupted.
+    fn solve_directly(
+        &self,
+        right: &[Vec<f64>; 2],
+        task: &SolveTask<'_>,
+        passes: usize,
+    ) -> Option<[Column; 2]> {
+        let unknowns = right[0].len();
+        let mut columns: Vec<Vec<f64>> = Vec::with_capacity(unknowns);
+        while columns.len() < unknowns {
+            if !task.report(passes, 1.0) {
+                return None;
+            }
+            let unit = |k: usize| (0..unknowns).map(|n| f64::from(u8::from(n == k))).collect();
+            let units: Vec<Vec<f64>> =
+                (columns.len()..unknowns.min(columns.len() + COLUMNS)).map(unit).collect();
+            columns.extend(self.products(&units));
         }
-    })
+        // Sums in f32 leave it symmetric to 1e-6.
+        let element = |a: usize, b: usize| 0.5 * (columns[a][b] + columns[b][a]);
+        let factor = Mat::from_fn(unknowns, unknowns, element).llt(Side::Lower).ok()?;
+        Some(right.each_ref().map(|right| {
+            let solved = factor.solve(&Mat::from_fn(unknowns, 1, |k, _| right[k]));
+            let x: Vec<f64> = (0..unknowns).map(|k| solved[(k, 0)]).collect();
+            let mut residual = right.clone();
+            for (a, left) in residual.iter_mut().enumerate() {
+                *left -= (0..unknowns).map(|b| element(a, b) * x[b]).sum::<f64>();
+            }
+            Column { x, residual }
+        }))
+    }
 }
 
-/// Mean squares of residuals in units of their noise.
-fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
-    #[derive(Clone, Copy, Default)]
-    struct Mean(f64, f64);
-    impl Mean {
-        fn add(&mut self, value: f64) {
-            self.0 += value;
-            self.1 += 1.0;
-        }
-        fn value(self) -> f64 {
-            self.0 / self.1.max(1.0)
-        }
-    }
-    let mut all = Mean::default();
-    let (mut pairs, mut daughters, mut days, mut phases) = (
-        BTreeMap::<_, Mean>::new(),
-        BTreeMap::<_, Mean>::new(),
-        BTreeMap::<_, Mean>::new(),
-        BTreeMap::<_, Mean>::new(),
-    );
-    for (k, ((at, left), weight)) in sums.at.iter().zip(left).zip(&sums.data.weight).enumerate() {
-        let value = 0.5 * left.norm_sqr() * weight;
-        all.add(value);
-        pairs.entry((at.pair.i, at.pair.j)).or_default().add(value);
-        for daughter in [at.pair.i, at.pair.j] {
-            daughters.entry(u16::from(daughter) + 1).or_default().add(value);
-        }
-        days.entry((at.time_s / DAY_S).floor() as i64).or_default().add(value);
-        if let Some(phase_deg) = orbit_phase_deg(&sums.at, k) {
-            phases.entry(phase_deg as u16 / PHASE_BIN_DEG * PHASE_BIN_DEG).or_default().add(value);
-        }
-    }
-    ChiSquares {
-        all: all.value(),
-        by_pair: pairs
-            .into_iter()
-            .map(|((i, j), mean)| (format!("{}-{}", u16::from(i) + 1, u16::from(j) + 1), mean.value()))
-            .collect(),
-        by_daughter: daughters.into_iter().map(|(daughter, mean)| (daughter, mean.value())).collect(),
-        by_day: days.into_iter().map(|(day, mean)| (day, mean.value())).collect(),
-        by_phase_deg: phases.into_iter().map(|(phase_deg, mean)| (phase_deg, mean.value())).collect(),
-    }
+/// `sqrt(r.Mr / b.Mb)`, with `z = M r`; 0 without data.
+fn relative_residual(column: &Column, z: &[f64], whole: f64) -> f64 {
+    if whole > 0.0 { (dot(&column.residual, z).max(0.0) / whole).sqrt() } else { 0.0 }
 }

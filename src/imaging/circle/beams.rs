@@ -39,7 +39,7 @@ pub fn harmonic_beams(
         sums.apply(&unknowns(&transform.adjoint(&point)?), &mut right);
         let mut beam = [vec![0.0; right.len()]];
         let task = watch.start(&format!("beam at pixel {pixel}"), request.rule.residual_max);
-        system.solve(&[&right], &mut beam, request.rule, &task);
+        system.solve(&[&right], &mut beam, &[request.rule], &task);
         if !watch.goes_on() {
             break;
         }

@@ -146,6 +146,7 @@ impl HarmonicBasis {
             tori,
             ranks: self.ranks.clone(),
             reached: OnceLock::new(),
+            used: OnceLock::new(),
             counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),

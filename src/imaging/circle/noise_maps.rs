@@ -49,7 +49,7 @@ pub fn solve_noises(
         let rights: Vec<&[f64]> = rights.iter().map(Vec::as_slice).collect();
         let mut solved = vec![vec![0.0; sums.unknowns()]; rights.len()];
         let task = watch.start("noise maps", request.rule.residual_max);
-        system.solve(&rights, &mut solved, request.rule, &task);
+        system.solve(&rights, &mut solved, &vec![request.rule; rights.len()], &task);
         if !watch.goes_on() {
             return Err(SolveError::Interrupted);
         }

@@ -40,6 +40,8 @@ pub(super) struct SharedTori<'a> {
     pub(super) tori: &'a Tori,
     /// The range of nodes that hold data, of any rank.
     pub(super) reached: Range<usize>,
+    /// Which alphas hold weights here.
+    pub(super) used: &'a [bool],
 }
 
 /// A right-hand side: of the data, or of the noise-only companion.
@@ -108,10 +110,9 @@ impl Operator {
     }
 
     /// Operations of the products with patterns and rotations in one application.
-    pub(super) fn matrix_product_flops(&self, tori: &Tori) -> f64 {
-        let reach = self.reach(tori.reached(&Ranks::one()));
-        let used = tori.alphas(&self.grids, TorusPart::Weights);
-        let blocks = used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
+    pub(super) fn matrix_product_flops(&self, shared: &SharedTori<'_>) -> f64 {
+        let reach = self.reach(shared.reached.clone());
+        let blocks = shared.used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
         let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
         let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
         // Forth and back, real and imaginary parts, multiplications and additions.
@@ -132,10 +133,9 @@ impl Operator {
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
         let circle = Circle { points: self.grids.points };
-        let used = tori.alphas(&self.grids, TorusPart::Weights);
         let over = Blocks {
             ranks: shared.ranks,
-            used: &used,
+            used: shared.used,
             reach,
             skies: skies.len(),
             backwards: tori.turns_back(),

@@ -25,6 +25,9 @@ pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
 /// Realisations or samples that are solved for together: a thread has a workspace for each.
 pub const NOISES_TOGETHER: usize = 4;
 
+/// Residual of the error of the mean: an error of an error.
+const BESIDE: f64 = 1e-3;
+
 /// Products with the blocks before the iteration for W_max.
 const LIFTS: usize = 6;
 
@@ -214,17 +217,21 @@ fn solve_with_power(
     let regularisation = Diagonal::ByDegree(regularisation);
     let precondition = |v: &mut [f64]| factors.solve(v);
     let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
-    // The third column is that of the covariance for the monopole.
-    let mut monopole = vec![0.0; right.len()];
-    monopole[0] = 1.0;
     let noise = match start {
         Some([_, noise]) if noise.len() == right.len() => noise.clone(),
         _ => vec![0.0; right.len()],
     };
+    // The third column is that of the covariance for the monopole.
+    let mut monopole = vec![0.0; right.len()];
+    monopole[0] = 1.0;
+    let right_hand_sides = [&right, sums.noise_right_hand_side(), &monopole];
     let mut columns = [solution, noise, vec![0.0; right.len()]];
+    let count = if watch.is_wanted() { 3 } else { 2 };
+    let beside = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
     let convergence = {
         let task = watch.start("map, noise map and error of the mean", rule.residual_max);
-        system.solve(&[&right, sums.noise_right_hand_side(), &monopole], &mut columns, rule, &task)
+        let rules = [rule, rule, beside];
+        system.solve(&right_hand_sides[..count], &mut columns[..count], &rules[..count], &task)
     };
     let [solved, noise, of_mean] = columns;
     let mut whole = solved.clone();
@@ -232,33 +239,44 @@ fn solve_with_power(
         add(&mut whole, &prior);
     }
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
-    let mut samples_k = Vec::new();
     let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
-    let numbers: Vec<u64> = (0..samples as u64).collect();
-    for which in numbers.chunks(NOISES_TOGETHER) {
-        let task = watch.start(&format!("samples from {}", which[0] + 1), SAMPLE_SETTLED);
-        for Drawn { whole: mut sample, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
-            sample.iter_mut().for_each(|value| *value *= factor);
-            add(&mut sample, &whole);
-            samples_k.push(map(&sample)?);
-        }
+    let mut uncertainty = None;
+    if watch.is_wanted() {
+        let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
+        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
+        let mean_sigma_k = factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt();
+        let samples_k = samples_k(&covariance, samples, (&whole, factor), &map, watch)?;
+        uncertainty = Some(Uncertainty { sigma_k, mean_sigma_k, power, samples_k });
     }
-    let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
-    sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
-    let uncertainty = Uncertainty {
-        sigma_k,
-        mean_sigma_k: factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
-        power,
-        samples_k,
-    };
     let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
         noise_k: map(&noise)?,
         unknowns: [solved, noise],
         diagnostics,
-        uncertainty: Some(uncertainty),
+        uncertainty,
     })
+}
+
+/// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
+fn samples_k(
+    covariance: &Covariance<'_>,
+    count: usize,
+    (whole, factor): (&[f64], f64),
+    map: &dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>,
+    watch: NamedWatch<'_>,
+) -> Result<Vec<Vec<f64>>, SolveError> {
+    let mut samples_k = Vec::new();
+    let numbers: Vec<u64> = (0..count as u64).collect();
+    for which in numbers.chunks(NOISES_TOGETHER) {
+        let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_SETTLED);
+        for Drawn { whole: mut sample, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
+            sample.iter_mut().for_each(|value| *value *= factor);
+            add(&mut sample, whole);
+            samples_k.push(map(&sample)?);
+        }
+    }
+    Ok(samples_k)
 }
 
 /// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest
@@ -286,7 +304,7 @@ fn iterate(
         _ => vec![0.0; unknowns],
     });
     let task = watch.start("map and noise map", rule.residual_max);
-    let convergence = system.solve(&right_hand_sides, &mut solved, rule, &task);
+    let convergence = system.solve(&right_hand_sides, &mut solved, &[rule, rule], &task);
     (solved, convergence)
 }
 

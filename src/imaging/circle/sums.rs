@@ -7,6 +7,7 @@ use super::HarmonicSetup;
 use super::blocks::OrderBlocks;
 use super::grid::Grids;
 use super::operator::{Operator, RightHandSide, SharedTori};
+use super::stored::TorusPart;
 use super::tori::Tori;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::ranks::Ranks;
@@ -32,6 +33,8 @@ pub struct HarmonicSums {
     pub(super) ranks: Ranks,
     /// The range of nodes that hold data, of any rank.
     pub(super) reached: OnceLock<Range<usize>>,
+    /// Which alphas hold weights here: to find out takes as long as a product.
+    pub(super) used: OnceLock<Vec<bool>>,
     pub(super) counts: SumCounts,
     pub(super) right: OnceLock<Vec<f64>>,
     pub(super) noise: OnceLock<Vec<f64>>,
@@ -58,13 +61,14 @@ impl HarmonicSums {
 
     pub(super) fn shared(&self) -> SharedTori<'_> {
         let reached = self.reached.get_or_init(|| self.tori.reached(&self.ranks)).clone();
-        SharedTori { ranks: &self.ranks, tori: &self.tori, reached }
+        let used = self.used.get_or_init(|| self.tori.alphas(&self.grids, TorusPart::Weights));
+        SharedTori { ranks: &self.ranks, tori: &self.tori, reached, used }
     }
 
     /// Floating-point operations of this process's matrix products in one [`NormalSums::apply`].
     #[must_use]
     pub fn matrix_product_flops(&self) -> f64 {
-        self.operator().matrix_product_flops(&self.tori)
+        self.operator().matrix_product_flops(&self.shared())
     }
 
     /// Bytes of this process's weights; one [`NormalSums::apply`] reads each once.

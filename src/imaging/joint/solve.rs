@@ -21,7 +21,7 @@ use rand_distr::{Distribution, StandardNormal};
 /// Lengths and own shares that are tried first, and the factor within which they are refined.
 const LENGTHS: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 8.0];
 const OWN_SHARES: [f64; 4] = [1e-4, 1e-3, 1e-2, 1e-1];
-const FINEST: f64 = 1.15;
+const FINEST: f64 = 1.05;
 /// Bounds of a search: beyond them nothing changes.
 const LENGTH_MAX: f64 = 64.0;
 const OWN_SHARE_RANGE: [f64; 2] = [1e-7, 0.999];
@@ -134,7 +134,8 @@ pub fn solve_jointly(
     let plain = Prior::new(all_hz, scale, Likeness { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let scaled = scaled_blocks(&plain, &blocks, &noise_factors);
     let watch = watch.named("all channels").wanted(true);
-    let likeness = most_likely(&plain, &scaled, &alone, watch)?;
+    let rights: Vec<Vec<f64>> = alone.iter().map(|alone| alone.right.clone()).collect();
+    let likeness = most_likely(&plain, &scaled, &rights, watch)?;
     let prior = plain.with(likeness)?;
     let channels_sums = sums.iter().map(|sums| *sums as &(dyn NormalSums + Sync)).collect();
     let joint = JointSums::new(&prior, channels_sums, noise_factors);
@@ -197,13 +198,12 @@ impl Alone {
 }
 
 /// The likeness of the greatest evidence: on a coarse grid, then step by step from the best.
-fn most_likely(
+pub(super) fn most_likely(
     plain: &Prior,
     scaled: &[ScaledBlocks],
-    alone: &[Alone],
+    rights: &[Vec<f64>],
     watch: NamedWatch<'_>,
 ) -> Result<Likeness, SolveError> {
-    let rights: Vec<Vec<f64>> = alone.iter().map(|alone| alone.right.clone()).collect();
     let mut known: BTreeMap<[u64; 2], f64> = BTreeMap::new();
     let task = watch.start("how alike channels are", FINEST);
     let mut evidence = |likeness: Likeness| -> Option<f64> {
@@ -214,7 +214,7 @@ fn most_likely(
         let prior = plain.with(likeness).ok()?;
         let blocks = joint_blocks(&prior, scaled);
         let unit = vec![1.0; plain.l_max.first().map_or(1, |l_max| l_max + 1)];
-        let found = value(&blocks, &unit, &prior.transposed(&rights))?;
+        let found = value(&blocks, &unit, &prior.transposed(rights))?;
         known.insert(key, found);
         Some(found)
     };
@@ -227,7 +227,9 @@ fn most_likely(
     let mut step = 0;
     while factor > FINEST && task.report_wanting(true, step, factor) {
         step += 1;
-        let near = [(factor, 1.0), (factor.recip(), 1.0), (1.0, factor), (1.0, factor.recip())];
+        // The corners, too: evidence has a ridge along which both change.
+        let moves = [factor.recip(), 1.0, factor];
+        let near: Vec<(f64, f64)> = moves.iter().flat_map(|a| moves.map(|b| (*a, b))).collect();
         let tried = near.iter().filter_map(|(length, own)| {
             let likeness = Likeness {
                 length: (at.length * length).min(LENGTH_MAX),
@@ -271,7 +273,7 @@ impl<'a> Posterior<'a> {
         let mut columns = [vec![0.0; count]];
         let convergence = {
             let task = watch.start("maps", request.rule.residual_max);
-            system.solve(&[sums.right_hand_side()], &mut columns, request.rule, &task)
+            system.solve(&[sums.right_hand_side()], &mut columns, &[request.rule], &task)
         };
         let [solution] = columns;
         let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
@@ -314,16 +316,33 @@ impl<'a> Posterior<'a> {
         (0..=view.l_max).map(of_degree).collect()
     }
 
+    /// Standard deviation of the coefficients of each degree that no channel decides, K sr^(1/2). Mean and dipole have a prior far above any
+    /// sky, so that it is their own size that counts, and they are smooth in frequency: no share of theirs is a channel's own.
+    fn open_sigma(&self, view: &View) -> Vec<f64> {
+        let mut sigma: Vec<f64> =
+            view.open.iter().zip(&view.scale).map(|(open, s)| s * open.sqrt()).collect();
+        let mut square = vec![0.0; view.l_max + 1];
+        for (l, x) in degrees(view.l_max).zip(self.seen(view, &self.solution)) {
+            square[l] += x * x / (2 * l + 1) as f64;
+        }
+        for l in 0..FREE_FACTORS.len().min(sigma.len()) {
+            let open = view.open[l] - self.prior().likeness.own_share;
+            sigma[l] = (open.max(0.0) * square[l]).sqrt();
+        }
+        sigma
+    }
+
     /// A sample of a view: what no channel decides is drawn, too.
     pub(super) fn sample(&self, view: &View, number: usize) -> Vec<f64> {
         let mut sky = self.seen(view, &self.draws[number].whole);
         crate::imaging::solver::add(&mut sky, &self.seen(view, &self.solution));
-        if view.open.iter().any(|open| *open > 0.0) {
+        let open = self.open_sigma(view);
+        if open.iter().any(|open| *open > 0.0) {
             let mut stream =
                 random_stream(4, StreamKind::Probe, [view.frequency_hz.to_bits(), number as u64]);
             for (x, l) in sky.iter_mut().zip(degrees(view.l_max)) {
                 let normal: f64 = StandardNormal.sample(&mut stream);
-                *x += view.scale[l] * view.open[l].sqrt() * normal;
+                *x += open[l] * normal;
             }
         }
         sky
@@ -338,7 +357,7 @@ impl<'a> Posterior<'a> {
             let is_of = l <= view.l_max && channel < view.shares.len();
             if is_of { ratio[l].sqrt() * view.scale[l] * view.shares[channel] } else { 0.0 }
         };
-        let open: Vec<f64> = view.open.iter().zip(&view.scale).map(|(open, s)| open * s * s).collect();
+        let open: Vec<f64> = self.open_sigma(view).iter().map(|sigma| sigma * sigma).collect();
         let sigma_k = view_sigma_k(&self.blocks, &factors, &row, &open, nside);
         let of_mean = |sky: &[f64]| sky[0] / (4.0 * std::f64::consts::PI).sqrt();
         let variance: f64 = (0..self.draws.len())

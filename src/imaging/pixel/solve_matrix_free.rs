@@ -56,7 +56,8 @@ pub fn solve_matrix_free(
         _ => vec![vec![0.0; pixels]; 2],
     };
     let task = watch.start("map", rule.residual_max);
-    let convergence = system.solve(&[&right, sums.noise_right_hand_side()], &mut solved, rule, &task);
+    let convergence =
+        system.solve(&[&right, sums.noise_right_hand_side()], &mut solved, &[rule, rule], &task);
     drop(task);
     if solved[0].iter().all(|x| *x == 0.0) && !watch.goes_on() {
         return Err(SolveError::Interrupted);

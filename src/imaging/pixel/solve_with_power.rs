@@ -102,11 +102,13 @@ pub fn solve_pixels_with_power(
         add(&mut sample, &map_k);
         Ok(sample)
     };
+    // A pixel holds the mean of a sky that has more than the degrees solved for.
+    let beyond_k2 = power.variance_beyond_k2(nside);
     let uncertainty = Uncertainty {
         sigma_k: factors
             .quadratic_forms(0, harmonics.transpose().to_owned())
             .into_iter()
-            .map(|variance| factor * variance.sqrt())
+            .map(|variance| (factor * factor * variance + beyond_k2).sqrt())
             .collect(),
         mean_sigma_k: factor * (monopole[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
         power,

@@ -22,6 +22,8 @@ mod rounds;
 #[cfg(test)]
 mod tests;
 
+use std::f64::consts::PI;
+
 use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, Side};
 use serde::Serialize;
@@ -33,6 +35,7 @@ pub(super) use rounds::{FoundPower, PowerProblem};
 use self::blocks::{evidence, greatest};
 use self::knots::{FREE, Knots};
 use crate::imaging::solver::SolveError;
+use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the least variance of noise.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
@@ -72,6 +75,22 @@ impl SkyPower {
         self.power_k2.iter().map(|power| power / self.noise_factor.powi(2)).collect()
     }
 
+    /// Variance that the sky's degrees beyond these have in means over pixels, K^2: of the curve continued as it ends.
+    pub(super) fn variance_beyond_k2(&self, nside: usize) -> f64 {
+        let [.., before, last] = self.power_k2[..] else { return 0.0 };
+        let first = self.power_k2.len();
+        let fall = (last / before).ln() / (first as f64 / (first - 1) as f64).ln();
+        let term = |l: usize| {
+            let l = l as f64;
+            let power_k2 = last * ((l + 1.0) / first as f64).powf(fall);
+            // The window of a disc of a pixel's area, 2 J_1(x) / x with x = 2 l / sqrt(N_pix): ln w_l^2 = -x^2 / 4 - x^4 / 192 - ..
+            let q = l * l / pixel_count(nside) as f64;
+            (2.0 * l + 1.0) / (4.0 * PI) * power_k2 * (-q - q * q / 12.0).exp()
+        };
+        // Of w_l^2 a hundredth is left at 8 nside.
+        (first..=8 * nside).map(term).sum()
+    }
+
     /// As found for data that were divided by `factor`.
     fn of_data_divided_by(mut self, factor: f64) -> Self {
         self.power_k2.iter_mut().for_each(|power| *power *= factor * factor);
@@ -84,7 +103,8 @@ impl SkyPower {
     pub fn csv(&self) -> String {
         let mut table = String::from(
             "# Angular power of the sky from the data, with the interval that holds it with 68 % probability; decided: how many of the 2 l + 1\n\
-             # coefficients the data decide. R = 1 / C_l.\n\
+             # coefficients the data decide. R = 1 / C_l. The interval is that of a smooth curve; of the last tenth of the degrees it leaves out\n\
+             # what the sky beyond the map's adds, some 10 %.\n\
              l,power_k2,low_k2,high_k2,decided\n",
         );
         for l in FREE..self.power_k2.len() {
@@ -99,7 +119,8 @@ impl SkyPower {
 /// What is known of a map's errors, with R from the data.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Uncertainty {
-    /// Standard deviation of every pixel, K: of noise and of what the data leave open, up to the map's degrees.
+    /// Standard deviation of every pixel, K: of noise and of what the data leave open. Of harmonic maps up to their degrees, of pixels also
+    /// of what the sky has beyond.
     pub sigma_k: Vec<f64>,
     /// Standard deviation of the mean, K.
     pub mean_sigma_k: f64,

@@ -8,9 +8,13 @@ use crate::imaging::NormalSums;
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 
-/// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error.
+/// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error. Maps on the
+/// way are content with more.
 const ROUNDS_MAX: usize = 6;
 const SETTLED: f64 = 0.1;
+const SETTLED_ON_THE_WAY: f64 = 0.5;
+/// Error of a map on the way in units of what the data leave open of it.
+const SOLVED: f64 = 0.1;
 /// The draws for the traces, always the same; samples have others. One is enough where the blocks are near: it tells what traces differ by.
 const TRACES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
 /// How far the logarithm of a trace may be from that of the blocks for one draw to be enough.
@@ -115,19 +119,24 @@ impl PowerProblem<'_> {
         }];
         let mut ratio = vec![1.0; l_max + 1];
         let mut factor = 1.0;
+        // Maps on the way do without draws. The blocks know more than data of a short time do, so that the power comes out too small, and
+        // the map too smooth: on the safe side.
+        let is_wanted = watch.is_wanted();
+        let settled = if is_wanted { SETTLED } else { SETTLED_ON_THE_WAY };
         for round in 1..=ROUNDS_MAX {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
-            // Maps on the way do without draws, which take most of the time. The blocks know more than data of a short time do, so that the
-            // power comes out too small, and the map too smooth: on the safe side.
-            if watch.is_wanted() {
+            let mut rule = rule;
+            if is_wanted {
                 ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
+            } else {
+                rule = self.rule(&factors, factor, rule);
             }
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
-                system.solve(&[self.right], &mut x, rule, &task);
+                system.solve(&[self.right], &mut x, &[rule], &task);
             }
             let traces = factors.traces(l_max);
             let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
@@ -140,8 +149,8 @@ impl PowerProblem<'_> {
             // That of the noise is one of the power, too.
             let change = next.change(&fit).max((factor / before).ln().abs());
             fit = next;
-            let task = watch.start("the sky's power", SETTLED);
-            if !task.report_wanting(change > SETTLED && round < ROUNDS_MAX, round, change) {
+            let task = watch.start("the sky's power", settled);
+            if !task.report_wanting(change > settled && round < ROUNDS_MAX, round, change) {
                 let factors = Factors::new(self.blocks, &fit.regularisation());
                 let mut traces = factors.traces(l_max);
                 traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
@@ -153,6 +162,21 @@ impl PowerProblem<'_> {
         Err(SolveError::NoPower)
     }
 
+    /// When a map on the way is good enough beside what the data leave open, or as good as `rule` asks.
+    pub(in crate::imaging) fn rule(
+        &self,
+        factors: &Factors<'_>,
+        factor: f64,
+        rule: StoppingRule,
+    ) -> StoppingRule {
+        let mut solved = self.right.to_vec();
+        factors.solve(&mut solved);
+        // The squares of errors of (A + R)^-1 add up to one an unknown in the norm of A + R, in which residuals are measured.
+        let open = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
+        // No less than a tenth of the map, whatever the noise.
+        StoppingRule { residual_max: rule.residual_max.max(SOLVED * open.min(1.0)), ..rule }
+    }
+
     /// The ratio of traces by draws: few where the last ones said that the blocks are near.
     fn drawn_ratio(
         &self,
@@ -161,7 +185,7 @@ impl PowerProblem<'_> {
         last: &[f64],
         watch: NamedWatch<'_>,
     ) -> Vec<f64> {
-        let is_near = last.iter().all(|ratio| ratio.ln().abs() < NEAR);
+        let is_near = watch.all(last.iter().all(|ratio| ratio.ln().abs() < NEAR));
         let which = if is_near { &TRACES[..1] } else { &TRACES };
         let task = watch.start("draws for the sky's power", TRACE_SETTLED);
         let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, TRACE_SETTLED, &task);

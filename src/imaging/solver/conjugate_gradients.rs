@@ -108,13 +108,13 @@ impl System<'_> {
         products
     }
 
-    /// Solves for each right-hand side `b` in place, from the first guess `x`; the best so far is left whenever it ends. Each solution has
+    /// Solves for each right-hand side `b` by its rule in place, from the first guess `x`; the best so far is left whenever it ends. Each solution has
     /// the bits that it has alone: only products are made together.
     pub(in crate::imaging) fn solve(
         &self,
         b: &[&[f64]],
         x: &mut [Vec<f64>],
-        rule: StoppingRule,
+        rules: &[StoppingRule],
         task: &SolveTask<'_>,
     ) -> Vec<Convergence> {
         let is_guess = |x: &Vec<f64>| x.iter().any(|x| *x != 0.0);
@@ -129,7 +129,7 @@ impl System<'_> {
             })
             .collect();
         loop {
-            let wants: Vec<bool> = iterations.iter().map(|iteration| iteration.wants(rule)).collect();
+            let wants: Vec<bool> = iterations.iter().zip(rules).map(|(one, rule)| one.wants(*rule)).collect();
             let products = iterations.iter().map(|iteration| iteration.products).max().unwrap_or(0);
             let residual = iterations.iter().map(Iteration::relative).fold(0.0, f64::max);
             let goes_on = task.report_each(&wants, products, residual);
@@ -147,7 +147,7 @@ impl System<'_> {
                 iteration.step(product, self.precondition);
             }
         }
-        let convergence = iterations.iter().map(|iteration| iteration.convergence(rule)).collect();
+        let convergence = iterations.iter().zip(rules).map(|(one, rule)| one.convergence(*rule)).collect();
         x.iter_mut().zip(iterations).for_each(|(x, iteration)| *x = iteration.x);
         convergence
     }
@@ -220,7 +220,8 @@ mod tests {
         watch: &SolveWatch,
     ) -> Vec<Convergence> {
         let system = System { sums: known, regularisation: Diagonal::Uniform(0.5), precondition: &|_| () };
-        system.solve(b, x, rule, &watch.named("test").start("columns", rule.residual_max))
+        let rules = vec![rule; b.len()];
+        system.solve(b, x, &rules, &watch.named("test").start("columns", rule.residual_max))
     }
 
     const RULE: StoppingRule = StoppingRule { residual_max: 1e-6, iterations_max: 100 };

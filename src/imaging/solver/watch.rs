@@ -131,9 +131,14 @@ impl<'a> NamedWatch<'a> {
         Self { wanted, ..self }
     }
 
+    /// Whether something holds for all ranks.
+    pub(in crate::imaging) fn all(self, holds: bool) -> bool {
+        self.watch.ranks.all(holds)
+    }
+
     /// Whether it is worth while to go on, for all ranks.
     pub(in crate::imaging) fn goes_on(self) -> bool {
-        self.watch.ranks.all(self.goes_on_here())
+        self.all(self.goes_on_here())
     }
 
     fn goes_on_here(self) -> bool {

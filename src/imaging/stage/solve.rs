@@ -28,7 +28,7 @@ pub struct Solution {
     pub channel: ChannelId,
     /// Number of the snapshot in its channel, from 1.
     pub number: u32,
-    /// Whether it is from all data.
+    /// Whether it is from all data. Whether it may be called final is [`Solution::is_final_map`].
     pub is_final: bool,
     /// First and last mission time of its data, s.
     pub span_s: [f64; 2],
@@ -48,6 +48,20 @@ pub struct Solution {
     pub refinement: Option<Refinement>,
     /// Errors of the map, and the sky's power that R is from; only with R from the data.
     pub uncertainty: Option<Uncertainty>,
+}
+
+impl Solution {
+    /// Whether it may be called final: from all data and, where it was refined, converged.
+    #[must_use]
+    pub fn is_final_map(&self) -> bool {
+        self.is_final && self.has_converged()
+    }
+
+    /// Whether its refinement, if there was one, has converged: more passes would change the map.
+    #[must_use]
+    pub fn has_converged(&self) -> bool {
+        self.refinement.as_ref().is_none_or(|refinement| refinement.convergence.converged)
+    }
 }
 
 /// Numbers in which ranks agree before they solve.
@@ -277,7 +291,8 @@ impl Request<'_> {
             }
         };
         let steps = RefineSteps { start, passed: &mut passed };
-        let (rule, prior) = (self.setup.refine, self.prior.as_deref());
+        let regulariser = self.setup.regulariser(usize::from(self.channel.0));
+        let (rule, prior) = ((self.setup.refine, &regulariser), self.prior.as_deref());
         let (solved, found) = match solve_refined(sums, request, rule, prior, steps, self.watch) {
             Err(SolveError::Interrupted) => return Ok(None),
             solved => solved?,

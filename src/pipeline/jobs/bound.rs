@@ -63,12 +63,16 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
         value,
         expected: expected.into(),
     };
-    solver.fits(&plan.instrument, maps.len(), "--model")?;
-    if solver.mode != CalibrationMode::Sky || maps.is_empty() {
-        let found = format!("{:?} and {} maps", solver.mode, maps.len());
-        let expected = "\"sky\" and a map for each channel: bounds are of what the sky tells".to_owned();
+    if solver.mode != CalibrationMode::Sky {
+        let found = format!("{:?}", solver.mode).to_lowercase();
+        let expected = "\"sky\": bounds are of what the sky tells; --set calibrate.mode=sky".to_owned();
         return Err(invalid("calibrate.mode", found, expected).into());
     }
+    if maps.is_empty() {
+        let expected = "a HEALPix map of the sky for each channel, here or in calibrate.model_files";
+        return Err(invalid("--model", "(none)".to_owned(), expected.to_owned()).into());
+    }
+    solver.fits(&plan.instrument, maps.len(), "--model")?;
     let Some(&window) = plan.windows.get(pass) else {
         let expected = format!("0 to {}, the passes of the mission", plan.windows.len().saturating_sub(1));
         return Err(invalid("--pass", pass.to_string(), expected).into());

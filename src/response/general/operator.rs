@@ -127,15 +127,14 @@ impl GeneralRows {
         self.products.back(out)
     }
 
-    /// `B x` and `Bt W B x` for several x, W being the rows' weights: [`Self::forward`] and [`Self::adjoint`] with each row
-    /// computed once for both.
+    /// `Bt W B x` for several x, W being the rows' weights: [`Self::forward`] and [`Self::adjoint`] with each row computed once
+    /// for both.
     #[must_use]
-    pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> (Vec<Vec<Complex64>>, Vec<Alm>) {
+    pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> Vec<Alm> {
         let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
         let (count, skies) = (skies.len(), self.products.of(skies));
         let skies = skies.as_slice();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
-        let mut seen = Vec::with_capacity(plan.groups.len());
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
                 memory.with_workspace(|of| {
@@ -163,16 +162,13 @@ impl GeneralRows {
                         self.gradients(number, frames.as_ref(), of, &mut gradients);
                     }
                     self.turn_back(frames.as_ref(), of, &mut gradients);
-                    (seen, gradients)
+                    gradients
                 })
             });
             let parts: Vec<_> = parts.collect();
-            for (values, gradients) in parts {
-                add_to(&mut out, &gradients);
-                seen.push(values);
-            }
+            parts.iter().for_each(|gradients| add_to(&mut out, gradients));
         }
-        (joined(plan, count, seen), self.products.back(out))
+        self.products.back(out)
     }
 
     /// How the frames of the tracks' nodes are combined from a chosen few, if they are.

@@ -1,3 +1,4 @@
+mod coverage;
 mod shared;
 
 use num_complex::Complex64;
