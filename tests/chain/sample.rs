@@ -69,9 +69,9 @@ fn samples_scatter_around_the_map_by_its_errors() {
         let variance =
             |pixel: usize| mean(samples.iter().map(|sample| (sample[pixel] - around[pixel]).powi(2)));
         let drawn = map(&folder, "sigma.fits");
-        for pixel in 0..around.len() {
+        for (pixel, drawn) in drawn.iter().enumerate() {
             // Files hold single precision.
-            assert!((drawn[pixel] / variance(pixel).sqrt() - 1.0).abs() < 1e-3, "{engine}, {pixel}");
+            assert!((drawn / variance(pixel).sqrt() - 1.0).abs() < 1e-3, "{engine}, {pixel}");
         }
         // Of harmonics sigma is that of the blocks scaled by few draws of 121 numbers, to some 10 %: twice that. Of pixels it also has the
         // degrees beyond the map's, which samples have not.

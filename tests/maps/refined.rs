@@ -219,7 +219,7 @@ fn dense_solution(sums: &RefinedSums, l_max: usize, w_max: f64) -> Vec<f64> {
         columns.extend(sums.rows.forward(&sums.plan, &skies));
     }
     // Real and imaginary parts are numbers of their own.
-    let part = |v: Complex64, row: usize| if row % 2 == 0 { v.re } else { v.im };
+    let part = |v: Complex64, row: usize| if row.is_multiple_of(2) { v.re } else { v.im };
     let root = |row: usize| sums.data.weight[row / 2].sqrt();
     let count = 2 * sums.at.len();
     let b = Mat::from_fn(count, unknowns, |row, k| root(row) * part(columns[k][row / 2], row));

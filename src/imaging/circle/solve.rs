@@ -258,12 +258,15 @@ fn solve_with_power(
     })
 }
 
+/// The map of coefficients, K.
+type Synthesis<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
+
 /// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
 fn samples_k(
     covariance: &Covariance<'_>,
     count: usize,
     (whole, factor): (&[f64], f64),
-    map: &dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>,
+    map: Synthesis<'_>,
     watch: NamedWatch<'_>,
 ) -> Result<Vec<Vec<f64>>, SolveError> {
     let mut samples_k = Vec::new();
