@@ -120,9 +120,9 @@ fn errors_hold_of_skies_that_end_where_the_map_does() {
     }
 }
 
-/// What a map leaves out of the sky is in the data all the same, and is taken for its last degrees.
+/// What a map leaves out of the sky is in the data all the same: here little of it, as the last degrees have no more signal than noise.
 #[test]
-fn errors_of_skies_with_more_degrees_hold_but_for_the_last_powers() {
+fn errors_hold_where_the_sky_has_more_degrees_than_the_map() {
     const SKIES: usize = 200;
     let found = coverage(SKIES, SKY_L_MAX);
     eprintln!("{SKIES} skies with more degrees: pixels, monopole, C_l at {DEGREES:?}: {found:.3?}");
