@@ -71,8 +71,8 @@ pub struct Agreement {
     pub chi_square_alone: f64,
     /// With the joint map.
     pub chi_square: f64,
-    /// By how much chi-square rises from the first to the second, in units of the rise that errors of the map alone explain: much more than 1
-    /// where this channel is not of the same sky, or of another scale.
+    /// By how much chi-square rises from the first to the second, a coefficient that the channel's data decide: of the order of 1 where the
+    /// joint map leaves no more than the noise of the channel's own map.
     pub strain: f64,
 }
 
