@@ -38,7 +38,6 @@ fn what_has_no_name_is_not_written_to_a_file_named_dash() {
     let place = Workplace::new(SMALL);
     let file = place.simulate("sent.ccsds", &[]);
     for args in [
-        vec!["simulate", &place.pipeline, "--out", "-"],
         vec!["run", &place.pipeline, "--out", "-"],
         vec!["replay", &file, "--out", "-"],
         vec!["corrupt", &file, "--out", "-"],
@@ -48,6 +47,9 @@ fn what_has_no_name_is_not_written_to_a_file_named_dash() {
         let said = fail(&args);
         assert!(said.contains("./-") || said.contains("--json with --out -"), "{args:?}: {said}");
     }
+    // Only a downlink goes to standard output, with the bytes of the file.
+    let said = lunarray(&["simulate", &place.pipeline, "--out", "-"]);
+    assert!(said.status.success() && said.stdout == std::fs::read(&file).unwrap());
     assert!(!std::path::Path::new("-").exists());
 }
 

@@ -24,7 +24,7 @@ pictures = false
 
 /// Mean rho_l of l = 6 to 10, which 10 MHz alone sees least.
 fn rho(map: &str, sky: &str) -> f64 {
-    let compared = json(&["compare", map, sky, "--json"]);
+    let compared = json(&["compare", map, sky]);
     let rho: Vec<f64> = compared["rho_l"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
     rho[6..=10].iter().sum::<f64>() / 5.0
 }
@@ -35,7 +35,7 @@ fn channels_see_together_what_one_misses() {
     let file = place.simulate("all.ccsds", &[]);
     let (state, alone, joint) = (place.path("state"), place.path("alone"), place.path("joint"));
     succeed(&["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", &alone]);
-    let report = json(&["joint", &state, "--at", "8.5MHz", "--count", "4", "--out", &joint, "--json"]);
+    let report = json(&["joint", &state, "--at", "8.5MHz", "--count", "4", "--out", &joint]);
     let maps: Vec<&Value> = report["maps"].as_array().unwrap().iter().collect();
     let frequencies: Vec<f64> = maps.iter().map(|map| map["frequency_hz"].as_f64().unwrap()).collect();
     assert_eq!(frequencies, [5e6, 7e6, 8.5e6, 10e6]);
@@ -56,7 +56,7 @@ fn channels_see_together_what_one_misses() {
             assert!(map["agreement"].is_null());
         }
         // The error of the mean is of its size: within five of them, and below a tenth.
-        let truth = json(&["compare", &sky, &sky, "--json"])["cl_map"][0].as_f64().unwrap();
+        let truth = json(&["compare", &sky, &sky])["cl_map"][0].as_f64().unwrap();
         let truth = (truth / (4.0 * std::f64::consts::PI)).sqrt();
         let [mean, sigma] = ["mean_k", "mean_sigma_k"].map(|key| map[key].as_f64().unwrap());
         assert!((mean - truth).abs() < 5.0 * sigma && sigma < 0.1 * truth, "{name}: {mean} {sigma} {truth}");

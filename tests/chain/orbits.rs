@@ -233,7 +233,9 @@ fn refinement_hardly_changes_the_map_of_a_circle() {
     let (refined, passes) = map("refined-usual", &["map.refine.passes_max=12"]);
     assert!(none.is_none() && passes.unwrap() <= 2, "{passes:?}");
     let apart = square(&mut fast.iter().zip(&refined).map(|(a, b)| a - b));
-    assert!((apart / square(&mut refined.iter().copied())).sqrt() < 1e-3);
+    let apart = (apart / square(&mut refined.iter().copied())).sqrt();
+    // Iterated to 1e-4 each is some 2e-3 from the end of its own iteration.
+    assert!(apart < 3e-3, "{apart:e}");
 }
 
 /// Tilts of the daughters' antennas, and patterns of their voltages, as flown and as known.

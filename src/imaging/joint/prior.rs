@@ -10,10 +10,16 @@
 //! L says over how many e-foldings of frequency the sky keeps its structure, p which share of its power is each channel's own. A power law
 //! with curvature at every point is of this kind, and so is one that turns over.
 
-use faer::{Mat, Side};
+use faer::linalg::triangular_solve::solve_upper_triangular_in_place;
+use faer::{Mat, Par, Side};
 use serde::Serialize;
 
 use crate::imaging::solver::SolveError;
+
+/// Degrees whose prior is free: mean and dipole.
+pub(super) const FREE: usize = 2;
+/// What stands for no own share: the least that has a Cholesky factor for channels close to each other.
+const OWN_SHARE_OF_FREE: f64 = 1e-6;
 
 /// How alike the sky's structure is at different frequencies.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -61,6 +67,8 @@ pub(super) struct View {
     pub(super) scale: Vec<f64>,
     /// q of each channel; at a degree those of the channels that have it count.
     pub(super) shares: Vec<f64>,
+    /// The same for mean and dipole, no share of which is a channel's own.
+    pub(super) shares_of_free: Vec<f64>,
     /// Variance of `x_lm / s_l` that no channel decides, by degree: 0 at a channel's own frequency.
     pub(super) open: Vec<f64>,
 }
@@ -135,11 +143,13 @@ impl Prior {
 
     /// The map of a channel.
     pub(super) fn view_of(&self, channel: usize) -> View {
+        let shares: Vec<f64> = (0..=channel).map(|of| self.share(channel, of)).collect();
         View {
             frequency_hz: self.frequencies_hz[channel],
             l_max: self.l_max[channel],
             scale: self.scale[channel].clone(),
-            shares: (0..=channel).map(|of| self.share(channel, of)).collect(),
+            shares_of_free: shares.clone(),
+            shares,
             open: vec![0.0; self.l_max[channel] + 1],
         }
     }
@@ -172,16 +182,22 @@ impl Prior {
         let ln = |channel: usize, l: usize| self.scale[channel][l].ln();
         let scale =
             (0..=l_max).map(|l| ((1.0 - share) * ln(below, l) + share * ln(above, l)).exp()).collect();
-        // q = root^-1 rho, step by step.
-        let mut shares: Vec<f64> = Vec::new();
-        for channel in 0..self.channels() {
-            let with = self.likeness.between(self.frequencies_hz[channel], frequency_hz);
-            let known: f64 = shares.iter().enumerate().map(|(of, q)| q * self.share(channel, of)).sum();
-            shares.push((with - known) / self.share(channel, channel));
-        }
-        let open_of = |l| 1.0 - shares.iter().take(self.of_degree(l)).map(|q| q * q).sum::<f64>();
-        let open = (0..=l_max).map(|l| open_of(l).max(0.0)).collect();
-        Ok(View { frequency_hz, l_max, scale, shares, open })
+        let shares = conditional(&self.root, self.likeness, &self.frequencies_hz, frequency_hz);
+        let left = |shares: &[f64]| (1.0 - shares.iter().map(|q| q * q).sum::<f64>()).max(0.0);
+        let smooth = Likeness { own_share: OWN_SHARE_OF_FREE, ..self.likeness };
+        let root = smooth.root(&self.frequencies_hz)?;
+        let of_smooth = conditional(&root, smooth, &self.frequencies_hz, frequency_hz);
+        let of_degree =
+            |l: usize| if l < FREE { left(&of_smooth) } else { left(&shares[..self.of_degree(l)]) };
+        let open = (0..=l_max).map(of_degree).collect();
+        // In terms of these unknowns: q' root^-1 is what each channel's map counts for.
+        let mut counts = Mat::from_fn(of_smooth.len(), 1, |k, _| of_smooth[k]);
+        solve_upper_triangular_in_place(root.as_ref().transpose(), counts.as_mut(), Par::Seq);
+        let of_unknown = |of: usize| {
+            (0..self.channels()).map(|channel| counts[(channel, 0)] * self.share(channel, of)).sum()
+        };
+        let shares_of_free = (0..self.channels()).map(of_unknown).collect();
+        Ok(View { frequency_hz, l_max, scale, shares, shares_of_free, open })
     }
 }
 
@@ -192,7 +208,8 @@ impl View {
         for_each_unknown(self.l_max, &mut |l, m, part| {
             let of_channel =
                 |(of, q): (usize, &f64)| q * u[offsets[of] + place_of(prior.l_max[of], l, m, part)];
-            let sum: f64 = self.shares.iter().enumerate().take(prior.of_degree(l)).map(of_channel).sum();
+            let shares = if l < FREE { &self.shares_of_free } else { &self.shares };
+            let sum: f64 = shares.iter().enumerate().take(prior.of_degree(l)).map(of_channel).sum();
             sky.push(self.scale[l] * sum);
         });
         sky
@@ -205,6 +222,16 @@ impl View {
         self.open.truncate(self.l_max + 1);
         self
     }
+}
+
+/// `q = root^-1 rho`, step by step: what a frequency has of each unknown.
+fn conditional(root: &Mat<f64>, likeness: Likeness, channels_hz: &[f64], frequency_hz: f64) -> Vec<f64> {
+    let mut shares: Vec<f64> = Vec::new();
+    for (channel, channel_hz) in channels_hz.iter().enumerate() {
+        let known: f64 = shares.iter().enumerate().map(|(of, q)| q * root[(channel, of)]).sum();
+        shares.push((likeness.between(*channel_hz, frequency_hz) - known) / root[(channel, channel)]);
+    }
+    shares
 }
 
 /// Degree, order and part of each unknown of a map, in their order.
@@ -287,7 +314,7 @@ mod tests {
         let (r, q) = ((-0.5 * (9.0_f64 / 4.0).ln().powi(2)).exp(), (-0.5 * 1.5_f64.ln().powi(2)).exp());
         // rho' C^-1 rho for rho = (q, q), C = (1 r; r 1).
         let explained = 2.0 * q * q / (1.0 + r);
-        assert!((view.open[1] - (1.0 - explained)).abs() < 1e-12, "{:?}", view.open);
+        assert!((view.open[2] - (1.0 - explained)).abs() < 1e-12, "{:?}", view.open);
         // The geometric mean of 4 and 9 MHz: the scale is that of both channels.
         assert!((view.scale[1] - 2.0_f64.sqrt()).abs() < 1e-12);
         assert!(prior.view_at(3e6).is_err() && prior.view_at(10e6).is_err());

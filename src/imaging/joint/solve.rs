@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::prior::{Likeness, Prior, View};
+use super::prior::{FREE, Likeness, Prior, View};
 use super::spectrum::{Spectra, SpectralMaps};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
 use crate::imaging::circle::{HarmonicSums, NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
@@ -25,8 +25,8 @@ const FINEST: f64 = 1.05;
 /// Bounds of a search: beyond them nothing changes.
 const LENGTH_MAX: f64 = 64.0;
 const OWN_SHARE_RANGE: [f64; 2] = [1e-7, 0.999];
-/// Degrees below which a prior is free, and how many times the power of l = 2 theirs is.
-const FREE_FACTORS: [f64; 2] = [1e6, 1e4];
+/// How many times the power of l = 2 the free priors are.
+const FREE_FACTORS: [f64; FREE] = [1e6, 1e4];
 
 /// A channel's sums.
 pub struct JointChannel {
@@ -317,7 +317,7 @@ impl<'a> Posterior<'a> {
     }
 
     /// Standard deviation of the coefficients of each degree that no channel decides, K sr^(1/2). Mean and dipole have a prior far above any
-    /// sky, so that it is their own size that counts, and they are smooth in frequency: no share of theirs is a channel's own.
+    /// sky, so that it is their own size that counts.
     fn open_sigma(&self, view: &View) -> Vec<f64> {
         let mut sigma: Vec<f64> =
             view.open.iter().zip(&view.scale).map(|(open, s)| s * open.sqrt()).collect();
@@ -325,9 +325,8 @@ impl<'a> Posterior<'a> {
         for (l, x) in degrees(view.l_max).zip(self.seen(view, &self.solution)) {
             square[l] += x * x / (2 * l + 1) as f64;
         }
-        for l in 0..FREE_FACTORS.len().min(sigma.len()) {
-            let open = view.open[l] - self.prior().likeness.own_share;
-            sigma[l] = (open.max(0.0) * square[l]).sqrt();
+        for (l, sigma) in sigma.iter_mut().enumerate().take(FREE) {
+            *sigma = (view.open[l] * square[l]).sqrt();
         }
         sigma
     }
@@ -354,8 +353,9 @@ impl<'a> Posterior<'a> {
         let map_k = synthesis(&coefficients(&sky, view.l_max), nside)?;
         let factors = Factors::new(&self.blocks, &unit_regularisation(self.prior()));
         let row = |channel: usize, l: usize| {
-            let is_of = l <= view.l_max && channel < view.shares.len();
-            if is_of { ratio[l].sqrt() * view.scale[l] * view.shares[channel] } else { 0.0 }
+            let shares = if l < FREE { &view.shares_of_free } else { &view.shares };
+            let is_of = l <= view.l_max && channel < shares.len();
+            if is_of { ratio[l].sqrt() * view.scale[l] * shares[channel] } else { 0.0 }
         };
         let open: Vec<f64> = self.open_sigma(view).iter().map(|sigma| sigma * sigma).collect();
         let sigma_k = view_sigma_k(&self.blocks, &factors, &row, &open, nside);
