@@ -107,8 +107,14 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
     }
     let mut known = metrics_in(&text);
     let collector = ours("src/serve/collector.rs");
-    for (name, unit) in [("solver_residual", "ratios"), ("solver_target", "ratios"), ("solver_iteration", "")]
-    {
+    // Those of the solver, and of a ground that takes datagrams.
+    let elsewhere = [
+        ("solver_residual", "ratios"),
+        ("solver_target", "ratios"),
+        ("solver_iteration", ""),
+        ("datagrams", "total"),
+    ];
+    for (name, unit) in elsewhere {
         assert!(collector.contains(&format!("\"{name}\"")));
         known.insert(format!("lunarray_{name}_{unit}").trim_end_matches('_').to_owned());
     }
