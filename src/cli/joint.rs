@@ -11,7 +11,7 @@ use crate::files::write_atomically;
 use crate::imaging::SolveWatch;
 use crate::imaging::joint::{Agreement, JointMap, JointRequest, JointSolution, Likeness, SpectralMaps};
 use crate::pipeline::{solve_states_jointly, use_threads};
-use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
+use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, View, draw_map};
 use crate::sky::Frame;
 use crate::sky::fits::{Card, Column, WriteOptions, write_columns};
 use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
