@@ -139,8 +139,8 @@ fn write_map(folder: &Path, map: &JointMap) -> Result<MapReport, CommandError> {
         unit: "K".to_owned(),
     };
     let subtitle = format!("mean ({mean_k:.4e} +- {:.1e}) K", map.mean_sigma_k);
-    draw_map(&panel, &subtitle, &View::of(Frame::Galactic, Frame::Ecliptic))?
-        .write(&folder.join("map.png"))?;
+    let view = View { sampling: Sampling::Interpolated, ..View::of(Frame::Galactic, Frame::Ecliptic) };
+    draw_map(&panel, &subtitle, &view)?.write(&folder.join("map.png"))?;
     Ok(MapReport {
         frequency_hz: map.frequency_hz,
         folder: folder.display().to_string(),
