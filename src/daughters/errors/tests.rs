@@ -227,6 +227,7 @@ fn everything_wrong_with_the_section_is_said() {
         "phase_deg.constant",
         "phase_deg.pass_rms",
         "phase_deg.drift_time_s",
+        "tilt_along_deg.constant_rms",
         "pattern.step_rms",
         "tilt_along_deg",
         "clock_allan_deviation",

@@ -201,7 +201,7 @@ mod tests {
     #[test]
     fn as_many_channels_as_memory_holds_are_a_group() {
         // Half of a symmetric matrix of 49152 pixels, 9.7 GB a channel.
-        let fine = ["map.nside=64", "map.snapshot_every_s=0"];
+        let fine = ["map.nside=64", "map.snapshot_every_s=0", "map.engine=pixel"];
         let automatic = |limit_gb| planned(GroupSize::Automatic, limit_gb, &fine);
         assert_eq!(automatic(1000).unwrap(), [vec![0, 1, 2, 3, 4]]);
         assert_eq!(automatic(24).unwrap(), [vec![0, 1], vec![2, 3], vec![4]]);
