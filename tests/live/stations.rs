@@ -161,10 +161,10 @@ fn places_that_cannot_be_are_told() {
     let place = Place::new();
     let out = place.path("out");
     let listen = |url: &str| complaint(&["replay", "--listen", url, "--out", &out]);
-    for url in ["127.0.0.1:1", "tcp://::1:5", "tcp://host", "udp://127.0.0.1:1"] {
+    for url in ["127.0.0.1:1", "tcp://::1:5", "tcp://host", "sctp://127.0.0.1:1"] {
         assert!(listen(url).contains("expected tcp://HOST:PORT"), "{url}");
     }
-    for url in ["tcp://0.0.0.0:0", "tcp://[::]:0"] {
+    for url in ["tcp://0.0.0.0:0", "tcp://[::]:0", "udp://0.0.0.0:0"] {
         assert!(listen(url).contains("--allow-remote"), "{url}");
     }
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
