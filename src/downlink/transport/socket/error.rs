@@ -27,12 +27,12 @@ pub enum SocketError {
     },
     /// Other machines can reach the address.
     #[error(
-        "{url}: other machines may reach this address, and whoever connects can add to the maps; expected \
+        "{address}: other machines may reach this address, and whoever connects can add to the maps; expected \
          127.0.0.1, [::1] or localhost, or --allow-remote"
     )]
     Remote {
-        /// The URL.
-        url: String,
+        /// Host and port.
+        address: String,
     },
     /// The address cannot be bound.
     #[error("cannot listen on {url}: {source}")]

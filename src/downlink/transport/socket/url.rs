@@ -66,7 +66,10 @@ impl TcpUrl {
         let found = self.addresses()?;
         match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {
             true => Ok(found),
-            false => Err(SocketError::Remote { url: self.to_string() }),
+            // Of either protocol.
+            false => {
+                Err(SocketError::Remote { address: self.to_string().trim_start_matches("tcp://").to_owned() })
+            }
         }
     }
 }
