@@ -25,7 +25,7 @@ pictures = false
 /// Mean rho_l of l = 6 to 10, which 10 MHz alone sees least.
 fn rho(map: &str, sky: &str) -> f64 {
     let compared = json(&["compare", map, sky]);
-    let rho: Vec<f64> = compared["rho_l"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
+    let rho: Vec<f64> = compared["rho"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
     rho[6..=10].iter().sum::<f64>() / 5.0
 }
 
