@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::arguments::{StateMapArgs, frequency_hz, output_path};
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
+use super::progress::while_solving;
 use crate::files::write_atomically;
 use crate::imaging::SolveWatch;
 use crate::imaging::joint::{Agreement, JointMap, JointRequest, JointSolution, Likeness, SpectralMaps};
@@ -83,8 +84,11 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     if let Some((_, config)) = states.first() {
         use_threads(&config.runtime)?;
     }
+    // What cannot be written is told before the work of minutes.
+    std::fs::create_dir_all(&args.out).map_err(|error| format!("{}: {error}", args.out.display()))?;
     let request = |rule| JointRequest { rule, samples: args.count as usize, at_hz: args.at.clone() };
-    let solved = solve_states_jointly(&states, &request, &SolveWatch::default())?;
+    let watch = SolveWatch::default();
+    let solved = while_solving(&watch, || solve_states_jointly(&states, &request, &watch))?;
     let report = write(&args.out, &solved)?;
     if args.json {
         print_json_line(&report)?;
@@ -99,12 +103,10 @@ fn write(out: &Path, solved: &JointSolution) -> Result<Report, CommandError> {
     for map in &solved.maps {
         let folder = out.join(format!("{:.3}MHz", map.frequency_hz / 1e6));
         std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        maps.push(write_map(&folder, map)?);
+        maps.push(write_map(&folder, map, solved.convergence.converged)?);
     }
     let spectra = out.join("spectra.fits");
-    if let Some(found) = &solved.spectra {
-        write_spectra(&spectra, found)?;
-    }
+    write_spectra(&spectra, &solved.spectra)?;
     let report = Report {
         likeness: solved.likeness,
         iterations: solved.convergence.iterations,
@@ -119,7 +121,7 @@ fn write(out: &Path, solved: &JointSolution) -> Result<Report, CommandError> {
     Ok(report)
 }
 
-fn write_map(folder: &Path, map: &JointMap) -> Result<MapReport, CommandError> {
+fn write_map(folder: &Path, map: &JointMap, converged: bool) -> Result<MapReport, CommandError> {
     let columns = [
         Column { name: "TEMPERATURE", unit: "K", values: &map.map_k },
         Column { name: "SIGMA", unit: "K", values: &map.sigma_k },
@@ -127,6 +129,7 @@ fn write_map(folder: &Path, map: &JointMap) -> Result<MapReport, CommandError> {
     let cards = vec![
         Card::real("FREQ", map.frequency_hz, "Hz"),
         Card::text("WHAT", "joint map of several channels", "posterior mean and standard deviation"),
+        Card::logical("CONVERGD", converged, "the iteration reached map.residual_max"),
     ];
     let options = WriteOptions { cards, ..WriteOptions::default() };
     write_columns(&folder.join("map.fits"), Frame::Ecliptic, &columns, &options)?;
@@ -138,7 +141,8 @@ fn write_map(folder: &Path, map: &JointMap) -> Result<MapReport, CommandError> {
         scale: ColourScale::robust(&map.map_k, Scaling::Log, Palette::default()),
         unit: "K".to_owned(),
     };
-    let subtitle = format!("mean ({mean_k:.4e} +- {:.1e}) K", map.mean_sigma_k);
+    let ending = if converged { "" } else { "; not converged" };
+    let subtitle = format!("mean ({mean_k:.4e} +- {:.1e}) K{ending}", map.mean_sigma_k);
     let view = View { sampling: Sampling::Interpolated, ..View::of(Frame::Galactic, Frame::Ecliptic) };
     draw_map(&panel, &subtitle, &view)?.write(&folder.join("map.png"))?;
     Ok(MapReport {

@@ -4,7 +4,7 @@
 //!
 //! A folder holds one map method, its sums and their solution: `pixel` forms the matrix itself (or makes its rows again for each product);
 //! [`circle`] holds what makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines
-//! its maps with rows at the true positions. `exact` is what they share to sum: integers, whose bits depend on the visibilities in them alone,
+//! its maps with rows at the true positions; `joint` solves for several channels of its sums together. `exact` is what they share to sum: integers, whose bits depend on the visibilities in them alone,
 //! and the format of checkpoints. `solver` is what they share to solve: conjugate gradients, eigenvalues, traces. `stage` holds the two stages of the
 //! pipeline, [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 

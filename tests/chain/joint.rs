@@ -64,4 +64,11 @@ fn channels_see_together_what_one_misses() {
     assert!(std::fs::metadata(format!("{joint}/spectra.fits")).unwrap().len() > 0);
     let said = fail(&["joint", &state, "--at", "12MHz", "--out", &place.path("beyond")]);
     assert!(said.contains("between 5.000 and 10.000 MHz"), "{said}");
+    // An iteration that may not go on says so, where people and where programs look.
+    let (short, cut) = (place.path("cut"), ["--set", "map.iterations_max=1", "--count", "2", "--out"]);
+    let said = succeed(&[&["joint", &state], &cut[..], &[&short]].concat());
+    assert!(said.contains("not converged"), "{said}");
+    let header = std::fs::read(format!("{short}/10.000MHz/map.fits")).unwrap();
+    let header = String::from_utf8_lossy(&header[..8640]).into_owned();
+    assert!(header.contains("CONVERGD=                    F"), "{header}");
 }

@@ -83,8 +83,8 @@ pub struct JointSolution {
     pub likeness: Likeness,
     /// Maps of the channels and between them, by rising frequency.
     pub maps: Vec<JointMap>,
-    /// Spectral index and curvature of every pixel; with two channels or more.
-    pub spectra: Option<SpectralMaps>,
+    /// Spectral index and curvature of every pixel.
+    pub spectra: SpectralMaps,
     /// How the iteration ended.
     pub convergence: Convergence,
 }
@@ -120,6 +120,11 @@ pub fn solve_jointly(
     frequencies_hz.dedup();
     if frequencies_hz.len() < 2 || frequencies_hz.len() < channels.len() {
         return Err(SolveError::FewChannels { channels: channels.len(), frequencies: frequencies_hz.len() });
+    }
+    // Before the work of minutes.
+    let ends_hz = [frequencies_hz[0], frequencies_hz[frequencies_hz.len() - 1]];
+    if let Some(&frequency_hz) = request.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
+        return Err(SolveError::BeyondChannels { frequency_hz, ends_hz });
     }
     let sums: Vec<&HarmonicSums> = channels.iter().map(|channel| &*channel.sums).collect();
     let order_blocks: Vec<_> = sums.iter().map(|sums| sums.order_blocks()).collect();
@@ -162,7 +167,7 @@ pub fn solve_jointly(
     let spectra = posterior.spectra(&views[..prior.channels()], nside)?;
     maps.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     maps.dedup_by(|a, b| a.frequency_hz == b.frequency_hz);
-    Ok(JointSolution { likeness, maps, spectra: Some(spectra), convergence: posterior.convergence })
+    Ok(JointSolution { likeness, maps, spectra, convergence: posterior.convergence })
 }
 
 impl Alone {
