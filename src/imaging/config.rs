@@ -13,6 +13,7 @@ use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
+use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::sky::{Frame, TEMPERATURE_K_MAX};
@@ -456,15 +457,19 @@ impl MapConfig {
     }
 
     /// What the rows of a refined map are made with.
-    #[must_use]
+    ///
+    /// # Errors
+    /// Files of antennas that cannot be used.
     #[doc(hidden)]
-    pub fn assumed(&self) -> AssumedInstrument {
-        let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
-        AssumedInstrument {
+    pub fn assumed(&self) -> Result<AssumedInstrument, MeasuredAntennasError> {
+        let AntennasConfig { pattern_by_frequency, files, .. } = &self.antennas;
+        Ok(AssumedInstrument {
             smear_integrations: self.refine.smear_integrations,
             antennas: self.antennas.assumed(),
             patterns: pattern_by_frequency.clone(),
-        }
+            measured: MeasuredAntennas::read(files)?,
+            ..AssumedInstrument::default()
+        })
     }
 
     /// Longest baseline used at a frequency, m.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::response::MeasuredAntennasError;
 use crate::response::general::RowsRefusal;
 use crate::response::pixel::ResponseError;
 use crate::units::{ChannelId, Dimension, InvalidValue};
@@ -85,6 +86,9 @@ pub enum AccumulationError {
     /// Positions without a row of B.
     #[error("a visibility has no row of the beam matrix: {0}")]
     Rows(RowsRefusal),
+    /// Antennas that files do not say.
+    #[error("map.antennas.files: {0}")]
+    Antennas(#[from] MeasuredAntennasError),
     /// More visibilities than may be held for refinement.
     #[error(
         "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \

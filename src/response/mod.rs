@@ -10,21 +10,27 @@
 //! | [`general`] | the same for satellites at any positions |
 //! | [`beacon`] | an artificial signal |
 //! | [`model`] | visibilities of a given sky, by either of the two |
-//! | [`PatternsByFrequency`] | how antennas' patterns change with frequency |
+//! | [`PatternsByFrequency`], [`MeasuredAntennas`] | antennas' patterns by frequency; attitudes and patterns by files |
 //!
 //! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
 //! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
 
+mod antenna_tables;
 #[doc(hidden)]
 pub mod beacon;
 #[doc(hidden)]
 pub mod general;
 #[doc(hidden)]
 pub mod harmonic;
+mod measured_antennas;
 #[doc(hidden)]
 pub mod model;
 mod patterns_by_frequency;
 pub mod pixel;
 
+#[doc(hidden)]
+pub use antenna_tables::{AntennaTables, FittedDipole, TableError};
+#[doc(hidden)]
+pub use measured_antennas::{AntennaFiles, AntennaOf, MeasuredAntennas, MeasuredAntennasError};
 #[doc(hidden)]
 pub use patterns_by_frequency::PatternsByFrequency;

@@ -333,6 +333,11 @@ impl Stage for Solver {
             return Ok(());
         }
         let beam_pixels = if is_final { setup.beam_pixels(nside) } else { Vec::new() };
+        let assumed = AssumedInstrument {
+            satellites: instrument.satellites.into(),
+            epoch_tai_s: instrument.epoch_tai_s,
+            ..setup.assumed.clone()
+        };
         let request = Request { setup, channel, nside, is_final, epsilon, prior, beam_pixels, watch };
         let regulariser = setup.regulariser(index);
         let solved = match sums {
@@ -340,7 +345,7 @@ impl Stage for Solver {
             SnapshotSums::Pixel(sums) => request.pixels(sums),
             SnapshotSums::Harmonic(sums) => request.harmonics(&sums, regulariser, last),
             SnapshotSums::MatrixFree(visibilities) => request.matrix_free(&visibilities.into_sums()?, last),
-            SnapshotSums::Refined(archive) => request.refined(&archive.into_sums(&setup.assumed)?, &data),
+            SnapshotSums::Refined(archive) => request.refined(&archive.into_sums(&assumed)?, &data),
         };
         let Some(solved) = solved? else { return Ok(()) };
         let Solved { map_k, noise_k, diagnostics, beams, refinement, uncertainty } = solved;

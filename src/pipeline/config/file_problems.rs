@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::plan::Plan;
 use super::problems::Problems;
 use super::sections::Config;
-use crate::imaging::Regulariser;
+use crate::imaging::{AccumulationError, Regulariser};
 use crate::sky::fits::{
     FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
@@ -48,6 +48,12 @@ impl Plan {
             found.push(|| problem);
         }
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {
+            found.push(|| problem);
+        }
+        if let Err(problem) = self.antenna_errors() {
+            found.push(|| problem);
+        }
+        if let Err(problem) = self.config.map.assumed().map_err(AccumulationError::from) {
             found.push(|| problem);
         }
         if let Err(problem) = self.config.calibration.build(Path::new("")) {
@@ -103,7 +109,9 @@ impl Config {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
         let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
         let maps = self.map.prior_files.iter().chain(self.map.power_files());
-        let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file).cloned();
+        let antennas = self.map.antennas.files.paths().chain(self.instrument.antenna_files.paths());
+        let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file);
+        let others = others.chain(antennas).cloned();
         skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
     }
 }

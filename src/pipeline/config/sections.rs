@@ -229,13 +229,14 @@ impl Config {
             ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
         ] {
             let expected = format!(
-                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern or pattern_by_frequency"
+                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern, pattern_by_frequency or antenna_files"
             );
             checks.require(key, value, good, expected);
         }
         // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
-        let upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
-        let expected = "0 with instrument.tilt_radial_deg";
+        let leans = !self.instrument.tilt_radial_deg.is_none() || self.instrument.antenna_files.is_some();
+        let upright = spacecraft.moon_reflection == 0.0 || !leans;
+        let expected = "0 with instrument.tilt_radial_deg or antenna_files";
         checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, upright, expected);
     }
 
@@ -291,12 +292,14 @@ impl Config {
         if let Some(added) = &mut sky.added {
             added.catalogue = added.catalogue.as_deref().map(contents);
         }
+        let mut instrument = instrument.clone();
+        instrument.antenna_files = instrument.antenna_files.map_paths(|path| contents(path));
         let daughters = HashedDaughters::of(daughters);
         // Data of an ideal instrument are those of before there were errors, byte for byte.
         match (instrument.is_on(), navigation.is_on()) {
             (false, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft)),
-            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument)),
-            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument, navigation)),
+            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, &instrument)),
+            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, &instrument, navigation)),
         }
     }
 
@@ -308,6 +311,7 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(contents);
         map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
+        map.antennas.files = map.antennas.files.map_paths(|path| contents(path));
         if let Some(RegulariserChoice::File(files)) = &mut map.regulariser {
             files.iter_mut().for_each(|path| *path = contents(path));
         }

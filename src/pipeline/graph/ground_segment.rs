@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 
 use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
-use crate::imaging::MapConfig;
 use crate::imaging::anywhere::RefineRule;
+use crate::imaging::{AccumulationError, MapConfig};
 use crate::imaging::{
     Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
 };
@@ -41,7 +41,7 @@ impl Config {
     /// Setup of the solver, which `watch` follows.
     ///
     /// # Errors
-    /// Prior maps and tables of power that cannot be read.
+    /// Prior maps, tables of power and files of antennas that cannot be read.
     #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
@@ -54,7 +54,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
-            assumed: map.assumed(),
+            assumed: map.assumed().map_err(AccumulationError::from)?,
             passes: None,
             trace_probes: map.trace_probes,
             samples: 0,
