@@ -73,9 +73,8 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
 
 /// All keys as a page of Markdown: those for every day first, then all others, section by section.
 fn page_of(all: &[KeyDescription]) -> String {
-    let mut page = "# All keys\n\nEvery key of a pipeline file with its default, as `lunarray explain` has them: a file names only those \
-                    that it changes. First those for every day, then all others. This page is written by `lunarray explain --markdown`.\n\n\
-                    ## For every day\n"
+    let mut page = "# All keys\n\nEvery key of a pipeline file with its default; a file names only those that it changes. Units stand at \
+                    the end of names. Written by `lunarray explain --markdown`.\n\n## For every day\n"
         .to_owned();
     page.push_str(TABLE);
     for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
@@ -91,22 +90,23 @@ fn page_of(all: &[KeyDescription]) -> String {
             .filter_map(|described| Some((described.key.strip_prefix(&inside)?, described)))
             .filter(|(name, _)| !name.contains('.'))
             .collect();
-        page.push_str(&format!(
-            "\n### {}\n\n{}{}\n",
-            section.key,
-            in_a_cell(&section.about),
-            condition_of(section)
-        ));
         let names: Vec<String> =
             rows.iter().map(|(name, described)| format!("{name} {}", described.about)).collect();
-        match told.iter().find(|(_, others)| *others == names && names.len() > 1) {
-            Some((first, _)) => page.push_str(&format!("\nKeys as in {first}.\n")),
-            None if rows.is_empty() => {}
-            None => {
-                page.push_str(TABLE);
-                rows.iter().for_each(|(name, described)| put_row(&mut page, name, described, Some(section)));
-                told.push((section.key.clone(), names));
-            }
+        let (key, about) = (&section.key, in_a_cell(&section.about));
+        if let Some((first, _)) = told.iter().find(|(_, others)| *others == names && names.len() > 1) {
+            let condition = condition_of(section);
+            page.push_str(&format!("\n- `{key}`, with the keys of `{first}`: {about}{condition}\n"));
+            continue;
+        }
+        // A condition that all keys share is told once.
+        let shared = rows.first().map(|(_, first)| *first);
+        let shared = shared.filter(|first| rows.iter().all(|(_, row)| row.only_with == first.only_with));
+        let head = shared.unwrap_or(section);
+        page.push_str(&format!("\n### {key}\n\n{about}{}\n", condition_of(head)));
+        if !rows.is_empty() {
+            page.push_str(TABLE);
+            rows.iter().for_each(|(name, described)| put_row(&mut page, name, described, Some(head)));
+            told.push((section.key.clone(), names));
         }
     }
     page
@@ -114,11 +114,11 @@ fn page_of(all: &[KeyDescription]) -> String {
 
 const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
 
-/// A row of a table; what the heading of its section says of its condition is not said again.
-fn put_row(page: &mut String, name: &str, described: &KeyDescription, section: Option<&KeyDescription>) {
+/// A row of a table. A condition that stands above the table is left out.
+fn put_row(page: &mut String, name: &str, described: &KeyDescription, head: Option<&KeyDescription>) {
     let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
     let about = in_a_cell(&described.about);
-    let said = section.is_some_and(|section| section.only_with == described.only_with);
+    let said = head.is_some_and(|head| head.only_with == described.only_with);
     let condition = if said { String::new() } else { condition_of(described) };
     page.push_str(&format!("| `{name}` | {default} | {about}{condition} |\n"));
 }
