@@ -73,7 +73,7 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
 
 /// All keys as a page of Markdown: those for every day first, then all others, section by section.
 fn page_of(all: &[KeyDescription]) -> String {
-    let mut page = "# All keys\n\nEvery key of a pipeline file with its default; a file names only those that it changes. Units stand at \
+    let mut page = "# All keys\n\nEvery key of a pipeline file with its default, if it has one; a file names only those that it changes. Units stand at \
                     the end of names. Written by `lunarray explain --markdown`.\n\n## For every day\n"
         .to_owned();
     page.push_str(TABLE);
@@ -112,15 +112,15 @@ fn page_of(all: &[KeyDescription]) -> String {
     page
 }
 
-const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
+const TABLE: &str = "\n| key | |\n|---|---|\n";
 
 /// A row of a table. A condition that stands above the table is left out.
 fn put_row(page: &mut String, name: &str, described: &KeyDescription, head: Option<&KeyDescription>) {
-    let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
+    let default = described.default.as_ref().map_or_else(String::new, |text| format!(" = {text}"));
     let about = in_a_cell(&described.about);
     let said = head.is_some_and(|head| head.only_with == described.only_with);
     let condition = if said { String::new() } else { condition_of(described) };
-    page.push_str(&format!("| `{name}` | {default} | {about}{condition} |\n"));
+    page.push_str(&format!("| `{name}{default}` | {about}{condition} |\n"));
 }
 
 /// Its own condition: the last of the list.
