@@ -8,9 +8,8 @@ use crate::units::echo;
 
 /// Explain keys of pipeline files: their defaults, units and meaning.
 ///
-/// Takes whole keys (map.epsilon), sections (map), or a part of a name (epsilon), which finds all keys that contain it, or else
-/// all whose explanation does (regularisation).
-/// Without one it lists the sections.
+/// Takes keys (map.epsilon), sections (map), or a word (epsilon): it finds all keys whose names contain it, or else all whose
+/// explanation does. Without one it lists the sections.
 ///
 /// Example: lunarray explain map.epsilon
 #[derive(Debug, Args)]
@@ -118,10 +117,8 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 
 /// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.
 ///
-/// Without options these are the everyday keys with their defaults, units and meanings; --all adds those for experts. A pipeline
-/// file needs only the keys that it changes. The quicklook is what `lunarray run` runs without a file. The reference has the keys for
-/// experts as comments. The schema of summary.json (JSON Schema 2020-12) names all its
-/// fields.
+/// Without options it prints the everyday keys with their defaults and meanings; --all adds those for experts. A pipeline file
+/// needs only the keys that it changes.
 ///
 /// Example: lunarray config --print quicklook > my.toml
 #[derive(Debug, Args)]
