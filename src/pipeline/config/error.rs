@@ -21,9 +21,9 @@ pub enum PipelineError {
     /// The array.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// Files of antennas.
-    #[error("instrument.antenna_files: {0}")]
-    Antennas(#[from] MeasuredAntennasError),
+    /// Files of antennas, which a section names.
+    #[error("{0}: {1}")]
+    Antennas(&'static str, MeasuredAntennasError),
     /// A map of the simulated sky or a prior map.
     #[error(transparent)]
     Map(#[from] MapError),

@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::error::PipelineError;
 use super::plan::Plan;
 use super::problems::Problems;
 use super::sections::Config;
-use crate::imaging::{AccumulationError, Regulariser};
+use crate::imaging::Regulariser;
 use crate::sky::fits::{
     FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
@@ -53,8 +54,8 @@ impl Plan {
         if let Err(problem) = self.antenna_errors() {
             found.push(|| problem);
         }
-        if let Err(problem) = self.config.map.assumed().map_err(AccumulationError::from) {
-            found.push(|| problem);
+        if let Err(error) = self.config.map.assumed() {
+            found.push(|| PipelineError::Antennas("map.antennas.files", error));
         }
         if let Err(problem) = self.config.calibration.build(Path::new("")) {
             found.push(|| problem);

@@ -8,7 +8,7 @@ use crate::array::Array;
 use crate::daughters::{AntennaErrors, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule};
-use crate::response::MeasuredAntennas;
+use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
@@ -114,19 +114,26 @@ impl Plan {
     pub fn antenna_errors(&self) -> Result<Option<Arc<AntennaErrors>>, PipelineError> {
         let Some(errors) = self.instrument_errors() else { return Ok(None) };
         let Instrument { response, epoch_tai_s, .. } = self.instrument;
+        let measured = self.measured_antennas();
+        let measured =
+            measured.map_err(|error| PipelineError::Antennas("instrument.antenna_files", error))?;
+        let (array, measured) = (Arc::clone(&self.array), (measured, epoch_tai_s));
+        Ok(AntennaErrors::new(&errors, array, &self.windows, response, measured))
+    }
+
+    /// Antennas as the instrument's files say they are, in all channels and windows.
+    fn measured_antennas(&self) -> Result<MeasuredAntennas, MeasuredAntennasError> {
+        let Instrument { response, epoch_tai_s, .. } = self.instrument;
         let measured = MeasuredAntennas::read(&self.config.instrument.antenna_files)?;
         for channel in &self.instrument.channels {
             measured.require(self.array.satellites(), response, channel.frequency_hz)?;
         }
         for satellite in 0..self.array.satellites() {
-            for window in &self.windows {
-                for end in [window.start, window.end] {
-                    measured.require_attitude(satellite, epoch_tai_s + end.seconds())?;
-                }
+            for end in self.windows.iter().flat_map(|window| [window.start, window.end]) {
+                measured.require_attitude(satellite, epoch_tai_s + end.seconds())?;
             }
         }
-        let (array, measured) = (Arc::clone(&self.array), (measured, epoch_tai_s));
-        Ok(AntennaErrors::new(&errors, array, &self.windows, response, measured))
+        Ok(measured)
     }
 
     /// The true errors in every pass as a table (CSV); `None` if there are none.

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 
 use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
+use crate::imaging::MapConfig;
 use crate::imaging::anywhere::RefineRule;
-use crate::imaging::{AccumulationError, MapConfig};
 use crate::imaging::{
     Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
 };
@@ -54,7 +54,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
-            assumed: map.assumed().map_err(AccumulationError::from)?,
+            assumed: map.assumed().map_err(|error| PipelineError::Antennas("map.antennas.files", error))?,
             passes: None,
             trace_probes: map.trace_probes,
             samples: 0,
