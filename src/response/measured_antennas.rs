@@ -13,16 +13,15 @@ use crate::units::vector::{Vec3, cross, scale};
 use crate::units::{Checks, keys};
 
 keys! {
-    /// Files of antennas. The dipole (the first of three) is along the body's z axis, the second along x, the third along y; where no
-    /// attitudes are given z is along the orbit's normal and x along the track.
+    /// Files of antennas.
     pub struct AntennaFiles {
-        /// Attitudes: CCSDS AEM files (KVN or XML, also compressed by gzip) of quaternions. Their objects are the daughters, in the order in
-        /// which they appear.
+        /// Attitudes: CCSDS AEM files (KVN or XML, also gzip) of quaternions; their objects are the daughters, in order of
+        /// appearance. The (first) dipole is along the body's z axis, the second along x, the third along y.
         expert attitudes: Vec<PathBuf> = Vec::new();
-        /// Patterns: tables (CSV) of gain or fields by frequency and direction on the body's axes, one for all daughters or one a
-        /// daughter. They are fitted by an effective axis and a factor of degree 2; overall factors are left to gains.
+        /// Patterns: tables (CSV) of gain or fields by frequency and direction on the body's axes, one for all daughters or one
+        /// each.
         expert tables: Vec<PathBuf> = Vec::new();
-        /// Greatest part of a table that its fit may leave, root mean square over directions: of fields, or of the gain.
+        /// Maximum part of a table that the fit of an effective axis and a form of degree 2 may leave, rms over directions.
         expert table_error_max: f64 = 0.02;
     }
 }

@@ -3,6 +3,7 @@
 use super::config::{CalibrationMode, SolverConfig};
 use super::model::{KnownSignal, Offsets};
 use super::positions::{Search, modelled};
+use super::smooth::smooth;
 use super::solution::{PassData, PassSolution, solve_from, solve_pass_in_parts};
 use super::sums::ModelledBlock;
 use crate::array::{Ephemeris, orbit_normal_hat};
@@ -172,6 +173,7 @@ impl Task<'_> {
                 break;
             }
         }
+        smooth(&mut solutions);
         if let Some(sought) = sought {
             solutions
                 .iter_mut()

@@ -228,7 +228,7 @@ impl CheckedFit {
             && found.converged
             && config.unexplained_max < 1.0
             && is_contradicted(layout, found, &fitted.used());
-        let judge = VerdictInputs { config, fitted, counts, unexplained, excess };
+        let judge = VerdictInputs { config, fitted, counts, unexplained, excess, model_error };
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],

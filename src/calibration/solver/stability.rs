@@ -46,8 +46,12 @@ pub(super) struct Residuals {
 pub(super) struct Excess {
     /// Of the change within the interval.
     pub(super) scatter: [f64; 2],
-    /// Of either, by errors of the model.
+    /// Of either, by errors of the model that are seen to stay.
     pub(super) model: f64,
+    /// The same by as much as may stay unseen in noise.
+    pub(super) model_unseen: f64,
+    /// Of either, by a model whose errors have the power of the signal.
+    pub(super) model_whole: f64,
 }
 
 /// Part of the visibilities of an instant that are outliers when something else is wrong than a gain.
@@ -170,14 +174,22 @@ impl Residuals {
                 });
                 // Of either part; an error of the model stays for the pass and is another one for each pair.
                 let share = if sum > 0.0 { square / (sum * sum) } else { 0.0 };
-                excess[channel * self.satellites + daughter].model = 0.5 * most * share;
+                let excess = &mut excess[channel * self.satellites + daughter];
+                excess.model = 0.5 * most * share;
+                excess.model_unseen = 0.5 * self.model_parts(channel, Some(daughter))[1] * share;
+                excess.model_whole = 0.5 * share;
             }
         }
         (excess, parts)
     }
 
-    /// Part of the signal, of all or of one daughter's pairs, that is left beyond noise.
+    /// Part of the signal, of all or of one daughter's pairs, that is left beyond noise; 0 where it may be noise.
     fn model_part(&self, channel: usize, daughter: Option<usize>) -> f64 {
+        self.model_parts(channel, daughter)[0]
+    }
+
+    /// [`Self::model_part`], and as much as noise may hide.
+    fn model_parts(&self, channel: usize, daughter: Option<usize>) -> [f64; 2] {
         let own: Vec<&PairResiduals> = self.pairs.iter().filter(|pair| pair.channel == channel).collect();
         let mut present = vec![false; self.satellites];
         own.iter().flat_map(|pair| pair.of).for_each(|n| present[n] = true);
@@ -198,10 +210,18 @@ impl Residuals {
             // Gains are solved for: residuals of noise have less than its variance.
             let freedom: f64 = (1.0 - (2.0 * gains - 1.0) / f64::max(all, 1.0)).max(0.0);
             let beyond = square - count * freedom;
-            let is_seen = beyond > SIGNIFICANT * (2.0 * count).sqrt();
-            if is_seen && information > 0.0 { beyond / information } else { 0.0 }
+            let noise = SIGNIFICANT * (2.0 * count).sqrt();
+            if information > 0.0 {
+                [
+                    if beyond > noise { beyond / information } else { 0.0 },
+                    (beyond + noise).max(0.0) / information,
+                ]
+            } else {
+                [0.0; 2]
+            }
         };
-        MODEL_SCALES.into_iter().map(part).fold(0.0, f64::max)
+        let parts = MODEL_SCALES.map(part);
+        [0, 1].map(|k| parts.iter().map(|part| part[k]).fold(0.0, f64::max))
     }
 
     /// The daughter, with the channels, whose gain jumps rather than drifts; the one with the largest jump. Those of `drifting` do not

@@ -24,6 +24,8 @@ pub(super) struct VerdictInputs<'a> {
     /// By channel, then daughter.
     pub(super) unexplained: &'a [f64],
     pub(super) excess: &'a [Excess],
+    /// Part of the signal that errors of the model are, by channel.
+    pub(super) model_error: &'a [f64],
 }
 
 /// A standard deviation (rad) of noise that holds phases, too.
@@ -72,7 +74,15 @@ impl VerdictInputs<'_> {
         }
         let mut parts = self.unexplained[c * n..(c + 1) * n].to_vec();
         parts.sort_unstable_by(f64::total_cmp);
-        0.25 * parts.get(n / 2).copied().unwrap_or(0.0)
+        // All pairs show together what is noise in those of most daughters.
+        0.25 * parts.get(n / 2).copied().unwrap_or(0.0).max(self.model_error[c])
+    }
+
+    /// Variance of a gain's logarithm by errors of the model: those that are seen to stay for the interval; where the daughter's
+    /// residuals show any, as much of them as may stay unseen.
+    fn model(&self, k: usize) -> f64 {
+        let Excess { model, model_unseen, model_whole, .. } = self.excess[k];
+        model.max(model_unseen.min(self.unexplained[k] * model_whole))
     }
 
     fn daughter(&self, n: usize) -> DaughterEstimate {
@@ -110,9 +120,10 @@ impl VerdictInputs<'_> {
         let (layout, found) = (&self.fitted.layout, &self.fitted.found);
         let k = c * layout.satellites + n;
         let (own, excess) = (&self.fitted.own[k], &self.excess[k]);
+        let reference = c * layout.satellites + layout.reference;
         let of_reference = match n == layout.reference {
-            true => Excess::default(),
-            false => self.excess[c * layout.satellites + layout.reference],
+            true => [0.0; 2],
+            false => [self.excess[reference].scatter[1], self.model(reference)],
         };
         // One that has no part in the solution is told by its own data.
         let is_alone = self.fitted.dropped[k] && own.presence != SignalPresence::None;
@@ -128,8 +139,9 @@ impl VerdictInputs<'_> {
             }
         };
         let is_relative = f64::from(u8::from(n != layout.reference));
-        let scatter = [excess.scatter[0], excess.scatter[1] + of_reference.scatter[1]];
-        let model = [excess.model + self.strength(c), is_relative * (excess.model + of_reference.model)];
+        let scatter = [excess.scatter[0], excess.scatter[1] + of_reference[0]];
+        let own_model = self.model(k);
+        let model = [own_model + self.strength(c), is_relative * (own_model + of_reference[1])];
         let noise = noise.map(with_wraps);
         let total = |axis: usize| (noise[axis].powi(2) + scatter[axis] + model[axis]).sqrt();
         let [visibilities, outliers] = self.counts.by_gain[k];
@@ -143,6 +155,8 @@ impl VerdictInputs<'_> {
             unexplained: self.unexplained[k],
             visibilities,
             outliers,
+            data_s: self.counts.data_s[k],
+            noise_sigma: [noise[0], is_relative * noise[1]],
             state: self.state(
                 (c, n),
                 gain.norm(),

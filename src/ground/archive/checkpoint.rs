@@ -16,10 +16,10 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA06";
+const MAGIC: &[u8; 8] = b"LNRSTA07";
 /// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 06; earlier versions keep less: make a new state by `lunarray \
+const VERSION: &str = "a checkpoint of the ground's state, version 07; earlier versions keep less: make a new state by `lunarray \
                        rebuild`, or replay the files into a new folder";
 /// Bytes of magic, length of the head, and checksum.
 const FIXED_BYTES: u64 = 24;
@@ -465,7 +465,7 @@ mod tests {
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 06") && said.contains("replay the files into a new folder"),
+                said.contains("version 07") && said.contains("replay the files into a new folder"),
                 "{said}"
             );
         });

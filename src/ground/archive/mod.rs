@@ -49,7 +49,7 @@
 //! another version is made from it by [`crate::ground::Ground::rebuild`].
 //!
 //! # A checkpoint
-//! Magic `LNRSTA06`; length of the head (u64 LE); head (bincode); the channels' engines as they write
+//! Magic `LNRSTA07`; length of the head (u64 LE); head (bincode); the channels' engines as they write
 //! themselves; CRC-64/NVME of all that (u64 LE). It is written under another name, synced and renamed; the previous one
 //! is kept, and used, with a note, if the newest is damaged. A checkpoint is damaged if its checksum or contents are wrong. If
 //! the system fails to read it, that is an error, and the folder stays as it was.
