@@ -13,6 +13,17 @@ use super::sums::ModelledBlock;
 /// Standard deviations of noise beyond which something is left.
 const SIGNIFICANT: f64 = 3.0;
 
+/// The same of all pairs of a channel together: what stays below turns amplitudes by no more than two deviations.
+const SIGNIFICANT_OF_ALL: f64 = 2.0;
+
+/// Parts of the signal that a solution leaves.
+pub(super) struct Unexplained {
+    /// By channel, then daughter.
+    pub(super) of_gains: Vec<f64>,
+    /// Of all pairs of a channel, without those of daughters that answer for more than is allowed.
+    pub(super) of_channels: Vec<f64>,
+}
+
 /// What is left of the signal of a pair in a channel, and the signal, in units of the variance of signal and noise together:
 /// beams, beacons and pairs of any strength count by the number of their visibilities.
 #[derive(Clone, Copy, Default)]
@@ -60,23 +71,24 @@ impl Residual {
         }
     }
 
-    /// Part of the signal that is left; none if it may be noise.
-    fn part(&self) -> f64 {
-        if self.left > SIGNIFICANT * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
+    /// Part of the signal that is left; none if it may be noise of so many standard deviations.
+    fn part(&self, significant: f64) -> f64 {
+        if self.left > significant * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
     }
 }
 
-/// Part of the signal of each daughter in each channel (by channel, then daughter) that its solution leaves. The worst daughter of a
+/// Part of the signal of each daughter in each channel, and of each channel, that its solution leaves. The worst daughter of a
 /// channel answers for its pairs, if it is above `most`; the next one for what remains.
 pub(super) fn unexplained(
     fitted: &Fitted,
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
     most: f64,
-) -> Vec<f64> {
+) -> Unexplained {
     let Fitted { layout, found, takes_part, .. } = fitted;
     let n = layout.satellites;
     let mut parts = vec![0.0; n * layout.channels()];
+    let mut of_channels = vec![0.0; layout.channels()];
     for (channel, parts) in parts.chunks_mut(n.max(1)).enumerate() {
         let mut pairs: Vec<([usize; 2], Residual)> = blocks
             .iter()
@@ -90,7 +102,7 @@ pub(super) fn unexplained(
         loop {
             let of = |daughter: usize| {
                 let own = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
-                own.fold(Residual::default(), |sum, (_, left)| sum.with(*left)).part()
+                own.fold(Residual::default(), |sum, (_, left)| sum.with(*left)).part(SIGNIFICANT)
             };
             let open: Vec<(usize, f64)> = (0..n).filter(|k| parts[*k] == 0.0).map(|k| (k, of(k))).collect();
             // Of two that are equally bad the reference stays.
@@ -102,11 +114,13 @@ pub(super) fn unexplained(
             let worst = worst.fold((0, 0.0), |worst, one| if one.1 > worst.1 { one } else { worst });
             if worst.1 <= most {
                 open.into_iter().for_each(|(k, part)| parts[k] = part);
+                let all = pairs.iter().fold(Residual::default(), |sum, (_, left)| sum.with(*left));
+                of_channels[channel] = all.part(SIGNIFICANT_OF_ALL);
                 break;
             }
             parts[worst.0] = worst.1;
             pairs.retain(|(pair, _)| !pair.contains(&worst.0));
         }
     }
-    parts
+    Unexplained { of_gains: parts, of_channels }
 }

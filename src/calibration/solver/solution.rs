@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::agree::is_contradicted;
 use super::config::SolverConfig;
 use super::estimates::{Counts, DaughterEstimate, GainState, OutlierParts};
-use super::fit::unexplained;
+use super::fit::{Unexplained, unexplained};
 use super::robust_fit::{Fitted, Interval};
 use super::stability::{Excess, jump_s};
 use super::sums::ModelledBlock;
@@ -182,7 +182,7 @@ struct CheckedFit {
     fitted: Fitted,
     excess: Vec<Excess>,
     model_error: Vec<f64>,
-    unexplained: Vec<f64>,
+    unexplained: Unexplained,
     counts: Counts,
 }
 
@@ -228,7 +228,7 @@ impl CheckedFit {
             && found.converged
             && config.unexplained_max < 1.0
             && is_contradicted(layout, found, &fitted.used());
-        let judge = VerdictInputs { config, fitted, counts, unexplained, excess, model_error };
+        let judge = VerdictInputs { config, fitted, counts, unexplained, excess };
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],

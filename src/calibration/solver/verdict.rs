@@ -3,6 +3,7 @@
 use super::config::{AmplitudeScale, SolverConfig};
 use super::detect::SignalPresence;
 use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
+use super::fit::Unexplained;
 use super::robust_fit::Fitted;
 use super::stability::Excess;
 
@@ -21,11 +22,8 @@ pub(super) struct VerdictInputs<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) fitted: &'a Fitted,
     pub(super) counts: &'a Counts,
-    /// By channel, then daughter.
-    pub(super) unexplained: &'a [f64],
+    pub(super) unexplained: &'a Unexplained,
     pub(super) excess: &'a [Excess],
-    /// Part of the signal that errors of the model are, by channel.
-    pub(super) model_error: &'a [f64],
 }
 
 /// A standard deviation (rad) of noise that holds phases, too.
@@ -72,17 +70,17 @@ impl VerdictInputs<'_> {
         if self.config.amplitude_scale == AmplitudeScale::UnitMean {
             return 0.0;
         }
-        let mut parts = self.unexplained[c * n..(c + 1) * n].to_vec();
+        let mut parts = self.unexplained.of_gains[c * n..(c + 1) * n].to_vec();
         parts.sort_unstable_by(f64::total_cmp);
         // All pairs show together what is noise in those of most daughters.
-        0.25 * parts.get(n / 2).copied().unwrap_or(0.0).max(self.model_error[c])
+        0.25 * parts.get(n / 2).copied().unwrap_or(0.0).max(self.unexplained.of_channels[c])
     }
 
     /// Variance of a gain's logarithm by errors of the model: those that are seen to stay for the interval; where the daughter's
     /// residuals show any, as much of them as may stay unseen.
     fn model(&self, k: usize) -> f64 {
         let Excess { model, model_unseen, model_whole, .. } = self.excess[k];
-        model.max(model_unseen.min(self.unexplained[k] * model_whole))
+        model.max(model_unseen.min(self.unexplained.of_gains[k] * model_whole))
     }
 
     fn daughter(&self, n: usize) -> DaughterEstimate {
@@ -152,7 +150,7 @@ impl VerdictInputs<'_> {
             phase_deg: gain.arg().to_degrees(),
             phase_sigma_deg: if is_relative > 0.0 { total(1).to_degrees() } else { 0.0 },
             phase_scatter_deg: excess.scatter[1].sqrt().to_degrees(),
-            unexplained: self.unexplained[k],
+            unexplained: self.unexplained.of_gains[k],
             visibilities,
             outliers,
             data_s: self.counts.data_s[k],
@@ -182,7 +180,7 @@ impl VerdictInputs<'_> {
             _ if noise * noise > most => GainState::Uncertain,
             _ if noise * noise + scatter > most => GainState::Unstable,
             _ if noise * noise + scatter + model > most => GainState::PoorFit,
-            _ if self.unexplained[k] > config.unexplained_max => GainState::PoorFit,
+            _ if self.unexplained.of_gains[k] > config.unexplained_max => GainState::PoorFit,
             _ => GainState::Good,
         }
     }
