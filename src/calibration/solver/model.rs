@@ -91,7 +91,7 @@ impl KnownSignal {
         }
     }
 
-    /// Sums over the sky of a channel as [`DirectMoments::sums_with`] gives them; nothing without a sky.
+    /// Sums over the sky of a channel as [`DirectMoments::weighted_sums`] gives them; nothing without a sky.
     ///
     /// # Errors
     /// Positions that the model does not cover.
