@@ -1,7 +1,8 @@
 //! Rows of B over spherical harmonics for satellites at any positions.
 //!
 //! No orbit is assumed. The two positions of a pair define its own frame and the part of the sky that the Moon occults, and so
-//! its fringe pattern (see `cap.rs`); the sky is rotated into that frame. Along a track the rows of a pair change slowly, so that
+//! its fringe pattern (see `cap.rs`); the sky is rotated into that frame. On a common circle the rows are those of
+//! [`crate::response::harmonic`]. Along a track the rows of a pair change slowly, so that
 //! few are computed and the others interpolated (see `plan.rs` and `planner.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`],
 //! [`GeneralRows::adjoint`]. As the reference, [`GeneralRows::plan_direct`] computes each row.
 //!
