@@ -121,8 +121,8 @@ impl PairResponse {
     /// Their sum, of the higher degree.
     fn plus(&self, other: &Self) -> Self {
         let degree = self.degree.max(other.degree);
-        let mut coefficients = self.coefficients_of(degree);
-        coefficients.iter_mut().zip(other.coefficients_of(degree)).for_each(|(a, b)| *a += b);
+        let mut coefficients = self.coefficients_of_degree(degree);
+        coefficients.iter_mut().zip(other.coefficients_of_degree(degree)).for_each(|(a, b)| *a += b);
         Self { degree, coefficients }
     }
 
