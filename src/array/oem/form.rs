@@ -1,16 +1,18 @@
 //! What messages of the kinds that are read have in common, whatever form they are written in.
 
-use std::io::Read;
-use std::path::Path;
+/// A fault of a file: its line, from 1, what was found, and what was expected there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(in crate::array) struct Fault {
+    pub(in crate::array) line: usize,
+    pub(in crate::array) found: String,
+    pub(in crate::array) expected: String,
+}
 
-use flate2::read::MultiGzDecoder;
-
-use super::message::Fault;
-use super::{kvn, xml};
-use crate::array::config::ArrayError;
-
-/// Largest file that is read, and largest content of a compressed one, bytes: ten years of states each minute.
-const FILE_BYTES_MAX: u64 = 1 << 30;
+impl Fault {
+    pub(in crate::array) fn new(line: usize, found: impl Into<String>, expected: impl Into<String>) -> Self {
+        Self { line, found: found.into(), expected: expected.into() }
+    }
+}
 
 /// A message that is gathered as its form, KVN or XML, is read.
 pub(in crate::array) trait Message: Default {
@@ -55,45 +57,11 @@ pub(in crate::array) trait Message: Default {
     fn covariance(&mut self) {}
 }
 
-pub(in crate::array) fn error(path: &Path, what: String) -> ArrayError {
-    ArrayError::Oem { path: path.to_owned(), what }
-}
-
-/// The fault of a file.
-pub(in crate::array) fn at_line(path: &Path, Fault { line, found, expected }: Fault) -> ArrayError {
-    error(path, format!("line {line}: found {found}; expected {expected}"))
-}
-
-/// Reads a message, KVN or XML, also compressed by gzip, to the end of its last segment; gives its last line, too.
-pub(in crate::array) fn read_message<M: Message>(path: &Path) -> Result<(M, usize), ArrayError> {
-    let of_io = |source: std::io::Error| error(path, source.to_string());
-    let size = std::fs::metadata(path).map_err(of_io)?.len();
-    let too_large = |size: u64| error(path, format!("{size} bytes; expected at most {FILE_BYTES_MAX}"));
-    if size > FILE_BYTES_MAX {
-        return Err(too_large(size));
+/// The beginning of a line, for messages.
+pub(in crate::array) fn short(content: &str) -> String {
+    let mut text: String = content.chars().take(60).filter(|c| !c.is_control()).collect();
+    if text.len() < content.len() {
+        text.push_str("..");
     }
-    let mut bytes = std::fs::read(path).map_err(of_io)?;
-    if bytes.starts_with(&[0x1f, 0x8b]) {
-        let mut content = Vec::new();
-        // A sum at the end says whether it is whole.
-        let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
-        unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
-        if content.len() as u64 > FILE_BYTES_MAX {
-            return Err(too_large(content.len() as u64));
-        }
-        bytes = content;
-    }
-    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
-        return Err(error(path, "UTF-16; expected ASCII or UTF-8".into()));
-    }
-    parse(&bytes).map_err(|fault| at_line(path, fault))
-}
-
-/// Reads a message that is given as bytes.
-pub(in crate::array) fn parse<M: Message>(bytes: &[u8]) -> Result<(M, usize), Fault> {
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    let is_xml = text.trim_ascii_start().starts_with(b"<");
-    let (mut message, line): (M, usize) = if is_xml { xml::parse(text)? } else { kvn::parse(text)? };
-    message.end_segment(line)?;
-    Ok((message, line))
+    format!("{text:?}")
 }

@@ -1,7 +1,6 @@
 //! Messages as lines of text (KVN).
 
-use super::form::Message;
-use super::message::{Fault, short};
+use super::form::{Fault, Message, short};
 
 /// Where the reader is.
 #[derive(Clone, Copy, PartialEq)]

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::form::Message;
+use super::form::{Fault, Message, short};
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::{Vec3, norm};
 
@@ -14,20 +14,6 @@ pub(super) const DEGREE_MAX: usize = 15;
 
 /// Most that a useable time may lie beyond the states, s: a rounded epoch.
 const ROUNDED_S: f64 = 1e-6;
-
-/// A fault of a file: its line, from 1, what was found, and what was expected there.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(in crate::array) struct Fault {
-    pub(in crate::array) line: usize,
-    pub(in crate::array) found: String,
-    pub(in crate::array) expected: String,
-}
-
-impl Fault {
-    pub(in crate::array) fn new(line: usize, found: impl Into<String>, expected: impl Into<String>) -> Self {
-        Self { line, found: found.into(), expected: expected.into() }
-    }
-}
 
 /// How a file asks to be interpolated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -360,15 +346,6 @@ pub(in crate::array) fn useable_s(
         return Err(Fault::new(at, found, "USEABLE_START_TIME before USEABLE_STOP_TIME"));
     }
     Ok(useable_s)
-}
-
-/// The beginning of a line, for messages.
-pub(in crate::array) fn short(content: &str) -> String {
-    let mut text: String = content.chars().take(60).filter(|c| !c.is_control()).collect();
-    if text.len() < content.len() {
-        text.push_str("..");
-    }
-    format!("{text:?}")
 }
 
 /// From equatorial to ecliptic axes.

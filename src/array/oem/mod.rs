@@ -1,6 +1,7 @@
 //! Orbits from CCSDS Orbit Ephemeris Messages.
 
 mod checks;
+mod file;
 mod form;
 mod interpolate;
 mod kvn;
@@ -8,6 +9,7 @@ mod message;
 mod orbit;
 mod xml;
 
-pub(super) use form::{Message, at_line, error, read_message};
-pub(super) use message::{Fault, Metadata, Useable, read_epoch, short, to_equatorial, turned, useable_s};
+pub(super) use file::{at_line, error, read_message};
+pub(super) use form::{Fault, Message, short};
+pub(super) use message::{Metadata, Useable, read_epoch, to_equatorial, turned, useable_s};
 pub(super) use orbit::{OrbitArc, TableOrbit, read};

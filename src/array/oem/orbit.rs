@@ -6,7 +6,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::checks::check;
-use super::form::{at_line, error, read_message};
+use super::file::{at_line, error, read_message};
 use super::interpolate::interpolated;
 use super::message::{Collector, OemMessage, OemSegment, Reading, TableMethod};
 use crate::array::config::ArrayError;

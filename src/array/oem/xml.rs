@@ -3,8 +3,7 @@
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::form::Message;
-use super::message::{Fault, short};
+use super::form::{Fault, Message, short};
 
 /// Longest value that is kept, bytes: a number, a date or a name.
 const VALUE_BYTES_MAX: usize = 1 << 10;
