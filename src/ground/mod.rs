@@ -1,10 +1,10 @@
-//! The ground, from the bytes of a downlink to sums: every packet once, in any order, over any number of sessions.
+//! The ground segment: turns the bytes of a downlink into sums. It uses every packet once, in any order, over any number of sessions.
 //!
-//! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration places and corrects
-//! visibilities, the accumulator adds them up. An [`archive`] keeps all of it from one session to the next.
+//! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration adds positions and
+//! corrects visibilities, the accumulator adds them up. An [`archive`] keeps its state from one session to the next.
 //!
-//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; knows nothing of the spacecraft, of
-//! solving, or of the pipeline.
+//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; does not depend on the spacecraft,
+//! on solvers, or on the pipeline.
 
 #[doc(hidden)]
 pub mod archive;
@@ -35,7 +35,7 @@ pub use error::GroundError;
 #[doc(hidden)]
 pub use hold_buffer::{HeldPacket, HoldBuffer, IsDue};
 #[doc(hidden)]
-pub use live_view::{ArrayNow, LiveView};
+pub use live_view::{ArrayGeometry, LiveView};
 #[doc(hidden)]
 pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 #[doc(hidden)]

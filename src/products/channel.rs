@@ -1,4 +1,4 @@
-//! The products of one channel.
+//! Writes the products of one channel.
 
 use std::path::{Path, PathBuf};
 
@@ -22,17 +22,17 @@ use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
 use crate::units::constants::DAY_S;
 
-/// Part of its disk that a listening ground leaves free.
-const KEPT_FREE: u64 = 20;
+/// Reciprocal of the fraction of the disk that products leave free, while a ground stage listens.
+const FREE_DIVISOR: u64 = 20;
 
 /// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
 const SHEET_MAPS_MAX: usize = 6;
 
-/// Fixed names of the last map and its picture. They are files of their own, as links break where a folder is copied or packed.
+/// Fixed names of copies of the last map and its picture. They are not links, which break if a folder is copied or packed.
 const LATEST_MAP: &str = "latest.fits";
 const LATEST_PICTURE: &str = "latest.png";
 
-/// A channel's output folder, and the summary of its maps so far.
+/// The output folder of a channel, and the summary of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
     /// Output folder of the run.
@@ -41,14 +41,14 @@ pub(super) struct ChannelFolder {
     name: String,
     frequency_hz: f64,
     truth: Option<ChannelTruth>,
-    /// Snapshots for the sheet.
-    shown: SheetMaps,
+    /// Selected snapshots for the sheet.
+    sheet_maps: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
     beams: Vec<PointBeamSummary>,
-    /// Whether it leaves a part of the disk free.
-    leaves_room: bool,
+    /// Whether a part of the disk has to stay free.
+    needs_free_disk: bool,
 }
 
 impl ChannelFolder {
@@ -71,26 +71,26 @@ impl ChannelFolder {
             name,
             frequency_hz,
             truth: truth.cloned(),
-            shown: SheetMaps::default(),
+            sheet_maps: SheetMaps::default(),
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
             beams: Vec::new(),
-            leaves_room: false,
+            needs_free_disk: false,
         })
     }
 
-    /// Leaves a part of the disk free for the state and the raw archive of a ground, which may be on the same one.
-    pub(super) fn leaving_room(self) -> Self {
-        Self { leaves_room: true, ..self }
+    /// Leaves a part of the disk free for the state and the raw archive, which may be on the same disk.
+    pub(super) fn with_free_disk(self) -> Self {
+        Self { needs_free_disk: true, ..self }
     }
 
-    /// Lets final maps take the rest of the disk: nothing comes after them.
-    fn require_room(&self, solution: &Solution) -> Result<(), ProductsError> {
-        let leaves = self.leaves_room && !solution.is_final;
-        match disk_room(&self.root).filter(|_| leaves) {
-            Some([free, size]) if free < size / KEPT_FREE => {
-                let reason = "less than a twentieth of the disk is free, which is left to state and archive";
+    /// Returns an error if less than 1 / [`FREE_DIVISOR`] of the disk is free. Final maps are exempt, as no data follow them.
+    fn require_free_disk(&self, solution: &Solution) -> Result<(), ProductsError> {
+        let is_limited = self.needs_free_disk && !solution.is_final;
+        match disk_room(&self.root).filter(|_| is_limited) {
+            Some([free, size]) if free < size / FREE_DIVISOR => {
+                let reason = "less than a twentieth of the disk is free, which is reserved for the state and the raw archive";
                 let source = std::io::Error::new(std::io::ErrorKind::StorageFull, reason);
                 Err(ProductsError::Write { path: self.root.clone(), source })
             }
@@ -98,7 +98,9 @@ impl ChannelFolder {
         }
     }
 
-    /// Writes the products of one solution; the complete set if it is final. If they cannot be written, only viewers see the map.
+    /// Writes the products of one solution, and all products if it is final.
+    ///
+    /// If the files cannot be written, viewers still get the map, but the summary has no entry for it.
     pub(super) fn publish(
         &mut self,
         solution: &Solution,
@@ -106,8 +108,9 @@ impl ChannelFolder {
         viewers: &MapWatch,
     ) -> Result<(), ProductsError> {
         let (snapshots, beams) = (self.snapshots.len(), self.beams.len());
-        let published = self.publish_whole(solution, provenance, viewers);
+        let published = self.write_products(solution, provenance, viewers);
         if published.is_err() {
+            // There is a new summary entry if the map itself is valid and only its files could not be written.
             if self.snapshots.len() > snapshots {
                 self.show(None, Origin { provenance, solution }, viewers);
             }
@@ -117,7 +120,7 @@ impl ChannelFolder {
         published
     }
 
-    fn publish_whole(
+    fn write_products(
         &mut self,
         solution: &Solution,
         provenance: &Provenance,
@@ -133,14 +136,14 @@ impl ChannelFolder {
             self.config.processing().map(|processing| solved.processed(processing)).transpose()?;
         let shown = processed.as_ref().unwrap_or(&solved);
         let comparison = self.compare(solution, shown)?;
-        self.note(solution, shown, comparison.as_ref());
-        self.require_room(solution)?;
+        self.record_snapshot(solution, shown, comparison.as_ref());
+        self.require_free_disk(solution)?;
         if self.config.snapshot_maps && !solution.is_final {
             let name = format!("{}.fits", map_name(solution));
             self.write_map(&name, &solved.map, None, origin)?;
         }
         if self.config.pictures {
-            self.shown.offer(shown.map.values(), &caption(solution));
+            self.sheet_maps.offer(shown.map.values(), &caption(solution));
             self.draw_snapshot(solution, shown)?;
         }
         self.write_named(LATEST_MAP, &map_name(solution), &solved.map, None, origin)?;
@@ -160,7 +163,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Shows the map to viewers, as its file has it.
+    /// Shows the map to viewers.
     fn show(&self, comparison: Option<&Comparison>, origin: Origin<'_>, viewers: &MapWatch) {
         let Origin { provenance, solution } = origin;
         let Some(figures) = self.snapshots.last() else { return };
@@ -171,7 +174,7 @@ impl ChannelFolder {
         });
     }
 
-    /// The truth beside maps that are shown.
+    /// The input sky, processed like the maps with which it is compared.
     fn input(&self, processing: Option<PostProcessing>) -> Option<&InputSky> {
         let truth = self.truth.as_ref()?;
         if processing.is_some() { truth.processed.as_ref() } else { Some(&truth.plain) }
@@ -179,19 +182,20 @@ impl ChannelFolder {
 
     fn compare(&self, solution: &Solution, shown: &ShownMaps) -> Result<Option<Comparison>, ProductsError> {
         let Some(input) = self.input(shown.processing) else { return Ok(None) };
-        // A harmonic map has no power beyond its own degrees; split pixels have no more than before.
+        // A harmonic map has no power above its l_max, and splitting pixels adds no degrees.
         let l_max = solution.diagnostics.l_max.unwrap_or(3 * solution.nside - 1);
         let comparison = compare_with(&shown.map, input, Some(&shown.noise), Some(l_max))?;
         let is_noisy = !solution.instrument.noiseless;
         Ok(Some(if is_noisy { comparison.with_noise_subtracted() } else { comparison }))
     }
 
-    /// The summary, if there was a final map.
+    /// The summary; `None` if there was no final map.
     pub(super) fn into_summary(self) -> Option<ChannelSummary> {
         self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
     }
 
-    fn note(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
+    /// Adds the summary of a map to the list of snapshots.
+    fn record_snapshot(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
         let input = self.input(shown.processing);
         let rms_error_over_rms_truth =
             input.map(|input| rms_error_over_rms_truth(shown.map.values(), input.map.values()));
@@ -253,7 +257,7 @@ impl ChannelFolder {
         }
     }
 
-    /// A path in the channel's folder, recorded in the list of files.
+    /// The path of a file in the channel's folder. Adds the file to the list in the summary.
     fn file(&mut self, name: &str) -> PathBuf {
         let relative = format!("{}/{name}", self.name);
         let path = self.root.join(&relative);
@@ -273,7 +277,7 @@ impl ChannelFolder {
         self.write_named(name, name.trim_end_matches(".fits"), map, processing, origin)
     }
 
-    /// Writes a map; `what` describes it in the header.
+    /// Writes a map; `what` is its description in the header.
     fn write_named(
         &mut self,
         name: &str,
@@ -288,7 +292,7 @@ impl ChannelFolder {
         Ok(write_map(&path, map, &options)?)
     }
 
-    /// Map, noise and input, as solved or post-processed.
+    /// Writes the maps of sky, noise and input, as solved or post-processed.
     fn write_final(&mut self, maps: &ShownMaps, origin: Origin<'_>) -> Result<(), ProductsError> {
         let &ShownMaps { ref map, ref noise, processing } = maps;
         let ending = if processing.is_some() { "-smooth" } else { "" };
@@ -312,7 +316,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Beams as maps, solved and post-processed, and a table of their widths.
+    /// Writes maps of the effective beams, as solved and post-processed, and a table of their widths.
     fn write_beams(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         let Origin { solution, .. } = origin;
         for (number, beam) in solution.beams.iter().enumerate() {
@@ -334,7 +338,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// The colour scale that map and input share: the range of the input, or of the map if there is no input.
+    /// The colour scale shared by map and input, with the range of the input, or of the map if there is no input.
     fn scale(&self, shown: &ShownMaps) -> ColourScale {
         let input = self.input(shown.processing).map(|input| &input.map);
         let reference = input.unwrap_or(&shown.map).values();
@@ -373,14 +377,14 @@ impl ChannelFolder {
         let map = shown.map.values();
         let scale = self.scale(shown);
         let how = provenance.caption(solution);
-        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
+        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution_text());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
         self.write_picture("map", &picture)?;
         picture.write(&self.file(LATEST_PICTURE))?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
-            let picture = draw_map(&panel, &shown.resolution(), &view(self.config.frame))?;
+            let picture = draw_map(&panel, &shown.resolution_text(), &view(self.config.frame))?;
             self.write_picture("input", &picture)?;
         }
         if let Some(comparison) = comparison {
@@ -388,7 +392,7 @@ impl ChannelFolder {
             let picture = draw_relative_error(&title, &subtitle, comparison, self.config.frame)?;
             self.write_picture("error", &picture)?;
             let noise = if solution.instrument.noiseless { "without" } else { "with" };
-            let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution());
+            let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution_text());
             self.write_picture("spectra", &draw_comparison(&title, comparison)?)?;
         }
         self.draw_sheet(shown, &caption(solution), scale)
@@ -401,10 +405,10 @@ impl ChannelFolder {
         caption: &str,
         scale: ColourScale,
     ) -> Result<(), ProductsError> {
-        let shown = self.shown.spread((last.map.values(), caption));
+        let shown = self.sheet_maps.evenly_spaced((last.map.values(), caption));
         let panels: Vec<MapPanel<'_>> = shown.map(|(map, caption)| self.panel(map, caption, scale)).collect();
         let sheet = Sheet {
-            title: format!("The map at {} MHz sharpens", self.frequency_hz / 1e6),
+            title: format!("Map at {} MHz by time observed", self.frequency_hz / 1e6),
             columns: 3,
             width_px: 1800,
             bars: Bars::Shared,
@@ -415,7 +419,7 @@ impl ChannelFolder {
         self.write_picture("sharpening", &picture)
     }
 
-    /// Writes a final picture, and the same as SVG if configured.
+    /// Writes a final picture as PNG, and as SVG if configured.
     fn write_picture(&mut self, name: &str, picture: &Picture) -> Result<(), ProductsError> {
         let path = self.file(&format!("{name}.png"));
         picture.write(&path)?;
@@ -427,18 +431,18 @@ impl ChannelFolder {
     }
 }
 
-/// Where a map comes from.
+/// Origin of a map.
 #[derive(Clone, Copy)]
 struct Origin<'a> {
     provenance: &'a Provenance,
     solution: &'a Solution,
 }
 
-/// A map and its noise-only companion, as solved or post-processed.
+/// A map and its noise-only map, as solved or post-processed.
 struct ShownMaps {
     map: SkyMap,
     noise: SkyMap,
-    /// How they were processed.
+    /// The processing; `None` for maps as solved.
     processing: Option<PostProcessing>,
 }
 
@@ -448,8 +452,8 @@ impl ShownMaps {
         Ok(Self { map: apply(&self.map)?, noise: apply(&self.noise)?, processing: Some(processing) })
     }
 
-    /// The processing in words.
-    fn resolution(&self) -> String {
+    /// nside and smoothing as text.
+    fn resolution_text(&self) -> String {
         let nside = self.map.nside();
         match self.processing {
             None => format!("nside {nside}"),
@@ -460,7 +464,7 @@ impl ShownMaps {
     }
 }
 
-/// A bounded selection of snapshots: the first, and every 2^n-th after it.
+/// A bounded selection of snapshots for the sheet: the first, and every 2^n-th after it.
 #[derive(Default)]
 struct SheetMaps {
     /// Maps with their captions.
@@ -472,7 +476,7 @@ struct SheetMaps {
 }
 
 impl SheetMaps {
-    /// Offers a map, which is kept if its number is due.
+    /// Offers a map, which is kept if its number is a multiple of the current stride.
     fn offer(&mut self, map: &[f64], caption: &str) {
         let is_kept = |offered: usize, halvings: u32| offered.is_multiple_of(1 << halvings);
         if is_kept(self.offered, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
@@ -490,7 +494,7 @@ impl SheetMaps {
     }
 
     /// The maps for the sheet, in equal steps from the first to `last`, which was offered last.
-    fn spread<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
+    fn evenly_spaced<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
         let is_last = |k: usize| (k << self.halvings) + 1 == self.offered;
         let others = (0..self.maps.len()).filter(|&k| !is_last(k)).count();
         let places = SHEET_MAPS_MAX.min(others + 1);
@@ -502,7 +506,7 @@ impl SheetMaps {
     }
 }
 
-/// Name of a map's file without its extension.
+/// File name of a map without extension.
 fn map_name(solution: &Solution) -> String {
     if solution.is_final { "map".to_owned() } else { format!("snapshot-{:03}", solution.number) }
 }
@@ -511,12 +515,12 @@ fn caption(solution: &Solution) -> String {
     format!("after {:.0} days", (solution.span_s[1] - solution.span_s[0]) / DAY_S)
 }
 
-/// Maps of the chain are on ecliptic axes.
+/// The view of a map, which is on ecliptic axes, in a celestial frame.
 fn view(frame: Frame) -> View {
     View { sampling: Sampling::Interpolated, ..View::of(frame, Frame::Ecliptic) }
 }
 
-/// RMS of (map - truth) divided by RMS of truth.
+/// RMS of (map - truth) divided by the RMS of the truth.
 fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
     let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
     let scale: f64 = truth.iter().map(|t| t * t).sum();
@@ -532,7 +536,7 @@ fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
 /// Draws (map - truth) / truth over the sky, percent, in a celestial frame.
 ///
 /// # Errors
-/// A page that is too large, which one map is not.
+/// [`PictureError::Size`], which cannot occur for one map.
 pub fn draw_relative_error(
     title: &str,
     subtitle: &str,
@@ -555,7 +559,7 @@ pub fn draw_relative_error(
 /// Draws rho_l, the angular power spectra and SNR_l as curves.
 ///
 /// # Errors
-/// A page that is too large, which three plots are not.
+/// [`PictureError::Size`], which cannot occur for three plots.
 pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, PictureError> {
     let curve = |label: &str, values: &[f64], dashed: bool| Curve {
         label: label.to_owned(),
@@ -564,9 +568,9 @@ pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, 
     };
     let correlations = match &comparison.rho_noise_subtracted {
         None => vec![curve("", &comparison.rho, false)],
-        Some(quiet) => vec![
+        Some(rho_noise_subtracted) => vec![
             curve("with the map's noise", &comparison.rho, false),
-            curve("its power subtracted", quiet, true),
+            curve("noise power subtracted", rho_noise_subtracted, true),
         ],
     };
     let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
@@ -616,7 +620,7 @@ mod tests {
             }
             let last = count - 1;
             let sheet: Vec<(f64, String)> = shown
-                .spread((&[last as f64], &last.to_string()))
+                .evenly_spaced((&[last as f64], &last.to_string()))
                 .map(|(map, caption)| (map[0], caption.to_owned()))
                 .collect();
             assert_eq!(sheet.len(), SHEET_MAPS_MAX.min(count));
@@ -624,7 +628,8 @@ mod tests {
             for (map, caption) in &sheet {
                 assert_eq!(&map.to_string(), caption);
             }
-            // Steps are whole multiples of the kept maps, a twelfth to a sixth of all: half to twice the equal step.
+            // Steps are multiples of the stride of kept maps, which is a twelfth to a sixth of all, so within a factor of two of
+            // equal steps.
             let equal = last as f64 / (sheet.len().max(2) - 1) as f64;
             let steps = sheet.windows(2).map(|two| two[1].0 - two[0].0);
             assert!(

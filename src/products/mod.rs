@@ -1,9 +1,9 @@
 //! The products of a run: maps, pictures, tables and summaries in an output folder.
 //!
 //! [`Publisher`] is the sink that writes every [`crate::imaging::Solution`]; [`write_autos`] writes the
-//! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
+//! auto-correlations; [`pictures`] draws. A [`MapViewer`] gets every map when it is published.
 //!
-//! May use [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! Uses [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;

@@ -489,7 +489,7 @@ fn forged(count: u64, s: u64) -> Vec<u8> {
 #[test]
 fn forged_packets_of_one_time_are_refused_beyond_a_number() {
     const ROOM: u64 = 100;
-    let mut collector = Collector::new(1 << 20).with_packets(ROOM);
+    let mut collector = Collector::new(1 << 20).with_packets_max(ROOM);
     let all: Vec<u8> = (0..3 * ROOM).flat_map(|k| forged(k, 5)).collect();
     for [beyond, duplicates] in [[2 * ROOM, 0], [4 * ROOM, ROOM]] {
         collector.push(&all);
@@ -503,7 +503,7 @@ fn forged_packets_of_one_time_are_refused_beyond_a_number() {
 #[test]
 fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
     const ROOM: usize = 100;
-    let mut collector = Collector::new(1 << 20).with_intervals(ROOM);
+    let mut collector = Collector::new(1 << 20).with_intervals_max(ROOM);
     let mut push = |packets: Vec<u8>| {
         collector.push(&packets);
         while collector.next_delivery(&|_| true).unwrap().is_some() {}

@@ -16,7 +16,7 @@ fn core(place: &Ground, state: &str, wait_bytes: u64, cancel: &Cancel) -> Core {
     let source = ConfigSource { file: Some(place.pipeline.clone().into()), ..ConfigSource::default() };
     let settings = source.load_ground().unwrap().ground(wait_bytes);
     let ground = Core::open(Path::new(&place.path(state)), &settings, u64::MAX).unwrap();
-    ground.cancelled_by(cancel, Duration::ZERO)
+    ground.with_cancel(cancel, Duration::ZERO)
 }
 
 #[test]

@@ -525,7 +525,7 @@ impl Sequence<'_> {
         let opened = Ground::open(&self.states[at].folder, &config, u64::MAX);
         let received = &self.states[at].received;
         let Some(&before) = received.len().checked_sub(2).and_then(|k| received.get(k)) else {
-            assert!(matches!(opened, Err(GroundError::NoneHolds { .. })));
+            assert!(matches!(opened, Err(GroundError::NoUsableCheckpoint { .. })));
             std::fs::write(newest, good).unwrap();
             return;
         };

@@ -1,9 +1,9 @@
-//! Views of the journal: counters, the ledger, received packets and blocks, spans. Each is a fold over its records.
+//! Data derived from the records of the journal: counters, the ledger, received packets and blocks, and time spans.
 
 use std::collections::BTreeMap;
 
 use super::entry::JournalEntry;
-use super::journal::{Journal, JournalRecord, Sent, SumsSpan};
+use super::journal::{Journal, JournalRecord, SendingKey, SumsSpan};
 use crate::calibration::{BlockKey, ReceivedBlocks};
 use crate::downlink::{Kind, ReceptionCounters};
 use crate::frames::VisibilityReason;
@@ -22,7 +22,7 @@ impl Journal {
     }
 
     /// Packets with visibilities, each with the fraction of its offered visibilities that was accumulated.
-    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+    pub(super) fn accumulated_fractions(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
         self.with_visibilities().map(|record| {
             let offered = (record.offered > 0).then_some(record.offered);
             let share = offered.map(|offered| f64::from(record.accumulated) / f64::from(offered));
@@ -30,25 +30,25 @@ impl Journal {
         })
     }
 
-    /// Packets that were delivered.
-    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, Sent)> {
+    /// Keys of the delivered packets.
+    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, SendingKey)> {
         let visibilities = self.visibilities.keys().map(|sent| (Kind::Visibilities, *sent));
         visibilities.chain(self.others.keys().copied())
     }
 
-    /// Counters of the packets that were delivered.
+    /// Counters of the delivered packets.
     pub(super) fn reception(&self) -> ReceptionCounters {
         let mut counters = ReceptionCounters::default();
         for record in self.visibilities.values() {
-            counters.add_packet(Kind::Visibilities, record.bytes, &record.reading);
+            counters.add_packet(Kind::Visibilities, record.bytes, &record.counts);
         }
         for ((kind, _), record) in &self.others {
-            counters.add_packet(*kind, record.bytes, &record.reading);
+            counters.add_packet(*kind, record.bytes, &record.counts);
         }
         counters
     }
 
-    /// Blocks that were received, and the spacecraft's reports.
+    /// The received blocks and the spacecraft's reports.
     pub(super) fn blocks(&self) -> ReceivedBlocks {
         let mut blocks = ReceivedBlocks::default();
         for record in self.with_visibilities() {
@@ -59,13 +59,13 @@ impl Journal {
             }
         }
         for record in self.visibilities.values() {
-            blocks.count_bad(record.window, u64::from(record.reading.visibilities_bad_value));
+            blocks.count_bad(record.window, u64::from(record.counts.visibilities_bad_value));
         }
         self.others.values().filter_map(|record| record.report).for_each(|report| blocks.report(report));
         blocks
     }
 
-    /// What applying all packets has posted to the ledger.
+    /// The ledger entries of all packets.
     pub(super) fn ledger(&self) -> LedgerReport<VisibilityReason> {
         let mut ledger = LedgerReport::default();
         for record in self.visibilities.values() {
@@ -81,7 +81,7 @@ impl Journal {
         ledger
     }
 
-    /// First and last mission time, s, of what was offered to the engine of each channel of the sums.
+    /// First and last mission time, s, of the data offered to the engine of each channel of the sums.
     pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
         let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
         for record in self.visibilities.values() {
@@ -97,7 +97,7 @@ impl Journal {
         self.spans_s().values().map(|[_, last]| *last).reduce(f64::max)
     }
 
-    /// Whether the sums hold visibilities of pairs whose positions lie in a span of time.
+    /// Whether the sums hold cross-correlations that overlap a time span.
     pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
         self.visibilities.values().any(|JournalRecord { entry, accumulated, .. }| {
             *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
@@ -142,7 +142,7 @@ mod tests {
         })
     }
 
-    /// An instrument; auto-correlations; a pair without positions, sent twice in different packets; reports.
+    /// An instrument; auto-correlations; a pair without ephemeris, sent twice in different packets; reports.
     fn transmission() -> Vec<u8> {
         let instrument = Instrument {
             name: "test".to_owned(),
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_ground_counts_is_what_is_folded() {
+    fn counts_of_a_ground_equal_those_derived_from_its_journal() {
         let folder = tempfile::tempdir().unwrap();
         let (calibration, map) = (CalibrationConfig::default(), MapConfig::default());
         let config = GroundConfig {
@@ -200,7 +200,7 @@ mod tests {
         ground.finish(&mut Outlet::collect()).unwrap();
         let said = (ground.outcome.ledger.close().unwrap(), ground.collector.counters());
         drop(ground);
-        // A session without data counts the same.
+        // A session without data has the same counts.
         let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         again.finish(&mut Outlet::collect()).unwrap();
         assert_eq!((again.outcome.ledger.close().unwrap(), again.collector.counters()), said);
@@ -242,7 +242,7 @@ mod tests {
         };
         assert!(on_threads(3, |ranks| session(ranks, first)).iter().all(|found| *found == expected[0]));
         assert_eq!(names(), set(1, 3).collect());
-        // Another number of ranks goes on; a part of a job that was ended does not count, and goes.
+        // Another number of ranks resumes; a part left by an interrupted job is not used, and removed.
         std::fs::copy(
             folder.path().join("checkpoint-00000001.2-of-3.lunarray"),
             folder.path().join("checkpoint-00000002.2-of-3.lunarray"),
@@ -251,13 +251,13 @@ mod tests {
         let whole = on_threads(2, |ranks| session(ranks, &bytes));
         assert_eq!(names(), set(1, 3).chain(set(2, 2)).collect());
         assert!(whole.iter().all(|found| *found == expected[1]));
-        // A part that is damaged, or of another place in the stream, takes its set with it.
+        // A part that is damaged, or from another place in the stream, makes its set unusable.
         let damaged = folder.path().join("checkpoint-00000002.2-of-2.lunarray");
         std::fs::copy(folder.path().join("checkpoint-00000001.2-of-3.lunarray"), damaged).unwrap();
         let again = on_threads(2, |ranks| session(ranks, &bytes));
         assert!(again[0].2[0].contains("parts of one checkpoint"), "{:?}", again[0].2);
         assert_eq!((&again[1].0, &again[1].1), (&expected[1].0, &expected[1].1));
-        // A process alone goes on, and what it writes takes the place of the sets before.
+        // A single process resumes, and its checkpoints replace the earlier sets.
         let alone = session(&Ranks::one(), &[]);
         assert_eq!((&alone.0, &alone.1), (&expected[2].0, &expected[2].1));
         session(&Ranks::one(), &[]);
@@ -277,7 +277,7 @@ mod tests {
             let channel = ChannelId(2);
             draft.offer(&PlacedFrame::Visibilities(PlacedVisibilities { channel, ..Default::default() }));
             draft.used_s = Some(times_s);
-            let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
+            let packet = DeliveredPacket { header, checksum: 1, counts: PacketReading::default() };
             journal.record_visibilities(&packet, draft, &LedgerReport::default());
         }
         assert_eq!(journal.spans_s(), BTreeMap::from([(ChannelId(2), [1.0, 4.0])]));

@@ -250,8 +250,8 @@ fn a_stage_that_stalls_ends_the_run_with_its_name() {
     graph.fail_after_stall(Duration::from_secs(1));
     let error = graph.run(&Cancel::new(), Duration::from_millis(10)).unwrap_err();
     drop(release);
-    let RuntimeError::Stalled { stages, laggards, .. } = &error else { panic!("{error:?}") };
-    assert!(stages.contains(&"middle".to_owned()) && laggards.stages.contains(&"middle".to_owned()));
+    let RuntimeError::Stalled { stages, unfinished, .. } = &error else { panic!("{error:?}") };
+    assert!(stages.contains(&"middle".to_owned()) && unfinished.stages.contains(&"middle".to_owned()));
     assert!(error.to_string().contains("`middle`"), "{error}");
     let kept = kept.lock().unwrap();
     assert!(!kept.finished && kept.items == (0..9).collect::<Vec<_>>());
@@ -334,9 +334,9 @@ fn a_stuck_stage_is_named() {
     let metrics = graph.metrics();
     let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
 
-    let RuntimeError::Failed { stage, at, laggards, .. } = &error else { panic!("{error:?}") };
+    let RuntimeError::Failed { stage, at, unfinished, .. } = &error else { panic!("{error:?}") };
     assert_eq!((stage.as_str(), *at), ("fail", Moment::Item(2)));
-    assert_eq!(laggards.stages, ["hang"]);
+    assert_eq!(unfinished.stages, ["hang"]);
     assert!(error.to_string().contains("`hang`"), "{error}");
     drop(release);
     // The stage ends by itself once it is free.
@@ -364,9 +364,9 @@ fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     let numbers = graph.source("count", 1, Count::to(u64::MAX));
     graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(TestError(n)) } else { Ok(()) }));
     let error = graph.run(&Cancel::new(), Duration::from_secs(2)).unwrap_err();
-    let RuntimeError::Failed { stage, laggards, .. } = &error else { panic!("{error:?}") };
+    let RuntimeError::Failed { stage, unfinished, .. } = &error else { panic!("{error:?}") };
     assert_eq!(stage, "fail");
     // Not `waiting`: it was woken although its source said nothing.
-    assert_eq!(laggards.stages, ["silent"]);
+    assert_eq!(unfinished.stages, ["silent"]);
     drop(release);
 }

@@ -51,10 +51,10 @@ fn check(stages: u64, fate: Mishap, result: Result<Report, RuntimeError>) {
         (Mishap::Nothing, Ok(report)) => {
             assert_eq!(report.stage("sink").map(|sink| sink.items_in), Some(ITEMS));
         }
-        (Mishap::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, laggards, .. }))
-        | (Mishap::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, laggards, .. })) => {
+        (Mishap::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, unfinished, .. }))
+        | (Mishap::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, unfinished, .. })) => {
             assert_eq!(name, format!("stage {stage}"));
-            assert!(laggards.stages.is_empty(), "{laggards}");
+            assert!(unfinished.stages.is_empty(), "{unfinished}");
         }
         (Mishap::Cancel { .. }, Ok(report)) => {
             let given = report.stage("source").map(|source| source.items_out);
