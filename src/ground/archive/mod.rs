@@ -38,11 +38,10 @@
 //! passes and the spans of open ones.
 //!
 //! # Size
-//! The journal takes some 95 bytes per packet of visibilities in a checkpoint and 300 in memory. For 26 million visibilities
-//! per channel in packets of 215, these are 12 MB and 36 MB, for 550 MB of downlink. Held packets take up to `wait_bytes`
-//! in both. With or without an archive, the ephemeris takes 9 kB per window for at most 8192 windows (two years), 72 MB. A
-//! packet of visibilities takes some 100 bytes more: 60 in the received set, which grows with the number of creation
-//! times, and 20 to 40 in the set of blocks.
+//! The journal takes some 95 bytes per packet of visibilities in a checkpoint and 300 in memory: 12 and 36 MB for a channel of
+//! 26 million visibilities in packets of 215. Held packets take up to `wait_bytes` in both. With or without an archive, memory
+//! holds the ephemeris, 9 kB per window for at most 8192 windows (72 MB, more than two years), and some 100 bytes per packet
+//! of visibilities: 60 in the received set and 20 to 40 in the set of blocks.
 //!
 //! # The raw archive
 //! A ground stage that listens stores every accepted packet in `archive/` beside its checkpoints before it answers `taken`
