@@ -9,6 +9,7 @@
 #[doc(hidden)]
 pub mod archive;
 mod collector;
+mod collector_state;
 mod config;
 mod core;
 mod error;
@@ -27,7 +28,9 @@ pub use self::core::Ground;
 #[doc(hidden)]
 pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
 #[doc(hidden)]
-pub use collector::{Collector, CollectorState, CollectorStep, CollectorView, DeliveredPacket, Delivery};
+pub use collector::{Collector, CollectorStep, DeliveredPacket, Delivery};
+#[doc(hidden)]
+pub use collector_state::{CollectorState, CollectorView};
 #[doc(hidden)]
 pub use config::GroundConfig;
 pub use config::WAIT_BYTES;

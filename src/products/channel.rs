@@ -3,15 +3,16 @@
 use std::path::{Path, PathBuf};
 
 use super::beam::EffectiveBeam;
+use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
 use super::latitudes::latitude_errors;
 use super::pictures::{
-    Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
-    View, draw_map, draw_plots, draw_sheet,
+    Bars, ColourScale, MapPanel, Palette, Picture, Sampling, Scaling, Sheet, View, draw_map, draw_sheet,
 };
 use super::point_beams::{PointBeamSummary, beams_csv};
 use super::provenance::Provenance;
+use super::sheet_maps::SheetMaps;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
@@ -19,14 +20,11 @@ use crate::files::{disk_room, write_atomically};
 use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
-use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
+use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::units::constants::DAY_S;
 
 /// Reciprocal of the fraction of the disk that products leave free, while a ground stage listens.
 const FREE_DIVISOR: u64 = 20;
-
-/// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
-const SHEET_MAPS_MAX: usize = 6;
 
 /// Fixed names of copies of the last map and its picture. They are not links, which break if a folder is copied or packed.
 const LATEST_MAP: &str = "latest.fits";
@@ -464,48 +462,6 @@ impl ShownMaps {
     }
 }
 
-/// A bounded selection of snapshots for the sheet: the first, and every 2^n-th after it.
-#[derive(Default)]
-struct SheetMaps {
-    /// Maps with their captions.
-    maps: Vec<(Vec<f64>, String)>,
-    /// Number of maps offered so far.
-    offered: usize,
-    /// log2 of the number of maps offered per map kept.
-    halvings: u32,
-}
-
-impl SheetMaps {
-    /// Offers a map, which is kept if its number is a multiple of the current stride.
-    fn offer(&mut self, map: &[f64], caption: &str) {
-        let is_kept = |offered: usize, halvings: u32| offered.is_multiple_of(1 << halvings);
-        if is_kept(self.offered, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
-            let mut is_odd = true;
-            self.maps.retain(|_| {
-                is_odd = !is_odd;
-                !is_odd
-            });
-            self.halvings += 1;
-        }
-        if is_kept(self.offered, self.halvings) {
-            self.maps.push((map.to_vec(), caption.to_owned()));
-        }
-        self.offered += 1;
-    }
-
-    /// The maps for the sheet, in equal steps from the first to `last`, which was offered last.
-    fn evenly_spaced<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
-        let is_last = |k: usize| (k << self.halvings) + 1 == self.offered;
-        let others = (0..self.maps.len()).filter(|&k| !is_last(k)).count();
-        let places = SHEET_MAPS_MAX.min(others + 1);
-        (0..places).map(move |place| {
-            let k = if places > 1 { place * others / (places - 1) } else { 0 };
-            let kept = self.maps[..others].get(k);
-            kept.map_or(last, |(map, caption)| (map.as_slice(), caption.as_str()))
-        })
-    }
-}
-
 /// File name of a map without extension.
 fn map_name(solution: &Solution) -> String {
     if solution.is_final { "map".to_owned() } else { format!("snapshot-{:03}", solution.number) }
@@ -531,111 +487,4 @@ fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
 fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     let range = &rho[1.min(rho.len())..rho.len().min(l_max + 1)];
     range.iter().sum::<f64>() / range.len().max(1) as f64
-}
-
-/// Draws (map - truth) / truth over the sky, percent, in a celestial frame.
-///
-/// # Errors
-/// [`PictureError::Size`], which cannot occur for one map.
-pub fn draw_relative_error(
-    title: &str,
-    subtitle: &str,
-    comparison: &Comparison,
-    frame: Frame,
-) -> Result<Picture, PictureError> {
-    let map = &comparison.relative_error_map;
-    let percent = |&value: &f64| if is_unseen(value) { value } else { 100.0 * value };
-    let values: Vec<f64> = map.values().iter().map(percent).collect();
-    let panel = MapPanel {
-        values: &values,
-        caption: title.to_owned(),
-        scale: ColourScale::symmetric(&values),
-        unit: "% of the truth".to_owned(),
-    };
-    let view = View { sampling: Sampling::Interpolated, ..View::of(frame, map.frame()) };
-    draw_map(&panel, subtitle, &view)
-}
-
-/// Draws rho_l, the angular power spectra and SNR_l as curves.
-///
-/// # Errors
-/// [`PictureError::Size`], which cannot occur for three plots.
-pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, PictureError> {
-    let curve = |label: &str, values: &[f64], dashed: bool| Curve {
-        label: label.to_owned(),
-        points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),
-        dashed,
-    };
-    let correlations = match &comparison.rho_noise_subtracted {
-        None => vec![curve("", &comparison.rho, false)],
-        Some(rho_noise_subtracted) => vec![
-            curve("with the map's noise", &comparison.rho, false),
-            curve("noise power subtracted", rho_noise_subtracted, true),
-        ],
-    };
-    let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
-    let mut plots = vec![
-        Plot {
-            title: "Correlation with the input".to_owned(),
-            x: l.clone(),
-            y: Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false },
-            curves: correlations,
-            levels: vec![1.0],
-        },
-        Plot {
-            title: "Angular power".to_owned(),
-            x: l.clone(),
-            y: Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None },
-            curves: vec![
-                curve("map", &comparison.cl_map, false),
-                curve("input", &comparison.cl_truth, true),
-                curve("cross", &comparison.cl_cross, false),
-            ],
-            levels: Vec::new(),
-        },
-    ];
-    if let Some(snr) = &comparison.snr {
-        plots.push(Plot {
-            title: "Signal to noise".to_owned(),
-            x: l,
-            y: Axis { label: "SNR_{l}".to_owned(), log: true, limits: None },
-            curves: vec![curve("", snr, false)],
-            levels: vec![1.0],
-        });
-    }
-    draw_plots(title, &plots, plots.len())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_sheet_goes_from_the_first_map_to_the_last_in_bounded_memory() {
-        for count in [1, 2, 5, 6, 7, 12, 13, 24, 25, 100, 471] {
-            let mut shown = SheetMaps::default();
-            for k in 0..count {
-                shown.offer(&[k as f64], &k.to_string());
-                assert!(shown.maps.len() <= 2 * SHEET_MAPS_MAX);
-            }
-            let last = count - 1;
-            let sheet: Vec<(f64, String)> = shown
-                .evenly_spaced((&[last as f64], &last.to_string()))
-                .map(|(map, caption)| (map[0], caption.to_owned()))
-                .collect();
-            assert_eq!(sheet.len(), SHEET_MAPS_MAX.min(count));
-            assert_eq!((sheet[0].0, sheet[sheet.len() - 1].0), (0.0, last as f64));
-            for (map, caption) in &sheet {
-                assert_eq!(&map.to_string(), caption);
-            }
-            // Steps are multiples of the stride of kept maps, which is a twelfth to a sixth of all, so within a factor of two of
-            // equal steps.
-            let equal = last as f64 / (sheet.len().max(2) - 1) as f64;
-            let steps = sheet.windows(2).map(|two| two[1].0 - two[0].0);
-            assert!(
-                steps.clone().all(|step| step >= 0.4 * equal && step <= 2.0 * equal),
-                "{count}: {sheet:?}"
-            );
-        }
-    }
 }

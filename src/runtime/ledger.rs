@@ -34,17 +34,17 @@ impl<R: Reason> Ledger<R> {
     }
 
     /// Adds `count` new samples.
-    pub fn sampled(&self, count: u64) {
+    pub fn add_sampled(&self, count: u64) {
         add(&mut self.counts().sampled, count);
     }
 
     /// Adds `count` samples that reached the result.
-    pub fn accumulated(&self, count: u64) {
+    pub fn add_accumulated(&self, count: u64) {
         add(&mut self.counts().accumulated, count);
     }
 
     /// Adds `count` samples that were flagged or lost for `reason`.
-    pub fn left_out(&self, reason: R, count: u64) {
+    pub fn add_left_out(&self, reason: R, count: u64) {
         self.counts().leave_out(reason, count);
     }
 
@@ -77,7 +77,7 @@ impl<R: Reason> Ledger<R> {
     /// # Errors
     /// [`LedgerImbalance`] unless sampled = accumulated + flagged + lost.
     #[doc(hidden)]
-    pub fn close(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
+    pub fn balanced_report(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
         let report = self.report();
         if report.unaccounted() == 0 { Ok(report) } else { Err(LedgerImbalance { report }) }
     }
@@ -286,8 +286,8 @@ mod tests {
 
     fn post(ledger: &Ledger<Why>, fate: Option<Why>, count: u64) {
         match fate {
-            None => ledger.accumulated(count),
-            Some(reason) => ledger.left_out(reason, count),
+            None => ledger.add_accumulated(count),
+            Some(reason) => ledger.add_left_out(reason, count),
         }
     }
 
@@ -297,11 +297,11 @@ mod tests {
             let ledger = Ledger::new();
             let total: u64 = fates.iter().map(|&(_, count)| count).sum();
             prop_assume!(total >= 3);
-            ledger.sampled(total.checked_add_signed(missing).unwrap());
+            ledger.add_sampled(total.checked_add_signed(missing).unwrap());
             for &(fate, count) in &fates {
                 post(&ledger, fate, count);
             }
-            match ledger.close() {
+            match ledger.balanced_report() {
                 Ok(report) => {
                     prop_assert_eq!(missing, 0);
                     let known = u128::from(report.accumulated) + report.flagged_total() + report.lost_total();
@@ -339,22 +339,22 @@ mod tests {
     #[test]
     fn forged_counts_saturate() {
         let ledger = Ledger::new();
-        ledger.left_out(Why::Gap, u64::MAX);
-        ledger.left_out(Why::Gap, u64::MAX);
-        ledger.left_out(Why::Checksum, u64::MAX);
+        ledger.add_left_out(Why::Gap, u64::MAX);
+        ledger.add_left_out(Why::Gap, u64::MAX);
+        ledger.add_left_out(Why::Checksum, u64::MAX);
         assert_eq!(ledger.report().unaccounted(), -2 * i128::from(u64::MAX));
-        assert!(ledger.close().is_err());
+        assert!(ledger.balanced_report().is_err());
     }
 
     #[test]
     fn the_report_is_shown_and_serialised() {
         let ledger = Ledger::new();
-        ledger.sampled(20);
-        ledger.accumulated(6);
+        ledger.add_sampled(20);
+        ledger.add_accumulated(6);
         for (reason, count) in REASONS.into_iter().zip([3, 2, 4, 0, 5]) {
-            ledger.left_out(reason, count);
+            ledger.add_left_out(reason, count);
         }
-        let report = ledger.close().unwrap();
+        let report = ledger.balanced_report().unwrap();
         let rows: Vec<(String, u64)> = report.rows();
         let rows: Vec<(&str, u64)> = rows.iter().map(|(name, count)| (name.as_str(), *count)).collect();
         let expected = [

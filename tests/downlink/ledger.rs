@@ -182,7 +182,7 @@ fn receive(arrived: &[u8]) -> Received {
         accumulator.step(frame, &mut maps).unwrap();
     }
     accumulator.finish(&mut maps).unwrap();
-    let ledger = ledger.close().unwrap();
+    let ledger = ledger.balanced_report().unwrap();
     let reception = account.lock().unwrap_or_else(PoisonError::into_inner).clone();
     Received { ledger, reception, completeness, summed }
 }
@@ -396,7 +396,7 @@ fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
     }
     ground.finish(&mut maps).unwrap();
     let completeness = outcome.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    (outcome.ledger.close().unwrap(), completeness)
+    (outcome.ledger.balanced_report().unwrap(), completeness)
 }
 
 /// Passes and frames that do not arrive, of each of which a ground may notice nothing.

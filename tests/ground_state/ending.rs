@@ -35,7 +35,7 @@ fn what_arrives_after_an_interrupt_is_held_and_added_by_the_next_session() {
                 cancel.cancel();
                 ground.step(parts[1].to_vec(), &mut out).unwrap();
                 ground.finish(&mut out).unwrap();
-                outcome.ledger.close().unwrap()
+                outcome.ledger.balanced_report().unwrap()
             };
             let name = |name: &str| format!("{name}.{wait_bytes}");
             let whole = session(&name("whole"), [&bytes, &[]]);

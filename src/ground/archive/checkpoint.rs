@@ -307,7 +307,7 @@ mod tests {
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
-        ledger.left_out(VisibilityReason::BaselineBeyondMap, 4);
+        ledger.add_left_out(VisibilityReason::BaselineBeyondMap, 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
         let mut calibrator = Calibrator::new(Box::new(Identity), ledger.clone()).with_autos();
         let mut collector = Collector::new(1000);

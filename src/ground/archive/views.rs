@@ -198,12 +198,12 @@ mod tests {
             assert_eq!(journal.delivered().count(), 7);
         }
         ground.finish(&mut Outlet::collect()).unwrap();
-        let said = (ground.outcome.ledger.close().unwrap(), ground.collector.counters());
+        let said = (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters());
         drop(ground);
         // A session without data has the same counts.
         let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         again.finish(&mut Outlet::collect()).unwrap();
-        assert_eq!((again.outcome.ledger.close().unwrap(), again.collector.counters()), said);
+        assert_eq!((again.outcome.ledger.balanced_report().unwrap(), again.collector.counters()), said);
     }
 
     #[test]
@@ -228,7 +228,7 @@ mod tests {
             ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
             ground.finish(&mut Outlet::collect()).unwrap();
             let told: Vec<String> = ground.notes().map(str::to_owned).collect();
-            (ground.outcome.ledger.close().unwrap(), ground.collector.counters(), told)
+            (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters(), told)
         };
         let session = |ranks: &Ranks, bytes: &[u8]| session_in(folder.path(), ranks, bytes);
         let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::one(), bytes));

@@ -491,7 +491,7 @@ fn conclude(
     }
     let FinishedGraph { report, outcome, .. } = ended;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ground.ledger.close()?;
+    let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
@@ -506,7 +506,7 @@ pub(in crate::pipeline) fn summarise(
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = ground.ledger.close()?;
+    let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(account) = &listening {
         account.complete(&mut reception);
