@@ -36,7 +36,6 @@ struct BaselineNumbers {
     altitude_m: [f64; 2],
 }
 
-/// Extremes of a pair in a window.
 #[derive(Clone, Copy)]
 struct Extremes {
     length_m: [f64; 2],
@@ -51,7 +50,6 @@ struct WindowExtremes {
     altitude_m: [f64; 2],
 }
 
-/// Finds the extremes of a window.
 fn extremes_of(plan: &Plan, pairs: &[Pair], window: ObservingWindow) -> WindowExtremes {
     let array = &plan.array;
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
@@ -114,7 +112,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     for window in &windows {
         for (pair, found) in pairs.iter().zip(&window.pairs) {
             let [shortest_m, longest_m] = found.length_m;
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{:.4},{},{},{shortest_m:.3},{longest_m:.3},{:.3},{:.3}",

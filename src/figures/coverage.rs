@@ -25,7 +25,6 @@ const NSIDE: usize = 8;
 const STEP_S: f64 = 120.0;
 /// Cells along a side of the plane of projected baselines.
 const CELLS: usize = 32;
-/// Number of words of 64 cells.
 const WORDS: usize = CELLS * CELLS / 64;
 /// Edges of the latitude bands, from the ecliptic to the pole, degrees.
 const BANDS_DEG: [[f64; 2]; 6] =
@@ -68,7 +67,6 @@ struct Direction {
     axes: [Vec3; 2],
 }
 
-/// Coverage of one channel by direction.
 #[derive(Clone)]
 struct ChannelMaps {
     limit_m: f64,
@@ -215,7 +213,6 @@ fn with_axes(n_hat: Vec3) -> Direction {
     Direction { n_hat, axes: [east, cross(n_hat, east)] }
 }
 
-/// Mean, minimum and maximum.
 fn mean_and_range(values: &[f64]) -> [f64; 3] {
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     let minimum = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -264,7 +261,6 @@ fn table(numbers: &CoverageNumbers, columns: &[[Vec<f64>; 4]], directions: &[Dir
         for (k, Direction { n_hat: [x, y, z], .. }) in directions.iter().enumerate() {
             let longitude_deg = y.atan2(*x).to_degrees().rem_euclid(360.0);
             let latitude_deg = z.asin().to_degrees();
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{},{k},{longitude_deg:.4},{latitude_deg:.4},{:.4},{:.0},{:.4},{:.4}",

@@ -15,7 +15,6 @@ use crate::products::pictures::Picture;
 pub struct FigureFiles {
     /// Name of the figure.
     pub figure: String,
-    /// The numbers of the figure.
     pub numbers: Value,
     /// Paths of the files.
     pub files: Vec<PathBuf>,
@@ -23,11 +22,8 @@ pub struct FigureFiles {
 
 /// A figure before it is written.
 pub(super) struct FigureParts {
-    /// The numbers of the figure.
     pub numbers: Value,
-    /// The CSV table.
     pub csv: String,
-    /// The picture.
     pub picture: Picture,
     /// Paths of files that have been written already.
     pub extra_files: Vec<PathBuf>,

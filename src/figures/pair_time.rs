@@ -195,7 +195,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
 fn table(numbers: &PairTimeNumbers) -> String {
     let mut csv = "from_m,to_m,pair_s".to_owned();
     for channel in &numbers.channels {
-        // Writing to a string cannot fail.
         let _ = write!(csv, ",visibilities_{}hz", channel.frequency_hz);
     }
     csv.push('\n');

@@ -112,7 +112,6 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     };
     let mut csv = "pixel,centre_re,centre_im,average_re,average_im\n".to_owned();
     for k in 0..pixels {
-        // Writing to a string cannot fail.
         let _ = writeln!(
             csv,
             "{k},{:.7},{:.7},{:.7},{:.7}",

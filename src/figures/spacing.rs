@@ -65,7 +65,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     for curve in &numbers.curves {
         for (ratio, q0) in curve.ratio.iter().zip(&curve.q0) {
             let q0 = q0.map_or_else(String::new, |q0| format!("{q0:.10}"));
-            // Writing to a string cannot fail.
             let _ = writeln!(csv, "{ratio},{},{q0}", curve.first_ratio);
         }
     }

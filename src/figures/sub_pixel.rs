@@ -148,7 +148,6 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
     let mut csv = "nside,rows,from_bp,to_bp,count,rms_k_sr,of_visibility,of_noise\n".to_owned();
     for case in &numbers.cases {
         for class in &case.classes {
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{},{},{},{},{},{:.5e},{:.5e},{:.5e}",
@@ -173,7 +172,6 @@ fn epsilon(plan: &Plan) -> f64 {
     plan.config.map.epsilon().get(0).unwrap_or(1e-4)
 }
 
-/// The cases of both methods at one nside.
 fn cases_for_nside(plan: &Plan, nside: usize) -> Result<Vec<SubPixelCase>, FigureError> {
     let sample = VisibilitySample::new(plan, nside)?;
     let nside_fine = CHILDREN * nside;
@@ -245,7 +243,6 @@ fn rows(sample: &VisibilitySample, nside: usize, method: PixelMethod) -> Result<
     Ok(Mat::from_fn(maker.pixels(), 2 * rows.len(), |pixel, k| rows[k / 2][k % 2][pixel]))
 }
 
-/// The inputs of a case.
 struct CaseInputs<'a> {
     epsilon: f64,
     sample: &'a VisibilitySample,

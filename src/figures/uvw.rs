@@ -12,7 +12,6 @@ use crate::products::pictures::{Axis, ColourScale, Palette, Raster, Scaling, dra
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot, scale, sub};
 
-/// Number of cells along a side.
 const CELLS: usize = 161;
 /// Time step, s, in which a baseline rotates by half a degree.
 const STEP_S: f64 = 12.0;
@@ -114,7 +113,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     for (plane_s, (x, y)) in counts.planes_s.iter().zip(PLANES) {
         let at = |cell: usize| limit_wavelengths * (2.0 * (cell as f64 + 0.5) / CELLS as f64 - 1.0);
         for (k, pair_s) in plane_s.iter().enumerate().filter(|(_, pair_s)| **pair_s > 0.0) {
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{}{},{:.3},{:.3},{pair_s:.1}",

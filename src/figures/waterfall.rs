@@ -20,13 +20,10 @@ use crate::sky::{Frame, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
-/// Number of times in the window.
 const TIMES: usize = 60;
-/// Number of frequencies.
 const FREQUENCIES: usize = 60;
 /// Lowest and highest frequency relative to the channel.
 const BAND: [f64; 2] = [0.1, 3.0];
-/// Maximum nside of the fine sky.
 const FINE_NSIDE_MAX: usize = 1024;
 /// Edges of the classes of baseline length, in units of b_p.
 const CLASSES_BP: [f64; 6] = [0.0, 0.5, 1.0, 2.0, 4.0, f64::INFINITY];
@@ -86,7 +83,6 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     let mut csv =
         "t_s,frequency_hz,length_bp,fine_re,fine_im,average_re,average_im,centre_re,centre_im\n".to_owned();
     for Cell { t_s, frequency_hz, length_bp, values: [fine, average, centre] } in &cells {
-        // Writing to a string cannot fail.
         let _ = writeln!(
             csv,
             "{t_s:.3},{frequency_hz:.0},{length_bp:.4},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e}",

@@ -348,14 +348,22 @@ impl Collector {
                 }
             }
             if !self.held.is_full() {
-                let packet = self.held.pop_excess_segment()?;
-                return Some(self.deliver_incomplete(packet));
+                return self.release_excess_segment();
             }
             if !self.make_candidates() {
-                let packet = self.held.pop_visibilities()?;
-                return Some(self.deliver(&[packet]));
+                return self.release_oldest_visibilities();
             }
         }
+    }
+
+    fn release_excess_segment(&mut self) -> Option<Delivery> {
+        let packet = self.held.pop_excess_segment()?;
+        Some(self.deliver_incomplete(packet))
+    }
+
+    fn release_oldest_visibilities(&mut self) -> Option<Delivery> {
+        let packet = self.held.pop_visibilities()?;
+        Some(self.deliver(&[packet]))
     }
 
     /// Makes all held packets candidates if an ephemeris has arrived. Returns whether it did.
@@ -397,7 +405,6 @@ impl Collector {
         delivery
     }
 
-    /// Takes one event from the stream.
     fn take_event(&mut self, is_due: IsDue<'_>) -> Result<EventOutcome, DownlinkError> {
         let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::NeedsBytes) };
         let Event::Packet(packet) = event else {
@@ -438,7 +445,7 @@ impl Collector {
             let packets = vec![DeliveredPacket { header, checksum: packet.check, counts }];
             return Ok(EventOutcome::Delivery(Delivery { packets, frame }));
         }
-        self.held.insert(HeldPacket::of(&packet));
+        self.held.insert(HeldPacket::new(&packet));
         if !is_instrument && !self.knows_instrument() {
             return Ok(EventOutcome::Consumed);
         }

@@ -63,7 +63,6 @@ impl CollectorState {
     }
 }
 
-/// Headers of all held packets.
 pub(super) fn headers(held: &HoldBuffer) -> VecDeque<PacketHeader> {
     held.packets().map(|packet| packet.header).collect()
 }

@@ -42,7 +42,6 @@ pub struct Ground {
     pub(super) cancel_grace: Duration,
     /// Whether the sums of earlier sessions are emitted as a snapshot at the start.
     pub(super) has_initial_snapshot: bool,
-    /// Number of steps so far.
     pub(super) steps: u64,
     /// Answers to senders that wait for a checkpoint.
     pub(super) promises: SenderPromises,
@@ -64,7 +63,7 @@ impl Ground {
             calibrator: config.calibrator(gate.as_ref(), &outcome.ledger)?,
             gate,
             accumulator: config.accumulator(&outcome.ledger),
-            live_view_writer: LiveViewWriter::of(&outcome.live_view),
+            live_view_writer: LiveViewWriter::new(&outcome.live_view),
             outcome,
             archive: None,
             cancel: Cancel::new(),
@@ -269,7 +268,7 @@ impl Ground {
             }
             return Ok(());
         };
-        let mut draft = RecordDraft::of(frame.as_ref());
+        let mut draft = RecordDraft::new(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
             self.live_view_writer.add(&placed);

@@ -14,7 +14,6 @@ use crate::units::MissionTime;
 /// Memory of a held packet in addition to its bytes.
 const OVERHEAD_BYTES: u64 = 128;
 
-/// Capacity for packets other than visibilities, bytes.
 const OTHERS_BYTES_MAX: u64 = 1 << 25;
 
 /// Minimum capacity before an instrument description arrives, bytes.
@@ -43,7 +42,7 @@ pub struct HeldPacket {
 impl HeldPacket {
     /// A copy of a packet.
     #[must_use]
-    pub fn of(packet: &Packet<'_>) -> Self {
+    pub fn new(packet: &Packet<'_>) -> Self {
         Self { header: packet.header, payload: packet.payload.to_vec(), checksum: packet.check }
     }
 
@@ -179,7 +178,7 @@ impl HoldBuffer {
         self.bytes > self.bytes_max
     }
 
-    /// Removes the packet of visibilities that was key_of first.
+    /// Removes the packet of visibilities that was sent first.
     pub fn pop_visibilities(&mut self) -> Option<HeldPacket> {
         let (_, packet) = self.visibilities.pop_first()?;
         self.bytes = self.bytes.saturating_sub(packet.cost());

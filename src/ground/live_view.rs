@@ -16,10 +16,8 @@ use crate::frames::{EphemerisSegment, GroundFrame, Instrument, PlacedFrame, Plac
 use crate::units::vector::{Vec3, scale, sub};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Maximum number of channels whose baselines are counted.
 const CHANNELS_MAX: usize = 256;
 
-/// Maximum number of points of a track.
 const TRACK_MAX: usize = 64;
 
 /// Positions of the satellites at the time of the latest data.
@@ -43,7 +41,7 @@ pub struct ArrayGeometry {
 
 impl ArrayGeometry {
     /// The geometry at a time; `None` if the ephemeris does not cover it.
-    fn at(ephemeris: &Ephemeris, instrument: &Instrument, time_s: f64) -> Option<Self> {
+    fn new(ephemeris: &Ephemeris, instrument: &Instrument, time_s: f64) -> Option<Self> {
         let covers = |segment: &&EphemerisSegment| {
             segment.start.seconds() <= time_s && time_s <= segment.end().seconds()
         };
@@ -81,7 +79,6 @@ struct Shared {
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
     /// Visible directions by channel.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
-    /// Powers of the daughters by channel.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
 
@@ -172,8 +169,7 @@ pub(super) struct LiveViewWriter {
 }
 
 impl LiveViewWriter {
-    /// A writer for a live view.
-    pub(super) fn of(live_view: &LiveView) -> Self {
+    pub(super) fn new(live_view: &LiveView) -> Self {
         Self { live_view: live_view.clone(), ..Self::default() }
     }
 
@@ -237,8 +233,8 @@ impl LiveViewWriter {
 
     fn put(&self, collector: &Collector, ephemeris: &Ephemeris) {
         let Some(instrument) = collector.instrument() else { return };
-        let passes = PassLine::of(instrument.epoch_tai_s, collector.received());
-        let array = self.latest_s.and_then(|latest_s| ArrayGeometry::at(ephemeris, instrument, latest_s));
+        let passes = PassLine::new(instrument.epoch_tai_s, collector.received());
+        let array = self.latest_s.and_then(|latest_s| ArrayGeometry::new(ephemeris, instrument, latest_s));
         *self.live_view.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
     }
 }

@@ -83,7 +83,6 @@ pub struct SharedSaving(Arc<Mutex<Option<SavingProgress>>>);
 #[derive(Debug, Default)]
 struct SavingProgress {
     report: SavingReport,
-    /// Bytes received.
     received: u64,
     /// Bytes received before the newest checkpoint.
     saved: u64,

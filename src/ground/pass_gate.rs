@@ -1,7 +1,7 @@
 //! Holds visibilities back until the gains of their pass are known.
 //!
 //! Visibilities wait in the hold buffer, as they do for their positions. A pass ends with the first visibilities that begin more
-//! than `calibrate.pass_gap_s` after it. At most two passes are open: the newest, and one of late data, index ends with
+//! than `calibrate.pass_gap_s` after it. At most two passes are open: the newest, and one of late data, which ends with
 //! late data of another pass. Late data of a closed pass, or within the gap of it, get the gains of that pass.
 
 use crate::array::Ephemeris;
@@ -40,7 +40,7 @@ impl PassGateState {
     }
 }
 
-/// Decides index visibilities are due, and solves for the gains of passes that have ended.
+/// Decides which visibilities are due, and solves for the gains of passes that have ended.
 pub(super) struct PassGate {
     solver: PassSolver,
     gains: SolvedGains,
@@ -59,7 +59,7 @@ impl PassGate {
         Self { solver, gains, gap_s, open: [None; 2], observer: None, must_note_held: true }
     }
 
-    /// The table of solved gains, index clones share.
+    /// The table of solved gains, which clones share.
     pub(super) fn gains(&self) -> &SolvedGains {
         &self.gains
     }
@@ -82,7 +82,7 @@ impl PassGate {
     /// Resumes from a state. The instrument must have been described.
     pub(super) fn resume(&mut self, state: PassGateState) {
         let PassGateState { mut passes, open, late } = state;
-        // In the order in index they were closed: the validity of each depends on the gains before it.
+        // In the order in which they were closed: the validity of each depends on the gains before it.
         passes.sort_unstable_by_key(|pass| pass.number);
         passes.into_iter().for_each(|pass| self.gains.close(pass));
         self.gains.count_late(late);
@@ -97,7 +97,9 @@ impl PassGate {
             return true;
         }
         let is_in_open_pass = || (0..2).any(|index| self.is_in_open_pass(index, [middle_s; 2]));
-        self.gains.away_s(middle_s).is_some_and(|away_s| away_s == 0.0 || !is_in_open_pass())
+        self.gains
+            .distance_to_pass_s(middle_s)
+            .is_some_and(|distance_s| distance_s == 0.0 || !is_in_open_pass())
     }
 
     /// Whether a block with this span belongs to an open pass, within the gap.
@@ -111,7 +113,9 @@ impl PassGate {
     pub(super) fn ended_by(&self, block: &VisibilityBlock) -> Option<usize> {
         let block_span_s = span_s(block)?;
         let [_, until_s] = self.open[NEWEST]?;
-        if self.gains.away_s(block_span_s[0]) == Some(0.0) || self.is_in_open_pass(NEWEST, block_span_s) {
+        if self.gains.distance_to_pass_s(block_span_s[0]) == Some(0.0)
+            || self.is_in_open_pass(NEWEST, block_span_s)
+        {
             return None;
         }
         if block_span_s[0] > until_s + self.gap_s {
@@ -119,21 +123,21 @@ impl PassGate {
         }
         (self.open[LATE].is_some()
             && !self.is_in_open_pass(LATE, block_span_s)
-            && self.gains.away_s(block_span_s[0]).is_none())
+            && self.gains.distance_to_pass_s(block_span_s[0]).is_none())
         .then_some(LATE)
     }
 
     /// Registers a held block, and returns whether it is in an open pass. The pass that it ends must have been closed before.
     pub(super) fn note(&mut self, block: &VisibilityBlock) -> bool {
         let Some(block_span_s) = span_s(block) else { return false };
-        let away_s = self.gains.away_s(block_span_s[0]);
-        let index = if away_s == Some(0.0) {
+        let distance_s = self.gains.distance_to_pass_s(block_span_s[0]);
+        let index = if distance_s == Some(0.0) {
             return false;
         } else if self.is_in_open_pass(NEWEST, block_span_s) {
             NEWEST
         } else if self.is_in_open_pass(LATE, block_span_s) {
             LATE
-        } else if away_s.is_some() {
+        } else if distance_s.is_some() {
             return false;
         } else if self.open[NEWEST].is_none() {
             NEWEST

@@ -7,13 +7,11 @@ use serde::Serialize;
 
 use crate::downlink::{CucTime, Kind, ReceivedSet};
 
-/// Maximum number of bins.
 const BINS_MAX: usize = 480;
 
 /// Minimum width of a bin, s. Wider bins are this times a power of two; a window spans three of the narrowest.
 const BIN_S_MIN: f64 = 900.0;
 
-/// Maximum number of listed ranges.
 const RANGES_MAX: usize = 1000;
 
 /// Packets of one kind by bin.
@@ -64,7 +62,7 @@ pub struct PassLine {
 impl PassLine {
     /// The time line of the received sets of each kind.
     #[must_use]
-    pub fn of<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) -> Self {
+    pub fn new<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) -> Self {
         let time_s = |made: CucTime| made.tai_s() - epoch_tai_s;
         let sets: Vec<(Kind, &ReceivedSet)> = received.filter(|(_, set)| !set.is_empty()).collect();
         let ends = sets.iter().filter_map(|(_, set)| set.span());
@@ -116,7 +114,6 @@ impl PassLine {
     }
 }
 
-/// Distributes a count evenly over bins.
 fn distribute(bins: &mut [u64], count: u64) {
     // The common case.
     if let [bin] = bins {
@@ -141,7 +138,7 @@ mod tests {
     }
 
     fn line_of(sets: &[(Kind, ReceivedSet)]) -> PassLine {
-        PassLine::of(EPOCH_S, sets.iter().map(|(kind, set)| (*kind, set)))
+        PassLine::new(EPOCH_S, sets.iter().map(|(kind, set)| (*kind, set)))
     }
 
     /// Ten packets per pass with the same creation time, without lost ones.

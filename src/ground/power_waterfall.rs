@@ -5,10 +5,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use serde::ser::{SerializeStruct, Serializer};
 
-/// Maximum number of time bins.
 const BINS_MAX: usize = 256;
 
-/// Maximum number of daughters.
 const DAUGHTERS_MAX: usize = 64;
 
 /// Minimum width of a time bin, s.

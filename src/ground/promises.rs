@@ -11,7 +11,6 @@ pub(super) struct SenderPromises {
     pub(super) bytes: u64,
     /// Bytes that were applied from the raw archive, before the stream began.
     archived_bytes: u64,
-    /// Packets in the newest checkpoint.
     packets: u64,
 }
 
@@ -31,7 +30,6 @@ impl SenderPromises {
         self.bytes = bytes.saturating_sub(self.archived_bytes);
     }
 
-    /// Whether `packets` is more than the newest checkpoint has.
     pub(super) fn has_new(&self, packets: u64) -> bool {
         packets > self.packets
     }

@@ -67,7 +67,6 @@ impl UvwDensity {
         }
     }
 
-    /// Counts a baseline, wavelengths.
     fn count(&mut self, uvw: Vec3) {
         let longest = uvw.iter().fold(0.0, |longest: f64, x| longest.max(x.abs()));
         // NaN counts as too long.

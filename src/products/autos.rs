@@ -109,7 +109,6 @@ fn table(powers: &[AutoPower]) -> String {
     for power in powers {
         let AutoPower { daughter, frequency_hz, width_hz, time_s, power_k_sr, sigma_k_sr } = power;
         let daughter = u32::from(*daughter) + 1;
-        // Writing to a String cannot fail.
         let _ = writeln!(
             text,
             "{frequency_hz},{width_hz},{daughter},{time_s:.6},{power_k_sr:.7e},{sigma_k_sr:.3e}"

@@ -7,7 +7,6 @@ use serde::Serialize;
 use crate::sky::Comparison;
 use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 
-/// One jansky, W m^-2 Hz^-1.
 const JANSKY: f64 = 1e-26;
 /// Step in angle times the number of degrees, rad, a tenth of the half width of the narrowest beam.
 const STEP: f64 = 0.2;

@@ -33,7 +33,6 @@ const LATEST_PICTURE: &str = "latest.png";
 /// The output folder of a channel, and the summary of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
-    /// Output folder of the run.
     root: PathBuf,
     /// Name of the channel's folder within `root`.
     name: String,
@@ -161,7 +160,6 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Shows the map to viewers.
     fn show(&self, comparison: Option<&Comparison>, origin: Origin<'_>, viewers: &MapWatch) {
         let Origin { provenance, solution } = origin;
         let Some(figures) = self.snapshots.last() else { return };
@@ -192,7 +190,6 @@ impl ChannelFolder {
         self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
     }
 
-    /// Adds the summary of a map to the list of snapshots.
     fn record_snapshot(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
         let input = self.input(shown.processing);
         let rms_error_over_rms_truth =
@@ -396,7 +393,6 @@ impl ChannelFolder {
         self.draw_sheet(shown, &caption(solution), scale)
     }
 
-    /// Draws the sheet of snapshots.
     fn draw_sheet(
         &mut self,
         last: &ShownMaps,
@@ -462,7 +458,6 @@ impl ShownMaps {
     }
 }
 
-/// File name of a map without extension.
 fn map_name(solution: &Solution) -> String {
     if solution.is_final { "map".to_owned() } else { format!("snapshot-{:03}", solution.number) }
 }

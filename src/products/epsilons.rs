@@ -264,7 +264,6 @@ pub fn epsilons_csv(all: &[EpsilonChoices]) -> String {
                 Some(p.risk_error),
                 p.curvature,
             ];
-            // Writing to a string does not fail.
             let _ = writeln!(
                 text,
                 "{label},{},{},{}",

@@ -27,11 +27,8 @@ const ORDER_MIN: u8 = 3;
 /// Minimum and maximum width of tiles. 512 is the standard, and 64 is used for published maps of nside 512 (WMAP). Clients cache
 /// hundreds of tiles, so that smaller ones save little.
 const WIDTHS: [usize; 2] = [64, 512];
-/// Width of a tile in the all-sky picture.
 const PREVIEW_WIDTH: usize = 64;
-/// Number of tiles of order 3.
 const PREVIEW_TILES: usize = 768;
-/// Number of tiles per row of the all-sky picture.
 const PREVIEW_COLUMNS: usize = 27;
 /// Name of the lock file of a folder that is being written. An interrupted export leaves it as a mark that its tiles may be
 /// replaced.
@@ -70,7 +67,6 @@ pub struct HipsReport {
 /// Values of a tile, K, row by row from the top; NaN for pixels without a value.
 type Tile = Vec<f32>;
 
-/// Writes the tiles of a HiPS.
 struct TileWriter<'a> {
     map: &'a SkyMap,
     /// Rotation from the frame of the tiles to that of the map.
@@ -193,7 +189,6 @@ impl Hips {
             lines.push(("em_max", format!("{wavelength_m:e}")));
         }
         lines.iter().fold(String::new(), |mut text, (key, value)| {
-            // Writing to a string does not fail.
             let _ = writeln!(text, "{key:<20} = {value}");
             text
         })
@@ -253,7 +248,6 @@ impl TileWriter<'_> {
         tile
     }
 
-    /// Merges four tiles into the tile of the order above.
     fn merged(&self, inside: &[Tile]) -> Tile {
         let half = self.width / 2;
         let mut tile = vec![f32::NAN; self.width * self.width];

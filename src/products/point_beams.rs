@@ -152,7 +152,6 @@ impl PointBeamSummary {
     }
 }
 
-/// Formats beams as a CSV table.
 #[must_use]
 pub(super) fn beams_csv(beams: &[PointBeamSummary]) -> String {
     let mut text = "longitude_deg,latitude_deg,processed,peak_k,offset_deg,fwhm_deg,fwhm_major_deg,fwhm_minor_deg,angle_deg\n".to_owned();
@@ -160,7 +159,6 @@ pub(super) fn beams_csv(beams: &[PointBeamSummary]) -> String {
         for (is_processed, widths) in [(false, beam.solved), (true, beam.processed)] {
             let Some(widths) = widths else { continue };
             let BeamWidths { peak_k, offset_deg, fwhm_major_deg, fwhm_minor_deg, angle_deg } = widths;
-            // Writing to a string does not fail.
             let _ = writeln!(
                 text,
                 "{},{},{is_processed},{peak_k:e},{offset_deg},{},{fwhm_major_deg},{fwhm_minor_deg},{angle_deg}",

@@ -92,7 +92,6 @@ impl Provenance {
         cards
     }
 
-    /// Cards on the regulariser R.
     fn regulariser_cards(&self, solution: &Solution) -> Vec<Card> {
         let mut cards = Vec::new();
         if let Some(epsilon) = solution.diagnostics.epsilon {
@@ -119,7 +118,6 @@ impl Provenance {
         cards
     }
 
-    /// Cards on the iterative refinement of a map.
     fn refinement_cards(&self, refinement: &Refinement) -> Vec<Card> {
         let iterations = i64::try_from(refinement.convergence.iterations).unwrap_or(i64::MAX);
         let antennas = match self.map.antennas.keys_set() {
@@ -135,7 +133,6 @@ impl Provenance {
         ]
     }
 
-    /// Description of the prior of a channel.
     fn prior(&self, channel: usize) -> String {
         let map = &self.map;
         match map.prior_files.get(channel) {

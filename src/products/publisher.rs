@@ -124,7 +124,6 @@ impl Publisher {
         Ok(())
     }
 
-    /// Writes maps that could not be written before.
     fn retry_unwritten(&mut self) -> Result<(), ProductsError> {
         while let Some((channel, solution)) = self.unwritten.pop_first() {
             if let Err(error) = self.publish(&solution, &MapWatch::default()) {

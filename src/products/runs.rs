@@ -65,7 +65,7 @@ pub struct PowerKept {
 
 impl PowerKept {
     /// The power of `map` relative to `ideal`; `None` if either has no spectra.
-    fn of(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
+    fn new(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
         let (map, ideal) = (map.power.as_ref()?, ideal.power.as_ref()?);
         let ratios = |found: &[Option<f64>], ideal: &[Option<f64>], power: i32| {
             let ratio = |(found, ideal): (&Option<f64>, &Option<f64>)| {
@@ -206,7 +206,7 @@ impl RunFigures {
     pub fn set_power_kept(&mut self, ideal: &Self) {
         for channel in &mut self.channels {
             let same = ideal.channels.iter().find(|ideal| ideal.frequency_hz == channel.frequency_hz);
-            channel.power_kept = same.and_then(|ideal| PowerKept::of(channel, ideal));
+            channel.power_kept = same.and_then(|ideal| PowerKept::new(channel, ideal));
         }
     }
 }
@@ -341,7 +341,6 @@ pub fn spectra_csv(runs: &[&RunFigures]) -> String {
         for l in 0..degrees {
             let values =
                 columns.map(|column| number(column.and_then(|column| column.get(l).copied().flatten())));
-            // Writing to a string does not fail.
             let _ = writeln!(text, "{},{},{l},{}", field(&run.label), channel.frequency_hz, values.join(","));
         }
     }

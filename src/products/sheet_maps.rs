@@ -6,9 +6,7 @@ const SHEET_MAPS_MAX: usize = 6;
 /// A bounded selection of snapshots for the sheet: the first, and every 2^n-th after it.
 #[derive(Default)]
 pub(super) struct SheetMaps {
-    /// Maps with their captions.
     maps: Vec<(Vec<f64>, String)>,
-    /// Number of maps offered so far.
     offered: usize,
     /// log2 of the number of maps offered per map kept.
     halvings: u32,

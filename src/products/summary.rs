@@ -123,7 +123,6 @@ fn with_error(value_k: f64, sigma_k: Option<f64>) -> String {
 }
 
 impl ChannelSummary {
-    /// Description of the regulariser.
     fn regulariser_text(&self) -> String {
         let Some(power) = &self.sky_power else {
             return match self.diagnostics.epsilon {

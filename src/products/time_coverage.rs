@@ -5,9 +5,7 @@ use crate::downlink::Kind;
 use crate::ground::archive::{ChannelCoverage, CoverageSurvey, Gaps, JournalEntry};
 use crate::units::constants::DAY_S;
 
-/// Number of time bins of a plot.
 const BINS: usize = 240;
-/// Maximum number of channels in a picture.
 const PLOTS_MAX: usize = 64;
 
 /// Time axis with bins of equal length.
@@ -18,7 +16,7 @@ struct TimeBins {
 }
 
 impl TimeBins {
-    fn of<'a>(entries: impl Iterator<Item = &'a JournalEntry> + Clone) -> Self {
+    fn new<'a>(entries: impl Iterator<Item = &'a JournalEntry> + Clone) -> Self {
         let first_s = entries.clone().map(|entry| entry.start.seconds()).fold(f64::INFINITY, f64::min);
         let last_s = entries.map(|entry| entry.end.seconds()).fold(f64::NEG_INFINITY, f64::max);
         Self { first_s, last_s, bin_s: ((last_s - first_s) / BINS as f64).max(1.0) }
@@ -46,7 +44,7 @@ impl TimeBins {
 /// [`PictureError::Size`] if nothing has been received. Only the first 64 channels are shown.
 pub fn draw_coverage(survey: &CoverageSurvey, gaps: &Gaps) -> Result<Picture, PictureError> {
     let packets = &survey.received().packets;
-    let bins = TimeBins::of(packets.iter().map(|packet| &packet.entry));
+    let bins = TimeBins::new(packets.iter().map(|packet| &packet.entry));
     // Without packets there is no time axis; `draw_plots` refuses zero plots.
     let plots_max = if packets.is_empty() { 0 } else { PLOTS_MAX };
     let plots: Vec<Plot> =

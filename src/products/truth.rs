@@ -12,7 +12,6 @@ use crate::units::ChannelId;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Truth(BTreeMap<ChannelId, ChannelTruth>);
 
-/// The true sky of a channel.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ChannelTruth {
     /// The sky in the pixels of the maps.

@@ -39,7 +39,7 @@ impl MapWatch {
     }
 
     /// Adds a viewer, which gets every map from now on.
-    pub fn join(&self, viewer: Box<dyn MapViewer>) {
+    pub fn add_viewer(&self, viewer: Box<dyn MapViewer>) {
         self.viewers().push(viewer);
     }
 

@@ -104,7 +104,6 @@ impl<R: Reason> Default for LedgerReport<R> {
     }
 }
 
-/// An entry for samples that were lost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 struct Loss {
     stage: &'static str,

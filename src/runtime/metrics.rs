@@ -33,15 +33,12 @@ pub(super) struct Counters {
     items_out: AtomicU64,
     units: AtomicU64,
     queue_depth_max: AtomicUsize,
-    /// Number of completed steps.
     steps: AtomicU64,
-    /// Time of work in each step.
     pub(super) working_time: LiveTiming,
     /// Time from the push of the source to the end of the step.
     pub(super) since_source: LiveTiming,
     /// Whether the stage is in a step and not waiting for space in its queue.
     working: AtomicBool,
-    /// Whether the stage is in `finish`.
     finishing: AtomicBool,
     ended: AtomicBool,
 }

@@ -136,7 +136,6 @@ pub(super) struct WaitingTimes {
     pub(super) input: Duration,
 }
 
-/// The sending end of a link.
 pub(super) struct Queue<T> {
     sender: Sender<StampedItem<T>>,
     halt: Arc<Halt>,

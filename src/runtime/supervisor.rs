@@ -32,7 +32,6 @@ impl FirstFailure {
     }
 }
 
-/// The result of a thread that has ended.
 struct WorkerEnd {
     index: usize,
     ending: Ending,
@@ -72,7 +71,6 @@ impl StageThread {
     }
 }
 
-/// Time limits of a run.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
     /// Time for stages that are not kept to end after cancellation; `None` for no limit.

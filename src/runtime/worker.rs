@@ -39,7 +39,6 @@ pub(super) struct StageNode {
     pub(super) must_finish: bool,
 }
 
-/// The four timings of a stage.
 pub(super) struct Timings {
     pub(super) waiting_in: Timing,
     pub(super) working: Timing,
@@ -47,7 +46,6 @@ pub(super) struct Timings {
     pub(super) since_source: Timing,
 }
 
-/// Counts and times one worker.
 pub(super) struct WorkerMonitor {
     pub(super) counters: Arc<Counters>,
     pub(super) timings: Timings,
@@ -126,7 +124,6 @@ impl WorkerMonitor {
     }
 }
 
-/// The receiving end of a link.
 pub(super) struct Inlet<T> {
     receiver: Receiver<StampedItem<T>>,
 }

@@ -144,7 +144,7 @@ impl Mission {
 
     /// The packets that a checkpoint says it has received.
     fn received(&self, checkpoint: &Path) -> Packets {
-        let survey = CoverageSurvey::of(checkpoint).unwrap();
+        let survey = CoverageSurvey::read(checkpoint).unwrap();
         let sets = &survey.received().sets;
         self.having(|k| {
             let PacketHeader { kind, count, time, .. } = self.headers[k];

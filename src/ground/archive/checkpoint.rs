@@ -24,7 +24,6 @@ replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
 
-/// Size of the read buffer, bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 
 /// Maximum memory of a decoded head per byte on disk. The record of an ephemeris packet needs the most, 120 bytes for at

@@ -22,12 +22,11 @@ pub(in crate::ground) struct RecordDraft {
 }
 
 impl RecordDraft {
-    /// The draft of a frame.
-    pub(in crate::ground) fn of(frame: Option<&GroundFrame>) -> Self {
+    pub(in crate::ground) fn new(frame: Option<&GroundFrame>) -> Self {
         let empty = Self::default();
         match frame {
             Some(GroundFrame::Visibilities(block)) => {
-                let entry = JournalEntry::of(CucTime::default(), 0, block);
+                let entry = JournalEntry::new(CucTime::default(), 0, block);
                 Self { entry, window: block.start, ..empty }
             }
             Some(GroundFrame::Ephemeris(segment)) => Self { segment: Some(segment.clone()), ..empty },

@@ -31,13 +31,12 @@ pub struct JournalEntry {
 }
 
 impl JournalEntry {
-    /// Key in the order of sending.
     pub(super) fn sent(&self) -> SendingKey {
         (self.made, self.count)
     }
 
     /// The summary of a packet with a block of visibilities.
-    pub(super) fn of(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
+    pub(super) fn new(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
         let empty = Self { count, made, ..Self::default() };
         let Some(last) = block.len().checked_sub(1) else { return empty };
         let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);

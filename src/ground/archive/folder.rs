@@ -16,7 +16,6 @@ use crate::ground::GroundError;
 use crate::imaging::anywhere::ArchiveSegment;
 use crate::ranks::Ranks;
 
-/// Number of checkpoints that are kept.
 const KEPT: usize = 2;
 
 /// A folder that one process, or one job of ranks, uses at a time.
@@ -45,20 +44,20 @@ impl StateFolder {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        Self::of_locked(path, ranks, lock)
+        Self::new(path, ranks, lock)
     }
 
     /// Opens a folder to read it. A folder on a read-only file system cannot change and needs no lock.
     pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
         match Self::open(path) {
             Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
-                Self::of_locked(path, &Ranks::one(), None)
+                Self::new(path, &Ranks::one(), None)
             }
             opened => opened,
         }
     }
 
-    fn of_locked(path: &Path, ranks: &Ranks, lock: Option<FolderLock>) -> Result<Self, GroundError> {
+    fn new(path: &Path, ranks: &Ranks, lock: Option<FolderLock>) -> Result<Self, GroundError> {
         if ranks.is_first() && lock.is_some() {
             let [_, unfinished] = numbered(path)?;
             // Parts left by an interrupted job must not be completed by parts of another.
@@ -75,7 +74,6 @@ impl StateFolder {
         Ok(Self { path: path.to_owned(), checkpoints, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
     }
 
-    /// Path of the folder.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
@@ -90,7 +88,6 @@ impl StateFolder {
         self.checkpoints.iter().map(|checkpoint| checkpoint.number).collect()
     }
 
-    /// The ranks that share the folder.
     pub(super) fn ranks(&self) -> &Ranks {
         &self.ranks
     }
@@ -287,7 +284,6 @@ impl StateFolder {
     }
 }
 
-/// Name of the lock file of a folder.
 const LOCK: &str = "lock";
 
 /// The note on a damaged checkpoint in place of which an older one is used.
@@ -301,7 +297,6 @@ pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
     Ok(whole.into_iter().map(|checkpoint| checkpoint.path(folder, 0)).collect())
 }
 
-/// Whether the error is a full disk or quota.
 fn is_out_of_room(error: &GroundError) -> bool {
     use ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error, GroundError::Io { source, .. }
@@ -319,22 +314,22 @@ mod tests {
     }
 
     /// A file with the checksum of a checkpoint.
-    fn sealed(text: &str) -> Vec<u8> {
-        let mut bytes = format!("{text:>32}").into_bytes();
+    fn sealed(content: &str) -> Vec<u8> {
+        let mut bytes = format!("{content:>32}").into_bytes();
         let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
         bytes.extend(crc.to_le_bytes());
         bytes
     }
 
-    fn save(folder: &mut StateFolder, text: &str) -> Result<(), GroundError> {
-        folder.save(|file, path| file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")))
+    fn save(folder: &mut StateFolder, content: &str) -> Result<(), GroundError> {
+        folder.save(|file, path| file.write_all(&sealed(content)).map_err(GroundError::io(path, "write")))
     }
 
     /// Like [`save`], on a disk with space for this number of checkpoints.
-    fn save_in(folder: &mut StateFolder, room: usize, text: &str) -> Result<(), GroundError> {
+    fn save_in(folder: &mut StateFolder, room: usize, content: &str) -> Result<(), GroundError> {
         let place = folder.path.clone();
         folder.save(|file, path| match checkpoints(&place)?.len() < room {
-            true => file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")),
+            true => file.write_all(&sealed(content)).map_err(GroundError::io(path, "write")),
             false => Err(full(path)),
         })
     }
@@ -378,7 +373,7 @@ mod tests {
     fn the_older_checkpoint_gives_way_only_to_one_that_holds() {
         let place = tempfile::tempdir().unwrap();
         let mut folder = StateFolder::open(place.path()).unwrap();
-        ["1", "2"].iter().for_each(|text| save(&mut folder, text).unwrap());
+        ["1", "2"].iter().for_each(|content| save(&mut folder, content).unwrap());
         fs::write(name(&folder, 2), b"damaged, and more than twenty-four bytes").unwrap();
         assert!(matches!(save_in(&mut folder, 2, "3"), Err(GroundError::Damaged { .. })));
         assert_eq!(names(place.path()), [1, 2].map(file_name));

@@ -128,7 +128,7 @@ fn gaps_of_era(
         return Vec::new();
     }
     let visibilities = received.packets.iter().filter(|packet| in_era(packet.entry.made));
-    let schedule = SendingOrder::learn(match kind {
+    let schedule = SendingOrder::new(match kind {
         Kind::Visibilities => visibilities.copied().collect(),
         _ => Vec::new(),
     });
@@ -193,7 +193,7 @@ fn missing_ephemeris(
     let first = before.map_or(0, |before| before.count + 1);
     let hole = first..after.map_or(gap.end, |after| after.count).max(gap.end);
     let shares = loss_fractions(gap, missing, &hole, windows.len());
-    let streams = PacketStreams::of(packets.iter().filter(|packet| packet.share.is_some()).copied());
+    let streams = PacketStreams::new(packets.iter().filter(|packet| packet.share.is_some()).copied());
     let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
     for (window, share) in windows.into_iter().zip(shares).filter(|(_, share)| *share > 0.0) {
         for packet in &waiting[window] {
@@ -239,13 +239,13 @@ mod tests {
     fn missing_positions_count_for_their_own_window_and_once() {
         // Eight packets of four windows: three lack one packet each, the last lacks both.
         let missing = [14..15, 16..17, 18..19, 20..22, 27..29];
-        let of = |gap: usize| loss_fractions(&missing[gap], &missing, &(14..22), 4);
-        assert_eq!(of(0), [1.0, 0.0, 0.0, 0.0]);
-        assert_eq!(of(1), [0.0, 1.0, 0.0, 0.0]);
-        assert_eq!(of(3), [0.0, 0.0, 0.0, 1.0]);
+        let fractions = |gap: usize| loss_fractions(&missing[gap], &missing, &(14..22), 4);
+        assert_eq!(fractions(0), [1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(fractions(1), [0.0, 1.0, 0.0, 0.0]);
+        assert_eq!(fractions(3), [0.0, 0.0, 0.0, 1.0]);
         // A window with two separate gaps counts once for both together.
-        let apart = [0..1, 1..2];
-        assert_eq!(apart.each_ref().map(|gap| loss_fractions(gap, &apart, &(0..2), 1)), [[0.5], [0.5]]);
+        let separate = [0..1, 1..2];
+        assert_eq!(separate.each_ref().map(|gap| loss_fractions(gap, &separate, &(0..2), 1)), [[0.5], [0.5]]);
         // A gap that fills its hole accounts for the whole loss.
         let hole = 3..8;
         let whole = std::slice::from_ref(&hole);
@@ -326,7 +326,7 @@ mod tests {
         let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
-        let schedule = SendingOrder::learn([entries, vec![far]].concat().into_iter().map(read).collect());
+        let schedule = SendingOrder::new([entries, vec![far]].concat().into_iter().map(read).collect());
         let report = schedule.report(Kind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
         let windows = missing / 12;

@@ -74,7 +74,6 @@ pub(super) struct Journal {
 }
 
 impl Journal {
-    /// Whether there are no records.
     pub(super) fn is_empty(&self) -> bool {
         self.visibilities.is_empty() && self.others.is_empty()
     }
@@ -87,7 +86,6 @@ impl Journal {
             && self.others.iter().all(|((_, key), record)| is_valid(key, record.bytes))
     }
 
-    /// Whether there is a record of the packet.
     pub(super) fn contains(&self, header: &PacketHeader) -> bool {
         let sent = (header.time, header.count);
         match header.kind {

@@ -14,9 +14,7 @@ use crate::ranks::RankShare;
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
-/// Maximum number of a checkpoint.
 pub(super) const NUMBER_MAX: u64 = u64::MAX / 2;
-/// Maximum number of parts of a set.
 const PARTS_MAX: usize = 1 << 20;
 
 /// A checkpoint, which consists of one or more files.
@@ -28,7 +26,6 @@ pub(super) struct CheckpointSet {
 }
 
 impl CheckpointSet {
-    /// File name of a part.
     pub(super) fn file_name(self, part: usize) -> String {
         let Self { number, parts } = self;
         match parts {
@@ -37,12 +34,10 @@ impl CheckpointSet {
         }
     }
 
-    /// Path of a part.
     pub(super) fn path(self, folder: &Path, part: usize) -> PathBuf {
         folder.join(self.file_name(part))
     }
 
-    /// Paths of all parts.
     pub(super) fn paths(self, folder: &Path) -> Vec<PathBuf> {
         (0..self.parts).map(|part| self.path(folder, part)).collect()
     }
@@ -56,7 +51,7 @@ impl CheckpointSet {
     }
 
     /// Parses a file name into the checkpoint and the part; `None` for other or invalid names.
-    fn of_name(text: &str) -> Option<(Self, usize)> {
+    fn parse(text: &str) -> Option<(Self, usize)> {
         let name = inner(text)?;
         let (number, part) = name.split_once('.').unwrap_or((name, ""));
         let (part, parts) = match part.split_once("-of-") {
@@ -72,7 +67,7 @@ impl CheckpointSet {
 /// Number of the checkpoint to which a file belongs.
 pub(super) fn number_of(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_string_lossy().into_owned();
-    CheckpointSet::of_name(&name).map(|(found, _)| found.number)
+    CheckpointSet::parse(&name).map(|(found, _)| found.number)
 }
 
 /// The part of a checkpoint's file name with its number and part.
@@ -83,7 +78,7 @@ fn inner(text: &str) -> Option<&str> {
 /// All files of the checkpoint to which a file belongs, each with its share. A file with another name is a checkpoint by itself.
 pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    match (CheckpointSet::of_name(&name), path.parent()) {
+    match (CheckpointSet::parse(&name), path.parent()) {
         (Some((found, _)), Some(folder)) if found.parts > 1 => {
             let share = |rank| RankShare { rank, count: found.parts };
             found.paths(folder).into_iter().enumerate().map(|(rank, path)| (path, share(rank))).collect()
@@ -102,7 +97,7 @@ pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundE
         if inner(&text).is_none() {
             continue;
         }
-        let Some((checkpoint, part)) = CheckpointSet::of_name(&text) else {
+        let Some((checkpoint, part)) = CheckpointSet::parse(&text) else {
             return Err(GroundError::CheckpointName { path: folder.join(&name) });
         };
         found.entry(checkpoint).or_default().insert(part);

@@ -215,7 +215,7 @@ impl OpenArchive {
         };
         let (cancel, cancel_grace, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());
-        let live_view_writer = LiveViewWriter::of(&outcome.live_view);
+        let live_view_writer = LiveViewWriter::new(&outcome.live_view);
         Ok(Ground {
             collector,
             calibrator,

@@ -28,7 +28,7 @@ fn mapped_fraction(packets: &[VisibilityPacket]) -> Option<f64> {
 pub(super) struct PacketStreams(BTreeMap<Stream, Vec<VisibilityPacket>>);
 
 impl PacketStreams {
-    pub(super) fn of(packets: impl Iterator<Item = VisibilityPacket>) -> Self {
+    pub(super) fn new(packets: impl Iterator<Item = VisibilityPacket>) -> Self {
         let mut streams: BTreeMap<Stream, Vec<VisibilityPacket>> = BTreeMap::new();
         for packet in packets {
             streams.entry(packet.stream()).or_default().push(packet);
@@ -71,16 +71,16 @@ pub(super) struct SendingOrder {
 
 /// A model of the content of a gap by the packets of a window.
 struct GapModel {
-    /// Number of repeats that each packet of the window is repeated.
+    /// Number of times that each packet of the window is repeated.
     repeats: Vec<u64>,
     /// Difference between the number of packets in the gap and in the model.
     misfit: u64,
 }
 
 impl SendingOrder {
-    pub(super) fn learn(mut packets: Vec<VisibilityPacket>) -> Self {
+    pub(super) fn new(mut packets: Vec<VisibilityPacket>) -> Self {
         packets.sort_by_key(|packet| packet.entry.count);
-        let streams = PacketStreams::of(packets.iter().copied());
+        let streams = PacketStreams::new(packets.iter().copied());
         let count = |at: usize| packets[at].entry.count;
         let is_complete = |range: &Range<usize>| {
             let (first, last) = (range.start, range.end - 1);

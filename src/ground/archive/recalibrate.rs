@@ -144,7 +144,7 @@ fn for_each_packet(
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
             Event::Packet(packet) if packet.header.kind == Kind::Visibilities => {
-                take(&HeldPacket::of(packet))
+                take(&HeldPacket::new(packet))
             }
             _ => Ok(()),
         })?;
@@ -214,7 +214,7 @@ impl Recalibration {
                 return Ok(());
             }
             let frame = GroundFrame::Visibilities(collector.decoded(packet).unwrap_or_default());
-            let mut draft = RecordDraft::of(Some(&frame));
+            let mut draft = RecordDraft::new(Some(&frame));
             if let Some(placed) = calibrator.accept(frame)? {
                 draft.offer(&placed);
                 draft.used_s = accumulator.accept(placed, &mut Outlet::collect())?;

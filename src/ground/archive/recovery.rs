@@ -10,7 +10,6 @@ use crate::files::write_atomically;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::runtime::{Outlet, Stage};
 
-/// Folder name of the raw archive in a state.
 const PACKETS: &str = "archive";
 
 /// File name of the settings in a raw archive.
@@ -151,7 +150,6 @@ pub(super) fn unsaved_note(state: &Path, checkpoint: Option<u64>) -> Option<Stri
     require_saved(state, checkpoint).err().map(|error| error.to_string())
 }
 
-/// Makes `folder` a link to another folder.
 fn link_to(folder: &Path, elsewhere: &Path) -> Result<(), GroundError> {
     std::fs::create_dir_all(elsewhere).map_err(GroundError::io(elsewhere, "create the folder"))?;
     let place = elsewhere.canonicalize().map_err(GroundError::io(elsewhere, "find"))?;

@@ -15,7 +15,6 @@ use crate::downlink::{Event, Kind, PacketHeader};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
 
-/// Maximum number of refused packets that are listed.
 const REFUSED_LISTED: usize = 20;
 
 /// A packet that cannot be removed from the archive.
@@ -117,7 +116,7 @@ impl Retraction {
     fn retract_file(&mut self, path: &Path) -> Result<(), GroundError> {
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
-            Event::Packet(packet) => self.retract_packet(&HeldPacket::of(packet)),
+            Event::Packet(packet) => self.retract_packet(&HeldPacket::new(packet)),
             _ => Ok(()),
         })?;
         if events.packets() == 0 {

@@ -159,7 +159,6 @@ impl Ground {
     }
 }
 
-/// Reads the settings of a checkpoint.
 fn settings_at(path: &Path) -> Result<Vec<(String, String)>, GroundError> {
     checkpoint::read(path, |head, engines| {
         std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;

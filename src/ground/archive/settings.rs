@@ -27,7 +27,6 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
     Ok(settings)
 }
 
-/// Checksum of a file, as text.
 fn checksum(path: &Path) -> Result<String, GroundError> {
     let bytes = std::fs::read(path).map_err(GroundError::io(path, "read"))?;
     let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);

@@ -76,7 +76,6 @@ impl Archive {
         self.posts.clone()
     }
 
-    /// Replaces the settings on which the sums depend.
     pub(super) fn set_settings(&mut self, settings: Vec<(String, String)>) {
         self.settings = settings;
     }
@@ -91,7 +90,6 @@ impl Archive {
         self.interval < u64::MAX
     }
 
-    /// Whether a checkpoint is due.
     pub(in crate::ground) fn is_due(&self) -> bool {
         self.since_attempt >= self.wait
     }
@@ -177,7 +175,6 @@ struct ArchiveHeadRef<'a> {
 }
 
 impl<'a> ArchiveHeadRef<'a> {
-    /// The head of a checkpoint.
     fn view(
         &self,
         collector: &'a Collector,

@@ -20,7 +20,6 @@ use crate::runtime::Ledger;
 
 /// Capacity of the hold buffer while reading a file, bytes.
 const WAIT_BYTES: u64 = 1 << 24;
-/// Maximum number of ephemeris segments.
 const SEGMENTS_MAX: usize = 1 << 14;
 
 /// The packets in an archive or a downlink file.
@@ -36,12 +35,12 @@ impl CoverageSurvey {
     ///
     /// # Errors
     /// A folder without a usable checkpoint; a file that cannot be read, or is of neither format.
-    pub fn of(path: &Path) -> Result<Self, GroundError> {
+    pub fn read(path: &Path) -> Result<Self, GroundError> {
         if path.is_dir() {
-            return Self::of_folder(path);
+            return Self::read_folder(path);
         }
         if checkpoint::is_checkpoint(path)? {
-            return Self::of_checkpoint(path);
+            return Self::read_checkpoint(path);
         }
         let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         let mut collector = Collector::new(WAIT_BYTES);
@@ -54,10 +53,10 @@ impl CoverageSurvey {
         Ok(survey)
     }
 
-    fn of_folder(path: &Path) -> Result<Self, GroundError> {
+    fn read_folder(path: &Path) -> Result<Self, GroundError> {
         let mut retries = 0;
         loop {
-            match Self::of_newest(path) {
+            match Self::read_newest(path) {
                 // A running ground stage has replaced the checkpoint since the folder was read.
                 Err(GroundError::Io { source, .. })
                     if source.kind() == ErrorKind::NotFound && retries < 10 =>
@@ -70,11 +69,11 @@ impl CoverageSurvey {
     }
 
     /// Surveys the newest usable checkpoint of a folder.
-    fn of_newest(path: &Path) -> Result<Self, GroundError> {
+    fn read_newest(path: &Path) -> Result<Self, GroundError> {
         let files: Vec<PathBuf> = checkpoints(path)?;
         let mut bad = Vec::new();
         for file in files.iter().rev() {
-            match Self::of_checkpoint(file) {
+            match Self::read_checkpoint(file) {
                 Ok(found) => {
                     let notes = bad.iter().map(|error| note(error, file));
                     let notes = notes.chain(unsaved_note(path, number_of(file))).collect();
@@ -94,29 +93,29 @@ impl CoverageSurvey {
         }
     }
 
-    fn of_checkpoint(path: &Path) -> Result<Self, GroundError> {
+    fn read_checkpoint(path: &Path) -> Result<Self, GroundError> {
         let head: ArchiveHead = checkpoint::read(path, |head, engines| {
             std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
             Ok(head)
         })?;
-        Ok(Self::of_head(head))
+        Ok(Self::from_head(head))
     }
 
     /// Surveys a checkpoint in memory, and reads its sums as a session with settings `map` does.
     ///
     /// # Errors
     /// A damaged checkpoint.
-    pub fn of_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, GroundError> {
+    pub fn from_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, GroundError> {
         let head: ArchiveHead =
             checkpoint::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
                 let accumulator = Accumulator::new(map.clone(), Ledger::default());
                 accumulator.resume(head.accumulator.clone(), engines, None)?;
                 Ok(head)
             })?;
-        Ok(Self::of_head(head))
+        Ok(Self::from_head(head))
     }
 
-    fn of_head(head: ArchiveHead) -> Self {
+    fn from_head(head: ArchiveHead) -> Self {
         let ArchiveHead { journal, ephemeris, collector, .. } = head;
         let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         for segment in ephemeris {
@@ -155,7 +154,7 @@ impl CoverageSurvey {
             Some(GroundFrame::Visibilities(block)) if !block.is_empty() => {
                 let entry = packets
                     .first()
-                    .map(|packet| JournalEntry::of(packet.header.time, packet.header.count, &block));
+                    .map(|packet| JournalEntry::new(packet.header.time, packet.header.count, &block));
                 let packet = entry.map(|entry| VisibilityPacket { entry, is_waiting: false, share: None });
                 self.received.packets.extend(packet);
             }

@@ -16,7 +16,6 @@ impl Journal {
         self.visibilities.values().filter(|record| record.entry.visibilities > 0)
     }
 
-    /// Number of packets with visibilities.
     pub(super) fn packets(&self) -> usize {
         self.with_visibilities().count()
     }
@@ -30,7 +29,6 @@ impl Journal {
         })
     }
 
-    /// Keys of the delivered packets.
     pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, SendingKey)> {
         let visibilities = self.visibilities.keys().map(|sent| (Kind::Visibilities, *sent));
         visibilities.chain(self.others.keys().copied())
@@ -198,12 +196,12 @@ mod tests {
             assert_eq!(journal.delivered().count(), 7);
         }
         ground.finish(&mut Outlet::collect()).unwrap();
-        let said = (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters());
+        let counts = (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters());
         drop(ground);
         // A session without data has the same counts.
         let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         again.finish(&mut Outlet::collect()).unwrap();
-        assert_eq!((again.outcome.ledger.balanced_report().unwrap(), again.collector.counters()), said);
+        assert_eq!((again.outcome.ledger.balanced_report().unwrap(), again.collector.counters()), counts);
     }
 
     #[test]
@@ -227,8 +225,8 @@ mod tests {
             assert_eq!(ground.ranks().share(), ranks.share());
             ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
             ground.finish(&mut Outlet::collect()).unwrap();
-            let told: Vec<String> = ground.notes().map(str::to_owned).collect();
-            (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters(), told)
+            let notes: Vec<String> = ground.notes().map(str::to_owned).collect();
+            (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters(), notes)
         };
         let session = |ranks: &Ranks, bytes: &[u8]| session_in(folder.path(), ranks, bytes);
         let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::one(), bytes));
@@ -261,8 +259,8 @@ mod tests {
         let alone = session(&Ranks::one(), &[]);
         assert_eq!((&alone.0, &alone.1), (&expected[2].0, &expected[2].1));
         session(&Ranks::one(), &[]);
-        let own = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
-        assert_eq!(names(), own.into_iter().collect());
+        let expected_names = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
+        assert_eq!(names(), expected_names.into_iter().collect());
     }
 
     #[test]
@@ -271,7 +269,7 @@ mod tests {
         for (count, times_s) in [(0, [3.0, 4.0]), (1, [1.0, 2.0])] {
             let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(count));
             let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
-            let mut draft = RecordDraft::of(Some(&block(Pair { i: 0, j: 1 }, 200)));
+            let mut draft = RecordDraft::new(Some(&block(Pair { i: 0, j: 1 }, 200)));
             // The second of two sub-bands of channel 2.
             draft.entry.channel = ChannelId(5);
             let channel = ChannelId(2);

@@ -32,7 +32,6 @@ impl Rect {
     }
 }
 
-/// Style of a line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Stroke {
     pub colour: Colour,
@@ -54,14 +53,25 @@ impl Stroke {
 #[derive(Clone, Debug)]
 pub(super) enum Shape {
     /// A filled rectangle, limited to the clip.
-    Fill { rect: Rect, colour: Colour, alpha: f32, clip: Rect },
-    /// A line through points.
-    Line { points: Vec<(f64, f64)>, stroke: Stroke, clip: Rect },
-    /// A line of text.
-    Text { text: String, anchor: (f64, f64), align: Align, style: Style },
+    Fill {
+        rect: Rect,
+        colour: Colour,
+        alpha: f32,
+        clip: Rect,
+    },
+    Line {
+        points: Vec<(f64, f64)>,
+        stroke: Stroke,
+        clip: Rect,
+    },
+    Text {
+        text: String,
+        anchor: (f64, f64),
+        align: Align,
+        style: Style,
+    },
 }
 
-/// A page that is being drawn.
 pub(super) struct Canvas {
     width: usize,
     height: usize,
@@ -82,7 +92,6 @@ impl Canvas {
         self.clip = clip.unwrap_or(page);
     }
 
-    /// Fills a rectangle.
     pub fn fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
         self.shapes.push(Shape::Fill { rect, colour, alpha, clip: self.clip });
     }
@@ -129,7 +138,6 @@ impl Canvas {
         span(low.max(self.clip.x), high.min(self.clip.right()), self.width)
     }
 
-    /// The rows of pixels from `low` to `high`, within the page and the clip.
     fn rows(&self, low: f64, high: f64) -> Range<usize> {
         span(low.max(self.clip.y), high.min(self.clip.bottom()), self.height)
     }
@@ -157,7 +165,6 @@ impl Canvas {
         }
     }
 
-    /// Draws the outline of a rectangle.
     pub fn outline(&mut self, rect: Rect, stroke: Stroke) {
         let (x, y, right, bottom) = (rect.x, rect.y, rect.right(), rect.bottom());
         self.polyline(&[(x, y), (right, y), (right, bottom), (x, bottom), (x, y)], stroke);

@@ -92,7 +92,6 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
     Ok(Picture::from_canvas(canvas, width, height, title))
 }
 
-/// The range of an axis.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Range {
     pub low: f64,

@@ -148,7 +148,6 @@ pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: MapField<'_>, scale: 
     }
 }
 
-/// The outline of the map on the page.
 struct Ellipse {
     x: f64,
     y: f64,
@@ -214,7 +213,7 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
     let mut sums = vec![([0.0_f32; 3], 0.0_f32); columns.min(line.len() - first)];
     for sub_row in 0..SUPERSAMPLING {
         let up = (ellipse.y - (y as f64 + inside(sub_row))) / ellipse.half_height;
-        let Some(parallel) = LatitudeLine::at(up) else { continue };
+        let Some(parallel) = LatitudeLine::at_height(up) else { continue };
         for (x, (sum, hits)) in sums.iter_mut().enumerate() {
             for sub_column in 0..SUPERSAMPLING {
                 let right = ((first + x) as f64 + inside(sub_column) - ellipse.x) / ellipse.half_height;

@@ -137,8 +137,8 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
     let meridian =
         |l: f64| (0..=200).map(|k| patch.cutout.place_deg(l, fine(k, low, high))).collect::<Vec<_>>();
     let parallel = |b: f64| {
-        let at = |k| patch.cutout.place_deg(fine(k, longitude - wide, longitude + wide), b);
-        (0..=200).map(at).collect::<Vec<_>>()
+        let point = |k| patch.cutout.place_deg(fine(k, longitude - wide, longitude + wide), b);
+        (0..=200).map(point).collect::<Vec<_>>()
     };
     meridians.iter().for_each(|&l| line(canvas, meridian(l)));
     parallels.iter().for_each(|&b| line(canvas, parallel(b)));

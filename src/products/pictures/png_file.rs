@@ -7,9 +7,7 @@ use super::error::PictureError;
 use super::svg::svg_of;
 use crate::files::write_atomically;
 
-/// Maximum side of a picture, pixels.
 const SIDE_MAX: usize = 16_384;
-/// Maximum number of pixels of a picture.
 const PIXELS_MAX: usize = 1 << 27;
 
 /// A finished picture.
@@ -34,7 +32,6 @@ impl Picture {
         Self { width, height, rgb: canvas.rgb(), background, shapes, texts }
     }
 
-    /// Checks the size of a page.
     pub(super) fn check_size(width: usize, height: usize) -> Result<(), PictureError> {
         for (what, value) in [("picture width", width), ("picture height", height)] {
             if !(16..=SIDE_MAX).contains(&value) {

@@ -35,7 +35,7 @@ pub(super) struct LatitudeLine {
 
 impl LatitudeLine {
     /// The parallel at height `y` of the ellipse; `None` outside it.
-    pub fn at(y: f64) -> Option<Self> {
+    pub fn at_height(y: f64) -> Option<Self> {
         if y.abs() > 1.0 {
             return None;
         }
@@ -63,7 +63,7 @@ mod tests {
             for j in -8..=8 {
                 let (longitude, latitude) = (f64::from(i) * 10.0, f64::from(j) * 11.0);
                 let (x, y) = forward(longitude.to_radians(), latitude.to_radians());
-                let parallel = LatitudeLine::at(y).unwrap();
+                let parallel = LatitudeLine::at_height(y).unwrap();
                 let (l, b) = (parallel.longitude(x).unwrap(), parallel.sin_latitude.asin());
                 assert!(
                     (l.to_degrees() - longitude).abs() < 1e-6 && (b.to_degrees() - latitude).abs() < 1e-6
@@ -72,8 +72,8 @@ mod tests {
         }
         // East is left, north is up.
         assert!(forward(0.1, 0.0).0 < 0.0 && forward(0.0, 0.1).1 > 0.0);
-        assert_eq!(LatitudeLine::at(0.0).unwrap().longitude(2.1), None);
-        assert_eq!(LatitudeLine::at(1.1), None);
+        assert_eq!(LatitudeLine::at_height(0.0).unwrap().longitude(2.1), None);
+        assert_eq!(LatitudeLine::at_height(1.1), None);
     }
 
     #[test]
@@ -87,7 +87,7 @@ mod tests {
                     2.0 * (f64::from(i) + 0.5) / f64::from(n) - 2.0,
                     2.0 * (f64::from(j) + 0.5) / f64::from(n) - 1.0,
                 );
-                let seen = LatitudeLine::at(y).filter(|p| p.longitude(x).is_some());
+                let seen = LatitudeLine::at_height(y).filter(|p| p.longitude(x).is_some());
                 inside += i32::from(seen.is_some_and(|p| p.sin_latitude > 0.5_f64.sin()));
             }
         }

@@ -33,7 +33,6 @@ pub enum Palette {
 /// Colour of zero and negative values on a logarithmic scale.
 pub(super) const NEGATIVE: Colour = [70, 130, 220];
 
-/// Colour of pixels without a value.
 pub(super) const UNSEEN: Colour = [160, 160, 160];
 
 /// A colour scale, which several maps may share.
@@ -146,12 +145,10 @@ impl ColourScale {
         .into_array()
     }
 
-    /// Whether lines over the map should be dark.
     pub(super) fn is_light(&self) -> bool {
         self.palette == Palette::Diverging
     }
 
-    /// Ticks at round values.
     pub(super) fn ticks(&self, wanted: usize) -> Ticks {
         match self.scaling {
             Scaling::Linear => labels::linear(self.low, self.high, wanted),

@@ -34,7 +34,6 @@ pub(super) fn svg_of(
     let page = Rect { x: 0.0, y: 0.0, width: width as f64, height: height as f64 };
     let mut clips: Vec<Rect> = Vec::new();
     for shape in shapes {
-        // Writing to a string cannot fail.
         let _ = match shape {
             Shape::Fill { rect, colour, alpha, clip } => {
                 fill(&mut out, within(*rect, *clip), *colour, *alpha)

@@ -24,7 +24,6 @@ pub(super) enum Align {
     End,
 }
 
-/// Style of a text.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
     /// Height of the font, pixels.

@@ -135,15 +135,15 @@ fn a_slow_sink_bounds_what_is_in_flight() {
     const CAPACITIES: [usize; 2] = [3, 5];
     const STAGES: usize = 3;
     let alive = Arc::new(AtomicUsize::new(0));
-    let most = Arc::new(AtomicUsize::new(0));
-    let (alive_there, most_there) = (Arc::clone(&alive), Arc::clone(&most));
+    let alive_max = Arc::new(AtomicUsize::new(0));
+    let (alive_in_stage, alive_max_in_stage) = (Arc::clone(&alive), Arc::clone(&alive_max));
 
     let mut graph = Graph::new();
     let numbers = graph.source("count", 1, Count::to(200));
     let make = Each::new(move |_: u64, out: &mut Outlet<Tracked>| {
-        let now = alive_there.fetch_add(1, Ordering::SeqCst) + 1;
-        most_there.fetch_max(now, Ordering::SeqCst);
-        out.push(Tracked(Arc::clone(&alive_there)));
+        let now = alive_in_stage.fetch_add(1, Ordering::SeqCst) + 1;
+        alive_max_in_stage.fetch_max(now, Ordering::SeqCst);
+        out.push(Tracked(Arc::clone(&alive_in_stage)));
         Ok(())
     });
     let made = graph.stage("make", CAPACITIES[0], numbers, make);
@@ -160,11 +160,11 @@ fn a_slow_sink_bounds_what_is_in_flight() {
     graph.run(&Cancel::new(), PATIENCE).unwrap();
 
     assert_eq!(alive.load(Ordering::SeqCst), 0);
-    let most = most.load(Ordering::SeqCst);
+    let alive_max = alive_max.load(Ordering::SeqCst);
     let bound = CAPACITIES.iter().sum::<usize>() + STAGES;
-    assert!(most <= bound, "{most} in flight, expected at most {bound}");
+    assert!(alive_max <= bound, "{alive_max} in flight, expected at alive_max {bound}");
     // The queues were full, as the source is faster.
-    assert!(most > CAPACITIES[1], "{most}");
+    assert!(alive_max > CAPACITIES[1], "{alive_max}");
 }
 
 #[test]
