@@ -67,23 +67,18 @@ pub struct Collector {
     decoder: Decoder,
     /// Counts duplicates, damaged bytes and bytes outside packets in this session.
     session_counts: Decoder,
-    /// Held packets to check for release.
     candidates: VecDeque<PacketHeader>,
     /// Whether an ephemeris has arrived since all held visibilities were last checked.
     has_new_ephemeris: bool,
     /// Whether visibilities are held although their positions are known, while there is room.
     holds_for_next_session: bool,
-    /// Maximum number of intervals in the received set of a kind.
     intervals_max: usize,
     /// Packets received, of all kinds.
     packets: u64,
-    /// Limit of `packets`.
     packets_max: u64,
-    /// New packets refused because the received set has no room.
     refused: RefusedPackets,
 }
 
-/// Number of refused packets.
 #[derive(Clone, Copy, Debug, Default)]
 struct RefusedPackets {
     packets: u64,
@@ -468,13 +463,11 @@ impl Collector {
     }
 }
 
-/// Outcome of [`Collector::take_event`].
 enum EventOutcome {
     /// There is no complete event.
     NeedsBytes,
     /// An event was taken that delivers nothing yet.
     Consumed,
-    /// Visibilities were put into the hold buffer.
     Held(PacketHeader),
     Delivery(Delivery),
 }

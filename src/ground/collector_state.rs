@@ -25,7 +25,6 @@ pub struct CollectorView<'a> {
 }
 
 impl CollectorState {
-    /// The state of a collector that has received nothing.
     #[must_use]
     pub(super) fn new(wait_bytes: u64) -> Self {
         Self { held: HoldBuffer::new(wait_bytes), decoder: DecoderState::default() }

@@ -31,21 +31,17 @@ const STEPS_PER_UPDATE: u64 = 32;
 pub struct Ground {
     pub(super) collector: Collector,
     pub(super) calibrator: Calibrator,
-    /// Present if gains are solved for.
     pub(super) gate: Option<PassGate>,
     pub(super) accumulator: Accumulator,
     pub(super) outcome: GroundOutcome,
     pub(super) archive: Option<Archive>,
-    /// Ends the work early; see [`Ground::with_cancel`].
     pub(super) cancel: Cancel,
     /// Time for which visibilities are still added after cancellation, without an archive.
     pub(super) cancel_grace: Duration,
     /// Whether the sums of earlier sessions are emitted as a snapshot at the start.
     pub(super) has_initial_snapshot: bool,
     pub(super) steps: u64,
-    /// Answers to senders that wait for a checkpoint.
     pub(super) promises: SenderPromises,
-    /// Updates the view of page visitors.
     pub(super) live_view_writer: LiveViewWriter,
 }
 
@@ -304,7 +300,6 @@ impl Ground {
         Ok(())
     }
 
-    /// Updates the counters of the reception and the live view.
     fn show(&self, activity: Activity) {
         // First, so that no visitor sees counters newer than the view.
         self.live_view_writer.show(activity, &self.collector, self.calibrator.ephemeris());
@@ -424,7 +419,6 @@ impl Stage for Ground {
         Ok(())
     }
 
-    /// Updates the view when no data arrive.
     fn idle(&mut self) {
         self.show(Activity::Idle);
     }

@@ -70,14 +70,12 @@ struct Views {
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// Whether the page is served.
     is_open: AtomicBool,
     /// Whether an update is requested even if data arrive without pause.
     is_due: AtomicBool,
     views: Mutex<Views>,
     /// Baselines by channel. The ground stage waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
-    /// Visible directions by channel.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
@@ -153,7 +151,6 @@ pub(super) enum Activity {
     Idle,
 }
 
-/// Channel, daughter and time span of a block of auto-correlations.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct AutoSpan {
     channel: ChannelId,
@@ -161,7 +158,6 @@ pub(super) struct AutoSpan {
     span: [MissionTime; 2],
 }
 
-/// Writes a [`LiveView`] from the ground stage.
 #[derive(Debug, Default)]
 pub(super) struct LiveViewWriter {
     live_view: LiveView,
@@ -189,7 +185,6 @@ impl LiveViewWriter {
         is_wanted.then_some(AutoSpan { channel: block.channel, daughter: i, span })
     }
 
-    /// Adds the calibrated powers of a block.
     pub(super) fn add_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
         let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
@@ -200,7 +195,6 @@ impl LiveViewWriter {
         }
     }
 
-    /// Adds visibilities with positions.
     pub(super) fn add(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
             && self.live_view.0.is_open.load(Ordering::Relaxed)

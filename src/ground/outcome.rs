@@ -79,7 +79,6 @@ fn attempts(count: u64) -> String {
 #[derive(Clone, Debug, Default)]
 pub struct SharedSaving(Arc<Mutex<Option<SavingProgress>>>);
 
-/// Shared source of a [`SavingReport`].
 #[derive(Debug, Default)]
 struct SavingProgress {
     report: SavingReport,

@@ -11,7 +11,6 @@ use crate::downlink::wire::VisibilitiesOutline;
 use crate::frames::{Instrument, VisibilityBlock};
 use crate::sky::fits::check_frequencies;
 
-/// Configuration key of the sky model.
 pub(super) const MODEL_FILES_KEY: &str = "calibrate.model_files";
 
 /// Index of the newest open pass.
@@ -156,7 +155,6 @@ impl PassGate {
         }
     }
 
-    /// Indices of the open passes, the late one first.
     pub(super) fn open_passes(&self) -> Vec<usize> {
         [LATE, NEWEST].into_iter().filter(|index| self.open[*index].is_some()).collect()
     }

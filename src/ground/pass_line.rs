@@ -106,7 +106,6 @@ impl PassLine {
         line
     }
 
-    /// Drops the earliest ranges beyond the maximum number.
     fn keep_latest(&mut self) {
         self.ranges.sort_by(|a, b| b.between_s[1].total_cmp(&a.between_s[1]));
         self.ranges_left_out += self.ranges.len().saturating_sub(RANGES_MAX) as u64;

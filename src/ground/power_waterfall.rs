@@ -9,7 +9,6 @@ const BINS_MAX: usize = 256;
 
 const DAUGHTERS_MAX: usize = 64;
 
-/// Minimum width of a time bin, s.
 const BIN_S_MIN: f64 = 15.0;
 
 /// Sum of powers, K sr, and the number of powers.
@@ -47,7 +46,6 @@ impl PowerWaterfall {
         }
     }
 
-    /// Doubles the width of the time bins.
     fn widen(&mut self) {
         self.bin_s *= 2.0;
         for (number, sums) in std::mem::take(&mut self.sums) {

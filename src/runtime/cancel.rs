@@ -87,7 +87,6 @@ impl Wake {
 #[derive(Debug)]
 pub(super) struct Halt {
     failed: AtomicBool,
-    /// Set for either reason.
     wake: Wake,
 }
 

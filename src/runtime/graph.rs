@@ -81,7 +81,6 @@ pub struct Graph {
     stall: Option<Duration>,
     /// Time that a cancelled run waits for stages that are not kept; `None` for no limit.
     grace: Option<Duration>,
-    /// First error in the calls that built the graph.
     build_error: Option<RuntimeError>,
 }
 

@@ -111,14 +111,12 @@ impl<T> Outlet<T> {
         self.take()
     }
 
-    /// Sets the source time of items that are pushed from now on.
     pub(super) fn set_source_time(&mut self, source_time: Instant) {
         if let Target::Queue(queue) = &mut self.0 {
             queue.source_time = Some(source_time);
         }
     }
 
-    /// Returns the waiting times since the last call.
     pub(super) fn take_waiting_times(&mut self) -> WaitingTimes {
         match &mut self.0 {
             Target::Queue(queue) => std::mem::take(&mut queue.waiting),
@@ -127,7 +125,6 @@ impl<T> Outlet<T> {
     }
 }
 
-/// Time spent waiting during a step.
 #[derive(Default)]
 pub(super) struct WaitingTimes {
     /// For space in the output queue.

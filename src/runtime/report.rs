@@ -160,7 +160,6 @@ fn percentiles(summary: &TimingSummary) -> String {
     format!("{p50} / {p99} / {p999}")
 }
 
-/// Formats a duration to three digits with a suitable unit.
 fn format_duration(seconds: f64) -> String {
     let (value, unit) = match seconds {
         s if s >= 1.0 => (s, "s"),
@@ -171,7 +170,6 @@ fn format_duration(seconds: f64) -> String {
     format!("{} {unit}", three_digits(value))
 }
 
-/// Formats a rate to three digits with a suitable prefix.
 fn format_rate(per_second: f64) -> String {
     let (value, prefix) = match per_second {
         r if r >= 1e9 => (r * 1e-9, " G"),

@@ -14,7 +14,6 @@ use super::metrics::Counters;
 use super::report::{Report, StageReport};
 use super::worker::{Ending, StageNode, Timings, Worker, WorkerMonitor};
 
-/// Keeps the first failure of a run.
 struct FirstFailure {
     halt: Arc<Halt>,
     first: Mutex<Option<RuntimeError>>,
@@ -38,7 +37,6 @@ struct WorkerEnd {
     timings: Timings,
 }
 
-/// Interval between checks of cancellation.
 const CANCEL_POLL: Duration = Duration::from_millis(50);
 
 /// Time that stages have to end after a cancelled run is cut short, before they are abandoned.
@@ -52,7 +50,6 @@ struct StageThread {
     counters: Arc<Counters>,
     /// Whether a cancelled run waits for the stage without a time limit.
     must_finish: bool,
-    /// Set to end the input of the stage.
     end_of_input: Arc<Wake>,
     /// Whether the run no longer waits for the stage.
     is_abandoned: bool,
@@ -81,7 +78,6 @@ pub(super) struct Limits {
     pub(super) stall: Option<Duration>,
 }
 
-/// Detects that no stage makes progress.
 struct StallWatch {
     limit: Duration,
     seen: Vec<[u64; 4]>,
@@ -130,7 +126,6 @@ fn names<'a>(threads: impl Iterator<Item = &'a StageThread>) -> Vec<String> {
     threads.map(|thread| thread.counters.name.clone()).collect()
 }
 
-/// Starts a thread for every node, or as many as the system allows.
 fn start(
     nodes: Vec<StageNode>,
     failure: &Arc<FirstFailure>,
@@ -228,9 +223,7 @@ struct GraceEnforcer {
     /// Time after which abandoned stages are no longer waited for.
     abandon_at: Option<Instant>,
     has_cut_input: bool,
-    /// Whether all stages were cut.
     is_over: bool,
-    /// Stages that lose data.
     cut: Vec<String>,
 }
 
@@ -279,7 +272,6 @@ impl GraceEnforcer {
         (self.has_cut_input, self.abandon_at) = (true, Some(Instant::now() + ABANDON_AFTER));
     }
 
-    /// Whether there is no stage to wait for.
     fn is_done(&self, threads: &[StageThread]) -> bool {
         let may_abandon = self.abandon_at.is_some_and(|abandon_at| Instant::now() >= abandon_at);
         threads.iter().all(|thread| !thread.is_running() || (may_abandon && thread.is_abandoned))

@@ -19,7 +19,6 @@ pub(super) enum Ending {
     Finished,
     /// Like `Finished`, after [`Cancel`] stopped a source.
     Cancelled,
-    /// Another stage failed.
     Halted,
 }
 
@@ -33,7 +32,6 @@ pub(super) trait Worker: Send {
 pub(super) struct StageNode {
     pub(super) counters: Arc<Counters>,
     pub(super) worker: Box<dyn Worker>,
-    /// Whether the output is connected; true for a sink.
     pub(super) is_connected: bool,
     /// Whether a cancelled run waits for the stage without a time limit.
     pub(super) must_finish: bool,
@@ -54,7 +52,6 @@ pub(super) struct WorkerMonitor {
     /// Set to end the input, as the stage before is no longer waited for.
     end_of_input: Arc<Wake>,
     finishing: bool,
-    /// End of the last timed interval.
     mark: Instant,
 }
 
@@ -79,7 +76,6 @@ impl WorkerMonitor {
         self.counters.set_finishing();
     }
 
-    /// Position of the worker in its input, for an error.
     pub(super) fn moment(&self) -> Moment {
         let is_source = self.counters.queue_capacity.is_none();
         match (self.finishing, is_source) {
@@ -90,7 +86,6 @@ impl WorkerMonitor {
         }
     }
 
-    /// Records the end of a wait for input.
     fn end_wait(&mut self) {
         let now = Instant::now();
         self.timings.waiting_in.record(now - self.mark);
@@ -243,7 +238,6 @@ impl<S: Stage> Worker for StageWorker<S> {
     }
 }
 
-/// A sink and its link.
 pub(super) struct SinkWorker<S: Sink> {
     pub(super) sink: S,
     pub(super) inlet: Inlet<S::In>,
