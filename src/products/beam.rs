@@ -52,7 +52,6 @@ impl EffectiveBeam {
     }
 }
 
-/// Flux density of a temperature over a solid angle, Jy.
 fn flux_jy(temperature_k: f64, frequency_hz: f64, area_sr: f64) -> f64 {
     let per_m = frequency_hz / SPEED_OF_LIGHT_M_S;
     2.0 * BOLTZMANN_J_K * temperature_k * per_m * per_m * area_sr / JANSKY

@@ -34,17 +34,14 @@ const LATEST_PICTURE: &str = "latest.png";
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
     root: PathBuf,
-    /// Name of the channel's folder within `root`.
     name: String,
     frequency_hz: f64,
     truth: Option<ChannelTruth>,
-    /// Selected snapshots for the sheet.
     sheet_maps: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
     beams: Vec<PointBeamSummary>,
-    /// Whether a part of the disk has to stay free.
     needs_free_disk: bool,
 }
 
@@ -425,7 +422,6 @@ impl ChannelFolder {
     }
 }
 
-/// Origin of a map.
 #[derive(Clone, Copy)]
 struct Origin<'a> {
     provenance: &'a Provenance,
@@ -446,7 +442,6 @@ impl ShownMaps {
         Ok(Self { map: apply(&self.map)?, noise: apply(&self.noise)?, processing: Some(processing) })
     }
 
-    /// nside and smoothing as text.
     fn resolution_text(&self) -> String {
         let nside = self.map.nside();
         match self.processing {
@@ -471,14 +466,12 @@ fn view(frame: Frame) -> View {
     View { sampling: Sampling::Interpolated, ..View::of(frame, Frame::Ecliptic) }
 }
 
-/// RMS of (map - truth) divided by the RMS of the truth.
 fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
     let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
     let scale: f64 = truth.iter().map(|t| t * t).sum();
     (difference / scale).sqrt()
 }
 
-/// Mean of rho_l over 1 <= l <= `l_max`.
 fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     let range = &rho[1.min(rho.len())..rho.len().min(l_max + 1)];
     range.iter().sum::<f64>() / range.len().max(1) as f64

@@ -196,7 +196,6 @@ impl Hips {
 }
 
 impl TileWriter<'_> {
-    /// Writes a tile and all tiles within it.
     fn write(&self, order: u8, number: usize) -> Result<TileSummary, ProductsError> {
         let (mut previews, mut count) = (Vec::new(), 1);
         let tile = if order == self.order {

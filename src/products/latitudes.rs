@@ -4,7 +4,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::sky::{Comparison, is_unseen};
 
-/// Edges of the bands, degrees.
 const EDGES_DEG: [f64; 7] = [0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0];
 
 /// Relative error of a map, (map - truth) / truth, in the northern and southern band at a distance from the ecliptic.

@@ -58,7 +58,6 @@ impl Provenance {
         cards
     }
 
-    /// Cards on the data and the method of the map.
     fn method_cards(&self, solution: &Solution, frequency_hz: f64) -> Vec<Card> {
         let map = &self.map;
         let mut cards = vec![

@@ -34,7 +34,6 @@ pub struct Publisher {
     unwritten: BTreeMap<ChannelId, Solution>,
 }
 
-/// Pause before a failed write is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
 /// Pauses between attempts to write the remaining files at the end.

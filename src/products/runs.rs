@@ -415,7 +415,6 @@ mod tests {
         );
         let spectra = spectra_csv(&all);
         assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,,,");
-        // Header and lines have the same number of fields.
         for text in [&table, &spectra] {
             let fields = |line: usize| text.lines().nth(line).unwrap().replace(", ", " ").split(',').count();
             assert_eq!(fields(0), fields(1), "{text}");

@@ -8,7 +8,6 @@ use crate::units::constants::DAY_S;
 const BINS: usize = 240;
 const PLOTS_MAX: usize = 64;
 
-/// Time axis with bins of equal length.
 struct TimeBins {
     first_s: f64,
     last_s: f64,

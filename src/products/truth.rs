@@ -60,7 +60,6 @@ impl Truth {
         Ok(self)
     }
 
-    /// The true sky of a channel; `None` if unknown.
     #[must_use]
     pub(super) fn channel(&self, channel: ChannelId) -> Option<&ChannelTruth> {
         self.0.get(&channel)

@@ -43,7 +43,6 @@ impl MapWatch {
         self.viewers().push(viewer);
     }
 
-    /// Calls `show` with every viewer.
     pub(super) fn offer(&self, show: impl Fn(&dyn MapViewer)) {
         self.viewers().iter().for_each(|viewer| show(viewer.as_ref()));
     }

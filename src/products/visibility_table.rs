@@ -19,7 +19,6 @@ use crate::units::{ChannelId, Pair};
 /// Maximum number of ephemeris segments, enough for two years of windows.
 const SEGMENTS_MAX: usize = 8192;
 
-/// Header line of the table of [`VisibilityTable::write_csv`].
 const CSV_HEADER: &str = "time_s,tai_s,dt_s,i,j,u_m,v_m,w_m,x_i_m,y_i_m,z_i_m,x_j_m,y_j_m,z_j_m,re_k_sr,im_k_sr,re_jy,im_jy,weight,flag";
 
 const JANSKY: f64 = 1e-26;

@@ -7,12 +7,10 @@ use bincode::{Decode, Encode};
 
 use crate::ground::PassGateState;
 
-/// Number of the calibration, and the passes that were solved.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct CalibrationState {
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
-    /// State of the passes, if gains are solved for.
     pub(super) passes: PassGateState,
 }
 
@@ -23,7 +21,6 @@ impl Default for CalibrationState {
 }
 
 impl CalibrationState {
-    /// Whether gains were solved for.
     pub(super) fn is_solved(&self) -> bool {
         self.passes != PassGateState::default()
     }

@@ -17,7 +17,6 @@ use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA06";
-/// Start of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
 const VERSION: &str = "a checkpoint of version 06; earlier versions lack data: make a new state with `lunarray rebuild`, or \
 replay the files into a new folder";
@@ -58,7 +57,6 @@ pub(super) struct ArchiveHeadView<'a> {
     pub(super) calibration: CalibrationState,
 }
 
-/// Computes the checksum of the bytes written.
 struct ChecksumWriter<'a, W> {
     inner: &'a mut W,
     crc: Digest,
@@ -142,7 +140,6 @@ pub(super) fn read<T>(
     read_from(&mut open(path)?, path, rest)
 }
 
-/// Verifies the checksum of a checkpoint.
 pub(super) fn verify(path: &Path) -> Result<(), GroundError> {
     verified_length(&mut open(path)?, path).map(|_| ())
 }

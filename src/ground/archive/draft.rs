@@ -35,7 +35,6 @@ impl RecordDraft {
         }
     }
 
-    /// Notes the data offered to the sums.
     pub(in crate::ground) fn offer(&mut self, placed: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = placed {
             (self.channel, self.digest, self.offered) = (placed.channel, digest(placed), placed.len() as u32);

@@ -35,7 +35,6 @@ impl JournalEntry {
         (self.made, self.count)
     }
 
-    /// The summary of a packet with a block of visibilities.
     pub(super) fn new(made: CucTime, count: u64, block: &VisibilityBlock) -> Self {
         let empty = Self { count, made, ..Self::default() };
         let Some(last) = block.len().checked_sub(1) else { return empty };

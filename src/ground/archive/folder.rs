@@ -78,12 +78,10 @@ impl StateFolder {
         &self.path
     }
 
-    /// Number of the newest checkpoint.
     pub(super) fn newest(&self) -> Option<u64> {
         self.checkpoints.last().map(|newest| newest.number)
     }
 
-    /// Numbers of all checkpoints, oldest first.
     pub(super) fn numbers(&self) -> Vec<u64> {
         self.checkpoints.iter().map(|checkpoint| checkpoint.number).collect()
     }
@@ -148,7 +146,6 @@ impl StateFolder {
         Ok(())
     }
 
-    /// Folder and number of the next checkpoint.
     pub(super) fn next(&self) -> (PathBuf, u64) {
         (self.path.clone(), self.checkpoints.last().map_or(1, |newest| newest.number + 1))
     }
@@ -417,7 +414,6 @@ mod tests {
         fs::write(place.path().join(file_name(NUMBER_MAX)), sealed("")).unwrap();
         let mut folder = StateFolder::open(place.path()).unwrap();
         assert!(matches!(save(&mut folder, ""), Err(GroundError::CheckpointName { .. })));
-        // Other files are ignored.
         let place = tempfile::tempdir().unwrap();
         for name in
             ["notes.txt", "checkpoint-00000001.lunarray.damaged", "checkpoint-00000002.lunarray.partial"]

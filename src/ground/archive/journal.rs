@@ -18,15 +18,12 @@ pub(super) use crate::ground::hold_buffer::SendingKey;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 
-/// Record of an applied packet of visibilities.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub(super) struct JournalRecord {
     pub(super) entry: JournalEntry,
     /// Start of the window of the visibilities.
     pub(super) window: MissionTime,
-    /// The packet's checksum.
     pub(super) checksum: u32,
-    /// The packet's length, bytes.
     pub(super) bytes: u32,
     pub(super) counts: PacketReading,
     /// Whether its block had been received already, in another packet.
@@ -35,7 +32,6 @@ pub(super) struct JournalRecord {
     pub(super) digest: u32,
     /// Number of visibilities with positions, which were offered to the sums.
     pub(super) offered: u32,
-    /// Number of visibilities in the sums.
     pub(super) accumulated: u32,
     /// Number of visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
@@ -50,12 +46,9 @@ pub(super) struct SumsSpan {
     pub(super) span_s: [f64; 2],
 }
 
-/// Record of an applied packet of another kind.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
 pub(super) struct OtherRecord {
-    /// The packet's checksum.
     pub(super) checksum: u32,
-    /// The packet's length, bytes.
     pub(super) bytes: u32,
     pub(super) counts: PacketReading,
     /// First and last count of the packets of its payload.

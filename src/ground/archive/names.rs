@@ -21,7 +21,6 @@ const PARTS_MAX: usize = 1 << 20;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct CheckpointSet {
     pub(super) number: u64,
-    /// Number of files.
     pub(super) parts: usize,
 }
 
@@ -64,7 +63,6 @@ impl CheckpointSet {
     }
 }
 
-/// Number of the checkpoint to which a file belongs.
 pub(super) fn number_of(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_string_lossy().into_owned();
     CheckpointSet::parse(&name).map(|(found, _)| found.number)

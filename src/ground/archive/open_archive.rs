@@ -21,7 +21,6 @@ use crate::imaging::{AccumulationError, Accumulator};
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger};
 
-/// Expected content of a segment file.
 const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 
 /// The contents of a checkpoint: data and the journal.
@@ -35,7 +34,6 @@ pub(super) struct ArchiveContents {
 }
 
 impl ArchiveContents {
-    /// The contents of a new archive.
     pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
         Self {
             collector: CollectorState::new(config.wait_bytes),
@@ -163,7 +161,6 @@ impl OpenArchive {
         }
     }
 
-    /// Merges the contents of another folder into these.
     pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
         self.notes.extend(other.notes);
         match (&mut self.contents, other.contents) {
@@ -174,7 +171,6 @@ impl OpenArchive {
         Ok(())
     }
 
-    /// A ground stage that resumes from these contents.
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));

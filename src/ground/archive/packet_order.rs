@@ -56,15 +56,12 @@ impl PacketStreams {
 struct SentWindow {
     /// Range of the packets in `SendingOrder::packets`.
     range: Range<usize>,
-    /// Whether no packet is missing.
     is_complete: bool,
 }
 
 /// The order of packets in an era, as received.
 pub(super) struct SendingOrder {
-    /// Packets by count.
     packets: Vec<VisibilityPacket>,
-    /// Windows in the order of sending.
     windows: Vec<SentWindow>,
     streams: PacketStreams,
 }

@@ -35,11 +35,9 @@ pub struct Recalibrated {
     pub gains: String,
 }
 
-/// A recalibration in progress.
 struct Recalibration {
     ground: Ground,
     journal: Journal,
-    /// Packets whose gains change.
     due: BTreeSet<SendingKey>,
     /// Records of packets that have been subtracted.
     removed: BTreeMap<SendingKey, JournalRecord>,
@@ -102,7 +100,6 @@ fn gains_of(config: &GroundConfig) -> Result<Option<AntennaGains>, GroundError> 
     Ok(file.map(|file| AntennaGains::read(file)).transpose()?)
 }
 
-/// Packets whose gains change.
 fn packets_to_change(
     ground: &Ground,
     journal: &Journal,

@@ -12,7 +12,6 @@ use crate::runtime::{Outlet, Stage};
 
 const PACKETS: &str = "archive";
 
-/// File name of the settings in a raw archive.
 const SETTINGS: &str = "settings.json";
 
 /// Default limit of a raw archive, bytes: 64 GiB, enough for four missions of 30 channels.

@@ -51,7 +51,6 @@ pub struct Retracted {
     pub refused_packets: Vec<RefusedPacket>,
 }
 
-/// Key of a packet in the journal.
 type RecordKey = (Kind, SendingKey);
 
 /// A retraction in progress. It removes records and subtracts their visibilities; derived data follow from the journal when
@@ -62,7 +61,6 @@ struct Retraction {
     report: Retracted,
     /// If given, only visibilities within this time span are removed.
     span: Option<[MissionTime; 2]>,
-    /// Packets already processed.
     done: BTreeSet<RecordKey>,
     /// Packets of other kinds that had been applied.
     others: BTreeSet<RecordKey>,

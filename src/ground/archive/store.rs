@@ -24,7 +24,6 @@ const RETRY_DIVISOR: u64 = 8;
 /// Keeps a journal of the packets applied by a ground stage, and writes its checkpoints into a folder.
 pub(in crate::ground) struct Archive {
     pub(super) folder: StateFolder,
-    /// Settings on which the sums depend.
     pub(super) settings: Vec<(String, String)>,
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
@@ -33,11 +32,9 @@ pub(in crate::ground) struct Archive {
     pub(super) notes: Vec<String>,
     /// Ledger entries of the current packet.
     pub(super) posts: Ledger<VisibilityReason>,
-    /// Number of visibilities between checkpoints.
     pub(super) interval: u64,
     /// Number of visibilities between the last attempt and the next. After a failure it is shorter than the interval, and grows.
     pub(super) wait: u64,
-    /// Number of visibilities since the last attempt.
     pub(super) since_attempt: u64,
     pub(super) saving: SharedSaving,
     /// The raw archive beside the checkpoints; `None` if the stage does not write to one.

@@ -68,7 +68,6 @@ impl CoverageSurvey {
         }
     }
 
-    /// Surveys the newest usable checkpoint of a folder.
     fn read_newest(path: &Path) -> Result<Self, GroundError> {
         let files: Vec<PathBuf> = checkpoints(path)?;
         let mut bad = Vec::new();

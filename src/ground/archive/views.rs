@@ -11,7 +11,6 @@ use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 
 impl Journal {
-    /// Records of packets with visibilities.
     fn with_visibilities(&self) -> impl Iterator<Item = &JournalRecord> {
         self.visibilities.values().filter(|record| record.entry.visibilities > 0)
     }
@@ -34,7 +33,6 @@ impl Journal {
         visibilities.chain(self.others.keys().copied())
     }
 
-    /// Counters of the delivered packets.
     pub(super) fn reception(&self) -> ReceptionCounters {
         let mut counters = ReceptionCounters::default();
         for record in self.visibilities.values() {
@@ -63,7 +61,6 @@ impl Journal {
         blocks
     }
 
-    /// The ledger entries of all packets.
     pub(super) fn ledger(&self) -> LedgerReport<VisibilityReason> {
         let mut ledger = LedgerReport::default();
         for record in self.visibilities.values() {

@@ -49,27 +49,11 @@ impl Stroke {
     }
 }
 
-/// A shape above the pixels.
 #[derive(Clone, Debug)]
 pub(super) enum Shape {
-    /// A filled rectangle, limited to the clip.
-    Fill {
-        rect: Rect,
-        colour: Colour,
-        alpha: f32,
-        clip: Rect,
-    },
-    Line {
-        points: Vec<(f64, f64)>,
-        stroke: Stroke,
-        clip: Rect,
-    },
-    Text {
-        text: String,
-        anchor: (f64, f64),
-        align: Align,
-        style: Style,
-    },
+    Fill { rect: Rect, colour: Colour, alpha: f32, clip: Rect },
+    Line { points: Vec<(f64, f64)>, stroke: Stroke, clip: Rect },
+    Text { text: String, anchor: (f64, f64), align: Align, style: Style },
 }
 
 pub(super) struct Canvas {
@@ -147,7 +131,6 @@ impl Canvas {
         self.pixels.chunks_exact_mut(self.width.max(1))
     }
 
-    /// Blends `colour` into one pixel.
     pub fn blend(&mut self, x: usize, y: usize, colour: Colour, alpha: f32) {
         if x < self.width && y < self.height {
             mix(&mut self.pixels[y * self.width + x], colour, alpha);
@@ -271,7 +254,6 @@ fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
     pieces
 }
 
-/// Pixels from `low` to `high` within a range.
 fn within(low: f64, high: f64, limits: &Range<usize>) -> Range<usize> {
     let whole = span(low, high, limits.end);
     let first = whole.start.max(limits.start);

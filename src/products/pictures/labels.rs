@@ -1,6 +1,5 @@
 //! Chooses ticks at round numbers, and their labels.
 
-/// Ticks of an axis or a colour bar.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Ticks {
     /// Values with a label.
@@ -81,7 +80,6 @@ pub(super) fn logarithmic(low: f64, high: f64, wanted: usize) -> Ticks {
     Ticks { labelled, minor, exponent }
 }
 
-/// A power of ten with superscript digits.
 pub(super) fn power_of_ten(exponent: i32) -> String {
     const RAISED: [char; 10] = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
     let raise = |c: char| match c.to_digit(10) {
@@ -98,7 +96,6 @@ fn plain(value: f64) -> String {
     minus(text.to_owned())
 }
 
-/// Replaces hyphens by minus signs.
 fn minus(text: String) -> String {
     text.replace('-', "−")
 }

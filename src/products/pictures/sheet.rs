@@ -149,7 +149,6 @@ fn footnote(panels: &[MapPanel<'_>]) -> String {
     notes.into_iter().filter(|(is_shown, _)| *is_shown).map(|(_, note)| note).collect::<Vec<_>>().join("; ")
 }
 
-/// The layout of a page, pixels.
 struct Layout {
     height: usize,
     columns: usize,

@@ -146,7 +146,6 @@ fn write_text(
     writeln!(out, "</text>")
 }
 
-/// Escapes a text for XML, and drops control characters.
 fn escaped(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).fold(String::new(), |mut out, c| {
         match c {

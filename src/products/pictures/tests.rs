@@ -20,7 +20,6 @@ fn panel(values: &[f64], scale: ColourScale) -> MapPanel<'_> {
 
 #[test]
 fn longitude_grows_to_the_left_and_latitude_upwards() {
-    // One map bright in the east, one in the north.
     for (axis, bright, dark) in [(1, (0.3, 0.5), (0.7, 0.5)), (2, (0.5, 0.3), (0.5, 0.7))] {
         let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[axis]).collect();
         let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();

@@ -16,7 +16,6 @@ fn parse(bytes: &'static [u8]) -> FontRef<'static> {
     FontRef::try_from_slice(bytes).expect("the embedded font is valid")
 }
 
-/// Position of the anchor along the text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Align {
     Start,
@@ -26,12 +25,10 @@ pub(super) enum Align {
 
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
-    /// Height of the font, pixels.
     pub size: f64,
     pub colour: Colour,
     pub alpha: f32,
     pub medium: bool,
-    /// Whether the text runs upwards.
     pub upwards: bool,
 }
 
