@@ -601,7 +601,7 @@ mod tests {
             let turned = |v: Vec3| add(add(scale(v[0], x), scale(v[1], y)), scale(v[2], body[2]));
             let product = |k: usize| dot(field_of(k, n), turned(field_of(k, on_body(n))));
             let expected = 0.5 * (product(0) + product(1) + product(2)) / square;
-            assert!((response.at(n) - expected).abs() < 1e-9, "{} {expected}", response.at(n));
+            assert!((response.value(n) - expected).abs() < 1e-9, "{} {expected}", response.value(n));
         }
     }
 

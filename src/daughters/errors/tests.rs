@@ -180,7 +180,7 @@ fn dipoles_lean_by_the_angles_that_are_given() {
             assert!(along_deg == 2.0 * f64::from(n) && distortion == 0.01 * f64::from(n));
             assert!(found.elements == AntennaResponse::DipoleNormal);
             // Along the axis P_2 is 1.
-            let along = found.forms.map_or(1.0, |forms| forms[0].at(found.axes[0]));
+            let along = found.forms.map_or(1.0, |forms| forms[0].value(found.axes[0]));
             assert!((along - 1.0 - distortion).abs() < 1e-14);
             // Seen along the radius the axis is off by one angle, seen along the track by the other.
             let (up, normal) = (unit(array.position_m(n.into(), t_s)), array.normal_hat(n.into(), t_s));

@@ -104,7 +104,7 @@ impl DirectionForm {
     /// Its value in a direction.
     #[inline(always)]
     #[must_use]
-    pub fn at(&self, [x, y, z]: Vec3) -> f64 {
+    pub fn value(&self, [x, y, z]: Vec3) -> f64 {
         let Self([xx, xy, xz, yy, yz, zz]) = self;
         x * (xx * x + xy * y + xz * z) + y * (yy * y + yz * z) + zz * z * z
     }
