@@ -437,8 +437,8 @@ fn antennas_by_files_are_those_of_keys() {
     let flown = [&TILTED[..], &[antenna, "instrument.pattern.constant=[0.2, 0.0, -0.1]"]].concat();
     let left = left_by_refinement(&flown, &[&known, &by_files, &[SMEARED]]);
     eprintln!("flown by keys; left of the data known by keys, by files, not at all: {left:?}");
-    // Rows are in f32, and an iteration ends; quaternions and interpolated normals differ by 1e-6.
-    assert!(left[1] < 1.5 * left[0] && left[1] < 1e-4 * left[2], "{left:?}");
+    // Rows are in f32, and an iteration ends. Normals of orbits come from the data's positions, attitudes from messages: those leave less.
+    assert!(left[1] < left[0] && left[0] < 1e-4 * left[2], "{left:?}");
 
     let flown = [
         format!("instrument.antenna_files.attitudes={attitudes}"),
@@ -446,7 +446,7 @@ fn antennas_by_files_are_those_of_keys() {
     ];
     let left = left_by_refinement(&[&flown[0], &flown[1], antenna], &[&known, &by_files, &[SMEARED]]);
     eprintln!("flown by files; left of the data known by keys, by files, not at all: {left:?}");
-    assert!(left[0] < 1.5 * left[1] && left[1] < 1e-4 * left[2], "{left:?}");
+    assert!(left[1] < left[0] && left[0] < 1e-4 * left[2], "{left:?}");
 
     // What files do not say is refused with their key.
     let short = place.file("short.aem", attitude_message(&plan, 1).as_bytes());
