@@ -95,8 +95,8 @@ impl Ground {
     /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
     #[must_use]
     #[doc(hidden)]
-    pub fn with_noises(self, seeds: &[u64]) -> Self {
-        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noise_realisations(seeds), ..self }
     }
 
     /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
@@ -175,7 +175,7 @@ impl Ground {
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
                 let written = self.checkpoint();
-                if self.ranks().are_many() {
+                if self.ranks().is_distributed() {
                     // Without it the parts of the others are worth nothing.
                     written?;
                 }
@@ -359,7 +359,7 @@ impl Ground {
     /// Whether what no checkpoint holds has become old; not of a rank, which writes where the others do.
     fn is_old(&self) -> bool {
         let saves = self.archive.as_ref().is_some_and(Archive::saves_on_the_way);
-        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
+        saves && !self.ranks().is_distributed() && self.outcome.saving.is_old()
     }
 
     /// Whether the only checkpoint in the folder is the one that would be written now.
@@ -371,7 +371,7 @@ impl Ground {
     /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
     /// [`Ground::advance`]; one that was told to end is not where the others are.
     fn last_checkpoint(&mut self) -> Result<(), GroundError> {
-        if self.ranks().are_many() {
+        if self.ranks().is_distributed() {
             return if self.cancel.is_cancelled() { Ok(()) } else { self.checkpoint() };
         }
         for wait in LAST_WAITS {

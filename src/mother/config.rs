@@ -378,7 +378,7 @@ impl SpacecraftConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         self.check_channels(&mut checks);
         self.check_fidelity(&mut checks);
         self.check_numbers(&mut checks);

@@ -20,7 +20,7 @@ impl RuntimeConfig {
     /// Everything that is wrong with the configuration; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("runtime");
+        let mut checks = Checks::new("runtime");
         let capacity = self.queue_capacity;
         checks.number(
             "queue_capacity",

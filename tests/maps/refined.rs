@@ -538,7 +538,7 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
     let at = geometry(20e3, 0.02, 300.0, 2, &BASELINES_M[..1]);
     let sums = sums(4, &blocks(&at, &vec![Complex64::ONE; at.len()], 1000));
     let cancel = Cancel::new();
-    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    let watch = SolveWatch::new(cancel.clone()).with_grace(Duration::ZERO);
     let rule = RefineRule { passes_max: 2, residual_max: 1e-9 };
     assert!(solve(&sums, request(2), rule, &watch).is_ok());
     cancel.cancel();

@@ -168,7 +168,7 @@ impl SolverConfig {
     /// Everything that keeps it from being used while the data arrive; empty if nothing does.
     #[must_use]
     pub fn problems_of_hook(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
+        let mut checks = Checks::new("calibrate");
         let known = self.mode != CalibrationMode::Sky || !self.model_files.is_empty();
         let expected =
             "maps of the sky, one a channel, with calibration.hook = \"solve\" and calibrate.mode = \"sky\"";
@@ -217,7 +217,7 @@ impl SolverConfig {
     /// Everything that is wrong with the section; empty if it is good.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
+        let mut checks = Checks::new("calibrate");
         for (key, value, most) in [
             ("amplitude_sigma", self.amplitude_sigma, 10.0),
             ("phase_sigma_deg", self.phase_sigma_deg, 1e4),

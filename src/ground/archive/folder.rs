@@ -35,7 +35,7 @@ pub(super) struct StateFolder {
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        Self::open_with_ranks(path, &Ranks::one())
+        Self::open_with_ranks(path, &Ranks::single())
     }
 
     /// As [`StateFolder::open`], together with the other ranks.
@@ -52,7 +52,7 @@ impl StateFolder {
     pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
         match Self::open(path) {
             Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
-                Self::of_locked(path, &Ranks::one(), None)
+                Self::of_locked(path, &Ranks::single(), None)
             }
             opened => opened,
         }
@@ -118,7 +118,7 @@ impl StateFolder {
         let used = found.as_ref().and_then(|(index, _)| self.held.get(*index)).copied();
         // Others may be reading what is to be renamed.
         let chosen = used.map_or([0; 2], |used| [used.number as i64, used.parts as i64]);
-        if !self.ranks.agree(&chosen) {
+        if !self.ranks.have_equal(&chosen) {
             return Err(GroundError::NotShared { path: self.path.clone() });
         }
         let Some((index, read)) = found else {
@@ -166,7 +166,7 @@ impl StateFolder {
     /// name. One that stays takes room and does no harm. Ranks have none.
     pub(super) fn remove_unnamed(&mut self) {
         self.segments.retain(|number, _| self.held.iter().any(|held| held.number == *number));
-        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
+        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.is_distributed() {
             return;
         }
         let named = || self.segments.values().flatten().flat_map(ArchiveSegment::file_names);
@@ -203,14 +203,14 @@ impl StateFolder {
             return Err(GroundError::CheckpointName { path: greatest.path(&self.path, 0) });
         }
         match self.write(&path, &mut write) {
-            Err(error) if is_out_of_room(&error) && self.held.len() > 1 && !self.ranks.are_many() => {
+            Err(error) if is_out_of_room(&error) && self.held.len() > 1 && !self.ranks.is_distributed() => {
                 self.drop_older()?;
                 self.write(&path, &mut write)?;
             }
             written => written?,
         }
         self.held.push(next);
-        match self.ranks.are_many() {
+        match self.ranks.is_distributed() {
             true => self.remove_superseded(),
             false => self.remove_all_but(KEPT),
         }

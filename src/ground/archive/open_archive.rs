@@ -83,7 +83,7 @@ fn read_parts(
     };
     let mut whole: Option<(ArchiveHead, Accumulator)> = None;
     for (path, part) in parts_with(path) {
-        let (head, sums) = of_part(&path, part, empty.without_sums())?;
+        let (head, sums) = of_part(&path, part, empty.without_data())?;
         match &mut whole {
             None => whole = Some((head, sums)),
             Some((first, _)) if first.checksum != head.checksum => {
@@ -119,7 +119,7 @@ pub(super) struct OpenArchive {
 impl OpenArchive {
     /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
     pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
-        Self::with_ranks(folder, config, sets_aside, &Ranks::one())
+        Self::with_ranks(folder, config, sets_aside, &Ranks::single())
     }
 
     /// As [`OpenArchive::new`], as one rank of several.
@@ -129,10 +129,10 @@ impl OpenArchive {
         sets_aside: bool,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        if config.map.holds_visibilities() && ranks.are_many() {
+        if config.map.holds_visibilities() && ranks.is_distributed() {
             return Err(AccumulationError::HeldByRank.into());
         }
-        let mut folder = match sets_aside || ranks.are_many() {
+        let mut folder = match sets_aside || ranks.is_distributed() {
             true => StateFolder::open_with_ranks(folder, ranks)?,
             false => StateFolder::open_to_read(folder)?,
         };
@@ -155,7 +155,7 @@ impl OpenArchive {
     pub(super) fn move_to(&mut self, folder: StateFolder) {
         self.folder = folder;
         if let Some(contents) = &mut self.contents {
-            contents.accumulator.leave_segments();
+            contents.accumulator.forget_segments();
         }
     }
 
@@ -180,7 +180,7 @@ impl OpenArchive {
         let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let mut gate = config.gate()?;
         if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {

@@ -40,7 +40,7 @@ pub fn harmonic_beams(
         let mut beam = [vec![0.0; right.len()]];
         let task = watch.start(&format!("beam at pixel {pixel}"), request.rule.residual_max);
         system.solve(&[&right], &mut beam, &[request.rule], &task);
-        if !watch.goes_on() {
+        if !watch.may_continue() {
             break;
         }
         beams.push(PointBeam { pixel, map_k: transform.synthesis(&coefficients(&beam[0], l_max))? });

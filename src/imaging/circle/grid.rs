@@ -86,7 +86,7 @@ impl Grids {
     pub(super) fn rows(&self, points: usize) -> usize {
         let blocks = points.div_ceil(ALPHAS);
         let missing = if self.share.holds(blocks - 1) { blocks * ALPHAS - points } else { 0 };
-        self.share.of(blocks) * ALPHAS - missing
+        self.share.block_count(blocks) * ALPHAS - missing
     }
 
     /// Points in alpha and in gamma of the sums of data.

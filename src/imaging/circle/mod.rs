@@ -113,7 +113,7 @@ impl HarmonicEngine {
     ) -> Result<Self, AccumulationError> {
         let (mut from, (head, totals)) = FrameReader::new(from, HarmonicBasis::KIND)?;
         let kept = ranks.share();
-        let engine = Self::of(HarmonicBasis::setup_of(head)?, totals, |basis| {
+        let engine = Self::with_sums(HarmonicBasis::setup_of(head)?, totals, |basis| {
             ExactTori::read(&basis.grids, &mut from, part, kept)
         })?;
         from.finish()?;
@@ -126,7 +126,7 @@ impl HarmonicEngine {
     /// Parts of different sums, or of the same alphas.
     pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
         let basis = Arc::clone(&self.basis);
-        let (ours, theirs) = self.halves(other)?;
+        let (ours, theirs) = self.matching_parts(other)?;
         ours.join(&basis.grids, &theirs)
     }
 }
@@ -135,7 +135,7 @@ impl HarmonicBasis {
     /// The same of a process that holds all sums.
     fn whole(&self) -> Self {
         let grids = Arc::new(Grids { share: RankShare::WHOLE, ..Grids::clone(&self.grids) });
-        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::one() }
+        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::single() }
     }
 
     fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
@@ -174,7 +174,7 @@ impl SkyBasis for HarmonicBasis {
             quanta: Quanta::new(scale),
             grids: Arc::new(setup.grids()),
             tables: Arc::new(OnceLock::new()),
-            ranks: Ranks::one(),
+            ranks: Ranks::single(),
         })
     }
 

@@ -34,8 +34,8 @@ pub fn solve_noises(
     let w_max = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         })
         .value
     };
@@ -50,7 +50,7 @@ pub fn solve_noises(
         let mut solved = vec![vec![0.0; sums.unknowns()]; rights.len()];
         let task = watch.start("noise maps", request.rule.residual_max);
         system.solve(&rights, &mut solved, &vec![request.rule; rights.len()], &task);
-        if !watch.goes_on() {
+        if !watch.may_continue() {
             return Err(SolveError::Interrupted);
         }
         for unknowns in &solved {

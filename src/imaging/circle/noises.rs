@@ -63,7 +63,7 @@ impl NoiseSums {
         for k in 0..placed.len() {
             if let Ok(accepted) = engine.accept(placed, k) {
                 let (place, weight) = (accepted.place, accepted.weight);
-                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::of(placed, k) });
+                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::new(placed, k) });
             }
             if self.pending.len() >= HarmonicBasis::BATCH {
                 self.flush();
@@ -106,7 +106,7 @@ impl NoiseSums {
                 let layout = grids.data_row();
                 let held = (0..).zip(&rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
                 for (row, out) in held.zip(right.chunks_exact_mut(layout.len())) {
-                    row.values(layout, quanta.right, out);
+                    row.write_values(layout, quanta.right, out);
                 }
                 NodeSums { weights: Vec::new(), right }
             };
@@ -122,7 +122,7 @@ impl NoiseSums {
 impl HarmonicSums {
     /// With the noises of further realisations.
     #[must_use]
-    pub fn with_noises(mut self, noises: NoiseSums) -> Self {
+    pub fn with_noise_realisations(mut self, noises: NoiseSums) -> Self {
         self.further = noises.into_right_hand_sides(&self);
         self
     }

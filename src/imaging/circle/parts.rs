@@ -72,7 +72,7 @@ impl StoredTori {
                 }
                 let mut values = vec![0.0_f32; block.alphas * row];
                 for (alpha, (out, integers)) in values.chunks_exact_mut(row).zip(rows).enumerate() {
-                    integers.values(layout, quantum, out);
+                    integers.write_values(layout, quantum, out);
                     if out.iter().any(|x| *x != 0.0) {
                         used.push(number * ALPHAS + alpha);
                     }
@@ -122,7 +122,7 @@ impl SumPart {
 
     /// What an engine of this part holds.
     pub(in crate::imaging) fn ranks(&self) -> Ranks {
-        Ranks::part(self.share)
+        Ranks::single_with_share(self.share)
     }
 }
 
@@ -135,7 +135,7 @@ impl HarmonicEngine {
         let mut made = part.made.lock().unwrap_or_else(PoisonError::into_inner);
         let (basis, exact, counts) = self.into_exact();
         if made.counts.is_some_and(|before| before != counts) {
-            return Err(AccumulationError::Mismatch { what: "data, of which each holds a part," });
+            return Err(AccumulationError::Mismatch { what: "data" });
         }
         made.counts = Some(counts);
         let folder = made.folder.clone();

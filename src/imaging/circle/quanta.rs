@@ -62,7 +62,7 @@ impl ExactNode {
         for (rows, out, layout, quantum) in parts {
             let held = (0..).zip(rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
             for (row, out) in held.zip(out.chunks_exact_mut(layout.len())) {
-                row.values(layout, quantum, out);
+                row.write_values(layout, quantum, out);
             }
         }
         node

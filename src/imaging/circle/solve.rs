@@ -102,8 +102,8 @@ pub fn solve_regularised(
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         })
     };
     let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
@@ -226,7 +226,7 @@ fn solve_with_power(
     monopole[0] = 1.0;
     let right_hand_sides = [&right, sums.noise_right_hand_side(), &monopole];
     let mut columns = [solution, noise, vec![0.0; right.len()]];
-    let count = if watch.is_wanted() { 3 } else { 2 };
+    let count = if watch.has_priority() { 3 } else { 2 };
     let beside = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
     let convergence = {
         let task = watch.start("map, noise map and error of the mean", rule.residual_max);
@@ -241,7 +241,7 @@ fn solve_with_power(
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
     let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
     let mut uncertainty = None;
-    if watch.is_wanted() {
+    if watch.has_priority() {
         let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
         sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
         let mean_sigma_k = factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt();

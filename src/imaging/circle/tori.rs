@@ -84,7 +84,7 @@ impl Tori {
         let first = self.nodes.iter().position(Option::is_some).unwrap_or(count);
         let last = self.nodes.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
         let mut ends = [(count - first) as i64, last as i64];
-        ranks.greatest(&mut ends);
+        ranks.max(&mut ends);
         let [from_first, last] = ends.map(|end| end as usize);
         (count - from_first).min(last)..last
     }

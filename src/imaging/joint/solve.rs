@@ -132,13 +132,13 @@ pub fn solve_jointly(
     let mut alone = Vec::new();
     for ((sums, blocks), frequency_hz) in sums.iter().zip(&blocks).zip(&all_hz) {
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
-        alone.push(Alone::of(sums, blocks, request.rule, watch.named(&name).wanted(true))?);
+        alone.push(Alone::of(sums, blocks, request.rule, watch.named(&name).with_priority(true))?);
     }
     let noise_factors: Vec<f64> = alone.iter().map(|alone| alone.power.noise_factor).collect();
     let scale = alone.iter().map(Alone::scale).collect();
     let plain = Prior::new(all_hz, scale, Likeness { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let scaled = scaled_blocks(&plain, &blocks, &noise_factors);
-    let watch = watch.named("all channels").wanted(true);
+    let watch = watch.named("all channels").with_priority(true);
     let rights: Vec<Vec<f64>> = alone.iter().map(|alone| alone.right.clone()).collect();
     let likeness = most_likely(&plain, &scaled, &rights, watch)?;
     let prior = plain.with(likeness)?;
@@ -230,7 +230,7 @@ pub(super) fn most_likely(
     let (mut best, mut at) = found.max_by(|a, b| a.0.total_cmp(&b.0)).ok_or(SolveError::NoPower)?;
     let mut factor: f64 = 2.0;
     let mut step = 0;
-    while factor > FINEST && task.report_wanting(true, step, factor) {
+    while factor > FINEST && task.report_step(true, step, factor) {
         step += 1;
         // The corners, too: evidence has a ridge along which both change.
         let moves = [factor.recip(), 1.0, factor];

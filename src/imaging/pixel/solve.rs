@@ -201,7 +201,7 @@ pub fn solve_pixels_with(
     let PixelExtras { probes, beams } = extras;
     let pixels = sums.unknowns();
     let LargestEigenvalue { value: w_max, iterations, .. } =
-        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on());
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.may_continue());
     // The solution takes the memory of the sums.
     let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
     let mut map_k = sums.right.clone();
@@ -216,7 +216,7 @@ pub fn solve_pixels_with(
     let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
     for step in 0..normal.along() {
-        if !watch.goes_on() {
+        if !watch.may_continue() {
             return Err(SolveError::Interrupted);
         }
         Cholesky::advance(&mut normal, step)

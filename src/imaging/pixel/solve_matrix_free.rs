@@ -33,11 +33,11 @@ pub fn solve_matrix_free(
     }
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        largest_eigenvalue_from(random_vector(pixels), sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        largest_eigenvalue_from(random_vector(pixels), sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         })
     };
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let regularisation = epsilon * w_max;
@@ -59,7 +59,7 @@ pub fn solve_matrix_free(
     let convergence =
         system.solve(&[&right, sums.noise_right_hand_side()], &mut solved, &[rule, rule], &task);
     drop(task);
-    if solved[0].iter().all(|x| *x == 0.0) && !watch.goes_on() {
+    if solved[0].iter().all(|x| *x == 0.0) && !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let mut columns = solved.into_iter();

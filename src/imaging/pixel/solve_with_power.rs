@@ -56,11 +56,11 @@ pub fn solve_pixels_with_power(
     };
     let degrees: Vec<usize> = degrees(l_max).collect();
     let harmonics = harmonics(&to_pixels, pixels, degrees.len())?;
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let matrix = projected(sums, &harmonics);
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let places = vec![(0..degrees.len()).collect()];

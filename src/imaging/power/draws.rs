@@ -149,9 +149,9 @@ impl Covariance<'_> {
             let wants: Vec<bool> = paths.iter().map(|path| path.is_open).collect();
             let change = paths.iter().map(|path| path.change).fold(0.0, f64::max).min(1.0);
             let steps = paths.iter().map(|path| path.alphas.len()).max().unwrap_or(0);
-            let goes_on = task.report_each(&wants, steps, change);
+            let may_continue = task.report_each(&wants, steps, change);
             let mut open: Vec<&mut Path> =
-                paths.iter_mut().zip(goes_on).filter_map(|(path, on)| on.then_some(path)).collect();
+                paths.iter_mut().zip(may_continue).filter_map(|(path, on)| on.then_some(path)).collect();
             if open.is_empty() {
                 break;
             }

@@ -133,7 +133,7 @@ pub struct Uncertainty {
 impl Uncertainty {
     /// Of a map that is divided by `factor`.
     #[must_use]
-    pub(super) fn reduced(mut self, factor: f64) -> Self {
+    pub(super) fn divided_by(mut self, factor: f64) -> Self {
         let samples = self.samples_k.iter_mut().flatten();
         self.sigma_k.iter_mut().chain(samples).for_each(|value| *value /= factor);
         self.mean_sigma_k /= factor;

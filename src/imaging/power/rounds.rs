@@ -121,14 +121,14 @@ impl PowerProblem<'_> {
         let mut factor = 1.0;
         // Maps on the way do without draws. The blocks know more than data of a short time do, so that the power comes out too small, and
         // the map too smooth: on the safe side.
-        let is_wanted = watch.is_wanted();
-        let settled = if is_wanted { SETTLED } else { SETTLED_ON_THE_WAY };
+        let has_priority = watch.has_priority();
+        let settled = if has_priority { SETTLED } else { SETTLED_ON_THE_WAY };
         for round in 1..=ROUNDS_MAX {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
-            if is_wanted {
+            if has_priority {
                 ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
             } else {
                 rule = self.rule(&factors, factor, rule);
@@ -150,7 +150,7 @@ impl PowerProblem<'_> {
             let change = next.change(&fit).max((factor / before).ln().abs());
             fit = next;
             let task = watch.start("the sky's power", settled);
-            if !task.report_wanting(change > settled && round < ROUNDS_MAX, round, change) {
+            if !task.report_step(change > settled && round < ROUNDS_MAX, round, change) {
                 let factors = Factors::new(self.blocks, &fit.regularisation());
                 let mut traces = factors.traces(l_max);
                 traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);

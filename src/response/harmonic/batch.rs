@@ -105,7 +105,7 @@ fn alpha_terms(model: &HarmonicModel, half: f64) -> usize {
 
 /// Number of runs at the head of `order` that can share alphas, and the interval they cover.
 fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, usize) {
-    let reach = chebyshev::reach(ALPHAS_AIMED_AT, ALPHA_TOLERANCE * model.settings().tolerance)
+    let reach = chebyshev::h_max(ALPHAS_AIMED_AT, ALPHA_TOLERANCE * model.settings().tolerance)
         / model.sky.l_max().max(1) as f64;
     let range = |k: usize| {
         let run = &runs[k];

@@ -76,7 +76,7 @@ impl FilteredPatterns {
 #[inline]
 fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
     let sum: f32 = values.iter().zip(taps).map(|(v, t)| v * t).sum();
-    f32::entry(f64::from(sum))
+    f32::table_entry(f64::from(sum))
 }
 
 /// Symmetric taps by least squares over the band; the rest of the spectrum is not constrained.

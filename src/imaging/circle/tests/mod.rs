@@ -554,7 +554,7 @@ fn further_realisations_have_the_bits_of_their_own_engines() {
         noises.add(&engine, block);
         assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
     }
-    let sums = engine.into_sums().with_noises(noises);
+    let sums = engine.into_sums().with_noise_realisations(noises);
     assert_eq!(sums.further_noises().len(), seeds.len());
     for (seed, found) in seeds.into_iter().zip(sums.further_noises()) {
         let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();

@@ -151,7 +151,7 @@ fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
         };
         // A process alone, whose checkpoint is the one that it would have written itself.
         let mut again = Vec::new();
-        joined(&Ranks::one()).checkpoint(&mut again).unwrap();
+        joined(&Ranks::single()).checkpoint(&mut again).unwrap();
         assert!(again == whole, "{written} parts");
         for count in [2, 3] {
             let found = on_threads(count, |ranks| {
@@ -175,7 +175,7 @@ fn what_are_no_parts_of_the_same_sums_is_refused() {
         part
     });
     let read = |at: usize, rank| {
-        HarmonicEngine::restore_part(&mut &parts[at][..], RankShare { rank, count: 2 }, &Ranks::one())
+        HarmonicEngine::restore_part(&mut &parts[at][..], RankShare { rank, count: 2 }, &Ranks::single())
     };
     // One that has the other's name.
     assert!(read(0, 1).unwrap_err().to_string().contains("the rank's own blocks"));
