@@ -53,8 +53,10 @@ impl Job {
         ended: &Result<T, impl std::fmt::Display>,
         interrupt: &Interrupt,
     ) -> Option<Completion> {
-        let error =
-            ended.as_ref().err().filter(|_| self.ranks.is_distributed() && interrupt.cancel().is_cancelled())?;
+        let error = ended
+            .as_ref()
+            .err()
+            .filter(|_| self.ranks.is_distributed() && interrupt.cancel().is_cancelled())?;
         match log::is_json() {
             true => log::log_json(Level::Error, "error", &Value::Null, Some(&error.to_string())),
             false => log::print_line(format_args!("error: {error}")),

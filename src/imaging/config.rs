@@ -298,7 +298,12 @@ impl MapConfig {
         checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map only");
         let is_single = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
         let files = self.prior_files.len();
-        checks.require("prior_files", format!("({files} files)"), is_single, "none where map.prior_k is given");
+        checks.require(
+            "prior_files",
+            format!("({files} files)"),
+            is_single,
+            "none where map.prior_k is given",
+        );
         checks.finish()
     }
 
@@ -499,8 +504,9 @@ impl MapConfig {
             EngineKind::Pixel if !self.is_matrix_free() => PixelEngine::memory_bytes(self.nside),
             EngineKind::Pixel | EngineKind::Harmonic => 0,
         };
-        let is_summed =
-            |channel: &ChannelId| self.is_mapped(*channel) && group.is_none_or(|group| group.contains(channel));
+        let is_summed = |channel: &ChannelId| {
+            self.is_mapped(*channel) && group.is_none_or(|group| group.contains(channel))
+        };
         let channels = (0..channels as u16).map(ChannelId).filter(is_summed).count();
         let needed_bytes = each.saturating_mul(channels as u64);
         match limit_bytes {

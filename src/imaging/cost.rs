@@ -5,8 +5,8 @@ use std::f64::consts::TAU;
 use super::circle::{SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size};
 use super::rates::{
     AVERAGE_ELEMENT_S, AVERAGE_INSTANTS, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
-    HARMONIC_VISIBILITIES_PER_S, INNER_SOLUTION_FRACTION, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S, REFINED_ITERATIONS,
-    ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
+    HARMONIC_VISIBILITIES_PER_S, INNER_SOLUTION_FRACTION, INTERPOLATION_S, RANK_K_MULTIPLY_ADDS_PER_S,
+    REFINED_ITERATIONS, ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::imaging::anywhere::REFINED_VISIBILITY_BYTES;
 use crate::imaging::{EngineKind, MapConfig, PixelEngine};
@@ -58,16 +58,13 @@ pub(crate) struct EngineCost {
     pub(crate) solution_s: f64,
     /// Estimated time of the random probes of the final solution, s.
     pub(crate) probes_s: f64,
-    /// Multiply-adds per visibility.
     pub(crate) visibility_multiply_adds: f64,
-    /// Multiply-adds per solution.
     pub(crate) solution_multiply_adds: f64,
 }
 
 /// The data of a channel as planned, before its sums exist.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ChannelData {
-    /// Centre frequency, Hz.
     pub(crate) frequency_hz: f64,
     /// Visibilities within the map's longest baseline.
     pub(crate) visibilities: f64,
@@ -216,12 +213,18 @@ impl EngineCost {
             sums_bytes: held,
             copy_bytes: 0.0,
             copies_final: true,
-            other_bytes: circle.other_bytes + circle.sums_bytes + while_summed.max(0.0) + rows + snapshot_bytes,
+            other_bytes: circle.other_bytes
+                + circle.sums_bytes
+                + while_summed.max(0.0)
+                + rows
+                + snapshot_bytes,
             // Each iteration takes a product and an inner solution, for the map and its noise map.
             solution_s: (iterations + 1.0) * (INNER_SOLUTION_FRACTION * circle.solution_s + iteration_s)
                 + visibilities * circle.visibility_s,
             visibility_s: if has_snapshots { circle.visibility_s } else { 0.0 },
-            solution_multiply_adds: (iterations + 1.0) * INNER_SOLUTION_FRACTION * circle.solution_multiply_adds,
+            solution_multiply_adds: (iterations + 1.0)
+                * INNER_SOLUTION_FRACTION
+                * circle.solution_multiply_adds,
             ..circle
         }
     }

@@ -77,7 +77,9 @@ pub enum AccumulationError {
         what: &'static str,
     },
     /// Parts of the sums come from an engine that does not divide its sums among ranks.
-    #[error("the sums of this engine are not divided among ranks; expected parts of harmonic sums (map.engine = \"harmonic\")")]
+    #[error(
+        "the sums of this engine are not divided among ranks; expected parts of harmonic sums (map.engine = \"harmonic\")"
+    )]
     Undivided,
     /// Combined sums would exceed the range of an engine, or become negative.
     #[error(

@@ -53,7 +53,7 @@ pub use regulariser::Regulariser;
 pub use solver::SolveError;
 #[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, STORED_MAX, LargestEigenvalue, NamedWatch, SolveWatch, Solving, SolvingPart,
+    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, STORED_MAX, SolveWatch, Solving, SolvingPart,
     Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
     noise_variance, probed_traces, regularisation, spectrum, traces,
 };

@@ -78,9 +78,6 @@ impl Regulariser {
     }
 
     /// The diagonal of R for a solution up to `l_max`.
-    ///
-    /// # Errors
-    /// The table ends before `l_max`; or R is from the data.
     pub(in crate::imaging) fn diagonal(
         &self,
         epsilon: f64,

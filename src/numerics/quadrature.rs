@@ -193,7 +193,10 @@ mod tests {
                 assert!(found >= points && found.is_multiple_of(16), "{points_max} {points}");
                 assert!(found < points + points / 16 + 32, "{points_max} {points}: {found}");
             }
-            assert_eq!(rules.at_least(10 * points_max).weights.len(), rules.at_least(points_max).weights.len());
+            assert_eq!(
+                rules.at_least(10 * points_max).weights.len(),
+                rules.at_least(points_max).weights.len()
+            );
         }
     }
 }

@@ -144,7 +144,10 @@ mod tests {
                 let held: usize = shares.clone().map(|share| share.block_count(blocks)).sum();
                 assert_eq!(held, blocks, "{count} ranks");
                 for share in shares {
-                    assert_eq!((0..blocks).filter(|block| share.holds(*block)).count(), share.block_count(blocks));
+                    assert_eq!(
+                        (0..blocks).filter(|block| share.holds(*block)).count(),
+                        share.block_count(blocks)
+                    );
                 }
             }
         }

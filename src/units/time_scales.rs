@@ -122,7 +122,9 @@ impl Tai {
     pub fn parse(date: &str, scale: TimeScale) -> Option<Self> {
         let CalendarTime { day, second, part_s } = CalendarTime::parse(date)?;
         let is_leap = second == DAY_S;
-        if is_leap && !(scale == TimeScale::Utc && LEAP_SECONDS.iter().skip(1).any(|(first, _)| *first == day + 1)) {
+        if is_leap
+            && !(scale == TimeScale::Utc && LEAP_SECONDS.iter().skip(1).any(|(first, _)| *first == day + 1))
+        {
             return None;
         }
         let label_s = day * DAY_S + second;
@@ -356,7 +358,10 @@ mod tests {
         ] {
             assert_eq!(Tai::parse(date, scale), None, "{date} {scale}");
         }
-        assert_eq!(Tai::parse("2027-01-01T00:00:00", TimeScale::Tai).unwrap().seconds_since_1958(), 2_177_452_800.0);
+        assert_eq!(
+            Tai::parse("2027-01-01T00:00:00", TimeScale::Tai).unwrap().seconds_since_1958(),
+            2_177_452_800.0
+        );
         assert_eq!(utc_text(2_177_452_800.0), "2026-12-31T23:59:23.000");
         // Rounding to the full second is the leap second's, too.
         assert_eq!(

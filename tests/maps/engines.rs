@@ -4,7 +4,7 @@
 use faer::{Mat, Side};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
-use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, nominal_orbit};
 use lunarray::imaging::{
     HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
     solve_harmonics, solve_pixels, spectrum, traces,
@@ -87,7 +87,7 @@ pub fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max
         baseline_m_max,
         moon_radius_m: ArrayConfig::default().moon_radius_m,
         response: AntennaResponse::Isotropic,
-        orbit: orbit_of(&blocks[0], GeometryLimits::default()).unwrap(),
+        orbit: nominal_orbit(&blocks[0], GeometryLimits::default()).unwrap(),
         companion_seed: 1,
         weight_max: 1e-5,
     };

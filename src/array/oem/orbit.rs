@@ -135,7 +135,9 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
         reading.message.zero.plus_s(first.map_or(0.0, |segment| segment.useable_s[0]))
     };
     let latest = readings.iter().map(begins).reduce(|a, b| if b > a { b } else { a });
-    let (Some(latest), Some(first)) = (latest, readings.first()) else { return Ok(Tai::from_seconds_since_1958(0.0)) };
+    let (Some(latest), Some(first)) = (latest, readings.first()) else {
+        return Ok(Tai::from_seconds_since_1958(0.0));
+    };
     let given = if epoch.is_empty() {
         latest
     } else {

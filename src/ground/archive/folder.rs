@@ -166,7 +166,8 @@ impl StateFolder {
     /// name. One that stays takes room and does no harm. Ranks have none.
     pub(super) fn remove_unnamed(&mut self) {
         self.segments.retain(|number, _| self.held.iter().any(|held| held.number == *number));
-        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.is_distributed() {
+        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.is_distributed()
+        {
             return;
         }
         let named = || self.segments.values().flatten().flat_map(ArchiveSegment::file_names);

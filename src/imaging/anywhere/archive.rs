@@ -13,7 +13,8 @@ use super::archived::{ArchivedVisibility, RefinedSetup, VisibilitiesHead};
 use super::assumed_instrument::AssumedInstrument;
 use super::segments::{ArchiveSegment, SEGMENTS_MAX, SegmentFolder};
 use super::sums::{
-    BLOCK, Departures, RefinedData, RefinedSums, circle_engine, VisibilityColumns, nearest_circle, refined_sums,
+    BLOCK, Departures, RefinedData, RefinedSums, VisibilityColumns, circle_engine, nearest_circle,
+    refined_sums,
 };
 use crate::frames::PlacedVisibilities;
 use crate::imaging::circle::{HarmonicEngine, HarmonicSums};
@@ -100,8 +101,9 @@ impl VisibilityArchive {
         for k in 0..placed.len() {
             let found = self.checked(placed, k).and_then(|held| {
                 let index = self.find(&held).ok_or(Refusal::Full)?;
-                let totals =
-                    self.totals.combined(Totals::single(self.scale, held.weight, held.value_k_sr), Direction::Out);
+                let totals = self
+                    .totals
+                    .combined(Totals::single(self.scale, held.weight, held.value_k_sr), Direction::Out);
                 Ok((index, totals.ok_or(Refusal::Full)?))
             });
             match found {

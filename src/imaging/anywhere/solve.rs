@@ -115,8 +115,7 @@ pub fn solve_refined(
         convergence: [map_convergence, noise_convergence],
         residuals,
         direct,
-    } =
-        problem.solve(right, circle_data, steps)?;
+    } = problem.solve(right, circle_data, steps)?;
     let area_sr = pixel_area_sr(request.nside);
     let synthesise = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = map.x.clone();
@@ -136,7 +135,10 @@ pub fn solve_refined(
     };
     let mut data_residuals = sums.data.value_k_sr.clone();
     let predicted = sums.rows.forward(&sums.plan, &[coefficients(&whole, l_max)]);
-    data_residuals.iter_mut().zip(predicted.iter().flatten()).for_each(|(value, predicted)| *value -= predicted);
+    data_residuals
+        .iter_mut()
+        .zip(predicted.iter().flatten())
+        .for_each(|(value, predicted)| *value -= predicted);
     let refinement = Refinement {
         convergence: map_convergence,
         residuals,

@@ -148,8 +148,9 @@ pub(in crate::imaging) fn nearest_circle(
     let found: Vec<PairOrientation> = (0..count).filter_map(|k| orientation(at(k))).collect();
     // If satellite j leads, the normal of the pair's plane is reversed.
     let prograde = |pair: &PairOrientation| pair.inclination_rad.min(PI - pair.inclination_rad);
-    let mean =
-        |value: &dyn Fn(&PairOrientation) -> f64| found.iter().map(value).sum::<f64>() / found.len().max(1) as f64;
+    let mean = |value: &dyn Fn(&PairOrientation) -> f64| {
+        found.iter().map(value).sum::<f64>() / found.len().max(1) as f64
+    };
     let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&prograde));
     let inclination_deg = (orbit_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     let mean_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
@@ -220,8 +221,10 @@ fn circle_sums(
     let mut first = 0;
     while first < at.len() {
         let is_same_block = |k: &usize| at[*k].pair == at[first].pair && bands[*k] == bands[first];
-        let end =
-            (first + 1..at.len().min(first + BLOCK)).take_while(is_same_block).last().map_or(first + 1, |k| k + 1);
+        let end = (first + 1..at.len().min(first + BLOCK))
+            .take_while(is_same_block)
+            .last()
+            .map_or(first + 1, |k| k + 1);
         let block = &at[first..end];
         let _ = engine.add(&PlacedVisibilities {
             channel: setup.channel,

@@ -198,10 +198,12 @@ impl<B: SkyBasis> ExactEngine<B> {
         // Done on this thread, while the pool sums the previous batch.
         let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
         let scale = self.scale;
-        let totals_of = |accepted: &Accepted<B::Place>| Totals::single(scale, accepted.weight, accepted.value_k_sr);
+        let totals_of =
+            |accepted: &Accepted<B::Place>| Totals::single(scale, accepted.weight, accepted.value_k_sr);
         if direction == Direction::Out {
             let mut accepted = found.iter().flatten();
-            let remaining = accepted.try_fold(self.totals, |totals, removed| totals.combined(totals_of(removed), direction));
+            let remaining = accepted
+                .try_fold(self.totals, |totals, removed| totals.combined(totals_of(removed), direction));
             remaining.ok_or(AccumulationError::NothingHeld(placed.channel))?;
         }
         if self.direction != direction {
@@ -210,7 +212,9 @@ impl<B: SkyBasis> ExactEngine<B> {
         }
         let mut added = Added::default();
         for found in found {
-            match found.and_then(|accepted| Ok((self.totals_with(totals_of(&accepted), direction)?, accepted))) {
+            match found
+                .and_then(|accepted| Ok((self.totals_with(totals_of(&accepted), direction)?, accepted)))
+            {
                 Ok((totals, accepted)) => {
                     added.visibilities += 1;
                     self.totals = totals;

@@ -68,7 +68,11 @@ impl Iteration {
 
     /// The residual relative to the right-hand side; 0 if that is zero.
     fn relative_residual(&self) -> f64 {
-        if self.right_square <= 0.0 { 0.0 } else { (self.residual_square.max(0.0) / self.right_square).sqrt() }
+        if self.right_square <= 0.0 {
+            0.0
+        } else {
+            (self.residual_square.max(0.0) / self.right_square).sqrt()
+        }
     }
 
     /// Whether the rule requires another iteration.
@@ -130,7 +134,8 @@ impl System<'_> {
             })
             .collect();
         loop {
-            let needs_step: Vec<bool> = iterations.iter().zip(rules).map(|(one, rule)| one.needs_step(*rule)).collect();
+            let needs_step: Vec<bool> =
+                iterations.iter().zip(rules).map(|(one, rule)| one.needs_step(*rule)).collect();
             let products = iterations.iter().map(|iteration| iteration.products).max().unwrap_or(0);
             let residual = iterations.iter().map(Iteration::relative_residual).fold(0.0, f64::max);
             let continues = task.report_each(&needs_step, products, residual);

@@ -36,7 +36,9 @@ pub fn largest_eigenvalue(
     report: &mut dyn FnMut(usize, f64) -> bool,
 ) -> LargestEigenvalue {
     let start = random_vector(sums.unknowns());
-    largest_eigenvalue_from(start, sums, tolerance, &mut |needs_step, step, change| report(step, change) && needs_step)
+    largest_eigenvalue_from(start, sums, tolerance, &mut |needs_step, step, change| {
+        report(step, change) && needs_step
+    })
 }
 
 /// A fixed vector of random direction.

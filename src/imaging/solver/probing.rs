@@ -46,7 +46,8 @@ pub fn noise_variance(
         let start_norm = norm(&start);
         let noise = |w: f64| w.max(0.0).sqrt() / (w + eps);
         let space = converged_space(sums, start, &task, &|w| noise(w).powi(2));
-        let map = transform.synthesis(&coefficients(&space.function(start_norm, noise), sums.setup().l_max))?;
+        let map =
+            transform.synthesis(&coefficients(&space.function(start_norm, noise), sums.setup().l_max))?;
         variance.iter_mut().zip(map).for_each(|(sum, x)| *sum += x * x / probes as f64);
     }
     Ok(variance)

@@ -179,8 +179,13 @@ impl Functions {
     ) -> Result<Traces, UnsupportedEpsilon> {
         let values = [traces.sigma_n_k2.value, traces.sigma_s.value];
         // The third trace needs no check: an uncertain eigenvalue changes it by at most 1.
-        let is_accurate = values.iter().zip(errors).all(|(value, error)| error <= ACCURACY_FRACTION_MAX * value);
-        if is_accurate { Ok(traces) } else { Err(UnsupportedEpsilon { epsilon, accuracy: self.delta / w_max }) }
+        let is_accurate =
+            values.iter().zip(errors).all(|(value, error)| error <= ACCURACY_FRACTION_MAX * value);
+        if is_accurate {
+            Ok(traces)
+        } else {
+            Err(UnsupportedEpsilon { epsilon, accuracy: self.delta / w_max })
+        }
     }
 
     fn thermal(self, w: f64) -> f64 {
@@ -201,9 +206,14 @@ impl Functions {
         let error = self.relative * w + self.delta;
         let (low, high) = ((w - error).max(0.0), w + error);
         // The first function has its maximum at eps.
-        let thermal_changes = [low, high, self.eps.clamp(low, high)].map(|x| (self.thermal(x) - self.thermal(w)).abs());
+        let thermal_changes =
+            [low, high, self.eps.clamp(low, high)].map(|x| (self.thermal(x) - self.thermal(w)).abs());
         let change_max = |f: &dyn Fn(f64) -> f64| (f(low) - f(w)).abs().max((f(high) - f(w)).abs());
-        [thermal_changes.into_iter().fold(0.0, f64::max), change_max(&|x| self.imperfection(x)), change_max(&|x| self.measured(x))]
+        [
+            thermal_changes.into_iter().fold(0.0, f64::max),
+            change_max(&|x| self.imperfection(x)),
+            change_max(&|x| self.measured(x)),
+        ]
     }
 
     /// The traces from one exact sum or from those of several probes, with their errors from the accuracy of the matrix.
@@ -333,7 +343,10 @@ fn quadratures(krylov: &Krylov, functions: Functions, can_grow: bool, norm_squar
     // w / (w + eps)^2 = g1 - eps g2.
     let mut accuracy_error = [0.0; TRACES];
     for (w, c) in &gauss {
-        accuracy_error.iter_mut().zip(functions.term_errors(*w)).for_each(|(sum, term)| *sum += norm_square * c * term);
+        accuracy_error
+            .iter_mut()
+            .zip(functions.term_errors(*w))
+            .for_each(|(sum, term)| *sum += norm_square * c * term);
     }
     Some(Bounds {
         // w / (w + eps) = 1 - eps g1, and the squared norm of the probe is `norm_square`.

@@ -1,11 +1,9 @@
 //! Arithmetic of vectors of unknowns.
 
-/// Scalar product.
 pub(in crate::imaging) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Euclidean norm.
 pub(in crate::imaging) fn norm(a: &[f64]) -> f64 {
     dot(a, a).sqrt()
 }

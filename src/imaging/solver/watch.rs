@@ -162,7 +162,6 @@ impl<'a> NamedWatch<'a> {
     }
 }
 
-/// A task in progress.
 pub(in crate::imaging) struct SolveTask<'a> {
     named: NamedWatch<'a>,
     watch: &'a SolveWatch,

@@ -7,7 +7,9 @@ use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentFolder, VisibilityArchive};
-use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, orbit_of};
+use crate::imaging::circle::{
+    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, nominal_orbit,
+};
 use crate::imaging::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
     NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
@@ -469,7 +471,10 @@ impl Accumulator {
     }
 
     /// The channel of `placed`, created by its first data.
-    fn channel_or_new(&mut self, placed: &PlacedVisibilities) -> Result<NewOrRefused<&mut ChannelState>, AccumulationError> {
+    fn channel_or_new(
+        &mut self,
+        placed: &PlacedVisibilities,
+    ) -> Result<NewOrRefused<&mut ChannelState>, AccumulationError> {
         let channel = placed.channel;
         let index = usize::from(channel.0);
         let unknown = || AccumulationError::UnknownChannel(channel);
@@ -625,7 +630,7 @@ fn new_engine(
             companion_seed: config.companion_seed,
             weight_max,
         })?))),
-        EngineKind::Harmonic => match orbit_of(placed, config.limits) {
+        EngineKind::Harmonic => match nominal_orbit(placed, config.limits) {
             // Positions are untrusted: an orbit inside the Moon, or smaller than the longest baseline, is refused. Later data may still
             // create the engine.
             Some(orbit) if orbit.radius_m <= moon_radius_m.max(config.baseline_m_max(frequency_hz)) => {

@@ -280,7 +280,11 @@ impl Request<'_> {
     fn refined(&self, sums: &RefinedSums, fingerprint: &[i64]) -> Result<Option<SolvedMap>, SolveError> {
         let request = HarmonicRequest { samples: 0, probes: 0, ..self.harmonic_request() };
         let fingerprint = [fingerprint, &[self.epsilon.to_bits().cast_signed()]].concat();
-        let file = self.setup.iteration_folder.as_ref().map(|folder| IterationFile::new(folder, self.channel, &fingerprint));
+        let file = self
+            .setup
+            .iteration_folder
+            .as_ref()
+            .map(|folder| IterationFile::new(folder, self.channel, &fingerprint));
         // An intermediate map would not help: it is the circle's, with which the iteration starts anyway.
         let start = file.as_ref().and_then(IterationFile::read);
         let mut save = |x: [&[f64]; 2]| {
@@ -338,7 +342,9 @@ impl Stage for Solver {
             SnapshotData::Pixel(sums) => request.pixels(sums),
             SnapshotData::Harmonic(sums) => request.harmonics(&sums, regulariser, last),
             SnapshotData::MatrixFree(visibilities) => request.matrix_free(&visibilities.into_sums()?, last),
-            SnapshotData::Refined(archive) => request.refined(&archive.into_sums(&setup.assumed)?, &fingerprint),
+            SnapshotData::Refined(archive) => {
+                request.refined(&archive.into_sums(&setup.assumed)?, &fingerprint)
+            }
         };
         let Some(solved) = solved? else { return Ok(()) };
         let SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty } = solved;

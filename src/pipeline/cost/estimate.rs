@@ -142,7 +142,11 @@ impl Plan {
                 visibilities: expected.mapped,
                 windows: self.windows.len() as f64,
             };
-            if is_mapped { EngineCost::estimate(map, data).with_ranks(ranks, map) } else { EngineCost::default() }
+            if is_mapped {
+                EngineCost::estimate(map, data).with_ranks(ranks, map)
+            } else {
+                EngineCost::default()
+            }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let sent: f64 = expected.iter().map(|e| e.sent).sum();

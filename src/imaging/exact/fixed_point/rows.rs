@@ -13,7 +13,6 @@ const NARROW_BOUND: u64 = 1 << 31;
 pub(in crate::imaging) struct RowLayout {
     /// Number of integers of a part, including its overhang.
     pub(in crate::imaging) stride: usize,
-    /// Number of parts.
     pub(in crate::imaging) parts: usize,
     /// Number of integers beyond the end of a part.
     pub(in crate::imaging) overhang: usize,
