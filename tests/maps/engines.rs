@@ -295,7 +295,7 @@ fn solutions_start_warm_and_end_early() {
     let convergence = ended.diagnostics.convergence.unwrap();
     assert!(!convergence.converged && convergence.iterations <= 12);
     assert!(distance(&ended.map_k, &cold.map_k) < 0.1, "{}", distance(&ended.map_k, &cold.map_k));
-    assert!(hurried.now().is_none());
+    assert!(hurried.progress().is_none());
 }
 
 /// With a prior the map goes to it where nothing was measured.

@@ -154,7 +154,7 @@ fn solve(
     rule: RefineRule,
     watch: &SolveWatch,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
-    let steps = RefineSteps { start: None, passed: &mut |_| {} };
+    let steps = RefineSteps { start: None, save: &mut |_| {} };
     solve_refined(sums, request, (rule, &Regulariser::default()), None, steps, watch.named("test"))
 }
 
@@ -275,7 +275,7 @@ fn a_refined_map_takes_an_r_of_the_degree() {
     let sums = sums(10, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, 10), 1000));
     let rule = RefineRule { passes_max: 20, residual_max: 1e-6 };
     let solved = |regulariser: &Regulariser| {
-        let steps = RefineSteps { start: None, passed: &mut |_| {} };
+        let steps = RefineSteps { start: None, save: &mut |_| {} };
         let (rule, watch) = ((rule, regulariser), SolveWatch::default());
         solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap().0
     };
@@ -499,7 +499,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     let watch = SolveWatch::default();
     let mut passes = Vec::new();
     let mut keep = |x: [&[f64]; 2]| passes.push(x.map(<[f64]>::to_vec));
-    let steps = RefineSteps { start: None, passed: &mut keep };
+    let steps = RefineSteps { start: None, save: &mut keep };
     let (whole, refinement) =
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap();
@@ -508,7 +508,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     assert_eq!(passes.last(), Some(&whole.unknowns));
     // The matrix tells errors in x from residuals by its condition, as far as that is measured: a prior of 1e-4 of W_max.
     let go_on = |start: [Vec<f64>; 2]| {
-        let steps = RefineSteps { start: Some(start), passed: &mut |_| {} };
+        let steps = RefineSteps { start: Some(start), save: &mut |_| {} };
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap()
     };
