@@ -21,7 +21,7 @@ use crate::imaging::circle::{HarmonicEngine, HarmonicSums};
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};
 use crate::imaging::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 
 /// Memory of a visibility while it is stored, sorted and used for refinement, bytes, including spare capacity of arrays.
 pub const REFINED_VISIBILITY_BYTES: u64 = 400;
@@ -173,7 +173,7 @@ impl VisibilityArchive {
     }
 
     /// The setup, and the sorted positions and data with their simulated noise.
-    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<PairAt>, RefinedData) {
+    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<TimedPair>, RefinedData) {
         self.circle = None;
         self.sort();
         self.flush();
