@@ -450,7 +450,7 @@ impl Accumulator {
             }
             PlacedFrame::Elsewhere(counted) => {
                 self.emit_if_due(counted.first_s, out)?;
-                self.ledger.left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
+                self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
             }
             PlacedFrame::Housekeeping(_) => {}
         }
@@ -505,11 +505,11 @@ impl Accumulator {
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
         let is_in_group = self.group.as_ref().is_none_or(|group| group.contains(&placed.channel));
         if !is_in_group || !self.config.is_mapped(placed.channel) {
-            self.ledger.left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
         let short = within_baseline(placed, self.config.baseline_m_max(placed.frequency_hz));
-        self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - short.len()) as u64);
+        self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - short.len()) as u64);
         if short.is_empty() {
             // A channel without usable data gets no engine and no map.
             return Ok(None);
@@ -517,7 +517,7 @@ impl Accumulator {
         let state = match self.channel_or_new(&short)? {
             Ok(state) => state,
             Err(reason) => {
-                self.ledger.left_out(reason, short.len() as u64);
+                self.ledger.add_left_out(reason, short.len() as u64);
                 return Ok(None);
             }
         };
@@ -530,9 +530,9 @@ impl Accumulator {
             state.span_s = [state.span_s[0].min(first), state.span_s[1].max(last)];
         }
         self.accumulated += visibilities;
-        self.ledger.accumulated(visibilities);
+        self.ledger.add_accumulated(visibilities);
         for (reason, count) in refused {
-            self.ledger.left_out(reason.into(), count);
+            self.ledger.add_left_out(reason.into(), count);
         }
         Ok(offered_s)
     }
