@@ -44,7 +44,7 @@ pub(in crate::imaging) fn refined_sums(
         response: response.as_ref().map(|response| response as &(dyn Fn(usize) -> PairResponse + Sync)),
     };
     // Each visibility was checked when it was added.
-    let plan = rows.plan_of(&at, &observed).map_err(|error| AccumulationError::Rows(error.refusal))?;
+    let plan = rows.plan_with(&at, &observed).map_err(|error| AccumulationError::Rows(error.refusal))?;
     Ok(RefinedSums { circle, rows, plan, at, data, departures })
 }
 
