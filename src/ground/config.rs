@@ -94,7 +94,7 @@ impl GroundConfig {
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
             .with_segments(SEGMENTS_MAX)
-            .of_group(self.group.clone()))
+            .with_group(self.group.clone()))
     }
 
     /// An accumulator without data, posting to `ledger`.

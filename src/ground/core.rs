@@ -294,7 +294,7 @@ impl Ground {
                 Some(GroundFrame::Visibilities(block))
                     if self.archive.is_some() && self.cancel.is_cancelled() =>
                 {
-                    self.calibrator.leave_for_later(block);
+                    self.calibrator.count_for_next_session(block);
                 }
                 _ => self.apply(delivery, out)?,
             }
@@ -432,7 +432,7 @@ impl Stage for Ground {
         // The checkpoint keeps held packets as they are; the final maps use them without their positions.
         self.last_checkpoint()?;
         self.flush(out)?;
-        fill(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
+        fill(&self.outcome.completeness, self.calibrator.post_losses(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }

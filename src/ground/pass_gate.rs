@@ -36,7 +36,7 @@ impl PassGateState {
     pub(super) fn is_sound(&self, instrument: Option<&Instrument>) -> bool {
         let is_open =
             |[from_s, until_s]: &[f64; 2]| from_s.is_finite() && until_s.is_finite() && from_s <= until_s;
-        let is_of = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.is_of(instrument));
+        let is_of = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.fits_instrument(instrument));
         self.passes.iter().all(is_of) && self.open.iter().flatten().all(is_open)
     }
 }
@@ -85,7 +85,7 @@ impl PassGate {
         let PassGateState { mut passes, open, late } = state;
         // As they were closed, so that each is judged by what was known then.
         passes.sort_unstable_by_key(|pass| pass.number);
-        passes.into_iter().for_each(|pass| self.gains.close(pass));
+        passes.into_iter().for_each(|pass| self.gains.add_pass(pass));
         self.gains.count_late(late);
         self.gains.begin_session();
         self.open = open;
@@ -98,7 +98,7 @@ impl PassGate {
             return true;
         }
         let is_open = || self.open.iter().flatten().any(|span_s| self.is_near(*span_s, [middle_s; 2]));
-        self.gains.away_s(middle_s).is_some_and(|away_s| away_s == 0.0 || !is_open())
+        self.gains.distance_s(middle_s).is_some_and(|distance_s| distance_s == 0.0 || !is_open())
     }
 
     fn is_near(&self, [from_s, until_s]: [f64; 2], of_s: [f64; 2]) -> bool {
@@ -113,25 +113,25 @@ impl PassGate {
     pub(super) fn ended_by(&self, block: &VisibilityBlock) -> Option<usize> {
         let of_s = span_s(block)?;
         let [_, until_s] = self.open[NEWEST]?;
-        if self.gains.away_s(of_s[0]) == Some(0.0) || self.is_of(NEWEST, of_s) {
+        if self.gains.distance_s(of_s[0]) == Some(0.0) || self.is_of(NEWEST, of_s) {
             return None;
         }
         if of_s[0] > until_s + self.gap_s {
             return Some(NEWEST);
         }
-        (self.open[LATE].is_some() && !self.is_of(LATE, of_s) && self.gains.away_s(of_s[0]).is_none())
+        (self.open[LATE].is_some() && !self.is_of(LATE, of_s) && self.gains.distance_s(of_s[0]).is_none())
             .then_some(LATE)
     }
 
     /// Takes note of a block that is held; what it ends is closed. Returns whether it is of an open pass.
     pub(super) fn note(&mut self, block: &VisibilityBlock) -> bool {
         let Some(of_s) = span_s(block) else { return false };
-        let away_s = self.gains.away_s(of_s[0]);
+        let distance_s = self.gains.distance_s(of_s[0]);
         let which = match () {
-            () if away_s == Some(0.0) => None,
+            () if distance_s == Some(0.0) => None,
             () if self.is_of(NEWEST, of_s) => Some(NEWEST),
             () if self.is_of(LATE, of_s) => Some(LATE),
-            () if away_s.is_some() => None,
+            () if distance_s.is_some() => None,
             () if self.open[NEWEST].is_none() => Some(NEWEST),
             () => Some(LATE),
         };
@@ -168,7 +168,7 @@ impl PassGate {
         let solved = self.solver.solve(PassBlocks { number, span_s, blocks }, ephemeris);
         let (solutions, unused) =
             solved.map_or((Vec::new(), all), |solved| (solved.solutions, solved.unused));
-        self.gains.close(ClosedPass { number, span_s, unused, solutions });
+        self.gains.add_pass(ClosedPass { number, span_s, unused, solutions });
         if let Some(observer) = &mut self.observer {
             observer(&self.gains);
         }
