@@ -33,7 +33,7 @@ impl ClosedPass {
             solution.daughters.len() == satellites
                 && solution.normal_hat.len() == satellites
                 && solution.daughters.iter().all(|daughter| daughter.gains.len() == channels)
-                && solution.outlier_parts.is_of(channels)
+                && solution.outlier_fractions.has_channels(channels)
                 && solution.model_error.len() == channels
                 && (1..=satellites).contains(&(solution.reference as usize))
         };

@@ -47,7 +47,7 @@ impl GroundConfig {
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         if self.calibration.hook == CalibrationHook::Solve {
             let maps = self.calibrate.model_files.len();
-            self.calibrate.fits(instrument, maps, MODEL).map_err(CalibrationError::from)?;
+            self.calibrate.check_instrument(instrument, maps, MODEL).map_err(CalibrationError::from)?;
             check_frequencies(&self.calibrate.model_files, &instrument.frequencies_hz())
                 .map_err(CalibrationError::from)?;
         }

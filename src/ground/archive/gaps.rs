@@ -193,10 +193,10 @@ fn positions_missing(
     let windows = windows_of(&waiting);
     let first = before.map_or(0, |before| before.count + 1);
     let hole = first..after.map_or(gap.end, |after| after.count).max(gap.end);
-    let shares = shares_of(gap, missing, &hole, windows.len());
+    let strides = shares_of(gap, missing, &hole, windows.len());
     let streams = PacketStreams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
     let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
-    for (window, share) in windows.into_iter().zip(shares).filter(|(_, share)| *share > 0.0) {
+    for (window, share) in windows.into_iter().zip(strides).filter(|(_, share)| *share > 0.0) {
         for reading in &waiting[window] {
             let stream = reading.stream();
             let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));

@@ -122,7 +122,7 @@ impl CoverageSurvey {
             survey.ephemeris.insert(segment);
         }
         let readings =
-            journal.shares().map(|(entry, share)| VisibilityPacket { entry: *entry, waits: false, share });
+            journal.strides().map(|(entry, share)| VisibilityPacket { entry: *entry, waits: false, share });
         survey.received.readings = readings.collect();
         for ((_, (made, count)), record) in &journal.others {
             let segment = record.segment.and_then(|start| survey.ephemeris.segment(start));

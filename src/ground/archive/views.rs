@@ -22,7 +22,7 @@ impl Journal {
     }
 
     /// Packets with visibilities, each with the fraction of its offered visibilities that was accumulated.
-    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+    pub(super) fn strides(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
         self.with_visibilities().map(|record| {
             let offered = (record.offered > 0).then_some(record.offered);
             let share = offered.map(|offered| f64::from(record.accumulated) / f64::from(offered));
