@@ -141,10 +141,10 @@ mod tests {
     fn shares_are_all_blocks_once() {
         for count in 1..6 {
             for blocks in 0..12 {
-                let shares = (0..count).map(|rank| RankShare { rank, count });
-                let held: usize = shares.clone().map(|share| share.of(blocks)).sum();
+                let strides = (0..count).map(|rank| RankShare { rank, count });
+                let held: usize = strides.clone().map(|share| share.of(blocks)).sum();
                 assert_eq!(held, blocks, "{count} ranks");
-                for share in shares {
+                for share in strides {
                     assert_eq!((0..blocks).filter(|block| share.holds(*block)).count(), share.of(blocks));
                 }
             }

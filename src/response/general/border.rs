@@ -98,8 +98,8 @@ impl Border {
 
     /// The series' coefficients of a function from its values at [`Self::angles_rad`].
     pub(super) fn series(&self, values: &[f64], out: &mut [Value]) {
-        for (out, shares) in out.iter_mut().zip(self.to_series.chunks_exact(self.terms)) {
-            *out = shares.iter().zip(values).map(|(share, value)| share * value).sum::<f64>() as Value;
+        for (out, strides) in out.iter_mut().zip(self.to_series.chunks_exact(self.terms)) {
+            *out = strides.iter().zip(values).map(|(share, value)| share * value).sum::<f64>() as Value;
         }
     }
 

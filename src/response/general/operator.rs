@@ -321,7 +321,7 @@ impl GeneralRows {
         let products = skies * self.products.count();
         let width = 2 * self.orders();
         let mut out = vec![Vec::with_capacity(rows_of(tracks).len()); skies];
-        let Workspace { amplitudes, table, shares, padded, .. } = of;
+        let Workspace { amplitudes, table, strides, padded, .. } = of;
         let [mut values, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; products]);
         for track in tracks {
             let amplitudes = &amplitudes[(track.nodes.start - first) * products * width..];
@@ -339,8 +339,8 @@ impl GeneralRows {
             for row in track.rows.clone() {
                 values.fill(Complex64::ZERO);
                 for instant in plan.instants_of(track, row, &self.instants) {
-                    let gamma_rad = plan.shares(track, row, instant, shares);
-                    padded.set(table, shares);
+                    let gamma_rad = plan.strides(track, row, instant, strides);
+                    padded.set(table, strides);
                     self.phases.at(table, gamma_rad, padded, &mut at);
                     values.iter_mut().zip(&at).for_each(|(value, at)| *value += instant.weight * at);
                 }
@@ -360,7 +360,7 @@ impl GeneralRows {
     fn spread(&self, plan: &RowPlan, tracks: &[Track], values: &[&[Complex64]], of: &mut Workspace) {
         let (first, first_row) = (nodes_of(tracks).start, rows_of(tracks).start);
         let (width, skies) = (2 * self.orders(), values.len() * self.products.count());
-        let Workspace { amplitudes: out, table, shares, padded, .. } = of;
+        let Workspace { amplitudes: out, table, strides, padded, .. } = of;
         self.no_amplitudes(tracks, skies, out);
         let [mut of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
         for track in tracks {
@@ -382,8 +382,8 @@ impl GeneralRows {
             for row in track.rows.clone() {
                 plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
                 for instant in plan.instants_of(track, row, &self.instants) {
-                    let gamma_rad = plan.shares(track, row, instant, shares);
-                    padded.set(table, shares);
+                    let gamma_rad = plan.strides(track, row, instant, strides);
+                    padded.set(table, strides);
                     at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);
                     self.phases.add(table, gamma_rad, padded, &at);
                 }
@@ -551,7 +551,7 @@ struct Workspace {
     /// `[node][sky][real or imaginary part][order]`.
     amplitudes: Vec<f64>,
     table: PhaseTable,
-    shares: Vec<f64>,
+    strides: Vec<f64>,
     padded: PaddedShares,
 }
 

@@ -61,9 +61,9 @@ impl PhaseTable {
     }
 
     /// The shares of nodes with what fills the last vector.
-    fn fill_shares(&self, shares: &[f64], filled: &mut Vec<f64>) {
+    fn fill_shares(&self, strides: &[f64], filled: &mut Vec<f64>) {
         filled.clear();
-        filled.extend_from_slice(shares);
+        filled.extend_from_slice(strides);
         filled.resize(self.padded(), 0.0);
     }
 }
@@ -146,7 +146,7 @@ impl PhaseGrid {
         &self,
         table: &PhaseTable,
         gamma_rad: f64,
-        shares: &PaddedShares,
+        strides: &PaddedShares,
         out: &mut [Complex64],
     ) {
         let (first, lanes) = self.near(gamma_rad);
@@ -155,7 +155,7 @@ impl PhaseGrid {
         for (sky, out) in out.iter_mut().enumerate() {
             let [re, im] = [0, 1].map(|part| {
                 let column = (2 * sky + part) * padded;
-                gather(&table.values[column..], stride, first, self.points, taps, &shares.0)
+                gather(&table.values[column..], stride, first, self.points, taps, &strides.0)
             });
             *out = Complex64::new(re, im);
         }
@@ -166,7 +166,7 @@ impl PhaseGrid {
         &self,
         table: &mut PhaseTable,
         gamma_rad: f64,
-        shares: &PaddedShares,
+        strides: &PaddedShares,
         values: &[Complex64],
     ) {
         let (first, lanes) = self.near(gamma_rad);
@@ -175,7 +175,7 @@ impl PhaseGrid {
         for (sky, value) in values.iter().enumerate() {
             for (part, value) in [value.re, value.im].into_iter().enumerate() {
                 let column = (2 * sky + part) * padded;
-                scatter(&mut table.values[column..], stride, first, self.points, taps, (&shares.0, value));
+                scatter(&mut table.values[column..], stride, first, self.points, taps, (&strides.0, value));
             }
         }
     }
@@ -186,16 +186,16 @@ impl PhaseGrid {
 pub(super) struct PaddedShares(Vec<f64>);
 
 impl PaddedShares {
-    pub(super) fn set(&mut self, table: &PhaseTable, shares: &[f64]) {
-        table.fill_shares(shares, &mut self.0);
+    pub(super) fn set(&mut self, table: &PhaseTable, strides: &[f64]) {
+        table.fill_shares(strides, &mut self.0);
     }
 }
 
 /// The sum over taps and nodes of one column.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f32], shares: &[f64]) -> f64 {
+fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f32], strides: &[f64]) -> f64 {
     let mut sums: Lanes = [0.0; LANES];
-    for (chunk, shares) in shares.chunks_exact(LANES).enumerate() {
+    for (chunk, strides) in strides.chunks_exact(LANES).enumerate() {
         let mut row: Lanes = [0.0; LANES];
         let mut angle = first;
         for tap in taps {
@@ -210,7 +210,7 @@ fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f3
             }
         }
         for k in 0..LANES {
-            sums[k] += shares[k] * row[k];
+            sums[k] += strides[k] * row[k];
         }
     }
     sums.iter().sum()
@@ -224,15 +224,15 @@ fn scatter(
     first: usize,
     points: usize,
     taps: &[f32],
-    (shares, value): (&[f64], f64),
+    (strides, value): (&[f64], f64),
 ) {
     let mut angle = first;
     for tap in taps {
         let factor = f64::from(*tap) * value;
-        let values = &mut values[angle * stride..][..shares.len()];
-        for (values, shares) in values.chunks_exact_mut(LANES).zip(shares.chunks_exact(LANES)) {
+        let values = &mut values[angle * stride..][..strides.len()];
+        for (values, strides) in values.chunks_exact_mut(LANES).zip(strides.chunks_exact(LANES)) {
             for k in 0..LANES {
-                values[k] += factor * shares[k];
+                values[k] += factor * strides[k];
             }
         }
         angle += 1;
@@ -265,13 +265,13 @@ mod tests {
             grid.fill(&amplitudes, orders, [nodes, skies], &mut table);
             let mut gradients = PhaseTable::default();
             grid.clear(&mut gradients, [nodes, skies]);
-            let (mut shares, mut product) = (PaddedShares::default(), 0.0);
+            let (mut strides, mut product) = (PaddedShares::default(), 0.0);
             for k in 0..50 {
                 let gamma_rad = 0.7 * f64::from(k) - 9.0;
                 let of_nodes: Vec<f64> = (0..nodes).map(|_| random()).collect();
                 let mut found = [Complex64::ZERO; 2];
-                shares.set(&table, &of_nodes);
-                grid.at(&table, gamma_rad, &shares, &mut found);
+                strides.set(&table, &of_nodes);
+                grid.at(&table, gamma_rad, &strides, &mut found);
                 for (sky, found) in found.iter().enumerate() {
                     let mut expected = Complex64::ZERO;
                     for (node, share) in of_nodes.iter().enumerate() {
@@ -287,7 +287,7 @@ mod tests {
                 }
                 let values = [Complex64::new(random(), random()), Complex64::new(random(), random())];
                 product += found.iter().zip(&values).map(|(a, b)| (a * b.conj()).re).sum::<f64>();
-                grid.add(&mut gradients, gamma_rad, &shares, &values);
+                grid.add(&mut gradients, gamma_rad, &strides, &values);
             }
             let mut back = vec![0.0; amplitudes.len()];
             grid.collect(&mut gradients, orders, &mut back);

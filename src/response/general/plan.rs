@@ -201,18 +201,24 @@ impl RowPlan {
     }
 
     /// The share of each node of a track in a row at an instant; returns the angle gamma.
-    pub(super) fn shares(&self, track: &Track, row: usize, instant: &Instant, shares: &mut Vec<f64>) -> f64 {
+    pub(super) fn strides(
+        &self,
+        track: &Track,
+        row: usize,
+        instant: &Instant,
+        strides: &mut Vec<f64>,
+    ) -> f64 {
         let (tau, gamma_rad) = (self.tau[row], self.gamma_rad[row]);
         if instant.offset == 0.0 {
-            track.shares(tau, shares);
+            track.strides(tau, strides);
             return gamma_rad;
         }
         let interpolated =
-            |shares: &[f64]| -> f64 { shares.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum() };
-        track.shares(tau, shares);
-        let middle_rad = interpolated(shares);
-        track.shares(tau + f64::from(self.reach[row]) * instant.offset, shares);
-        gamma_rad + interpolated(shares) - middle_rad
+            |strides: &[f64]| -> f64 { strides.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum() };
+        track.strides(tau, strides);
+        let middle_rad = interpolated(strides);
+        track.strides(tau + f64::from(self.reach[row]) * instant.offset, strides);
+        gamma_rad + interpolated(strides) - middle_rad
     }
 
     /// Adds a row's values of all skies to their lists, from the values of the skies' products.
@@ -282,15 +288,15 @@ fn coefficients(most: usize, rows: usize, observed: &Observed<'_>) -> Result<Vec
 
 impl Track {
     /// The share of each node at a time.
-    fn shares(&self, tau: f64, shares: &mut Vec<f64>) {
-        shares.clear();
+    fn strides(&self, tau: f64, strides: &mut Vec<f64>) {
+        strides.clear();
         if let Some(at) = self.tau.iter().position(|node| *node == tau) {
-            shares.extend((0..self.tau.len()).map(|k| f64::from(u8::from(k == at))));
+            strides.extend((0..self.tau.len()).map(|k| f64::from(u8::from(k == at))));
             return;
         }
-        shares.extend(self.tau.iter().zip(&self.weights).map(|(node, weight)| weight / (tau - node)));
-        let sum: f64 = shares.iter().sum();
-        shares.iter_mut().for_each(|share| *share /= sum);
+        strides.extend(self.tau.iter().zip(&self.weights).map(|(node, weight)| weight / (tau - node)));
+        let sum: f64 = strides.iter().sum();
+        strides.iter_mut().for_each(|share| *share /= sum);
     }
 }
 
@@ -451,10 +457,10 @@ impl TrackBuilder<'_> {
             let turns = ((track.gamma_rad[k] - track.gamma_rad[k - 1]) / TAU).round();
             track.gamma_rad[k] -= turns * TAU;
         }
-        let mut shares = Vec::new();
+        let mut strides = Vec::new();
         let is_told = |row: usize| {
-            track.shares(plan.tau[row], &mut shares);
-            let told: f64 = shares.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum();
+            track.strides(plan.tau[row], &mut strides);
+            let told: f64 = strides.iter().zip(&track.gamma_rad).map(|(a, b)| a * b).sum();
             let off = (told - plan.gamma_rad[row]) / TAU;
             (off - off.round()).abs() * TAU < GAMMA_ERROR_RAD
         };
