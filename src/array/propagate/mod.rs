@@ -50,11 +50,11 @@ const TELL_EVERY: usize = 4_000;
 /// Callback for progress, with the number of days done and their total.
 pub type PropagationProgress = fn(f64, f64);
 
-static TELLER: OnceLock<PropagationProgress> = OnceLock::new();
+static PROGRESS: OnceLock<PropagationProgress> = OnceLock::new();
 
 /// Sets the callback for the progress of long propagations; only the first call in a process counts.
 pub fn report_propagation_to(progress: PropagationProgress) {
-    let _ = TELLER.set(progress);
+    let _ = PROGRESS.set(progress);
 }
 
 /// Cache of the last propagated orbits: a pipeline requests them several times.
@@ -75,9 +75,9 @@ pub(super) fn orbits(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError
 }
 
 fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
-    let flight = Propagation::new(config)?;
+    let propagation = Propagation::new(config)?;
     // The leader is propagated with each group of followers.
-    let groups: Vec<Vec<usize>> = match flight.formation {
+    let groups: Vec<Vec<usize>> = match propagation.formation {
         Some(_) => {
             let followers: Vec<usize> = (1..config.satellites).collect();
             followers.chunks(LANES - 1).map(|some| [&[0], some].concat()).collect()
@@ -90,7 +90,7 @@ fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
     let found: Result<Vec<Vec<Vec<OrbitArc>>>, ArrayError> = groups
         .par_iter()
         .enumerate()
-        .map(|(index, group)| flight.propagate_group(group, index == 0))
+        .map(|(index, group)| propagation.propagate_group(group, index == 0))
         .collect();
     let mut orbits: Vec<TableOrbit> = Vec::with_capacity(config.satellites);
     for (stretches, group) in found?.into_iter().zip(&groups) {
@@ -154,7 +154,7 @@ impl<'a> Propagation<'a> {
             states = step(&[time_s; LANES], &[STEP_S; LANES], &states, &slopes);
             if reports_progress
                 && node % TELL_EVERY == 0
-                && let Some(tell) = TELLER.get()
+                && let Some(tell) = PROGRESS.get()
             {
                 tell(time_s / DAY_S, self.nodes as f64 * STEP_S / DAY_S);
             }

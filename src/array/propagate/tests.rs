@@ -53,7 +53,7 @@ fn the_acceleration_is_the_gradient_of_the_potential() {
         [1.8e6 * angle.cos(), 1.7e6 * angle.sin(), 1.1e6 * (1.3 * angle).cos() - 0.3e6]
     };
     for degree in [0, 2, 3, 8, DEGREE_MAX] {
-        let mut states = filled(SatelliteState { position_m: [0.0; 3], velocity_m_s: [1.0, 2.0, 3.0] });
+        let mut states = all_lanes(SatelliteState { position_m: [0.0; 3], velocity_m_s: [1.0, 2.0, 3.0] });
         for lane in 0..LANES {
             put(&mut states, lane, SatelliteState { position_m: place(lane), velocity_m_s: [1.0, 2.0, 3.0] });
         }
@@ -121,15 +121,15 @@ fn without_a_field_orbits_are_ellipses() {
     for eccentricity in [0.0, 0.1] {
         config.eccentricity = eccentricity;
         let array = Array::new(&config).unwrap();
-        let flight = Flight::new(&config).unwrap();
-        let leader = KeplerOrbit::about(&flight.leader(0.0, 0.0), GM_M3_S2);
+        let propagation = Propagation::new(&config).unwrap();
+        let leader = KeplerOrbit::about(&propagation.leader(0.0, 0.0), GM_M3_S2);
         for t_s in [0.0, 100.0, 5e4, 20.0 * DAY_S - 77.0] {
             // There are 209 revolutions. Each closes to 1e-4 m at most, and a change of 1e-13 of the energy shifts
             // each later revolution by 3 pi 1e-13 of a turn times the radius.
             let error_m = norm(sub(array.position_m(0, t_s), leader.state(t_s).position_m));
             assert!(error_m < 0.02, "{eccentricity} {t_s}: {error_m}");
             // Followers are on the same track, each in its own plane.
-            let arc_m = flight.formation.as_ref().unwrap().arc_m(7, 0.0).0;
+            let arc_m = propagation.formation.as_ref().unwrap().arc_m(7, 0.0).0;
             let delay_s = arc_m / (GM_M3_S2 / leader.semi_major_axis_m()).sqrt();
             let behind_m = leader.state(t_s - delay_s).position_m;
             assert!(norm(sub(array.position_m(7, t_s), behind_m)) < 0.02, "{eccentricity} {t_s}");
