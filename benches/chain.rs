@@ -47,7 +47,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let plan = Plan::new(config)?;
     let out = std::env::temp_dir().join(format!("lunarray-bench-{}", std::process::id()));
     println!("{} threads, nside {nside}, one channel at 3 MHz", rayon::current_num_threads());
-    let mut strides = Vec::new();
+    let mut shares = Vec::new();
     for round in 1..=5 {
         let before = rank_k_limit(nside);
         let since = Instant::now();
@@ -62,10 +62,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
              {limit:.0}: {:.0} %",
             100.0 * share
         );
-        strides.push(share);
+        shares.push(share);
     }
     std::fs::remove_dir_all(&out)?;
-    strides.sort_by(f64::total_cmp);
-    println!("median: {:.0} % of the rank-k limit, from sky to map", 100.0 * strides[strides.len() / 2]);
+    shares.sort_by(f64::total_cmp);
+    println!("median: {:.0} % of the rank-k limit, from sky to map", 100.0 * shares[shares.len() / 2]);
     Ok(())
 }

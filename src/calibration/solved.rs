@@ -102,7 +102,7 @@ impl SolvedGains {
 
     /// Time to the nearest closed pass, s; `None` if it is too far for its gains to apply.
     #[must_use]
-    pub fn distance_s(&self, time_s: f64) -> Option<f64> {
+    pub fn distance_to_pass_s(&self, time_s: f64) -> Option<f64> {
         self.table().nearest(time_s).map(|(_, distance_s)| distance_s)
     }
 

@@ -140,10 +140,10 @@ mod tests {
     fn shares_are_all_blocks_once() {
         for count in 1..6 {
             for blocks in 0..12 {
-                let strides = (0..count).map(|rank| RankShare { rank, count });
-                let held: usize = strides.clone().map(|share| share.of(blocks)).sum();
+                let shares = (0..count).map(|rank| RankShare { rank, count });
+                let held: usize = shares.clone().map(|share| share.of(blocks)).sum();
                 assert_eq!(held, blocks, "{count} ranks");
-                for share in strides {
+                for share in shares {
                     assert_eq!((0..blocks).filter(|block| share.holds(*block)).count(), share.of(blocks));
                 }
             }

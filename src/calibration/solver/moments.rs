@@ -62,7 +62,11 @@ impl MomentSetup<'_> {
         moments.resize(2 * count * positions.len(), 0.0);
         let (beacon, frequency_hz) = self.signal.beacon(self.channel);
         let mut beacon_harmonics = vec![0.0; count];
-        real_harmonics(self.axes.map(|axis| dot(axis, beacon.from_hat())), self.l_max, &mut beacon_harmonics);
+        real_harmonics(
+            self.axes.map(|axis| dot(axis, beacon.source_hat())),
+            self.l_max,
+            &mut beacon_harmonics,
+        );
         for (position, moments) in positions.iter().zip(moments.chunks_exact_mut(2 * count)) {
             let (re, im) = moments.split_at_mut(count);
             if *beacon_is_on {

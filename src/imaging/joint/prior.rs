@@ -66,7 +66,7 @@ pub(super) struct View {
     pub(super) l_max: usize,
     pub(super) scale: Vec<f64>,
     /// q of each channel; at a degree those of the channels that have it count.
-    pub(super) strides: Vec<f64>,
+    pub(super) shares: Vec<f64>,
     /// The same for mean and dipole, no share of which is a channel's own.
     pub(super) shares_of_free: Vec<f64>,
     /// Variance of `x_lm / s_l` that no channel decides, by degree: 0 at a channel's own frequency.
@@ -143,13 +143,13 @@ impl Prior {
 
     /// The map of a channel.
     pub(super) fn view_of(&self, channel: usize) -> View {
-        let strides: Vec<f64> = (0..=channel).map(|of| self.share(channel, of)).collect();
+        let shares: Vec<f64> = (0..=channel).map(|of| self.share(channel, of)).collect();
         View {
             frequency_hz: self.frequencies_hz[channel],
             l_max: self.l_max[channel],
             scale: self.scale[channel].clone(),
-            shares_of_free: strides.clone(),
-            strides,
+            shares_of_free: shares.clone(),
+            shares,
             open: vec![0.0; self.l_max[channel] + 1],
         }
     }
@@ -182,13 +182,13 @@ impl Prior {
         let ln = |channel: usize, l: usize| self.scale[channel][l].ln();
         let scale =
             (0..=l_max).map(|l| ((1.0 - share) * ln(below, l) + share * ln(above, l)).exp()).collect();
-        let strides = conditional(&self.root, self.likeness, &self.frequencies_hz, frequency_hz);
-        let left = |strides: &[f64]| (1.0 - strides.iter().map(|q| q * q).sum::<f64>()).max(0.0);
+        let shares = conditional(&self.root, self.likeness, &self.frequencies_hz, frequency_hz);
+        let left = |shares: &[f64]| (1.0 - shares.iter().map(|q| q * q).sum::<f64>()).max(0.0);
         let smooth = Likeness { own_share: OWN_SHARE_OF_FREE, ..self.likeness };
         let root = smooth.root(&self.frequencies_hz)?;
         let of_smooth = conditional(&root, smooth, &self.frequencies_hz, frequency_hz);
         let of_degree =
-            |l: usize| if l < FREE { left(&of_smooth) } else { left(&strides[..self.of_degree(l)]) };
+            |l: usize| if l < FREE { left(&of_smooth) } else { left(&shares[..self.of_degree(l)]) };
         let open = (0..=l_max).map(of_degree).collect();
         // In terms of these unknowns: q' root^-1 is what each channel's map counts for.
         let mut counts = Mat::from_fn(of_smooth.len(), 1, |k, _| of_smooth[k]);
@@ -197,7 +197,7 @@ impl Prior {
             (0..self.channels()).map(|channel| counts[(channel, 0)] * self.share(channel, of)).sum()
         };
         let shares_of_free = (0..self.channels()).map(of_unknown).collect();
-        Ok(View { frequency_hz, l_max, scale, strides, shares_of_free, open })
+        Ok(View { frequency_hz, l_max, scale, shares, shares_of_free, open })
     }
 }
 
@@ -208,8 +208,8 @@ impl View {
         for_each_unknown(self.l_max, &mut |l, m, part| {
             let of_channel =
                 |(of, q): (usize, &f64)| q * u[offsets[of] + place_of(prior.l_max[of], l, m, part)];
-            let strides = if l < FREE { &self.shares_of_free } else { &self.strides };
-            let sum: f64 = strides.iter().enumerate().take(prior.of_degree(l)).map(of_channel).sum();
+            let shares = if l < FREE { &self.shares_of_free } else { &self.shares };
+            let sum: f64 = shares.iter().enumerate().take(prior.of_degree(l)).map(of_channel).sum();
             sky.push(self.scale[l] * sum);
         });
         sky
@@ -226,12 +226,12 @@ impl View {
 
 /// `q = root^-1 rho`, step by step: what a frequency has of each unknown.
 fn conditional(root: &Mat<f64>, likeness: Likeness, channels_hz: &[f64], frequency_hz: f64) -> Vec<f64> {
-    let mut strides: Vec<f64> = Vec::new();
+    let mut shares: Vec<f64> = Vec::new();
     for (channel, channel_hz) in channels_hz.iter().enumerate() {
-        let known: f64 = strides.iter().enumerate().map(|(of, q)| q * root[(channel, of)]).sum();
-        strides.push((likeness.between(*channel_hz, frequency_hz) - known) / root[(channel, channel)]);
+        let known: f64 = shares.iter().enumerate().map(|(of, q)| q * root[(channel, of)]).sum();
+        shares.push((likeness.between(*channel_hz, frequency_hz) - known) / root[(channel, channel)]);
     }
-    strides
+    shares
 }
 
 /// Degree, order and part of each unknown of a map, in their order.

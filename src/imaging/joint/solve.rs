@@ -358,9 +358,9 @@ impl<'a> Posterior<'a> {
         let map_k = synthesis(&coefficients(&sky, view.l_max), nside)?;
         let factors = Factors::new(&self.blocks, &unit_regularisation(self.prior()));
         let row = |channel: usize, l: usize| {
-            let strides = if l < FREE { &view.shares_of_free } else { &view.strides };
-            let is_of = l <= view.l_max && channel < strides.len();
-            if is_of { ratio[l].sqrt() * view.scale[l] * strides[channel] } else { 0.0 }
+            let shares = if l < FREE { &view.shares_of_free } else { &view.shares };
+            let is_of = l <= view.l_max && channel < shares.len();
+            if is_of { ratio[l].sqrt() * view.scale[l] * shares[channel] } else { 0.0 }
         };
         let open: Vec<f64> = self.open_sigma(view).iter().map(|sigma| sigma * sigma).collect();
         let sigma_k = view_sigma_k(&self.blocks, &factors, &row, &open, nside);

@@ -34,7 +34,7 @@ impl Held {
         self.1 += 1.0;
     }
 
-    fn strides(&self) -> [f64; 2] {
+    fn shares(&self) -> [f64; 2] {
         self.0.map(|held| held / self.1)
     }
 }
@@ -103,7 +103,7 @@ fn coverage(skies: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             held.count((found.power.power_k2[l] / power(l)).ln() / found.power.sigma_ln[l]);
         }
     }
-    held.iter().map(Held::strides).collect()
+    held.iter().map(Held::shares).collect()
 }
 
 #[test]
@@ -111,8 +111,8 @@ fn errors_hold_of_skies_that_end_where_the_map_does() {
     let skies = std::env::var("LUNARRAY_SKIES").ok().and_then(|text| text.parse().ok()).unwrap_or(200);
     let found = coverage(skies, L_MAX);
     eprintln!("{skies} skies: pixels, monopole, C_l at {DEGREES:?}: {found:.3?}");
-    for (what, strides) in ["pixels", "monopole", "C_3", "C_6", "C_12", "C_20"].iter().zip(&found) {
-        for (share, expected) in strides.iter().zip([0.683, 0.95]) {
+    for (what, shares) in ["pixels", "monopole", "C_3", "C_6", "C_12", "C_20"].iter().zip(&found) {
+        for (share, expected) in shares.iter().zip([0.683, 0.95]) {
             // Three standard errors, pixels of a sky counted as one; R is taken as known, which leaves out its own error: 0.03.
             let error = (expected * (1.0 - expected) / skies as f64).sqrt();
             assert!((share - expected).abs() < 3.0 * error + 0.03, "{what}: {share} {expected}");
