@@ -26,7 +26,7 @@ pub fn tilted_axes([along, normal, up]: [Vec3; 3], [along_deg, radial_deg]: [f64
     [axis, unit(sub(along, scale(dot(along, axis), axis)))]
 }
 
-/// Normal of an orbit from two positions a short time apart; `None` if they are in line with the Moon's centre.
+/// Normal of an orbit from two positions a short time apart; `None` if they are collinear with the Moon's centre.
 #[must_use]
 pub fn orbit_normal_hat(r_before_m: Vec3, r_after_m: Vec3) -> Option<Vec3> {
     let normal = cross(r_before_m, r_after_m);

@@ -47,14 +47,16 @@ impl GroundConfig {
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         if self.calibration.hook == CalibrationHook::Solve {
             let maps = self.calibrate.model_files.len();
-            self.calibrate.fits(instrument, maps, MODEL_FILES_KEY).map_err(CalibrationError::from)?;
+            self.calibrate
+                .check_instrument(instrument, maps, MODEL_FILES_KEY)
+                .map_err(CalibrationError::from)?;
             check_frequencies(&self.calibrate.model_files, &instrument.frequencies_hz())
                 .map_err(CalibrationError::from)?;
         }
         let described = self.described(instrument)?;
         self.map.check_priors(&described)?;
         let channels = described.channels.len();
-        if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
+        if let Some(misfit) = self.map.mismatches(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
         }
         Ok(self.map.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?)
@@ -94,14 +96,14 @@ impl GroundConfig {
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
             .with_segments(SEGMENTS_MAX)
-            .of_group(self.group.clone()))
+            .with_group(self.group.clone()))
     }
 
     /// An accumulator without data that posts to `ledger`.
     pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
         Accumulator::new(self.map.clone(), ledger.clone())
-            .within_memory(self.memory_max_bytes)
-            .of_group(self.group.clone())
-            .in_part(self.part.clone())
+            .with_memory_limit(self.memory_max_bytes)
+            .with_group(self.group.clone())
+            .with_part(self.part.clone())
     }
 }

@@ -165,7 +165,7 @@ impl Message for Collector {
         let Some(form) = &mut self.latest else {
             return Err(Fault::new(line, short(epoch), "metadata before attitudes"));
         };
-        let time_s = read_epoch(epoch, form.scale, line)?.from_1958();
+        let time_s = read_epoch(epoch, form.scale, line)?.seconds_since_1958();
         let Some(&[a, b, c, d]) = numbers.first_chunk().filter(|four| four.iter().all(|x| x.is_finite()))
         else {
             return Err(Fault::new(line, format!("{} numbers after {epoch}", numbers.len()), Self::LINE));
@@ -212,7 +212,7 @@ impl Message for Collector {
             let expected = format!("{} or more in a segment, as its interpolation needs", segment.points);
             return Err(Fault::new(line, format!("{count} attitudes"), expected));
         }
-        let zero = Tai::from_1958_s(0.0);
+        let zero = Tai::from_seconds_since_1958(0.0);
         segment.useable_s =
             useable_s(useable, (zero, scale), [segment.time_s[0], segment.time_s[count - 1]])?;
         segment.require_steps(&lines, scale)?;
@@ -256,7 +256,7 @@ impl AttitudeSegment {
             let middle_s = 0.5 * (from_s + until_s);
             let apart = self.to_body(self.points, middle_s).apart_rad(self.to_body(other, middle_s));
             if apart.to_degrees() > allowed_deg {
-                let date = Tai::from_1958_s(from_s).text(scale, 3);
+                let date = Tai::from_seconds_since_1958(from_s).text(scale, 3);
                 let found = format!(
                     "{:.3} s after {date} {scale}, in which the interpolation errs by some {:.2} deg",
                     until_s - from_s,

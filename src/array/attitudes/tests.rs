@@ -49,7 +49,7 @@ fn read(files: &[String]) -> Result<Attitudes, String> {
 }
 
 fn tai_s(date: &str) -> f64 {
-    Tai::read(date, TimeScale::Tai).unwrap().from_1958()
+    Tai::parse(date, TimeScale::Tai).unwrap().seconds_since_1958()
 }
 
 fn assert_axes(found: Option<[Vec3; 3]>, expected: [Vec3; 3]) {

@@ -171,7 +171,7 @@ impl Message for Collector {
         else {
             return Err(Fault::new(line, format!("{} numbers after {epoch}", numbers.len()), Self::LINE));
         };
-        let zero = *self.zero.get_or_insert_with(|| time.whole());
+        let zero = *self.zero.get_or_insert_with(|| time.floor_second());
         let time_s = time.since_s(zero);
         if segment.time_s.last().is_some_and(|before| *before >= time_s) {
             let expected = "epochs in rising order: each later than the one before";
@@ -239,7 +239,7 @@ impl Metadata {
     pub(in crate::array) fn scale(&self, end: usize) -> Result<TimeScale, Fault> {
         let (system, line) = self.value("TIME_SYSTEM", end);
         let expected = "TIME_SYSTEM = UTC, TAI, TT, TDB or GPS";
-        TimeScale::of_name(system).ok_or_else(|| Fault::new(line, system, expected))
+        TimeScale::from_name(system).ok_or_else(|| Fault::new(line, system, expected))
     }
 
     /// First and last useable time, if they are given.
@@ -301,7 +301,7 @@ impl Metadata {
             return Ok(None);
         }
         let (text, line) = self.value(key, end);
-        match Tai::read(text, scale) {
+        match Tai::parse(text, scale) {
             Some(time) => Ok(Some((time, line))),
             None => Err(Fault::new(
                 line,
@@ -314,7 +314,7 @@ impl Metadata {
 
 /// Reads the epoch of a state.
 pub(in crate::array) fn read_epoch(epoch: &str, scale: TimeScale, line: usize) -> Result<Tai, Fault> {
-    Tai::read(epoch, scale).ok_or_else(|| {
+    Tai::parse(epoch, scale).ok_or_else(|| {
         let expected = format!(
             "an epoch on {scale} such as 2030-01-31T12:00:00.000 or 2030-031T12:00:00; UTC from 1972 on, with a second 60 only \
              where there was a leap second"

@@ -84,7 +84,7 @@ impl Ground {
             return Err(GroundError::GainsWithoutData { missing, count: *count });
         }
         work.add(files, &new)?;
-        let moves = gains.iter().flatten().any(AntennaGains::moves);
+        let moves = gains.iter().flatten().any(AntennaGains::corrects_positions);
         if config.map.engine == EngineKind::Harmonic {
             work.check_first_data(&firsts, moves)?;
         }
@@ -114,7 +114,7 @@ fn packets_to_change(
         }
         let span_s = [entry.start, entry.end].map(|time| time.seconds());
         match gains {
-            [Some(old), Some(new)] => !old.does_as(new, channel.frequency_hz, entry.pair, span_s),
+            [Some(old), Some(new)] => !old.is_equivalent(new, channel.frequency_hz, entry.pair, span_s),
             _ => true,
         }
     };
@@ -193,7 +193,7 @@ impl Recalibration {
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
             return Ok(());
         };
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
@@ -252,7 +252,7 @@ impl Recalibration {
     /// Writes the archive twice, so that falling back to the older checkpoint does not bring the old gains back.
     fn write(self, new: &GroundConfig) -> Result<Recalibrated, GroundError> {
         let Self { mut ground, journal, mut report, .. } = self;
-        ground.accumulator.set_spans(&journal.spans_s());
+        ground.accumulator.retain_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             let settings = settings_of(new)?;
             let gains = settings.iter().find(|(key, _)| key == "calibration.gains_file");
