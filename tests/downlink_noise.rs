@@ -7,7 +7,7 @@ mod common;
 use std::io::Read;
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::{Decoder, DownlinkConfig, Format, Intake};
+use lunarray::downlink::{Decoder, DownlinkConfig, DownlinkReceiver, Format};
 use lunarray::units::{StreamKind, random_stream};
 use rand::Rng;
 
@@ -39,7 +39,7 @@ fn receive(sound: &[u8], seed: u64) -> (u64, Option<Format>) {
     let bytes = if sound.is_empty() { NOISE_BYTES } else { NOISE_BYTES_BEHIND };
     let noise = Noise(random_stream(seed, StreamKind::Probe, [0, 0])).take(bytes);
     let mut stream = sound.chain(noise);
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut intake, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     loop {
         let read = intake.fill_from(&mut stream).unwrap();
         if read == 0 {

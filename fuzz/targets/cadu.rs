@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use libfuzzer_sys::fuzz_target;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon};
-use lunarray::downlink::{Decoder, Event, Intake};
+use lunarray::downlink::{Decoder, Event, DownlinkReceiver};
 
 static PASS: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let mut encoder = CaduEncoder::new(ReedSolomon::new(1).expect("depth 1"), 1, 2);
@@ -20,11 +20,11 @@ static PASS: LazyLock<Vec<u8>> = LazyLock::new(|| {
 
 fuzz_target!(|data: &[u8]| {
     let Some((&how, data)) = data.split_first() else { return };
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut intake, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     let sound: &[u8] = if how & 1 == 0 { &PASS } else { &[] };
     let chunk = 1 + usize::from(how >> 1) * 40;
     let mut bytes = 0;
-    let mut drain = |intake: &mut Intake| {
+    let mut drain = |intake: &mut DownlinkReceiver| {
         while let Some(event) = intake.next_event() {
             bytes += match &event {
                 Event::Packet(packet) => packet.header.bytes as u64,

@@ -8,11 +8,11 @@ use bincode::{Decode, Encode};
 use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, Sent};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
+    ByteFeed, Decoder, DecoderState, DownlinkReceiver, Event, PacketInsertion, PacketOutcome, ReceivedSet,
     ReceptionCounters,
 };
 use crate::downlink::wire::payload::visibilities_outline;
-use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
+use crate::downlink::wire::{PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 
 /// What a checkpoint keeps of a collector: the packets it holds, and its instrument. Packets that were delivered are in
@@ -77,7 +77,7 @@ pub struct DeliveredPacket {
     /// Its checksum.
     pub check: u32,
     /// Its contribution to the counters.
-    pub reading: PacketReading,
+    pub reading: PacketOutcome,
 }
 
 /// Most intervals of the received set of a kind: packets of consecutive counts made at one time are one. A pass has a few,
@@ -117,8 +117,8 @@ pub enum CollectorStep {
 /// Until the description of the instrument arrives, nothing can be decoded, and all packets are held.
 #[derive(Debug)]
 pub struct Collector {
-    intake: Intake,
-    received: [ReceivedSet; Kind::ALL.len()],
+    intake: DownlinkReceiver,
+    received: [ReceivedSet; PacketKind::ALL.len()],
     held: HoldBuffer,
     decoder: Decoder,
     /// Counts what is no new packet, in this session alone.
@@ -143,7 +143,7 @@ impl Collector {
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
-            intake: Intake::unfiltered(),
+            intake: DownlinkReceiver::unfiltered(),
             received: Default::default(),
             held: HoldBuffer::new(wait_bytes),
             decoder: Decoder::new(),
@@ -176,7 +176,7 @@ impl Collector {
     #[must_use]
     pub fn resume(
         state: CollectorState,
-        delivered: impl Iterator<Item = (Kind, Sent)>,
+        delivered: impl Iterator<Item = (PacketKind, Sent)>,
         counters: ReceptionCounters,
     ) -> Self {
         let CollectorState { held, decoder } = state;
@@ -308,8 +308,8 @@ impl Collector {
     }
 
     /// Packets received of each kind.
-    pub fn received(&self) -> impl Iterator<Item = (Kind, &ReceivedSet)> {
-        Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
+    pub fn received(&self) -> impl Iterator<Item = (PacketKind, &ReceivedSet)> {
+        PacketKind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
     }
 
     /// Packets of all kinds received so far, without duplicates.
@@ -357,7 +357,7 @@ impl Collector {
         counters.bytes_truncated = link.bytes_truncated;
         counters.bytes_damaged = link.bytes_damaged;
         counters.bytes_duplicate = link.bytes_duplicate;
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let counts = counters.kind_mut(kind);
             counts.duplicates = link.kind(kind).duplicates;
             counts.damaged = link.kind(kind).damaged;
@@ -386,8 +386,8 @@ impl Collector {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
                     // The next session considers all of them.
-                    Kind::Visibilities if self.sets_aside => None,
-                    Kind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
+                    PacketKind::Visibilities if self.sets_aside => None,
+                    PacketKind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
                     _ => self.held.take_payload(&header),
                 };
                 if let Some(packets) = found {
@@ -452,7 +452,7 @@ impl Collector {
             return Ok(EventOutcome::Event);
         };
         let (offset, header) = (packet.offset, packet.header);
-        let describes = header.kind == Kind::Instrument;
+        let describes = header.kind == PacketKind::Instrument;
         if describes && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload) {
             return Err(DownlinkError::OtherInstrument { offset });
         }
@@ -474,7 +474,7 @@ impl Collector {
             }
         }
         // As nearly all are: never copied into the hold buffer.
-        if header.kind == Kind::Visibilities
+        if header.kind == PacketKind::Visibilities
             && !(self.sets_aside && self.held.has_room(&header))
             && self.decoder.instrument().is_some()
             && visibilities_outline(packet.payload).as_ref().is_none_or(is_due)
@@ -487,7 +487,7 @@ impl Collector {
         if !describes && !self.knows_instrument() {
             return Ok(EventOutcome::Event);
         }
-        if header.kind == Kind::Visibilities {
+        if header.kind == PacketKind::Visibilities {
             self.candidates.push_back(header);
             return Ok(EventOutcome::Held(header));
         }

@@ -13,7 +13,7 @@ use prometheus_client::registry::{Registry, Unit};
 
 use super::console::Console;
 use super::status::{Phase, Status};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::downlink::transport::socket::ConnectionEnd;
 use crate::files::disk_room;
 use crate::pipeline::MemoryLimit;
@@ -232,8 +232,9 @@ impl Scrape {
     fn reception(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let Some(reception) = &self.status.reception else { return Ok(()) };
         let packets = || Some(Unit::Other("packets".into()));
-        let kinds =
-            |of: &dyn Fn(Kind) -> u64| Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64));
+        let kinds = |of: &dyn Fn(PacketKind) -> u64| {
+            PacketKind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64))
+        };
         let sound = kinds(&|kind| reception.kind(kind).packets);
         gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
         let missing = kinds(&|kind| reception.kind(kind).missing);

@@ -211,9 +211,9 @@ fn empty_foreign_and_missing_files_are_named() {
     };
     assert!(matches!(said(&path), DownlinkError::Io { .. }));
     fs::write(&path, "").unwrap();
-    assert!(matches!(said(&path), DownlinkError::Empty { .. }));
+    assert!(matches!(said(&path), DownlinkError::EmptyFile { .. }));
     fs::write(&path, "SIMPLE  =                    T".repeat(96)).unwrap();
-    assert!(matches!(said(&path), DownlinkError::Foreign { bytes: 2880, .. }));
+    assert!(matches!(said(&path), DownlinkError::NotADownlink { bytes: 2880, .. }));
     assert!(said(&path).to_string().contains("expected CCSDS space packets"));
     for (bytes, name) in [
         (&b"SIMPLE  =                    T"[..], "a FITS file"),

@@ -7,7 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use common::downlink::{mission, packets_of, transmit};
 use lunarray::downlink::link::{FrameFate, LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::receive::cadu::FrameCounters;
-use lunarray::downlink::{Decoder, DownlinkConfig, Event, Format, Intake, PacketHeader, ReceptionCounters};
+use lunarray::downlink::{
+    Decoder, DownlinkConfig, DownlinkReceiver, Event, Format, PacketHeader, ReceptionCounters,
+};
 use lunarray::frames::GroundFrame;
 use proptest::prelude::*;
 
@@ -22,9 +24,9 @@ struct Received {
 }
 
 fn receive(stream: &[u8]) -> Received {
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut intake, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     let (mut packets, mut bodies) = (Vec::new(), BTreeMap::new());
-    let mut drain = |intake: &mut Intake| {
+    let mut drain = |intake: &mut DownlinkReceiver| {
         while let Some(event) = intake.next_event() {
             if let Event::Packet(packet) = &event {
                 let name = (packet.header.kind.apid(), packet.header.count);

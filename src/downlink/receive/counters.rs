@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::cadu::FrameCounters;
-use crate::downlink::wire::Kind;
+use crate::downlink::wire::PacketKind;
 use crate::downlink::wire::payload::PayloadFault;
 
 /// Packets of one kind.
@@ -89,7 +89,7 @@ pub enum PayloadOutcome {
 
 /// What decoding one packet adds to the counters, beside the packet and its bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
-pub struct PacketReading {
+pub struct PacketOutcome {
     /// What became of the payload.
     pub payload: PayloadOutcome,
     /// Visibilities decoded.
@@ -178,29 +178,29 @@ impl ReceptionCounters {
     /// Counts of one kind.
     #[must_use]
     #[doc(hidden)]
-    pub fn kind(&self, kind: Kind) -> &KindCounts {
+    pub fn kind(&self, kind: PacketKind) -> &KindCounts {
         match kind {
-            Kind::Instrument => &self.instrument,
-            Kind::Ephemeris => &self.ephemeris,
-            Kind::Visibilities => &self.visibilities,
-            Kind::Calibration => &self.calibration,
-            Kind::Housekeeping => &self.housekeeping,
+            PacketKind::Instrument => &self.instrument,
+            PacketKind::Ephemeris => &self.ephemeris,
+            PacketKind::Visibilities => &self.visibilities,
+            PacketKind::Calibration => &self.calibration,
+            PacketKind::Housekeeping => &self.housekeeping,
         }
     }
 
-    pub(crate) fn kind_mut(&mut self, kind: Kind) -> &mut KindCounts {
+    pub(crate) fn kind_mut(&mut self, kind: PacketKind) -> &mut KindCounts {
         match kind {
-            Kind::Instrument => &mut self.instrument,
-            Kind::Ephemeris => &mut self.ephemeris,
-            Kind::Visibilities => &mut self.visibilities,
-            Kind::Calibration => &mut self.calibration,
-            Kind::Housekeeping => &mut self.housekeeping,
+            PacketKind::Instrument => &mut self.instrument,
+            PacketKind::Ephemeris => &mut self.ephemeris,
+            PacketKind::Visibilities => &mut self.visibilities,
+            PacketKind::Calibration => &mut self.calibration,
+            PacketKind::Housekeeping => &mut self.housekeeping,
         }
     }
 
     /// Adds a good packet that is no duplicate.
-    pub(crate) fn add_packet(&mut self, kind: Kind, bytes: u32, reading: &PacketReading) {
-        let PacketReading { payload, orphans, visibilities_unread: unread, .. } = *reading;
+    pub(crate) fn add_packet(&mut self, kind: PacketKind, bytes: u32, reading: &PacketOutcome) {
+        let PacketOutcome { payload, orphans, visibilities_unread: unread, .. } = *reading;
         // A forged journal may claim anything: sums saturate.
         let add = |count: &mut u64, more: u32| *count = count.saturating_add(u64::from(more));
         add(&mut self.bytes, bytes);
@@ -235,7 +235,7 @@ impl ReceptionCounters {
         self.garbage_stretches += other.garbage_stretches;
         self.bytes_truncated += other.bytes_truncated;
         self.bytes_damaged += other.bytes_damaged;
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             self.kind_mut(kind).damaged += other.kind(kind).damaged;
         }
         if let Some(frames) = &other.frames {
@@ -245,7 +245,7 @@ impl ReceptionCounters {
 
     /// A sentence about restarts of the packet counts, if there were any.
     pub(crate) fn restarts_text(&self) -> Option<String> {
-        let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
+        let kinds = PacketKind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
         let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
         (!times.is_empty()).then(|| {
             format!(
@@ -259,7 +259,7 @@ impl ReceptionCounters {
     #[must_use]
     #[doc(hidden)]
     pub fn packets(&self) -> u64 {
-        Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
+        PacketKind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
     }
 }
 
@@ -269,7 +269,7 @@ impl std::fmt::Display for ReceptionCounters {
         if let Some(frames) = &self.frames {
             writeln!(f, "{frames}")?;
         }
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let counts = self.kind(kind);
             if *counts != KindCounts::default() {
                 let KindCounts { packets, bytes, damaged, duplicates, missing, .. } = counts;

@@ -1,11 +1,11 @@
 //! Packets to ground frames.
 
-use super::{Event, Packet, PacketReading, PayloadOutcome, ReceptionCounters};
+use super::{Event, Packet, PacketOutcome, PayloadOutcome, ReceptionCounters};
 use crate::downlink::wire::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
 };
-use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, PacketSegment};
+use crate::downlink::wire::{CucTime, FORMAT_VERSION, PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument};
 
 /// Longest payload that is assembled from segments; the ephemeris of a window is a thousandth of it.
@@ -63,10 +63,10 @@ impl DecoderState {
 pub struct Decoder {
     instrument: Option<Instrument>,
     standing: DescriptionState,
-    partial: [Option<Partial>; Kind::ALL.len()],
+    partial: [Option<Partial>; PacketKind::ALL.len()],
     counters: ReceptionCounters,
     /// Of the packet that is being decoded, or was decoded last.
-    reading: PacketReading,
+    reading: PacketOutcome,
     fault: Option<(u64, PayloadFault)>,
 }
 
@@ -134,7 +134,7 @@ impl Decoder {
 
     /// Ends the stream: discards incomplete payloads. Another stream may follow.
     pub fn finish(&mut self) {
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let orphans = self.drop_partial(kind);
             self.counters.kind_mut(kind).orphans += u64::from(orphans);
         }
@@ -147,8 +147,8 @@ impl Decoder {
         &mut self,
         packet: Packet<'_>,
         is_last: bool,
-    ) -> (Option<GroundFrame>, PacketReading) {
-        self.reading = PacketReading::default();
+    ) -> (Option<GroundFrame>, PacketOutcome) {
+        self.reading = PacketOutcome::default();
         let PacketHeader { kind, bytes, .. } = packet.header;
         let frame = self.decode_packet(packet);
         if is_last {
@@ -218,32 +218,32 @@ impl Decoder {
     }
 
     /// Discards an incomplete payload and counts it.
-    fn give_up(&mut self, kind: Kind) {
+    fn give_up(&mut self, kind: PacketKind) {
         self.reading.orphans += self.drop_partial(kind);
     }
 
     /// Drops the segments of an unfinished payload; returns how many payloads there were.
-    fn drop_partial(&mut self, kind: Kind) -> u32 {
+    fn drop_partial(&mut self, kind: PacketKind) -> u32 {
         u32::from(self.partial[kind.index()].take().is_some())
     }
 
     fn decode_payload(&mut self, packet: Packet<'_>, payload: &[u8]) -> Option<GroundFrame> {
         let kind = packet.header.kind;
         let decoded = match kind {
-            Kind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
+            PacketKind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
             _ if self.standing != DescriptionState::Known => {
                 self.set_aside(kind, payload);
                 return None;
             }
-            Kind::Ephemeris => self.take_ephemeris(payload).map(Some),
-            Kind::Visibilities => self.take_visibilities(payload).map(Some),
-            Kind::Housekeeping => {
+            PacketKind::Ephemeris => self.take_ephemeris(payload).map(Some),
+            PacketKind::Visibilities => self.take_visibilities(payload).map(Some),
+            PacketKind::Housekeeping => {
                 decode_housekeeping(payload).map(|counts| Some(GroundFrame::Housekeeping(counts)))
             }
-            Kind::Calibration => return None,
+            PacketKind::Calibration => return None,
         };
         decoded.unwrap_or_else(|fault| {
-            if kind == Kind::Visibilities {
+            if kind == PacketKind::Visibilities {
                 self.reading.visibilities_unread = count_visibilities(payload) as u32;
             }
             self.refuse(packet, fault)
@@ -282,9 +282,9 @@ impl Decoder {
     }
 
     /// Counts a payload that cannot be decoded because its instrument description is missing.
-    fn set_aside(&mut self, kind: Kind, payload: &[u8]) {
+    fn set_aside(&mut self, kind: PacketKind, payload: &[u8]) {
         self.reading.visibilities_unread =
-            if kind == Kind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
+            if kind == PacketKind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
         self.reading.payload = match self.standing {
             DescriptionState::Unknown => PayloadOutcome::BeforeInstrument,
             _ => PayloadOutcome::Foreign,

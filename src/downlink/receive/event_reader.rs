@@ -3,7 +3,7 @@
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::{DownlinkFile, Event, Intake};
+use super::{DownlinkFile, DownlinkReceiver, Event};
 use crate::downlink::error::{DownlinkError, io_error, require_packets};
 
 /// Feeds a source to an intake, chunk by chunk, and names the source in errors.
@@ -35,7 +35,7 @@ impl<R: Read> ByteFeed<R> {
     ///
     /// # Errors
     /// The source cannot be read.
-    pub fn feed(&mut self, intake: &mut Intake) -> Result<bool, DownlinkError> {
+    pub fn feed(&mut self, intake: &mut DownlinkReceiver) -> Result<bool, DownlinkError> {
         if self.at_end {
             return Ok(false);
         }
@@ -51,7 +51,7 @@ impl<R: Read> ByteFeed<R> {
 #[derive(Debug)]
 pub struct EventReader<R = DownlinkFile> {
     feed: ByteFeed<R>,
-    intake: Intake,
+    intake: DownlinkReceiver,
     packets: u64,
     /// Whether the stream has been looked at for frames of another kind.
     looked: bool,
@@ -75,13 +75,13 @@ impl<R: Read> EventReader<R> {
     }
 
     fn of(feed: ByteFeed<R>) -> Self {
-        Self { feed, intake: Intake::new(), packets: 0, looked: false }
+        Self { feed, intake: DownlinkReceiver::new(), packets: 0, looked: false }
     }
 
-    /// The same source through [`Intake::unfiltered`]: every sound packet, duplicates too.
+    /// The same source through [`DownlinkReceiver::unfiltered`]: every sound packet, duplicates too.
     #[must_use]
     pub fn unfiltered(self) -> Self {
-        Self { intake: Intake::unfiltered(), ..self }
+        Self { intake: DownlinkReceiver::unfiltered(), ..self }
     }
 
     /// Reads on until `take` returns something; `None` at the end of the source.
@@ -115,9 +115,11 @@ impl<R: Read> EventReader<R> {
         self.looked = self.intake.has_whole_head();
         match self.intake.foreign_frames() {
             None => Ok(()),
-            name => {
-                Err(DownlinkError::Foreign { path: self.feed.path.clone(), bytes: self.intake.bytes(), name })
-            }
+            name => Err(DownlinkError::NotADownlink {
+                path: self.feed.path.clone(),
+                bytes: self.intake.bytes(),
+                name,
+            }),
         }
     }
 
@@ -135,7 +137,7 @@ impl<R: Read> EventReader<R> {
     /// Requires that a packet has been read.
     ///
     /// # Errors
-    /// [`DownlinkError::Empty`] for a source without a byte, [`DownlinkError::Foreign`] for one without a packet.
+    /// [`DownlinkError::EmptyFile`] for a source without a byte, [`DownlinkError::NotADownlink`] for one without a packet.
     pub fn require_packets(&self) -> Result<(), DownlinkError> {
         require_packets(&self.feed.path, self.intake.bytes(), self.packets, || self.intake.foreign_name())
     }
@@ -148,7 +150,7 @@ impl<R: Read> EventReader<R> {
 
     /// The intake, for what it has found out about the stream.
     #[must_use]
-    pub fn intake(&self) -> &Intake {
+    pub fn intake(&self) -> &DownlinkReceiver {
         &self.intake
     }
 }

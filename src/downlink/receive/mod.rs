@@ -5,7 +5,7 @@
 //! |---|---|
 //! | coded frames to packets | [`cadu::CaduReceiver`] |
 //! | bytes to packets, gaps and damage | [`PacketReceiver`] |
-//! | either format, detected | [`Intake`], [`EventReader`] |
+//! | either format, detected | [`DownlinkReceiver`], [`EventReader`] |
 //! | packets to ground frames | [`Decoder`] |
 //! | a file, packed or not, to bytes | [`DownlinkFile`] |
 //! | a whole file for people | [`inspect`] |
@@ -17,20 +17,20 @@ pub mod cadu;
 mod counters;
 mod decoder;
 mod downlink_file;
+mod downlink_receiver;
 mod event_reader;
 mod foreign;
 pub mod inspect;
-mod intake;
 mod listing;
 mod received_set;
 mod receiver;
 mod sequence;
 
-pub use counters::{FaultCounts, FaultKind, KindCounts, PacketReading, PayloadOutcome, ReceptionCounters};
+pub use counters::{FaultCounts, FaultKind, KindCounts, PacketOutcome, PayloadOutcome, ReceptionCounters};
 pub use decoder::{Decoder, DecoderState};
 pub use downlink_file::DownlinkFile;
+pub use downlink_receiver::DownlinkReceiver;
 pub use event_reader::{ByteFeed, EventReader};
-pub use intake::Intake;
 pub use listing::{LISTED_MAX, Listing};
 pub use received_set::{Era, PacketInsertion, ReceivedSet};
 pub use receiver::{Event, Packet, PacketReceiver};

@@ -5,7 +5,9 @@ use std::io::{self, Read};
 
 use super::sequence::{Arrival, Sequence};
 use crate::downlink::wire::cadu::framer::{IDLE_APID, PACKET_HEADER_BYTES as PRIMARY_HEADER_BYTES};
-use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_check, packet_holds};
+use crate::downlink::wire::{
+    HEADER_BYTES, PacketHeader, PacketKind, TRAILER_BYTES, packet_checksum, has_valid_checksum,
+};
 
 /// Bytes that [`PacketReceiver::fill_from`] reads at a time.
 const CHUNK_BYTES: usize = 1 << 18;
@@ -35,7 +37,7 @@ impl Packet<'_> {
         out.reserve(self.header.bytes.min(HEADER_BYTES + self.payload.len() + TRAILER_BYTES));
         out.extend_from_slice(&self.header.to_bytes());
         out.extend_from_slice(self.payload);
-        let check = packet_check(&out[start..]);
+        let check = packet_checksum(&out[start..]);
         out.extend_from_slice(&check);
     }
 }
@@ -156,7 +158,7 @@ pub struct PacketReceiver {
     cut_at: Option<u64>,
     finished: bool,
     pending: VecDeque<PendingEvent>,
-    sequences: [Sequence; Kind::ALL.len()],
+    sequences: [Sequence; PacketKind::ALL.len()],
     /// Whether packet counts are left to the caller.
     unfiltered: bool,
 }
@@ -226,7 +228,7 @@ impl PacketReceiver {
     }
 
     /// Restarts of the packet count of a kind, independent of the order of arrival.
-    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+    pub(super) fn restarts(&self, kind: PacketKind) -> u64 {
         self.sequences[kind.index()].restarts()
     }
 
@@ -337,7 +339,7 @@ impl PacketReceiver {
         let Some(packet) = rest.get(..header.bytes) else {
             return if self.finished { PacketMatch::Cut } else { PacketMatch::Unknown };
         };
-        if packet_holds(packet) {
+        if has_valid_checksum(packet) {
             return PacketMatch::Good(header);
         }
         let after = &rest[header.bytes..];
@@ -492,7 +494,7 @@ mod tests {
         let forged: Vec<u8> = (0..20_000)
             .flat_map(|count| {
                 PacketHeader {
-                    kind: Kind::Visibilities,
+                    kind: PacketKind::Visibilities,
                     segment: PacketSegment::Whole,
                     count: 2 * count,
                     time: CucTime(1),

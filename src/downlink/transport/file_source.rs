@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::downlink::error::{DownlinkError, io_error};
-use crate::downlink::receive::{DownlinkFile, Event, EventReader, Intake};
+use crate::downlink::receive::{DownlinkFile, DownlinkReceiver, Event, EventReader};
 use crate::downlink::wire::Format;
 use crate::files::is_at;
 use crate::runtime::{Flow, Outlet, Source, Units};
@@ -57,9 +57,9 @@ struct OpenFile {
     /// Bytes read so far.
     bytes: u64,
     /// Searches for the first packet in a file that could not be probed when the source was opened.
-    probe: Option<Box<Intake>>,
+    probe: Option<Box<DownlinkReceiver>>,
     /// Takes packets out of coded frames, for a stream of packets.
-    unframing: Option<Box<Intake>>,
+    unframing: Option<Box<DownlinkReceiver>>,
 }
 
 impl FileSource {
@@ -97,7 +97,7 @@ impl FileSource {
     fn note_format(&mut self, path: &Path, format: Format) -> Result<(), DownlinkError> {
         match &self.format {
             Some((other, expected)) if *expected != format => {
-                Err(DownlinkError::Mixed { path: path.to_owned(), other: other.clone() })
+                Err(DownlinkError::MixedFormats { path: path.to_owned(), other: other.clone() })
             }
             Some(_) => Ok(()),
             None => {
@@ -114,14 +114,14 @@ impl FileSource {
         let probe = (is_followed || file.is_some()).then(Box::default);
         let is_coded_among_packets = format == Some(Format::Cadu)
             && self.format.as_ref().is_some_and(|(_, format)| *format == Format::Packets);
-        let unframing = is_coded_among_packets.then(|| Box::new(Intake::unfiltered()));
+        let unframing = is_coded_among_packets.then(|| Box::new(DownlinkReceiver::unfiltered()));
         let file = match file {
             Some(file) => file,
             None => File::open(&path).map_err(io_error(&path, "open the file"))?,
         };
         let file = DownlinkFile::of(file).map_err(io_error(&path, "read"))?;
         if is_followed && file.file().is_none() {
-            return Err(DownlinkError::Packed { path });
+            return Err(DownlinkError::Compressed { path });
         }
         Ok(Some(OpenFile { path, file, bytes: 0, probe, unframing }))
     }
@@ -131,7 +131,7 @@ impl FileSource {
         let Some(probe) = &mut open.probe else { return Ok(()) };
         probe.push(bytes);
         if let name @ Some(_) = probe.foreign_frames() {
-            return Err(DownlinkError::Foreign { path: open.path.clone(), bytes: open.bytes, name });
+            return Err(DownlinkError::NotADownlink { path: open.path.clone(), bytes: open.bytes, name });
         }
         while let Some(event) = probe.next_event() {
             if matches!(event, Event::Packet(_)) {
@@ -179,7 +179,7 @@ impl OpenFile {
     fn refuse_foreign(&self) -> Result<(), DownlinkError> {
         match self.probe.as_ref().and_then(|probe| probe.foreign_name()) {
             None => Ok(()),
-            name => Err(DownlinkError::Foreign { path: self.path.clone(), bytes: self.bytes, name }),
+            name => Err(DownlinkError::NotADownlink { path: self.path.clone(), bytes: self.bytes, name }),
         }
     }
 
@@ -200,7 +200,7 @@ impl OpenFile {
 }
 
 /// Passes on the packets that have been found.
-fn push_packets(intake: &mut Intake, out: &mut Outlet<Vec<u8>>) {
+fn push_packets(intake: &mut DownlinkReceiver, out: &mut Outlet<Vec<u8>>) {
     let mut packets = Vec::new();
     while let Some(event) = intake.next_event() {
         if let Event::Packet(packet) = event {

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, RecvTimeoutError};
 
 use crate::downlink::error::DownlinkError;
-use crate::downlink::receive::{Event, Intake};
-use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
+use crate::downlink::receive::{DownlinkReceiver, Event};
+use crate::downlink::wire::{CucTime, Format, PacketHeader, PacketKind};
 use crate::runtime::{Flow, Outlet, Source, Units};
 
 /// Bytes examined between two decisions about their release: far less than a coded frame.
@@ -51,7 +51,7 @@ pub struct PacedSource<S> {
     pace: Pace,
     gate: Gate,
     /// Finds the packets ahead of their release.
-    scout: Intake,
+    scout: DownlinkReceiver,
     /// Chunks not yet released, and the number of bytes of the first that the scout has examined.
     pending: VecDeque<Vec<u8>>,
     scouted: usize,
@@ -78,7 +78,7 @@ impl<S> PacedSource<S> {
             source,
             pace,
             gate: Gate::Open,
-            scout: Intake::unfiltered(),
+            scout: DownlinkReceiver::unfiltered(),
             pending: VecDeque::new(),
             scouted: 0,
             given: 0,
@@ -128,11 +128,11 @@ impl<S> PacedSource<S> {
         self.start.get_or_insert_with(|| (Instant::now(), header.time));
         self.newest = self.newest.max(header.time);
         // A report ends a pass if something else came since the last one; else it begins the next.
-        self.pass_over = header.kind == Kind::Housekeeping && self.in_pass;
+        self.pass_over = header.kind == PacketKind::Housekeeping && self.in_pass;
         match header.kind {
-            Kind::Housekeeping => self.in_pass = false,
-            Kind::Ephemeris | Kind::Visibilities => self.in_pass = true,
-            Kind::Instrument | Kind::Calibration => {}
+            PacketKind::Housekeeping => self.in_pass = false,
+            PacketKind::Ephemeris | PacketKind::Visibilities => self.in_pass = true,
+            PacketKind::Instrument | PacketKind::Calibration => {}
         }
         if let Pace::Steps(Steps { every_s: Some(every_s), .. }) = self.pace {
             let step = ((every_s * f64::from(1 << 24)) as u64).max(1);

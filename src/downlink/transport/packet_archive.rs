@@ -17,8 +17,8 @@ use crc_fast::{CrcAlgorithm, checksum};
 use serde::Serialize;
 
 use crate::downlink::error::{DownlinkError, io_error};
-use crate::downlink::receive::{ByteFeed, Event, Intake, ReceivedSet};
-use crate::downlink::wire::{CucTime, Kind, PacketHeader};
+use crate::downlink::receive::{ByteFeed, DownlinkReceiver, Event, ReceivedSet};
+use crate::downlink::wire::{CucTime, PacketHeader, PacketKind};
 use crate::files::{FolderLock, read_folder, write_atomically};
 
 /// Greatest size of a segment, bytes: a new one begins beyond.
@@ -40,11 +40,11 @@ const RETRACTED: &str = "retracted";
 const LOCK: &str = "lock";
 
 /// A packet by kind, count and creation time.
-pub type PacketName = (Kind, u64, CucTime);
+pub type PacketName = (PacketKind, u64, CucTime);
 
 /// A place in an archive: between two packets.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub struct ArchivePlace {
+pub struct ArchivePosition {
     /// Number of the segment, from 1.
     pub segment: u64,
     /// Bytes before it in the segment.
@@ -99,7 +99,7 @@ struct Writer {
     /// Number of the segment that is written, or will be.
     number: u64,
     bytes_max: u64,
-    seen: [ReceivedSet; Kind::ALL.len()],
+    seen: [ReceivedSet; PacketKind::ALL.len()],
     /// Packets that may not have reached the disk.
     recent: Vec<PacketName>,
     /// Counts failures: packets that were not on disk by then may never be.
@@ -108,10 +108,10 @@ struct Writer {
     synced: u64,
     synced_at: Instant,
     /// Bytes of the session's stream, and the place where packets that arrive later begin.
-    batches: VecDeque<(u64, ArchivePlace)>,
+    batches: VecDeque<(u64, ArchivePosition)>,
     /// By number of a checkpoint: the place before which it holds everything.
-    marks: BTreeMap<u64, ArchivePlace>,
-    retracted: BTreeMap<PacketName, ArchivePlace>,
+    marks: BTreeMap<u64, ArchivePosition>,
+    retracted: BTreeMap<PacketName, ArchivePosition>,
     failed: u64,
     failure: Option<String>,
 }
@@ -126,7 +126,7 @@ impl PacketArchive {
         let lock = FolderLock::acquire(folder, LOCK, false).map_err(io_error(folder, "lock the folder"))?;
         let closed: VecDeque<(u64, u64)> = segments(folder)?.into();
         let number = closed.back().map_or(1, |(number, _)| number + 1);
-        let place = ArchivePlace { segment: number, offset: 0 };
+        let place = ArchivePosition { segment: number, offset: 0 };
         Ok(Self(Arc::new(Shared {
             writer: Mutex::new(Writer {
                 folder: folder.to_owned(),
@@ -157,7 +157,7 @@ impl PacketArchive {
     }
 
     /// Leaves out packets that are known already.
-    pub fn know<'a>(&self, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) {
+    pub fn know<'a>(&self, received: impl Iterator<Item = (PacketKind, &'a ReceivedSet)>) {
         let mut writer = self.writer();
         for (kind, set) in received {
             writer.seen[kind.index()] = set.clone();
@@ -238,7 +238,7 @@ impl PacketArchive {
             writer.retracted.insert(*name, place);
             writer.seen[name.0.index()].remove(name.1, name.2);
         }
-        let line = |((kind, count, time), place): (&PacketName, &ArchivePlace)| {
+        let line = |((kind, count, time), place): (&PacketName, &ArchivePosition)| {
             format!("{} {count} {} {} {}\n", kind.apid(), time.0, place.segment, place.offset)
         };
         let text: String = writer.retracted.iter().map(line).collect();
@@ -270,8 +270,8 @@ impl Writer {
             + self.open.as_ref().map_or(0, |(_, bytes)| *bytes)
     }
 
-    fn end(&self) -> ArchivePlace {
-        ArchivePlace { segment: self.number, offset: self.open.as_ref().map_or(0, |(_, bytes)| *bytes) }
+    fn end(&self) -> ArchivePosition {
+        ArchivePosition { segment: self.number, offset: self.open.as_ref().map_or(0, |(_, bytes)| *bytes) }
     }
 
     fn append(&mut self, packets: &[u8]) -> io::Result<()> {
@@ -371,7 +371,7 @@ impl Writer {
 
     fn note_batch(&mut self, passed: u64) {
         let end = self.end();
-        let is_near = |step: &(u64, ArchivePlace)| passed - step.0 < BATCH_STEP;
+        let is_near = |step: &(u64, ArchivePosition)| passed - step.0 < BATCH_STEP;
         // The last one is exact; those before it are apart.
         let before = self.batches.len().checked_sub(2).map(|at| self.batches[at]);
         match (before, self.batches.back_mut()) {
@@ -399,7 +399,7 @@ impl Writer {
 
 /// What was found when an archive was read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ArchiveReading {
+pub struct ArchiveScan {
     /// Sound packets.
     pub packets: u64,
     /// Their bytes.
@@ -418,20 +418,20 @@ pub struct ArchiveReading {
 pub fn read_archive<E: From<DownlinkError>>(
     folder: &Path,
     take: impl FnMut(Vec<u8>) -> Result<(), E>,
-) -> Result<ArchiveReading, E> {
+) -> Result<ArchiveScan, E> {
     let retracted = read_retracted(folder)?;
-    read_segments(folder, ArchivePlace::default(), &retracted, take)
+    read_segments(folder, ArchivePosition::default(), &retracted, take)
 }
 
 /// As [`read_archive`], only packets that no checkpoint holds yet.
 ///
 /// # Errors
 /// Likewise.
-pub fn read_behind<E: From<DownlinkError>>(
+pub fn read_unsaved<E: From<DownlinkError>>(
     folder: &Path,
     checkpoint: Option<u64>,
     take: impl FnMut(Vec<u8>) -> Result<(), E>,
-) -> Result<ArchiveReading, E> {
+) -> Result<ArchiveScan, E> {
     let retracted = read_retracted(folder)?;
     read_segments(folder, place_in(&read_marks(folder), checkpoint), &retracted, take)
 }
@@ -440,7 +440,7 @@ pub fn read_behind<E: From<DownlinkError>>(
 ///
 /// # Errors
 /// A folder that cannot be read.
-pub fn bytes_behind(folder: &Path, checkpoint: Option<u64>) -> Result<u64, DownlinkError> {
+pub fn unsaved_bytes(folder: &Path, checkpoint: Option<u64>) -> Result<u64, DownlinkError> {
     let from = place_in(&read_marks(folder), checkpoint);
     let behind = segments(folder)?.into_iter().filter(|(number, _)| *number >= from.segment);
     let before = |number: u64| if number == from.segment { from.offset } else { 0 };
@@ -449,19 +449,19 @@ pub fn bytes_behind(folder: &Path, checkpoint: Option<u64>) -> Result<u64, Downl
 
 fn read_segments<E: From<DownlinkError>>(
     folder: &Path,
-    from: ArchivePlace,
-    retracted: &BTreeMap<PacketName, ArchivePlace>,
+    from: ArchivePosition,
+    retracted: &BTreeMap<PacketName, ArchivePosition>,
     mut take: impl FnMut(Vec<u8>) -> Result<(), E>,
-) -> Result<ArchiveReading, E> {
+) -> Result<ArchiveScan, E> {
     let segments = segments(folder)?;
     let first_segment = segments.first().map_or(1, |(number, _)| *number);
-    let mut reading = ArchiveReading { first_segment, ..ArchiveReading::default() };
+    let mut reading = ArchiveScan { first_segment, ..ArchiveScan::default() };
     for (number, _) in segments.into_iter().filter(|(number, _)| *number >= from.segment) {
         let path = folder.join(segment_name(number));
         let start = if number == from.segment { from.offset } else { 0 };
         let mut file = File::open(&path).map_err(io_error(&path, "open the segment"))?;
         file.seek(SeekFrom::Start(start)).map_err(io_error(&path, "read"))?;
-        let (mut feed, mut intake) = (ByteFeed::new(file, &path), Intake::unfiltered());
+        let (mut feed, mut intake) = (ByteFeed::new(file, &path), DownlinkReceiver::unfiltered());
         let mut piece = Vec::new();
         while feed.feed(&mut intake)? {
             while let Some(event) = intake.next_event() {
@@ -470,7 +470,7 @@ fn read_segments<E: From<DownlinkError>>(
                     continue;
                 };
                 let header = packet.header;
-                let place = ArchivePlace { segment: number, offset: start + packet.offset };
+                let place = ArchivePosition { segment: number, offset: start + packet.offset };
                 let name = (header.kind, header.count, header.time);
                 if retracted.get(&name).is_some_and(|until| place < *until) {
                     continue;
@@ -490,7 +490,7 @@ fn read_segments<E: From<DownlinkError>>(
     Ok(reading)
 }
 
-fn place_in(marks: &BTreeMap<u64, ArchivePlace>, checkpoint: Option<u64>) -> ArchivePlace {
+fn place_in(marks: &BTreeMap<u64, ArchivePosition>, checkpoint: Option<u64>) -> ArchivePosition {
     // Later checkpoints hold what earlier ones do.
     let mark = checkpoint.and_then(|number| marks.range(..=number).next_back());
     mark.map(|(_, place)| *place).unwrap_or_default()
@@ -547,16 +547,16 @@ fn read_sealed(path: &Path) -> io::Result<Option<Vec<Vec<u64>>>> {
 }
 
 /// Ignores damaged marks: more is read than necessary.
-fn read_marks(folder: &Path) -> BTreeMap<u64, ArchivePlace> {
+fn read_marks(folder: &Path) -> BTreeMap<u64, ArchivePosition> {
     let lines = read_sealed(&folder.join(MARKS)).ok().flatten().unwrap_or_default();
     let mark = |line: &Vec<u64>| match line[..] {
-        [number, segment, offset] => Some((number, ArchivePlace { segment, offset })),
+        [number, segment, offset] => Some((number, ArchivePosition { segment, offset })),
         _ => None,
     };
     lines.iter().filter_map(mark).collect()
 }
 
-fn read_retracted(folder: &Path) -> Result<BTreeMap<PacketName, ArchivePlace>, DownlinkError> {
+fn read_retracted(folder: &Path) -> Result<BTreeMap<PacketName, ArchivePosition>, DownlinkError> {
     let path = folder.join(RETRACTED);
     let read = read_sealed(&path).and_then(|lines| {
         let reason = "its checksum does not hold: without it packets that were retracted would come back; restore it, or remove \
@@ -566,8 +566,8 @@ fn read_retracted(folder: &Path) -> Result<BTreeMap<PacketName, ArchivePlace>, D
     let lines = read.map_err(io_error(&path, "read the list of retracted packets"))?;
     let entry = |line: &Vec<u64>| match line[..] {
         [apid, count, time, segment, offset] => {
-            let kind = Kind::of_apid(u16::try_from(apid).ok()?)?;
-            Some(((kind, count, CucTime(time)), ArchivePlace { segment, offset }))
+            let kind = PacketKind::of_apid(u16::try_from(apid).ok()?)?;
+            Some(((kind, count, CucTime(time)), ArchivePosition { segment, offset }))
         }
         _ => None,
     };
@@ -583,17 +583,17 @@ fn is_full(error: &io::Error) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::downlink::wire::{PacketSegment, packet_check};
+    use crate::downlink::wire::{PacketSegment, packet_checksum};
 
     /// A packet of visibilities with a payload that nobody decodes.
     fn packet(count: u64) -> Vec<u8> {
         let payload = [count as u8; 100];
-        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(1 << 40));
+        let (kind, segment, time) = (PacketKind::Visibilities, PacketSegment::Whole, CucTime(1 << 40));
         let bytes = crate::downlink::wire::HEADER_BYTES + payload.len() + 4;
         let header =
             PacketHeader { kind, segment, count, time, version: crate::downlink::FORMAT_VERSION, bytes };
         let mut packet = [header.to_bytes().as_slice(), &payload].concat();
-        packet.extend(packet_check(&packet));
+        packet.extend(packet_checksum(&packet));
         packet
     }
 
@@ -601,7 +601,7 @@ mod tests {
         counts.flat_map(packet).collect()
     }
 
-    fn all_of(folder: &Path) -> (Vec<u8>, ArchiveReading) {
+    fn all_of(folder: &Path) -> (Vec<u8>, ArchiveScan) {
         let mut found = Vec::new();
         let take = |piece: Vec<u8>| -> Result<(), DownlinkError> {
             found.extend(piece);
@@ -613,7 +613,7 @@ mod tests {
 
     fn behind(folder: &Path, checkpoint: u64) -> u64 {
         let none = |_: Vec<u8>| -> Result<(), DownlinkError> { Ok(()) };
-        read_behind(folder, Some(checkpoint), none).unwrap().packets
+        read_unsaved(folder, Some(checkpoint), none).unwrap().packets
     }
 
     #[test]
@@ -638,7 +638,7 @@ mod tests {
         // Damaged marks are ignored: everything is read.
         let marks = std::fs::read_to_string(place.path().join(MARKS)).unwrap();
         std::fs::write(place.path().join(MARKS), marks.replacen('8', "9", 1)).unwrap();
-        assert_eq!(bytes_behind(place.path(), Some(8)).unwrap(), packets(0..9).len() as u64);
+        assert_eq!(unsaved_bytes(place.path(), Some(8)).unwrap(), packets(0..9).len() as u64);
     }
 
     #[test]
@@ -666,7 +666,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let archive = PacketArchive::open(place.path(), u64::MAX).unwrap();
         archive.append(&packets(0..3), 1).unwrap();
-        archive.retract(&[(Kind::Visibilities, 1, CucTime(1 << 40))]).unwrap();
+        archive.retract(&[(PacketKind::Visibilities, 1, CucTime(1 << 40))]).unwrap();
         assert_eq!(all_of(place.path()).0, [packet(0), packet(2)].concat());
         archive.append(&packets(0..3), 2).unwrap();
         assert_eq!(all_of(place.path()).0, [packet(0), packet(2), packet(1)].concat());

@@ -5,7 +5,7 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::entry::JournalEntry;
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::units::{ChannelId, Pair};
 
 /// Channel and pair: each sends its packets in turn, pass by pass.
@@ -57,8 +57,8 @@ impl LostStream {
 /// A run of missing packets, to be requested again.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapReport {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the first missing packet.
@@ -78,7 +78,7 @@ pub struct GapReport {
 
 impl GapReport {
     pub(super) fn new(
-        kind: Kind,
+        kind: PacketKind,
         gap: &Range<u64>,
         between_s: [Option<f64>; 2],
         lost: Vec<LostStream>,

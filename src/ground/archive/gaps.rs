@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
 use super::packet_order::{PacketStreams, SendingOrder, windows_of};
-use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
+use crate::downlink::{CucTime, Era, PacketKind, ReceivedSet};
 use crate::units::MissionTime;
 
 /// What has been received, as input to [`find_gaps`].
@@ -18,7 +18,7 @@ pub struct ReceivedPackets {
     /// Every packet of positions that was decoded, in the order of sending.
     pub positions: Vec<PositionsPacket>,
     /// Packets received, by kind.
-    pub sets: Vec<(Kind, ReceivedSet)>,
+    pub sets: Vec<(PacketKind, ReceivedSet)>,
     /// Frequencies of the instrument's channels, Hz.
     pub frequencies_hz: Vec<f64>,
 }
@@ -37,8 +37,8 @@ pub struct PositionsPacket {
 /// A restart of the spacecraft's counts.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RestartReport {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the last packet received before it. What was sent after that one is not known.
@@ -102,7 +102,7 @@ pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
         let mut weights: BTreeMap<u16, f64> = BTreeMap::new();
         for lost in &gap.lost {
             let Some(coverage) = channels.get_mut(&lost.channel) else { continue };
-            if gap.kind == Kind::Visibilities {
+            if gap.kind == PacketKind::Visibilities {
                 coverage.missing_integration_s += lost.integration_s;
                 coverage.missing_weight += lost.weight;
             }
@@ -121,7 +121,7 @@ pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
 
 fn gaps_of_era(
     received: &ReceivedPackets,
-    kind: Kind,
+    kind: PacketKind,
     era: &Era,
     in_era: &dyn Fn(CucTime) -> bool,
 ) -> Vec<GapReport> {
@@ -130,16 +130,18 @@ fn gaps_of_era(
     }
     let visibilities = received.readings.iter().filter(|reading| in_era(reading.entry.made));
     let schedule = SendingOrder::learn(match kind {
-        Kind::Visibilities => visibilities.copied().collect(),
+        PacketKind::Visibilities => visibilities.copied().collect(),
         _ => Vec::new(),
     });
     let mut positions: Vec<PositionsPacket> = match kind {
-        Kind::Ephemeris => received.positions.iter().filter(|known| in_era(known.made)).copied().collect(),
+        PacketKind::Ephemeris => {
+            received.positions.iter().filter(|known| in_era(known.made)).copied().collect()
+        }
         _ => Vec::new(),
     };
     positions.sort_by_key(|known| known.count);
     let report = |gap: &Range<u64>| match kind {
-        Kind::Ephemeris => positions_missing(&received.readings, &positions, &era.missing, gap),
+        PacketKind::Ephemeris => positions_missing(&received.readings, &positions, &era.missing, gap),
         _ => schedule.report(kind, gap),
     };
     era.missing.iter().map(report).collect()
@@ -207,7 +209,7 @@ fn positions_missing(
     }
     let [before_s, after_s] = [before.map(|before| before.span[1]), after.map(|after| after.span[0])];
     let between_s = [before_s, after_s].map(|time| time.map(MissionTime::seconds));
-    GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
+    GapReport::new(PacketKind::Ephemeris, gap, between_s, lost.into_values().collect())
 }
 
 /// Share of each window's loss that a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
@@ -297,7 +299,7 @@ mod tests {
             }
         }
         let readings = kept.into_iter().map(read).collect();
-        let sets = vec![(Kind::Visibilities, set)];
+        let sets = vec![(PacketKind::Visibilities, set)];
         (find_gaps(&ReceivedPackets { readings, sets, ..ReceivedPackets::default() }), held)
     }
 
@@ -328,7 +330,7 @@ mod tests {
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
         let schedule = SendingOrder::learn([entries, vec![far]].concat().into_iter().map(read).collect());
-        let report = schedule.report(Kind::Visibilities, &(last..last + missing));
+        let report = schedule.report(PacketKind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
         let passes = missing / 12;
         let [one, three] = [passes + 1, 3 * passes];
@@ -349,7 +351,7 @@ mod tests {
     #[test]
     fn nothing_missing_and_nothing_received() {
         assert!(without(&[]).0.gaps.is_empty());
-        let sets = vec![(Kind::Visibilities, ReceivedSet::default())];
+        let sets = vec![(PacketKind::Visibilities, ReceivedSet::default())];
         assert_eq!(find_gaps(&ReceivedPackets { sets, ..ReceivedPackets::default() }), Gaps::default());
     }
 }

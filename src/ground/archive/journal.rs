@@ -9,9 +9,9 @@ use bincode::{Decode, Encode};
 
 use super::draft::RecordDraft;
 use super::entry::JournalEntry;
-use crate::downlink::receive::PacketReading;
+use crate::downlink::receive::PacketOutcome;
 use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
-use crate::downlink::{Kind, PacketHeader};
+use crate::downlink::{PacketHeader, PacketKind};
 use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
 pub(super) use crate::ground::hold_buffer::Sent;
@@ -28,7 +28,7 @@ pub(super) struct JournalRecord {
     pub(super) check: u32,
     /// The packet's bytes.
     pub(super) bytes: u32,
-    pub(super) reading: PacketReading,
+    pub(super) reading: PacketOutcome,
     /// Whether its block had been received already, in another packet.
     pub(super) is_duplicate: bool,
     /// Digest of what was offered to the sums: positions, values, weights.
@@ -57,7 +57,7 @@ pub(super) struct OtherRecord {
     pub(super) check: u32,
     /// The packet's bytes.
     pub(super) bytes: u32,
-    pub(super) reading: PacketReading,
+    pub(super) reading: PacketOutcome,
     /// First and last count of the packets of its payload.
     pub(super) payload: [u64; 2],
     /// Start of the positions in it, if they are those that are used.
@@ -70,7 +70,7 @@ pub(super) struct OtherRecord {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
     pub(super) visibilities: BTreeMap<Sent, JournalRecord>,
-    pub(super) others: BTreeMap<(Kind, Sent), OtherRecord>,
+    pub(super) others: BTreeMap<(PacketKind, Sent), OtherRecord>,
 }
 
 impl Journal {
@@ -91,7 +91,7 @@ impl Journal {
     pub(super) fn contains(&self, header: &PacketHeader) -> bool {
         let sent = (header.time, header.count);
         match header.kind {
-            Kind::Visibilities => self.visibilities.contains_key(&sent),
+            PacketKind::Visibilities => self.visibilities.contains_key(&sent),
             kind => self.others.contains_key(&(kind, sent)),
         }
     }
@@ -165,9 +165,9 @@ mod tests {
     use crate::downlink::{CucTime, FORMAT_VERSION, PacketSegment};
 
     fn packet(count: u64, check: u32) -> DeliveredPacket {
-        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
+        let (kind, segment, time) = (PacketKind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
         let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
-        DeliveredPacket { header, check, reading: PacketReading::default() }
+        DeliveredPacket { header, check, reading: PacketOutcome::default() }
     }
 
     const FAR: VisibilityReason = VisibilityReason::BaselineBeyondMap;
@@ -218,11 +218,11 @@ mod tests {
         assert!(!with(COUNT_MAX + 1, 60).is_sound() && !with(u64::MAX, 60).is_sound());
         assert!(!with(1, PACKET_BYTES_MAX + 1).is_sound());
         let (mut others, of) = (Journal::default(), with(1, 60));
-        let (check, bytes, reading) = (1, 60, PacketReading::default());
+        let (check, bytes, reading) = (1, 60, PacketOutcome::default());
         let record = OtherRecord { check, bytes, reading, payload: [1, 1], segment: None, report: None };
-        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
+        others.others.insert((PacketKind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
         assert!(others.is_sound() && of.is_sound());
-        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
+        others.others.insert((PacketKind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
         assert!(!others.is_sound());
     }
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
 use super::journal::Sent;
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 
 /// Windows are further apart than this, s, and packets of a window are not.
 const APART_S: f64 = 600.0;
@@ -93,7 +93,7 @@ impl SendingOrder {
         Self { readings, windows, streams }
     }
 
-    pub(super) fn report(&self, kind: Kind, gap: &Range<u64>) -> GapReport {
+    pub(super) fn report(&self, kind: PacketKind, gap: &Range<u64>) -> GapReport {
         let next = self.readings.partition_point(|reading| reading.entry.count < gap.start);
         let before = next.checked_sub(1).map(|at| &self.readings[at].entry);
         let after = self.readings.get(next).map(|reading| &reading.entry);

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::folder::checkpoints;
 use crate::downlink::transport::packet_archive::{
-    ArchiveReading, PacketArchive, PacketName, bytes_behind, read_archive, read_behind,
+    ArchiveScan, PacketArchive, PacketName, read_archive, read_unsaved, unsaved_bytes,
 };
 use crate::files::write_atomically;
 use crate::ground::{Ground, GroundConfig, GroundError};
@@ -36,7 +36,7 @@ impl Ground {
         let checkpoint = self.archive.as_ref().and_then(|archive| archive.folder.newest());
         // Nobody else writes there from now on.
         let packets = keeps.then(|| PacketArchive::open(&folder, u64::MAX)).transpose()?;
-        let reading = read_behind(&folder, checkpoint, |piece| self.take_piece(piece))?;
+        let reading = read_unsaved(&folder, checkpoint, |piece| self.take_piece(piece))?;
         self.note_recovered(&folder, reading);
         if let Some(archive) = &mut self.archive {
             archive.packets = packets;
@@ -80,7 +80,7 @@ impl Ground {
         folder: &Path,
         archive: &Path,
         config: &GroundConfig,
-    ) -> Result<(Self, ArchiveReading), GroundError> {
+    ) -> Result<(Self, ArchiveScan), GroundError> {
         if folder.is_dir() && !checkpoints(folder)?.is_empty() {
             return Err(GroundError::Occupied { path: folder.to_owned() });
         }
@@ -104,8 +104,8 @@ impl Ground {
         self.step(piece, &mut Outlet::collect())
     }
 
-    fn note_recovered(&mut self, folder: &Path, reading: ArchiveReading) {
-        let ArchiveReading { packets, bytes, damaged, .. } = reading;
+    fn note_recovered(&mut self, folder: &Path, reading: ArchiveScan) {
+        let ArchiveScan { packets, bytes, damaged, .. } = reading;
         let Some(archive) = &mut self.archive else { return };
         if packets > 0 {
             let folder = folder.display();
@@ -138,7 +138,7 @@ pub(super) fn kept_settings(folder: &Path) -> Option<Vec<(String, String)>> {
 
 /// Refuses a state whose raw archive has packets that its checkpoint may lack.
 pub(super) fn require_saved(state: &Path, checkpoint: Option<u64>) -> Result<(), GroundError> {
-    match bytes_behind(&packets_folder(state), checkpoint)? {
+    match unsaved_bytes(&packets_folder(state), checkpoint)? {
         0 => Ok(()),
         bytes => Err(GroundError::Unsaved { path: state.to_owned(), bytes }),
     }

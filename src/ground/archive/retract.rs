@@ -11,7 +11,7 @@ use super::journal::{Journal, OtherRecord, Sent};
 use super::recovery::forget;
 use crate::downlink::receive::EventReader;
 use crate::downlink::transport::packet_archive::PacketName;
-use crate::downlink::{Event, Kind, PacketHeader};
+use crate::downlink::{Event, PacketHeader, PacketKind};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
 
@@ -21,8 +21,8 @@ const REFUSED_LISTED: usize = 20;
 /// A packet that stays in the archive.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RefusedPacket {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Packet count.
     pub count: u64,
     /// Why.
@@ -51,7 +51,7 @@ pub struct Retracted {
 }
 
 /// Place of a packet in the journal.
-type RecordKey = (Kind, Sent);
+type RecordKey = (PacketKind, Sent);
 
 /// A retraction under way. Records are removed and their visibilities subtracted; the views of the journal are folded
 /// again when the checkpoint is next opened.
@@ -139,7 +139,7 @@ impl Retraction {
         }
         let held = self.ground.collector.held().get(&header).map(|held| held.check);
         let check = held.or_else(|| match header.kind {
-            Kind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.check),
+            PacketKind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.check),
             _ => self.journal.others.get(&key).map(|record| record.check),
         });
         match check {
@@ -155,7 +155,7 @@ impl Retraction {
                 self.report.packets += 1;
                 self.report.waited += 1;
             }
-            Some(_) if header.kind == Kind::Visibilities => return self.retract_visibilities(packet),
+            Some(_) if header.kind == PacketKind::Visibilities => return self.retract_visibilities(packet),
             Some(_) => drop(self.others.insert(key)),
         }
         Ok(())
@@ -202,7 +202,7 @@ impl Retraction {
 
     /// Removes payloads of other kinds whose packets were all found, unless something depends on them.
     fn retract_others(&mut self) {
-        let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
+        let mut payloads: BTreeMap<(PacketKind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {
             let Some(record) = self.journal.others.get(key) else { continue };
             let first = (*kind, (*time, record.payload[0]));

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use crate::downlink::receive::cadu::FrameCounters;
 use crate::downlink::receive::{Listing, ReceptionCounters};
-use crate::downlink::wire::{Format, Kind};
+use crate::downlink::wire::{Format, PacketKind};
 
 /// An interval of mission time, with dates.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -51,8 +51,8 @@ pub struct InstrumentSummary {
 /// Packets of one kind.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindSummary {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Sound packets.
@@ -135,8 +135,8 @@ pub struct HousekeepingSummary {
 /// A gap in the packet counts of a kind. Counts have 46 bits, so no gap is ambiguous.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapEntry {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the first missing packet.
@@ -158,8 +158,8 @@ pub struct GapEntry {
 pub struct DamagedEntry {
     /// Offset in the file, bytes.
     pub offset: u64,
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Packet count.

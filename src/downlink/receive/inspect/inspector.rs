@@ -13,7 +13,7 @@ use crate::downlink::error::DownlinkError;
 use crate::downlink::receive::{
     Decoder, DownlinkFile, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters,
 };
-use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
+use crate::downlink::wire::{CucTime, Format, PacketHeader, PacketKind};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
@@ -75,7 +75,7 @@ impl Contents {
         events.require_packets()?;
         let intake = events.intake();
         let mut reception = ReceptionCounters { frames: intake.frames(), ..decoder.counters().clone() };
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             reception.kind_mut(kind).restarts = intake.restarts(kind);
         }
         Ok(inspector.conclude(path, intake.bytes(), &reception))
@@ -128,7 +128,7 @@ struct Inspector {
     contradictory: u64,
     covered: EphemerisCoverage,
     housekeeping: Option<Housekeeping>,
-    seen: [KindExtent; Kind::ALL.len()],
+    seen: [KindExtent; PacketKind::ALL.len()],
     gaps: Listing<(GapEntry, Option<CucTime>, CucTime)>,
     damaged: Listing<(DamagedEntry, CucTime)>,
     garbage: Listing<GarbageEntry>,
@@ -241,7 +241,7 @@ impl Inspector {
         };
         let place_damaged =
             |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
-        let packets = Kind::ALL.map(|kind| {
+        let packets = PacketKind::ALL.map(|kind| {
             let (counts, seen) = (reception.kind(kind), self.seen[kind.index()]);
             KindSummary {
                 kind,

@@ -50,7 +50,7 @@ pub enum SocketError {
     },
     /// The listener's thread panicked.
     #[error("the listener stopped unexpectedly, which is a bug in the program")]
-    Fallen,
+    Panicked,
     /// No connection could be made.
     #[error(
         "{url}: no connection within {waited_s} s: {source}; start `lunarray replay --listen {url}` first, or wait \
@@ -86,5 +86,5 @@ pub enum SocketError {
     #[error(
         "downlink.link has faults, and their truth goes beside the downlink file; name one with --out FILE"
     )]
-    TruthNowhere,
+    NoTruthFile,
 }

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::preamble::Preamble;
 use super::report::ConnectionEnd;
 use crate::downlink::receive::cadu::FrameCounters;
-use crate::downlink::receive::{Decoder, Event, Intake, ReceivedSet, ReceptionCounters};
-use crate::downlink::wire::{Format, Kind, PacketHeader, PacketSegment};
+use crate::downlink::receive::{Decoder, DownlinkReceiver, Event, ReceivedSet, ReceptionCounters};
+use crate::downlink::wire::{Format, PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
@@ -32,7 +32,7 @@ pub type InstrumentCheck = Arc<dyn Fn(&Instrument) -> bool + Send + Sync>;
 pub(super) struct Mission {
     known: Arc<Mutex<Option<Instrument>>>,
     fits: InstrumentCheck,
-    seen: Arc<Mutex<[ReceivedSet; Kind::ALL.len()]>>,
+    seen: Arc<Mutex<[ReceivedSet; PacketKind::ALL.len()]>>,
 }
 
 impl Default for Mission {
@@ -43,7 +43,7 @@ impl Default for Mission {
 
 impl Mission {
     /// Accepts a first instrument only if it fits.
-    pub(super) fn accepting(self, fits: InstrumentCheck) -> Self {
+    pub(super) fn with_instrument_check(self, fits: InstrumentCheck) -> Self {
         Self { fits, ..self }
     }
 
@@ -113,8 +113,8 @@ impl SenderCheck {
     }
 
     /// Takes a sound packet.
-    fn see(&mut self, event: &Event<'_>, kind: Kind) {
-        let describes = kind == Kind::Instrument;
+    fn see(&mut self, event: &Event<'_>, kind: PacketKind) {
+        let describes = kind == PacketKind::Instrument;
         if self.refused().is_some() || (self.standing == SenderStanding::Ours && !describes) {
             return;
         }
@@ -165,7 +165,7 @@ pub(super) struct Signs {
 /// The receiver of one connection. It counts everything but packets, which the ground counts.
 pub(super) struct SenderIntake {
     preamble: Preamble,
-    intake: Intake,
+    intake: DownlinkReceiver,
     stream: Decoder,
     judge: SenderCheck,
     /// Packets of a payload that lacks its last segment.
@@ -186,7 +186,7 @@ impl SenderIntake {
     pub(super) fn new(mission: Mission, preamble: Preamble) -> Self {
         Self {
             preamble,
-            intake: Intake::unfiltered(),
+            intake: DownlinkReceiver::unfiltered(),
             stream: Decoder::new(),
             judge: SenderCheck::new(mission),
             group: Vec::new(),
@@ -228,7 +228,7 @@ impl SenderIntake {
     /// # Errors
     /// The instrument is refused, or not confirmed in time.
     pub(super) fn take_packet(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> Result<Signs, ConnectionEnd> {
-        self.intake = Intake::unfiltered();
+        self.intake = DownlinkReceiver::unfiltered();
         self.intake.push(bytes);
         self.intake.finish();
         self.judge_taken(out)
@@ -521,7 +521,7 @@ mod tests {
 
     #[test]
     fn an_instrument_that_does_not_fit_is_refused_and_replayed_packets_are_not_new() {
-        let mission = Mission::default().accepting(Arc::new(|found| found.name != "unfit"));
+        let mission = Mission::default().with_instrument_check(Arc::new(|found| found.name != "unfit"));
         let mut sender = SenderIntake::new(mission.clone(), anyone());
         let bytes = with_block("unfit", 5);
         assert_eq!(sender.take(&bytes, &mut Vec::new()), Err(ConnectionEnd::UnfitInstrument));

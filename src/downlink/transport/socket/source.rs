@@ -113,7 +113,7 @@ impl SocketSource {
 
     /// Accepts packets of this instrument only; with `None`, of the first whose visibilities come with positions.
     #[must_use]
-    pub fn knowing(self, instrument: Option<Instrument>) -> Self {
+    pub fn with_instrument(self, instrument: Option<Instrument>) -> Self {
         if let (Some((_, mission, _)), Some(instrument)) = (&self.waiting, &instrument) {
             mission.confirm(instrument);
         }
@@ -122,9 +122,9 @@ impl SocketSource {
 
     /// Accepts an instrument only if `fits` says so.
     #[must_use]
-    pub fn accepting(mut self, fits: InstrumentCheck) -> Self {
+    pub fn with_instrument_check(mut self, fits: InstrumentCheck) -> Self {
         if let Some((listener, mission, tell)) = self.waiting.take() {
-            self.waiting = Some((listener, mission.accepting(fits), tell));
+            self.waiting = Some((listener, mission.with_instrument_check(fits), tell));
         }
         self
     }
@@ -132,14 +132,14 @@ impl SocketSource {
     /// Answers senders that ask what checkpoints hold, through `answers`; the ground that writes them has to share it. Without it they
     /// are refused.
     #[must_use]
-    pub fn answering(mut self, answers: &HeldAnswers) -> Self {
+    pub fn with_held_answers(mut self, answers: &HeldAnswers) -> Self {
         self.held = Some(answers.clone());
         self
     }
 
     /// Keeps packets in `archive` before it tells a sender that they are taken.
     #[must_use]
-    pub fn keeping(mut self, archive: &PacketArchive) -> Self {
+    pub fn with_archive(mut self, archive: &PacketArchive) -> Self {
         self.archive = Some(archive.clone());
         self.listening.archive = Some(archive.clone());
         self
@@ -147,7 +147,7 @@ impl SocketSource {
 
     /// Takes packets of these stations only.
     #[must_use]
-    pub fn of_stations(mut self, stations: Stations) -> Self {
+    pub fn with_stations(mut self, stations: Stations) -> Self {
         // Also those that never send.
         self.listening.write().know(stations.names());
         self.stations = Some(Arc::new(stations));
@@ -156,7 +156,7 @@ impl SocketSource {
 
     /// Reports what happens to connections, one note at a time.
     #[must_use]
-    pub fn telling(mut self, tell: NoteHandler) -> Self {
+    pub fn with_note_handler(mut self, tell: NoteHandler) -> Self {
         if let Some((_, _, teller)) = &mut self.waiting {
             *teller = tell;
         }
@@ -226,7 +226,7 @@ impl SocketSource {
     /// Waits for the listener's thread, which is about to end.
     fn join(&mut self) -> Result<(), SocketError> {
         match self.running.take().map(|(_, thread)| thread.join()) {
-            Some(Err(_)) => Err(SocketError::Fallen),
+            Some(Err(_)) => Err(SocketError::Panicked),
             _ => Ok(()),
         }
     }

@@ -62,7 +62,7 @@ impl TcpUrl {
     ///
     /// # Errors
     /// [`SocketError::Remote`]; the host has no address.
-    pub fn own_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
+    pub fn loopback_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
         let found = self.addresses()?;
         match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {
             true => Ok(found),
@@ -157,7 +157,7 @@ mod tests {
             ("tcp://192.0.2.7:1", false),
             ("tcp://[2001:db8::7]:1", false),
         ] {
-            assert_eq!(text.parse::<TcpUrl>().unwrap().own_addresses().is_ok(), own, "{text}");
+            assert_eq!(text.parse::<TcpUrl>().unwrap().loopback_addresses().is_ok(), own, "{text}");
         }
     }
 }

@@ -5,9 +5,9 @@ use std::io::{self, Read};
 use super::cadu::{CaduReceiver, FrameCounters};
 use super::foreign::{HEAD_BYTES, frames_of, name_of};
 use super::{Event, PacketReceiver};
-use crate::downlink::wire::{Format, Kind};
+use crate::downlink::wire::{Format, PacketKind};
 
-/// Bytes that [`Intake::fill_from`] asks for at a time.
+/// Bytes that [`DownlinkReceiver::fill_from`] asks for at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
 /// Finds packets in a stream of either format, given in chunks of any size.
@@ -15,7 +15,7 @@ const CHUNK_BYTES: usize = 1 << 18;
 /// Detects the format by content: by the first packet or coded frame, neither of which occurs in the other format by
 /// chance. Used like a [`PacketReceiver`]. In a coded stream, offsets of events count recovered packet bytes.
 #[derive(Debug, Default)]
-pub struct Intake {
+pub struct DownlinkReceiver {
     format: Option<Format>,
     packets: PacketReceiver,
     frames: CaduReceiver,
@@ -27,7 +27,7 @@ pub struct Intake {
     head: Vec<u8>,
 }
 
-impl Intake {
+impl DownlinkReceiver {
     /// An intake at the start of a stream.
     #[must_use]
     pub fn new() -> Self {
@@ -139,7 +139,7 @@ impl Intake {
     }
 
     /// Restarts of the packet count of a kind, independent of the order of arrival.
-    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+    pub(super) fn restarts(&self, kind: PacketKind) -> u64 {
         self.packets.restarts(kind)
     }
 
