@@ -10,38 +10,39 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-/// Bytes that are buffered before a write.
+/// Number of bytes that are buffered before a write.
 const WRITE_BYTES: usize = 1 << 20;
 
-/// What unfinished files end with.
+/// Suffix of unfinished files.
 const PARTIAL: &str = ".partial";
 
-/// Names that are tried for an unfinished file before the folder counts as unusable.
-const NAMES_TRIED: usize = 100;
+/// Maximum number of names that are tried for an unfinished file before the folder counts as unusable.
+const NAMES_MAX: usize = 100;
 
-/// Interval and number of retries while another writer, which began at the same time, holds the name.
+/// Interval between retries while another writer, which began at the same time, has the name.
 const RIVAL_POLL: Duration = Duration::from_millis(20);
-const RIVAL_LOOKS: usize = 50;
+/// Maximum number of retries.
+const RIVAL_POLLS_MAX: usize = 50;
 
 /// What happens to a file that is dropped before it is finished.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum IfUnfinished {
-    /// It is removed.
+    /// The file is removed.
     Remove,
-    /// It remains as `NAME.partial`, unless it is empty.
+    /// The file remains as `NAME.partial`, unless it is empty.
     Keep,
 }
 
-/// A file under a temporary name until [`AtomicFile::finish`] has put all of it on disk. Then it takes its own name and
+/// A file with a temporary name until [`AtomicFile::finish`] has put all of it on disk, gives it its final name and thereby
 /// replaces an older file.
 ///
-/// The temporary name is new and unpredictable, `.NAME.PROCESS-NUMBER.partial`, and the file is locked: a second writer
-/// of the same name is refused, and unfinished files that nobody writes any more are removed.
+/// The temporary name `.NAME.PROCESS-NUMBER.partial` is new and unpredictable, and the file is locked. A second writer of the
+/// same name is refused, and unfinished files without a writer are removed.
 #[derive(Debug)]
 pub struct AtomicFile {
     path: PathBuf,
     partial_path: PathBuf,
-    /// `None` once finished.
+    /// The open file; `None` once it is finished.
     file: Option<File>,
     unfinished: IfUnfinished,
     pending: Vec<u8>,
@@ -52,8 +53,8 @@ impl AtomicFile {
     /// Creates the file, and its folder if necessary.
     ///
     /// # Errors
-    /// Those of [`require_replaceable`]; the system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, is
-    /// writing the file.
+    /// The errors of [`require_replaceable`] and of the system; [`io::ErrorKind::ResourceBusy`] if another process, or this one,
+    /// is writing the file.
     pub fn create(path: &Path, unfinished: IfUnfinished) -> io::Result<Self> {
         require_replaceable(path)?;
         if let Some(folder) = folder_of(path) {
@@ -68,10 +69,10 @@ impl AtomicFile {
             pending: Vec::new(),
             written: 0,
         };
-        // From here on an error removes what was created, as nothing is in it.
-        for _ in 0..RIVAL_LOOKS {
+        // On an error from here on, `drop` removes the empty file.
+        for _ in 0..RIVAL_POLLS_MAX {
             let Some(rival) = partial.rival() else { return Ok(partial) };
-            // Of two that began at the same time, the one with the lesser name stays.
+            // Of two writers that began at the same time, the one whose temporary name sorts first continues.
             if rival < partial.partial_path {
                 return Err(busy(&rival));
             }
@@ -83,7 +84,7 @@ impl AtomicFile {
         }
     }
 
-    /// Bytes written so far.
+    /// Number of bytes written.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.written + self.pending.len() as u64
@@ -105,16 +106,16 @@ impl AtomicFile {
         Ok(self.written)
     }
 
-    /// The first of the other unfinished files of this name that another writer holds; those that nobody holds are
-    /// removed.
+    /// The first unfinished file of the same name that another writer has locked. Removes unfinished files without a writer.
     fn rival(&self) -> Option<PathBuf> {
         let name = self.path.file_name().map(|name| name.as_encoded_bytes());
         let is_other = |path: &PathBuf| *path != self.partial_path && finished_name(path) == name;
         let unfinished = unfinished_files(&self.path.with_file_name("")).into_iter().filter(is_other);
-        // A failed writer leaves the last one.
+        // A writer that failed leaves `NAME.partial`.
         unfinished.chain([self.kept_path()]).filter_map(|path| remove_stale(&path)).min()
     }
 
+    /// The path of the file if it remains unfinished.
     fn kept_path(&self) -> PathBuf {
         let mut kept = self.path.clone().into_os_string();
         kept.push(PARTIAL);
@@ -122,21 +123,21 @@ impl AtomicFile {
     }
 }
 
-/// Protects the files that a command reads: nothing in this process replaces them while this value lives.
+/// Protects the files that a command reads: this process does not replace them while this value exists.
 #[derive(Debug, Default)]
 pub struct ProtectedInputs(Vec<FileKey>);
 
-/// Identity of a file on the system, whatever names lead to it.
+/// Identity of a file, which is the same for all names that lead to it.
 #[cfg(unix)]
 type FileKey = (u64, u64);
 #[cfg(not(unix))]
 type FileKey = PathBuf;
 
-/// Inputs of all commands, and how many protect each.
+/// The protected inputs, with the number of values that protect each.
 static PROTECTED: Mutex<BTreeMap<FileKey, usize>> = Mutex::new(BTreeMap::new());
 
 impl ProtectedInputs {
-    /// Protects regular files; others, and names that lead nowhere, are left to those who open them.
+    /// Protects regular files; ignores all other paths, which fail when they are opened.
     pub fn of<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Self {
         let keys: Vec<FileKey> = paths.into_iter().filter_map(|path| key_of(path.as_ref())).collect();
         let mut protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
@@ -168,37 +169,39 @@ fn key_of(path: &Path) -> Option<FileKey> {
     fs::canonicalize(path).ok().filter(|path| path.is_file())
 }
 
-/// Requires that a file may be written at `path`, in place of what is there: the one gate of everything that writes files.
+/// Requires that a file may be written at `path` and replace a file there. All code that writes files calls this.
 ///
 /// # Errors
-/// [`io::ErrorKind::InvalidInput`] for an input of a command in this process, by whatever name, for a link to another file, and for
-/// anything that is not a regular file.
+/// [`io::ErrorKind::InvalidInput`] for an input of a command in this process, under any of its names, for a symbolic link, and
+/// for anything that is not a regular file.
 pub fn require_replaceable(path: &Path) -> io::Result<()> {
     let refuse = |reason: String| Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
     let protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
     if key_of(path).is_some_and(|key| protected.contains_key(&key)) {
-        return refuse("it is read as an input, which would be lost; expected another name".to_owned());
+        return refuse(
+            "it is read as an input, which would be overwritten; expected another name".to_owned(),
+        );
     }
     match fs::symlink_metadata(path) {
         Ok(found) if found.is_symlink() => {
-            let to = fs::read_link(path).unwrap_or_default();
+            let target = fs::read_link(path).unwrap_or_default();
             refuse(format!(
-                "it is a link to {}; expected a file, a new name, or that name itself",
-                to.display()
+                "it is a link to {}; expected the name of that file, a new name, or a regular file",
+                target.display()
             ))
         }
         Ok(found) if !found.is_file() => {
-            refuse("something is there that is not a regular file; expected a file or a new name".to_owned())
+            refuse("it exists and is not a regular file; expected a regular file or a new name".to_owned())
         }
         _ => Ok(()),
     }
 }
 
-/// Opens a file that grows while others follow it. It replaces an older file at once by an empty one; a pipe or terminal is
+/// Opens a file that other processes can follow as it grows. It immediately replaces an older file; a pipe or terminal is
 /// written to directly.
 ///
 /// # Errors
-/// As [`AtomicFile::create`]; a folder that does not exist.
+/// The errors of [`AtomicFile::create`]; the folder does not exist.
 pub fn growing_file(path: &Path) -> io::Result<File> {
     if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         return File::options().write(true).open(path);
@@ -212,23 +215,23 @@ pub fn growing_file(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// A new, locked file for the content of `path`, in its folder.
+/// Creates a locked file with a temporary name for the content of `path`, in its folder.
 fn create_partial(path: &Path) -> io::Result<(PathBuf, File)> {
     let name = path.file_name().ok_or(io::ErrorKind::InvalidFilename)?;
-    for _ in 0..NAMES_TRIED {
+    for _ in 0..NAMES_MAX {
         let mut unique = OsString::from(".");
         unique.push(name);
-        // Seeded by the system.
+        // The system seeds the hash, so the number is unpredictable.
         let number = RandomState::new().hash_one(());
         unique.push(format!(".{}-{number:016x}{PARTIAL}", std::process::id()));
         let unique = path.with_file_name(unique);
-        // O_CREAT | O_EXCL: fails if anything is there, and never follows a symbolic link.
+        // O_CREAT | O_EXCL: fails if the name exists, and never follows a symbolic link.
         let file = match File::options().write(true).create_new(true).open(&unique) {
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
             other => other?,
         };
         match file.try_lock() {
-            // Another writer may have taken it for one that nobody holds, and removed it.
+            // Before the lock, another writer may have removed it as a file without a writer.
             Ok(()) if is_at(&file, &unique) => return Ok((unique, file)),
             Ok(()) | Err(TryLockError::WouldBlock) => {}
             Err(TryLockError::Error(error)) => {
@@ -245,7 +248,7 @@ fn busy(rival: &Path) -> io::Error {
     io::Error::new(io::ErrorKind::ResourceBusy, reason)
 }
 
-/// Removes an unfinished file that nobody holds; returns its path if somebody does. Anything but a regular file stays.
+/// Removes an unfinished file without a writer; returns its path if it has one. Ignores anything except regular files.
 fn remove_stale(path: &Path) -> Option<PathBuf> {
     if !fs::symlink_metadata(path).is_ok_and(|found| found.is_file()) {
         return None;
@@ -253,7 +256,7 @@ fn remove_stale(path: &Path) -> Option<PathBuf> {
     let file = File::options().read(true).write(true).open(path).ok()?;
     match file.try_lock() {
         Ok(()) if is_at(&file, path) => {
-            // If it cannot be removed, it does no harm.
+            // A file that cannot be removed does no harm.
             let _ = fs::remove_file(path);
             None
         }
@@ -262,7 +265,7 @@ fn remove_stale(path: &Path) -> Option<PathBuf> {
     }
 }
 
-/// The entries of a folder. Interrupted calls are repeated, which the standard library leaves to its callers here.
+/// The entries of a folder. Repeats interrupted calls, which the standard library does not do here.
 ///
 /// # Errors
 /// The folder cannot be read.
@@ -275,8 +278,8 @@ pub fn read_folder(folder: &Path) -> io::Result<fs::ReadDir> {
     }
 }
 
-/// Paths of the files in a folder that have names of unfinished files; none if it cannot be read. An empty path is the
-/// working directory.
+/// Paths of the files in a folder that are named as unfinished files; none if the folder cannot be read. An empty path means
+/// the working directory.
 fn unfinished_files(folder: &Path) -> Vec<PathBuf> {
     let here = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
     let names = read_folder(here).into_iter().flatten().flatten().map(|entry| entry.file_name());
@@ -284,7 +287,7 @@ fn unfinished_files(folder: &Path) -> Vec<PathBuf> {
     unfinished.map(|name| folder.join(name)).collect()
 }
 
-/// Name of the file that an unfinished file `.NAME.PROCESS-NUMBER.partial` was to become.
+/// The final name NAME of an unfinished file `.NAME.PROCESS-NUMBER.partial`; `None` for another form.
 fn finished_name(path: &Path) -> Option<&[u8]> {
     let name = path.file_name()?.as_encoded_bytes();
     let name = name.strip_prefix(b".")?.strip_suffix(PARTIAL.as_bytes())?;
@@ -320,18 +323,17 @@ impl Drop for AtomicFile {
         if self.file.is_none() {
             return;
         }
-        // The error that stopped the writing matters; a leftover file does not.
+        // Errors are ignored here, as the error that stopped the writing is reported.
         if self.unfinished == IfUnfinished::Remove || self.bytes() == 0 {
             let _ = fs::remove_file(&self.partial_path);
             return;
         }
-        // Everything written so far, not only full buffers.
         let _ = self.flush();
         let _ = fs::rename(&self.partial_path, self.kept_path());
     }
 }
 
-/// Writes a whole file atomically.
+/// Writes a complete file atomically.
 ///
 /// # Errors
 /// The system's error.
@@ -341,21 +343,21 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     file.finish().map(|_| ())
 }
 
-/// Reads a text of at most `bytes_max` bytes. An endless input, such as a device, is an error and takes no more memory.
+/// Reads a text of at most `bytes_max` bytes, with bounded memory even for an endless input such as a device.
 ///
 /// # Errors
-/// The system's error; [`io::ErrorKind::FileTooLarge`]; [`io::ErrorKind::InvalidData`] for what is not UTF-8.
+/// The system's error; [`io::ErrorKind::FileTooLarge`] for a longer text; [`io::ErrorKind::InvalidData`] if it is not UTF-8.
 pub fn read_text(path: &Path, bytes_max: u64) -> io::Result<String> {
     let mut bytes = Vec::new();
     File::open(path)?.take(bytes_max.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {
-        let reason = format!("longer than {bytes_max} bytes, the most that is expected of it");
+        let reason = format!("it is too long; expected at most {bytes_max} bytes");
         return Err(io::Error::new(io::ErrorKind::FileTooLarge, reason));
     }
     String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
 }
 
-/// A new file without a name on the disk of a folder: it vanishes once it is closed, however the process ends.
+/// Creates a file without a name on the disk of a folder. The system deletes it once it is closed, however the process ends.
 ///
 /// # Errors
 /// The system's error.
@@ -367,10 +369,10 @@ pub fn nameless_file(folder: &Path) -> io::Result<File> {
     file
 }
 
-/// Reads bytes at a place of a file; several threads may.
+/// Reads bytes at an offset of a file, which several threads may do at a time.
 ///
 /// # Errors
-/// The system's error; a system that has no such call.
+/// The system's error; an error on systems without such a call.
 pub fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
     #[cfg(unix)]
     return std::os::unix::fs::FileExt::read_exact_at(file, bytes, offset);
@@ -378,10 +380,10 @@ pub fn read_at(file: &File, bytes: &mut [u8], offset: u64) -> io::Result<()> {
     return Err(io::Error::new(io::ErrorKind::Unsupported, format!("{file:?}: {} at {offset}", bytes.len())));
 }
 
-/// Writes bytes at a place of a file; several threads may.
+/// Writes bytes at an offset of a file, which several threads may do at a time.
 ///
 /// # Errors
-/// The system's error; a system that has no such call.
+/// The system's error; an error on systems without such a call.
 pub fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<()> {
     #[cfg(unix)]
     return std::os::unix::fs::FileExt::write_all_at(file, bytes, offset);
@@ -389,25 +391,26 @@ pub fn write_at(file: &File, bytes: &[u8], offset: u64) -> io::Result<()> {
     return Err(io::Error::new(io::ErrorKind::Unsupported, format!("{file:?}: {} at {offset}", bytes.len())));
 }
 
-/// A folder that one process uses at a time: holds a lock on a file in it.
+/// The lock of a folder that one process uses at a time: it locks a file in the folder.
 ///
-/// The system unlocks it however the process ends.
+/// The system releases the lock however the process ends.
 #[derive(Debug)]
 pub struct FolderLock {
     folder: PathBuf,
     lock_path: PathBuf,
     lock: File,
-    /// The folder as it was when it was locked.
+    /// Identity of the folder that was locked.
     locked: Metadata,
     removes_lock: bool,
-    /// It was not there before.
+    /// Whether the folder was created for the lock.
     is_new: bool,
 }
 
 impl FolderLock {
-    /// Creates the folder if needed, and locks it by a file `name` in it. Removes unfinished files that nobody holds.
-    /// If `removes_lock`, the file goes when the lock is dropped, and the folder with it if it was created and is empty: whoever fails
-    /// before the first product leaves nothing behind.
+    /// Creates the folder if necessary and locks it with the file `name` in it. Removes unfinished files without a writer.
+    ///
+    /// With `removes_lock`, dropping the lock removes this file, and the folder if it is new and empty, so that a run that fails
+    /// before its first product leaves nothing behind.
     ///
     /// # Errors
     /// The system's error; [`io::ErrorKind::ResourceBusy`] if another process, or this one, has locked the folder.
@@ -418,11 +421,11 @@ impl FolderLock {
         let lock = loop {
             let lock = File::options().create(true).append(true).open(&lock_path)?;
             match lock.try_lock() {
-                // The one who had locked it may have removed it.
+                // The previous owner may have removed the file in the meantime.
                 Ok(()) if is_at(&lock, &lock_path) => break lock,
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => {
-                    let reason = "in use by another process; expected one at a time";
+                    let reason = "in use by another process; expected one process at a time";
                     return Err(io::Error::new(io::ErrorKind::ResourceBusy, reason));
                 }
                 Err(TryLockError::Error(error)) => return Err(error),
@@ -435,12 +438,14 @@ impl FolderLock {
         Ok(Self { folder: folder.to_owned(), lock_path, lock, locked, removes_lock, is_new })
     }
 
-    /// Why the folder is no longer the one that was locked: moved, replaced, or without its lock; `None` if it still is.
+    /// Why the lock is lost, as the folder or the lock's file was moved, removed or replaced; `None` if it is not.
     #[must_use]
-    pub fn lost(&self) -> Option<&'static str> {
+    pub fn loss(&self) -> Option<&'static str> {
         match fs::metadata(&self.folder) {
-            Err(_) => Some("is gone: it was moved or removed"),
-            Ok(found) if !is_same(&found, &self.locked) => Some("is another one: it was moved and replaced"),
+            Err(_) => Some("is missing: it was moved or removed"),
+            Ok(found) if !is_same(&found, &self.locked) => {
+                Some("is a different one: it was moved and replaced")
+            }
             Ok(_) if !is_at(&self.lock, &self.lock_path) => Some("has lost its lock: the file was removed"),
             Ok(_) => None,
         }
@@ -449,19 +454,19 @@ impl FolderLock {
 
 impl Drop for FolderLock {
     fn drop(&mut self) {
-        if self.removes_lock && self.lost().is_none() {
+        if self.removes_lock && self.loss().is_none() {
             let _ = fs::remove_file(&self.lock_path);
             if self.is_new {
-                // Not if there is anything in it.
+                // Fails if the folder is not empty.
                 let _ = fs::remove_dir(&self.folder);
             }
         }
     }
 }
 
-/// Room and size of the disk that a folder is on, bytes; `None` if the system does not tell.
+/// Free space and size of the disk of a folder, bytes; `None` if the system does not report them.
 #[must_use]
-pub fn disk_room(folder: &Path) -> Option<[u64; 2]> {
+pub fn disk_space(folder: &Path) -> Option<[u64; 2]> {
     #[cfg(unix)]
     return rustix::fs::statvfs(folder).ok().map(|found| {
         let bytes = |blocks: u64| blocks.saturating_mul(found.f_frsize);
@@ -471,17 +476,17 @@ pub fn disk_room(folder: &Path) -> Option<[u64; 2]> {
     return folder.file_name().and(None);
 }
 
-/// Whether `path` leads to an open file.
+/// Whether `path` leads to this open file.
 pub fn is_at(file: &File, path: &Path) -> bool {
-    let found = file.metadata().and_then(|here| Ok((here, fs::metadata(path)?)));
-    found.is_ok_and(|(here, there)| is_same(&here, &there))
+    let both = file.metadata().and_then(|open| Ok((open, fs::metadata(path)?)));
+    both.is_ok_and(|(open, at_path)| is_same(&open, &at_path))
 }
 
 /// Whether both describe the same file or folder.
 #[cfg(unix)]
-fn is_same(here: &Metadata, there: &Metadata) -> bool {
+fn is_same(a: &Metadata, b: &Metadata) -> bool {
     use std::os::unix::fs::MetadataExt;
-    (here.dev(), here.ino()) == (there.dev(), there.ino())
+    (a.dev(), a.ino()) == (b.dev(), b.ino())
 }
 
 /// Whether both describe the same file or folder; unknown on this system.
@@ -490,6 +495,7 @@ fn is_same(_: &Metadata, _: &Metadata) -> bool {
     true
 }
 
+/// The folder in `path`; `None` for a bare file name.
 fn folder_of(path: &Path) -> Option<&Path> {
     path.parent().filter(|folder| !folder.as_os_str().is_empty())
 }
@@ -507,7 +513,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_there_once_it_is_finished() {
+    fn a_file_has_its_name_once_it_is_finished() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("new/folder/file");
         let mut file = AtomicFile::create(&path, IfUnfinished::Remove).unwrap();
@@ -521,7 +527,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finished_goes_or_stays_as_asked() {
+    fn an_unfinished_file_is_removed_or_kept() {
         let folder = tempfile::tempdir().unwrap();
         for (unfinished, remains) in [(IfUnfinished::Remove, false), (IfUnfinished::Keep, true)] {
             let path = folder.path().join(format!("{unfinished:?}"));
@@ -550,7 +556,7 @@ mod tests {
             assert!(refused.to_string().contains("another process is writing it"), "{refused}");
         }
         assert_eq!(names(folder.path()).len(), 1);
-        // Of another name, in the same folder.
+        // Another name in the same folder is free.
         write_atomically(&folder.path().join("file2"), b"second").unwrap();
         first.finish().unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"first");
@@ -559,7 +565,7 @@ mod tests {
     }
 
     #[test]
-    fn of_writers_that_begin_together_one_writes() {
+    fn of_several_simultaneous_writers_one_writes() {
         let folder = tempfile::tempdir().unwrap();
         for round in 0..10 {
             let path = folder.path().join(format!("file-{round}"));
@@ -571,7 +577,7 @@ mod tests {
                         scope.spawn(move || {
                             barrier.wait();
                             let file = AtomicFile::create(path, IfUnfinished::Remove);
-                            // Nobody gives up his place before all have asked.
+                            // Each writer keeps its file until all have tried.
                             barrier.wait();
                             let written = file.and_then(|mut file| {
                                 file.write_all(&[writer; 9])?;
@@ -589,7 +595,7 @@ mod tests {
     }
 
     #[test]
-    fn leftovers_that_nobody_holds_are_removed() {
+    fn unfinished_files_without_a_writer_are_removed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("file");
         let leftovers = [".file.77-0123456789abcdef.partial", "file.partial"];
@@ -602,7 +608,7 @@ mod tests {
         let mut expected: Vec<&str> = others.iter().copied().chain(["file"]).collect();
         expected.sort_unstable();
         assert_eq!(names(folder.path()), expected);
-        // Whoever locks the folder removes all of its unfinished files.
+        // A lock of the folder removes all its unfinished files.
         drop(FolderLock::acquire(folder.path(), ".lock", true).unwrap());
         expected.retain(|name| *name != others[0]);
         assert_eq!(names(folder.path()), expected);
@@ -620,7 +626,7 @@ mod tests {
         let mut file = AtomicFile::create(&path, IfUnfinished::Keep).unwrap();
         file.write_all(b"mine").unwrap();
         drop(file);
-        // It took the link's place.
+        // The file has replaced the link.
         assert_eq!(fs::read(folder.path().join("file.partial")).unwrap(), b"mine");
         write_atomically(&path, b"whole").unwrap();
         assert_eq!(fs::read(&victim).unwrap(), b"precious");
@@ -689,17 +695,17 @@ mod tests {
         let lock = FolderLock::acquire(&folder, ".lock", true).unwrap();
         let refused = FolderLock::acquire(&folder, ".lock", true).unwrap_err();
         assert_eq!(refused.kind(), io::ErrorKind::ResourceBusy);
-        assert_eq!(lock.lost(), None);
+        assert_eq!(lock.loss(), None);
         fs::remove_file(folder.join(".lock")).unwrap();
-        assert!(lock.lost().unwrap().contains("lost its lock"));
+        assert!(lock.loss().unwrap().contains("lost its lock"));
         // The next one is not disturbed when the first lets go.
         let next = FolderLock::acquire(&folder, ".lock", true).unwrap();
         drop(lock);
-        assert_eq!(next.lost(), None);
+        assert_eq!(next.loss(), None);
         fs::rename(&folder, place.path().join("elsewhere")).unwrap();
-        assert!(next.lost().unwrap().contains("moved or removed"));
+        assert!(next.loss().unwrap().contains("moved or removed"));
         fs::create_dir(&folder).unwrap();
-        assert!(next.lost().unwrap().contains("replaced"));
+        assert!(next.loss().unwrap().contains("replaced"));
         drop(next);
         let last = FolderLock::acquire(&folder, ".lock", true).unwrap();
         drop(last);

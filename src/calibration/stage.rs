@@ -228,7 +228,7 @@ impl Calibrator {
         self.blocks.count(block.start, count);
         if block.pair.i != block.pair.j {
             if self.is_elsewhere(&block) {
-                return Ok(self.count_elsewhere(&block).map(PlacedFrame::Elsewhere));
+                return Ok(self.count_elsewhere(&block).map(PlacedFrame::NotMapped));
             }
             let placed = self.place(block)?.filter(|placed| !placed.is_empty());
             return Ok(placed.map(PlacedFrame::Visibilities));

@@ -441,8 +441,8 @@ impl Session<'_> {
         }
         let pace = match (args.step, args.speed) {
             (Some(StepLength(every_s)), _) => {
-                let tell = Box::new(|note: &str| say("step", &Value::Null, note));
-                Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+                let prompt = Box::new(|note: &str| say("step", &Value::Null, note));
+                Pace::Steps(Steps { every_s, requests: lines_of_input(), prompt })
             }
             (None, Speed(Some(times))) => Pace::Speed(times),
             (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),

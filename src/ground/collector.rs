@@ -459,7 +459,7 @@ impl Collector {
         let received = &mut self.received[header.kind.index()];
         let insertion = match self.packets < self.packets_max || received.contains(header.count, header.time)
         {
-            true => received.insert_within(header.count, header.time, self.intervals_max),
+            true => received.insert_bounded(header.count, header.time, self.intervals_max),
             false => PacketInsertion::Full,
         };
         match insertion {

@@ -44,12 +44,13 @@ impl SenderPromises {
     /// Whether a checkpoint has to be written because senders wait for it. If the newest one has all `packets` already, they are
     /// told.
     pub(super) fn are_due(&self, packets: u64) -> bool {
-        let Some(answers) = self.answers.as_ref().filter(|answers| answers.begin(self.bytes)) else {
+        let Some(answers) = self.answers.as_ref().filter(|answers| answers.start_checkpoint(self.bytes))
+        else {
             return false;
         };
         let is_new = packets > self.packets;
         if !is_new {
-            answers.hold(self.bytes);
+            answers.record_checkpoint(self.bytes);
         }
         is_new
     }
@@ -60,8 +61,8 @@ impl SenderPromises {
             self.packets = packets;
         }
         match &self.answers {
-            Some(answers) if is_written => answers.hold(self.bytes),
-            Some(answers) => answers.fail(),
+            Some(answers) if is_written => answers.record_checkpoint(self.bytes),
+            Some(answers) => answers.record_failure(),
             None => {}
         }
     }

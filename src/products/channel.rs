@@ -15,7 +15,7 @@ use super::provenance::Provenance;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
-use crate::files::{disk_room, write_atomically};
+use crate::files::{disk_space, write_atomically};
 use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
@@ -88,7 +88,7 @@ impl ChannelFolder {
     /// Lets final maps take the rest of the disk: nothing comes after them.
     fn require_room(&self, solution: &Solution) -> Result<(), ProductsError> {
         let leaves = self.leaves_room && !solution.is_final;
-        match disk_room(&self.root).filter(|_| leaves) {
+        match disk_space(&self.root).filter(|_| leaves) {
             Some([free, size]) if free < size / KEPT_FREE => {
                 let reason = "less than a twentieth of the disk is free, which is left to state and archive";
                 let source = std::io::Error::new(std::io::ErrorKind::StorageFull, reason);

@@ -15,7 +15,7 @@ use super::console::Console;
 use super::status::{Phase, Status};
 use crate::downlink::PacketKind;
 use crate::downlink::transport::socket::ConnectionEnd;
-use crate::files::disk_room;
+use crate::files::disk_space;
 use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
@@ -266,7 +266,7 @@ impl Scrape {
     /// Room on disks, and memory.
     fn machine(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let disks: Vec<_> =
-            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_room(path)?))).collect();
+            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_space(path)?))).collect();
         let label = |name: &str| [("folder", name.to_owned())];
         let free = disks.iter().map(|(name, [free, _])| (label(name), *free as f64));
         gauges(out, MetricInfo("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;

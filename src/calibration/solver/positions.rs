@@ -130,7 +130,7 @@ impl Search<'_> {
             let every = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(most);
             let mut thinned = parts.first()?.without_visibilities();
             let each = parts.iter().flat_map(|part| (0..part.len()).map(move |k| (part, k)));
-            each.step_by(every.max(1)).for_each(|(part, k)| thinned.push_of(part, k));
+            each.step_by(every.max(1)).for_each(|(part, k)| thinned.push_from(part, k));
             Some((thinned, is_on, place))
         };
         all.into_iter().filter_map(thin).collect()

@@ -22,7 +22,8 @@ pub(super) struct BitErrors {
 impl BitErrors {
     pub(super) fn new(config: &LinkConfig, mut random: ChaCha8Rng) -> Self {
         let has_bursts = config.burst_every_bits > 0.0;
-        let end_probabilities = if has_bursts { [1.0 / config.burst_every_bits, 1.0 / config.burst_bits] } else { [0.0; 2] };
+        let end_probabilities =
+            if has_bursts { [1.0 / config.burst_every_bits, 1.0 / config.burst_bits] } else { [0.0; 2] };
         let bits_left = geometric(&mut random, end_probabilities[0]).saturating_add(1);
         let error_rates = [config.bit_error_rate, config.burst_bit_error_rate];
         Self { random, error_rates, end_probabilities, in_burst: false, bits_left }

@@ -44,7 +44,7 @@ impl LinkConfig {
     /// Whether any fault is configured.
     #[must_use]
     #[doc(hidden)]
-    pub fn has_faults(&self) -> bool {
+    pub fn is_on(&self) -> bool {
         let rates = [
             self.bit_error_rate,
             self.burst_every_bits,

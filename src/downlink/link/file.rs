@@ -46,7 +46,7 @@ impl LinkStage {
     /// The configuration is invalid.
     pub fn new(config: &DownlinkConfig, seed: u64, downlink: &Path) -> Result<Option<Self>, DownlinkError> {
         // With a limited rate the spacecraft drops data, which the truth reports too.
-        if !config.link.has_faults() && config.rate_bits_per_s_max == 0.0 {
+        if !config.link.is_on() && config.rate_bits_per_s_max == 0.0 {
             return Ok(None);
         }
         let simulator = LinkSimulator::new(&config.link, seed, config.code())?;
@@ -122,8 +122,8 @@ fn code_of(path: &Path) -> Result<Option<ReedSolomon>, DownlinkError> {
     let mut events = EventReader::open(path)?;
     // The receiver knows the format before it returns an event.
     events.find(|_| Some(()))?;
-    if events.intake().format().is_none() {
+    if events.receiver().format().is_none() {
         events.require_packets()?;
     }
-    Ok(events.intake().frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
+    Ok(events.receiver().frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
 }

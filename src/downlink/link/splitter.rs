@@ -148,7 +148,8 @@ impl Splitter {
         let mut block = block.to_vec();
         randomize(&mut block);
         let is_undamaged = *marker == SYNC_MARKER.to_be_bytes() && code.decode(&mut block) == Ok(0);
-        let header = FrameHeader::parse(&block).filter(|_| is_undamaged).ok_or_else(|| self.damaged_input())?;
+        let header =
+            FrameHeader::parse(&block).filter(|_| is_undamaged).ok_or_else(|| self.damaged_input())?;
         let unit = self.pass.units.len();
         self.pass.units.push(Unit { bytes: bytes.to_vec(), frame: Some((header.channel, header.count)) });
         if header.channel != IDLE {

@@ -21,7 +21,7 @@ mod transmission;
 
 pub use cuc::CucTime;
 pub use format::Format;
-pub(crate) use header::{COUNT_MAX, packet_checksum, has_valid_checksum};
+pub(crate) use header::{COUNT_MAX, has_valid_checksum, packet_checksum};
 pub use header::{
     FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketSegment, TRAILER_BYTES,
 };

@@ -66,8 +66,8 @@ impl Ground {
             None => PacketArchive::open(&folder, bytes_max)?,
         };
         keep_settings(&folder, &archive.settings)?;
-        packets.limit(bytes_max);
-        packets.know(self.collector.received());
+        packets.set_bytes_max(bytes_max);
+        packets.set_received(self.collector.received());
         archive.packets = Some(packets.clone());
         Ok(Some(packets))
     }

@@ -103,7 +103,7 @@ impl Archive {
     /// are read once more after a restart.
     pub(in crate::ground) fn mark_packets(&self, passed: u64) {
         if let (Some(packets), Some(newest)) = (&self.packets, self.folder.newest()) {
-            let _ = packets.mark(newest, passed, &self.folder.numbers());
+            let _ = packets.record_checkpoint(newest, passed, &self.folder.numbers());
         }
     }
 

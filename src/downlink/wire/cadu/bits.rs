@@ -126,7 +126,8 @@ mod tests {
         let mut noise = vec![0; 1 << 20];
         random_stream(5, StreamKind::Probe, [5, 5]).fill_bytes(&mut noise);
         let to = 8 * (noise.len() - 4);
-        let plain: Vec<usize> = (0..to).filter(|at| marker_polarity(word_at(&noise, *at)).is_some()).collect();
+        let plain: Vec<usize> =
+            (0..to).filter(|at| marker_polarity(word_at(&noise, *at)).is_some()).collect();
         let mut found = Vec::new();
         let mut at = 0;
         while let Some(hit) = find_marker(&noise, at, to) {

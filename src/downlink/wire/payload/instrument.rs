@@ -75,7 +75,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
         _ => None,
     };
     let code = record.response;
-    let decoded = Instrument::response_of_code(code);
+    let decoded = Instrument::decode_response(code);
     let expected = "0 (isotropic) or 1 (dipole), plus 128 without thermal noise";
     require(decoded.is_some(), "antenna response", f64::from(code), expected)?;
     let (response, noiseless) = decoded.unwrap_or_default();

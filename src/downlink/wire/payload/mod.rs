@@ -76,7 +76,12 @@ pub enum PayloadFault {
 }
 
 /// Returns a fault unless `is_valid`.
-fn require(is_valid: bool, what: &'static str, value: f64, expected: &'static str) -> Result<(), PayloadFault> {
+fn require(
+    is_valid: bool,
+    what: &'static str,
+    value: f64,
+    expected: &'static str,
+) -> Result<(), PayloadFault> {
     if is_valid { Ok(()) } else { Err(PayloadFault::Value { what, value, expected }) }
 }
 
