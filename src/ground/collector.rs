@@ -117,7 +117,7 @@ pub enum CollectorStep {
 /// Until the description of the instrument arrives, nothing can be decoded, and all packets are held.
 #[derive(Debug)]
 pub struct Collector {
-    intake: DownlinkReceiver,
+    receiver: DownlinkReceiver,
     received: [ReceivedSet; PacketKind::ALL.len()],
     held: HoldBuffer,
     decoder: Decoder,
@@ -143,7 +143,7 @@ impl Collector {
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
-            intake: DownlinkReceiver::unfiltered(),
+            receiver: DownlinkReceiver::unfiltered(),
             received: Default::default(),
             held: HoldBuffer::new(wait_bytes),
             decoder: Decoder::new(),
@@ -203,18 +203,18 @@ impl Collector {
 
     /// Appends the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
-        self.intake.push(bytes);
+        self.receiver.push(bytes);
     }
 
     /// Ends the stream.
     pub fn finish(&mut self) {
-        self.intake.finish();
+        self.receiver.finish();
     }
 
     /// Bytes of this session.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.intake.bytes()
+        self.receiver.bytes()
     }
 
     /// The next delivery; `None` until more bytes arrive.
@@ -281,7 +281,7 @@ impl Collector {
     /// A file that cannot be read, is empty, or does not hold a packet of ours.
     pub fn read_file(&mut self, path: &Path, take: &mut dyn FnMut(Delivery)) -> Result<(), DownlinkError> {
         let mut file = ByteFeed::open(path)?;
-        while file.feed(&mut self.intake)? {
+        while file.feed(&mut self.receiver)? {
             while let Some(found) = self.next_delivery(&|_| true)? {
                 take(found);
             }
@@ -298,7 +298,7 @@ impl Collector {
     /// A file that cannot be read.
     pub fn instrument_of(path: &Path) -> Result<Option<Instrument>, DownlinkError> {
         let (mut file, mut collector) = (ByteFeed::open(path)?, Self::new(0));
-        while file.feed(&mut collector.intake)? {
+        while file.feed(&mut collector.receiver)? {
             while collector.next_delivery(&|_| true)?.is_some() {}
             if let Some(instrument) = collector.instrument() {
                 return Ok(Some(instrument.clone()));
@@ -348,7 +348,7 @@ impl Collector {
     pub fn counters(&self) -> ReceptionCounters {
         let mut counters = self.decoder.counters().clone();
         let link = self.link.counters();
-        counters.frames = self.intake.frames();
+        counters.frames = self.receiver.frames();
         let [packets_beyond, bytes_beyond] = self.beyond;
         counters.bytes += link.bytes + bytes_beyond;
         (counters.packets_beyond, counters.bytes_beyond) = (packets_beyond, bytes_beyond);
@@ -446,7 +446,7 @@ impl Collector {
 
     /// Takes one event of the stream.
     fn take_event(&mut self, is_due: IsDue<'_>) -> Result<EventOutcome, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::Nothing) };
+        let Some(event) = self.receiver.next_event() else { return Ok(EventOutcome::Nothing) };
         let Event::Packet(packet) = event else {
             self.link.accept(&event);
             return Ok(EventOutcome::Event);

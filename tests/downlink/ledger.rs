@@ -133,10 +133,10 @@ fn numbers(block: &VisibilityBlock) -> Vec<u64> {
 
 /// The numbers of the visibilities in each packet, by its count.
 fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
-    let (mut intake, mut decoder, mut found) = (DownlinkReceiver::new(), Decoder::new(), BTreeMap::new());
-    intake.push(sound);
-    intake.finish();
-    while let Some(event) = intake.next_event() {
+    let (mut receiver, mut decoder, mut found) = (DownlinkReceiver::new(), Decoder::new(), BTreeMap::new());
+    receiver.push(sound);
+    receiver.finish();
+    while let Some(event) = receiver.next_event() {
         let header = if let Event::Packet(packet) = &event { Some(packet.header) } else { None };
         if let Some(GroundFrame::Visibilities(block)) = decoder.accept(&event) {
             found.insert(header.unwrap().count, numbers(&block));

@@ -244,7 +244,7 @@ impl StateFolder {
 
     /// Checks that the path still leads to the folder that was locked: another process may use the folder that is there now.
     fn check_place(&self) -> Result<(), GroundError> {
-        match self.lock.as_ref().and_then(FolderLock::lost) {
+        match self.lock.as_ref().and_then(FolderLock::loss) {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }
