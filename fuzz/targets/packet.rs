@@ -3,7 +3,7 @@
 
 use crc_fast::{CrcAlgorithm, checksum};
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::{Decoder, HEADER_BYTES, PacketKind, PacketHeader, PacketReceiver};
+use lunarray::downlink::{Decoder, HEADER_BYTES, PacketHeader, PacketKind, PacketReceiver};
 
 fuzz_target!(|data: &[u8]| {
     let mut stream = data.to_vec();

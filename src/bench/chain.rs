@@ -20,9 +20,7 @@ use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
 
-/// Interval at which queue depths are sampled.
 const SAMPLE_INTERVAL: Duration = Duration::from_millis(5);
-/// Maximum number of samples kept.
 const SAMPLES_MAX: usize = 512;
 
 /// One run of a chain of stages.
@@ -70,7 +68,6 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
 /// Maximum number of ephemeris segments that the receiving stage keeps.
 const SEGMENTS_MAX: usize = 8192;
 
-/// The receiving stage of the ground.
 pub(super) fn reception() -> Reception {
     Reception::new(WAIT_BYTES, SEGMENTS_MAX, Arc::default())
 }
@@ -86,7 +83,6 @@ pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRu
     run_sampled(graph)
 }
 
-/// Runs a graph and samples its queue depths.
 fn run_sampled(graph: Graph) -> Result<ChainRun, PipelineError> {
     let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
     let since = Instant::now();
@@ -150,7 +146,6 @@ impl QueueSamples {
     }
 }
 
-/// A source of packets from memory.
 struct Packets(Vec<Vec<u8>>);
 
 impl Source for Packets {
@@ -164,7 +159,6 @@ impl Source for Packets {
     }
 }
 
-/// A sink that drops sums.
 struct SumsSink;
 
 impl Sink for SumsSink {

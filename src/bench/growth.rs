@@ -26,9 +26,7 @@ pub struct GrowthRow {
     pub core_s_per_mission_s: Option<f64>,
 }
 
-/// Numbers of daughters to run with.
 const DAUGHTERS: [usize; 3] = [4, 8, 16];
-/// Block sizes to run with, samples.
 const BLOCKS: [usize; 4] = [256, 1024, 4096, 16_384];
 
 /// Runs the chain with a third, two thirds and all of the channels, and with other numbers of daughters and block sizes.

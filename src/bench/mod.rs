@@ -195,14 +195,12 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-/// Runs a source to its end; returns its output.
 fn run_source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     while source.next(&mut out)? == Flow::Continue {}
     Ok(out.into_vec())
 }
 
-/// Runs a stage on its input; returns its output.
 fn run_stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     for item in input {
@@ -249,7 +247,6 @@ fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
     blocks.map(|block| &block.samples)
 }
 
-/// Runs one stage alone and measures its time.
 fn time_stage(
     plan: &Plan,
     skies: &[SkyMap],

@@ -4,7 +4,6 @@ use std::time::Instant;
 
 use crate::pipeline::Plan;
 
-/// Time spent on a task.
 pub(super) struct TimeSpent {
     pub(super) seconds: f64,
     /// Processor time of the whole process, s; `None` where the system does not report it.

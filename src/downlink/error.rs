@@ -140,7 +140,6 @@ pub enum DownlinkError {
 }
 
 impl DownlinkError {
-    /// Adds the file that the error concerns.
     pub(crate) fn at(self, path: &std::path::Path) -> Self {
         Self::At { path: path.to_owned(), source: Box::new(self) }
     }

@@ -71,7 +71,6 @@ pub fn is_at(file: &File, path: &Path) -> bool {
     both.is_ok_and(|(open, at_path)| is_same(&open, &at_path))
 }
 
-/// Whether both describe the same file or folder.
 #[cfg(unix)]
 pub(super) fn is_same(a: &Metadata, b: &Metadata) -> bool {
     use std::os::unix::fs::MetadataExt;

@@ -13,7 +13,6 @@ use super::protected::require_replaceable;
 /// Number of bytes that are buffered before a write.
 pub(super) const WRITE_BYTES: usize = 1 << 20;
 
-/// Suffix of unfinished files.
 const PARTIAL: &str = ".partial";
 
 /// Maximum number of names that are tried for an unfinished file before the folder counts as unusable.
@@ -22,7 +21,6 @@ const NAMES_MAX: usize = 100;
 /// Interval between retries while another writer, which began at the same time, has the name.
 const RIVAL_POLL: Duration = Duration::from_millis(20);
 
-/// Maximum number of retries.
 const RIVAL_POLLS_MAX: usize = 50;
 
 /// What happens to a file that is dropped before it is finished.
@@ -116,7 +114,6 @@ impl AtomicFile {
         unfinished.chain([self.kept_path()]).filter_map(|path| remove_stale(&path)).min()
     }
 
-    /// The path of the file if it remains unfinished.
     fn kept_path(&self) -> PathBuf {
         let mut kept = self.path.clone().into_os_string();
         kept.push(PARTIAL);

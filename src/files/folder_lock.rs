@@ -15,7 +15,6 @@ pub struct FolderLock {
     folder: PathBuf,
     lock_path: PathBuf,
     lock: File,
-    /// Identity of the folder that was locked.
     locked: Metadata,
     removes_lock: bool,
     /// Whether the folder was created for the lock.

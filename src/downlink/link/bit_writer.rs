@@ -41,7 +41,6 @@ impl BitWriter {
         self.push(after);
     }
 
-    /// Number of bits written.
     pub(super) fn bits(&self) -> i64 {
         8 * self.bytes.len() as i64 - i64::from((8 - self.used_bits) % 8)
     }

@@ -13,7 +13,6 @@ use crate::downlink::wire::cadu::ReedSolomon;
 use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Bytes read at a time.
 const READ_BYTES: usize = 1 << 18;
 
 /// Path of the truth about a damaged downlink: the downlink's path plus `.truth.json`.

@@ -20,7 +20,6 @@ struct UnitCopy {
     unit: usize,
     /// Sort key of the order of arrival.
     order: u64,
-    /// Number of bytes that arrive.
     bytes: usize,
     /// Whether a bit is lost or added.
     slips: bool,
@@ -40,7 +39,6 @@ struct PassInTransit {
 /// What happened to a unit.
 #[derive(Clone, Copy, Debug, Default)]
 struct UnitOutcome {
-    /// Number of recoverable copies.
     recoverable: u32,
     /// The greatest fate of the other copies.
     fate: Option<FrameFate>,
@@ -243,7 +241,6 @@ impl LinkSimulator {
         bytes
     }
 
-    /// Adds to the shift since the last lock.
     fn shift(&mut self, bits: i64) {
         self.shift_bits = self.shift_bits.map(|before| before + bits);
     }
@@ -255,7 +252,6 @@ impl LinkSimulator {
         self.code.is_none() || is_due || wrong <= MARKER_ERRORS_MAX as usize
     }
 
-    /// Records the outcomes of a pass in the truth.
     fn record(&mut self, pass: &SentPass, outcomes: &[UnitOutcome]) {
         if let Some(report) = pass.report {
             // The counts never decrease, so the maximum also holds for swapped passes.

@@ -145,7 +145,6 @@ impl fmt::Display for LinkTruth {
 }
 
 impl LinkTruth {
-    /// Adds a frame that cannot be recovered.
     pub(super) fn add_lost_frame(&mut self, channel: u8, count: u32, fate: FrameFate) {
         match self.frames_lost.last_mut() {
             Some(last) if (last.channel, last.fate, last.to.wrapping_add(1)) == (channel, fate, count) => {
@@ -156,7 +155,6 @@ impl LinkTruth {
     }
 }
 
-/// Adds a packet to a list of ranges.
 pub(super) fn list_packet(list: &mut Vec<PacketRange>, apid: u16, count: u64) {
     match list.last_mut() {
         Some(last) if (last.apid, last.to + 1) == (apid, count) => last.to = count,

@@ -27,7 +27,6 @@ const EXPANSION_BYTES: u64 = 1 << 26;
 /// Decompresses as it is read, in bounded memory.
 pub struct DownlinkFile {
     content: Content,
-    /// Number of decompressed bytes.
     expanded: u64,
 }
 
@@ -47,7 +46,6 @@ struct CountedBytes {
 struct ZstdFrames {
     source: BufReader<CountedBytes>,
     decoder: FrameDecoder,
-    /// Whether a frame is being read.
     in_frame: bool,
 }
 

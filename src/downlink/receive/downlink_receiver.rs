@@ -23,7 +23,6 @@ pub struct DownlinkReceiver {
     chunk: Vec<u8>,
     recovered: Vec<u8>,
     unfiltered: bool,
-    /// The first bytes of the stream.
     head: Vec<u8>,
 }
 

@@ -141,7 +141,6 @@ fn identify_packets(head: &[u8]) -> Option<String> {
     Some(format!("space packets of other APIDs: {}{more}", shown.join(", ")))
 }
 
-/// Identifies a text format by its beginning.
 fn identify_text(head: &[u8]) -> Option<String> {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
     let is_text = |byte: &u8| matches!(byte, b'\t' | b'\n' | b'\r' | 0x20..=0x7e | 0x80..);
@@ -164,7 +163,6 @@ fn identify_text(head: &[u8]) -> Option<String> {
     })
 }
 
-/// Name of the root element of an XML document.
 fn root_element(text: &str) -> String {
     let elements = text.split('<').skip(1).filter(|element| !element.starts_with(['?', '!']));
     let name = |element: &str| {

@@ -203,7 +203,6 @@ impl PacketReceiver {
         self.is_finished = true;
     }
 
-    /// Whether the stream has ended.
     pub(super) fn is_finished(&self) -> bool {
         self.is_finished
     }
@@ -314,7 +313,6 @@ impl PacketReceiver {
         }
     }
 
-    /// Examines the first unconsumed bytes.
     fn examine(&self) -> PacketMatch {
         let rest = &self.buffer[self.begin..self.end];
         // Idle packets have no checksum, so they are accepted only directly after a packet.

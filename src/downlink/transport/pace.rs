@@ -55,11 +55,9 @@ pub struct PacedSource<S> {
     pending: VecDeque<Vec<u8>>,
     /// Number of bytes of the first chunk that have been examined.
     examined: usize,
-    /// Number of bytes released.
     released: u64,
     /// When the first packet was released, and its time.
     start: Option<(Instant, CucTime)>,
-    /// Latest packet time.
     latest: CucTime,
     /// Packet time at which the next step begins.
     next_step: CucTime,
@@ -67,7 +65,6 @@ pub struct PacedSource<S> {
     pass_ended: bool,
     /// Whether positions or visibilities came since the last housekeeping report.
     in_pass: bool,
-    /// Number of steps.
     steps: u64,
     is_ended: bool,
 }
@@ -168,7 +165,6 @@ impl<S> PacedSource<S> {
         }
     }
 
-    /// Releases bytes.
     fn release(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
         self.released += bytes.len() as u64;
         if !bytes.is_empty() {
@@ -176,7 +172,6 @@ impl<S> PacedSource<S> {
         }
     }
 
-    /// Prompts for a request of the next step.
     fn prompt(&mut self) {
         self.steps += 1;
         if let Pace::Steps(steps) = &self.pace {

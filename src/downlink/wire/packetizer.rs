@@ -148,7 +148,6 @@ impl Packetizer {
         self.send_payload(PacketKind::Ephemeris, now, out)
     }
 
-    /// Keeps an ephemeris segment, to repeat it.
     fn keep_for_repeat(&mut self, segment: &EphemerisSegment) {
         if !std::mem::replace(&mut self.continues_ephemeris, true) {
             self.ephemeris.clear();
@@ -226,7 +225,6 @@ impl Packetizer {
         *self.now.insert(self.now.map_or(time, |now| now.max(time)))
     }
 
-    /// The time code of a mission time.
     fn time_code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
         let epoch_tai_s = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?.epoch_tai_s;
         let error = || DownlinkError::Time { epoch_tai_s, time_s: time.seconds() };

@@ -25,7 +25,6 @@ const SEEN_MAX: usize = 1 << 16;
 /// Offset of unwrapped counts, so that earlier ones do not underflow.
 const ORIGIN: u64 = 1 << 40;
 
-/// Where a piece ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum PieceEnd {
     /// With its packet; another packet begins after it.
@@ -43,7 +42,6 @@ struct Pieces {
     head: Option<Vec<u8>>,
 }
 
-/// Assembles the packets of one virtual channel.
 #[derive(Debug, Default)]
 pub(super) struct Assembler {
     /// Highest unwrapped frame count.
@@ -51,7 +49,6 @@ pub(super) struct Assembler {
     sequence: Sequence,
     /// Checksums of recent frames by count.
     seen: BTreeMap<u64, u32>,
-    /// Pieces by frame count.
     pieces: BTreeMap<u64, Pieces>,
     counts: ChannelCounts,
 }

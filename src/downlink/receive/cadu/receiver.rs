@@ -91,7 +91,6 @@ pub struct CaduReceiver {
     counters: FrameCounters,
     /// Number of bits that the buffer must have before it is examined again.
     needed_bits: usize,
-    /// Number of octets decoded.
     octets_decoded: u64,
 }
 
@@ -170,7 +169,6 @@ impl CaduReceiver {
         8 * PARITY_BYTES * self.code.map_or(0, ReedSolomon::interleave)
     }
 
-    /// Processes the buffer as far as its bytes allow.
     fn process(&mut self, at_end: bool, out: &mut Vec<u8>) {
         while at_end || 8 * self.buffer.len() >= self.needed_bits {
             let has_advanced =
@@ -332,7 +330,6 @@ impl CaduReceiver {
         if is_image { FrameMatch::NoFrame } else { FrameMatch::Frame(best) }
     }
 
-    /// Whether all octets of the block are equal.
     fn is_constant(&self) -> bool {
         self.block.iter().all(|octet| Some(octet) == self.block.first())
     }
@@ -375,7 +372,6 @@ impl CaduReceiver {
         }
     }
 
-    /// Sets the polarity, and counts its changes.
     fn set_polarity(&mut self, polarity: Polarity) {
         self.counters.inversions += u64::from(polarity != self.polarity);
         self.polarity = polarity;
@@ -405,7 +401,6 @@ impl CaduReceiver {
         self.block.get(..FRAME_HEADER_BYTES).and_then(FrameHeader::parse).filter(is_own)
     }
 
-    /// Processes the frame in `self.block`.
     fn deliver(&mut self, found: LocatedFrame, out: &mut Vec<u8>) {
         self.set_polarity(found.polarity);
         self.counters.frames += 1;

@@ -82,7 +82,6 @@ impl Contents {
     }
 }
 
-/// Running counts of visibilities.
 #[derive(Clone, Copy, Debug, Default)]
 struct Tally {
     count: u64,
@@ -111,7 +110,6 @@ struct KindExtent {
     time: Option<CucTime>,
 }
 
-/// Running summary of a file.
 #[derive(Debug, Default)]
 struct Inspector {
     instrument: Option<Instrument>,

@@ -7,7 +7,6 @@ use super::{Contents, HousekeepingSummary, VisibilityCounts};
 use crate::downlink::receive::{Listing, ReceptionCounters};
 use crate::units::printable;
 
-/// Number of channels in a row of the table.
 const CHANNELS_PER_ROW: usize = 6;
 
 /// Maximum number of entries shown per list; `--json` shows more.

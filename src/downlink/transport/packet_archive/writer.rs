@@ -23,7 +23,6 @@ const SYNC_EVERY: Duration = Duration::from_secs(5);
 /// Minimum distance between kept positions in the stream, bytes.
 pub(super) const BATCH_STEP: u64 = 1 << 20;
 
-/// The writing end of an archive.
 pub(super) struct Writer {
     pub(super) folder: PathBuf,
     _lock: FolderLock,
@@ -82,18 +81,15 @@ impl Writer {
         })
     }
 
-    /// Number of bytes of the archive.
     pub(super) fn bytes(&self) -> u64 {
         self.closed.iter().map(|(_, bytes)| bytes).sum::<u64>()
             + self.open.as_ref().map_or(0, |(_, bytes)| *bytes)
     }
 
-    /// The position after the last packet.
     pub(super) fn end(&self) -> ArchivePosition {
         ArchivePosition { segment: self.number, offset: self.open.as_ref().map_or(0, |(_, bytes)| *bytes) }
     }
 
-    /// Appends the packets that are new.
     pub(super) fn append(&mut self, packets: &[u8]) -> io::Result<()> {
         let (mut new, mut names, mut rest) = (Vec::new(), Vec::new(), packets);
         while let Some(header) = PacketHeader::parse(rest) {
@@ -218,7 +214,6 @@ impl Writer {
     }
 }
 
-/// Whether the disk or a quota is full.
 fn is_full(error: &io::Error) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)

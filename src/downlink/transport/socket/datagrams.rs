@@ -17,7 +17,6 @@ use super::stream_receiver::StreamReceiver;
 use crate::downlink::transport::packet_archive::Ticket;
 use crate::downlink::wire::cadu::SYNC_MARKER;
 
-/// Maximum length of a datagram, bytes.
 const DATAGRAM_BYTES_MAX: usize = 1 << 16;
 /// Number of bytes of datagrams after which they are processed.
 const ROUND_BYTES: usize = 1 << 20;
@@ -40,13 +39,11 @@ impl DatagramSender {
         Self { peer, packets: receiver(), frames: receiver(), last_received: Instant::now() }
     }
 
-    /// Number of packets forwarded.
     fn packets(&self) -> u64 {
         self.packets.packets().0 + self.frames.packets().0
     }
 }
 
-/// All senders of datagrams.
 struct DatagramSenders {
     reception: SharedReception,
     senders: Vec<DatagramSender>,
@@ -202,7 +199,6 @@ async fn forward(bytes: Vec<u8>, shared: &Arc<ListenContext>) -> Option<Option<T
     Some(forwarded.ticket.ok().flatten())
 }
 
-/// Synchronises packets to disk.
 async fn sync(ticket: Option<Ticket>, shared: &ListenContext) {
     if let (Some(ticket), Some(archive)) = (ticket, shared.archive.clone()) {
         // The archive's report has a failure.

@@ -42,7 +42,6 @@ pub(super) struct PacketBatch {
     pub(super) arrived: std::time::Instant,
 }
 
-/// The result of forwarding a batch.
 pub(super) struct ForwardedBatch {
     /// Number of bytes in all batches up to the end of this one.
     pub(super) mark: u64,
@@ -50,7 +49,6 @@ pub(super) struct ForwardedBatch {
     pub(super) ticket: Result<Option<Ticket>, String>,
 }
 
-/// The state that all connections share.
 pub(super) struct ListenContext {
     pub(super) config: ListenConfig,
     pub(super) until: ListenLimits,
@@ -76,7 +74,6 @@ pub(super) struct ListenContext {
 }
 
 impl ListenContext {
-    /// Capacity of the backlog, bytes.
     pub(super) fn backlog_capacity(config: &ListenConfig) -> usize {
         (config.backlog_bytes_max as usize).min(Semaphore::MAX_PERMITS)
     }
@@ -91,7 +88,6 @@ impl ListenContext {
         self.batches.send(batch).ok().map(|()| ForwardedBatch { mark, ticket: ticket.transpose() })
     }
 
-    /// Records the arrival of a valid packet or frame.
     pub(super) fn record_activity(&self) {
         *self.last_activity.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     }
@@ -102,7 +98,6 @@ impl ListenContext {
         let _ = self.stop.subscribe().wait_for(|stop| *stop).await;
     }
 
-    /// Whether an end condition holds.
     pub(super) fn is_over(&self) -> bool {
         let status = &self.listening.status;
         let ListenLimits { idle_s, connections } = self.until;
@@ -117,7 +112,6 @@ impl ListenContext {
         idle_s > 0.0 && last_activity.elapsed().as_secs_f64() > idle_s
     }
 
-    /// Refuses a connection for which there is no slot.
     pub(super) fn refuse(&self, stream: &TcpStream, peer: SocketAddr) {
         self.listening.write().refused += 1;
         // A sender need not read the answer.
@@ -150,7 +144,6 @@ pub(super) struct Notes {
     budget: Mutex<NoteBudget>,
 }
 
-/// The number of notes that may be reported.
 struct NoteBudget {
     allowed: f64,
     updated: Instant,

@@ -26,7 +26,6 @@ pub(super) struct Preamble {
     is_over: bool,
 }
 
-/// Classification of the beginning of a line.
 enum LineStart {
     /// The incomplete beginning of one of the two lines.
     Incomplete,
@@ -92,7 +91,6 @@ impl Preamble {
         Ok(std::mem::take(&mut self.line))
     }
 
-    /// Classifies the beginning of the line.
     fn classify(&self) -> LineStart {
         let Self { line, .. } = self;
         if line == HELD_REQUEST {
@@ -114,7 +112,6 @@ impl Preamble {
         }
     }
 
-    /// Finds the station of the token in the line.
     fn identify_station(&mut self) -> Result<(), ConnectionEnd> {
         let token = self.line.strip_prefix(TOKEN).and_then(|token| token.strip_suffix(b"\n"));
         if let Some(stations) = &self.stations {
@@ -139,7 +136,6 @@ impl Preamble {
         if self.requests_held && !self.has_checkpoints { Err(ConnectionEnd::NoState) } else { Ok(()) }
     }
 
-    /// Whether the sender requests the answer `held`.
     pub(super) fn requests_held(&self) -> bool {
         self.requests_held
     }

@@ -130,7 +130,6 @@ pub struct SenderReport {
 /// A note about an event of a connection, reported when it happens. In JSON, its field `event` has the kind of event.
 #[derive(Debug, Serialize)]
 pub struct ListenNote<'a> {
-    /// The event.
     #[serde(flatten)]
     pub(super) event: ListenEvent<'a>,
     /// Number of notes before this one that were suppressed, as there were too many.
@@ -268,7 +267,6 @@ impl ListenReport {
         }
     }
 
-    /// Adds the report on a connection that has ended.
     pub(super) fn close(&mut self, report: SenderReport, refused: u64, stream: &ReceptionCounters) {
         self.bytes += report.bytes;
         self.packets += report.packets;
@@ -352,12 +350,10 @@ impl ListenStatus {
         self.last_activity.lock().unwrap_or_else(PoisonError::into_inner).map(|instant| instant.elapsed())
     }
 
-    /// Records the arrival of a valid packet or frame.
     pub(super) fn record_activity(&self) {
         *self.last_activity.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
     }
 
-    /// Marks the backlog as empty.
     pub(super) fn clear_backlog(&self) {
         self.backlog_bytes.store(0, Ordering::Relaxed);
     }

@@ -29,10 +29,8 @@ const RESEND_BYTES_MAX: usize = 1 << 24;
 
 /// Pause before the first new attempt; it doubles with each attempt, up to [`PAUSE_MAX`].
 const PAUSE: Duration = Duration::from_millis(200);
-/// Maximum pause between attempts.
 const PAUSE_MAX: Duration = Duration::from_secs(5);
 
-/// Maximum length of an answer, bytes.
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
 /// Options for sending.
@@ -115,7 +113,6 @@ impl SocketSink {
         }
     }
 
-    /// Waits, unless the run is cancelled.
     fn pause(&self, length: Duration) {
         let until = Instant::now() + length;
         while let Some(left) = until.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {

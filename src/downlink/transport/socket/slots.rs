@@ -15,7 +15,6 @@ const GRACE: Duration = Duration::from_millis(500);
 /// Time after its last new packet for which a connection counts as active.
 const ACTIVE: Duration = Duration::from_secs(2);
 
-/// The slot of an open connection.
 #[derive(Debug)]
 struct Slot {
     /// The sender's address, see [`quota_key`].
@@ -83,12 +82,10 @@ impl ConnectionSlots {
         (number, evicted)
     }
 
-    /// Releases a slot.
     pub(super) fn release(&self, number: u64) {
         self.lock().remove(&number);
     }
 
-    /// Records that a connection has delivered a new packet.
     pub(super) fn record_new_packet(&self, number: u64, now: Instant) {
         if let Some(slot) = self.lock().get_mut(&number) {
             slot.last_new_packet = Some(now);
@@ -154,7 +151,6 @@ fn quota_key(address: IpAddr) -> IpAddr {
 mod tests {
     use super::*;
 
-    /// Slots with a start time.
     struct Table {
         slots: ConnectionSlots,
         start: Instant,

@@ -45,7 +45,6 @@ pub struct SocketSource {
     bytes: u64,
 }
 
-/// What the listener's thread needs when it starts.
 struct PendingListener {
     listener: Option<std::net::TcpListener>,
     reception: SharedReception,
@@ -189,7 +188,6 @@ impl SocketSource {
         self.listening.clone()
     }
 
-    /// Starts the listener's thread.
     fn start(&mut self) -> Result<(), SocketError> {
         let Some(PendingListener { listener, reception, note_handler }) = self.pending.take() else {
             return Ok(());

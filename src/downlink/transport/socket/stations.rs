@@ -8,11 +8,9 @@ use super::error::SocketError;
 
 /// Minimum length of a token, so that it cannot be guessed if it is random.
 const TOKEN_BYTES_MIN: usize = 16;
-/// Maximum length of a token.
 pub(super) const TOKEN_BYTES_MAX: usize = 256;
 const NAME_CHARACTERS_MAX: usize = 64;
 const STATIONS_MAX: usize = 1000;
-/// Maximum length of the file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
 /// Stations with their tokens. Their file has a line `NAME TOKEN` for each; empty lines and lines that begin with `#` are
@@ -78,7 +76,6 @@ impl Stations {
         if found.is_empty() { Err("no station; expected lines NAME TOKEN".into()) } else { Ok(Self(found)) }
     }
 
-    /// Names of the stations.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.0.iter().map(|(name, _)| name.as_str())
     }

@@ -125,7 +125,6 @@ impl StreamReceiver {
         }
     }
 
-    /// The lines before the packets.
     pub(super) fn preamble(&self) -> &Preamble {
         &self.preamble
     }
@@ -149,7 +148,6 @@ impl StreamReceiver {
         self.receiver.format()
     }
 
-    /// Memory of the receiver, bytes.
     pub(super) fn memory_bytes(&self) -> usize {
         self.receiver.memory_bytes() + self.partial_payload.capacity() + self.unconfirmed.capacity()
     }
@@ -186,7 +184,6 @@ impl StreamReceiver {
         has_valid
     }
 
-    /// Processes all events of the receiver.
     fn drain_events(&mut self, out: &mut Vec<u8>) {
         while let Some(event) = self.receiver.next_event() {
             let Event::Packet(packet) = event else {
@@ -352,7 +349,6 @@ mod tests {
         }
     }
 
-    /// Visibilities that begin at `start`.
     fn block(start: i64) -> GroundFrame {
         GroundFrame::Visibilities(VisibilityBlock {
             pair: crate::units::Pair { i: 0, j: 1 },

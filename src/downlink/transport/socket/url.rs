@@ -29,7 +29,6 @@ impl FromStr for ListenUrl {
     }
 }
 
-/// The URL of an address for datagrams.
 pub(super) fn udp_url(address: SocketAddr) -> String {
     TcpUrl::from(address).to_string().replacen("tcp", "udp", 1)
 }

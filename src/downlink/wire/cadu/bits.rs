@@ -39,7 +39,6 @@ pub(crate) fn marker_polarity(word: u32) -> Option<Polarity> {
     }
 }
 
-/// Number of wrong bits in a marker.
 pub(crate) fn marker_errors(word: u32, polarity: Polarity) -> u32 {
     let wrong = (word ^ SYNC_MARKER).count_ones();
     if polarity == Polarity::Upright { wrong } else { 32 - wrong }

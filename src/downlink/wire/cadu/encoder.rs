@@ -66,7 +66,6 @@ impl CaduEncoder {
     }
 }
 
-/// Appends the CADU of a frame.
 fn code_frame(code: ReedSolomon, frame: &[u8], out: &mut Vec<u8>) {
     out.extend_from_slice(&SYNC_MARKER.to_be_bytes());
     let start = out.len();

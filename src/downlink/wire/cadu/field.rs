@@ -7,7 +7,6 @@ const POLYNOMIAL: u8 = 0x87;
 /// (131.0-B, annex F).
 const TO_DUAL: [u8; 8] = [0x8D, 0xEF, 0xEC, 0x86, 0xFA, 0x99, 0xAF, 0x7B];
 
-/// Number of powers of the primitive element.
 pub(super) const ORDER: usize = 255;
 
 /// Placeholder for the logarithm of 0, larger than any sum of two others.
@@ -66,7 +65,6 @@ impl GaloisField {
         self.exp[self.log(a) + self.log(b)]
     }
 
-    /// Logarithm of a non-zero element.
     pub(super) fn log(&self, a: u8) -> usize {
         usize::from(self.log[usize::from(a)])
     }

@@ -9,7 +9,6 @@ pub(crate) const PACKET_HEADER_BYTES: usize = 6;
 /// Octet that fills idle packets; the randomizer provides bit transitions.
 const IDLE_OCTET: u8 = 0x55;
 
-/// Bits of a frame count.
 const COUNT_BITS: u32 = 28;
 
 /// Fills the frames of one virtual channel with packets.
@@ -84,7 +83,6 @@ impl Framer {
         self.add(&idle_packet(length), send);
     }
 
-    /// Sends a frame of idle data.
     pub(super) fn send_idle(&mut self, mut send: impl FnMut(&[u8])) {
         // Idle data begins after the primary header, as there is no packet zone.
         let pointer = u16::from_be_bytes([self.idle.octet(), self.idle.octet()]);
@@ -95,7 +93,6 @@ impl Framer {
         self.frame.truncate(ZONE_START);
     }
 
-    /// Sends the full frame.
     fn send_full(&mut self, send: &mut impl FnMut(&[u8])) {
         self.write_headers(self.first_header);
         send(&self.frame);

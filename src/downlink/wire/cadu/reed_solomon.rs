@@ -105,7 +105,6 @@ impl ReedSolomon {
         Ok(wrong)
     }
 
-    /// Remainder of the data of each codeword.
     fn remainders(self, block: &[u8]) -> [Parity; 8] {
         let mut found = [Parity::default(); 8];
         let data = &block[..self.data_bytes()];
@@ -122,7 +121,6 @@ impl ReedSolomon {
     }
 }
 
-/// Octet number `at` of a parity.
 fn octet_of(parity: &Parity, at: usize) -> u8 {
     (parity[at / 4] >> (24 - 8 * (at % 4))) as u8
 }

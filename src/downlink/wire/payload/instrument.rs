@@ -17,7 +17,6 @@ const NAME_BYTES_MAX: usize = 256;
 const CHANNELS_MAX: usize = 4096;
 /// Bytes of the spectrometer's numbers, which follow the channels.
 const SPECTROMETER_BYTES: usize = 24;
-/// Frequency range of a spectrometer, Hz.
 const SPECTRUM_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=1e9;
 /// The band of the mission, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;

@@ -75,7 +75,6 @@ pub enum PayloadFault {
     Order,
 }
 
-/// Returns a fault unless `is_valid`.
 fn require(
     is_valid: bool,
     what: &'static str,
@@ -100,13 +99,11 @@ fn config() -> Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> {
     bincode::config::standard().with_fixed_int_encoding().with_limit::<RECORD_BYTES_MAX>()
 }
 
-/// Appends a record.
 fn put_record<R: Encode>(what: &'static str, record: R, out: &mut Vec<u8>) -> Result<(), PayloadFault> {
     bincode::encode_into_std_write(record, out, config()).map_err(|_| PayloadFault::Record { what })?;
     Ok(())
 }
 
-/// Splits a payload into its record and the rest.
 fn take_record<'a, R: Decode<()>>(
     what: &'static str,
     bytes: &'a [u8],

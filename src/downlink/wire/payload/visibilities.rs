@@ -17,9 +17,7 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::{Flags, Instrument, VisibilityBlock};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Bytes of the record.
 const RECORD_BYTES: usize = 16;
-/// Bytes of one visibility.
 pub(crate) const VISIBILITY_BYTES: usize = 21;
 
 #[derive(Encode, Decode)]
