@@ -149,10 +149,10 @@ impl ReceivedBlocks {
             (VisibilityReason::NotReceived, missing),
             (VisibilityReason::NotReceivedAtLeast, at_least),
         ] {
-            ledger.sampled(count);
-            ledger.left_out(reason, count);
+            ledger.add_sampled(count);
+            ledger.add_left_out(reason, count);
         }
-        ledger.sampled(self.visibilities());
+        ledger.add_sampled(self.visibilities());
         let last_reports = self.reports.range((Housekeeping::FOREVER, 0, 0)..).count();
         let reasons = match latest {
             None => vec!["no report of the spacecraft's counts was received"],
@@ -238,8 +238,8 @@ mod tests {
     ) -> (crate::runtime::LedgerReport<VisibilityReason>, Completeness) {
         let ledger = Ledger::new();
         let completeness = blocks.close(&ledger, MissingPackets { all, unreported });
-        ledger.accumulated(blocks.visibilities());
-        (ledger.close().unwrap(), completeness)
+        ledger.add_accumulated(blocks.visibilities());
+        (ledger.balanced_report().unwrap(), completeness)
     }
 
     #[test]

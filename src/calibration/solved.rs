@@ -101,7 +101,7 @@ impl SolvedGains {
 
     /// Time to the nearest pass that is closed, s; `None` if there is none near enough for its gains to hold.
     #[must_use]
-    pub fn away_s(&self, time_s: f64) -> Option<f64> {
+    pub fn distance_to_pass_s(&self, time_s: f64) -> Option<f64> {
         self.table().nearest(time_s).map(|(_, away_s)| away_s)
     }
 

@@ -192,10 +192,10 @@ impl Calibrator {
         let Some(key) = BlockKey::of(block) else { return };
         if self.blocks.insert(key) {
             self.blocks.count(block.start, count);
-            self.ledger.left_out(VisibilityReason::NextSession, count);
+            self.ledger.add_left_out(VisibilityReason::NextSession, count);
         } else {
-            self.ledger.sampled(count);
-            self.ledger.left_out(VisibilityReason::Duplicate, count);
+            self.ledger.add_sampled(count);
+            self.ledger.add_left_out(VisibilityReason::Duplicate, count);
         }
     }
 
@@ -221,8 +221,8 @@ impl Calibrator {
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(&block) else { return Ok(None) };
         if !self.blocks.insert(key) {
-            self.ledger.sampled(count);
-            self.ledger.left_out(VisibilityReason::Duplicate, count);
+            self.ledger.add_sampled(count);
+            self.ledger.add_left_out(VisibilityReason::Duplicate, count);
             return Ok(None);
         }
         self.blocks.count(block.start, count);
@@ -274,13 +274,13 @@ impl Calibrator {
 
     fn keep_autos(&mut self, placed: &PlacedVisibilities) {
         let Some(autos) = &mut self.autos else {
-            self.ledger.left_out(VisibilityReason::Auto, placed.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::Auto, placed.len() as u64);
             return;
         };
         let insertion = autos.insert(placed, AUTOS_MAX);
-        self.ledger.accumulated(insertion.kept);
-        self.ledger.left_out(VisibilityReason::AutoTableFull, insertion.beyond);
-        self.ledger.left_out(VisibilityReason::AutoRepeated, insertion.duplicates);
+        self.ledger.add_accumulated(insertion.kept);
+        self.ledger.add_left_out(VisibilityReason::AutoTableFull, insertion.beyond);
+        self.ledger.add_left_out(VisibilityReason::AutoRepeated, insertion.duplicates);
     }
 
     fn is_spectrum(&self, pair: Pair) -> bool {
@@ -291,7 +291,7 @@ impl Calibrator {
     fn prepare(&self, block: &mut VisibilityBlock) -> Option<Channel> {
         let channel = self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair));
         let Some(channel) = channel else {
-            self.ledger.left_out(VisibilityReason::NoInstrument, block.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::NoInstrument, block.len() as u64);
             return None;
         };
         // The spectrometer has no sample quantiser.
@@ -313,7 +313,7 @@ impl Calibrator {
     /// Posts what would become of a block of two daughters; `None` if nothing of it would be left.
     fn count_elsewhere(&self, block: &VisibilityBlock) -> Option<CountedVisibilities> {
         let (placing, first_s) = self.ephemeris.count(block);
-        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         first_s.map(|first_s| CountedVisibilities { first_s, visibilities: placing.placed })
     }
@@ -322,7 +322,7 @@ impl Calibrator {
     fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
-        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
         Ok(Some(placed))
@@ -332,14 +332,14 @@ impl Calibrator {
         let calibrated = self.calibration.apply(placed)?;
         placed.check_lengths()?;
         for (reason, count) in calibrated.removed() {
-            self.ledger.left_out(reason, count as u64);
+            self.ledger.add_left_out(reason, count as u64);
         }
         Ok(())
     }
 
     fn post_flagged(&self, flagged: BTreeMap<VisibilityReason, u64>) {
         for (reason, count) in flagged {
-            self.ledger.left_out(reason, count);
+            self.ledger.add_left_out(reason, count);
         }
     }
 }

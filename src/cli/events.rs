@@ -71,7 +71,7 @@ impl Events {
     /// The run begins, or a further pass of it.
     pub(super) fn watch(&self, watched: &Watched) {
         let Some(writer) = &self.writer else { return };
-        watched.maps.join(Box::new(writer.viewer()));
+        watched.maps.add_viewer(Box::new(writer.viewer()));
         writer.send(Message::Watch(Box::new(watched.clone())));
     }
 

@@ -56,7 +56,7 @@ impl Progress {
         let (stop, stopped) = channel();
         let cancel = cancel.clone();
         if is_json() {
-            watched.maps.join(Box::new(LogViewer));
+            watched.maps.add_viewer(Box::new(LogViewer));
         }
         let thread = std::thread::spawn(move || {
             let mut shown = ProgressView::new(total);

@@ -310,7 +310,7 @@ impl Integrator {
             let time_s = from.seconds() + 0.5 * dt_s;
             let smeared = self.options.smear_integrations;
             PairPosition {
-                at: Some((scheduled.pair, time_s)),
+                pair_time: Some((scheduled.pair, time_s)),
                 r_i_m: self.array.position_m(i.into(), time_s),
                 r_j_m: self.array.position_m(j.into(), time_s),
                 span_rad: if smeared { TAU * dt_s / self.array.orbital_period_s() } else { 0.0 },

@@ -33,7 +33,7 @@ impl SkyPowers {
         array: &Array,
         windows: &[ObservingWindow],
     ) -> Result<Vec<Self>, ModelError> {
-        let shared = array.formation().is_some() && !model.has_own_antennas();
+        let shared = array.formation().is_some() && !model.has_individual_antennas();
         let tables = if shared { 1 } else { array.satellites() };
         // Arcs are longest at the start of a breathing period.
         let lags_s = (0..array.satellites()).map(|n| lag_s(array, n, 0.0));
@@ -48,7 +48,7 @@ impl SkyPowers {
         let place = |n: usize, t_s: f64| DaughterPosition {
             r_m: if shared { array.trailing_m(0.0, t_s) } else { array.position_m(n, t_s) },
             normal_hat: array.normal_hat(n, t_s),
-            at: Some((n as u8, t_s)),
+            daughter_time: Some((n as u8, t_s)),
         };
         let instants = |&(from_s, count): &(f64, usize)| (0..count).map(move |k| from_s + STEP_S * k as f64);
         let places: Vec<DaughterPosition> = spans

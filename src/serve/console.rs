@@ -126,7 +126,7 @@ impl Console {
     pub(super) fn begin(&self, watched: &Watched) {
         let viewer =
             PageViewer { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
-        watched.maps.join(Box::new(viewer));
+        watched.maps.add_viewer(Box::new(viewer));
         if let Some(ground) = &watched.ground {
             ground.live_view.open();
         }

@@ -153,7 +153,7 @@ impl CircleSky {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.frequency_hz;
         let longest_m = wavelengths_max(self.nside) * wavelength_m;
         let pairs: Vec<Option<PairOrientation>> =
-            positions.iter().map(|at| PairOrientation::of(at.r_i_m, at.r_j_m).ok()).collect();
+            positions.iter().map(|at| PairOrientation::of_pair(at.r_i_m, at.r_j_m).ok()).collect();
         let circle = Circle::of(&pairs, longest_m).filter(|circle| circle.radius_m > self.moon_radius_m);
         let is_on = |pair: &Option<PairOrientation>| match (circle, pair) {
             (Some(circle), Some(pair)) => {
@@ -254,7 +254,7 @@ mod tests {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         (0..COUNT).map(|k| at(1000.0 + 20.0 * k as f64)).collect()
     }

@@ -84,7 +84,7 @@ fn pass(frequency_hz: f64, after_s: f64) -> Vec<PairData> {
         .map(|(n, t_s)| DaughterPosition {
             r_m: array.position_m(n, t_s),
             normal_hat: array.orbit_normal_hat(t_s),
-            at: None,
+            daughter_time: None,
         })
         .collect();
     let mut powers = vec![0.0; places.len()];

@@ -91,7 +91,7 @@ impl KnownSignal {
         }
     }
 
-    /// Sums over the sky of a channel as [`DirectMoments::sums_with`] gives them; nothing without a sky.
+    /// Sums over the sky of a channel as [`DirectMoments::weighted_sums`] gives them; nothing without a sky.
     ///
     /// # Errors
     /// Positions that the model does not cover.
@@ -102,7 +102,7 @@ impl KnownSignal {
         functions: &[f32],
     ) -> Result<Vec<f32>, ModelError> {
         match self.sky.get(channel) {
-            Some(ChannelSky::Gradient(sum)) => sum.sums_with(positions, functions),
+            Some(ChannelSky::Gradient(sum)) => sum.weighted_sums(positions, functions),
             _ => Ok(Vec::new()),
         }
     }
@@ -155,7 +155,7 @@ impl KnownSignal {
             r_i_m: flown(r_i_m, i),
             r_j_m: flown(r_j_m, j),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         placed.r_i_m.iter().zip(&placed.r_j_m).map(position).collect()
     }
@@ -195,7 +195,7 @@ impl KnownSignal {
         let Predicted { mut values, mut gradients } = sky;
         let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
         let channel = usize::from(placed.channel.0);
-        let (from_hat, per_m) = (self.beacon.from_hat(), self.per_m(channel));
+        let (from_hat, per_m) = (self.beacon.source_hat(), self.per_m(channel));
         for (k, position) in lit.into_iter().flatten().enumerate() {
             let hz = self.frequencies_hz[channel];
             let wave = self.beacon.visibility_k_sr(position.r_i_m, position.r_j_m, hz);

@@ -61,7 +61,7 @@ impl MomentSetup<'_> {
         moments.resize(2 * count * positions.len(), 0.0);
         let (beacon, frequency_hz) = self.signal.beacon(self.channel);
         let mut of_beacon = vec![0.0; count];
-        real_harmonics(self.axes.map(|axis| dot(axis, beacon.from_hat())), self.l_max, &mut of_beacon);
+        real_harmonics(self.axes.map(|axis| dot(axis, beacon.source_hat())), self.l_max, &mut of_beacon);
         for (position, moments) in positions.iter().zip(moments.chunks_exact_mut(2 * count)) {
             let (re, im) = moments.split_at_mut(count);
             if *is_on {

@@ -174,7 +174,7 @@ pub fn run_with_ranks(
     let grace = Grace::of(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ground =
-        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).with_ranks(ranks);
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.to_add).with_ranks(ranks);
     let maps = MapWatch::default();
     let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
@@ -294,7 +294,7 @@ pub(in crate::pipeline) fn ground_alone<S: GroundSource + 'static>(
     let grace = Grace::of(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
     let ranks = ground.ranks().clone();
-    let ground = ground.cancelled_by(cancel, grace.to_add);
+    let ground = ground.with_cancel(cancel, grace.to_add);
     let maps = MapWatch::default();
     let trouble = is_service.then(ProductsWatch::default);
     let (viewers, products) = (maps.clone(), trouble.clone());
@@ -491,7 +491,7 @@ fn conclude(
     }
     let FinishedGraph { report, outcome, .. } = ended;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ground.ledger.close()?;
+    let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
@@ -506,7 +506,7 @@ pub(in crate::pipeline) fn summarise(
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = ground.ledger.close()?;
+    let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(account) = &listening {
         account.complete(&mut reception);

@@ -111,7 +111,7 @@ impl RunSummary {
     pub(in crate::pipeline) fn after(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
         let ledger =
-            earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_accumulation, elsewhere);
+            earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_accumulation, elsewhere);
         Self {
             seed: earlier.seed.or(self.seed),
             space_hash: earlier.space_hash.or(self.space_hash),

@@ -119,7 +119,7 @@ fn observed(
         lengths.push(f64::from(one.duration_ticks) / TICKS_PER_SECOND as f64);
         for n in [pair.i, pair.j].map(usize::from) {
             let (r_m, normal_hat) = (plan.array.position_m(n, t_s), plan.array.normal_hat(n, t_s));
-            daughters.push(DaughterPosition { r_m, normal_hat, at: None });
+            daughters.push(DaughterPosition { r_m, normal_hat, daughter_time: None });
         }
     }
     let mut powers = vec![0.0; daughters.len()];

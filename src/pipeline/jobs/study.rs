@@ -341,7 +341,7 @@ fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
     for (case, summary) in done.iter().zip(cases) {
         let key = ideal_of(case);
         if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
-            summary.figures.against_ideal(ideal);
+            summary.figures.set_power_kept(ideal);
         }
     }
 }
