@@ -294,7 +294,7 @@ impl Stage for Door {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), GroundError> {
-        black_box(self.calibrator.close(MissingPackets::default()));
+        black_box(self.calibrator.post_losses(MissingPackets::default()));
         Ok(())
     }
 }

@@ -30,7 +30,7 @@ pub struct Epochs {
     pub count: usize,
 }
 
-/// Where the visibilities V_ji of one pair are stored, as an expansion over the channel.
+/// Location of the visibilities V_ji of one pair, as an expansion over the channel.
 pub(super) struct PairSeries {
     pub(super) pair: Pair,
     /// Basis functions of frequency.
@@ -107,7 +107,7 @@ fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
     table
 }
 
-/// Which covariances to predict.
+/// Inputs of a prediction of covariances.
 pub struct CovarianceRequest<'a> {
     /// The array.
     pub array: &'a Array,

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::array::{EarthShadow, SatelliteState};
+use crate::array::{EarthOccultation, SatelliteState};
 use crate::frames::ObservingWindow;
 use crate::pipeline::Plan;
 use crate::units::{MissionTime, Pair, all_pairs};
@@ -51,7 +51,7 @@ fn sample_window(plan: &Plan, step_s: f64, window: ObservingWindow, add: &mut dy
     let steps = ((end_s - start_s) / step_s).ceil().max(1.0) as usize;
     let length_s = (end_s - start_s) / steps as f64;
     let satellites = plan.array.satellites();
-    let shadow = plan.config.spacecraft.flag_earth.then(|| EarthShadow::new(&plan.array, window));
+    let shadow = plan.config.spacecraft.flag_earth.then(|| EarthOccultation::new(&plan.array, window));
     let all = all_pairs(satellites);
     let mut pairs = Vec::with_capacity(all.len());
     for step in 0..steps {

@@ -47,7 +47,9 @@ impl GroundConfig {
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         if self.calibration.hook == CalibrationHook::Solve {
             let maps = self.calibrate.model_files.len();
-            self.calibrate.fits(instrument, maps, MODEL_FILES_KEY).map_err(CalibrationError::from)?;
+            self.calibrate
+                .check_instrument(instrument, maps, MODEL_FILES_KEY)
+                .map_err(CalibrationError::from)?;
             check_frequencies(&self.calibrate.model_files, &instrument.frequencies_hz())
                 .map_err(CalibrationError::from)?;
         }
@@ -94,7 +96,7 @@ impl GroundConfig {
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
             .with_segments(SEGMENTS_MAX)
-            .of_group(self.group.clone()))
+            .with_group(self.group.clone()))
     }
 
     /// An accumulator without data that posts to `ledger`.

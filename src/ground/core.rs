@@ -293,7 +293,7 @@ impl Ground {
                 Some(GroundFrame::Visibilities(block))
                     if self.archive.is_some() && self.cancel.is_cancelled() =>
                 {
-                    self.calibrator.leave_for_later(block);
+                    self.calibrator.count_for_next_session(block);
                 }
                 _ => self.apply(delivery, out)?,
             }
@@ -430,7 +430,7 @@ impl Stage for Ground {
         // The checkpoint keeps held packets held; the final maps use them although their positions are unknown.
         self.last_checkpoint()?;
         self.flush(out)?;
-        store(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
+        store(&self.outcome.completeness, self.calibrator.post_losses(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }

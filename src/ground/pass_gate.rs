@@ -34,7 +34,7 @@ impl PassGateState {
     pub(super) fn is_sound(&self, instrument: Option<&Instrument>) -> bool {
         let is_span =
             |[from_s, until_s]: &[f64; 2]| from_s.is_finite() && until_s.is_finite() && from_s <= until_s;
-        let fits = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.is_of(instrument));
+        let fits = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.fits_instrument(instrument));
         self.passes.iter().all(fits) && self.open.iter().flatten().all(is_span)
     }
 }
@@ -83,7 +83,7 @@ impl PassGate {
         let PassGateState { mut passes, open, late } = state;
         // In the order in which they were closed: the validity of each depends on the gains before it.
         passes.sort_unstable_by_key(|pass| pass.number);
-        passes.into_iter().for_each(|pass| self.gains.close(pass));
+        passes.into_iter().for_each(|pass| self.gains.add_pass(pass));
         self.gains.count_late(late);
         self.gains.begin_session();
         self.open = open;
@@ -175,7 +175,7 @@ impl PassGate {
         let solved = self.solver.solve(PassBlocks { number, span_s, blocks }, ephemeris);
         let (solutions, unused) =
             solved.map_or((Vec::new(), all), |solved| (solved.solutions, solved.unused));
-        self.gains.close(ClosedPass { number, span_s, unused, solutions });
+        self.gains.add_pass(ClosedPass { number, span_s, unused, solutions });
         if let Some(observer) = &mut self.observer {
             observer(&self.gains);
         }

@@ -10,7 +10,6 @@ use super::healpix::{
 use crate::units::constants::HEALPIX_UNSEEN;
 use crate::units::vector::Vec3;
 
-/// Number of pixels of one task.
 const PIXELS_PER_TASK: usize = 4096;
 
 /// Maximum temperature of a sky, K: above any source below 100 MHz, even solar bursts (1e15 K), and low enough that the square of a

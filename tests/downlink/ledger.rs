@@ -170,7 +170,7 @@ fn receive(arrived: &[u8]) -> Received {
     for frame in frames.into_vec() {
         calibrator.step(frame, &mut placed).unwrap();
     }
-    let completeness = calibrator.close(MissingPackets::default());
+    let completeness = calibrator.post_losses(MissingPackets::default());
     // All baselines and weights: what is placed is summed.
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let mut accumulator = Accumulator::new(map, ledger.clone());

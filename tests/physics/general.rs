@@ -419,7 +419,7 @@ fn antennas_that_differ(elements: AntennaResponse) {
     let [a, b] = [antenna(elements, 1, 0.0), antenna(elements, 4, 5e3)];
     let constant = PairResponse::of_antennas([&a, &b]);
     let product: Vec<f64> =
-        pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.at(*n) * t).collect();
+        pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.value(*n) * t).collect();
     let product = analysis(&product, L_MAX + 6, &AnalysisOptions { method: Method::ACCURATE }).unwrap().alm;
     let same = |_: usize| constant.clone();
     // Rows of lower degrees do not hold it.

@@ -84,7 +84,7 @@ impl Ground {
             return Err(GroundError::GainsWithoutData { missing, count: *count });
         }
         work.add(files, &new)?;
-        let moves = gains.iter().flatten().any(AntennaGains::moves);
+        let moves = gains.iter().flatten().any(AntennaGains::corrects_positions);
         if config.map.engine == EngineKind::Harmonic {
             work.check_first_data(&firsts, moves)?;
         }
@@ -114,7 +114,7 @@ fn packets_to_change(
         }
         let span_s = [entry.start, entry.end].map(|time| time.seconds());
         match gains {
-            [Some(old), Some(new)] => !old.does_as(new, channel.frequency_hz, entry.pair, span_s),
+            [Some(old), Some(new)] => !old.is_equivalent(new, channel.frequency_hz, entry.pair, span_s),
             _ => true,
         }
     };

@@ -72,7 +72,7 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
         let expected = "a HEALPix map of the sky for each channel, here or in calibrate.model_files";
         return Err(invalid("--model", "(none)".to_owned(), expected.to_owned()).into());
     }
-    solver.fits(&plan.instrument, maps.len(), "--model")?;
+    solver.check_instrument(&plan.instrument, maps.len(), "--model")?;
     let Some(&window) = plan.windows.get(pass) else {
         let expected = format!("0 to {}, the passes of the mission", plan.windows.len().saturating_sub(1));
         return Err(invalid("--pass", pass.to_string(), expected).into());

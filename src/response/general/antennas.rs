@@ -18,10 +18,8 @@ use crate::units::vector::{Vec3, dot};
 /// Maximum degree of a response: two dipoles, each with an individual pattern.
 pub const DEGREE_MAX: usize = 6;
 
-/// Exponents of n_x, n_y and n_z.
 type Exponents = [usize; 3];
 
-/// Lists the exponents of the monomials of one degree.
 fn monomials(degree: usize) -> Vec<Exponents> {
     (0..=degree).rev().flat_map(|p| (0..=degree - p).rev().map(move |q| [p, q, degree - p - q])).collect()
 }
@@ -131,7 +129,7 @@ impl PairResponse {
 
     /// Value in a direction, a unit vector.
     #[must_use]
-    pub fn at(&self, n_hat: Vec3) -> f64 {
+    pub fn value(&self, n_hat: Vec3) -> f64 {
         let power = |exponents: Exponents| -> f64 {
             n_hat.iter().zip(exponents).map(|(n, exponent)| n.powi(exponent as i32)).product()
         };
@@ -165,7 +163,6 @@ impl SkyProducts {
         self.degree
     }
 
-    /// Number of products of each sky.
     pub(super) fn count(&self) -> usize {
         (self.degree + 1) * (self.degree + 2) / 2
     }
@@ -232,7 +229,7 @@ mod tests {
         let p_2 = |x: f64| 1.5 * x * x - 0.5;
         for n in [[0.2, 0.3, -0.7], [1.0, 0.0, 0.0], [-0.4, 0.9, 0.1]].map(unit) {
             let dipoles = dot(across(d, n), across(e, n));
-            assert!((PairResponse::of_dipoles(d, e).at(n) - dipoles).abs() < 1e-15);
+            assert!((PairResponse::of_dipoles(d, e).value(n) - dipoles).abs() < 1e-15);
             let [a, b] = [(d, 0.2), (e, -0.1)].map(|(axis_hat, distortion)| SatelliteAntenna {
                 elements: AntennaResponse::DipoleNormal,
                 axes_hat: [axis_hat, unit(cross(axis_hat, n))],
@@ -241,12 +238,12 @@ mod tests {
             let expected = dipoles * (1.0 + 0.2 * p_2(dot(d, n))) * (1.0 - 0.1 * p_2(dot(e, n)));
             let found = PairResponse::of_antennas([&a, &b]);
             assert_eq!(found.degree(), 6);
-            assert!((found.at(n) - expected).abs() < 1e-14, "{} {expected}", found.at(n));
+            assert!((found.value(n) - expected).abs() < 1e-14, "{} {expected}", found.value(n));
             let higher = PairResponse {
                 degree: 6,
                 coefficients: PairResponse::of_dipoles(d, e).coefficients_of_degree(6),
             };
-            assert!((higher.at(n) - dipoles).abs() < 1e-14);
+            assert!((higher.value(n) - dipoles).abs() < 1e-14);
         }
     }
 
@@ -257,10 +254,10 @@ mod tests {
         let (sin, cos) = 10.0_f64.to_radians().sin_cos();
         let turned = axes.map(|[x, y, z]| [x, cos * y - sin * z, sin * y + cos * z]);
         for n in [[0.2, 0.3, -0.7], [1.0, 0.0, 0.0], [-0.4, 0.9, 0.1]].map(unit) {
-            assert!((PairResponse::of_triads(axes, axes).at(n) - 1.0).abs() < 1e-15);
+            assert!((PairResponse::of_triads(axes, axes).value(n) - 1.0).abs() < 1e-15);
             // sum_k d_k . e_k = 1 + 2 cos; sum_k (n . d_k) (n . e_k) = n . R n = nx^2 + cos (ny^2 + nz^2).
             let expected = 0.5 * (1.0 + 2.0 * cos - n[0] * n[0] - cos * (1.0 - n[0] * n[0]));
-            let found = PairResponse::of_triads(axes, turned).at(n);
+            let found = PairResponse::of_triads(axes, turned).value(n);
             assert!((found - expected).abs() < 1e-15, "{found} {expected}");
         }
     }

@@ -39,7 +39,6 @@ use crate::response::harmonic::degree_count;
 /// Number of real and imaginary parts of [`LANES`] pairs.
 const COMPLEX_LANES: usize = 2 * LANES;
 
-/// A ring of the occulted cap.
 #[derive(Clone, Copy, Debug)]
 struct Ring {
     sin: f64,
@@ -438,7 +437,6 @@ impl NodePatterns {
         self.coefficients.resize(groups * count * VALUES, 0.0);
     }
 
-    /// Rows of a group of nodes.
     pub(super) fn rows(&self, group: usize) -> &[Value] {
         &self.coefficients[group * self.count * VALUES..][..self.count * VALUES]
     }

@@ -35,7 +35,6 @@ const CHOSEN_FRACTION_MAX: f64 = 0.5;
 pub(super) struct Frames {
     /// Frames into which skies are rotated.
     pub(super) chosen: Vec<RowNode>,
-    /// Number of all frames.
     count: usize,
     /// Weights `[chosen][frame]`.
     weights: Vec<Value>,
@@ -181,7 +180,6 @@ impl Frames {
     }
 }
 
-/// Computes the weights `[chosen][frame]` by back substitution.
 fn weights(chosen: &[usize], triangle: &[Vec<f64>], count: usize) -> Vec<Value> {
     let mut weights: Vec<Vec<f64>> = triangle.to_vec();
     for row in (0..chosen.len()).rev() {

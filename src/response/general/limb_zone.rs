@@ -87,7 +87,6 @@ impl LimbZone {
         }
     }
 
-    /// Number of points in psi.
     pub(super) fn points(&self) -> usize {
         self.cos_psi.len()
     }
@@ -198,7 +197,6 @@ fn raise_to_limb(class_rad: f64, limb_rad: f64, nadir: [f64; 2], cos_psi: &[f64]
     }
 }
 
-/// Point of the inner quadrature.
 struct InnerPoint {
     limb_rad: f64,
     inverse_width: f64,

@@ -180,14 +180,12 @@ impl GeneralRows {
         if plan.direct { None } else { Frames::new(&plan.nodes[node_range(tracks)], self.setup.l_max) }
     }
 
-    /// Rotates skies into the chosen frames, if there are any.
     fn rotate_skies(&self, frames: Option<&Frames>, skies: &[Alm], workspace: &mut Workspace) {
         if let Some(frames) = frames {
             self.turns.rotate_skies(&frames.chosen, skies, &mut workspace.rotation, &mut workspace.basis);
         }
     }
 
-    /// Zeroes the gradients in the chosen frames.
     fn clear_gradients(&self, frames: Option<&Frames>, skies: usize, workspace: &mut Workspace) {
         if let Some(frames) = frames {
             resize_buffers(&mut workspace.basis, self.setup.l_max, padded_count(&frames.chosen) * skies);
@@ -449,7 +447,6 @@ fn row_range(tracks: &[Track]) -> Range<usize> {
     tracks.first().map_or(0, |track| track.rows.start)..tracks.last().map_or(0, |track| track.rows.end)
 }
 
-/// Concatenates the values of groups, by sky.
 fn concatenate(plan: &RowPlan, skies: usize, groups: Vec<Vec<Vec<Complex64>>>) -> Vec<Vec<Complex64>> {
     let mut out = vec![Vec::with_capacity(plan.rows()); skies];
     for group in groups {

@@ -21,7 +21,6 @@ const TOLERANCE: f64 = 1e-8;
 #[derive(Clone)]
 pub(super) struct PhaseGrid {
     l_max: usize,
-    /// Number of angles.
     points: usize,
     kernel: Kernel,
     /// Reciprocal of the kernel's transform at each order, by mu + `l_max`.
@@ -55,7 +54,6 @@ impl PhaseTable {
         self.nodes.next_multiple_of(LANES)
     }
 
-    /// Number of values at one angle.
     fn stride(&self) -> usize {
         2 * self.skies * self.padded()
     }
@@ -81,7 +79,6 @@ impl PhaseGrid {
         Self { l_max, points, kernel, factors, forward, inverse }
     }
 
-    /// Zeroes a table.
     pub(super) fn clear(&self, table: &mut PhaseTable, [nodes, skies]: [usize; 2]) {
         (table.nodes, table.skies) = (nodes, skies);
         table.values.clear();

@@ -95,7 +95,6 @@ impl RowPlan {
     }
 }
 
-/// Number of rows whose responses a task computes.
 const ROWS_PER_TASK: usize = 4096;
 
 /// Returns the coefficients of the responses of rows as polynomials of degree `degree_max`; none if rows have the setup's response.
@@ -263,7 +262,6 @@ impl TrackBuilder<'_> {
         if has_known_motion(duration_s) { 0.5 * duration_s } else { 0.0 }
     }
 
-    /// Plans a node for each row.
     fn plan_each(&self, rows: Range<usize>, plan: &mut RowPlan) {
         let first = plan.nodes.len();
         for row in rows.clone() {

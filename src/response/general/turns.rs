@@ -62,7 +62,6 @@ impl QuarterTurns {
         Self { degrees }
     }
 
-    /// Maximum degree.
     pub(super) fn l_max(&self) -> usize {
         self.degrees.len().saturating_sub(1)
     }

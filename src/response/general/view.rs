@@ -13,9 +13,7 @@ const BASELINE_M_MIN: f64 = 1e-3;
 /// Geometry of a pair in its own frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct PairView {
-    /// Unit vectors x, y, z.
     pub(super) axes: [Vec3; 3],
-    /// Length of the baseline, m.
     pub(super) baseline_m: f64,
     /// Angles of i and j in the plane from x towards y, rad.
     pub(super) angle_rad: [f64; 2],

@@ -42,7 +42,6 @@ pub(super) struct Batch {
     /// Indices among the nodes of the group's tracks.
     pub(super) indices: Vec<usize>,
     pub(super) nodes: Vec<RowNode>,
-    /// Patterns of each mu.
     pub(super) patterns: Vec<NodePatterns>,
 }
 

@@ -20,7 +20,6 @@ use crate::units::arithmetic::sinc;
 
 /// Maximum number of runs in a batch, which bounds its memory.
 const RUNS_MAX: usize = 256;
-/// Target number of alphas in groups of several runs.
 const ALPHAS_TARGET: usize = 4;
 
 /// Groups of runs and their plans; runs are indexed within the batch.
@@ -32,7 +31,6 @@ pub(super) struct Batch {
     blocks: Vec<usize>,
 }
 
-/// Interval of alpha that a group covers.
 #[derive(Clone, Copy)]
 struct AlphaRange {
     low: f64,
@@ -126,7 +124,6 @@ fn next_range(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRan
     (whole, count)
 }
 
-/// Computes the weights of a run.
 fn plan_run(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> RunPlan {
     let tolerance = model.settings().tolerance;
     let fringe_phase = TAU * run.u.half.abs() + model.sky.l_max() as f64 * run.node.half.abs();

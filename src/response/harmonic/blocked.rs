@@ -5,7 +5,6 @@ use rayon::prelude::*;
 use super::filter::FilteredPatterns;
 use super::pattern::{NodeGrid, degree_count};
 
-/// Nodes in a block.
 pub(crate) const BLOCK_NODES: usize = 8;
 /// Values of a block at one degree: both signs of mu at every node.
 pub(crate) const PATTERN_LANES: usize = 2 * BLOCK_NODES;

@@ -8,9 +8,7 @@ use super::Real;
 use super::pattern::{NodeGrid, PatternTable, degree_count};
 use crate::units::arithmetic::sinc;
 
-/// Filter taps on each side of a node.
 const TAPS_PER_SIDE: usize = 10;
-/// Frequencies of the fit per tap.
 const SAMPLES_PER_TAP: usize = 12;
 
 /// Patterns after a symmetric filter along the nodes, with both signs of mu interleaved.

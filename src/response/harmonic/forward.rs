@@ -8,7 +8,6 @@ use super::rotation::{RotatedSky, order_count};
 
 /// Orders mu of one task, which fill a vector of the rotated sky.
 pub(crate) const ORDER_LANES: usize = 16;
-/// Maximum number of alphas in a group.
 pub(crate) const ALPHAS_MAX: usize = 6;
 
 /// Part of the interpolation to one alpha: the rotated sky, the index of its first alpha, and the kernel at the following ones.
@@ -27,7 +26,6 @@ type Products = [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX];
 pub(crate) struct RunGroup {
     /// Interpolation to each alpha, in one or two parts.
     pub(crate) alphas: Vec<Vec<AlphaPart>>,
-    /// Indices of the group's runs in the batch.
     pub(crate) runs: Vec<usize>,
     /// Blocks of nodes that the runs need, in order.
     pub(crate) blocks: Vec<usize>,
@@ -36,11 +34,8 @@ pub(crate) struct RunGroup {
 /// Weights that reduce products at alphas and nodes to the Chebyshev coefficients of a run.
 #[derive(Clone, Debug)]
 pub(crate) struct RunPlan {
-    /// First block of nodes of the run.
     pub(crate) first_block: usize,
-    /// Number of blocks.
     pub(crate) blocks: usize,
-    /// Number of Chebyshev terms.
     pub(crate) terms: usize,
     /// `[term][block][alpha]`: a weight for each lane of the pattern vector.
     pub(crate) weights: Vec<[f32; PATTERN_LANES]>,
@@ -67,7 +62,6 @@ pub(crate) struct Projection<'a> {
     pub(crate) skies: &'a [RotatedSky<f32>],
     pub(crate) patterns: &'a BlockedPatterns,
     pub(crate) groups: &'a [RunGroup],
-    /// Weights of each run.
     pub(crate) plans: &'a [RunPlan],
     /// Index of each run's first term in the output, and the total number of terms.
     pub(crate) offsets: &'a [usize],

@@ -22,7 +22,6 @@ const NODES_PER_WAVELENGTH: f64 = 4.5;
 pub(super) const ALPHA_BLOCK: usize = 64;
 /// Maximum number of blocks of alphas that are kept and that a batch uses.
 pub(super) const BLOCKS_KEPT: usize = 4;
-/// Maximum number of Chebyshev terms along a run.
 pub(super) const TERMS: usize = 8;
 
 /// Factor by which the error in alpha may exceed the tolerance at the highest order m, which few coefficients have.

@@ -97,7 +97,6 @@ impl<T: Real> PatternTable<T> {
         table
     }
 
-    /// Computes the nodes `first .. first + count`.
     fn fill(&mut self, geometry: PatternGeometry, first: usize, count: usize) {
         let (grid, l_max) = (self.grid, self.l_max);
         let u: Vec<f64> = (first..first + count).map(|k| grid.u(k)).collect();
@@ -162,7 +161,6 @@ impl<T> PatternTable<T> {
         &self.blocks[mu]
     }
 
-    /// Mutable rows of all orders.
     pub(crate) fn orders_mut(&mut self) -> &mut [Vec<T>] {
         &mut self.blocks
     }

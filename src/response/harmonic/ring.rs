@@ -62,7 +62,6 @@ impl RingSolver {
         }
     }
 
-    /// Computes `I_0` and `I_1` by quadrature.
     fn start(&self, x: f64, limb: f64) -> [f64; 2] {
         let points = GaussLegendre::points_for(0.5 * limb * x);
         let rule = self.rules.of(points);
@@ -139,7 +138,6 @@ fn integrate_start(x: f64, limb: f64, abscissae: &[f64], weights: &[f64]) -> [f6
 mod tests {
     use super::*;
 
-    /// The integral by direct quadrature.
     fn integral(x: f64, limb: f64, mu: i64) -> f64 {
         let rule = GaussLegendre::new(240);
         let sum: f64 = rule

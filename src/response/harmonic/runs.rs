@@ -37,14 +37,10 @@ const PHASE_STEP_RAD_MAX: f64 = 0.25 * PI;
 /// Maximum relative change of the integration's span within a run, which has one span for all states.
 const SPAN_CHANGE_MAX: f64 = 0.02;
 
-/// Limits of a run.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RunLimits {
-    /// Maximum order m.
     pub(crate) m_max: f64,
-    /// Maximum half range of u.
     pub(crate) u_half: f64,
-    /// Maximum half range of the node, rad.
     pub(crate) node_half: f64,
     /// Maximum half range of the fringe phase `2 pi u + m node`, rad.
     pub(crate) fringe_phase_half: f64,
@@ -86,7 +82,6 @@ pub(crate) fn split(states: &[PairState], limits: RunLimits) -> Vec<Run> {
     runs
 }
 
-/// Whether `b` cannot continue the run of `a`.
 fn is_discontinuous(a: &PairState, b: &PairState, step: f64, limits: RunLimits) -> bool {
     let fringe_phase = TAU * (b.baseline_wavelengths - a.baseline_wavelengths).abs()
         + limits.m_max * wrap(b.node_rad - a.node_rad).abs();

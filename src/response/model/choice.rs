@@ -80,7 +80,7 @@ pub struct Workload {
 pub struct ModelPlan {
     /// The model.
     pub kind: ModelKind,
-    /// Reason for the choice.
+    /// Reason of the choice.
     pub why: &'static str,
     /// Band limit of the harmonic and of the general model.
     pub l_max: usize,

@@ -111,7 +111,6 @@ impl DirectMoments {
     }
 }
 
-/// Positions whose rows are multiplied together.
 const ROWS: usize = 16;
 
 impl DirectMoments {

@@ -192,7 +192,6 @@ mod tests {
         SkyMap::new(Frame::Ecliptic, vec![-MOON_K; 12 * nside * nside]).unwrap()
     }
 
-    /// Coefficient l = 0 of a sky of -T.
     fn cold_alm() -> Alm {
         let mut alm = Alm::zeros(0);
         *alm.get_mut(0, 0) = Complex64::new(-MOON_K * (4.0 * PI).sqrt(), 0.0);

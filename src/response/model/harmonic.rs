@@ -21,7 +21,6 @@ pub(super) const BATCH: usize = 100_000;
 /// that higher degrees contribute 1e-4.
 const POWERS_L_MAX: usize = 96;
 
-/// Positions that one task converts to states.
 const POSITIONS_PER_TASK: usize = 1024;
 
 /// Parameters of a [`HarmonicSum`].
@@ -104,7 +103,6 @@ fn harmonic(setup: &HarmonicSumSetup, source: HarmonicError) -> ModelError {
     ModelError::Harmonic { frequency_hz: setup.frequency_hz, source }
 }
 
-/// Copies the coefficients of `sky` up to `l_max`.
 fn truncate(sky: &Alm, l_max: usize) -> Alm {
     let mut truncated = Alm::zeros(l_max.min(sky.l_max()));
     for m in 0..=truncated.l_max() {

@@ -17,7 +17,6 @@ pub struct TimeAverage {
     model: Box<dyn VisibilityModel>,
     array: Arc<Array>,
     wavelength_m: f64,
-    /// Maximum degree of the model's sky.
     l_max: usize,
     instants: Instants,
 }
@@ -29,7 +28,6 @@ impl TimeAverage {
         Self { model, array, wavelength_m, l_max, instants: Instants::new() }
     }
 
-    /// Positions of satellites i and j at a mission time.
     fn positions_at(&self, position: &PairPosition, t_s: f64) -> Option<[Vec3; 2]> {
         let (pair, _) = position.pair_time?;
         Some([pair.i, pair.j].map(|n| self.array.position_m(n.into(), t_s)))

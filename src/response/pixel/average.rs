@@ -17,9 +17,7 @@ use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused, polynomia
 /// Mean responses over a group of blocks.
 #[derive(Clone, Debug)]
 pub(super) struct Means {
-    /// Real parts.
     pub re: [f32; GROUP],
-    /// Imaginary parts.
     pub im: [f32; GROUP],
     /// 1 where the limb of the Moon may cross the block, else 0.
     pub cut: [f32; GROUP],

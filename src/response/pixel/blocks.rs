@@ -18,7 +18,6 @@ pub(super) const GY: usize = 3;
 pub(super) const HXX: usize = 6;
 pub(super) const HXY: usize = 9;
 pub(super) const HYY: usize = 12;
-/// Number of `f32` coefficients.
 pub(super) const SLOPES: usize = 15;
 
 /// Maximum half phase (rad) over a block for which the closed form's polynomials hold.
@@ -55,7 +54,6 @@ impl BlockGroup {
 /// Blocks of one size.
 #[derive(Debug)]
 pub(super) struct BlockSet {
-    /// Number of children along a block's side.
     pub children: usize,
     /// Index of each block's pixel in a row.
     pub pixels: Vec<u32>,
@@ -63,7 +61,6 @@ pub(super) struct BlockSet {
     pub groups: Vec<BlockGroup>,
 }
 
-/// One fitted block.
 #[derive(Clone, Copy, Debug)]
 struct FittedBlock {
     children: usize,
@@ -184,7 +181,6 @@ impl FittedBlock {
     }
 }
 
-/// Fits a block of m x m children.
 fn fit(children: &[Vec3], m: usize) -> FittedBlock {
     let variance = (1.0 - 1.0 / (m * m) as f64) / 12.0;
     let place = |k: usize| (k as f64 + 0.5) / m as f64 - 0.5;

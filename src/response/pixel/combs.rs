@@ -59,7 +59,6 @@ pub fn comb_sums(
     Ok(sums)
 }
 
-/// Adds one chunk of the sky, without the area.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add_chunk(pair: &KernelGeometry, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &mut [Complex64]) {
     const FMA: bool =

@@ -11,13 +11,11 @@ use crate::units::vector::{Vec3, dot, scale};
 /// Number of directions that a kernel handles at a time; its buffers fit the first-level cache.
 pub(super) const CHUNK: usize = 256;
 
-/// The components of a chunk of directions.
 pub(super) type ChunkDirections<'a> = [&'a [f64; CHUNK]; 3];
 
 /// A chunk of the sky shorter than [`CHUNK`], padded with pixels of 0 K.
 pub(super) struct PaddedChunk {
     n: [[f64; CHUNK]; 3],
-    /// Temperatures, K.
     pub sky_k: [f32; CHUNK],
 }
 
@@ -33,7 +31,6 @@ impl PaddedChunk {
         chunk
     }
 
-    /// Directions.
     #[inline(always)]
     pub fn directions(&self) -> ChunkDirections<'_> {
         [&self.n[0], &self.n[1], &self.n[2]]
@@ -162,13 +159,11 @@ impl KernelGeometry {
     }
 }
 
-/// Scalar product in `f64`.
 #[inline(always)]
 pub(super) fn dot64<const FMA: bool>(a: Vec3, x: f64, y: f64, z: f64) -> f64 {
     fused64::<FMA>(a[0], x, fused64::<FMA>(a[1], y, a[2] * z))
 }
 
-/// Scalar product in `f32`.
 #[inline(always)]
 pub(super) fn dot32<const FMA: bool>(a: [f32; 3], x: f32, y: f32, z: f32) -> f32 {
     fused::<FMA>(a[0], x, fused::<FMA>(a[1], y, a[2] * z))

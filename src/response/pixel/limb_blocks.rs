@@ -78,7 +78,6 @@ struct ColumnSlice {
 }
 
 impl BlockFields {
-    /// Sums over the children of a slice.
     #[inline(always)]
     fn sum<const FMA: bool>(&self, slice: ColumnSlice) -> [f32; 2] {
         let per_side = 1.0 / slice.children as f32;

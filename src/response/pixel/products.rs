@@ -26,10 +26,8 @@ const ROWS: usize = 8;
 /// Number of parts of a product, each with its own sums.
 const PARTS: usize = 32;
 
-/// Pixels of a chunk.
 const CHUNK: usize = GROUP;
 
-/// Lanes of partial sums.
 const LANES: usize = 16;
 
 /// Real and imaginary parts of a row over a chunk of pixels.
@@ -84,7 +82,6 @@ struct RowGroup {
 /// Factors of the real and imaginary parts of each row of a block, by column.
 type Factors = Vec<[[f32; 2]; ROWS]>;
 
-/// Sums over a map, chunk by chunk.
 type ChunkSums = Vec<[f64; CHUNK]>;
 
 impl RowProducts {
@@ -137,19 +134,19 @@ impl RowProducts {
     /// Computes `Bt W B x` for several x, with W the weights of the pairs.
     #[must_use]
     pub fn normal(&self, pairs: &[PairGeometry], weights: &[f64], x: &[&[f64]]) -> Vec<Vec<f64>> {
-        let scaled: Vec<ScaledMap> = x.iter().map(|x| self.scaled(x)).collect();
+        let scaled: Vec<ScaledMap> = x.iter().map(|x| self.scale_map(x)).collect();
         let largest = weights.iter().copied().fold(0.0, f64::max);
         let mut sums = self.sums(pairs, x.len(), &|group, chunked_rows, sums| {
-            let seen = chunked_rows.forward(group.count, &scaled);
-            let factors = |seen: &[[f64; 2]; ROWS]| {
+            let visibilities = chunked_rows.forward(group.count, &scaled);
+            let factors = |visibilities: &[[f64; 2]; ROWS]| {
                 let mut factors = [[0.0; 2]; ROWS];
                 for (row, factors) in factors.iter_mut().enumerate().take(group.count) {
                     let weight = weights[group.first + row] / largest;
-                    *factors = seen[row].map(|seen| (weight * seen) as f32);
+                    *factors = visibilities[row].map(|part| (weight * part) as f32);
                 }
                 factors
             };
-            chunked_rows.add_to(group.count, &seen.iter().map(factors).collect(), sums);
+            chunked_rows.add_to(group.count, &visibilities.iter().map(factors).collect(), sums);
         });
         let area_sr = pixel_area_sr(self.rows.nside());
         for (sums, scaled) in sums.iter_mut().zip(&scaled) {
@@ -187,19 +184,25 @@ impl RowProducts {
     /// Computes `B x`: one value per pair.
     #[must_use]
     pub fn forward(&self, pairs: &[PairGeometry], x: &[f64]) -> Vec<Complex64> {
-        let scaled = [self.scaled(x)];
+        let scaled = [self.scale_map(x)];
         let unit = pixel_area_sr(self.rows.nside()) * scaled[0].scale;
-        let of_block = |chunked_rows: &mut ChunkedRows, group: &RowGroup| -> Vec<Complex64> {
+        let values_of_group = |chunked_rows: &mut ChunkedRows, group: &RowGroup| -> Vec<Complex64> {
             self.compute_rows(pairs, group, chunked_rows);
-            let seen = chunked_rows.forward(group.count, &scaled);
-            seen[0][..group.count].iter().map(|[re, im]| Complex64::new(re * unit, im * unit)).collect()
+            let visibilities = chunked_rows.forward(group.count, &scaled);
+            visibilities[0][..group.count]
+                .iter()
+                .map(|[re, im]| Complex64::new(re * unit, im * unit))
+                .collect()
         };
-        let blocks = self.blocks(pairs);
-        blocks.par_iter().map_init(|| ChunkedRows::new(self.chunks.len()), of_block).flatten_iter().collect()
+        let groups = self.row_groups(pairs);
+        groups
+            .par_iter()
+            .map_init(|| ChunkedRows::new(self.chunks.len()), values_of_group)
+            .flatten_iter()
+            .collect()
     }
 
-    /// Converts a map to scaled chunks.
-    fn scaled(&self, x: &[f64]) -> ScaledMap {
+    fn scale_map(&self, x: &[f64]) -> ScaledMap {
         let largest = x.iter().map(|x| x.abs()).fold(0.0, f64::max);
         let scale = if largest > 0.0 { largest } else { 1.0 };
         let chunk = |places: &[usize]| {
@@ -213,7 +216,7 @@ impl RowProducts {
     }
 
     /// Divides pairs into groups of consecutive pairs of one class, and builds the tables of these classes.
-    fn blocks(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
+    fn row_groups(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
         let is_average = self.rows.method() == PixelMethod::Average;
         let mut blocks: Vec<RowGroup> = Vec::new();
         for (k, pair) in pairs.iter().enumerate() {
@@ -236,7 +239,7 @@ impl RowProducts {
         columns: usize,
         add: &(dyn Fn(&RowGroup, &ChunkedRows, &mut [ChunkSums]) + Sync),
     ) -> Vec<Vec<f64>> {
-        let blocks = self.blocks(pairs);
+        let groups = self.row_groups(pairs);
         let part = |blocks: &[RowGroup]| -> Vec<ChunkSums> {
             let mut sums = vec![vec![[0.0; CHUNK]; self.chunks.len()]; columns];
             let mut chunked_rows = ChunkedRows::new(self.chunks.len());
@@ -246,7 +249,7 @@ impl RowProducts {
             }
             sums
         };
-        let parts: Vec<_> = blocks.par_chunks(blocks.len().div_ceil(PARTS).max(1)).map(part).collect();
+        let parts: Vec<_> = groups.par_chunks(groups.len().div_ceil(PARTS).max(1)).map(part).collect();
         (0..columns)
             .map(|column| {
                 let mut sums = vec![0.0; self.pixels()];
@@ -259,7 +262,6 @@ impl RowProducts {
             .collect()
     }
 
-    /// Computes the rows of a group.
     fn compute_rows(&self, pairs: &[PairGeometry], group: &RowGroup, chunked_rows: &mut ChunkedRows) {
         let pairs = &pairs[group.first..][..group.count];
         let prepared: Vec<KernelGeometry> = pairs.iter().map(KernelGeometry::pair).collect();
@@ -316,7 +318,6 @@ impl ChunkedRows {
         }
     }
 
-    /// Multiplies the first `count` rows by vectors.
     fn forward(&self, count: usize, x: &[ScaledMap]) -> Vec<[[f64; 2]; ROWS]> {
         let column = |x: &ScaledMap| {
             let mut lanes = [[[0.0_f64; LANES]; 2]; ROWS];
@@ -328,7 +329,6 @@ impl ChunkedRows {
         x.iter().map(column).collect()
     }
 
-    /// Adds the first `count` rows times their factors to `sums`.
     fn add_to(&self, count: usize, factors: &Factors, sums: &mut [ChunkSums]) {
         for (k, (pieces, views)) in self.pieces.iter().zip(&self.views).enumerate() {
             for (sums, factors) in sums.iter_mut().zip(factors) {

@@ -237,7 +237,6 @@ pub(super) fn means_of_group(pair: &KernelGeometry, children: usize, group: &Blo
     }
 }
 
-/// Averages the blocks of each pixel.
 fn sum_whole(pair: &KernelGeometry, class: &BlockClass, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
     let per_pixel = class.per_side * class.per_side;
@@ -261,7 +260,6 @@ pub(super) fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32
     }
 }
 
-/// Adds the smaller blocks that fill gaps.
 fn add_finer(pair: &KernelGeometry, set: &BlockSet, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
     let fraction = (set.children * set.children) as f32 / (CHILDREN * CHILDREN) as f32;

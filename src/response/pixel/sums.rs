@@ -8,7 +8,6 @@ use super::kernel::{CHUNK, ChunkDirections, KernelGeometry, PaddedChunk, dot64, 
 use super::{Directions, PairGeometry, ResponseError, SatelliteAntenna, SingleGeometry};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
-/// Pairs of one task.
 const PAIRS_PER_TASK: usize = 32;
 
 /// Directions that a task sums for all its pairs before the next section; they stay in the second-level cache.

@@ -4,7 +4,6 @@ use std::fmt;
 
 use super::error::FitsProblem;
 
-/// Length of a card, bytes.
 pub(super) const CARD_BYTES: usize = 80;
 /// Column at which fixed-format numbers end.
 const VALUE_END: usize = 30;

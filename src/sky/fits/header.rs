@@ -61,7 +61,6 @@ impl Header {
         Self { cards }
     }
 
-    /// Returns the first card of a keyword.
     pub(super) fn card(&self, key: &str) -> Option<&Card> {
         self.cards.iter().find(|card| card.key == key)
     }

@@ -6,9 +6,7 @@ use super::header::Header;
 use crate::units::Dimension;
 use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 
-/// Keywords of a map's frequency.
 const FREQUENCY_KEYS: [&str; 5] = ["FREQ", "FREQUENCY", "OBSFREQ", "RESTFRQ", "RESTFREQ"];
-/// Keywords of the unit of FREQ.
 const FREQUENCY_UNIT_KEYS: [&str; 3] = ["FREQUNIT", "FREQ_UNI", "UNITFREQ"];
 
 /// Relative difference up to which two frequencies count as equal, as headers may lose digits.
@@ -88,7 +86,6 @@ fn stated_hz(header: &Header, card: &Card) -> Result<f64, FitsProblem> {
     if hz.is_finite() && hz > 0.0 { Ok(hz) } else { Err(wrong()) }
 }
 
-/// Parses a unit of frequency, Hz.
 fn unit_hz(word: &str) -> Option<f64> {
     match word.to_ascii_lowercase().as_str() {
         "hz" => Some(1.0),
@@ -129,7 +126,6 @@ fn hz_in(text: &str) -> Option<f64> {
     (number > 0.0 && number.is_finite()).then_some(number * unit)
 }
 
-/// Unit of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum MapUnit {
     /// Multiple of 1 K.

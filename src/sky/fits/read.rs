@@ -13,7 +13,6 @@ use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count}
 use crate::sky::{Frame, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// Approximate size of one read, bytes.
 const PIECE_BYTES: usize = 1 << 20;
 /// Maximum number of header-data units before the table.
 const UNITS_MAX: usize = 1000;
@@ -264,7 +263,6 @@ fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u
     Err(FitsProblem::NoTable { units })
 }
 
-/// Unit of a column, counted from 1; empty if not stated.
 fn unit(header: &Header, column: usize) -> Result<String, FitsProblem> {
     let key = format!("TUNIT{column}");
     match header.get(&key) {

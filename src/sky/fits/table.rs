@@ -3,7 +3,6 @@
 use super::error::FitsProblem;
 use super::header::Header;
 
-/// Types of cells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CellType {
     /// Unsigned byte, B.
@@ -22,7 +21,6 @@ pub(super) enum CellType {
     Other,
 }
 
-/// A column of the table.
 #[derive(Clone, Debug)]
 pub(super) struct ColumnLayout {
     pub name: String,
@@ -127,7 +125,6 @@ impl ColumnLayout {
         })
     }
 
-    /// Returns the column's part of a row.
     pub(super) fn cells<'a>(&self, row: &'a [u8]) -> &'a [u8] {
         &row[self.offset..self.offset + self.width]
     }
@@ -148,7 +145,6 @@ impl ColumnLayout {
         }
     }
 
-    /// Appends the integers of the column's part of a row.
     pub(super) fn decode_integers(&self, cells: &[u8], out: &mut Vec<i64>) {
         let zero = self.zero as i64;
         match self.cell {

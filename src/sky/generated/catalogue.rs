@@ -42,7 +42,6 @@ pub enum CatalogueError {
     },
 }
 
-/// A point source of a catalogue.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Source {
     /// Direction on ecliptic axes, a unit vector.
@@ -95,7 +94,6 @@ impl fmt::Display for Catalogue {
 }
 
 impl Catalogue {
-    /// Reads a catalogue.
     pub(super) fn read(path: &Path) -> Result<Self, CatalogueError> {
         Reader { path }.read()
     }

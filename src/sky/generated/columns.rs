@@ -6,7 +6,6 @@ use crate::sky::Frame;
 /// Frequency of GLEAM's wide-band fluxes and fits, Hz.
 const GLEAM_WIDE_HZ: f64 = 200e6;
 
-/// Frequency of VLSSr, Hz.
 const VLSSR_HZ: f64 = 73.8e6;
 
 /// Names of longitude and latitude columns in each frame, without case and punctuation.

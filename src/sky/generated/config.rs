@@ -6,9 +6,7 @@ use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Range of frequencies of generated skies, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
-/// Maximum nside of generated skies.
 const NSIDE_MAX: usize = 1024;
 
 keys! {

@@ -77,7 +77,6 @@ fn depth_per_measure(frequency_hz: f64) -> f64 {
     3.28e-7 * (ELECTRON_K / 1e4).powf(-1.35) * (frequency_hz / 1e9).powf(-OPACITY_INDEX)
 }
 
-/// Nebula at one frequency.
 struct Screen {
     direction: Vec3,
     sin2_radius: f64,
@@ -86,7 +85,6 @@ struct Screen {
     before_loops: bool,
 }
 
-/// Loops and nebulae at one frequency.
 pub(super) struct Features {
     loops: Vec<(Vec3, f64, f64)>,
     loop_depth: f64,
@@ -95,7 +93,6 @@ pub(super) struct Features {
     screens: Vec<Screen>,
 }
 
-/// Line of sight with loops and nebulae.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FeatureSight {
     /// Temperature with loops and nebulae, K.

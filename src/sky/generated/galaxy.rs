@@ -16,7 +16,6 @@ pub(super) const REFERENCE_HZ: f64 = 10e6;
 pub(super) const SYNCHROTRON_INDEX: f64 = 2.51;
 /// Frequency index of the free-free opacity.
 pub(super) const OPACITY_INDEX: f64 = 2.1;
-/// Temperature of the ionised gas, K.
 pub(super) const ELECTRON_K: f64 = 8_000.0;
 
 /// Galactocentric distance of the Sun, kpc (GRAVITY Collaboration 2019).
@@ -92,7 +91,6 @@ fn sech2(x: f64) -> f64 {
     4.0 * e / ((1.0 + e) * (1.0 + e))
 }
 
-/// Edges of the steps, kpc.
 fn step_edges() -> [f64; STEPS + 1] {
     let top = (LENGTH_KPC / FIRST_KPC).ln_1p();
     std::array::from_fn(|k| FIRST_KPC * (top * k as f64 / STEPS as f64).exp_m1())
@@ -140,15 +138,14 @@ pub(super) struct Galaxy {
     opacity_scale: f64,
     /// Standard deviation of the logarithm of the gas's opacity.
     cloud_rms: f64,
-    /// Logarithm of the optical depth at the reference frequency, [latitude][longitude].
+    /// Logarithm of the optical depth at the reference frequency, `[latitude][longitude]`.
     depth: Vec<f64>,
-    /// Logarithm of the unabsorbed temperature, [latitude][longitude].
+    /// Logarithm of the unabsorbed temperature, `[latitude][longitude]`.
     unabsorbed: Vec<f64>,
-    /// Logarithm of the absorbed temperature, [latitude][longitude][cloudiness].
+    /// Logarithm of the absorbed temperature, `[latitude][longitude][cloudiness]`.
     absorbed: Vec<f64>,
 }
 
-/// Line of sight through the smooth Galaxy.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct GalaxySight {
     /// Absorbed synchrotron temperature, K.
@@ -230,7 +227,6 @@ impl Galaxy {
     }
 }
 
-/// Unit vector of a longitude and latitude.
 pub(super) fn direction_of(longitude_rad: f64, latitude_rad: f64) -> Vec3 {
     let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
     let (sin_latitude, cos_latitude) = latitude_rad.sin_cos();

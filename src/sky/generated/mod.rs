@@ -52,7 +52,6 @@ const HASLAM_HZ: f64 = 408e6;
 /// by T = I c^2 / (2 k nu^2).
 const EXTRAGALACTIC_K: f64 = 5.468e4;
 
-/// Temperature index of the extragalactic background.
 const EXTRAGALACTIC_INDEX: f64 = 2.80;
 
 /// Minimum factor of the fluctuations on the diffuse emission.
@@ -109,7 +108,6 @@ pub fn generate(
     Ok(if fine == nside { kelvin } else { averaged(&kelvin, fine, nside) })
 }
 
-/// Diffuse sky at one frequency.
 struct DiffuseSky<'a> {
     config: &'a GeneratedSky,
     to_galactic: Rotation,
@@ -159,7 +157,6 @@ impl<'a> DiffuseSky<'a> {
     }
 }
 
-/// Values of the random fields at one pixel.
 #[derive(Clone, Copy, Debug)]
 struct FieldValues {
     small: f64,

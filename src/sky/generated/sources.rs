@@ -28,11 +28,9 @@ pub(super) fn differential_counts(flux_jy: f64) -> f64 {
     10.0_f64.powf(log - 2.5 * x)
 }
 
-/// Integrated source counts between two fluxes.
 struct Counts {
     /// ln S at the first node.
     first: f64,
-    /// Step of ln S.
     step: f64,
     /// Number of sources per sr fainter than each node.
     below: Vec<f64>,
@@ -66,10 +64,8 @@ impl Counts {
     }
 }
 
-/// A point source.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct PointSource {
-    /// Direction, a unit vector.
     pub direction: Vec3,
     /// Flux at 154 MHz, Jy.
     pub flux_jy: f64,

@@ -123,7 +123,6 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
         }
     }
 
-    /// Minimum and maximum scale.
     #[inline(always)]
     fn scales(&self) -> (f64, f64) {
         let simd = self.simd;
@@ -240,7 +239,6 @@ impl<S: Simd, const U: usize> FunctionSink<S, U> for SumRings<'_, S, U> {
     }
 }
 
-/// Loads `U` vectors from a slice.
 #[inline(always)]
 fn load<S: Simd, const U: usize>(values: &[f64]) -> [S::f64s; U] {
     let vectors = S::as_simd_f64s(values).0;

@@ -73,7 +73,6 @@ impl RingLanes {
     }
 }
 
-/// Returns 2^`exponent`.
 pub(super) const fn power_of_two(exponent: i32) -> f64 {
     f64::from_bits(((1023 + exponent) as u64) << 52)
 }

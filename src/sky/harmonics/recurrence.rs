@@ -12,7 +12,6 @@ use std::f64::consts::PI;
 
 /// Tables of one order m; computed function j has degree m + 2 j.
 pub(super) struct Order {
-    /// The order m.
     pub m: usize,
     /// Factor of the first function, p_m = `start` (sin theta)^m.
     pub start: f64,
@@ -24,7 +23,6 @@ pub(super) struct Order {
     between: Vec<[f64; 2]>,
 }
 
-/// Computes the tables of all orders up to `l_max`.
 pub(super) fn all_orders(l_max: usize) -> Vec<Order> {
     use rayon::prelude::*;
     let mut start = (0.25 / PI).sqrt();
@@ -68,7 +66,6 @@ impl Order {
         Self { m, start, steps, scale, between }
     }
 
-    /// Number of computed functions.
     pub(super) fn len(&self) -> usize {
         self.steps.len()
     }

@@ -30,7 +30,6 @@ pub(super) struct RingPair<P> {
     pub south: P,
 }
 
-/// Buffers for the transform of one ring.
 pub(super) struct Scratch {
     phase: Vec<Complex64>,
     spectrum: Vec<Complex64>,
