@@ -259,7 +259,7 @@ impl ReplayArgs {
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
         let of_state = self.state.as_deref().map(|folder| {
             let source = source.clone();
-            match job.ranks().are_many() {
+            match job.ranks().is_distributed() {
                 true => source.of_state_for_ranks(folder),
                 false => source.of_state(folder),
             }

@@ -91,8 +91,8 @@ impl Ground {
     /// Also accumulates additional noise realisations, one per seed. Only for final maps of the harmonic engine, without an archive.
     #[must_use]
     #[doc(hidden)]
-    pub fn with_noises(self, seeds: &[u64]) -> Self {
-        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noise_realisations(seeds), ..self }
     }
 
     /// Reports through `answers` which data the checkpoints hold, for senders that wait for it. It needs an archive and, from its
@@ -173,7 +173,7 @@ impl Ground {
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
                 let written = self.checkpoint();
-                if self.ranks().are_many() {
+                if self.ranks().is_distributed() {
                     // Without it the parts of the other ranks are useless.
                     written?;
                 }
@@ -357,7 +357,7 @@ impl Ground {
     /// Whether a checkpoint is due by the age of unsaved data. Ranks write at the same place of the stream, so never for them.
     fn is_old(&self) -> bool {
         let saves = self.archive.as_ref().is_some_and(Archive::saves_during_session);
-        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
+        saves && !self.ranks().is_distributed() && self.outcome.saving.is_old()
     }
 
     /// Whether the only checkpoint in the folder is the one that would be written now.
@@ -370,7 +370,7 @@ impl Ground {
     ///
     /// With ranks, a failure is an error. A cancelled rank writes none, as it stopped at another place of the stream than the others.
     fn last_checkpoint(&mut self) -> Result<(), GroundError> {
-        if self.ranks().are_many() {
+        if self.ranks().is_distributed() {
             return if self.cancel.is_cancelled() { Ok(()) } else { self.checkpoint() };
         }
         for pause in LAST_CHECKPOINT_PAUSES {

@@ -232,7 +232,7 @@ impl Console {
                 report,
             }
         });
-        let solving = watched.and_then(|watched| watched.solving.now());
+        let solving = watched.and_then(|watched| watched.solving.progress());
         let saving = ground.and_then(|ground| ground.saving.report());
         let read = |ground: &GroundOutcome| {
             let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();

@@ -193,7 +193,7 @@ impl Recalibration {
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
             return Ok(());
         };
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
@@ -252,7 +252,7 @@ impl Recalibration {
     /// Writes the archive twice, so that falling back to the older checkpoint does not bring the old gains back.
     fn write(self, new: &GroundConfig) -> Result<Recalibrated, GroundError> {
         let Self { mut ground, journal, mut report, .. } = self;
-        ground.accumulator.set_spans(&journal.spans_s());
+        ground.accumulator.retain_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             let settings = settings_of(new)?;
             let gains = settings.iter().find(|(key, _)| key == "calibration.gains_file");

@@ -14,7 +14,7 @@ use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::pass_gate::PassGate;
 use crate::ground::{Collector, DeliveredPacket, GroundError, SharedSaving};
-use crate::imaging::anywhere::SegmentPlace;
+use crate::imaging::anywhere::SegmentFolder;
 use crate::imaging::{AccumulationError, Accumulator};
 use crate::runtime::{Ledger, LedgerReport};
 
@@ -150,7 +150,7 @@ impl Archive {
             ArchiveHeadRef { settings: &self.settings, journal: &self.journal, version: self.version };
         let head = parts.view(collector, (calibrator, gate), accumulator, &no_autos);
         let (folder, number) = self.folder.next();
-        let place = SegmentPlace { folder: &folder, number };
+        let place = SegmentFolder { folder: &folder, number };
         self.folder.save(|out, path| {
             let add_path = |error| match error {
                 AccumulationError::Io(source) => GroundError::io(path, "write")(source),

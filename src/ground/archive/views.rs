@@ -226,7 +226,7 @@ mod tests {
             (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters(), notes)
         };
         let session = |ranks: &Ranks, bytes: &[u8]| session_in(folder.path(), ranks, bytes);
-        let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::one(), bytes));
+        let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::single(), bytes));
         let names = || {
             let entries = std::fs::read_dir(folder.path()).unwrap();
             let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
@@ -253,9 +253,9 @@ mod tests {
         assert!(again[0].2[0].contains("parts of one checkpoint"), "{:?}", again[0].2);
         assert_eq!((&again[1].0, &again[1].1), (&expected[1].0, &expected[1].1));
         // A single process resumes, and its checkpoints replace the earlier sets.
-        let alone = session(&Ranks::one(), &[]);
+        let alone = session(&Ranks::single(), &[]);
         assert_eq!((&alone.0, &alone.1), (&expected[2].0, &expected[2].1));
-        session(&Ranks::one(), &[]);
+        session(&Ranks::single(), &[]);
         let expected_names = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
         assert_eq!(names(), expected_names.into_iter().collect());
     }
