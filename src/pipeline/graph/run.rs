@@ -199,7 +199,7 @@ pub fn simulate(
 ) -> Result<Report, PipelineError> {
     let to = to.into();
     if plan.config.downlink.link.is_on() && to.file.is_none() {
-        return Err(DownlinkError::from(SocketError::TruthNowhere).into());
+        return Err(DownlinkError::from(SocketError::NoTruthFile).into());
     }
     if let Some(file) = &to.file {
         write_instrument_truth(plan, file)?;
