@@ -472,6 +472,8 @@ fn antennas_by_files_are_those_of_keys() {
             "--set",
             "map.engine=harmonic",
             "--set",
+            "map.rows=average",
+            "--set",
             "map.refine.passes_max=1",
             "--set",
             "spacecraft.model=general",
