@@ -276,7 +276,7 @@ fn fit_table(table: &Table, left_max: f64) -> Result<(Vec<FittedSet>, f64), Stri
         let mut set = Vec::new();
         for (dipole, samples) in samples.into_iter().enumerate() {
             let (fitted, left) = fit(samples, phase, dipole);
-            if !(left <= left_max) {
+            if left.is_nan() || left > left_max {
                 return Err(format!(
                     "{}: a dipole with an effective axis and a form of degree 2 leaves {:.2} % of the table; expected at most \
                      {:.2} % (table_error_max)",
@@ -449,9 +449,9 @@ fn start(samples: &[Sample], phase: Complex64, dipole: usize) -> Numbers {
         match sample.value {
             // The mean of a field is two thirds of its axis.
             Value::Field(field) => {
-                for k in 0..2 {
-                    let part = 1.5 * sample.weight / weight * (field[k] * phase).re;
-                    axis = add(axis, scale(part, sample.across[k]));
+                for (part, across) in field.into_iter().zip(sample.across) {
+                    let part = 1.5 * sample.weight / weight * (part * phase).re;
+                    axis = add(axis, scale(part, across));
                 }
             }
             Value::Gain(gain) => power += 1.5 * sample.weight / weight * gain,
@@ -468,14 +468,13 @@ fn solved(mut matrix: [[f64; 9]; 8]) -> Option<[f64; 8]> {
     for k in 0..8 {
         let pivot = (k..8).max_by(|a, b| matrix[*a][k].abs().total_cmp(&matrix[*b][k].abs()))?;
         matrix.swap(k, pivot);
-        if !(matrix[k][k].abs() > 0.0) {
+        if matrix[k][k] == 0.0 || matrix[k][k].is_nan() {
             return None;
         }
-        for row in k + 1..8 {
-            let factor = matrix[row][k] / matrix[k][k];
-            for column in k..9 {
-                matrix[row][column] -= factor * matrix[k][column];
-            }
+        let from = matrix[k];
+        for row in &mut matrix[k + 1..] {
+            let factor = row[k] / from[k];
+            row.iter_mut().zip(from).skip(k).for_each(|(x, of_pivot)| *x -= factor * of_pivot);
         }
     }
     let mut x = [0.0; 8];
@@ -541,7 +540,7 @@ mod tests {
             .collect();
         let gains = format!("frequency_hz,theta_deg,phi_deg,gain_db\n{gains}");
         for (text, q, left) in [(fields, q, left), (gains, -0.161_104_852, 0.001_310_502)] {
-            let tables = read(&[text.clone()], 0.02).unwrap();
+            let tables = read(std::slice::from_ref(&text), 0.02).unwrap();
             let [FittedDipole { axis, form }] = tables.dipoles_at(0, 2e6)[..] else { panic!() };
             assert!(norm(sub(axis, [0.0, 0.0, 1.0])) < 1e-6, "{axis:?}");
             // 1 + q P_2 is 1 - q / 2 across the axis, 1 + q along it.
@@ -650,7 +649,7 @@ mod tests {
                 format!("{HEADER}{good}").replace("e_phi_im", "e_phi"),
                 "expected frequency_hz, theta_deg, phi_deg",
             ),
-            (format!("{HEADER}"), "no directions"),
+            (HEADER.to_owned(), "no directions"),
             (String::new(), "no lines"),
             (
                 "frequency_hz,dipole,theta_deg,phi_deg,gain\n1e6,1,0,0,1\n1e6,2,0,0,1\n".to_owned(),
