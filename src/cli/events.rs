@@ -71,7 +71,7 @@ impl Events {
     /// Starts to report a graph: the run, or a further reading of it.
     pub(super) fn watch(&self, handles: &RunHandles) {
         let Some(writer) = &self.writer else { return };
-        handles.maps.join(Box::new(writer.viewer()));
+        handles.maps.add_viewer(Box::new(writer.viewer()));
         writer.send(Message::Watch(Box::new(handles.clone())));
     }
 

@@ -55,7 +55,7 @@ impl Progress {
         let (stop, stopped) = channel();
         let cancel = cancel.clone();
         if is_json() {
-            handles.maps.join(Box::new(LogViewer));
+            handles.maps.add_viewer(Box::new(LogViewer));
         }
         let thread = std::thread::spawn(move || {
             let mut view = ProgressView::new(total);

@@ -409,7 +409,8 @@ impl Session<'_> {
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
-            (source, ground) = (source.answering(&answers), ground.answering(&answers).beginning_with_maps());
+            (source, ground) =
+                (source.answering(&answers), ground.with_answers(&answers).with_initial_snapshot());
             if !args.no_archive {
                 let bytes_max = args.archive_max.unwrap_or(ARCHIVE_BYTES_MAX);
                 let kept = ground.keep_packets(args.archive.as_deref(), bytes_max)?;

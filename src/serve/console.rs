@@ -126,7 +126,7 @@ impl Console {
     pub(super) fn set_run(&self, handles: &RunHandles) {
         let viewer =
             PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log), started: self.started };
-        handles.maps.join(Box::new(viewer));
+        handles.maps.add_viewer(Box::new(viewer));
         if let Some(ground) = &handles.ground {
             ground.live_view.open();
         }

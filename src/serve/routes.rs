@@ -291,7 +291,7 @@ async fn gaps(State(page): State<PageState>) -> Response {
             "gaps need a ground segment with a state; expected replay --state DIR",
         );
     };
-    match run_slow(&page, move || CoverageSurvey::of(&folder).map(|survey| survey.gaps())).await {
+    match run_slow(&page, move || CoverageSurvey::read(&folder).map(|survey| survey.gaps())).await {
         Ok(Ok(gaps)) => json(&gaps),
         // There is no checkpoint yet.
         Ok(Err(error)) => refusal(StatusCode::SERVICE_UNAVAILABLE, &error.to_string()),

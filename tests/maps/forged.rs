@@ -87,7 +87,7 @@ fn positions_just_above_the_surface_or_far_away_end_no_refined_ground() {
         let mut out = Outlet::collect();
         accumulator.step(PlacedFrame::Instrument(instrument()), &mut out).unwrap();
         for _ in 0..2 {
-            ledger.sampled(bad.len() as u64);
+            ledger.add_sampled(bad.len() as u64);
             accumulator.step(PlacedFrame::Visibilities(bad.clone()), &mut out).unwrap();
             bad.time_s.iter_mut().for_each(|time_s| *time_s += 1e4);
         }
@@ -108,11 +108,11 @@ fn positions_within_the_moon_make_no_engine_and_end_nothing() {
         let count = good.len() as u64;
         accumulator.step(PlacedFrame::Instrument(instrument()), &mut out).unwrap();
         for placed in [&bad, &good] {
-            ledger.sampled(count);
+            ledger.add_sampled(count);
             accumulator.step(PlacedFrame::Visibilities(placed.clone()), &mut out).unwrap();
         }
         accumulator.finish(&mut out).unwrap();
-        let report = ledger.close().unwrap();
+        let report = ledger.balanced_report().unwrap();
         assert_eq!((report.count(VisibilityReason::OffAltitude), report.accumulated), (count, count));
         assert_eq!(out.into_vec().len(), 1);
     }

@@ -21,7 +21,7 @@ use crate::imaging::circle::{HarmonicEngine, HarmonicSums};
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};
 use crate::imaging::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 
 /// Memory of a visibility while it is held, sorted and refined with, bytes: the arrays' elements, and what they grow by.
 pub const REFINED_VISIBILITY_BYTES: u64 = 400;
@@ -172,7 +172,7 @@ impl VisibilityArchive {
     }
 
     /// The visibilities, sorted, and the noise of their companion.
-    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<PairAt>, RefinedData) {
+    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<TimedPair>, RefinedData) {
         self.circle = None;
         self.sort();
         self.flush();

@@ -5,7 +5,7 @@ use num_complex::Complex64;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::exact::checkpoint::{RESPONSES, number_of, refused};
 use crate::imaging::{AccumulationError, Refusal};
-use crate::response::general::{PairAt, check_positions};
+use crate::response::general::{TimedPair, check_positions};
 use crate::response::harmonic::GeometryLimits;
 use crate::units::ChannelId;
 use crate::units::vector::Vec3;
@@ -97,7 +97,7 @@ impl VisibilitiesHead {
 /// A visibility that is held.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::imaging) struct ArchivedVisibility {
-    pub(in crate::imaging) at: PairAt,
+    pub(in crate::imaging) at: TimedPair,
     pub(in crate::imaging) band: u16,
     pub(in crate::imaging) value_k_sr: Complex64,
     pub(in crate::imaging) weight: f64,
@@ -117,7 +117,7 @@ impl ArchivedVisibility {
     ) -> Result<Self, Refusal> {
         let (r_i_m, r_j_m) = (placed.r_i_m[k], placed.r_j_m[k]);
         check_positions(r_i_m, r_j_m, moon_radius_m)?;
-        let at = PairAt { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
+        let at = TimedPair { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
         let (value_k_sr, weight) = (placed.value_k_sr[k], placed.weight[k]);
         // What is no length is that of an instant.
         let length_s = placed.duration_s.get(k).copied().filter(|length_s| *length_s > 0.0);
@@ -127,7 +127,7 @@ impl ArchivedVisibility {
     /// What visibilities are sorted by: all that they are, and nothing of how they arrived.
     pub(in crate::imaging) fn order(&self) -> ArchiveOrder {
         let Self { at, band, value_k_sr: value, weight, duration_s } = self;
-        let PairAt { pair, time_s, r_i_m, r_j_m } = *at;
+        let TimedPair { pair, time_s, r_i_m, r_j_m } = *at;
         (pair.i, pair.j, time_s, *band, value.re, value.im, *weight, r_i_m, r_j_m, *duration_s)
     }
 }

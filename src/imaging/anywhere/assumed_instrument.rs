@@ -3,7 +3,7 @@
 use crate::array::{orbit_normal_hat, tilted_axes};
 use crate::frames::AntennaResponse;
 use crate::response::PatternsByFrequency;
-use crate::response::general::{PairAt, PairResponse};
+use crate::response::general::{PairResponse, TimedPair};
 use crate::response::pixel::SatelliteAntenna;
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
@@ -11,7 +11,7 @@ use crate::units::vector::{Vec3, cross, dot, sub, unit};
 const SAME_PASS_S: f64 = 1500.0;
 
 /// Whether one visibility follows another of the same pair soon after.
-pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
+pub(in crate::imaging) fn is_same_pass(before: &TimedPair, after: &TimedPair) -> bool {
     let apart_s = after.time_s - before.time_s;
     before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
 }
@@ -59,7 +59,7 @@ impl AssumedInstrument {
         &self,
         elements: AntennaResponse,
         frequency_hz: f64,
-        at: &[PairAt],
+        at: &[TimedPair],
     ) -> Option<PairAntennas> {
         let (antennas, patterns) = (self.antennas.clone(), self.patterns.clone());
         let found = PairAntennas { antennas, patterns, frequency_hz, elements };
@@ -84,7 +84,7 @@ impl PairAntennas {
     }
 
     /// The response of a pair.
-    pub(in crate::imaging) fn response(&self, at: &[PairAt], k: usize) -> PairResponse {
+    pub(in crate::imaging) fn response(&self, at: &[TimedPair], k: usize) -> PairResponse {
         let pair = &at[k];
         let [normal_i, normal_j] = normals(at, k);
         let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
@@ -100,7 +100,7 @@ impl PairAntennas {
 }
 
 /// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
-fn leave_the_plane(at: &[PairAt]) -> bool {
+fn leave_the_plane(at: &[TimedPair]) -> bool {
     at.iter().enumerate().any(|(k, pair)| {
         let plane = unit(cross(pair.r_i_m, pair.r_j_m));
         normals(at, k).into_iter().any(|normal| {
@@ -111,7 +111,7 @@ fn leave_the_plane(at: &[PairAt]) -> bool {
 }
 
 /// Whether the satellites of a pair, each upright in its own orbit, have different attitudes.
-fn turn_apart(at: &[PairAt]) -> bool {
+fn turn_apart(at: &[TimedPair]) -> bool {
     at.iter().enumerate().any(|(k, pair)| {
         let [a, b] = normals(at, k);
         let (normals, verticals) = (sub(a, b), sub(unit(pair.r_i_m), unit(pair.r_j_m)));
@@ -122,7 +122,7 @@ fn turn_apart(at: &[PairAt]) -> bool {
 }
 
 /// Normals of the orbits of satellites i and j, as they move from or to a neighbouring visibility; without one that of their plane.
-fn normals(at: &[PairAt], k: usize) -> [Vec3; 2] {
+fn normals(at: &[TimedPair], k: usize) -> [Vec3; 2] {
     let here = &at[k];
     let after = at.get(k + 1).filter(|after| is_same_pass(here, after)).map(|after| [here, after]);
     let before = k.checked_sub(1).map(|k| &at[k]).filter(|before| is_same_pass(before, here));
@@ -132,7 +132,7 @@ fn normals(at: &[PairAt], k: usize) -> [Vec3; 2] {
         // A satellite j that leads turns it upside down; orbits are prograde more often than not.
         if normal[2] < 0.0 { normal.map(|x| -x) } else { normal }
     };
-    let normal = |of: fn(&PairAt) -> Vec3| {
+    let normal = |of: fn(&TimedPair) -> Vec3| {
         moves.and_then(|[from, to]| orbit_normal_hat(of(from), of(to))).unwrap_or_else(plane)
     };
     [normal(|at| at.r_i_m), normal(|at| at.r_j_m)]

@@ -23,7 +23,7 @@ use num_complex::Complex64;
 use super::archived::ArchivedVisibility;
 use crate::files::{AtomicFile, IfUnfinished};
 use crate::imaging::AccumulationError;
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 use crate::units::{ChannelId, Pair};
 
 /// Bytes of a held visibility on disk.
@@ -241,7 +241,7 @@ fn held(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
     let [time_s, a, b, c, d, e, f, re, im, weight] = numbers;
     let pair = Pair { i: bytes[0], j: bytes[1] };
     ArchivedVisibility {
-        at: PairAt { pair, time_s, r_i_m: [a, b, c], r_j_m: [d, e, f] },
+        at: TimedPair { pair, time_s, r_i_m: [a, b, c], r_j_m: [d, e, f] },
         band: u16::from_le_bytes([bytes[2], bytes[3]]),
         value_k_sr: Complex64::new(re, im),
         weight,
@@ -257,7 +257,7 @@ mod tests {
         let one = |k: usize| {
             let x = k as f64 + 0.25;
             ArchivedVisibility {
-                at: PairAt {
+                at: TimedPair {
                     pair: Pair { i: 1, j: 2 + (k % 5) as u8 },
                     time_s: x,
                     r_i_m: [x, -x, 1e-300],

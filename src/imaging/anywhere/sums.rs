@@ -14,7 +14,9 @@ use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums};
 use crate::imaging::circle::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 use crate::imaging::exact::noise::companion_noise;
 use crate::imaging::{AccumulationError, NormalEngine};
-use crate::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowPlan, RowsSetup};
+use crate::response::general::{
+    GeneralRows, ObservationDetails, PairResponse, RowPlan, RowsSetup, TimedPair,
+};
 use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, cross, dot};
@@ -37,18 +39,18 @@ pub(in crate::imaging) fn refined_sums(
         polynomial_degree: antennas.as_ref().map_or(0, PairAntennas::degree),
     });
     let response = antennas.as_ref().map(|antennas| |k: usize| antennas.response(&at, k));
-    let observed = Observed {
+    let observed = ObservationDetails {
         duration_s: if assumed.smear_integrations { &duration_s } else { &[] },
         response: response.as_ref().map(|of| of as &(dyn Fn(usize) -> PairResponse + Sync)),
     };
     // Each visibility was checked when it came.
-    let plan = rows.plan_of(&at, &observed).map_err(|error| AccumulationError::Rows(error.refusal))?;
+    let plan = rows.plan_with(&at, &observed).map_err(|error| AccumulationError::Rows(error.refusal))?;
     Ok(RefinedSums { circle, rows, plan, at, data, departures })
 }
 
 /// Visibilities as lists.
 pub(in crate::imaging) struct VisibilityColumns {
-    pub(in crate::imaging) at: Vec<PairAt>,
+    pub(in crate::imaging) at: Vec<TimedPair>,
     bands: Vec<u16>,
     pub(in crate::imaging) data: RefinedData,
     duration_s: Vec<f32>,
@@ -107,12 +109,12 @@ pub struct Departures {
 
 /// The normal of the orbit, m^2 and as the satellite turns, from where it moves to until the next visibility of the pair; `None` if
 /// the next is another pair's or another pass's. The planes of pairs lie across the orbit's if satellites do not follow each other.
-fn orbit_normal(before: &PairAt, after: &PairAt) -> Option<Vec3> {
+fn orbit_normal(before: &TimedPair, after: &TimedPair) -> Option<Vec3> {
     is_same_pass(before, after).then(|| cross(before.r_i_m, after.r_i_m))
 }
 
 /// Mean inclination of the orbits' planes; `None` if each visibility stands alone.
-fn orbit_inclination_rad(at: &dyn Fn(usize) -> PairAt, count: usize) -> Option<f64> {
+fn orbit_inclination_rad(at: &dyn Fn(usize) -> TimedPair, count: usize) -> Option<f64> {
     let (mut sum, mut found) = (0.0, 0.0);
     for k in 1..count {
         if let Some(normal) = orbit_normal(&at(k - 1), &at(k)) {
@@ -126,7 +128,7 @@ fn orbit_inclination_rad(at: &dyn Fn(usize) -> PairAt, count: usize) -> Option<f
 /// Phase of the orbit at visibility `k` of sorted ones, degrees from 0 to 360: the angle of satellite i from the ascending node, in the
 /// plane in which it moves from or to a neighbouring visibility. `None` without one, or for an orbit over the equator.
 #[must_use]
-pub fn orbit_phase_deg(at: &[PairAt], k: usize) -> Option<f64> {
+pub fn orbit_phase_deg(at: &[TimedPair], k: usize) -> Option<f64> {
     let here = at.get(k)?;
     let after = at.get(k + 1).and_then(|after| orbit_normal(here, after));
     let before = k.checked_sub(1).and_then(|before| orbit_normal(at.get(before)?, here));
@@ -142,11 +144,11 @@ pub fn orbit_phase_deg(at: &[PairAt], k: usize) -> Option<f64> {
 /// The circle of the mean radius and inclination of all.
 pub(in crate::imaging) fn nearest_circle(
     setup: &RefinedSetup,
-    at: &dyn Fn(usize) -> PairAt,
+    at: &dyn Fn(usize) -> TimedPair,
     count: usize,
 ) -> (NominalOrbit, Departures) {
     use std::f64::consts::PI;
-    let orientation = |at: PairAt| PairOrientation::of(at.r_i_m, at.r_j_m).ok();
+    let orientation = |at: TimedPair| PairOrientation::of_pair(at.r_i_m, at.r_j_m).ok();
     let found: Vec<PairOrientation> = (0..count).filter_map(|k| orientation(at(k))).collect();
     // A satellite j that leads turns the pair's plane upside down.
     let prograde = |pair: &PairOrientation| pair.inclination_rad.min(PI - pair.inclination_rad);
@@ -214,7 +216,7 @@ pub(in crate::imaging) fn circle_engine(
 fn circle_sums(
     setup: &RefinedSetup,
     orbit: NominalOrbit,
-    at: &[PairAt],
+    at: &[TimedPair],
     bands: &[u16],
     data: &RefinedData,
 ) -> Result<HarmonicSums, AccumulationError> {
@@ -263,7 +265,7 @@ pub struct RefinedSums {
     /// The plan of the rows, in the order of `at`.
     pub plan: RowPlan,
     /// Pairs, times and positions, sorted.
-    pub at: Vec<PairAt>,
+    pub at: Vec<TimedPair>,
     /// Data in that order.
     pub data: RefinedData,
     /// How far they are from the circle.
@@ -286,9 +288,9 @@ mod tests {
                 let (sp, cp) = (0.3 + 0.2 * k as f64).sin_cos();
                 let [x, y] = [2e6 * cp, 2e6 * sp];
                 let r_i_m = [x * co - y * so * ci, x * so + y * co * ci, y * si];
-                PairAt { pair: Pair { i: 0, j: 1 }, time_s: 60.0 * k as f64, r_i_m, r_j_m: [0.0; 3] }
+                TimedPair { pair: Pair { i: 0, j: 1 }, time_s: 60.0 * k as f64, r_i_m, r_j_m: [0.0; 3] }
             };
-            let all: Vec<PairAt> = (0..40).map(at).collect();
+            let all: Vec<TimedPair> = (0..40).map(at).collect();
             for k in 0..all.len() {
                 let expected = (0.3 + 0.2 * k as f64).to_degrees().rem_euclid(360.0);
                 let found = orbit_phase_deg(&all, k).unwrap();
@@ -299,7 +301,7 @@ mod tests {
             }
             // Alone, or long before the next, its plane is not known.
             assert_eq!(orbit_phase_deg(&all[..1], 0), None);
-            let late = PairAt { time_s: 1e6, ..all[1] };
+            let late = TimedPair { time_s: 1e6, ..all[1] };
             assert_eq!(orbit_phase_deg(&[all[0], late], 0), None);
         }
     }

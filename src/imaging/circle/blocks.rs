@@ -14,7 +14,7 @@ use super::tori::Tori;
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::imaging::power::Block;
 use crate::ranks::Ranks;
-use crate::response::harmonic::degrees;
+use crate::response::harmonic::degree_count;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::sky::harmonics::WignerTable;
 
@@ -205,7 +205,7 @@ fn totals(grids: &Grids, tori: &Tori, ranks: &Ranks) -> Vec<[f64; NODES]> {
 
 /// The banded matrix of weights times the patterns of order mu, for both signs of mu.
 fn weighted(patterns: &FilteredPatterns, totals: &[[f64; NODES]], mu: usize, l_max: usize) -> Vec<f32> {
-    let count = degrees(l_max, mu);
+    let count = degree_count(l_max, mu);
     let stride = 2 * patterns.grid.count;
     let pattern = &patterns.order(mu)[..count * stride];
     let mut weighted = vec![0.0_f32; count * stride];
@@ -243,7 +243,7 @@ impl MuPart {
         totals: &[[f64; NODES]],
         wigner: &WignerTable,
     ) -> Self {
-        let count = degrees(l_max, mu);
+        let count = degree_count(l_max, mu);
         let stride = 2 * patterns.grid.count;
         let pattern = &patterns.order(mu)[..count * stride];
         let weighted = weighted(patterns, totals, mu, l_max);

@@ -69,7 +69,8 @@ impl GeometrySurvey {
                 }
                 for (&r_i_m, &r_j_m) in placed.r_i_m.iter().zip(&placed.r_j_m) {
                     let orbit = self.orbit.ok_or(GeometryRefusal::Degenerate);
-                    let pair = orbit.and_then(|o| o.pair(&PairOrientation::of(r_i_m, r_j_m)?, wavelength_m));
+                    let pair =
+                        orbit.and_then(|o| o.pair(&PairOrientation::of_pair(r_i_m, r_j_m)?, wavelength_m));
                     match pair {
                         Ok(_) => self.coverage.covered += 1,
                         Err(reason) => *self.refused.entry(reason).or_default() += 1,

@@ -7,7 +7,7 @@ use crate::numerics::fft_length;
 use crate::ranks::RankShare;
 use crate::response::harmonic::NodeGrid;
 use crate::response::harmonic::filter::FilteredPatterns;
-use crate::response::harmonic::kernel::{Kernel, LANES};
+use crate::response::harmonic::gridding_kernel::{Kernel, LANES};
 
 /// Nodes in u per wavelength; a pattern's band of |n_y| <= 1 needs 2.
 const NODES_PER_WAVELENGTH: f64 = 3.5;

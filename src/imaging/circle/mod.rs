@@ -188,7 +188,7 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<TorusPoint, Refusal> {
-        let orientation = PairOrientation::of(r_i_m, r_j_m)?;
+        let orientation = PairOrientation::of_pair(r_i_m, r_j_m)?;
         let pair = self.setup.orbit.pair(&orientation, self.setup.wavelength_m())?;
         if orientation.baseline_m > self.setup.baseline_m_max {
             return Err(Refusal::TooLong);

@@ -18,8 +18,8 @@ use super::workspace::{NodeRange, Workspace};
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::ranks::Ranks;
 use crate::response::harmonic::filter::FilteredPatterns;
-use crate::response::harmonic::rotation::{RotationTable, orders};
-use crate::response::harmonic::{PatternGeometry, PatternTable, degrees};
+use crate::response::harmonic::rotation::{RotationTable, order_count};
+use crate::response::harmonic::{PatternGeometry, PatternTable, degree_count};
 use crate::sky::harmonics::Alm;
 
 /// Tables of the operator.
@@ -98,8 +98,9 @@ impl Operator {
 
     /// Bytes of the tables.
     pub(super) fn table_bytes(l_max: usize, grids: &Grids) -> u64 {
-        let patterns: usize = (0..=l_max).map(|mu| 2 * grids.table_nodes().count * degrees(l_max, mu)).sum();
-        let rotation: usize = (0..=l_max).map(|l| 2 * orders(l) * (l + 1)).sum();
+        let patterns: usize =
+            (0..=l_max).map(|mu| 2 * grids.table_nodes().count * degree_count(l_max, mu)).sum();
+        let rotation: usize = (0..=l_max).map(|l| 2 * order_count(l) * (l + 1)).sum();
         // The patterns are filtered from a table of the same size.
         (4 * (2 * patterns + rotation)) as u64
     }
@@ -113,8 +114,8 @@ impl Operator {
     pub(super) fn matrix_product_flops(&self, shared: &SharedTori<'_>) -> f64 {
         let reach = self.reach(shared.reached.clone());
         let blocks = shared.used.chunks(ALPHAS).filter(|block| block.contains(&true)).count();
-        let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degrees(self.l_max, mu)).sum();
-        let rotations: usize = (0..=self.l_max).map(|l| orders(l) * (l + 1)).sum();
+        let patterns: usize = (0..=self.l_max).map(|mu| 2 * reach.count * degree_count(self.l_max, mu)).sum();
+        let rotations: usize = (0..=self.l_max).map(|l| order_count(l) * (l + 1)).sum();
         // Forth and back, real and imaginary parts, multiplications and additions.
         (2 * 2 * 2 * ALPHAS * blocks * (patterns + rotations)) as f64
     }
@@ -226,7 +227,7 @@ impl Operator {
 
     /// Start of each order mu in `columns` columns of turned skies.
     fn turned_starts(&self, columns: usize) -> Vec<usize> {
-        let lengths = (0..=self.l_max).map(|mu| 2 * columns * degrees(self.l_max, mu));
+        let lengths = (0..=self.l_max).map(|mu| 2 * columns * degree_count(self.l_max, mu));
         lengths.scan(0, |end, length| Some(std::mem::replace(end, *end + length))).collect()
     }
 
@@ -238,16 +239,16 @@ impl Operator {
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
         let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
-        let mut out = vec![0.0_f32; 2 * orders(self.l_max) * ALPHAS];
+        let mut out = vec![0.0_f32; 2 * order_count(self.l_max) * ALPHAS];
         for l in 0..=self.l_max {
             let [re, im] = &mut z;
-            let out = &mut out[..2 * orders(l) * count];
+            let out = &mut out[..2 * order_count(l) * count];
             self.rotation.rotate_degree(l, |m| sky.get(l, m).conj(), &turns, [re, im], out);
-            for (part, out) in out.chunks_exact(orders(l) * count).enumerate() {
-                for (k, column) in out.chunks_exact(orders(l)).enumerate() {
+            for (part, out) in out.chunks_exact(order_count(l) * count).enumerate() {
+                for (k, column) in out.chunks_exact(order_count(l)).enumerate() {
                     for (order, value) in column.iter().enumerate() {
                         let mu = l % 2 + 2 * order;
-                        let rows = degrees(self.l_max, mu);
+                        let rows = degree_count(self.l_max, mu);
                         turned[starts[mu] + (part * *columns + first + k) * rows + (l - mu) / 2] = *value;
                     }
                 }
@@ -263,14 +264,19 @@ impl Operator {
     fn pattern(&self, mu: usize, reach: NodeRange) -> MatRef<'_, f32> {
         let stride = 2 * self.patterns.grid.count;
         let rows = &self.patterns.order(mu)[2 * reach.first..];
-        MatRef::from_column_major_slice_with_stride(rows, 2 * reach.count, degrees(self.l_max, mu), stride)
+        MatRef::from_column_major_slice_with_stride(
+            rows,
+            2 * reach.count,
+            degree_count(self.l_max, mu),
+            stride,
+        )
     }
 
     /// The turned skies times the patterns of every node.
     fn multiply_patterns(&self, work: &mut Workspace, reach: NodeRange) {
         let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
         for (mu, products) in work.products.chunks_exact_mut(columns * 2 * reach.count).enumerate() {
-            let rows = degrees(self.l_max, mu);
+            let rows = degree_count(self.l_max, mu);
             let turned = &work.turned[starts[mu]..starts[mu] + columns * rows];
             faer::linalg::matmul::matmul(
                 MatMut::from_column_major_slice_mut(products, 2 * reach.count, columns),
@@ -343,7 +349,7 @@ impl Operator {
     ) -> Vec<Vec<f64>> {
         let (starts, columns) = (self.turned_starts(work.columns), 2 * work.columns);
         for (mu, products) in work.products.chunks_exact(columns * 2 * reach.count).enumerate() {
-            let rows = degrees(self.l_max, mu);
+            let rows = degree_count(self.l_max, mu);
             let turned = &mut work.turned[starts[mu]..starts[mu] + columns * rows];
             faer::linalg::matmul::matmul(
                 MatMut::from_column_major_slice_mut(turned, rows, columns),
@@ -371,16 +377,16 @@ impl Operator {
         let count = alphas.len();
         let turns = self.turns(circle, alphas);
         let mut sum = Alm::zeros(self.l_max);
-        let mut column = vec![0.0_f32; orders(self.l_max) * ALPHAS];
+        let mut column = vec![0.0_f32; order_count(self.l_max) * ALPHAS];
         let mut z = [vec![0.0_f32; (self.l_max + 1) * ALPHAS], vec![0.0_f32; (self.l_max + 1) * ALPHAS]];
         for l in 0..=self.l_max {
             let (plus, minus) = self.rotation.degree(l);
             for (part, d) in [plus, minus].into_iter().enumerate() {
-                let column = &mut column[..orders(l) * count];
-                for (k, column) in column.chunks_exact_mut(orders(l)).enumerate() {
+                let column = &mut column[..order_count(l) * count];
+                for (k, column) in column.chunks_exact_mut(order_count(l)).enumerate() {
                     for (order, value) in column.iter_mut().enumerate() {
                         let mu = l % 2 + 2 * order;
-                        let rows = degrees(self.l_max, mu);
+                        let rows = degree_count(self.l_max, mu);
                         *value =
                             work.turned[starts[mu] + (part * work.columns + first + k) * rows + (l - mu) / 2];
                     }
@@ -388,8 +394,8 @@ impl Operator {
                 faer::linalg::matmul::matmul(
                     MatMut::from_column_major_slice_mut(&mut z[part][..(l + 1) * count], l + 1, count),
                     Accum::Replace,
-                    MatRef::from_row_major_slice(d, orders(l), l + 1).transpose(),
-                    MatRef::from_column_major_slice(column, orders(l), count),
+                    MatRef::from_row_major_slice(d, order_count(l), l + 1).transpose(),
+                    MatRef::from_column_major_slice(column, order_count(l), count),
                     1.0,
                     Par::Seq,
                 );

@@ -5,7 +5,9 @@ use super::grid::Grids;
 use super::operator::Operator;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::AccumulationError;
-use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
+use crate::response::harmonic::{
+    GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degree_count,
+};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Setup of a harmonic engine; only engines of equal setup can be merged.
@@ -43,7 +45,7 @@ pub(in crate::imaging) const RADIUS_STEP_M: f64 = 100.0;
 #[must_use]
 pub fn orbit_of(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
     let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
-    let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of(r_i_m, r_j_m).ok())?;
+    let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of_pair(r_i_m, r_j_m).ok())?;
     // A satellite j that leads turns the pair's plane upside down; orbits are assumed prograde.
     let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
     let inclination_deg =
@@ -164,7 +166,7 @@ pub struct ApplicationSize {
 pub fn application_size(l_max: usize, u_max: f64) -> ApplicationSize {
     let grids = Grids::new(l_max, u_max);
     let (points, nodes) = (grids.points, grids.nodes.count);
-    let patterns: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
+    let patterns: usize = (0..=l_max).map(|mu| degree_count(l_max, mu)).sum();
     // Forth and back; real and imaginary parts; both signs of mu.
     let matrix_multiply_adds = (2 * 2 * 2 * points * nodes * patterns) as f64;
     ApplicationSize { points, lines: points * nodes, matrix_multiply_adds }

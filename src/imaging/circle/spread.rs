@@ -10,7 +10,7 @@ use crate::imaging::exact::engine::Accepted;
 use crate::imaging::exact::fixed_point::Direction;
 use crate::imaging::exact::fixed_point::rows::{IntegerRow, Integers};
 use crate::ranks::RankShare;
-use crate::response::harmonic::kernel::{Kernel, LANES};
+use crate::response::harmonic::gridding_kernel::{Kernel, LANES};
 
 /// A visibility's place among the sums, on a torus at a baseline length.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -6,7 +6,7 @@ use num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
 use super::grid::{ALPHAS, NODE_GROUP};
-use crate::response::harmonic::degrees;
+use crate::response::harmonic::degree_count;
 
 /// Whole groups of nodes that hold all sums.
 #[derive(Clone, Copy)]
@@ -43,7 +43,7 @@ impl Workspace {
     pub(super) fn new(l_max: usize, points: usize, range: NodeRange, skies: usize) -> Self {
         let columns = skies * ALPHAS;
         let line = || vec![Complex32::ZERO; points];
-        let turned: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
+        let turned: usize = (0..=l_max).map(|mu| degree_count(l_max, mu)).sum();
         Self {
             l_max,
             range,

@@ -8,7 +8,7 @@ use num_complex::Complex64;
 
 use crate::imaging::anywhere::VisibilityArchive;
 use crate::imaging::{AccumulationError, Accuracy, NormalSums, SumCounts};
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 use crate::response::pixel::{PairGeometry, PixelMethod, RowProducts};
 
 /// Rows are those of the stored matrix, good to 1e-6; their sums in f32 are good to 1e-7 of the greatest.
@@ -51,7 +51,7 @@ impl MatrixFreeVisibilities {
         let products = RowProducts::new(self.nside, self.method)?;
         let counts = self.archive.counts();
         let (setup, at, data) = self.archive.into_data();
-        let pair = |PairAt { r_i_m, r_j_m, .. }| PairGeometry {
+        let pair = |TimedPair { r_i_m, r_j_m, .. }| PairGeometry {
             r_i_m,
             r_j_m,
             frequency_hz: setup.frequency_hz,

@@ -445,7 +445,7 @@ impl Accumulator {
             }
             PlacedFrame::Elsewhere(counted) => {
                 self.emit_if_due(counted.first_s, out)?;
-                self.ledger.left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
+                self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
             }
             PlacedFrame::Housekeeping(_) => {}
         }
@@ -499,11 +499,11 @@ impl Accumulator {
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
         let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&placed.channel));
         if is_other || !self.config.maps(placed.channel) {
-            self.ledger.left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
         let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
-        self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
+        self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {
             // A channel without usable data has no sums, and no map.
             return Ok(None);
@@ -511,7 +511,7 @@ impl Accumulator {
         let sums = match self.sums(&near)? {
             Ok(sums) => sums,
             Err(reason) => {
-                self.ledger.left_out(reason, near.len() as u64);
+                self.ledger.add_left_out(reason, near.len() as u64);
                 return Ok(None);
             }
         };
@@ -524,9 +524,9 @@ impl Accumulator {
             sums.span_s = [sums.span_s[0].min(first), sums.span_s[1].max(last)];
         }
         self.accumulated += visibilities;
-        self.ledger.accumulated(visibilities);
+        self.ledger.add_accumulated(visibilities);
         for (reason, count) in refused {
-            self.ledger.left_out(reason.into(), count);
+            self.ledger.add_left_out(reason.into(), count);
         }
         Ok(offered_s)
     }

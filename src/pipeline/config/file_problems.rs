@@ -82,7 +82,7 @@ impl Plan {
         };
         for (channel, &hz) in spacecraft.channels_hz.iter().enumerate() {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let outline = path.and_then(|path| MapOutline::of(&path, &sky_options(sky, hz)).ok());
+            let outline = path.and_then(|path| MapOutline::read(&path, &sky_options(sky, hz)).ok());
             add_line("sky.file", outline.map(|outline| outline.to_string()));
         }
         for (key, files, frame) in [
@@ -91,7 +91,7 @@ impl Plan {
         ] {
             let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
             for path in files {
-                add_line(key, MapOutline::of(path, &options).ok().map(|outline| outline.to_string()));
+                add_line(key, MapOutline::read(path, &options).ok().map(|outline| outline.to_string()));
             }
         }
         let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());

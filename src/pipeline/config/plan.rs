@@ -71,8 +71,8 @@ impl Plan {
         let channels = spacecraft.channels_hz.len();
         SkyChannel {
             frequency_hz: spacecraft.channels_hz[channel],
-            may_be_dark: spacecraft.receiver_k_sr()[channel] > 0.0,
-            shares_file: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
+            is_dark_accepted: spacecraft.receiver_k_sr()[channel] > 0.0,
+            is_file_shared: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
         }
     }
 

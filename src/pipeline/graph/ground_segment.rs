@@ -109,10 +109,10 @@ pub(in crate::pipeline) fn add(
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
     let publisher =
-        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
-    let publisher = product_state.iter().fold(publisher, Publisher::persisting);
+        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.with_viewers(viewers);
+    let publisher = product_state.iter().fold(publisher, Publisher::with_retries);
     let mut writer = GainsWriter::new(config, out);
-    let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
+    let ground = ground.with_observer(Box::new(move |gains| writer.update(gains)));
     // Snapshots are large: only one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

@@ -12,7 +12,8 @@ use crate::pipeline::config::{PipelineError, Plan};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup,
-    ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithReflection, WithSphereReflection,
+    ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithFlatReflection,
+    WithSphereReflection,
 };
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
@@ -153,13 +154,20 @@ fn with_moon(
         return Ok(sky);
     }
     if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
-        let mirror = (plan.array.moon_radius_m(), reflectivity);
-        let response = plan.instrument.response;
-        return Ok(Box::new(WithSphereReflection::new(sky, map.clone(), frequency_hz, response, mirror)));
+        let (radius_m, response) = (plan.array.moon_radius_m(), plan.instrument.response);
+        let map = map.clone();
+        return Ok(Box::new(WithSphereReflection::new(
+            sky,
+            map,
+            frequency_hz,
+            response,
+            radius_m,
+            reflectivity,
+        )));
     }
     // A Moon just below the orbit hides everything below the local horizontal, to 5e-5 rad.
     let above_horizontal = build(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
-    Ok(Box::new(WithReflection::new(sky, above_horizontal, reflectivity)))
+    Ok(Box::new(WithFlatReflection::new(sky, above_horizontal, reflectivity)))
 }
 
 /// The model, averaged over the channel's bandwidth if the configuration asks for it.

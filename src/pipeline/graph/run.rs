@@ -175,9 +175,8 @@ pub fn run_with_ranks(
     drop(skies);
     let grace = Grace::new(&plan.config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.iterate);
-    let ground = Ground::new(&plan.config.ground(WAIT_BYTES))?
-        .cancelled_by(cancel, grace.accumulate)
-        .with_ranks(ranks);
+    let ground =
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.accumulate).with_ranks(ranks);
     let maps = MapWatch::default();
     let mapping =
         MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), product_state: None };
@@ -315,7 +314,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     let grace = Grace::new(&config.runtime);
     let solving = SolveWatch::new(cancel.clone()).within(grace.iterate);
     let ranks = ground.ranks().clone();
-    let ground = ground.cancelled_by(cancel, grace.accumulate);
+    let ground = ground.with_cancel(cancel, grace.accumulate);
     let maps = MapWatch::default();
     let products = is_service.then(ProductsWatch::default);
     let (viewers, product_state) = (maps.clone(), products.clone());
@@ -514,7 +513,7 @@ fn collect_and_write_summary(
     }
     let FinishedGraph { report, outcome, .. } = finished;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ground.ledger.close()?;
+    let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
@@ -529,7 +528,7 @@ pub(in crate::pipeline) fn collect_summary(
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = ground.ledger.close()?;
+    let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(report) = &listening {
         report.complete(&mut reception);

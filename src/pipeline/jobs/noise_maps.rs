@@ -97,7 +97,7 @@ impl NoiseMaps<'_> {
         let source = FileSource::open(&[self.file.to_owned()])?;
         let bytes = graph.source(READ, config.runtime.queue_capacity, source);
         let ground = Ground::new(&config.ground(WAIT_BYTES))?;
-        let ground = ground.with_noises(seeds).cancelled_by(cancel, Duration::ZERO);
+        let ground = ground.with_noises(seeds).with_cancel(cancel, Duration::ZERO);
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let solving = SolveWatch::new(cancel.clone());
         let setup = config.solver(solving.clone())?;

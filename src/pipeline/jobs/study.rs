@@ -340,7 +340,7 @@ fn compare_with_ideal(done: &[&StudyCase], cases: &mut [CaseSummary]) {
     for (case, summary) in done.iter().zip(cases) {
         let key = ideal_key(case);
         if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
-            summary.figures.against_ideal(ideal);
+            summary.figures.set_power_kept(ideal);
         }
     }
 }

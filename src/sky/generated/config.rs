@@ -6,9 +6,7 @@ use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Frequencies of generated skies, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
-/// Finest map.
 const NSIDE_MAX: usize = 1024;
 
 keys! {
@@ -68,7 +66,7 @@ pub enum GeneratedSkyError {
 }
 
 impl GeneratedSky {
-    /// Everything that is wrong with the section; empty if it is good.
+    /// Lists the problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::of("sky.generated");
@@ -95,8 +93,8 @@ impl GeneratedSky {
         for (key, value, range, expected) in rules {
             checks.number(key, value, range.contains(&value), expected);
         }
-        let (least_jy, most_jy) = (self.source_flux_jy_min, self.source_flux_jy_max);
-        checks.require("source_flux_jy_max", most_jy, most_jy > least_jy, "more than source_flux_jy_min");
+        let (min_jy, max_jy) = (self.source_flux_jy_min, self.source_flux_jy_max);
+        checks.require("source_flux_jy_max", max_jy, max_jy > min_jy, "more than source_flux_jy_min");
         checks.finish()
     }
 }

@@ -112,7 +112,7 @@ fn forward_of(setup: &HarmonicSetup, unknowns: &[f64], blocks: &[PlacedVisibilit
         .iter()
         .flat_map(|block| block.r_i_m.iter().zip(&block.r_j_m))
         .map(|(&r_i, &r_j)| {
-            let orientation = PairOrientation::of(r_i, r_j).unwrap();
+            let orientation = PairOrientation::of_pair(r_i, r_j).unwrap();
             let pair = setup.orbit.pair(&orientation, wavelength_m).unwrap();
             assert!(!pair.reversed);
             pair.state
