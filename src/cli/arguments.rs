@@ -89,12 +89,10 @@ pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     })
 }
 
-/// Whether a path stands for standard input or output.
 pub(super) fn is_standard(path: &Path) -> bool {
     path.as_os_str() == STANDARD
 }
 
-/// Parses a frame, by its name or letter.
 pub(super) fn frame(text: &str) -> Result<Frame, String> {
     Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
 }
@@ -111,7 +109,6 @@ pub(super) struct StateMapArgs {
 }
 
 impl ArrayArgs {
-    /// The pipeline file, if there is one.
     pub(super) fn inputs(&self) -> Vec<PathBuf> {
         self.pipeline.iter().cloned().collect()
     }
@@ -269,7 +266,6 @@ pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
     }
 }
 
-/// A frequency band as text, for messages.
 pub(super) fn band_text([low_hz, high_hz]: [f64; 2]) -> String {
     format!("{} to {}", Dimension::Frequency.show(low_hz), Dimension::Frequency.show(high_hz))
 }

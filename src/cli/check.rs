@@ -39,7 +39,6 @@ pub(super) struct CheckArgs {
 struct CheckReport<'a> {
     #[serde(flatten)]
     cost: &'a Cost,
-    /// Epoch of the mission, UTC.
     epoch_utc: &'a str,
     /// Description of the model of the Earth.
     earth: String,

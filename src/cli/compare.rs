@@ -96,7 +96,6 @@ fn read(path: &Path, maps: MapFileArgs) -> Result<(SkyMap, Option<f64>), Command
     Ok((file.map, frequency_hz))
 }
 
-/// Compares the figures of runs.
 fn compare_runs(args: &CompareArgs) -> CommandResult {
     let map_options = [
         ("--noise", args.noise.is_some()),

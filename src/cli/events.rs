@@ -24,7 +24,6 @@ use crate::pipeline::{Config, RunHandles};
 use crate::products::{MapViewer, PublishedMap, SnapshotSummary};
 use crate::runtime::{LedgerReport, StageProgress};
 
-/// Interval between two lines of progress.
 const PROGRESS_EVERY: Duration = Duration::from_secs(1);
 
 /// Capacity of the queue to the writing thread.
@@ -201,7 +200,6 @@ struct End {
 /// A line of the output.
 #[derive(Serialize)]
 struct EventLine<'a> {
-    /// Unix time, s.
     unix_s: f64,
     elapsed_s: f64,
     #[serde(flatten)]
@@ -268,7 +266,6 @@ impl MapViewer for EventViewer {
     }
 }
 
-/// The output of lines.
 struct EventLines {
     out: Box<dyn Write + Send>,
     since: Instant,
@@ -277,7 +274,6 @@ struct EventLines {
 }
 
 impl EventLines {
-    /// Writes and flushes a line.
     fn write(&mut self, entry: Entry<'_>) -> std::io::Result<()> {
         let unix_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
         let line = EventLine { unix_s, elapsed_s: self.since.elapsed().as_secs_f64(), entry };

@@ -160,7 +160,6 @@ struct Destination {
 }
 
 impl ExportArgs {
-    /// The input files.
     fn inputs(&self) -> Vec<PathBuf> {
         match &self.what {
             ExportKind::Visibilities(args) => vec![args.file.clone()],

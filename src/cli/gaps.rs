@@ -130,7 +130,6 @@ fn table(gaps: &Gaps, gaps_max: usize) -> String {
     text
 }
 
-/// The largest losses of a gap, by channel and pair.
 fn largest_losses(gap: &GapReport) -> String {
     const SHOWN: usize = 3;
     let kind = match gap.kind {

@@ -10,7 +10,6 @@ use super::output::{CommandResult, Completion, is_broken_pipe, print_error};
 use crate::pipeline::MemoryLimit;
 use crate::ranks::{RankJob, Ranks, RanksError};
 
-/// Exit code of a rank that failed.
 const FAILED: u8 = 1;
 /// Delay of other ranks before they print an error, so that one on all ranks is printed by the first.
 const ERROR_DELAY: Duration = Duration::from_millis(500);

@@ -56,7 +56,6 @@ pub(super) struct JointArgs {
 struct Report {
     /// Correlation of the channels.
     likeness: Likeness,
-    /// Number of iterations.
     iterations: usize,
     residual: f64,
     converged: bool,

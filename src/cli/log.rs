@@ -23,7 +23,6 @@ pub(super) enum LogFormat {
     Json,
 }
 
-/// Whether the log is JSON.
 static IS_JSON: AtomicBool = AtomicBool::new(false);
 
 /// Installs the panic hook once.
@@ -53,7 +52,6 @@ struct LogLine<'a> {
     fields: &'a Value,
 }
 
-/// Sets the format of the log.
 pub(super) fn use_format(format: LogFormat) {
     IS_JSON.store(format == LogFormat::Json, Ordering::Relaxed);
     if format == LogFormat::Json {
@@ -68,7 +66,6 @@ pub(super) fn use_format(format: LogFormat) {
     }
 }
 
-/// Whether the log is in JSON.
 pub(super) fn is_json() -> bool {
     IS_JSON.load(Ordering::Relaxed)
 }
@@ -97,7 +94,6 @@ pub(super) fn note(event: &str, fields: &Value, message: impl Display) {
     }
 }
 
-/// Writes a line in JSON.
 pub(super) fn log_json(level: Level, event: &str, fields: &Value, message: Option<&str>) {
     let message = message.map(|message| message.trim().to_owned());
     let time = format!("{}Z", system_utc_text(SystemTime::now()));

@@ -144,7 +144,6 @@ const MISCONFIGURED: u8 = 2;
 /// Exit code of a failure of the system: a disk, a socket, a lock, memory.
 const SYSTEM: u8 = 3;
 
-/// The exit code for an error.
 fn exit_code(error: &(dyn std::error::Error + 'static)) -> u8 {
     let causes = || std::iter::successors(Some(error), |error| error.source());
     if causes().any(is_configuration_error) {

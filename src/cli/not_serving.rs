@@ -24,7 +24,6 @@ impl ServeArgs {
     }
 }
 
-/// No page.
 pub(super) struct Page;
 
 impl Page {

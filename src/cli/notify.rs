@@ -14,7 +14,6 @@ use crate::runtime::Cancel;
 /// Interval of checks for cancellation.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Minimum time between two status texts.
 const STATUS_EVERY: Duration = Duration::from_secs(2);
 
 const STOPPING: &str = "STOPPING=1\nSTATUS=saving what was received";
@@ -66,7 +65,6 @@ impl Drop for Notifier {
     }
 }
 
-/// Connection to the supervisor.
 struct Supervisor {
     socket: UnixDatagram,
     address: SocketAddr,
@@ -105,7 +103,6 @@ fn socket_address(name: &str) -> Option<SocketAddr> {
     }
 }
 
-/// The status of a run in one line.
 fn status_line(handles: &RunHandles) -> String {
     let mut parts = Vec::new();
     if let Some(listening) = &handles.listening {

@@ -10,13 +10,11 @@ use crate::pipeline::{Config, RunSummary};
 
 /// Error of a command; its message says where it occurred and what was expected.
 pub(super) type CommandError = Box<dyn std::error::Error + Send + Sync>;
-/// Result of a command.
 pub(super) type CommandResult = Result<Completion, CommandError>;
 
 /// Completion of a command that did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Completion {
-    /// The command is complete.
     Done,
     /// A signal interrupted the command; its output is valid. Contains the exit code.
     Interrupted(u8),
@@ -42,7 +40,6 @@ pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), Comma
     print(&json_text(value)?)
 }
 
-/// Prints text for people.
 pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
     print(&printable_text(text))
 }
@@ -62,7 +59,6 @@ pub(super) fn stdout_error(error: std::io::Error) -> CommandError {
     }
 }
 
-/// Prints notes to standard error.
 pub(super) fn print_notes<T: std::fmt::Display>(notes: impl IntoIterator<Item = T>) {
     for note in notes {
         log::note("note", &Value::Null, note);

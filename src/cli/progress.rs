@@ -20,13 +20,11 @@ use crate::units::ChannelId;
 
 /// Interval of refreshes on a terminal, and of checks for cancellation.
 const POLL: Duration = Duration::from_millis(200);
-/// Interval between lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
 /// Interval between lines of the propagation of orbits.
 const PROPAGATION_EVERY: Duration = Duration::from_secs(3);
 
-/// Message when a run is interrupted.
 const INTERRUPTED: &str =
     "\ninterrupted: finishing with the data so far (interrupt again to stop immediately)";
 
@@ -179,7 +177,6 @@ impl Parts {
     }
 }
 
-/// Text on the time left, to end a line.
 pub(super) fn time_left(left_s: Option<f64>) -> String {
     match left_s {
         Some(left_s) if left_s >= 90.0 => format!("; about {:.0} min left", left_s / 60.0),
@@ -188,7 +185,6 @@ pub(super) fn time_left(left_s: Option<f64>) -> String {
     }
 }
 
-/// Text on the amount that a stage has processed.
 fn amount(count: u64, unit: &str) -> String {
     match unit {
         "bytes" => DecimalBytes(count).to_string(),

@@ -197,7 +197,6 @@ fn show_until_quit(
     Ok(())
 }
 
-/// Action of a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Action {
     Quit,

@@ -113,7 +113,6 @@ impl Console {
         }
     }
 
-    /// Time since the server's start, s.
     fn up_s(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
     }
@@ -122,7 +121,6 @@ impl Console {
         self.log.push(self.up_s(), is_bad, text.into());
     }
 
-    /// Starts to show a run.
     pub(super) fn set_run(&self, handles: &RunHandles) {
         let viewer =
             PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log), started: self.started };
@@ -135,7 +133,6 @@ impl Console {
         }
     }
 
-    /// Records the end of the run.
     pub(super) fn set_end(&self, error: Option<String>, cancelled: bool) {
         let end = RunEnd { error, cancelled, up_s: self.up_s() };
         match &end {
@@ -160,7 +157,6 @@ impl Console {
         self.last_update.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The status of the last update.
     pub(super) fn status(&self) -> Status {
         let last = self.last_update().status.clone();
         last.unwrap_or_else(|| self.update())
@@ -338,7 +334,6 @@ fn failure_change(what: &str, before: &Option<String>, now: &Option<String>) -> 
     }
 }
 
-/// Receives maps for the console.
 struct PageViewer {
     maps: Arc<MapCache>,
     log: Arc<EventLog>,

@@ -5,19 +5,15 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::Serialize;
 
-/// Maximum number of events that are kept.
 const EVENTS_MAX: usize = 256;
 
 /// An event of a run.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Event {
-    /// Number of the event, from 1.
     pub(super) id: u64,
-    /// Time since the server's start, s.
     elapsed_s: f64,
     /// Whether it needs attention.
     is_bad: bool,
-    /// Description.
     text: String,
 }
 

@@ -9,7 +9,6 @@ use crate::ground::ArrayGeometry;
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
 
-/// Number of points of a drawn orbit.
 const ORBIT_POINTS: u32 = 180;
 
 /// Maximum eccentricity of an orbit that is drawn.

@@ -16,7 +16,6 @@ use crate::sky::spectra::auto_cl;
 use crate::sky::{Comparison, Frame, MapError, SkyMap};
 use crate::units::ChannelId;
 
-/// Maximum number of maps held for a channel.
 const MAPS_MAX: usize = 32;
 
 /// Maximum size of all maps before the last of each channel, bytes.
@@ -105,7 +104,6 @@ impl ShownMap {
     }
 }
 
-/// Map of one snapshot.
 #[derive(Clone, Debug)]
 struct Snapshot {
     number: u32,
@@ -127,20 +125,15 @@ struct ChannelMaps {
     input: Option<Arc<ShownMap>>,
     figures: Vec<SnapshotSummary>,
     spectra: Option<SpectraOfMap>,
-    /// Time when the last map was made.
     made: SystemTime,
 }
 
 /// Status of a channel's maps.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ChannelStatus {
-    /// Number of the channel.
     channel: u16,
-    /// Frequency, Hz.
     pub(super) frequency_hz: f64,
-    /// nside of the maps.
     nside: usize,
-    /// Whether the data contain no thermal noise.
     is_noiseless: bool,
     /// Whether the last map is from all data.
     is_final: bool,
@@ -148,13 +141,9 @@ pub(super) struct ChannelStatus {
     span_s: [f64; 2],
     /// Numbers of the maps that are held, ascending; the last is `latest`.
     held: Vec<u32>,
-    /// Whether the input sky is known.
     has_input: bool,
-    /// Time since the last map was made, s.
     pub(super) age_s: f64,
-    /// Figures of the last map.
     pub(super) figures: Option<SnapshotSummary>,
-    /// RMS of the noise-only map, K.
     pub(super) noise_rms_k: f64,
     /// Regularisation and convergence of the last map.
     diagnostics: Diagnostics,
@@ -264,7 +253,6 @@ impl MapCache {
         }
     }
 
-    /// Status of all channels.
     pub(super) fn status(&self) -> Vec<ChannelStatus> {
         let status = |(channel, held_maps): (&ChannelId, &ChannelMaps)| ChannelStatus {
             channel: channel.0,

@@ -20,7 +20,6 @@ use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
 
-/// Content type of the metrics.
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Writes all metrics as text.
@@ -51,10 +50,8 @@ fn resident_bytes() -> Option<u64> {
     line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Labels and value of a sample.
 type Sample<const N: usize, V> = ([(&'static str, String); N], V);
 
-/// Name, help text and unit of a metric.
 struct MetricInfo(&'static str, &'static str, Option<Unit>);
 
 fn items() -> Option<Unit> {
@@ -91,7 +88,6 @@ fn gauge(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: f64) -> fmt:
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
-/// A gauge, if it has a value.
 fn gauge_if(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: Option<f64>) -> fmt::Result {
     value.map_or(Ok(()), |value| gauge(out, about, value))
 }

@@ -36,7 +36,6 @@ use crate::units::time_scales::leap_seconds;
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
     img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Number of colours of a palette.
 const PALETTE_STEPS: u32 = 256;
 
 /// State that all request handlers share.
@@ -55,10 +54,8 @@ pub(super) struct PageState {
     pub(super) readers: Arc<Semaphore>,
 }
 
-/// Maximum number of simultaneous readers of `/events`.
 pub(super) const READERS_MAX: usize = 96;
 
-/// The router with all routes.
 pub(super) fn router(page: PageState) -> Router {
     Router::new()
         .route("/", get(|| asset("text/html; charset=utf-8", include_str!("page/index.html"))))
@@ -333,7 +330,6 @@ async fn readyz(State(page): State<PageState>) -> Response {
     }
 }
 
-/// State of one reader of events.
 struct EventReader {
     page: PageState,
     /// Number of the last event that was sent.

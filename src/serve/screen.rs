@@ -15,10 +15,8 @@ use super::screen_text::{
 use crate::units::constants::DAY_S;
 use crate::units::printable;
 
-/// Packet kinds that are shown.
 const KINDS: [&str; 4] = ["instrument", "ephemeris", "visibilities", "housekeeping"];
 
-/// Width of a bar, characters.
 const BAR_WIDTH: usize = 10;
 
 /// Preferred width of the packets panel, characters.

@@ -69,7 +69,6 @@ pub(super) fn with_prefix(value: f64) -> String {
     }
 }
 
-/// Formats a fraction as a percentage.
 pub(super) fn percent(fraction: f64) -> String {
     format!("{:.0} %", 100.0 * fraction)
 }
@@ -92,7 +91,6 @@ pub(super) fn clock(seconds: f64) -> String {
     }
 }
 
-/// Draws a bar that is filled to a fraction.
 pub(super) fn bar(fraction: f64, width: usize) -> String {
     let full = (fraction.clamp(0.0, 1.0) * width as f64).round() as usize;
     format!("{}{}", "\u{2588}".repeat(full), "\u{2591}".repeat(width - full))

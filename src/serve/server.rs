@@ -17,7 +17,6 @@ use super::routes::{PageState, READERS_MAX, router};
 use super::subject::Subject;
 use crate::pipeline::RunHandles;
 
-/// Interval between two updates of the status.
 const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Delay before the shutdown, in which the last status reaches the connected clients.

@@ -25,7 +25,6 @@ struct StageSample {
 pub(super) struct StageRate {
     /// Fraction of the time in which the stage worked.
     pub(super) busy: f64,
-    /// Units processed per second.
     pub(super) units_per_s: f64,
 }
 
@@ -56,7 +55,6 @@ impl RateMeter {
     }
 }
 
-/// Rates over a whole run of `elapsed_s`.
 pub(super) fn whole_run_rates(stages: &[StageProgress], elapsed_s: f64) -> Vec<StageRate> {
     let seconds = elapsed_s.max(1e-3);
     let rate = |stage: &StageProgress| StageRate {

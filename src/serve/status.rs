@@ -20,11 +20,9 @@ pub(super) enum Phase {
     /// The run is being prepared.
     #[default]
     Starting,
-    /// The graph runs.
     Running,
     /// The run is complete or was cancelled.
     Ended,
-    /// The run has failed.
     Failed,
 }
 
@@ -44,11 +42,8 @@ impl Phase {
 /// Status of the input queue of a stage.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct QueueStatus {
-    /// Maximum number of items.
     pub(super) capacity: usize,
-    /// Current number of items.
     pub(super) depth: usize,
-    /// Greatest number of items so far.
     depth_max: usize,
 }
 
@@ -134,7 +129,6 @@ impl Serialize for LedgerStatus {
 /// Status of the senders.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ListenerStatus {
-    /// Open connections.
     pub(super) open: usize,
     /// Bytes read from all senders.
     pub(super) bytes: u64,
@@ -142,7 +136,6 @@ pub(super) struct ListenerStatus {
     pub(super) backlog_bytes: u64,
     /// Time since the last valid packet from any sender, s; null before the first of this session.
     pub(super) silence_s: Option<f64>,
-    /// The raw archive, if there is one.
     pub(super) archive: Option<ArchiveReport>,
     /// Counters of connections, datagrams and stations.
     pub(super) report: ListenReport,
@@ -158,7 +151,6 @@ pub(super) struct VisitorStatus {
     pub(super) requests: u64,
 }
 
-/// Status of a run.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Status {
     pub(super) version: &'static str,
@@ -169,9 +161,7 @@ pub(super) struct Status {
     /// Why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) error: Option<String>,
-    /// Whether the run was cancelled.
     pub(super) cancelled: bool,
-    /// Time since the server's start, s.
     pub(super) up_s: f64,
     /// Time from the server's start to the end of the run, or until now, s.
     pub(super) elapsed_s: f64,
@@ -192,7 +182,6 @@ pub(super) struct Status {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) products: Option<ProductsReport>,
     pub(super) channels: Vec<ChannelStatus>,
-    /// Whether `/api/gaps` is available.
     pub(super) has_state: bool,
     pub(super) visitors: VisitorStatus,
 }

@@ -8,7 +8,6 @@ use super::problems::Problems;
 use super::sections::Config;
 use crate::units::{Level, shortened};
 
-/// Maximum number of characters of a value that are shown.
 const SHOWN_MAX: usize = 60;
 
 /// A key that is set and has no effect.
@@ -91,7 +90,6 @@ fn is_above(value: &Value, limit: &Value) -> bool {
 mod tests {
     use super::*;
 
-    /// The problems of a pipeline, by its text.
     fn messages(text: &str) -> Vec<String> {
         let config: Config = toml::from_str(text).unwrap();
         config.problems().iter().map(ToString::to_string).collect()

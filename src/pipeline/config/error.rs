@@ -188,7 +188,6 @@ pub enum PipelineError {
     },
 }
 
-/// Bytes as gigabytes.
 fn gigabytes(bytes: f64) -> String {
     match bytes {
         1e8.. => format!("{:.2} GB", bytes / 1e9),

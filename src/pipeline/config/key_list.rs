@@ -8,9 +8,7 @@ use crate::units::{Key, Level};
 /// A key with its full path.
 #[derive(Clone, Debug)]
 pub(super) struct FlatKey {
-    /// Full key.
     pub(super) path: String,
-    /// Declaration of the key.
     pub(super) key: &'static Key,
     /// Default value; `None` for a section or an optional key.
     pub(super) default: Option<Value>,

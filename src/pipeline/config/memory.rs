@@ -57,7 +57,6 @@ impl MemoryLimit {
     }
 }
 
-/// MemAvailable of `/proc/meminfo`, bytes.
 fn available_bytes(meminfo: &str) -> Option<u64> {
     let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
@@ -102,7 +101,6 @@ fn folder_bytes(folder: &Path, [limit, usage, unused]: [&str; 3]) -> Option<u64>
 mod tests {
     use super::*;
 
-    /// A temporary folder with the given files.
     fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().unwrap();
         for (name, text) in files {

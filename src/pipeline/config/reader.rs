@@ -83,9 +83,7 @@ pub enum ReadProblem {
 pub(in crate::pipeline) struct PartialConfig {
     /// The values that could be read; defaults for the others.
     pub(in crate::pipeline) config: Config,
-    /// Problems of the keys and values that could not be read.
     pub(in crate::pipeline) problems: Problems,
-    /// Keys whose values could not be read.
     unread: Vec<String>,
 }
 
@@ -200,7 +198,6 @@ fn nested_table(path: &[&str], value: Value) -> Table {
     path.fold(innermost, |table, key| Table::from_iter([((*key).to_owned(), Value::Table(table))]))
 }
 
-/// Whether keys below `path` have been renamed.
 fn is_renamed_below(path: &[&str]) -> bool {
     let prefix = format!("{}.", path.join("."));
     RENAMED_KEYS.iter().any(|(before, _)| before.starts_with(&prefix))
@@ -232,7 +229,6 @@ fn known_keys_message(path: &[&str], known: &Table) -> String {
     }
 }
 
-/// Levenshtein distance of two words.
 fn edit_distance(from: &str, to: &str) -> usize {
     // No key is hundreds of letters long.
     let from = from.bytes().take(2 * SHOWN_MAX);
@@ -279,17 +275,14 @@ fn with_units(message: &str, units: Option<&str>) -> String {
 pub(in crate::pipeline) struct KeyLocator<'a> {
     text: &'a str,
     table: Option<Spanned<DeTable<'a>>>,
-    /// Text of each override, by key.
     overrides: HashMap<String, String>,
 }
 
 impl<'a> KeyLocator<'a> {
-    /// Locates the keys of a TOML text.
     pub(in crate::pipeline) fn new(text: &'a str) -> Self {
         Self { text, table: DeTable::parse(text).ok(), overrides: HashMap::new() }
     }
 
-    /// Records that a key is set by an override.
     pub(in crate::pipeline) fn add_override(&mut self, key: &str, text: &str) {
         self.overrides.insert(key.to_owned(), shortened(text, SHOWN_MAX));
     }

@@ -12,7 +12,6 @@ use super::reader::{KeyLocator, PartialConfig, SHOWN_MAX, parse_table};
 use super::sections::Config;
 use crate::units::shortened;
 
-/// Name of the default pipeline in messages.
 const QUICKLOOK_NAME: &str = "embedded quicklook";
 /// The default pipeline, which is used if no file is named.
 pub const QUICKLOOK: &str = include_str!("../../../pipelines/quicklook.toml");
@@ -220,7 +219,6 @@ impl ConfigSource {
 /// Top-level keys that only studies have.
 const STUDY_KEYS: [&str; 6] = ["realisations", "calibrated", "covariance_at_deg", "model", "pipeline", "set"];
 
-/// Whether a table has sections of a pipeline.
 pub(in crate::pipeline) fn has_sections(table: &toml::Table) -> bool {
     ["array", "map", "sky", "spacecraft"].iter().any(|section| table.contains_key(*section))
 }

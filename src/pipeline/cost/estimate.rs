@@ -202,7 +202,6 @@ impl Plan {
         }
     }
 
-    /// Observing time of the mission, s.
     fn observing_s(&self) -> f64 {
         let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
         self.windows.iter().map(length_s).sum()

@@ -12,7 +12,6 @@ use crate::products::ProductsError;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 use crate::units::constants::DAY_S;
 
-/// Creates a folder, with its parents.
 pub(in crate::pipeline) fn create_folder(folder: &Path) -> Result<(), PipelineError> {
     let created = std::fs::create_dir_all(folder);
     Ok(created.map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?)
@@ -23,7 +22,6 @@ fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
     Ok(written.map_err(|source| ProductsError::Write { path: path.to_owned(), source })?)
 }
 
-/// Writes a value as JSON.
 pub(in crate::pipeline) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), PipelineError> {
     let text = serde_json::to_vec(value)
         .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
@@ -66,7 +64,6 @@ pub(in crate::pipeline) fn write_products(
     }
 }
 
-/// Phases and amplitudes of a channel over time.
 fn plots(solutions: &[PassSolution], channel: usize) -> [Plot; 2] {
     let satellites = solutions.first().map_or(0, |solution| solution.daughters.len());
     let frequency_hz =

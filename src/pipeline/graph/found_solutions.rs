@@ -12,7 +12,6 @@ use crate::calibration::{GainsFile, SolvedGains};
 use crate::frames::Instrument;
 use crate::numerics::median;
 
-/// Maximum number of events that are printed.
 const EVENTS_SHOWN: usize = 20;
 
 /// One round of calibration: all passes solved with one sky model.
@@ -162,7 +161,6 @@ impl FoundSolutions {
         }
     }
 
-    /// Every gain of every solution.
     fn all_gains(&self) -> impl Iterator<Item = &GainEstimate> + Clone {
         self.solutions.iter().flat_map(|solution| &solution.daughters).flat_map(|daughter| &daughter.gains)
     }

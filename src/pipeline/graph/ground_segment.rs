@@ -18,7 +18,6 @@ use crate::sky::fits::{ReadOptions, read_prior};
 /// Name of the stage that decodes, calibrates and accumulates, and keeps the state.
 pub(in crate::pipeline) const GROUND: &str = "ground";
 
-/// Name of the stage that makes maps.
 pub(in crate::pipeline) const SOLVE: &str = "solve";
 
 impl Config {
@@ -64,21 +63,15 @@ impl Config {
 /// Results of the ground segment in memory, beside its files.
 #[derive(Clone, Debug)]
 pub(in crate::pipeline) struct SegmentOutcome {
-    /// Shared results of the ground stage.
     pub(in crate::pipeline) ground: GroundOutcome,
-    /// Summary of each channel's final map.
     pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
 }
 
 /// Destination, input sky and handles for the maps of the ground segment.
 pub(in crate::pipeline) struct MappingContext<'a> {
-    /// Folder for the products.
     pub(in crate::pipeline) out: &'a Path,
-    /// The true sky, to compare the maps with.
     pub(in crate::pipeline) truth: Truth,
-    /// Progress and cancellation of solutions.
     pub(in crate::pipeline) watch: SolveWatch,
-    /// Receives the maps for display.
     pub(in crate::pipeline) viewers: MapWatch,
     /// State of the product files; `Some` if a failure to write them does not end the run.
     pub(in crate::pipeline) product_state: Option<ProductsWatch>,

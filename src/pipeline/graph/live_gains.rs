@@ -12,7 +12,6 @@ use crate::pipeline::config::{Config, PipelineError};
 /// Least time between two writings, in units of the last one's duration: products grow with the mission.
 const REWRITE_INTERVAL: u32 = 20;
 
-/// Writes the products of gains into a folder.
 pub(in crate::pipeline) struct GainsWriter {
     out: PathBuf,
     solver: SolverConfig,
@@ -37,7 +36,6 @@ impl GainsWriter {
         }
     }
 
-    /// Writes all products of the gains so far.
     pub(in crate::pipeline) fn write(&self, gains: &SolvedGains) -> Result<CalibrateSummary, PipelineError> {
         let found = FoundSolutions::from_gains(gains);
         let summary = found.single_round_summary(&self.solver, !self.solver.model_files.is_empty());

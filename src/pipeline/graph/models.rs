@@ -119,7 +119,6 @@ fn orbit_dipoles(plan: &Plan) -> Option<Arc<dyn AntennaPatterns>> {
     }
 }
 
-/// Subtracts a uniform temperature from a sky map.
 fn minus_temperature(sky: &SkyMap, offset_k: f64) -> Result<Cow<'_, SkyMap>, MapError> {
     if offset_k == 0.0 {
         return Ok(Cow::Borrowed(sky));

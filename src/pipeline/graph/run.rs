@@ -41,7 +41,6 @@ pub struct RunHandles {
 }
 
 impl RunHandles {
-    /// Handles of a graph without a ground segment.
     pub(in crate::pipeline) fn without_ground(graph: &Graph) -> Self {
         let (solving, maps) = (SolveWatch::default(), MapWatch::default());
         Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps, products: None }
@@ -106,7 +105,6 @@ pub type OnStart<'a> = &'a mut dyn FnMut(RunHandles);
 /// Name of the stage that reads the downlink.
 pub const READ: &str = "read";
 
-/// Name of the stage that writes the downlink file.
 pub(in crate::pipeline) const RECORD: &str = "record";
 
 /// Name of the downlink file among the products of `run`.
@@ -222,13 +220,10 @@ pub fn simulate(
     simulate_skies(plan, &skies, sinks, cancel, on_start)
 }
 
-/// Open sinks of a simulated downlink.
 pub(in crate::pipeline) struct DownlinkSinks {
     /// Path of the downlink file, if `recorder` writes to one.
     pub(in crate::pipeline) file: Option<PathBuf>,
-    /// Writer of the file or of standard output.
     pub(in crate::pipeline) recorder: Option<Recorder>,
-    /// A connection to a listening ground segment.
     pub(in crate::pipeline) socket: Option<SocketSink>,
 }
 
@@ -491,7 +486,6 @@ pub(in crate::pipeline) struct FinishedGraph {
 }
 
 impl FinishedGraph {
-    /// Number of auto-correlations that were accumulated.
     pub(in crate::pipeline) fn autocorrelation_count(&self) -> u64 {
         self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
     }

@@ -53,7 +53,6 @@ pub fn sample_stages(
     (sampler, link, correlator)
 }
 
-/// Adds sampler, links and correlator to `graph`.
 pub(crate) fn add_sample_stages(
     graph: &mut Graph,
     plan: &Plan,

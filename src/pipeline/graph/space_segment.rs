@@ -184,7 +184,6 @@ fn ninth_sky(plan: &Plan) -> Result<NinthSky, PipelineError> {
     Ok(NinthSky::Maps(NinthSky::nodes_hz(ninth.band_hz).into_iter().map(map).collect::<Result<_, _>>()?))
 }
 
-/// Adds the onboard store and the transmitter.
 fn add_transmitter(
     graph: &mut Graph,
     plan: &Plan,

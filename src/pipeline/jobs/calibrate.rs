@@ -350,7 +350,6 @@ fn make_maps(
     instrument.channels.iter().map(read).collect()
 }
 
-/// Angular power spectrum of a map, K^2.
 fn map_cl_k2(map: &SkyMap) -> Result<Vec<f64>, PipelineError> {
     Ok(auto_cl(&map.harmonics(2 * map.nside(), &AnalysisOptions::default())?))
 }

@@ -44,5 +44,4 @@ impl CaseMarker {
     }
 }
 
-/// Name of the marker file in the folder of a finished case.
 pub(in crate::pipeline) const MARKER: &str = "case.json";

@@ -25,11 +25,8 @@ const MEMORY_FRACTION: f64 = 0.7;
 
 /// Maps of additional noise realisations; the first realisation is the map's own `noise.fits`.
 pub(in crate::pipeline) struct NoiseMaps<'a> {
-    /// Settings of the ground segment.
     pub(in crate::pipeline) config: &'a Config,
-    /// The downlink file.
     pub(in crate::pipeline) file: &'a Path,
-    /// Folder of the products.
     pub(in crate::pipeline) out: &'a Path,
     /// Seeds of realisations 2, 3, ...
     pub(in crate::pipeline) seeds: &'a [u64],
@@ -111,7 +108,6 @@ impl NoiseMaps<'_> {
 struct NoiseMapSolver {
     setup: SolverSetup,
     out: PathBuf,
-    /// Number of the first realisation.
     first: usize,
 }
 

@@ -230,7 +230,6 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
     Ok(write_atomically(path, bytes).map_err(failed)?)
 }
 
-/// Means and standard deviations of C_l as a table (CSV).
 pub(in crate::pipeline) fn spreads_csv(spreads: &[RealisationSpread]) -> String {
     let mut out =
         "case,frequency_hz,realisations,l,noise_mean_k2,noise_deviation_k2,map_mean_k2,map_deviation_k2\n"

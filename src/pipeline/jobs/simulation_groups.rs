@@ -23,14 +23,12 @@ const SPOOL: &str = "spool";
 pub const MERGE: &str = "merge";
 
 impl Plan {
-    /// Key that identifies the spool files of this plan.
     fn spool_key(&self) -> u64 {
         let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
         crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
     }
 }
 
-/// Path of a group's spool file.
 fn spool_path(file: &Path, group: &ChannelGroup) -> PathBuf {
     let number = |channel: Option<&ChannelId>| channel.map_or(0, |channel| channel.0);
     let mut name = file.as_os_str().to_owned();

@@ -75,7 +75,6 @@ struct CaseInputs<'a> {
     state: Option<&'a PathBuf>,
 }
 
-/// A study that is being run.
 struct StudyRun<'a> {
     study: &'a Study,
     out: &'a Path,

@@ -13,11 +13,9 @@ use crate::pipeline::config::{ConfigSource, PipelineError, Plan, has_sections, i
 use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, check_frequencies, read_known_sky};
 
-/// Maximum number of cases of a study.
 const CASES_MAX: usize = 1000;
 /// Maximum number of directions in `covariance_at_deg`: each needs a map in memory.
 const COVARIANCES_MAX: usize = 16;
-/// Maximum length of a study file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Maximum length of the name of a case's folder, without `case-`.
 const FOLDER_CHARACTERS_MAX: usize = 100;
@@ -209,7 +207,6 @@ impl StudyFile {
         (1..=realisations).map(case).collect()
     }
 
-    /// Files of the maps to calibrate with.
     fn model_files(&self, path: &Path, common: &ConfigSource) -> Result<Vec<PathBuf>, StudyError> {
         if self.model.is_empty() && self.calibrated {
             // Errors of the configuration are reported with the cases.
@@ -277,7 +274,6 @@ pub struct StudyCase {
     pub noise_seeds: Vec<u64>,
     /// Number shared by the cases that differ only in their realisation.
     pub(in crate::pipeline) family: usize,
-    /// Hash of the maps to calibrate with.
     pub(in crate::pipeline) models_hash: u64,
 }
 
@@ -426,7 +422,6 @@ fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
     (!steps.is_empty()).then_some(steps)
 }
 
-/// Formats a direction for file names.
 pub(in crate::pipeline) fn direction_name([longitude_deg, latitude_deg]: [f64; 2]) -> String {
     // Adding 0.0 turns -0.0 into 0.0.
     format!("{:.3}_{:.3}", longitude_deg + 0.0, latitude_deg + 0.0)
