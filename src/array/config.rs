@@ -219,7 +219,7 @@ impl ArrayConfig {
     fn check_dates(&self, checks: &mut Checks) {
         let epoch = &self.oem_epoch;
         // Whether a second 60 exists depends on the files' time system.
-        let is_date = |scale| Tai::read(epoch, scale).is_some();
+        let is_date = |scale| Tai::parse(epoch, scale).is_some();
         let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
         let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
         checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
@@ -320,7 +320,7 @@ impl ArrayConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array");
+        let mut checks = Checks::new("array");
         self.check_orbit(&mut checks);
         self.check_ellipse(&mut checks);
         self.check_arcs(&mut checks);

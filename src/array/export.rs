@@ -29,7 +29,7 @@ impl OemExport {
     /// # Errors
     /// The first value that is not accepted.
     pub fn new(epoch_tai_s: f64, until_s: f64, step_s: f64) -> Result<Self, InvalidValue> {
-        let mut checks = Checks::of("");
+        let mut checks = Checks::new("");
         let [from_s, to_s] = DATES_1958_S;
         let expected = "TAI since 1958, s, of the years 1972 to 2200";
         checks.number("epoch", epoch_tai_s, (from_s..to_s).contains(&epoch_tai_s), expected);
@@ -42,7 +42,7 @@ impl OemExport {
         checks.number("--step", step_s, (1.0..=600.0).contains(&step_s), "1 s to 600 s");
         match checks.finish().into_iter().next() {
             Some(problem) => Err(problem),
-            None => Ok(Self { epoch: Tai::from_1958_s(epoch_tai_s), until_s, step_s }),
+            None => Ok(Self { epoch: Tai::from_seconds_since_1958(epoch_tai_s), until_s, step_s }),
         }
     }
 

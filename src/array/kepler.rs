@@ -42,7 +42,7 @@ pub struct KeplerElements {
 impl KeplerElements {
     /// Invalid elements of satellite `index`, from 0, above a Moon of a radius; empty if there are none.
     pub(super) fn problems(&self, index: usize, moon_radius_m: f64) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array");
+        let mut checks = Checks::new("array");
         let key = |name: &str| format!("kepler[{index}].{name}");
         let eccentricity = self.eccentricity;
         let bound = (0.0..1.0).contains(&eccentricity);

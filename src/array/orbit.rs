@@ -203,7 +203,7 @@ impl Array {
     #[doc(hidden)]
     #[must_use]
     pub fn epoch_tai_s(&self) -> Option<f64> {
-        self.epoch.map(Tai::from_1958)
+        self.epoch.map(Tai::seconds_since_1958)
     }
 
     /// Notes on content of orbit files that is not used.

@@ -47,7 +47,7 @@ impl CalibrationConfig {
     /// All invalid values; empty if there are none. Does not open the gains file.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibration");
+        let mut checks = Checks::new("calibration");
         let bits = self.quantiser_bits;
         checks.require("quantiser_bits", bits, bits == 0 || VanVleck::new(bits).is_ok(), QUANTISER_BITS);
         checks.require(

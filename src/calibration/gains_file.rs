@@ -114,7 +114,7 @@ impl GainsFile {
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("");
+        let mut checks = Checks::new("");
         let tolerance_hz = self.frequency_tolerance_hz;
         let expected = "a finite number of at least 0";
         checks.number("frequency_tolerance_hz", tolerance_hz, tolerance_hz >= 0.0, expected);

@@ -391,7 +391,7 @@ fn progress_entry(handles: &RunHandles, stages: &[StageProgress], untold: u64) -
         let counters = ground.reception.lock();
         Box::new(counters.unwrap_or_else(std::sync::PoisonError::into_inner).clone())
     });
-    let solving = handles.solving.now().map(|solving| SolveCount {
+    let solving = handles.solving.progress().map(|solving| SolveCount {
         what: solving.what,
         iteration: solving.iteration,
         residual: solving.residual,

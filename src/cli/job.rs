@@ -24,7 +24,7 @@ impl Job {
     /// Joins the MPI job in which the process was started, if `is_wanted`.
     pub(super) fn join(is_wanted: bool) -> Result<Self, RanksError> {
         if !is_wanted {
-            return Ok(Self { job: None, ranks: Ranks::one() });
+            return Ok(Self { job: None, ranks: Ranks::single() });
         }
         let (job, ranks) = RankJob::start()?;
         Ok(Self { job: Some(job), ranks })
@@ -52,8 +52,10 @@ impl Job {
         result: &Result<T, impl std::fmt::Display>,
         interrupt: &Interrupt,
     ) -> Option<Completion> {
-        let error =
-            result.as_ref().err().filter(|_| self.ranks.are_many() && interrupt.cancel().is_cancelled())?;
+        let error = result
+            .as_ref()
+            .err()
+            .filter(|_| self.ranks.is_distributed() && interrupt.cancel().is_cancelled())?;
         match log::is_json() {
             true => log::log_json(Level::Error, "error", &Value::Null, Some(&error.to_string())),
             false => log::print_line(format_args!("error: {error}")),
@@ -63,7 +65,7 @@ impl Job {
 
     /// Ends the job: normally if this rank succeeded, otherwise by aborting all ranks.
     pub(super) fn conclude(self, result: CommandResult) -> CommandResult {
-        let Some(job) = self.job.filter(|_| self.ranks.are_many()) else { return result };
+        let Some(job) = self.job.filter(|_| self.ranks.is_distributed()) else { return result };
         let code = match result {
             Ok(Completion::Done) => return Ok(Completion::Done),
             Ok(Completion::Interrupted(code)) => code,

@@ -99,7 +99,7 @@ pub(super) fn while_solving<T>(watch: &SolveWatch, work: impl FnOnce() -> T) -> 
         scope.spawn(move || {
             let mut view = ProgressView::new(0);
             while matches!(stopped.recv_timeout(LINE_EVERY), Err(RecvTimeoutError::Timeout)) {
-                if let Some(solving) = watch.now() {
+                if let Some(solving) = watch.progress() {
                     let Solving { what, iteration, residual, target, .. } = &solving;
                     let fields =
                         json!({ "what": what, "iteration": iteration, "residual": residual, "target": target });
@@ -347,7 +347,7 @@ impl ProgressView {
         if let Some(listening) = &handles.listening {
             message.insert(0, self.senders(&listening.status));
         }
-        if let Some(solving) = handles.solving.now() {
+        if let Some(solving) = handles.solving.progress() {
             message.push(self.solution(&solving));
         }
         if let Some(saving) = handles

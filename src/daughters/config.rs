@@ -61,7 +61,7 @@ impl DaughtersConfig {
     /// All invalid values for channels of a width; empty if there are none.
     #[must_use]
     pub fn problems(&self, channel_width_hz: f64) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("daughters");
+        let mut checks = Checks::new("daughters");
         let bits = f64::from(self.bits);
         checks.number("bits", bits, [1, 2, 4, 8, FLOAT_BITS].contains(&self.bits), "1, 2, 4, 8 or 32");
         let level = self.level_time_constant_s;

@@ -56,7 +56,7 @@ impl GroundConfig {
         let described = self.described(instrument)?;
         self.map.check_priors(&described)?;
         let channels = described.channels.len();
-        if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
+        if let Some(misfit) = self.map.mismatches(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
         }
         Ok(self.map.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?)
@@ -102,8 +102,8 @@ impl GroundConfig {
     /// An accumulator without data that posts to `ledger`.
     pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
         Accumulator::new(self.map.clone(), ledger.clone())
-            .within_memory(self.memory_max_bytes)
-            .of_group(self.group.clone())
-            .in_part(self.part.clone())
+            .with_memory_limit(self.memory_max_bytes)
+            .with_group(self.group.clone())
+            .with_part(self.part.clone())
     }
 }

@@ -12,7 +12,7 @@ use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, G
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
-use crate::downlink::{CucTime, Kind, PacketHeader};
+use crate::downlink::{CucTime, PacketHeader, PacketKind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
@@ -91,8 +91,8 @@ impl Ground {
     /// Also accumulates additional noise realisations, one per seed. Only for final maps of the harmonic engine, without an archive.
     #[must_use]
     #[doc(hidden)]
-    pub fn with_noises(self, seeds: &[u64]) -> Self {
-        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noise_realisations(seeds), ..self }
     }
 
     /// Reports through `answers` which data the checkpoints hold, for senders that wait for it. It needs an archive and, from its
@@ -173,7 +173,7 @@ impl Ground {
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
                 let written = self.checkpoint();
-                if self.ranks().are_many() {
+                if self.ranks().is_distributed() {
                     // Without it the parts of the other ranks are useless.
                     written?;
                 }
@@ -213,7 +213,7 @@ impl Ground {
         gate.must_note_held = false;
         let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
         held.iter()
-            .filter(|header| header.kind == Kind::Visibilities)
+            .filter(|header| header.kind == PacketKind::Visibilities)
             .for_each(|header| self.note(header, false));
         self.collector.recheck_held();
     }
@@ -226,7 +226,8 @@ impl Ground {
     /// Solves for the gains of a pass with the packets held, in the order of sending.
     fn close_pass(&mut self, which: usize) {
         let Self { collector, calibrator, gate: Some(gate), .. } = self else { return };
-        let waiting = collector.held().packets().filter(|packet| packet.header.kind == Kind::Visibilities);
+        let waiting =
+            collector.held().packets().filter(|packet| packet.header.kind == PacketKind::Visibilities);
         let blocks = waiting.filter_map(|packet| collector.decoded(packet));
         let blocks = blocks.filter(|block| gate.holds(which, block)).collect();
         gate.close(which, blocks, calibrator.ephemeris());
@@ -322,7 +323,7 @@ impl Ground {
             CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
         });
         let mut missing = MissingPackets::default();
-        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == Kind::Visibilities) {
+        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == PacketKind::Visibilities) {
             let [all, since] = received.missing_since(reported.unwrap_or_default());
             missing = MissingPackets { all, unreported: if reported.is_some() { since } else { all } };
         }
@@ -356,7 +357,7 @@ impl Ground {
     /// Whether a checkpoint is due by the age of unsaved data. Ranks write at the same place of the stream, so never for them.
     fn is_old(&self) -> bool {
         let saves = self.archive.as_ref().is_some_and(Archive::saves_during_session);
-        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
+        saves && !self.ranks().is_distributed() && self.outcome.saving.is_old()
     }
 
     /// Whether the only checkpoint in the folder is the one that would be written now.
@@ -369,7 +370,7 @@ impl Ground {
     ///
     /// With ranks, a failure is an error. A cancelled rank writes none, as it stopped at another place of the stream than the others.
     fn last_checkpoint(&mut self) -> Result<(), GroundError> {
-        if self.ranks().are_many() {
+        if self.ranks().is_distributed() {
             return if self.cancel.is_cancelled() { Ok(()) } else { self.checkpoint() };
         }
         for pause in LAST_CHECKPOINT_PAUSES {

@@ -383,7 +383,7 @@ impl SpacecraftConfig {
     /// All invalid values; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         self.check_channels(&mut checks);
         self.check_fidelity(&mut checks);
         self.check_numbers(&mut checks);

@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
-use crate::numerics::lagrange;
+use crate::numerics::lagrange_weights;
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{
@@ -62,7 +62,7 @@ impl NinthConfig {
     /// All problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         let [low_hz, high_hz] = self.band_hz;
         let is_inside = NINTH_BAND_HZ[0] <= low_hz && low_hz < high_hz && high_hz <= NINTH_BAND_HZ[1];
         checks.number("ninth.band_hz", high_hz, is_inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
@@ -154,7 +154,7 @@ impl NinthSky {
                 }
                 let nodes: Vec<f64> = maps.iter().map(|(frequency_hz, _)| frequency_hz.ln()).collect();
                 let weights: Vec<Vec<f64>> =
-                    frequencies_hz.iter().map(|at_hz| lagrange(&nodes, at_hz.ln())).collect();
+                    frequencies_hz.iter().map(|at_hz| lagrange_weights(&nodes, at_hz.ln())).collect();
                 let at = |position: usize, weights: &Vec<f64>| {
                     weights
                         .iter()

@@ -73,7 +73,7 @@ impl ProductsConfig {
     /// All problems of the configuration; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("products");
+        let mut checks = Checks::new("products");
         let fwhm_deg = self.smooth_fwhm_deg;
         checks.require("smooth_fwhm_deg", fwhm_deg, (0.0..=90.0).contains(&fwhm_deg), "0 to 90 degrees");
         checks.finish()

@@ -122,12 +122,12 @@ mod tests {
             ("[[1e6, 2.5]]", "patterns of -2 to 2"),
             ("[[1e6, nan]]", "patterns of -2 to 2"),
         ] {
-            let mut checks = Checks::of("instrument");
+            let mut checks = Checks::new("instrument");
             table(text).check("pattern", Some(3), &mut checks);
             let said: Vec<String> = checks.finish().iter().map(ToString::to_string).collect();
             assert!(said.len() == 1 && said[0].contains(expected), "{text}: {said:?}");
         }
-        let mut checks = Checks::of("map");
+        let mut checks = Checks::new("map");
         table("[[1e6, 0.1, 0.2], [2e6, 0.0, 0.1]]").check("antennas.pattern", None, &mut checks);
         assert!(checks.finish().is_empty());
     }

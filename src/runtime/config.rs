@@ -20,7 +20,7 @@ impl RuntimeConfig {
     /// All problems of the configuration; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("runtime");
+        let mut checks = Checks::new("runtime");
         let capacity = self.queue_capacity;
         checks.number(
             "queue_capacity",

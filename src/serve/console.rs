@@ -228,7 +228,7 @@ impl Console {
                 report,
             }
         });
-        let solving = handles.and_then(|handles| handles.solving.now());
+        let solving = handles.and_then(|handles| handles.solving.progress());
         let saving = ground.and_then(|ground| ground.saving.report());
         let read = |ground: &GroundOutcome| {
             let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();

@@ -93,7 +93,7 @@ impl SkyConfig {
     /// [`InvalidValue`] for `sky.l_max`.
     pub fn check_l_max(l_max: usize, nside: usize) -> Result<(), InvalidValue> {
         let limit = Self::l_max_limit(nside);
-        let mut checks = Checks::of("sky");
+        let mut checks = Checks::new("sky");
         checks.require("l_max", l_max, l_max <= limit, Self::l_max_expected(limit));
         checks.finish().pop().map_or(Ok(()), Err)
     }
@@ -101,7 +101,7 @@ impl SkyConfig {
     /// Lists the problems of the configuration for `channels` channels; empty if it is valid.
     #[must_use]
     pub fn problems(&self, channels: usize) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("sky");
+        let mut checks = Checks::new("sky");
         let nside = self.nside;
         let good = is_valid_nside(nside) && nside <= GENERATED_NSIDE_MAX;
         checks.require("nside", nside, good, format!("a power of two from 1 to {GENERATED_NSIDE_MAX}"));

@@ -10,7 +10,7 @@ use lunarray::imaging::anywhere::AssumedInstrument;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::{
     Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
-    SnapshotSums, SumCounts,
+    SnapshotData, SumCounts,
 };
 use lunarray::imaging::{SolveError, SolveWatch, Solver, SolverSetup, StoppingRule};
 use lunarray::response::pixel::PixelMethod;
@@ -140,7 +140,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             is_final,
             span_s: [0.0, 1.0],
             nside: 2,
-            sums: SnapshotSums::Pixel(sums),
+            data: SnapshotData::Pixel(sums),
         };
         let setup = SolverSetup {
             epsilon: PerChannel::All(1e-4),
@@ -152,7 +152,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
             refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
             assumed: AssumedInstrument::default(),
-            passes: None,
+            iteration_folder: None,
             trace_probes: 0,
             samples: 0,
             watch: SolveWatch::default(),

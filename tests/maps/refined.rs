@@ -159,7 +159,7 @@ fn solve(
     rule: RefineRule,
     watch: &SolveWatch,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
-    let steps = RefineSteps { start: None, passed: &mut |_| {} };
+    let steps = RefineSteps { start: None, save: &mut |_| {} };
     solve_refined(sums, request, (rule, &Regulariser::default()), None, steps, watch.named("test"))
 }
 
@@ -280,7 +280,7 @@ fn a_refined_map_takes_an_r_of_the_degree() {
     let sums = sums(10, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, 10), 1000));
     let rule = RefineRule { passes_max: 20, residual_max: 1e-6 };
     let solved = |regulariser: &Regulariser| {
-        let steps = RefineSteps { start: None, passed: &mut |_| {} };
+        let steps = RefineSteps { start: None, save: &mut |_| {} };
         let (rule, watch) = ((rule, regulariser), SolveWatch::default());
         solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap().0
     };
@@ -504,7 +504,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     let watch = SolveWatch::default();
     let mut passes = Vec::new();
     let mut keep = |x: [&[f64]; 2]| passes.push(x.map(<[f64]>::to_vec));
-    let steps = RefineSteps { start: None, passed: &mut keep };
+    let steps = RefineSteps { start: None, save: &mut keep };
     let (whole, refinement) =
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap();
@@ -513,7 +513,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     assert_eq!(passes.last(), Some(&whole.unknowns));
     // The matrix tells errors in x from residuals by its condition, as far as that is measured: a prior of 1e-4 of W_max.
     let go_on = |start: [Vec<f64>; 2]| {
-        let steps = RefineSteps { start: Some(start), passed: &mut |_| {} };
+        let steps = RefineSteps { start: Some(start), save: &mut |_| {} };
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap()
     };
@@ -543,7 +543,7 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
     let at = geometry(20e3, 0.02, 300.0, 2, &BASELINES_M[..1]);
     let sums = sums(4, &blocks(&at, &vec![Complex64::ONE; at.len()], 1000));
     let cancel = Cancel::new();
-    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    let watch = SolveWatch::new(cancel.clone()).with_grace(Duration::ZERO);
     let rule = RefineRule { passes_max: 2, residual_max: 1e-9 };
     assert!(solve(&sums, request(2), rule, &watch).is_ok());
     cancel.cancel();

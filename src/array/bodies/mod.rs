@@ -46,7 +46,7 @@ impl EarthModel {
     pub fn hat(self, epoch_tai_s: f64, t_s: f64) -> Vec3 {
         match self {
             Self::Circle(earth_deg) => Earth::Circle(earth_deg.to_radians()).hat(t_s),
-            Self::Dated => earth_hat(Tai::from_1958_s(epoch_tai_s).plus_s(t_s)),
+            Self::Dated => earth_hat(Tai::from_seconds_since_1958(epoch_tai_s).plus_s(t_s)),
         }
     }
 }
@@ -194,7 +194,7 @@ mod tests {
     #[test]
     fn directions_agree_with_another_ephemeris() {
         for (date, earth, sun) in PLACES {
-            let time = Tai::read(date, TimeScale::Utc).unwrap();
+            let time = Tai::parse(date, TimeScale::Utc).unwrap();
             let off_deg = |found: Vec3, place| norm(sub(found, towards(place))).to_degrees();
             // The tolerance is the stated accuracy of the series, plus 1e-4 of rounding in the table above.
             let [earth_deg, sun_deg] = [off_deg(earth_hat(time), earth), off_deg(sun_hat(time), sun)];
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn a_table_of_directions_is_the_series() {
-        let epoch = Tai::read("2027-03-05T06:30:00", TimeScale::Utc).unwrap();
+        let epoch = Tai::parse("2027-03-05T06:30:00", TimeScale::Utc).unwrap();
         let earth = DatedEarth::new(epoch, [-7200.0, 2.6e6]);
         for k in 0..3000 {
             // Times extend from before the table to beyond it.

@@ -55,7 +55,7 @@ impl PropagateConfig {
 
     /// All invalid values; empty if there are none.
     pub(in crate::array) fn problems(&self, satellites: usize, from_elements: bool) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array.propagate");
+        let mut checks = Checks::new("array.propagate");
         let days_max = DAYS_MAX / satellites.max(1) as f64;
         let expected =
             format!("0 to {days_max:.0} for {satellites} satellites, whose states take 40 kB a day each");

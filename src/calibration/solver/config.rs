@@ -168,7 +168,7 @@ impl SolverConfig {
     /// All settings that cannot be used while the data arrive; empty if there are none.
     #[must_use]
     pub fn problems_of_hook(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
+        let mut checks = Checks::new("calibrate");
         let has_signal = self.mode != CalibrationMode::Sky || !self.model_files.is_empty();
         let expected = "maps of the sky, one for each channel, with calibration.hook = \"solve\" and calibrate.mode = \"sky\"";
         checks.require("model_files", "[]", has_signal, expected);
@@ -216,7 +216,7 @@ impl SolverConfig {
     /// All invalid values; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
+        let mut checks = Checks::new("calibrate");
         for (key, value, most) in [
             ("amplitude_sigma", self.amplitude_sigma, 10.0),
             ("phase_sigma_deg", self.phase_sigma_deg, 1e4),

@@ -277,7 +277,7 @@ impl InstrumentConfig {
     /// fidelity. Empty if there are none.
     #[must_use]
     pub fn problems(&self, satellites: usize, channels: usize, samples: bool) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("instrument");
+        let mut checks = Checks::new("instrument");
         for (name, terms) in self.terms() {
             let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
             terms.check(name, (satellites, "a daughter"), maxima_of(name), smooth, &mut checks);

@@ -55,7 +55,7 @@ impl NavigationConfig {
     /// All invalid values for an array of `satellites`; empty if there are none.
     #[must_use]
     pub fn problems(&self, satellites: usize) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("navigation");
+        let mut checks = Checks::new("navigation");
         for (name, terms) in self.terms() {
             let of_tags = name == "time_tag_ms";
             let of = if of_tags { (1, "for the formation") } else { (satellites, "a daughter") };

@@ -34,7 +34,7 @@ pub(super) struct StateFolder {
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        Self::open_with_ranks(path, &Ranks::one())
+        Self::open_with_ranks(path, &Ranks::single())
     }
 
     /// Like [`StateFolder::open`], together with the other ranks.
@@ -51,7 +51,7 @@ impl StateFolder {
     pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
         match Self::open(path) {
             Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
-                Self::new(path, &Ranks::one(), None)
+                Self::new(path, &Ranks::single(), None)
             }
             opened => opened,
         }
@@ -114,7 +114,7 @@ impl StateFolder {
         let used = found.as_ref().and_then(|(index, _)| self.checkpoints.get(*index)).copied();
         // Other ranks may still be reading files that are about to be renamed.
         let chosen = used.map_or([0; 2], |used| [used.number as i64, used.parts as i64]);
-        if !self.ranks.agree(&chosen) {
+        if !self.ranks.have_equal(&chosen) {
             return Err(GroundError::NotShared { path: self.path.clone() });
         }
         let Some((index, read)) = found else {
@@ -164,7 +164,7 @@ impl StateFolder {
             .retain(|number, _| self.checkpoints.iter().any(|checkpoint| checkpoint.number == *number));
         if self.segments.len() < self.checkpoints.len()
             || self.require_same_folder().is_err()
-            || self.ranks.are_many()
+            || self.ranks.is_distributed()
         {
             return;
         }
@@ -203,14 +203,16 @@ impl StateFolder {
             return Err(GroundError::CheckpointName { path: greatest.path(&self.path, 0) });
         }
         match self.write(&path, &mut write) {
-            Err(error) if is_out_of_room(&error) && self.checkpoints.len() > 1 && !self.ranks.are_many() => {
+            Err(error)
+                if is_out_of_room(&error) && self.checkpoints.len() > 1 && !self.ranks.is_distributed() =>
+            {
                 self.drop_older()?;
                 self.write(&path, &mut write)?;
             }
             written => written?,
         }
         self.checkpoints.push(next);
-        match self.ranks.are_many() {
+        match self.ranks.is_distributed() {
             true => self.remove_superseded(),
             false => self.remove_all_but(KEPT),
         }
@@ -244,7 +246,7 @@ impl StateFolder {
 
     /// Checks that the path still leads to the locked folder, as another process may use a folder that replaced it.
     fn require_same_folder(&self) -> Result<(), GroundError> {
-        match self.lock.as_ref().and_then(FolderLock::lost) {
+        match self.lock.as_ref().and_then(FolderLock::loss) {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }

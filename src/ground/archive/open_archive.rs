@@ -12,7 +12,7 @@ use super::names::parts_with;
 use super::settings::{require_equal, settings_of};
 use super::store::Archive;
 use crate::calibration::AutoTable;
-use crate::downlink::{DownlinkError, Kind};
+use crate::downlink::{DownlinkError, PacketKind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::live_view::LiveViewWriter;
 use crate::ground::promises::SenderPromises;
@@ -55,8 +55,8 @@ impl ArchiveContents {
         }
         self.calibration.version = self.calibration.version.max(other.calibration.version);
         self.journal.merge(other.journal).map_err(|count| {
-            let apid = Kind::Visibilities.apid();
-            DownlinkError::TakenTwice { apid, count }
+            let apid = PacketKind::Visibilities.apid();
+            DownlinkError::DuplicatePacket { apid, count }
         })?;
         self.collector.merge(other.collector, |header| self.journal.contains(header))?;
         // If two segments start at the same time, the first is used.
@@ -81,7 +81,7 @@ fn read_parts(
     };
     let mut whole: Option<(ArchiveHead, Accumulator)> = None;
     for (path, part) in parts_with(path) {
-        let (head, sums) = read_part(&path, part, empty.without_sums())?;
+        let (head, sums) = read_part(&path, part, empty.without_data())?;
         match &mut whole {
             None => whole = Some((head, sums)),
             Some((first, _)) if first.checksum != head.checksum => {
@@ -121,7 +121,7 @@ impl OpenArchive {
         config: &GroundConfig,
         renames_damaged: bool,
     ) -> Result<Self, GroundError> {
-        Self::with_ranks(folder, config, renames_damaged, &Ranks::one())
+        Self::with_ranks(folder, config, renames_damaged, &Ranks::single())
     }
 
     /// Like [`OpenArchive::new`], as one of several ranks.
@@ -131,10 +131,10 @@ impl OpenArchive {
         renames_damaged: bool,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        if config.map.holds_visibilities() && ranks.are_many() {
+        if config.map.holds_visibilities() && ranks.is_distributed() {
             return Err(AccumulationError::HeldByRank.into());
         }
-        let mut folder = match renames_damaged || ranks.are_many() {
+        let mut folder = match renames_damaged || ranks.is_distributed() {
             true => StateFolder::open_with_ranks(folder, ranks)?,
             false => StateFolder::open_to_read(folder)?,
         };
@@ -157,7 +157,7 @@ impl OpenArchive {
     pub(super) fn move_to(&mut self, folder: StateFolder) {
         self.folder = folder;
         if let Some(contents) = &mut self.contents {
-            contents.accumulator.leave_segments();
+            contents.accumulator.forget_segments();
         }
     }
 
@@ -180,7 +180,7 @@ impl OpenArchive {
         let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let mut gate = config.gate()?;
         if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {

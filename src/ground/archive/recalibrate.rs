@@ -11,7 +11,7 @@ use super::journal::{Journal, JournalRecord, SendingKey};
 use super::settings::settings_of;
 use crate::calibration::{AntennaGains, AutoTable, CalibrationHook, Calibrator, ReceivedBlocks};
 use crate::downlink::receive::EventReader;
-use crate::downlink::{Event, Kind};
+use crate::downlink::{Event, PacketKind};
 use crate::frames::GroundFrame;
 use crate::ground::{DeliveredPacket, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::imaging::EngineKind;
@@ -140,7 +140,7 @@ fn for_each_packet(
     for path in files {
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
-            Event::Packet(packet) if packet.header.kind == Kind::Visibilities => {
+            Event::Packet(packet) if packet.header.kind == PacketKind::Visibilities => {
                 take(&HeldPacket::new(packet))
             }
             _ => Ok(()),
@@ -193,7 +193,7 @@ impl Recalibration {
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
             return Ok(());
         };
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
@@ -252,7 +252,7 @@ impl Recalibration {
     /// Writes the archive twice, so that falling back to the older checkpoint does not bring the old gains back.
     fn write(self, new: &GroundConfig) -> Result<Recalibrated, GroundError> {
         let Self { mut ground, journal, mut report, .. } = self;
-        ground.accumulator.set_spans(&journal.spans_s());
+        ground.accumulator.retain_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             let settings = settings_of(new)?;
             let gains = settings.iter().find(|(key, _)| key == "calibration.gains_file");

@@ -22,7 +22,7 @@ impl Ground {
     /// A folder that cannot be used or is in use; an archive that was made with other settings, or without a usable
     /// checkpoint; calibration that cannot be read.
     pub fn open(folder: &Path, config: &GroundConfig, checkpoint_every: u64) -> Result<Self, GroundError> {
-        Self::open_with_ranks(folder, config, checkpoint_every, &Ranks::one())
+        Self::open_with_ranks(folder, config, checkpoint_every, &Ranks::single())
     }
 
     /// Like [`Ground::open`], as one of several ranks that open the folder together. Each writes its part of every checkpoint.
@@ -40,7 +40,7 @@ impl Ground {
         let mut ground =
             OpenArchive::with_ranks(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
         // Ranks apply the raw archive but do not write to it; only a stage that listens does.
-        ground.recover(folder, !ranks.are_many())?;
+        ground.recover(folder, !ranks.is_distributed())?;
         let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());
         ground.show_state(latest_s);
         Ok(ground)

@@ -8,7 +8,7 @@ use crate::ground::{GroundConfig, GroundError};
 /// The settings on which the sums depend, including checksums of input files.
 pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>, GroundError> {
     let mut settings: Vec<(String, String)> =
-        config.map.of_sums().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+        config.map.sum_settings().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
     settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
     settings.push(("calibration.quantiser_bits".to_owned(), config.calibration.quantiser_bits.to_string()));
     settings.push(("calibration.sub_bands".to_owned(), config.calibration.sub_bands.to_string()));

@@ -143,7 +143,7 @@ impl Plan {
         let map = &self.config.map;
         let bands = self.config.spacecraft.sub_bands as f64;
         let expected = |(channel, schedule): (usize, &Schedule)| {
-            let is_mapped = map.maps(ChannelId(channel as u16));
+            let is_mapped = map.is_mapped(ChannelId(channel as u16));
             let limit_m = map.baseline_m_max(schedule.frequency_hz);
             let mut expected = Expected::default();
             for &window in &self.windows {

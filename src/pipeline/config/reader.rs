@@ -258,7 +258,7 @@ fn plain_type_names(message: &str) -> String {
 /// The units that a key accepts, if its value is a text or a list with texts.
 fn expected_units(key: &str, value: &Value) -> Option<&'static str> {
     let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
-    Dimension::of_key(key).filter(|_| is_text).map(Dimension::expected)
+    Dimension::from_key(key).filter(|_| is_text).map(Dimension::expected)
 }
 
 /// Adds the units that the key accepts to a message of the parser.

@@ -141,10 +141,10 @@ pub(in crate::pipeline) fn complete_costs(
     let channels = (0..).map(ChannelId).zip(&instrument.channels);
     let cost = |frequency_hz: f64| {
         let visibilities = map.refine.visibilities_max as f64;
-        EngineCost::of(map, ChannelData { frequency_hz, visibilities, windows: f64::INFINITY })
+        EngineCost::estimate(map, ChannelData { frequency_hz, visibilities, windows: f64::INFINITY })
     };
     channels
-        .filter(|(channel, _)| map.maps(*channel))
+        .filter(|(channel, _)| map.is_mapped(*channel))
         .map(|(id, channel)| (id, cost(channel.frequency_hz)))
         .collect()
 }

@@ -52,7 +52,7 @@ impl Config {
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
             assumed: map.assumed(),
-            passes: None,
+            iteration_folder: None,
             trace_probes: map.trace_probes,
             samples: 0,
             watch,
@@ -91,8 +91,8 @@ pub(in crate::pipeline) fn add(
     let MappingContext { out, truth, watch, viewers, product_state } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
-    let passes = config.map.refine.is_on().then(|| out.to_owned());
-    let setup = SolverSetup { passes, ..config.solver(watch.with_ranks(&ranks))? };
+    let iteration_folder = config.map.refine.is_on().then(|| out.to_owned());
+    let setup = SolverSetup { iteration_folder, ..config.solver(watch.with_ranks(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

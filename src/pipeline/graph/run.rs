@@ -126,7 +126,7 @@ pub fn run(
     cancel: &Cancel,
     on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    run_with_ranks(&Ranks::one(), plan, out, cancel, on_start)
+    run_with_ranks(&Ranks::single(), plan, out, cancel, on_start)
 }
 
 /// Runs the whole chain as one of several MPI ranks that share the normal equations.
@@ -145,7 +145,7 @@ pub fn run_with_ranks(
 ) -> Result<RunSummary, PipelineError> {
     plan.config.require_shareable(ranks.share().count)?;
     let DownlinkConfig { link, rate_bits_per_s_max, .. } = &plan.config.downlink;
-    if ranks.are_many() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
+    if ranks.is_distributed() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
         let found = "downlink.link with faults, or downlink.rate_bits_per_s_max";
         return Err(PipelineError::NotShareable {
             found,
@@ -172,7 +172,7 @@ pub fn run_with_ranks(
     let truth = Truth::new(&skies, plan.config.map_shape())?;
     drop(skies);
     let grace = Grace::new(&plan.config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).within(grace.iterate);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.iterate);
     let ground =
         Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.accumulate).with_ranks(ranks);
     let maps = MapWatch::default();
@@ -206,7 +206,7 @@ pub fn simulate(
 ) -> Result<Report, PipelineError> {
     let destination = destination.into();
     if plan.config.downlink.link.is_on() && destination.file.is_none() {
-        return Err(DownlinkError::from(SocketError::TruthNowhere).into());
+        return Err(DownlinkError::from(SocketError::NoTruthFile).into());
     }
     if let Some(file) = &destination.file {
         write_instrument_truth(plan, file)?;
@@ -307,7 +307,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let grace = Grace::new(&config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).within(grace.iterate);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.iterate);
     let ranks = ground.ranks().clone();
     let ground = ground.with_cancel(cancel, grace.accumulate);
     let maps = MapWatch::default();
@@ -460,7 +460,7 @@ pub(in crate::pipeline) fn start_single_process(
     config: &RuntimeConfig,
     cancel: &Cancel,
 ) -> Result<Report, PipelineError> {
-    start(graph, &Ranks::one(), config, cancel)
+    start(graph, &Ranks::single(), config, cancel)
 }
 
 fn start(
@@ -474,7 +474,7 @@ fn start(
     }
     // The named stages save data: they may finish without a time limit.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
-    Ok(graph.run(cancel, if ranks.are_many() { RANK_SHUTDOWN } else { SHUTDOWN })?)
+    Ok(graph.run(cancel, if ranks.is_distributed() { RANK_SHUTDOWN } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.
@@ -499,7 +499,7 @@ fn collect_and_write_summary(
     out: &Path,
     finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    if ranks.are_many() && finished.report.cancelled {
+    if ranks.is_distributed() && finished.report.cancelled {
         return Err(PipelineError::RankInterrupted);
     }
     if ranks.is_first() {

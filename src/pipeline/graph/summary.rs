@@ -110,7 +110,8 @@ impl RunSummary {
     /// Merges this summary with that of an earlier reading of the same downlink, which mapped other channels.
     pub(in crate::pipeline) fn merged_with_earlier(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
-        let ledger = earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
+        let ledger =
+            earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_accumulation, elsewhere);
         Self {
             seed: earlier.seed.or(self.seed),
             space_hash: earlier.space_hash.or(self.space_hash),

@@ -103,7 +103,7 @@ fn alpha_terms(model: &HarmonicModel, half: f64) -> usize {
 
 /// Finds how many of the first runs of `order` can share alphas, and the interval that they cover.
 fn next_range(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, usize) {
-    let reach = chebyshev::reach(ALPHAS_TARGET, ALPHA_TOLERANCE * model.settings().tolerance)
+    let reach = chebyshev::h_max(ALPHAS_TARGET, ALPHA_TOLERANCE * model.settings().tolerance)
         / model.sky.l_max().max(1) as f64;
     let range = |k: usize| {
         let run = &runs[k];

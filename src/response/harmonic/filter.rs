@@ -74,7 +74,7 @@ impl FilteredPatterns {
 #[inline]
 fn apply_taps(values: &[f32], taps: &[f32; 2 * TAPS_PER_SIDE + 1]) -> f32 {
     let sum: f32 = values.iter().zip(taps).map(|(v, t)| v * t).sum();
-    f32::entry(f64::from(sum))
+    f32::table_entry(f64::from(sum))
 }
 
 /// Fits symmetric taps by least squares over the band; the spectrum outside is not constrained.

@@ -230,8 +230,8 @@ impl HarmonicModel {
             m_max: self.sky.l_max() as f64,
             // A wider range would read more than a block of nodes for a few visibilities.
             u_half: 0.5 * BLOCK_NODES as f64 / NODES_PER_WAVELENGTH,
-            fringe_phase_half: chebyshev::reach(TERMS, tolerance),
-            node_half: chebyshev::reach(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
+            fringe_phase_half: chebyshev::h_max(TERMS, tolerance),
+            node_half: chebyshev::h_max(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
                 / self.sky.l_max().max(1) as f64,
             residual: 10.0 * tolerance,
         }

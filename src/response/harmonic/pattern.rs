@@ -116,7 +116,7 @@ impl<T: Real> PatternTable<T> {
                     let limb = if ring.is_whole { ring.limb } else { ring.limb - half };
                     solver.solve(std::f64::consts::TAU * u * ring.sin_theta, limb, orders_of_ring);
                     for (place, value) in chunk[k..].iter_mut().step_by(count).zip(orders_of_ring.iter()) {
-                        *place = T::entry(*value);
+                        *place = T::table_entry(*value);
                     }
                 }
             },
@@ -136,7 +136,7 @@ impl<T: Real> PatternTable<T> {
                 );
                 let out = out.as_mut().subrows_mut(sign * grid.count + first, count);
                 // lambda_{l,-mu} = (-1)^mu lambda_{l,mu} gives the sign in the table.
-                faer::linalg::matmul::matmul(out, Accum::Replace, ring, lambda, T::of(1.0), Par::Seq);
+                faer::linalg::matmul::matmul(out, Accum::Replace, ring, lambda, T::nearest(1.0), Par::Seq);
             }
         });
     }

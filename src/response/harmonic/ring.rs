@@ -20,13 +20,13 @@
 
 use std::f64::consts::PI;
 
-use crate::numerics::quadrature::{GaussLegendre, Rules};
+use crate::numerics::quadrature::{GaussLegendre, QuadratureRules};
 use crate::numerics::trigonometry::sin_cos;
 
 /// Quadrature rules for `I_0` and `I_1`, and buffers for one ring.
 #[derive(Clone, Debug)]
 pub(crate) struct RingSolver {
-    rules: std::sync::Arc<Rules>,
+    rules: std::sync::Arc<QuadratureRules>,
     order_max: usize,
     ratio: Vec<f64>,
     values: Vec<f64>,
@@ -36,7 +36,7 @@ impl RingSolver {
     /// Prepares quadrature rules for |x| <= `x_max`.
     pub(crate) fn new(x_max: f64) -> Self {
         let points = GaussLegendre::points_for(0.5 * PI * x_max.abs());
-        let rules = std::sync::Arc::new(Rules::up_to(points));
+        let rules = std::sync::Arc::new(QuadratureRules::up_to(points));
         Self { rules, order_max: 0, ratio: Vec::new(), values: Vec::new() }
     }
 
@@ -64,7 +64,7 @@ impl RingSolver {
 
     fn start(&self, x: f64, limb: f64) -> [f64; 2] {
         let points = GaussLegendre::points_for(0.5 * limb * x);
-        let rule = self.rules.of(points);
+        let rule = self.rules.at_least(points);
         integrate_start(x, limb, &rule.abscissae, &rule.weights)
     }
 

@@ -75,8 +75,8 @@ impl<T: Real> RotationTable<T> {
         for m in 0..=l {
             let a = coefficient(m);
             for (k, (sin, cos)) in sin_cos[m * count..(m + 1) * count].iter().enumerate() {
-                z[0][k * columns + m] = T::of(a.re * cos + a.im * sin);
-                z[1][k * columns + m] = T::of(a.im * cos - a.re * sin);
+                z[0][k * columns + m] = T::nearest(a.re * cos + a.im * sin);
+                z[1][k * columns + m] = T::nearest(a.im * cos - a.re * sin);
             }
         }
         let (plus, minus) = self.degree(l);
@@ -87,7 +87,7 @@ impl<T: Real> RotationTable<T> {
                 Accum::Replace,
                 MatRef::from_row_major_slice(d, rows, columns),
                 MatRef::from_column_major_slice(&z[..columns * count], columns, count),
-                T::of(1.0),
+                T::nearest(1.0),
                 Par::Seq,
             );
         }
@@ -103,10 +103,10 @@ fn sum_and_difference_rows<T: Real>(wigner: &WignerTable, mu: usize) -> Vec<T> {
             continue;
         }
         for sign in [1.0, -1.0] {
-            values.push(T::entry(row[l]));
+            values.push(T::table_entry(row[l]));
             for m in 1..=l {
                 let parity = if m % 2 == 0 { sign } else { -sign };
-                values.push(T::entry(row[l + m] + parity * row[l - m]));
+                values.push(T::table_entry(row[l + m] + parity * row[l - m]));
             }
         }
     }

@@ -69,7 +69,7 @@ impl GeneratedSky {
     /// Lists the problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("sky.generated");
+        let mut checks = Checks::new("sky.generated");
         let rules = [
             ("small_scale_amplitude", self.small_scale_amplitude, 0.0..=10.0, "0 to 10"),
             ("small_scale_fwhm_deg", self.small_scale_fwhm_deg, 0.1..=30.0, "0.1 to 30 degrees"),

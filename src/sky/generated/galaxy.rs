@@ -138,11 +138,11 @@ pub(super) struct Galaxy {
     opacity_scale: f64,
     /// Standard deviation of the logarithm of the gas's opacity.
     cloud_rms: f64,
-    /// Logarithm of the optical depth at the reference frequency, [latitude][longitude].
+    /// Logarithm of the optical depth at the reference frequency, `[latitude][longitude]`.
     depth: Vec<f64>,
-    /// Logarithm of the unabsorbed temperature, [latitude][longitude].
+    /// Logarithm of the unabsorbed temperature, `[latitude][longitude]`.
     unabsorbed: Vec<f64>,
-    /// Logarithm of the absorbed temperature, [latitude][longitude][cloudiness].
+    /// Logarithm of the absorbed temperature, `[latitude][longitude][cloudiness]`.
     absorbed: Vec<f64>,
 }
 

@@ -3,7 +3,7 @@
 //! | entry point | provides |
 //! |---|---|
 //! | [`Transform`] | synthesis of HEALPix maps and its transpose, after libsharp |
-//! | [`analysis`] | coefficients of a map |
+//! | [`analysis()`] | coefficients of a map |
 //! | [`Alm`] | coefficients of a real field; [`Alm::rotated`] rotates them to another frame |
 //! | [`times_direction`] | the product of a field and a component of the direction |
 //! | [`WignerTable`] | Wigner's d-functions |

@@ -107,7 +107,7 @@ impl Transform {
 
     /// Computes the transpose of the synthesis times the pixel area: the sum over pixels of map conj(Y_lm) 4 pi / N_pix.
     ///
-    /// This is the quadrature for a_lm without corrections; [`crate::sky::harmonics::analysis`] computes the coefficients.
+    /// This is the quadrature for a_lm without corrections; [`crate::sky::harmonics::analysis()`] computes the coefficients.
     ///
     /// # Errors
     /// [`HarmonicsError::Pixels`] unless `map` has the transform's `nside`.
