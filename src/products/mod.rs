@@ -12,6 +12,7 @@ mod channel;
 mod config;
 mod epsilons;
 mod error;
+mod error_maps;
 mod hips;
 mod latitudes;
 pub mod pictures;
@@ -39,6 +40,7 @@ pub use epsilons::{
 };
 #[doc(hidden)]
 pub use error::ProductsError;
+pub(crate) use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
 #[doc(hidden)]

@@ -7,6 +7,7 @@ use std::process::Command;
 
 use common::workplace::{Workplace, fail, files, json, succeed};
 use lunarray::sky::fits::{ReadOptions, read_map_file};
+use lunarray::units::constants::MOON_RADIUS_M;
 use serde_json::Value;
 
 /// One channel whose large scales the array measures less well than its noise: R matters.
@@ -101,9 +102,11 @@ fn the_same_state_gives_the_same_samples_and_stays_as_it_is() {
         succeed(&["sample", &state, "--count", count, "--out", &out]);
         files(Path::new(&out))
     });
-    assert_eq!(one.len(), 5, "{:?}", one.keys());
-    assert_eq!(more.len(), 7, "{:?}", more.keys());
-    for (path, bytes) in one.iter().filter(|(path, _)| !path.ends_with("sigma.fits")) {
+    assert_eq!(one.len(), 8, "{:?}", one.keys());
+    assert_eq!(more.len(), 10, "{:?}", more.keys());
+    // Of all samples together.
+    let together = ["sigma.fits", "spectrum.csv"];
+    for (path, bytes) in one.iter().filter(|(path, _)| !together.iter().any(|name| path.ends_with(name))) {
         assert!(bytes == &more[path], "{}", path.display());
     }
     assert!(files(Path::new(&state)) == before);
@@ -117,6 +120,41 @@ fn an_r_without_a_posterior_is_refused_before_anything_is_solved() {
     let said = fail(&["sample", &state, "--out", &out, "--set", "map.regulariser=identity"]);
     assert!(said.contains("expected --set map.regulariser=data"), "{said}");
     assert!(!Path::new(&out).exists());
+}
+
+/// Sigma, mask, resolution, mean and dipole, against matrices that numpy forms of the same visibilities.
+#[test]
+#[ignore = "needs LUNARRAY_PYTHON"]
+fn errors_are_those_of_dense_matrices() {
+    let place = Workplace::new(&SMALL.replace("nside = 4", "nside = 8"));
+    for (engine, pixels) in [("harmonic", false), ("pixel", true)] {
+        let (_, channel, folder) = state(&place, engine);
+        let visibilities = place.path("visibilities.csv");
+        succeed(&["export", "visibilities", &place.path("small.ccsds"), "--out", &visibilities]);
+        let asked = serde_json::json!({
+            "visibilities": visibilities, "channel": channel, "folder": folder, "l_max": 20, "moon_radius_m": MOON_RADIUS_M,
+        });
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/posterior.py");
+        let output = assert_cmd::Command::new(common::python())
+            .arg(script)
+            .write_stdin(asked.to_string())
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let found: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let numbers = |key: &str| -> Vec<f64> {
+            found[key].as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect()
+        };
+        let spread = |key: &str| {
+            let ratios = numbers(key);
+            let middle = mean(ratios.iter().copied());
+            [middle, mean(ratios.iter().map(|ratio| (ratio - middle).powi(2))).sqrt()]
+        };
+        eprintln!(
+            "{engine}: map {} sigma {:?} resolution {:?} mask {} of which measured {} moments {:?} dipole {:?}",
+            found["map"], spread("sigma"), spread("resolution"), found["mask"], found["measured"], numbers("moments_sigma"), numbers("dipole")
+        );
+    }
 }
 
 #[test]

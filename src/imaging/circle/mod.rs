@@ -55,7 +55,7 @@ pub use setup::{
     shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
-pub(super) use sigma::view_sigma_k;
+pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k};
 pub use solve::{HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, solve_harmonics, solve_regularised};
 pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};

@@ -1,11 +1,11 @@
 //! The regularised solution over harmonic coefficients.
 
-use super::sigma::pixel_sigma_k;
+use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
 use crate::imaging::power::{
-    Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, Uncertainty,
+    Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, Sample, Uncertainty,
 };
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::FitInputs;
@@ -25,8 +25,8 @@ pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
 /// Realisations or samples that are solved for together: a thread has a workspace for each.
 pub const NOISES_TOGETHER: usize = 4;
 
-/// Residual of the error of the mean: an error of an error.
-const BESIDE: f64 = 1e-3;
+/// Residual of the errors of mean and dipole: they err by its square.
+const BESIDE: f64 = 0.03;
 
 /// Products with the blocks before the iteration for W_max.
 const LIFTS: usize = 6;
@@ -212,28 +212,21 @@ fn solve_with_power(
     };
     let found = sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
     let factor = found.noise_factor();
-    let FoundPower { regularisation, solution, power, ratio } = found;
-    let factors = Factors::new(&blocks, &regularisation);
-    let regularisation = Diagonal::ByDegree(regularisation);
+    let FoundPower { regularisation: r, solution, power, ratio } = found;
+    let factors = Factors::new(&blocks, &r);
+    let regularisation = Diagonal::ByDegree(r.clone());
     let precondition = |v: &mut [f64]| factors.solve(v);
     let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
     let noise = match start {
         Some([_, noise]) if noise.len() == right.len() => noise.clone(),
         _ => vec![0.0; right.len()],
     };
-    // The third column is that of the covariance for the monopole.
-    let mut monopole = vec![0.0; right.len()];
-    monopole[0] = 1.0;
-    let right_hand_sides = [&right, sums.noise_right_hand_side(), &monopole];
-    let mut columns = [solution, noise, vec![0.0; right.len()]];
-    let count = if watch.is_wanted() { 3 } else { 2 };
-    let beside = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
+    let mut columns = [solution, noise];
     let convergence = {
-        let task = watch.start("map, noise map and error of the mean", rule.residual_max);
-        let rules = [rule, rule, beside];
-        system.solve(&right_hand_sides[..count], &mut columns[..count], &rules[..count], &task)
+        let task = watch.start("map and noise map", rule.residual_max);
+        system.solve(&[&right, sums.noise_right_hand_side()], &mut columns, &[rule, rule], &task)
     };
-    let [solved, noise, of_mean] = columns;
+    let [solved, noise] = columns;
     let mut whole = solved.clone();
     if let Some(prior) = prior {
         add(&mut whole, &prior);
@@ -244,9 +237,20 @@ fn solve_with_power(
     if watch.is_wanted() {
         let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
         sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
-        let mean_sigma_k = factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt();
-        let samples_k = samples_k(&covariance, samples, (&whole, factor), &map, watch)?;
-        uncertainty = Some(Uncertainty { sigma_k, mean_sigma_k, power, samples_k });
+        let resolution_deg = pixel_resolution_deg(&blocks, &factors, (&ratio, &r), nside);
+        let [mean_sigma_k, x, y, z] = moments_sigma(&system, l_max, rule, watch).map(|sigma| factor * sigma);
+        let [_, dipole_k @ ..] = moments_k(&whole, l_max);
+        let samples = drawn_samples(&covariance, samples, (&whole, factor), &map, watch)?;
+        let dipole_sigma_k = [x, y, z];
+        uncertainty = Some(Uncertainty {
+            sigma_k,
+            resolution_deg,
+            mean_sigma_k,
+            dipole_k,
+            dipole_sigma_k,
+            power,
+            samples,
+        });
     }
     let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
@@ -258,28 +262,45 @@ fn solve_with_power(
     })
 }
 
+/// Standard deviations of mean and dipole, K: columns of the covariance.
+fn moments_sigma(system: &System<'_>, l_max: usize, rule: StoppingRule, watch: NamedWatch<'_>) -> [f64; 4] {
+    let count = system.sums.unknowns();
+    let unit = |(place, factor): (usize, f64)| {
+        let mut unit = vec![0.0; count];
+        unit[place] = factor;
+        unit
+    };
+    let units = moments(l_max).map(unit);
+    let mut columns = units.each_ref().map(|unit| vec![0.0; unit.len()]);
+    let rule = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
+    let task = watch.start("errors of mean and dipole", rule.residual_max);
+    system.solve(&units.each_ref().map(Vec::as_slice), &mut columns, &[rule; 4], &task);
+    [0, 1, 2, 3].map(|k| dot(&units[k], &columns[k]).max(0.0).sqrt())
+}
+
 /// The map of coefficients, K.
 type Synthesis<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
 
 /// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
-fn samples_k(
+fn drawn_samples(
     covariance: &Covariance<'_>,
     count: usize,
     (whole, factor): (&[f64], f64),
     map: Synthesis<'_>,
     watch: NamedWatch<'_>,
-) -> Result<Vec<Vec<f64>>, SolveError> {
-    let mut samples_k = Vec::new();
+) -> Result<Vec<Sample>, SolveError> {
+    let l_max = whole.len().isqrt().saturating_sub(1);
+    let mut samples = Vec::new();
     let numbers: Vec<u64> = (0..count as u64).collect();
     for which in numbers.chunks(NOISES_TOGETHER) {
         let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_SETTLED);
-        for Drawn { whole: mut sample, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
-            sample.iter_mut().for_each(|value| *value *= factor);
-            add(&mut sample, whole);
-            samples_k.push(map(&sample)?);
+        for Drawn { whole: mut drawn, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
+            drawn.iter_mut().for_each(|value| *value *= factor);
+            add(&mut drawn, whole);
+            samples.push(sample(&drawn, l_max, map(&drawn)?));
         }
     }
-    Ok(samples_k)
+    Ok(samples)
 }
 
 /// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest

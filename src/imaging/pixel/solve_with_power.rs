@@ -6,11 +6,11 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, Par};
 
 use super::solve::{Diagnostics, PixelSolution, PointBeam, check_request, seen_point, subtract_prediction};
-use crate::imaging::circle::{coefficients, degrees, unknowns};
-use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Uncertainty};
+use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
+use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Uncertainty};
 use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
-use crate::sky::harmonics::Transform;
+use crate::sky::harmonics::{AnalysisOptions, Transform, analysis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{StreamKind, random_stream};
 use rand_distr::{Distribution, StandardNormal};
@@ -94,25 +94,42 @@ pub fn solve_pixels_with_power(
         Ok(PointBeam { pixel, map_k: solved(&seen.map_k)? })
     };
     let beams = beams.iter().map(point).collect::<Result<Vec<_>, SolveError>>()?;
-    let mut monopole = vec![0.0; degrees.len()];
-    monopole[0] = 1.0;
-    factors.solve(&mut monopole);
-    let sample = |which: usize| {
-        let mut sample = to_pixels(&draw(&factors, degrees.len(), factor, which))?;
-        add(&mut sample, &map_k);
-        Ok(sample)
+    let of_moment = |(place, scale): (usize, f64)| {
+        let mut column = vec![0.0; degrees.len()];
+        column[place] = 1.0;
+        factors.solve(&mut column);
+        factor * scale.abs() * column[place].max(0.0).sqrt()
+    };
+    let [mean_sigma_k, dipole_sigma_k @ ..] = moments(l_max).map(of_moment);
+    // The map's own, whatever the prior has beyond its degrees.
+    let whole = unknowns(&analysis(&map_k, l_max, &AnalysisOptions::default())?.alm);
+    let [_, dipole_k @ ..] = moments_k(&whole, l_max);
+    let drawn = |which: usize| -> Result<Sample, SolveError> {
+        let mut drawn = draw(&factors, degrees.len(), factor, which);
+        let mut map = to_pixels(&drawn)?;
+        add(&mut map, &map_k);
+        add(&mut drawn, &whole);
+        Ok(sample(&drawn, l_max, map))
     };
     // A pixel holds the mean of a sky that has more than the degrees solved for.
     let beyond_k2 = power.variance_beyond_k2(nside);
+    let columns = harmonics.transpose().to_owned();
+    let open = Mat::from_fn(columns.nrows(), pixels, |row, pixel| {
+        regularisation[degrees[row]].sqrt() * columns[(row, pixel)]
+    });
+    let open = factors.quadratic_forms(0, open);
     let uncertainty = Uncertainty {
+        resolution_deg: open.into_iter().map(|open| resolution_deg(l_max + 1, open)).collect(),
         sigma_k: factors
-            .quadratic_forms(0, harmonics.transpose().to_owned())
+            .quadratic_forms(0, columns)
             .into_iter()
             .map(|variance| (factor * factor * variance + beyond_k2).sqrt())
             .collect(),
-        mean_sigma_k: factor * (monopole[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
+        mean_sigma_k,
+        dipole_k,
+        dipole_sigma_k,
         power,
-        samples_k: (0..samples).map(sample).collect::<Result<_, SolveError>>()?,
+        samples: (0..samples).map(drawn).collect::<Result<_, SolveError>>()?,
     };
     let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;

@@ -122,23 +122,53 @@ pub struct Uncertainty {
     /// Standard deviation of every pixel, K: of noise and of what the data leave open. Of harmonic maps up to their degrees, of pixels also
     /// of what the sky has beyond.
     pub sigma_k: Vec<f64>,
+    /// Root of the solid angle for each coefficient that the data decide, by pixel, degrees: `sqrt(4 pi) / (l_max + 1)` rad of a map that
+    /// keeps all degrees up to l_max.
+    pub resolution_deg: Vec<f64>,
     /// Standard deviation of the mean, K.
     pub mean_sigma_k: f64,
+    /// Dipole along the ecliptic's x, y and z, K: the map has `mean + dipole . n` of degrees 0 and 1.
+    pub dipole_k: [f64; 3],
+    /// Standard deviations of the dipole, K.
+    pub dipole_sigma_k: [f64; 3],
     /// The sky's power that R is the inverse of.
     pub power: SkyPower,
-    /// Maps as likely as the map itself (draws from the posterior), K, if any were asked for.
-    pub samples_k: Vec<Vec<f64>>,
+    /// Draws from the posterior, if any were asked for.
+    pub samples: Vec<Sample>,
+}
+
+/// A map as likely as the map itself: a draw from the posterior.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sample {
+    /// The map, K.
+    pub map_k: Vec<f64>,
+    /// Its dipole along the ecliptic's x, y and z, K.
+    pub dipole_k: [f64; 3],
+    /// Its own angular power, K^2, from l = 0.
+    pub power_k2: Vec<f64>,
 }
 
 impl Uncertainty {
     /// Of a map that is divided by `factor`.
     #[must_use]
     pub(super) fn reduced(mut self, factor: f64) -> Self {
-        let samples = self.samples_k.iter_mut().flatten();
-        self.sigma_k.iter_mut().chain(samples).for_each(|value| *value /= factor);
+        let samples = self.samples.iter_mut();
+        let samples = samples.flat_map(|sample| sample.map_k.iter_mut().chain(&mut sample.dipole_k));
+        let dipole = self.dipole_k.iter_mut().chain(&mut self.dipole_sigma_k);
+        self.sigma_k.iter_mut().chain(samples).chain(dipole).for_each(|value| *value /= factor);
         self.mean_sigma_k /= factor;
-        self.power.power_k2.iter_mut().for_each(|power| *power /= factor * factor);
+        let powers = self.samples.iter_mut().flat_map(|sample| &mut sample.power_k2);
+        self.power.power_k2.iter_mut().chain(powers).for_each(|power| *power /= factor * factor);
         self
+    }
+
+    /// 1 for the pixels that the data measure, 0 for the others: those where they leave open more than half of the variance that R expects of
+    /// the sky's structure (l >= 2), so that the map shows the expectation more than the sky.
+    #[must_use]
+    pub fn mask(&self) -> Vec<f64> {
+        let of_degree = |(l, power): (usize, &f64)| (2 * l + 1) as f64 / (4.0 * PI) * power;
+        let expected: f64 = self.power.power_k2.iter().enumerate().skip(FREE).map(of_degree).sum();
+        self.sigma_k.iter().map(|sigma| f64::from(u8::from(sigma * sigma < 0.5 * expected))).collect()
     }
 }
 
