@@ -9,7 +9,7 @@ use super::arguments::{StateMapArgs, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use super::progress::while_solving;
 use crate::files::write_atomically;
-use crate::imaging::{RegulariserChoice, Sample, Solution, SolveWatch};
+use crate::imaging::{RegulariserChoice, Sample, Samples, Solution, SolveWatch};
 use crate::pipeline::{sample_state, use_threads};
 use crate::products::{ErrorMap, own_power_csv, told_vector};
 use crate::sky::fits::{WriteOptions, write_map};
@@ -34,6 +34,10 @@ pub(super) struct SampleArgs {
     /// Number of samples.
     #[arg(long, value_name = "NUMBER", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=COUNT_MAX))]
     count: u64,
+    /// Draw the sky's angular power with each map (Gibbs sampling), in place of the most likely one: samples then scatter by what is not known
+    /// of it, too. Takes some four times as long.
+    #[arg(long)]
+    gibbs: bool,
     /// Output folder.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
@@ -66,17 +70,24 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {
         return Err(format!(
-            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.refine, \
-             map.matrix, or pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
+            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.matrix, or \
+             pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
             args.state.display()
         )
         .into());
+    }
+    if args.gibbs && config.map.refine.is_on() {
+        return Err(
+            "--gibbs with map.refine: each turn would be a refined map; expected samples without --gibbs"
+                .into(),
+        );
     }
     use_threads(&config.runtime)?;
     let mut written = Vec::new();
     let mut take = |solution: Solution| written.push(write(args, &solution));
     let watch = SolveWatch::default();
-    while_solving(&watch, || sample_state(&args.state, &config, args.count as usize, &watch, &mut take))?;
+    let samples = Samples { count: args.count as usize, gibbs: args.gibbs };
+    while_solving(&watch, || sample_state(&args.state, &config, samples, &watch, &mut take))?;
     let mut all = Vec::new();
     for sampled in written {
         all.push(sampled?);

@@ -109,8 +109,8 @@ keys! {
         /// "file" take 1e-4 without it.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
-        /// Regulariser R: "data", 1 / C_l of the sky as the data have it, the default without epsilon, map.refine, matrix =
-        /// "free" and pixels beyond nside 32; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
+        /// Regulariser R: "data", 1 / C_l of the sky as the data have it, the default without epsilon, matrix = "free" and pixels beyond
+        /// nside 32; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
         /// (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a channel.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
@@ -205,13 +205,13 @@ fn is_usual(matrix: &MatrixKind) -> bool {
 }
 
 impl MapConfig {
-    /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do visibilities that are held
-    /// one by one and pixels too many for an R from the data.
+    /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do pixels without their matrix
+    /// or too many for an R from the data.
     #[must_use]
     #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
         let is_large = self.engine == EngineKind::Pixel && self.nside > POWER_NSIDE_MAX;
-        let is_identity = self.holds_visibilities() || self.epsilon.is_some() || is_large;
+        let is_identity = self.is_matrix_free() || self.epsilon.is_some() || is_large;
         let usual = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
         self.regulariser.clone().unwrap_or(usual)
     }
@@ -350,8 +350,8 @@ impl MapConfig {
         checks.require(
             "regulariser",
             found,
-            is_identity || !self.holds_visibilities() || (by_degree && self.refine.is_on()),
-            "\"identity\", or no such key, with map.matrix = \"free\"; not \"data\" with map.refine",
+            is_identity || !self.is_matrix_free(),
+            "\"identity\", or no such key, with map.matrix = \"free\"",
         );
         checks.require(
             "regulariser",

@@ -45,7 +45,7 @@ pub use pixel::{
 };
 pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]
-pub use power::{Sample, SkyPower, Uncertainty};
+pub use power::{Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
 pub use solver::SolveError;

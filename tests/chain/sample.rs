@@ -152,7 +152,13 @@ fn errors_are_those_of_dense_matrices() {
         };
         eprintln!(
             "{engine}: map {} sigma {:?} resolution {:?} mask {} of which measured {} moments {:?} dipole {:?}",
-            found["map"], spread("sigma"), spread("resolution"), found["mask"], found["measured"], numbers("moments_sigma"), numbers("dipole")
+            found["map"],
+            spread("sigma"),
+            spread("resolution"),
+            found["mask"],
+            found["measured"],
+            numbers("moments_sigma"),
+            numbers("dipole")
         );
     }
 }

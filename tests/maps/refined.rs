@@ -12,6 +12,7 @@ use faer::linalg::solvers::Solve;
 use faer::{Mat, Side};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::Refusal;
+use lunarray::imaging::Samples;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::anywhere::RefineSteps;
 use lunarray::imaging::anywhere::Refinement;
@@ -144,7 +145,7 @@ fn sums_of(mut archive: VisibilityArchive, blocks: &[PlacedVisibilities]) -> Ref
 
 fn request(nside: usize) -> HarmonicRequest {
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 300 };
-    HarmonicRequest { epsilon: EPSILON, nside, rule, samples: 0, probes: 0 }
+    HarmonicRequest { epsilon: EPSILON, nside, rule, samples: Samples::default(), probes: 0 }
 }
 
 /// From the beginning, and telling nobody.

@@ -1,12 +1,10 @@
 //! The regularised solution over harmonic coefficients.
 
-use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
+use super::posterior::Posterior;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::power::{
-    Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, Sample, Uncertainty,
-};
+use crate::imaging::power::{Factors, PowerProblem, Samples, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::FitInputs;
 use crate::imaging::solver::NamedWatch;
@@ -22,12 +20,6 @@ use crate::sky::healpix::{nside_of, pixel_area_sr};
 /// Change of W_max from product to product, relative, at which it is found: it only scales R, and no map knows epsilon to a percent.
 pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
 
-/// Realisations or samples that are solved for together: a thread has a workspace for each.
-pub const NOISES_TOGETHER: usize = 4;
-
-/// Residual of the errors of mean and dipole: they err by its square.
-const BESIDE: f64 = 0.03;
-
 /// Products with the blocks before the iteration for W_max.
 const LIFTS: usize = 6;
 
@@ -41,7 +33,7 @@ pub struct HarmonicRequest {
     /// When to stop.
     pub rule: StoppingRule,
     /// Maps as likely as the map itself to be drawn beside it; with R from the data.
-    pub samples: usize,
+    pub samples: Samples,
     /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces. Traces are those of
     /// an R that is a multiple of the identity.
     pub probes: usize,
@@ -211,17 +203,15 @@ fn solve_with_power(
         numbers: 2.0 * visibilities as f64,
     };
     let found = sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
-    let factor = found.noise_factor();
-    let FoundPower { regularisation: r, solution, power, ratio } = found;
-    let factors = Factors::new(&blocks, &r);
-    let regularisation = Diagonal::ByDegree(r.clone());
+    let factors = Factors::new(&blocks, &found.regularisation);
+    let regularisation = Diagonal::ByDegree(found.regularisation.clone());
     let precondition = |v: &mut [f64]| factors.solve(v);
-    let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
+    let system = System { sums, regularisation, precondition: &precondition };
     let noise = match start {
         Some([_, noise]) if noise.len() == right.len() => noise.clone(),
         _ => vec![0.0; right.len()],
     };
-    let mut columns = [solution, noise];
+    let mut columns = [found.solution.clone(), noise];
     let convergence = {
         let task = watch.start("map and noise map", rule.residual_max);
         system.solve(&[&right, sums.noise_right_hand_side()], &mut columns, &[rule, rule], &task)
@@ -232,26 +222,19 @@ fn solve_with_power(
         add(&mut whole, &prior);
     }
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
-    let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
-    let mut uncertainty = None;
-    if watch.is_wanted() {
-        let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
-        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
-        let resolution_deg = pixel_resolution_deg(&blocks, &factors, (&ratio, &r), nside);
-        let [mean_sigma_k, x, y, z] = moments_sigma(&system, l_max, rule, watch).map(|sigma| factor * sigma);
-        let [_, dipole_k @ ..] = moments_k(&whole, l_max);
-        let samples = drawn_samples(&covariance, samples, (&whole, factor), &map, watch)?;
-        let dipole_sigma_k = [x, y, z];
-        uncertainty = Some(Uncertainty {
-            sigma_k,
-            resolution_deg,
-            mean_sigma_k,
-            dipole_k,
-            dipole_sigma_k,
-            power,
-            samples,
-        });
-    }
+    let posterior = Posterior {
+        sums,
+        blocks: &blocks,
+        found: &found,
+        right: &right,
+        solved: &solved,
+        whole: &whole,
+        nside,
+        rule,
+        watch,
+    };
+    let errors = || posterior.uncertainty(samples, &|x| sums.apply_all(x));
+    let uncertainty = watch.is_wanted().then(errors).transpose()?;
     let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
@@ -260,47 +243,6 @@ fn solve_with_power(
         diagnostics,
         uncertainty,
     })
-}
-
-/// Standard deviations of mean and dipole, K: columns of the covariance.
-fn moments_sigma(system: &System<'_>, l_max: usize, rule: StoppingRule, watch: NamedWatch<'_>) -> [f64; 4] {
-    let count = system.sums.unknowns();
-    let unit = |(place, factor): (usize, f64)| {
-        let mut unit = vec![0.0; count];
-        unit[place] = factor;
-        unit
-    };
-    let units = moments(l_max).map(unit);
-    let mut columns = units.each_ref().map(|unit| vec![0.0; unit.len()]);
-    let rule = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
-    let task = watch.start("errors of mean and dipole", rule.residual_max);
-    system.solve(&units.each_ref().map(Vec::as_slice), &mut columns, &[rule; 4], &task);
-    [0, 1, 2, 3].map(|k| dot(&units[k], &columns[k]).max(0.0).sqrt())
-}
-
-/// The map of coefficients, K.
-type Synthesis<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
-
-/// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
-fn drawn_samples(
-    covariance: &Covariance<'_>,
-    count: usize,
-    (whole, factor): (&[f64], f64),
-    map: Synthesis<'_>,
-    watch: NamedWatch<'_>,
-) -> Result<Vec<Sample>, SolveError> {
-    let l_max = whole.len().isqrt().saturating_sub(1);
-    let mut samples = Vec::new();
-    let numbers: Vec<u64> = (0..count as u64).collect();
-    for which in numbers.chunks(NOISES_TOGETHER) {
-        let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_SETTLED);
-        for Drawn { whole: mut drawn, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
-            drawn.iter_mut().for_each(|value| *value *= factor);
-            add(&mut drawn, whole);
-            samples.push(sample(&drawn, l_max, map(&drawn)?));
-        }
-    }
-    Ok(samples)
 }
 
 /// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest

@@ -281,7 +281,13 @@ impl<'a> Posterior<'a> {
             system.solve(&[sums.right_hand_side()], &mut columns, &[request.rule], &task)
         };
         let [solution] = columns;
-        let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
+        let products = |x: &[&[f64]]| sums.apply_all(x);
+        let covariance = Covariance {
+            products: &products,
+            unknowns: count,
+            regularisation: &regularisation,
+            factors: &factors,
+        };
         let mut draws = Vec::new();
         let numbers: Vec<u64> = (0..request.samples as u64).collect();
         for which in numbers.chunks(NOISES_TOGETHER) {

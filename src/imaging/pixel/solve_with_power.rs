@@ -7,8 +7,8 @@ use faer::{Accum, Mat, Par};
 
 use super::solve::{Diagnostics, PixelSolution, PointBeam, check_request, seen_point, subtract_prediction};
 use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
-use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Uncertainty};
-use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
+use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Samples, Uncertainty};
+use crate::imaging::solver::{NamedWatch, SolveError, add, dot, subtract};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, Transform, analysis};
 use crate::sky::healpix::pixel_area_sr;
@@ -19,6 +19,8 @@ use rand_distr::{Distribution, StandardNormal};
 pub const POWER_NSIDE_MAX: usize = 32;
 /// Degrees per nside, as of harmonic maps.
 const DEGREES_PER_NSIDE: f64 = 2.5;
+/// First number of the draws of Gibbs sampling: those of plain samples are below.
+const GIBBS: usize = 1 << 40;
 /// Rows of the matrix that are multiplied at once.
 const ROWS: usize = 512;
 
@@ -30,7 +32,7 @@ const ROWS: usize = 512;
 pub fn solve_pixels_with_power(
     sums: &PixelSums,
     prior_k: Option<&[f64]>,
-    samples: usize,
+    samples: Samples,
     beams: &[usize],
     watch: NamedWatch<'_>,
 ) -> Result<(PixelSolution, Uncertainty), SolveError> {
@@ -78,14 +80,14 @@ pub fn solve_pixels_with_power(
     };
     let found = sought.found_in_blocks()?;
     let factor = found.noise_factor();
-    let FoundPower { regularisation, solution, power, .. } = found;
-    let factors = Factors::new(&blocks, &regularisation);
+    let FoundPower { regularisation, solution, power, .. } = &found;
+    let factors = Factors::new(&blocks, regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = from_pixels(map)?;
         factors.solve(&mut x);
         to_pixels(&x)
     };
-    let mut map_k = to_pixels(&solution)?;
+    let mut map_k = to_pixels(solution)?;
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);
     }
@@ -105,7 +107,22 @@ pub fn solve_pixels_with_power(
     let whole = unknowns(&analysis(&map_k, l_max, &AnalysisOptions::default())?.alm);
     let [_, dipole_k @ ..] = moments_k(&whole, l_max);
     let drawn = |which: usize| -> Result<Sample, SolveError> {
-        let mut drawn = draw(&factors, degrees.len(), factor, which);
+        // Away from the map.
+        let mut drawn = if samples.gibbs {
+            let mut turn = 0;
+            let mut sky = found.gibbs(which as u64, &mut |r| {
+                turn += 1;
+                let factors = Factors::new(&blocks, r);
+                let mut sky = right.clone();
+                factors.solve(&mut sky);
+                add(&mut sky, &draw(&factors, degrees.len(), factor, GIBBS + 16 * which + turn));
+                sky
+            });
+            subtract(&mut sky, 1.0, solution);
+            sky
+        } else {
+            draw(&factors, degrees.len(), factor, which)
+        };
         let mut map = to_pixels(&drawn)?;
         add(&mut map, &map_k);
         add(&mut drawn, &whole);
@@ -128,8 +145,8 @@ pub fn solve_pixels_with_power(
         mean_sigma_k,
         dipole_k,
         dipole_sigma_k,
-        power,
-        samples: (0..samples).map(drawn).collect::<Result<_, SolveError>>()?,
+        power: power.clone(),
+        samples: (0..samples.count).map(drawn).collect::<Result<_, SolveError>>()?,
     };
     let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;

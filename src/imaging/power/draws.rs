@@ -8,9 +8,9 @@ use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::blocks::Factors;
+use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::SolveTask;
 use crate::imaging::solver::{dot, normalised, subtract};
-use crate::imaging::{NormalSums, regulariser::Diagonal};
 use crate::units::{StreamKind, random_stream};
 
 /// Change of a sample from step to step, relative, at which it is done: far below what samples scatter by.
@@ -29,7 +29,9 @@ pub(in crate::imaging) struct Drawn {
 /// The matrix whose inverse is the covariance of draws.
 #[derive(Clone, Copy)]
 pub(in crate::imaging) struct Covariance<'a> {
-    pub(in crate::imaging) sums: &'a dyn NormalSums,
+    /// Products with the normal matrix.
+    pub(in crate::imaging) products: &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>,
+    pub(in crate::imaging) unknowns: usize,
     pub(in crate::imaging) regularisation: &'a Diagonal,
     pub(in crate::imaging) factors: &'a Factors<'a>,
 }
@@ -127,7 +129,7 @@ impl Covariance<'_> {
             })
             .collect();
         let of: Vec<&[f64]> = upper.iter().map(Vec::as_slice).collect();
-        let mut products = self.sums.apply_all(&of);
+        let mut products = (self.products)(&of);
         for (product, vector) in products.iter_mut().zip(&upper) {
             self.regularisation.add_product(vector, product);
             self.factors.solve_lower(product);
@@ -138,7 +140,7 @@ impl Covariance<'_> {
     /// Draws, one for each number of `which`, from numbers that depend on it alone, until none changes by more than `settled`. They share
     /// products.
     pub(in crate::imaging) fn draw(&self, which: &[u64], settled: f64, task: &SolveTask<'_>) -> Vec<Drawn> {
-        let unknowns = self.sums.unknowns();
+        let unknowns = self.unknowns;
         let normal = |which: &u64| -> Vec<f64> {
             let mut stream = random_stream(3, StreamKind::Probe, [unknowns as u64, *which]);
             (0..unknowns).map(|_| StandardNormal.sample(&mut stream)).collect()

@@ -17,6 +17,7 @@
 
 mod blocks;
 mod draws;
+mod gibbs;
 mod knots;
 mod rounds;
 #[cfg(test)]
@@ -137,6 +138,15 @@ pub struct Uncertainty {
     pub samples: Vec<Sample>,
 }
 
+/// Draws from the posterior that are wanted beside a map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Samples {
+    /// Their number.
+    pub count: usize,
+    /// Whether the sky's power is drawn with each (Gibbs sampling), in place of that which was found.
+    pub gibbs: bool,
+}
+
 /// A map as likely as the map itself: a draw from the posterior.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sample {
@@ -174,7 +184,7 @@ impl Uncertainty {
 
 /// A power on its way to the most likely one.
 #[derive(Clone, Debug)]
-pub(super) struct PowerFit {
+pub(in crate::imaging) struct PowerFit {
     knots: Knots,
     theta: Vec<f64>,
     /// C_l, K^2.
@@ -214,7 +224,7 @@ impl PowerFit {
     }
 
     /// R by degree, K^-2.
-    pub(super) fn regularisation(&self) -> Vec<f64> {
+    pub(in crate::imaging) fn regularisation(&self) -> Vec<f64> {
         self.power.iter().map(|power| power.recip()).collect()
     }
 
@@ -284,15 +294,19 @@ impl PowerFit {
     }
 
     /// Greatest change of ln C_l at a knot.
-    pub(super) fn change(&self, from: &Self) -> f64 {
+    pub(in crate::imaging) fn change(&self, from: &Self) -> f64 {
         self.theta.iter().zip(&from.theta).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
     }
 
-    /// The estimate with its uncertainty; `traces` are those of `(A + R)^-1` by degree.
+    /// The estimate with its uncertainty, and the covariance of the parameters; `traces` are those of `(A + R)^-1` by degree.
     ///
     /// # Errors
     /// As [`PowerFit::begin`].
-    pub(super) fn estimate(&self, data: BlockData<'_>, traces: &[f64]) -> Result<SkyPower, SolveError> {
+    pub(super) fn estimate(
+        &self,
+        data: BlockData<'_>,
+        traces: &[f64],
+    ) -> Result<(SkyPower, Mat<f64>), SolveError> {
         let (_, information) = self.derivatives(data).ok_or(SolveError::NoPower)?;
         let covariance = information.llt(Side::Lower).map_err(|_| SolveError::NoPower)?.inverse();
         let sigma = |l: usize| {
@@ -311,11 +325,12 @@ impl PowerFit {
         }
         let decided =
             (count.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
-        Ok(SkyPower {
+        let power = SkyPower {
             power_k2: self.power.clone(),
             sigma_ln: (0..self.power.len()).map(sigma).collect(),
             decided: decided.collect(),
             noise_factor: 1.0,
-        })
+        };
+        Ok((power, covariance))
     }
 }

@@ -1,5 +1,7 @@
 //! Rounds of solution and power, until neither changes.
 
+use faer::Mat;
+
 use super::blocks::{Block, Factors};
 use super::draws::{Covariance, Drawn, TRACE_SETTLED};
 use super::knots::FREE;
@@ -47,6 +49,12 @@ pub(in crate::imaging) struct FoundPower {
     pub(in crate::imaging) power: SkyPower,
     /// Traces of `(A + R)^-1` over those of the blocks, by degree.
     pub(in crate::imaging) ratio: Vec<f64>,
+    /// The curve, with which further rounds begin.
+    pub(in crate::imaging) fit: PowerFit,
+    /// Covariance of its parameters.
+    pub(super) covariance: Mat<f64>,
+    /// Degree of each unknown.
+    pub(super) degrees: Vec<usize>,
 }
 
 impl FoundPower {
@@ -80,8 +88,16 @@ impl PowerProblem<'_> {
             factors.solve(&mut solution);
             let next = self.noise_factor(&solution, &regularisation);
             if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_SETTLED {
-                let power = fit.estimate(data, &factors.traces(l_max))?.of_data_divided_by(factor);
-                return Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] });
+                let (power, covariance) = fit.estimate(data, &factors.traces(l_max))?;
+                return Ok(FoundPower {
+                    regularisation,
+                    solution,
+                    power: power.of_data_divided_by(factor),
+                    ratio: vec![1.0; l_max + 1],
+                    fit,
+                    covariance,
+                    degrees: self.degrees.to_vec(),
+                });
             }
             factor = next;
         }
@@ -138,28 +154,73 @@ impl PowerProblem<'_> {
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
                 system.solve(&[self.right], &mut x, &[rule], &task);
             }
-            let traces = factors.traces(l_max);
-            let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
             let before = factor;
             factor = self.noise_factor(&x[0], &r);
-            let mut right = fit.data_of(self.blocks, &x[0], self.degrees);
-            right.iter_mut().for_each(|b| *b /= factor);
-            let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
-            let next = fit.maximised(data)?;
+            let next = self.next(&fit, &x[0], (factor, &ratio))?;
             // That of the noise is one of the power, too.
-            let change = next.change(&fit).max((factor / before).ln().abs());
-            fit = next;
+            let change = next.fit.change(&fit).max((factor / before).ln().abs());
             let task = watch.start("the sky's power", settled);
             if !task.report_wanting(change > settled && round < ROUNDS_MAX, round, change) {
-                let factors = Factors::new(self.blocks, &fit.regularisation());
-                let mut traces = factors.traces(l_max);
-                traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
-                let power = fit.estimate(data, &traces)?.of_data_divided_by(factor);
-                let [solution] = x;
-                return Ok(FoundPower { regularisation: fit.regularisation(), solution, power, ratio });
+                return Ok(next);
             }
+            fit = next.fit;
         }
         Err(SolveError::NoPower)
+    }
+
+    /// The power of `fit`, of which `x` is the solution, with its uncertainty.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(in crate::imaging) fn estimated(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+    ) -> Result<FoundPower, SolveError> {
+        self.of_round(fit, x, (factor, ratio), &|_| Ok(fit.clone()))
+    }
+
+    /// The power that the solution `x` of `fit` makes most likely, of data whose noise is larger by a factor and with these ratios of traces.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(in crate::imaging) fn next(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+    ) -> Result<FoundPower, SolveError> {
+        self.of_round(fit, x, (factor, ratio), &|data| fit.maximised(data))
+    }
+
+    fn of_round(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+        step: &dyn Fn(BlockData<'_>) -> Result<PowerFit, SolveError>,
+    ) -> Result<FoundPower, SolveError> {
+        let l_max = self.l_max();
+        let traces = |fit: &PowerFit| Factors::new(self.blocks, &fit.regularisation()).traces(l_max);
+        let (r, before) = (fit.regularisation(), traces(fit));
+        let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * before[l]).collect();
+        let mut right = fit.data_of(self.blocks, x, self.degrees);
+        right.iter_mut().for_each(|b| *b /= factor);
+        let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
+        let fit = step(data)?;
+        let mut traces = traces(&fit);
+        traces.iter_mut().zip(ratio).for_each(|(trace, ratio)| *trace *= ratio);
+        let (power, covariance) = fit.estimate(data, &traces)?;
+        Ok(FoundPower {
+            regularisation: fit.regularisation(),
+            solution: x.to_vec(),
+            power: power.of_data_divided_by(factor),
+            ratio: ratio.to_vec(),
+            fit,
+            covariance,
+            degrees: self.degrees.to_vec(),
+        })
     }
 
     /// When a map on the way is good enough beside what the data leave open, or as good as `rule` asks.
@@ -178,7 +239,7 @@ impl PowerProblem<'_> {
     }
 
     /// The ratio of traces by draws: few where the last ones said that the blocks are near.
-    fn drawn_ratio(
+    pub(in crate::imaging) fn drawn_ratio(
         &self,
         regularisation: &Diagonal,
         factors: &Factors<'_>,
@@ -188,7 +249,10 @@ impl PowerProblem<'_> {
         let is_near = watch.all(last.iter().all(|ratio| ratio.ln().abs() < NEAR));
         let which = if is_near { &TRACES[..1] } else { &TRACES };
         let task = watch.start("draws for the sky's power", TRACE_SETTLED);
-        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, TRACE_SETTLED, &task);
+        let products = |x: &[&[f64]]| self.sums.apply_all(x);
+        let unknowns = self.right.len();
+        let covariance = Covariance { products: &products, unknowns, regularisation, factors };
+        let drawn = covariance.draw(which, TRACE_SETTLED, &task);
         self.ratio(&drawn, &factors.traces(self.l_max()))
     }
 

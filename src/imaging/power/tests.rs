@@ -182,7 +182,13 @@ fn draws_have_the_covariance_of_the_posterior() {
     let factors = Factors::new(&blocks, &r);
     let sums = Dense { matrix: a, right: vec![0.0; ORDER] };
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
-    let covariance = Covariance { sums: &sums, regularisation: &regularisation, factors: &factors };
+    let products = |x: &[&[f64]]| sums.apply_all(x);
+    let covariance = Covariance {
+        products: &products,
+        unknowns: ORDER,
+        regularisation: &regularisation,
+        factors: &factors,
+    };
     let which: Vec<u64> = (0..DRAWS as u64).collect();
     let drawn = covariance.draw(&which, SAMPLE_SETTLED, &watch.named("test").start("draws", 0.0));
     for i in 0..ORDER {

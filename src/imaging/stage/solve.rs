@@ -13,7 +13,7 @@ use crate::imaging::circle::{
 use crate::imaging::pixel::{MatrixFreeSums, PixelExtras, PixelSolution, PixelSums, PointBeam};
 use crate::imaging::pixel::{solve_matrix_free, solve_pixels_with, solve_pixels_with_power};
 use crate::imaging::solver::NamedWatch;
-use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule, Uncertainty};
+use crate::imaging::{Diagnostics, Regulariser, Samples, SolveError, SolveWatch, StoppingRule, Uncertainty};
 use crate::imaging::{NormalSums, Snapshot, SnapshotSums, SumCounts};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
@@ -95,7 +95,7 @@ pub struct SolverSetup {
     /// Random probes for the traces of a final map, where its matrix is too large to be held; 0 for no traces.
     pub trace_probes: usize,
     /// Maps as likely as a final map that are drawn beside it, with R from the data.
-    pub samples: usize,
+    pub samples: Samples,
     /// Receives progress, and may interrupt.
     pub watch: SolveWatch,
 }
@@ -189,18 +189,22 @@ impl Request<'_> {
         if self.is_final { count } else { 0 }
     }
 
+    fn samples(&self) -> Samples {
+        if self.is_final { self.setup.samples } else { Samples::default() }
+    }
+
     fn is_stopped(&self) -> bool {
         !self.watch.goes_on() && !self.is_final
     }
 
     fn harmonic_request(&self) -> HarmonicRequest {
-        let samples = self.if_final(self.setup.samples);
+        let samples = self.samples();
         let probes = self.if_final(self.setup.trace_probes);
         HarmonicRequest { epsilon: self.epsilon, nside: self.nside, rule: self.setup.rule, samples, probes }
     }
 
     fn pixels_with_power(&self, sums: &PixelSums) -> Result<Option<Solved>, SolveError> {
-        let samples = self.if_final(self.setup.samples);
+        let samples = self.samples();
         let prior = self.prior.as_deref();
         match solve_pixels_with_power(sums, prior, samples, &self.beam_pixels, self.watch) {
             Err(SolveError::Interrupted) => Ok(None),
@@ -280,7 +284,7 @@ impl Request<'_> {
 
     /// `data` are numbers by which a solution on disk is known to be of these data.
     fn refined(&self, sums: &RefinedSums, data: &[i64]) -> Result<Option<Solved>, SolveError> {
-        let request = HarmonicRequest { samples: 0, probes: 0, ..self.harmonic_request() };
+        let request = HarmonicRequest { probes: 0, ..self.harmonic_request() };
         let of = [data, &[self.epsilon.to_bits().cast_signed()]].concat();
         let file = self.setup.passes.as_ref().map(|folder| PassFile::new(folder, self.channel, &of));
         // Not from a map on the way: that is the circle's, with which the iteration begins anyway.
@@ -301,9 +305,9 @@ impl Request<'_> {
         if let Some(file) = file.filter(|_| self.watch.goes_on()) {
             file.remove();
         }
-        let HarmonicSolution { map_k, noise_k, diagnostics, .. } = solved;
+        let HarmonicSolution { map_k, noise_k, diagnostics, uncertainty, .. } = solved;
         let (beams, refinement) = (Vec::new(), Some(found));
-        Ok(Some(Solved { map_k, noise_k, diagnostics, beams, refinement, uncertainty: None }))
+        Ok(Some(Solved { map_k, noise_k, diagnostics, beams, refinement, uncertainty }))
     }
 }
 

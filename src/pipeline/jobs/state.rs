@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, solve_jointly};
 use crate::imaging::{REFINED, Regulariser, RegulariserChoice, SnapshotSums, SolveError, StoppingRule};
-use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
+use crate::imaging::{Samples, Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
@@ -143,7 +143,7 @@ pub fn solve_state(
     Ok(())
 }
 
-/// Maps of the sums in a state with `count` others that are as likely, draws from the posterior of R from the data. The state stays as
+/// Maps of the sums in a state with others that are as likely, draws from the posterior of R from the data. The state stays as
 /// it is.
 ///
 /// # Errors
@@ -151,11 +151,11 @@ pub fn solve_state(
 pub fn sample_state(
     folder: &Path,
     config: &Config,
-    count: usize,
+    samples: Samples,
     watch: &SolveWatch,
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
-    let setup = SolverSetup { samples: count, ..config.solver(watch.clone())? };
+    let setup = SolverSetup { samples, ..config.solver(watch.clone())? };
     solve_sums(folder, config, setup, found)
 }
 
