@@ -7,7 +7,7 @@ use crate::imaging::SolveError;
 use crate::imaging::circle::degrees;
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem};
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::add;
+use crate::imaging::solver::{Convergence, add};
 
 /// Most maps, and the change of ln C_l at a knot, and of that of the noise, at which they end: as of maps on the circle.
 const ROUNDS_MAX: usize = 3;
@@ -56,7 +56,9 @@ impl RefinedProblem<'_> {
             if change <= SETTLED || is_last {
                 // Of the R that this map has.
                 let found = on_circle.estimated(&found.fit, x, (factor, &ratio))?;
-                return Ok((Refined { residuals, ..refined }, found));
+                let iterations = residuals.len();
+                let convergence = refined.convergence.map(|last| Convergence { iterations, ..last });
+                return Ok((Refined { residuals, convergence, ..refined }, found));
             }
             steps.start = Some(refined.columns.map(|column| column.x));
             found = next;

@@ -5,7 +5,7 @@
 //! of its own, drawn from the Gaussian of the evidence around its maximum, and is what a few turns make of them.
 
 use faer::{Mat, Side};
-use rand::Rng;
+use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::knots::{FREE, Knots};
