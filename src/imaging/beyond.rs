@@ -51,7 +51,9 @@ pub(crate) fn read_power(path: &Path) -> Result<(usize, Vec<f64>), SolveError> {
     let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
     let (first, power_k2) = power_of(&text).map_err(failed)?;
     if power_k2.len() < 2 {
-        return Err(failed("one degree: expected two or more, the last of which tell how it goes on".to_owned()));
+        return Err(failed(
+            "one degree: expected two or more, the last of which tell how it goes on".to_owned(),
+        ));
     }
     Ok((first, power_k2))
 }
@@ -171,7 +173,8 @@ mod tests {
                     for m in 0..=l {
                         let scale = power[l].sqrt() * if m == 0 { 1.0 } else { 0.5_f64.sqrt() };
                         let [re, im]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut stream));
-                        *alm.get_mut(l, m) = Complex64::new(scale * re, if m == 0 { 0.0 } else { scale * im });
+                        *alm.get_mut(l, m) =
+                            Complex64::new(scale * re, if m == 0 { 0.0 } else { scale * im });
                     }
                 }
                 synthesis(&alm, NSIDE).unwrap()
@@ -180,13 +183,8 @@ mod tests {
         let directions = pixel_directions(NSIDE);
         let radius_m = MOON_RADIUS_M + 300e3;
         let wavelength_m = 30.0;
-        let mut beyond = BeyondNoise::new(
-            (0, &power),
-            L_MAX,
-            SPEED_OF_LIGHT_M_S / wavelength_m,
-            300.0,
-            MOON_RADIUS_M,
-        );
+        let mut beyond =
+            BeyondNoise::new((0, &power), L_MAX, SPEED_OF_LIGHT_M_S / wavelength_m, 300.0, MOON_RADIUS_M);
         for u in [1.0, 2.0, 3.0, 5.0, 8.0] {
             let (mut sum, mut count) = (0.0, 0.0);
             for place in 0..24 {
@@ -196,7 +194,8 @@ mod tests {
                 let at = |phase: f64| {
                     let (x, y) = (phase.cos(), phase.sin());
                     let (y, z) = (y * tilt.cos(), y * tilt.sin());
-                    [x * node.cos() - y * node.sin(), x * node.sin() + y * node.cos(), z].map(|x| radius_m * x)
+                    [x * node.cos() - y * node.sin(), x * node.sin() + y * node.cos(), z]
+                        .map(|x| radius_m * x)
                 };
                 let [i, j] = [at(phase), at(phase - u * wavelength_m / radius_m)];
                 let b = sub(i, j);
@@ -206,7 +205,11 @@ mod tests {
                     .map(|n| {
                         let is_seen = dot(i, *n) > limit && dot(j, *n) > limit;
                         let phase = -TAU * dot(b, *n) / wavelength_m;
-                        if is_seen { Complex64::from_polar(pixel_area_sr(NSIDE), phase) } else { Complex64::ZERO }
+                        if is_seen {
+                            Complex64::from_polar(pixel_area_sr(NSIDE), phase)
+                        } else {
+                            Complex64::ZERO
+                        }
                     })
                     .collect();
                 for sky in &skies {

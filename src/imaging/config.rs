@@ -114,6 +114,10 @@ keys! {
         /// (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a channel.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
+        /// Tables of the sky's angular power, one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the map's degrees
+        /// then counts as noise of each visibility by its baseline's length. Tables go on as they end. Empty to count none.
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        expert beyond_files: Vec<PathBuf> = Vec::new();
         /// Ecliptic longitude and latitude of points at which the effective beam is solved for, such as `[[0.0, 90.0]]`,
         /// degrees.
         #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -412,6 +416,7 @@ impl MapConfig {
             channels_max: _,
             epsilon: _,
             regulariser: _,
+            beyond_files: _, // By their contents.
             beams_deg: _,
             prior_k: _,
             prior_files: _,
@@ -540,6 +545,7 @@ impl MapConfig {
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
             ("regulariser.file", [0, channels].contains(&tables), tables),
+            ("beyond_files", [0, channels].contains(&self.beyond_files.len()), self.beyond_files.len()),
         ] {
             let expected = format!("one value, or one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);

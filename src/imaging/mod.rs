@@ -11,6 +11,7 @@
 mod antennas;
 #[doc(hidden)]
 pub mod anywhere;
+mod beyond;
 #[doc(hidden)]
 pub mod circle;
 mod config;
@@ -26,6 +27,7 @@ mod regulariser;
 mod solver;
 mod stage;
 
+pub(crate) use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
     HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,

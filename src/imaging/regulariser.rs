@@ -8,7 +8,7 @@ use crate::imaging::circle::degrees;
 use crate::imaging::solver::SolveError;
 
 /// Longest table, bytes: more than one of the greatest degree needs.
-const FILE_BYTES_MAX: u64 = 1 << 20;
+pub(in crate::imaging) const POWER_FILE_BYTES_MAX: u64 = 1 << 20;
 
 /// How R depends on the degree.
 #[derive(Clone, Debug, PartialEq)]
@@ -75,8 +75,11 @@ impl Regulariser {
     /// A file that cannot be read or is no such table; power that is not positive.
     pub fn read(path: &Path) -> Result<Self, SolveError> {
         let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
-        let text = read_text(path, FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
-        power_of(&text).map(Self::Wiener).map_err(failed)
+        let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
+        match power_of(&text).map_err(failed)? {
+            (0, power_k2) => Ok(Self::Wiener(power_k2)),
+            (first, _) => Err(failed(format!("l = {first} first"))),
+        }
     }
 
     /// R of a solution up to `l_max`.
@@ -107,26 +110,32 @@ impl Regulariser {
     }
 }
 
-/// C_l of a table, or what is wrong in it.
-fn power_of(text: &str) -> Result<Vec<f64>, String> {
-    let mut power_k2 = Vec::new();
+/// The first degree of a table and C_l from there on, or what is wrong in it.
+pub(in crate::imaging) fn power_of(text: &str) -> Result<(usize, Vec<f64>), String> {
+    let (mut first, mut power_k2) = (0, Vec::new());
     for (number, line) in text.lines().enumerate() {
         let fields: Vec<&str> =
             line.split([',', ' ', '\t']).map(str::trim).filter(|field| !field.is_empty()).collect();
-        let is_head = number == 0 && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
+        let is_head =
+            power_k2.is_empty() && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
         if fields.is_empty() || is_head || line.starts_with('#') {
             continue;
         }
         let values = (fields.first().and_then(|l| l.parse::<usize>().ok()), fields.get(1));
         let power = values.1.and_then(|power| power.parse::<f64>().ok());
         match (values.0, power) {
-            (Some(l), Some(power)) if l == power_k2.len() && power > 0.0 && power.is_finite() => {
+            (Some(l), Some(power))
+                if (power_k2.is_empty() || l == first + power_k2.len())
+                    && power > 0.0
+                    && power.is_finite() =>
+            {
+                first = l - power_k2.len();
                 power_k2.push(power);
             }
             _ => return Err(format!("line {}: {}", number + 1, line.chars().take(60).collect::<String>())),
         }
     }
-    if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok(power_k2) }
+    if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok((first, power_k2)) }
 }
 
 #[cfg(test)]
@@ -146,8 +155,10 @@ mod tests {
 
     #[test]
     fn tables_hold_every_degree_or_say_where_they_do_not() {
-        assert_eq!(power_of("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok(vec![3e9, 2.5, 1.0]));
-        assert_eq!(power_of("# from elsewhere\n0 1\n"), Ok(vec![1.0]));
+        assert_eq!(power_of("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok((0, vec![3e9, 2.5, 1.0])));
+        assert_eq!(power_of("# from elsewhere\n0 1\n"), Ok((0, vec![1.0])));
+        // As a map leaves it.
+        assert_eq!(power_of("# C_l\nl,power_k2,low_k2\n2,4,3\n3,2,1\n"), Ok((2, vec![4.0, 2.0])));
         for (text, found) in [
             ("", "no degrees"),
             ("0,1\n2,1", "line 2: 2,1"),
@@ -156,6 +167,7 @@ mod tests {
             ("0,inf", "line 1: 0,inf"),
             ("0,1\n1", "line 2: 1"),
             ("0,1\none,1", "line 2: one,1"),
+            ("2,1\n4,1", "line 2: 4,1"),
         ] {
             assert_eq!(power_of(text), Err(found.to_owned()), "{text}");
         }

@@ -1,7 +1,8 @@
 """Errors of a map with R from the data, by dense matrices over harmonics: rows of B summed over the pixels of a fine map.
 
 Reads a JSON object from standard input: `visibilities` (a table of `lunarray export visibilities`), `channel` (of summary.json), `folder` (of
-the channel's products), `l_max` and `moon_radius_m`. Writes for each product the value of the program over that of the matrices, or their difference.
+the channel's products), `l_max`, `moon_radius_m`, `fine` (nside of the
+pixels over which rows are summed) and `beyond` (whether pixels have more degrees than the map). Writes for each product the value of the program over that of the matrices, or their difference.
 Nothing but C_l and the factor of the noise is taken from the program.
 """
 
@@ -11,9 +12,9 @@ import sys
 import healpy
 import numpy as np
 
-FINE = 32
 LIGHT = 299792458.0
 asked = json.load(sys.stdin)
+FINE = asked["fine"]
 channel, l_max = asked["channel"], asked["l_max"]
 rows = np.genfromtxt(asked["visibilities"], delimiter=",", names=True)
 wavelength = LIGHT / channel["frequency_hz"]
@@ -54,6 +55,15 @@ inverse = np.linalg.inv(normal + np.diag(r))
 nside = channel["nside"]
 y = harmonics(nside)[0]
 sigma = factor * np.sqrt(np.einsum("pi,ij,pj->p", y, inverse, y, optimize=True))
+if asked["beyond"]:
+    # A power law through the last two degrees, averaged over discs of a pixel's area.
+    slope = np.log(power[l_max] / power[l_max - 1]) / np.log((l_max + 1) / l_max)
+    further = np.arange(l_max + 1, 8 * nside + 1)
+    x = 2 * further / np.sqrt(12) / nside
+    turn = np.linspace(0, np.pi, 4001)[:, None]
+    j1 = np.trapezoid(np.cos(turn - x * np.sin(turn)), turn, axis=0) / np.pi
+    more = power[l_max] * ((further + 1) / (l_max + 1)) ** slope * (2 * j1 / x) ** 2
+    sigma = np.sqrt(sigma**2 + ((2 * further + 1) * more).sum() / (4 * np.pi))
 root = y * np.sqrt(r)
 density = (l_max + 1) ** 2 / (4 * np.pi) - np.einsum("pi,ij,pj->p", root, inverse, root, optimize=True)
 resolution = np.degrees(1 / np.sqrt(density))

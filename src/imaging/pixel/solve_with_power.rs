@@ -136,7 +136,7 @@ pub fn solve_pixels_with_power(
     });
     let open = factors.quadratic_forms(0, open);
     let uncertainty = Uncertainty {
-        resolution_deg: open.into_iter().map(|open| resolution_deg(l_max + 1, open)).collect(),
+        resolution_deg: open.into_iter().map(|open| resolution_deg(degrees.len() as f64, open)).collect(),
         sigma_k: factors
             .quadratic_forms(0, columns)
             .into_iter()

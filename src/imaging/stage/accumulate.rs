@@ -7,7 +7,9 @@ use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
+use crate::imaging::beyond::{BeyondNoise, read_power};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, orbit_of};
+use crate::imaging::solver::SolveError;
 use crate::imaging::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
     NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
@@ -177,6 +179,8 @@ pub struct Accumulator {
     part: Option<SumPart>,
     /// Seeds of further realisations of noise.
     noise_seeds: Vec<u64>,
+    /// What the sky has beyond the degrees of the maps, if it counts as noise.
+    beyond: BTreeMap<ChannelId, BeyondNoise>,
 }
 
 impl Accumulator {
@@ -196,6 +200,7 @@ impl Accumulator {
             ranks: Ranks::one(),
             part: None,
             noise_seeds: Vec::new(),
+            beyond: BTreeMap::new(),
         }
     }
 
@@ -406,7 +411,7 @@ impl Accumulator {
     /// # Errors
     /// A channel that holds nothing, or as [`NormalEngine::remove`].
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
+        let near = self.usable(placed)?;
         if near.is_empty() {
             return Ok(Added::default());
         }
@@ -496,13 +501,35 @@ impl Accumulator {
         Ok(Ok(sums))
     }
 
+    /// The visibilities that a map uses, with the weights that it gives them.
+    fn usable(&mut self, placed: &PlacedVisibilities) -> Result<PlacedVisibilities, AccumulationError> {
+        let (config, channel) = (&self.config, placed.channel);
+        let baseline_m_max = config.baseline_m_max(placed.frequency_hz);
+        let mut near = within(placed, baseline_m_max);
+        let Some(path) = config.beyond_files.get(usize::from(channel.0)).filter(|_| !near.is_empty()) else {
+            return Ok(near);
+        };
+        if !self.beyond.contains_key(&channel) {
+            let instrument = self.instrument.as_ref().ok_or(AccumulationError::UnknownChannel(channel))?;
+            let failed = |error: SolveError| AccumulationError::Beyond(error.to_string());
+            let (first, power_k2) = read_power(path).map_err(failed)?;
+            let (hz, moon_m) = (placed.frequency_hz, instrument.moon_radius_m);
+            let beyond = BeyondNoise::new((first, &power_k2), config.degree(), hz, baseline_m_max, moon_m);
+            self.beyond.insert(channel, beyond);
+        }
+        if let Some(beyond) = self.beyond.get_mut(&channel) {
+            beyond.lower_weights(&mut near);
+        }
+        Ok(near)
+    }
+
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
         let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&placed.channel));
         if is_other || !self.config.maps(placed.channel) {
             self.ledger.left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
-        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
+        let near = self.usable(placed)?;
         self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
         if near.is_empty() {
             // A channel without usable data has no sums, and no map.

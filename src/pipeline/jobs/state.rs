@@ -60,6 +60,11 @@ fn require_files(
             "--old-calibration FILE (recalibrate), --calibration FILE (replay) or --set calibration.gains_file=FILE (other commands)",
         ),
         (
+            "map.beyond_files",
+            "the sky's power beyond the maps' degrees, of",
+            "--set map.beyond_files=[FILE, ...]",
+        ),
+        (
             "calibrate.model_files",
             "gains that were found with maps of the known sky,",
             "--set calibrate.model_files=[FILE, ...]",
