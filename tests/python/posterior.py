@@ -17,6 +17,7 @@ asked = json.load(sys.stdin)
 FINE = asked["fine"]
 channel, l_max = asked["channel"], asked["l_max"]
 rows = np.genfromtxt(asked["visibilities"], delimiter=",", names=True)
+rows = rows[rows["flag"] == 0]
 wavelength = LIGHT / channel["frequency_hz"]
 
 
