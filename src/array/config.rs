@@ -27,53 +27,52 @@ keys! {
     pub struct ArrayConfig {
         /// Number of daughters on the circle.
         everyday satellites: usize = 8;
-        /// Altitude of the circular orbit, or of the semi-major axis, m.
+        /// Altitude of the circular orbit, or of the semi-major axis.
         everyday altitude_m: f64 = 300e3;
-        /// Radius of the Moon, m.
+        /// Radius of the Moon.
         expert moon_radius_m: f64 = MOON_RADIUS_M;
-        /// Inclination to the ecliptic, degrees.
+        /// Inclination to the ecliptic.
         everyday inclination_deg: f64 = 30.0;
-        /// Orbital period, s.
+        /// Orbital period.
         expert orbital_period_s: f64 = 8_248.68;
-        /// Period of the precession of the node, s.
+        /// Period of the precession of the node.
         expert precession_period_s: f64 = 1.3 * YEAR_S;
         /// Sense of the precession: "regress" or "advance".
         expert node_motion: NodeMotion = NodeMotion::Regress;
-        /// Orbital phase of daughter 1 at the epoch, degrees.
+        /// Orbital phase of daughter 1 at the epoch.
         expert orbital_phase_deg: f64 = 0.0;
-        /// Longitude of the ascending node at the epoch, degrees.
+        /// Longitude of the ascending node at the epoch.
         expert node_longitude_deg: f64 = 0.0;
-        /// Eccentricity of the formation's orbit; 0 for the circle.
+        /// Eccentricity of the formation's orbit.
         everyday eccentricity: f64 = 0.0;
-        /// Argument of the periapsis at the epoch, degrees.
+        /// Argument of the periapsis at the epoch.
         expert periapsis_deg: f64 = 0.0;
-        /// Motion of the argument of the periapsis, degrees a day.
+        /// Rate of the argument of the periapsis.
         expert periapsis_rate_deg_per_day: f64 = 0.0;
-        /// Greatest distance of each daughter from daughter 1 across the track, in units of that along it: their planes are
-        /// inclined to each other by that much.
+        /// Maximum distance of each daughter from daughter 1 across the track, over that along it: their orbital planes differ by
+        /// this.
         expert cross_track_ratio: f64 = 0.0;
-        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch, degrees: of the idealised Earth on a circle in the
-        /// ecliptic, which missions without `oem` have.
+        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except along
+        /// `oem` files.
         expert earth_longitude_deg: f64 = 0.0;
-        /// Arcs by which daughter 2 and those after it trail daughter 1 at their greatest, m, in ascending order; empty for
-        /// those that `breathing` describes.
+        /// Maximum arcs by which daughters 2, 3, ... trail daughter 1, ascending; empty for those of `breathing`.
         expert arcs_m: Vec<f64> = Vec::new();
-        /// Orbits of their own, one a satellite, in place of the circle and its formation: `{ semi_major_axis_m = 2037.1e3,
-        /// eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0
-        /// }` at the epoch, on ecliptic axes; if they turn, `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
+        /// Kepler orbits, one a satellite, instead of the formation: `{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01,
+        /// inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 }` at the epoch, on
+        /// ecliptic axes; optional `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
         everyday kepler: Vec<KeplerElements> = Vec::new();
-        /// Orbits from CCSDS OEM files (KVN or XML, also compressed by gzip), one a satellite, in place of the circle and its
-        /// formation; empty for the circle. Their dates give the mission's epoch, and where the Earth is.
+        /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, instead of the formation. Their dates fix the mission's
+        /// epoch and the Earth's position.
         everyday oem: Vec<PathBuf> = Vec::new();
         /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first
-        /// useable times.
+        /// usable times.
         #[only_with("array.oem")]
         expert oem_epoch: String = String::new();
-        /// Orbits by numerical integration in the Moon's field (GRGM900C), from the formation at the epoch, whose followers go
-        /// where daughter 1 went, or from array.kepler. Periods, precession and rates are not used then.
+        /// Numerical integration in the Moon's field (GRGM900C), from the formation at the epoch or from array.kepler. Periods,
+        /// precession and rates are then ignored.
         #[serde(skip_serializing_if = "PropagateConfig::is_default")]
         section propagate: PropagateConfig = PropagateConfig::default();
-        /// Contraction and expansion of the formation along the track.
+        /// Contraction and expansion of the formation.
         section breathing: BreathingConfig = BreathingConfig::default();
     }
 }
@@ -92,21 +91,20 @@ pub enum Spacing {
 keys! {
     /// Contraction and expansion of the formation along the track (the paper, Sect. 2).
     pub struct BreathingConfig {
-        /// Period of contraction and expansion, s.
+        /// Period of contraction and expansion.
         expert period_s: f64 = 14.0 * DAY_S;
-        /// Smallest distance of daughters 1 and 2, m; the largest is R_2 times this.
+        /// Minimum distance of daughters 1 and 2.
         expert first_spacing_m_min: f64 = 100.0;
-        /// Ratio R_2 of largest to smallest distance of daughters 1 and 2.
+        /// Ratio R_2 of maximum to minimum distance of daughters 1 and 2.
         expert first_ratio: f64 = 6.0;
-        /// Smallest distance of daughters 2 and 3, m; the largest is R times this. Used for four daughters or more whose steps
-        /// grow.
+        /// Minimum distance of daughters 2 and 3, for four daughters or more whose steps grow.
         expert second_spacing_m_min: f64 = 500.0;
-        /// Ratio R of largest to smallest arc of daughters 3 and later.
+        /// Ratio R of maximum to minimum arc of daughters 3 and later.
         expert ratio: f64 = 3.0;
-        /// Longest arc from the first to the last daughter, m.
+        /// Maximum arc from the first to the last daughter.
         everyday span_m_max: f64 = 100e3;
-        /// What grows by the same factor: the "steps" from daughter to daughter, or the "arcs" from daughter 1, which puts more
-        /// of many daughters close to it.
+        /// What grows by a constant factor: the "steps" from daughter to daughter, or the "arcs" from daughter 1, which puts more
+        /// daughters close to it.
         expert growing: Spacing = Spacing::Steps;
     }
 }

@@ -30,10 +30,10 @@ keys! {
     /// The `[calibration]` section.
     #[derive(Eq)]
     pub struct CalibrationConfig {
-        /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": they are found while the data
-        /// arrive, by the section `calibrate`.
+        /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": found while the data arrive, by the
+        /// section `calibrate`.
         everyday hook: CalibrationHook = CalibrationHook::Identity;
-        /// File of gains for the hook "antenna-gains", such as "gains.json".
+        /// File of gains for "antenna-gains", such as "gains.json".
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday gains_file: Option<PathBuf> = None;
         /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.

@@ -12,17 +12,17 @@ keys! {
     pub struct DaughtersConfig {
         /// Bits of the real and of the imaginary part: 1, 2, 4, 8, or 32 for floats.
         everyday bits: u32 = 8;
-        /// Time constant of the automatic level control, s.
+        /// Time constant of the automatic level control.
         expert level_time_constant_s: f64 = 10.0;
         /// Samples in a block: a power of two from 256 to 65536.
         expert block_samples: usize = 1024;
-        /// Greatest rate of the link from one daughter to the mother, bit/s; 0 for no limit.
+        /// Maximum rate of a daughter's link to the mother; 0 for no limit.
         expert link_bits_per_s_max: f64 = 0.0;
-        /// Buffer of one daughter before its link, bytes.
+        /// Buffer before a daughter's link.
         expert link_buffer_bytes: u64 = 16 << 20;
-        /// What a full buffer drops: the "newest" block or the "oldest".
+        /// What a full buffer drops: the "newest" or the "oldest" block.
         expert link_drop: DropPolicy = DropPolicy::Newest;
-        /// Tones that are added to the samples: interference from the Earth, and a signal for calibration.
+        /// Tones added to the samples: interference from the Earth, and a calibration signal.
         #[serde(skip_serializing_if = "Tones::is_none")]
         section tones: Tones = Tones::default();
     }
@@ -42,17 +42,17 @@ pub enum DropPolicy {
 keys! {
     /// Tones that are added to samples. Errors of gains, phases and clocks are in `[instrument]`.
     pub struct Tones {
-        /// Power of narrow-band leakage from the Earth at the limb, K sr; 0 for none.
+        /// Power of narrow-band leakage from the Earth at the limb.
         expert interference_k_sr: f64 = 0.0;
-        /// Frequency of the leakage from the Earth, Hz from the channel's centre.
+        /// Frequency of the leakage, from the channel's centre.
         expert interference_offset_hz: f64 = 0.0;
-        /// Depth behind the limb over which the power of the leakage falls by a factor e, m.
+        /// Depth behind the limb over which the leakage falls by a factor e.
         expert interference_depth_m: f64 = 0.0;
-        /// Power of the calibration tone, K sr, equal and in phase at all daughters; 0 for none.
+        /// Power of the calibration tone, equal and in phase at all daughters.
         expert calibration_k_sr: f64 = 0.0;
-        /// Frequency of the calibration tone, Hz from the channel's centre.
+        /// Frequency of the calibration tone, from the channel's centre.
         expert calibration_offset_hz: f64 = 0.0;
-        /// Phase of the calibration tone at the start of a window, rad.
+        /// Phase of the calibration tone at the start of a window.
         expert calibration_phase_rad: f64 = 0.0;
     }
 }

@@ -19,18 +19,18 @@ keys! {
     pub struct DownlinkConfig {
         /// Format: "packets", or "cadu": packets in coded transfer frames.
         everyday format: Format = Format::Packets;
-        /// Maximum packet length, bytes. A lost packet loses only its own visibilities (21 bytes each).
+        /// Maximum packet length. A lost packet loses only its own visibilities (21 bytes each).
         expert packet_bytes_max: usize = 8_192;
-        /// Bytes after which the instrument description and the current ephemeris are repeated. Bounds what one damaged packet
+        /// Bytes after which the instrument description and the current ephemeris are repeated: bounds what one damaged packet
         /// can cost.
         expert repeat_bytes: u64 = 1 << 20;
-        /// Reed-Solomon codewords interleaved in a block, for `cadu`: 1, 2, 3, 4, 5 or 8. Each adds 223 bytes to a frame.
+        /// Reed-Solomon codewords interleaved in a block of "cadu": 1, 2, 3, 4, 5 or 8. Each adds 223 bytes to a frame.
         expert interleave: usize = 5;
-        /// Spacecraft identifier of the frames, for `cadu`.
+        /// Spacecraft identifier of "cadu" frames.
         expert spacecraft_id: u8 = 0x4C;
-        /// Idle frames at the start of each pass, for `cadu`: the ground needs one to synchronise.
+        /// Idle "cadu" frames at the start of each pass: the ground needs one to synchronise.
         expert idle_frames: u32 = 2;
-        /// Rate of the link including coding, bit/s; 0 for no limit. Data that exceeds the passes stays on board.
+        /// Maximum rate of the link including coding; 0 for no limit. What exceeds the passes stays on board.
         everyday rate_bits_per_s_max: f64 = 0.0;
         /// Faults between spacecraft and ground. A list of them is written beside the file.
         section link: LinkConfig = LinkConfig::default();

@@ -7,13 +7,13 @@ use crate::units::{Checks, keys};
 keys! {
     /// Antennas by daughter; those beyond a list are ideal.
     pub struct AntennasConfig {
-        /// Tilt of an antenna's axis from the orbit's normal towards the direction of the track, degrees.
+        /// Tilt of an antenna's axis from the orbit's normal towards the track.
         expert tilt_along_deg: Vec<f64> = Vec::new();
-        /// Tilt of an antenna's axis away from the Moon, degrees.
+        /// Tilt of an antenna's axis away from the Moon.
         expert tilt_radial_deg: Vec<f64> = Vec::new();
-        /// Distortion q: a factor 1 + q (3 cos^2 - 1) / 2 of the voltage pattern, with the angle from the axis.
+        /// Distortion q of the voltage pattern, as instrument.pattern.
         expert pattern: Vec<f64> = Vec::new();
-        /// Distortion by frequency, added to map.antennas.pattern, as instrument.pattern_by_frequency.
+        /// Distortion by frequency, added to `pattern`, as instrument.pattern_by_frequency.
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
     }

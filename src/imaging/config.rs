@@ -82,82 +82,81 @@ pub enum RegulariserChoice {
 keys! {
     /// Configuration of map making.
     pub struct MapConfig {
-        /// HEALPix nside of the maps: a power of two, up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
+        /// HEALPix nside of the maps: a power of two up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
         /// Basis of the normal equations: "pixel", exact on any orbit, or "harmonic", far cheaper, for satellites on one circle
         /// or with map.refine.
         everyday engine: EngineKind = EngineKind::Pixel;
-        /// Most channels of an instrument: each with data takes memory for a map, so a forged description is refused.
+        /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;
-        /// Numbers of the channels to map, from 0; all if empty.
+        /// Channels to map, from 0; all if empty.
         everyday channels: Vec<u16> = Vec::new();
-        /// Rows of B: "average" over pixels, or "centre" of pixels.
+        /// Rows of B: the "average" over a pixel, or its "centre".
         #[only_with(r#"map.engine = "pixel""#)]
         expert rows: PixelMethod = PixelMethod::Average;
-        /// What the pixel engine does with its matrix: "stored" in memory and factorised, or "free": rows of B are computed again for each product
-        /// of an iteration.
+        /// The matrix of the pixel engine: "stored" in memory and factorised, or "free": rows of B are computed again for each
+        /// product of an iteration.
         #[only_with(r#"map.engine = "pixel""#)]
         #[serde(skip_serializing_if = "is_usual")]
         everyday matrix: MatrixKind = MatrixKind::Stored;
-        /// Highest degree of a map; 0 for 2.5 nside.
+        /// Maximum degree of a map; 0 for 2.5 nside.
         #[only_with(r#"map.engine = "harmonic""#)]
         expert l_max: usize = 0;
-        /// Longest baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
+        /// Maximum baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
         everyday baseline_bp_max: f64 = 2.0;
         /// Regularisation epsilon; one value, or one a channel. Alone it asks for R = epsilon W_max I, the paper's; "degree" and
         /// "file" take 1e-4 without it.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
-        /// Regulariser R: "data", 1 / C_l of the sky as the data have it, the default without epsilon, matrix = "free" and pixels beyond
-        /// nside 32; "identity", epsilon W_max I, the paper's; with the engine "harmonic" also { degree = 2.0 }, epsilon W_max
-        /// (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a channel.
+        /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's
+        /// (default with epsilon, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also {
+        /// degree = 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a
+        /// channel.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
-        /// Tables of the sky's angular power, one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the map's degrees
-        /// then counts as noise of each visibility by its baseline's length. Tables go on as they end. Empty to count none.
+        /// Tables of the sky's C_l (K^2), one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the
+        /// map's degrees then counts as noise, by the baseline's length. Tables go on as they end.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         expert beyond_files: Vec<PathBuf> = Vec::new();
-        /// Ecliptic longitude and latitude of points at which the effective beam is solved for, such as `[[0.0, 90.0]]`,
-        /// degrees.
+        /// Ecliptic longitudes and latitudes of points whose effective beam is computed, such as `[[0.0, 90.0]]`.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         everyday beams_deg: Vec<[f64; 2]> = Vec::new();
-        /// Prior map: a uniform temperature, K; 0 for none; one value, or one a channel.
+        /// Uniform prior map; 0 for none; one value, or one a channel.
         everyday prior_k: PerChannel<f64> = PerChannel::All(0.0);
-        /// Prior maps: HEALPix FITS files, one per channel, in K; empty for none.
+        /// Prior maps: HEALPix FITS files, one a channel, in K.
         everyday prior_files: Vec<PathBuf> = Vec::new();
-        /// Frame of prior maps without COORDSYS, as sky.frame. Without it such files are refused.
+        /// Frame of prior maps without COORDSYS, as sky.frame. Without it they are refused.
         #[only_with("map.prior_files")]
         #[serde(skip_serializing_if = "Option::is_none")]
         expert prior_frame: Option<Frame> = None;
-        /// FWHM to which prior maps are smoothed, degrees.
+        /// FWHM to which prior maps are smoothed.
         #[only_with("map.prior_files")]
         expert prior_fwhm_deg: f64 = 5.0;
-        /// Share of the power of the sky that the Moon is taken to reflect, xi_R: visibilities are divided by one plus this; 0
-        /// for none.
+        /// Share xi_R of the sky's power that the Moon is taken to reflect: visibilities are divided by one plus this.
         expert moon_reflection: f64 = 0.0;
-        /// Mission time between snapshot maps, s; 0 for a final map only.
+        /// Mission time between snapshot maps; 0 for a final map only.
         everyday snapshot_every_s: f64 = 0.0;
-        /// Greatest weight of a visibility that is accepted, (K sr)^-2; it sets the resolution of the sums. 0 for 1024 times
-        /// that of 25 s under the mean sky of the channel's frequency.
+        /// Maximum weight of a visibility, (K sr)^-2, which sets the resolution of the sums; 0 for 1024 times that of 25 s under
+        /// the mean sky of the channel's frequency.
         expert weight_max: f64 = 0.0;
         /// Seed of the noise-only companion map.
         expert companion_seed: u64 = 1;
         /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
         #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
         expert residual_max: f64 = 1e-4;
-        /// Most iterations of a solution.
+        /// Maximum number of iterations of a solution.
         #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
         expert iterations_max: usize = 300;
-        /// Random probes for the traces of the covariances of a final map; 0 for no traces. Those of up to 3072 unknowns (nside
-        /// 16, or l_max 54) are exact and need none: any number above 0 will do.
+        /// Random probes for the traces of a final map's covariances; 0 for no traces. Up to 3072 unknowns (nside 16, or l_max
+        /// 54) traces are exact, with any number above 0.
         everyday trace_probes: usize = 0;
-        /// Departures from the common circle beyond which visibilities are refused.
+        /// Maximum departures from the common circle; visibilities beyond are refused.
         #[only_with(r#"map.engine = "harmonic""#)]
         section limits: GeometryLimits = GeometryLimits::default();
-        /// Refinement of a harmonic map with the positions as they are, on any orbit.
+        /// Refinement of a harmonic map with the true rows of B, on any orbit.
         section refine: RefineConfig = RefineConfig::default();
-        /// Antennas as a refined map takes them to be, a value a daughter.
+        /// Antennas that a refined map assumes, one value a daughter.
         #[only_with("map.refine.passes_max > 0")]
         #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
         section antennas: AntennasConfig = AntennasConfig::default();
@@ -172,17 +171,17 @@ keys! {
     /// nearest circle. Nothing is refused for its geometry then.
     #[derive(Copy)]
     pub struct RefineConfig {
-        /// Most products with the true matrix; 0 for no refinement; four to ten are usual.
+        /// Maximum number of products with the true matrix; 0 for no refinement; four to ten are usual.
         #[only_with(r#"map.engine = "harmonic""#)]
         everyday passes_max: usize = 0;
         /// Residual at which it stops, relative to the right-hand side, in the preconditioner's norm.
         #[only_with("map.refine.passes_max > 0")]
         expert residual_max: f64 = 1e-3;
-        /// Most visibilities of a channel that are held in memory for it, or without the matrix of the pixel engine; further
-        /// ones are left out and counted.
+        /// Maximum number of visibilities of a channel held in memory, here and with matrix = "free"; further ones are left out
+        /// and counted.
         #[only_with(r#"map.refine.passes_max > 0 or map.matrix = "free""#)]
         expert visibilities_max: u64 = 30_000_000;
-        /// Whether visibilities are averages over their integrations, or instants in their middle.
+        /// Average rows of B over integrations, instead of taking the middle.
         #[only_with("map.refine.passes_max > 0")]
         #[serde(skip_serializing_if = "is_off")]
         everyday smear_integrations: bool = false;

@@ -36,77 +36,75 @@ keys! {
         /// What is simulated: "visibilities", or "samples", the voltages of every daughter, which are correlated; for minutes
         /// to hours of mission time.
         everyday fidelity: Fidelity = Fidelity::default();
-        /// Centre frequencies of the channels, Hz: up to 30, from 0.1 to 30 MHz.
+        /// Centre frequencies of up to 30 channels, from 0.1 to 30 MHz.
         everyday channels_hz: Vec<f64> = vec![10e6];
-        /// Width of every channel, Hz.
+        /// Width of every channel.
         expert channel_width_hz: f64 = 8_000.0;
-        /// Length of the mission, s.
+        /// Length of the mission.
         everyday duration_s: f64 = 1.3 * YEAR_S;
-        /// Keep one visibility in this many, from windows that have all phases of month, breathing and precession; in place of
+        /// Keep one visibility in this many, from windows at all phases of month, breathing and precession; instead of
         /// every_nth_window and every_nth_integration.
         #[serde(skip_serializing_if = "is_one")]
         everyday thin: u64 = 1;
         /// Observe only in every n-th window; there is one an orbit.
         everyday every_nth_window: u64 = 1;
-        /// Observe only for this time from the start of each window, s; 0 for all of it.
+        /// Maximum time observed from the start of each window; 0 for all of it.
         everyday window_s_max: f64 = 0.0;
-        /// Flag a visibility while the Earth is in sight of one of its two daughters. Windows are daughter 1's, and the others
-        /// trail her into the shadow.
+        /// Flag a visibility while one of its daughters sees the Earth. Windows are daughter 1's; the others trail her into the
+        /// shadow.
         expert flag_earth: bool = true;
         /// Send only every n-th integration of a window; one value, or one a channel.
         everyday every_nth_integration: PerChannel<u64> = PerChannel::All(1);
-        /// Longest integration, s.
+        /// Maximum length of an integration.
         expert integration_s_max: f64 = IntegrationRule::default().duration_s_max;
-        /// Longest motion of a baseline in one integration, wavelengths.
+        /// Maximum motion of a baseline in one integration.
         expert motion_wavelengths_max: f64 = IntegrationRule::default().motion_wavelengths_max;
-        /// Longest baseline that is correlated, wavelengths; 0 for no limit; one value, or one a channel.
+        /// Maximum baseline that is correlated; 0 for no limit; one value, or one a channel.
         expert baseline_wavelengths_max: PerChannel<f64> = PerChannel::All(0.0);
         /// Model of the visibilities: "direct" sums over pixels, "harmonic" on a circle, "general" harmonics anywhere, or
         /// "auto", by cost.
         expert model: ModelChoice = ModelChoice::default();
-        /// Whether visibilities are averages over their integrations, or values at their middle.
+        /// Average visibilities over their integrations, instead of taking the middle.
         expert smear_integrations: bool = false;
-        /// Whether visibilities are averages over the width of their channel, as those of samples are: the integrand times
-        /// `sinc(pi n . r_ij dnu / c)`. The ground's rows of B are for the centre of the channel.
+        /// Average visibilities over the channel's width, as those of samples are: the integrand times `sinc(pi n . r_ij dnu /
+        /// c)`. The ground's rows of B are for the channel's centre.
         expert smear_bandwidth: bool = false;
-        /// Whether thermal noise is added. Weights describe the noise in either case.
+        /// Add thermal noise. Weights describe it in either case.
         everyday thermal_noise: bool = true;
-        /// Receiver noise T_rec / zeta, added to the sky, K sr: one value, one a channel, or a table of [frequency in Hz, K sr]
-        /// at rising frequencies, linear in the logarithms of both, such as `[[1e6, 2e4], [10e6, 300.0], [30e6, 100.0]]`.
+        /// Receiver noise T_rec / zeta, added to the sky: one value, one a channel, or a table of [Hz, K sr] at rising
+        /// frequencies, linear in both logarithms, such as `[[1e6, 2e4], [10e6, 300.0], [30e6, 100.0]]`.
         everyday receiver_noise_k_sr: ReceiverNoise = ReceiverNoise::default();
-        /// Frequency at which the receiver's 1/f noise equals its other noise, Hz: `receiver_noise_k_sr` is multiplied by `1 +
-        /// knee / frequency`; 0 for none.
+        /// Frequency at which the receiver's 1/f noise equals its other noise: `receiver_noise_k_sr` is multiplied by `1 + knee /
+        /// frequency`.
         #[serde(skip_serializing_if = "is_zero")]
         expert receiver_knee_hz: f64 = 0.0;
-        /// Radio interference of the spacecraft itself, added to the receiver noise of every daughter, K sr; one value, or one
-        /// a channel.
+        /// Radio interference of the spacecraft itself, added to every daughter's receiver noise; one value, or one a channel.
         #[serde(skip_serializing_if = "is_none")]
         expert interference_floor_k_sr: PerChannel<f64> = PerChannel::All(0.0);
-        /// Share of the power of the sky that the Moon reflects, xi_R; 0 for none. The paper has 0.07.
+        /// Share xi_R of the sky's power that the Moon reflects; the paper has 0.07.
         everyday moon_reflection: f64 = 0.0;
         /// Form of the Moon that reflects: "flat", or "sphere" with spacecraft.model = "direct".
         #[serde(skip_serializing_if = "MoonMirror::is_flat")]
         expert moon_mirror: MoonMirror = MoonMirror::default();
-        /// Brightness temperature of the Moon's disc, equal over it, K; physically some 250. The ground does not correct for
-        /// it.
+        /// Brightness temperature of the Moon's disc, uniform; physically some 250. The ground does not correct for it.
         #[serde(skip_serializing_if = "is_zero")]
         expert moon_temperature_k: f64 = 0.0;
-        /// Antenna of the daughters: "isotropic", "dipole-normal", or "three-dipoles": three across each other, each with a
+        /// Antenna of the daughters: "isotropic", "dipole-normal", or "three-dipoles": three crossed dipoles, each with a
         /// receiver, as one antenna.
         everyday antenna: Antenna = Antenna::default();
-        /// Sub-bands into which each channel of samples is divided before correlation: a power of two, 1 for none.
+        /// Sub-bands into which a channel of samples is divided before correlation: a power of two, 1 for none.
         expert sub_bands: usize = 1;
-        /// Delay centre of samples: ecliptic longitude and latitude, deg; empty for no delays.
+        /// Delay centre of samples: ecliptic longitude and latitude; empty for no delays.
         expert delay_centre_deg: Vec<f64> = Vec::new();
-        /// Integration time of auto-correlations, s, in whole blocks of samples; 0 for no auto-correlations.
+        /// Integration time of auto-correlations, in whole blocks of samples; 0 for no auto-correlations.
         #[only_with(r#"spacecraft.auto_powers = true or spacecraft.fidelity = "samples""#)]
         expert auto_integration_s: f64 = 1.0;
-        /// Whether auto-correlations are simulated with fidelity "visibilities", too; with samples they always are.
+        /// Simulate auto-correlations with fidelity "visibilities", too; samples always have them.
         expert auto_powers: bool = false;
         /// Blocks that the correlator reads ahead while one is missing.
         #[only_with(r#"spacecraft.fidelity = "samples""#)]
         expert wait_blocks: u64 = 16;
-        /// Capacity of the onboard store, bytes.
+        /// Capacity of the onboard store.
         expert store_bytes_max: u64 = 4 << 30;
         /// What a full store drops: the "newest" data, the "oldest", or "lowest-value", which adds least to the map.
         expert store_drop: StoreDrop = StoreDrop::default();

@@ -24,24 +24,24 @@ const SAMPLES_MIN: f64 = 1e4;
 keys! {
     /// The `[spacecraft.ninth]` section.
     pub struct NinthConfig {
-        /// Whether there is a ninth daughter.
+        /// Add a ninth daughter.
         everyday on: bool = false;
-        /// Lowest and highest frequency of the spectrum, Hz.
+        /// Minimum and maximum frequency of the spectrum.
         #[only_with("spacecraft.ninth.on = true")]
         expert band_hz: [f64; 2] = NINTH_BAND_HZ;
         /// Number of channels in the band.
         #[only_with("spacecraft.ninth.on = true")]
         expert channels: usize = 90;
-        /// Length of an integration, s.
+        /// Length of an integration.
         #[only_with("spacecraft.ninth.on = true")]
         expert integration_s: f64 = 10.0;
-        /// Receiver noise T_rec / zeta, as the antenna would see it from the sky, K sr.
+        /// Receiver noise T_rec / zeta, as the antenna would see it from the sky.
         #[only_with("spacecraft.ninth.on = true")]
         expert receiver_noise_k_sr: f64 = 0.0;
-        /// Arc by which it trails the first daughter on the same circle, m.
+        /// Arc by which it trails daughter 1 on the same circle.
         #[only_with("spacecraft.ninth.on = true")]
         expert arc_m: f64 = 110e3;
-        /// Spectral index of temperature with which a sky from files is extrapolated above its highest channel.
+        /// Spectral index of temperature that extrapolates a sky from files above its highest channel.
         #[only_with("spacecraft.ninth.on = true")]
         expert file_index: f64 = -2.51;
     }

@@ -10,17 +10,16 @@ use crate::units::{Checks, InvalidValue, keys};
 keys! {
     /// The `[products]` section: products besides the final maps.
     pub struct ProductsConfig {
-        /// Whether pictures are drawn.
+        /// Draw pictures.
         everyday pictures: bool = true;
-        /// Whether final pictures are written as SVG, too.
+        /// Write final pictures as SVG, too.
         #[only_with("products.pictures = true")]
         expert svg: bool = false;
-        /// Whether every snapshot is written as a FITS map, too.
+        /// Write every snapshot as a FITS map, too.
         expert snapshot_maps: bool = false;
-        /// Frame of pictures: "galactic", "ecliptic" or "equatorial"; maps are on ecliptic axes in any case.
+        /// Frame of pictures: "galactic", "ecliptic" or "equatorial"; maps are always on ecliptic axes.
         everyday frame: Frame = Frame::Galactic;
-        /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn, degrees; 0
-        /// for none.
+        /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn; 0 for none.
         everyday smooth_fwhm_deg: f64 = 0.0;
     }
 }

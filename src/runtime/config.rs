@@ -5,15 +5,13 @@ use crate::units::{Checks, InvalidValue, keys};
 keys! {
     /// Queues and threads. None of this changes a byte of the results.
     pub struct RuntimeConfig {
-        /// Greatest number of items between two stages.
+        /// Maximum number of items between two stages.
         expert queue_capacity: usize = 64;
         /// Threads for the work inside stages; 0 for one a core.
         everyday threads: usize = 0;
-        /// Time for maps of the data so far after Ctrl-C, s; solutions that take longer are cut off. What was received is saved
-        /// first, and is not part of it.
+        /// Time for maps of the data so far after Ctrl-C; longer solutions are cut off. What was received is saved before.
         everyday grace_s: f64 = 2.5;
-        /// Longest time without progress before the run fails, s; must exceed the longest step, for example that of a solution.
-        /// 0 for no limit.
+        /// Maximum time without progress before the run fails; must exceed the longest step, such as a solution. 0 for no limit.
         expert stall_s: f64 = 0.0;
     }
 }

@@ -24,26 +24,25 @@ pub enum MapFrequency {
 keys! {
     /// The `[sky]` section.
     pub struct SkyConfig {
-        /// Map of the sky: HEALPix FITS in K, such as "map.fits"; one for all channels, or a list with one a channel. Without
-        /// it the sky is generated.
+        /// Map of the sky: HEALPix FITS, such as "map.fits", for all channels, or a list with one a channel. Without it the sky
+        /// is generated.
         everyday file: Option<PerChannel<PathBuf>> = None;
-        /// Frame of map files without COORDSYS: "ecliptic", "galactic" or "equatorial". Without it such files are refused.
+        /// Frame of map files without COORDSYS: "ecliptic", "galactic" or "equatorial". Without it they are refused.
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday frame: Option<Frame> = None;
-        /// What is done with a map file whose FREQ is not the channel's: "must-match" refuses it; `{ spectral_index = -2.5 }`
-        /// scales it, T(nu) = T(FREQ) (nu / FREQ)^index.
+        /// What to do if the FREQ of a map file is not the channel's: "must-match" refuses it, `{ spectral_index = -2.5 }` scales
+        /// it by (nu / FREQ)^index.
         #[only_with("sky.file")]
         expert frequency: MapFrequency = MapFrequency::default();
-        /// HEALPix nside of the generated sky, or of a map file to which something is added: a power of two up to 1024.
+        /// HEALPix nside of the generated sky, or of map files with `added`: a power of two up to 1024.
         everyday nside: usize = 64;
-        /// Highest degree of the harmonic model; 0 for what the baselines need.
+        /// Maximum degree of the harmonic model; 0 for what the baselines need.
         expert l_max: usize = 0;
-        /// Components of the generated sky.
+        /// The generated sky.
         section generated: GeneratedSky = GeneratedSky::default();
-        /// What is added to map files at sky.nside, such as `{ small_scales = true, sources = true }`: fluctuations and counted
-        /// sources with the numbers of [sky.generated]; `catalogue = "sources.csv"` adds those of a table, as `lunarray sky
-        /// --sources` writes it.
+        /// What to add to map files: `{ small_scales = true, sources = true }` adds generated ones, `catalogue = "sources.csv"`
+        /// those of a table, as `lunarray sky --sources` writes it.
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         expert added: Option<AddedSky> = None;

@@ -22,19 +22,20 @@ pub enum StationKeeping {
 keys! {
     /// Orbits by numerical integration of the forces, from the formation's state at the epoch or from `array.kepler`.
     pub struct PropagateConfig {
-        /// How long, days from the epoch; 0 for orbits that are not propagated.
+        /// Days for which orbits are integrated in the Moon's field; 0 for none.
         everyday days: f64 = 0.0;
         /// Degree and order of the Moon's field: 0, or 2 to 16.
         #[only_with("array.propagate.days > 0")]
         expert degree: usize = 12;
-        /// Whether the Earth pulls, too.
+        /// Attraction by the Earth.
         #[only_with("array.propagate.days > 0")]
         expert earth: bool = true;
-        /// Time between corrections of station keeping, days: followers are put on daughter 1's track again when the Earth is
-        /// next high above her; 0 for none.
+        /// Time between corrections of station keeping; 0 for none. Followers are put back on daughter 1's track when the Earth
+        /// is next high above her.
         #[only_with("array.propagate.days > 0")]
         expert keep_every_days: f64 = 0.0;
-        /// What a correction restores: the "formation", or the "orbit": daughter 1's ellipse, too, with the node of that time.
+        /// What a correction restores: the "formation", or the "orbit", which is daughter 1's ellipse, too, with the node of that
+        /// time.
         #[only_with("array.propagate.keep_every_days > 0")]
         expert keep: StationKeeping = StationKeeping::Formation;
     }

@@ -62,49 +62,48 @@ keys! {
         everyday mode: CalibrationMode = CalibrationMode::default();
         /// What fixes the common amplitude: the "model", or "unit-mean": the sky keeps its scale.
         expert amplitude_scale: AmplitudeScale = AmplitudeScale::default();
-        /// Daughter whose phase, clock and position are the reference, from 1.
+        /// Daughter, from 1, whose phase, clock and position are the reference.
         expert reference_daughter: u32 = 1;
         /// Expected deviation of the natural logarithm of a gain's amplitude.
         everyday amplitude_sigma: f64 = 0.3;
-        /// Expected deviation of a gain's phase, degrees.
+        /// Expected deviation of a gain's phase.
         everyday phase_sigma_deg: f64 = 120.0;
-        /// Expected deviation of a clock, for all channels, ns.
+        /// Expected deviation of a clock, for all channels.
         everyday clock_sigma_ns: f64 = 0.0;
-        /// Expected deviation of a position along each axis, m.
+        /// Expected deviation of a position along each axis.
         everyday position_sigma_m: f64 = 0.0;
         /// Solutions of equal length in a pass.
         expert solutions_per_pass: u32 = 1;
-        /// Time without data after which a new pass begins, s.
+        /// Time without data after which a new pass begins.
         expert pass_gap_s: f64 = 900.0;
-        /// Residual beyond which a visibility is left out of a solution, in units of its spread.
+        /// Residual beyond which a visibility is left out of a solution, over its spread.
         expert outlier_sigma: f64 = 6.0;
-        /// Most Gauss-Newton iterations of a round.
+        /// Maximum number of Gauss-Newton iterations in a round.
         expert iterations_max: u32 = 50;
-        /// Most predictions of the model at positions found before.
+        /// Maximum number of predictions of the model at positions found before.
         expert position_rounds: u32 = 3;
-        /// Part of a daughter's signal that a solution may leave unexplained; with more, its data are left out
-        /// of maps.
+        /// Maximum part of a daughter's signal that a solution may leave unexplained; with more, its data are left out of maps.
         expert unexplained_max: f64 = 0.15;
-        /// Standard deviation of a phase, deg, beyond which a daughter's data are left out of maps.
+        /// Maximum standard deviation of a phase; with more, a daughter's data are left out of maps.
         expert phase_sigma_deg_max: f64 = 15.0;
-        /// Gain amplitude below which a receiver is taken to be dead.
+        /// Gain amplitude below which a receiver counts as dead.
         expert dead_amplitude: f64 = 0.05;
         /// Maps of the known sky (K, FITS), one a channel of the downlink.
         everyday model_files: Vec<PathBuf> = Vec::new();
         /// HEALPix nside to which the model map's pixels are split; 0 for its own.
         expert model_nside: usize = 0;
-        /// How the visibilities of the known sky are computed: "direct" sums over pixels, "harmonic" on the circle of a pass to
-        /// degree 5/2 nside, "auto" by nside and visibilities of the pass.
+        /// How visibilities of the known sky are computed: "direct" sums over pixels, "harmonic" on the circle of a pass to
+        /// degree 5/2 nside, or "auto", by nside and number of visibilities.
         expert sky_model: SkyModel = SkyModel::default();
-        /// Power of the artificial signal at a daughter, K sr.
+        /// Power of the artificial signal at a daughter.
         expert beacon_k_sr: f64 = 0.0;
-        /// Ecliptic longitude and latitude that the artificial signal comes from, degrees.
+        /// Ecliptic longitude and latitude that the artificial signal comes from.
         expert beacon_direction_deg: [f64; 2] = [0.0, 0.0];
-        /// Most times that the map is made and calibrated with; 0 for the given model alone.
+        /// Maximum number of rounds of map and calibration; 0 for the given model alone.
         everyday map_rounds: u32 = 0;
-        /// Root mean square change of the gains, relative to one, at which map and solutions are taken as settled.
+        /// Rms change of the gains, relative to one, below which map and solutions are settled.
         expert settled: f64 = 1e-3;
-        /// Every n-th pass is left out of the maps that calibrate, and tests them; 0 for none.
+        /// Leave every n-th pass out of the maps that calibrate, to test them; 0 for none.
         expert hold_out_every: u32 = 0;
     }
 }

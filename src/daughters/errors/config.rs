@@ -14,49 +14,49 @@ keys! {
     /// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
     /// they are without the section. What is wrong with positions and times is in [`NavigationConfig`](super::NavigationConfig).
     pub struct InstrumentConfig {
-        /// Number of the realisation: other random errors, those of `[navigation]` included, with the same sky and noise.
+        /// Number of the realisation: other random errors, also of `[navigation]`, with the same sky and noise.
         everyday realisation: u32 = 0;
-        /// Natural logarithm of the amplitude of the voltage gain, by daughter and channel.
+        /// Natural logarithm of the voltage gain's amplitude, by daughter and channel.
         section amplitude: ErrorTerms = ErrorTerms::default();
-        /// Phase of the voltage gain, deg, by daughter and channel.
+        /// Phase of the voltage gain, by daughter and channel.
         section phase_deg: ErrorTerms = ErrorTerms::default();
-        /// Offset of the clock, ns; positive if samples are late. By daughter, for all channels.
+        /// Offset of the clock by daughter, for all channels; positive if samples are late.
         section clock_ns: ErrorTerms = ErrorTerms::default();
-        /// Tilt of an antenna's axis from the orbit's normal towards the direction of the track, degrees; needs
-        /// spacecraft.model = "direct" or "general", or samples.
+        /// Tilt of an antenna's axis from the orbit's normal towards the track; needs spacecraft.model = "direct" or "general",
+        /// or samples.
         section tilt_along_deg: ErrorTerms = ErrorTerms::default();
-        /// Tilt of an antenna's axis from the orbit's normal away from the Moon, degrees.
+        /// Tilt of an antenna's axis from the orbit's normal away from the Moon.
         section tilt_radial_deg: ErrorTerms = ErrorTerms::default();
         /// Distortion q of the voltage pattern: a factor 1 + q (3 cos^2 - 1) / 2 with the angle from the axis.
         section pattern: ErrorTerms = ErrorTerms::default();
         /// Distortion of the voltage pattern by frequency, added to instrument.pattern: rows `[frequency_hz, q]`, or
-        /// `[frequency_hz, q_1, q_2, ...]` with one q a daughter; linear between rows, and beyond the ends that of the end.
+        /// `[frequency_hz, q_1, q_2, ...]` with one q a daughter; linear between rows, constant beyond.
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
-        /// Allan deviation of every clock at 1 s; it falls as the root of time (white noise of frequency).
+        /// Allan deviation of every clock at 1 s, with white frequency noise.
         expert clock_allan_deviation: f64 = 0.0;
-        /// Time within which clocks are brought back, s: their noise is forgotten as exp(-|t| / this).
+        /// Time within which steering brings clocks back: their noise is forgotten as exp(-|t| / this).
         expert clock_steering_s: f64 = 86_400.0;
-        /// Daughters that deliver noise and no signal, from 1.
+        /// Daughters, from 1, that deliver noise and no signal.
         expert dead_daughters: Vec<u32> = Vec::new();
-        /// Daughter, from 1, and channel, from 0, of receivers that deliver noise and no signal.
+        /// Receivers that deliver noise and no signal: daughter, from 1, and channel, from 0.
         expert dead_channels: Vec<[u32; 2]> = Vec::new();
         /// Probability that a visibility is an outlier.
         expert outlier_probability: f64 = 0.0;
-        /// Standard deviation of either part of what is added to an outlier, in units of the thermal noise.
+        /// Standard deviation of either part of what is added to an outlier, over that of thermal noise.
         expert outlier_sigma: f64 = 0.0;
-        /// Mean time between bursts of interference from the Earth, s; 0 for none.
+        /// Mean time between bursts of interference from the Earth; 0 for none.
         expert burst_every_s: f64 = 0.0;
-        /// Length of a burst, s.
+        /// Length of a burst.
         expert burst_s: f64 = 0.0;
-        /// Power of a burst at a daughter, K sr.
+        /// Power of a burst at a daughter.
         expert burst_k_sr: f64 = 0.0;
-        /// Power of interference from the Earth at the Moon's limb at a daughter, K sr; 0 for none.
+        /// Power at a daughter of interference from the Earth at the Moon's limb; 0 for none.
         expert leak_k_sr: f64 = 0.0;
-        /// Angle below the limb over which the power of the leakage falls by a factor e, degrees.
+        /// Angle below the limb over which the leakage falls by a factor e.
         expert leak_depth_deg: f64 = 1.0;
-        /// Artificial signal for calibration: a plane wave, equal at all daughters. Integrations while it is on are flagged,
-        /// and stay out of maps.
+        /// Artificial signal for calibration: a plane wave, equal at all daughters. Its integrations are flagged and stay out of
+        /// maps.
         section beacon: BeaconSchedule = BeaconSchedule::default();
     }
 }
@@ -67,21 +67,21 @@ keys! {
     pub struct ErrorTerms {
         /// Given values, one a daughter, or none.
         expert constant: Vec<f64> = Vec::new();
-        /// Given rates, 1/day since the epoch, one a daughter, or none.
+        /// Given rates since the epoch, one a daughter, or none.
         expert rate_per_day: Vec<f64> = Vec::new();
-        /// Standard deviation of a constant of the whole mission.
+        /// Rms of a constant of the mission.
         expert constant_rms: f64 = 0.0;
-        /// Standard deviation of a constant that every pass draws anew.
+        /// Rms of a constant of each pass.
         expert pass_rms: f64 = 0.0;
-        /// Standard deviation of an oscillation with the period of the orbit.
+        /// Rms of an oscillation with the orbital period.
         expert orbit_rms: f64 = 0.0;
-        /// Standard deviation of a Gauss-Markov process: correlation exp(-|t| / drift_time_s).
+        /// Rms of a Gauss-Markov process with correlation exp(-|t| / drift_time_s).
         expert drift_rms: f64 = 0.0;
-        /// Correlation time of the Gauss-Markov process, s.
+        /// Correlation time of the Gauss-Markov process.
         expert drift_time_s: f64 = 3600.0;
-        /// Standard deviation of a level that jumps.
+        /// Rms of a level that jumps.
         expert step_rms: f64 = 0.0;
-        /// Time in which the level jumps once, at a random instant, s.
+        /// Interval in which the level jumps once, at a random time.
         expert step_every_s: f64 = 86_400.0;
     }
 }
@@ -89,13 +89,13 @@ keys! {
 keys! {
     /// The artificial signal and its times.
     pub struct BeaconSchedule {
-        /// Power at a daughter, K sr, in every channel; 0 for no signal.
+        /// Power at a daughter, in every channel; 0 for no signal.
         expert k_sr: f64 = 0.0;
-        /// Ecliptic longitude and latitude that the signal comes from, degrees.
+        /// Ecliptic longitude and latitude that it comes from.
         expert direction_deg: [f64; 2] = [0.0, 0.0];
-        /// Time for which the signal is on, from the start of each pass, s.
+        /// Time for which it is on, from the start of each pass.
         expert on_s: f64 = 0.0;
-        /// Time after which the signal is repeated in a pass, s; 0 for once.
+        /// Time after which it is repeated in a pass; 0 for once.
         expert every_s: f64 = 0.0;
     }
 }

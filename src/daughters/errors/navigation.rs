@@ -13,13 +13,13 @@ keys! {
     /// The `[navigation]` section: what the packets say less what is true. Without any of it, data are as they are without the
     /// section.
     pub struct NavigationConfig {
-        /// Error of the position in the packets along the track, m, by daughter: what they say less what was flown.
+        /// Error of the position along the track, by daughter.
         section along_m: ErrorTerms = ErrorTerms::default();
-        /// Error of the position in packets along the orbit's normal, m, by daughter.
+        /// Error of the position along the orbit's normal, by daughter.
         section across_m: ErrorTerms = ErrorTerms::default();
-        /// Error of the position in packets away from the Moon, m, by daughter.
+        /// Error of the position away from the Moon, by daughter.
         section radial_m: ErrorTerms = ErrorTerms::default();
-        /// Error of the time tags of all data, ms, one for the formation: what packets say minus the true time.
+        /// Error of the time tags of all data, one for the formation.
         section time_tag_ms: ErrorTerms = ErrorTerms::default();
     }
 }

@@ -13,10 +13,9 @@ keys! {
     pub struct LinkConfig {
         /// Probability that a bit is wrong.
         everyday bit_error_rate: f64 = 0.0;
-        /// Mean distance between bursts, bits; 0 for none. Bursts and the gaps between them are the states of a Gilbert-Elliott
-        /// channel.
+        /// Mean distance between bursts; 0 for none. Bursts and gaps are the states of a Gilbert-Elliott channel.
         expert burst_every_bits: f64 = 0.0;
-        /// Mean length of bursts, bits.
+        /// Mean length of bursts.
         expert burst_bits: f64 = 0.0;
         /// Probability that a bit of a burst is wrong.
         expert burst_bit_error_rate: f64 = 0.5;
@@ -30,13 +29,13 @@ keys! {
         expert duplicate: f64 = 0.0;
         /// Probability that a frame arrives late.
         expert reorder: f64 = 0.0;
-        /// Maximum delay of a late frame, frames.
+        /// Maximum delay of a late frame.
         expert reorder_frames: u64 = 16;
-        /// Probability that a pass arrives after the one that follows it.
+        /// Probability that a pass arrives after the next one.
         expert pass_swap: f64 = 0.0;
         /// Probability that a bit is lost or added within a coded frame.
         expert bit_slip: f64 = 0.0;
-        /// Frames at the end of each pass that a second station receives too, with faults of its own.
+        /// Frames at the end of each pass that a second station receives, too, with its own faults.
         expert second_station_frames: u64 = 0;
     }
 }

@@ -25,20 +25,20 @@ keys! {
     /// Sections are in the order of the data path. A ground segment reads only `calibration`, `calibrate`, `map`, `products` and
     /// `runtime`, and `downlink.listen` when it listens.
     pub struct Config {
-        /// Name of the run: products go to `out/NAME`. Empty for the name of the file.
+        /// Name of the run: products go to `out/NAME`. Empty for the file's name.
         everyday name: String = String::new();
         /// Seed of all random numbers of the space segment.
         everyday seed: u64 = 0;
         /// The simulated sky.
         section sky: SkyConfig = SkyConfig::default();
-        /// Orbit and formation of the satellites; the defaults are the array of the paper.
+        /// Orbit and formation; the defaults are the paper's.
         section array: ArrayConfig = ArrayConfig::default();
-        /// Samples of the daughters, their quantisers and their links to the mother.
+        /// Samples of the daughters, quantisers, and links to the mother.
         #[only_with(r#"spacecraft.fidelity = "samples""#)]
         section daughters: DaughtersConfig = DaughtersConfig::default();
-        /// Errors of the instrument. Their true values are written beside the downlink, as FILE.instrument.csv.
+        /// Errors of the instrument. The truth is written beside the downlink, as FILE.instrument.csv.
         section instrument: InstrumentConfig = InstrumentConfig::default();
-        /// Errors of the positions and times in packets: what packets say minus what is true.
+        /// Errors of the positions and times in packets: reported minus true.
         section navigation: NavigationConfig = NavigationConfig::default();
         /// Channels, integration and model of the visibilities.
         section spacecraft: SpacecraftConfig = SpacecraftConfig::default();
@@ -46,14 +46,14 @@ keys! {
         section downlink: DownlinkConfig = DownlinkConfig::default();
         /// Corrections of visibilities before they are mapped.
         section calibration: CalibrationConfig = CalibrationConfig::default();
-        /// The solver of gains, for `lunarray calibrate` and `calibration.hook = "solve"`. Keys with `_sigma` are what is
-        /// expected before the data are seen; what has 0 is not solved for.
+        /// The solver of gains, for `lunarray calibrate` and `calibration.hook = "solve"`. Keys with `_sigma` are standard
+        /// deviations expected before the data are seen; parameters with 0 are not solved for.
         section calibrate: SolverConfig = SolverConfig::default();
         /// How maps are made.
         section map: MapConfig = MapConfig::default();
         /// Products besides the maps.
         section products: ProductsConfig = ProductsConfig::default();
-        /// Queues and threads. None of them changes a byte of the results.
+        /// Queues and threads. They do not change a byte of the results.
         section runtime: RuntimeConfig = RuntimeConfig::default();
     }
 }

@@ -62,13 +62,13 @@ keys! {
     /// of these u.
     #[derive(Copy)]
     pub struct GeometryLimits {
-        /// Greatest angle between a baseline and the plane of the orbit, degrees.
+        /// Angle between a baseline and the orbital plane.
         expert out_of_track_deg_max: f64 = 0.1;
-        /// Greatest deviation of the orbit's inclination from its nominal value, degrees.
+        /// Deviation of the inclination from its nominal value.
         expert inclination_deg_max: f64 = 0.1;
-        /// Greatest deviation of the altitude from its nominal value, m.
+        /// Deviation of the altitude from its nominal value.
         expert altitude_m_max: f64 = 150.0;
-        /// Greatest angle between a baseline and the horizontal at its mid-point, degrees, from unequal altitudes.
+        /// Angle between a baseline and the horizontal at its mid-point, from unequal altitudes.
         expert radial_deg_max: f64 = 0.1;
     }
 }

@@ -14,31 +14,31 @@ const NSIDE_MAX: usize = 1024;
 keys! {
     /// The `[sky.generated]` section: components of a generated sky and their amplitudes.
     pub struct GeneratedSky {
-        /// Whether the diffuse emission fluctuates on small scales.
+        /// Small-scale fluctuations of the diffuse emission.
         expert small_scales: bool = true;
         /// Factor on the amplitude of the small scales of Remazeilles et al. (2015).
         expert small_scale_amplitude: f64 = 1.0;
-        /// Resolution of the smooth model below the small scales, FWHM, degrees.
+        /// FWHM of the smooth model, below which the small scales are added.
         expert small_scale_fwhm_deg: f64 = 5.0;
-        /// Greatest degree l of the small scales; a map holds at most 3 nside - 1.
+        /// Maximum degree of the small scales; a map holds at most 3 nside - 1.
         expert small_scale_l_max: usize = 3071;
-        /// Standard deviation of the logarithm of the opacity of the gas over the sky.
+        /// Rms of the logarithm of the gas's opacity over the sky.
         expert cloud_log_rms: f64 = 0.33;
-        /// Standard deviation of the synchrotron index over the sky.
+        /// Rms of the synchrotron index over the sky.
         expert index_rms: f64 = 0.05;
-        /// Whether the sky has the radio loops, with the North Polar Spur.
+        /// Radio loops, with the North Polar Spur.
         expert loops: bool = true;
-        /// Whether the sky has opaque nebulae.
+        /// Opaque nebulae.
         expert nebulae: bool = true;
-        /// Whether the sky has point sources.
+        /// Point sources.
         expert point_sources: bool = true;
-        /// Flux density of the faintest source, Jy at 154 MHz; fainter ones are part of the smooth background.
+        /// Minimum flux density of a source, at 154 MHz; fainter ones are part of the smooth background.
         expert source_flux_jy_min: f64 = 4.36;
-        /// Flux density of the brightest source, Jy at 154 MHz.
+        /// Maximum flux density of a source, at 154 MHz.
         expert source_flux_jy_max: f64 = 75.0;
-        /// Spectral index of the sources' fluxes.
+        /// Spectral index of the sources' flux densities.
         expert source_spectral_index: f64 = -0.8;
-        /// Whether Galactic gas absorbs the sources.
+        /// Absorption of the sources by Galactic gas.
         expert sources_absorbed: bool = true;
     }
 }

@@ -6,21 +6,21 @@ keys! {
     /// The `[downlink.listen]` section: limits for senders. Memory for all of them stays below `connections_max` times
     /// (`memory_bytes_max` + 128 KiB), plus `backlog_bytes_max`.
     pub struct ListenConfig {
-        /// Maximum number of open connections. For a further one the least useful gives way; if all deliver, it is refused.
+        /// Maximum number of connections. A further one replaces the least useful, or is refused if all deliver.
         expert connections_max: usize = 16;
-        /// Maximum time from connecting to the first sound packet or frame, s; 0 for no limit.
+        /// Maximum time from connecting to the first valid packet or frame; 0 for no limit.
         expert first_packet_s_max: f64 = 30.0;
-        /// Maximum time between sound packets or frames, s; 0 for no limit. Bytes alone are no sign of life.
+        /// Maximum time between valid packets or frames, whatever other bytes arrive; 0 for no limit.
         expert idle_s_max: f64 = 600.0;
-        /// Maximum rate at which a connection is read, bytes/s; 0 for no limit. TCP slows the sender accordingly.
+        /// Maximum rate at which a connection is read; 0 for no limit. TCP slows the sender accordingly.
         expert bytes_per_s_max: f64 = 1e8;
-        /// Maximum number of bytes between sound packets or frames.
+        /// Maximum number of bytes between valid packets or frames.
         expert garbage_bytes_max: u64 = 4 << 20;
-        /// Maximum memory for a connection's incomplete data, bytes.
+        /// Maximum memory for a connection's incomplete data.
         expert memory_bytes_max: u64 = 32 << 20;
-        /// Maximum backlog of packets of all connections together, bytes.
+        /// Maximum backlog of packets of all connections together.
         expert backlog_bytes_max: u64 = 8 << 20;
-        /// Minimum time between two checkpoints that are written because senders wait for one, s.
+        /// Minimum time between checkpoints that are written because senders wait for one.
         expert held_every_s: f64 = 10.0;
     }
 }
