@@ -13,7 +13,7 @@ use crate::sky::harmonics::synthesis;
 pub const NOISES_TOGETHER: usize = 4;
 
 /// Residual of the errors of mean and dipole: they err by its square.
-const BESIDE: f64 = 0.03;
+const BESIDE: f64 = 0.1;
 
 /// First number of the draws of Gibbs sampling: those of plain samples are below.
 const GIBBS: u64 = 1 << 40;

@@ -79,15 +79,13 @@ pub fn solve_pixels_with_power(
         numbers,
     };
     let found = sought.found_in_blocks()?;
-    let factor = found.noise_factor();
-    let FoundPower { regularisation, solution, power, .. } = &found;
-    let factors = Factors::new(&blocks, regularisation);
+    let factors = Factors::new(&blocks, &found.regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = from_pixels(map)?;
         factors.solve(&mut x);
         to_pixels(&x)
     };
-    let mut map_k = to_pixels(solution)?;
+    let mut map_k = to_pixels(&found.solution)?;
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);
     }
@@ -96,70 +94,100 @@ pub fn solve_pixels_with_power(
         Ok(PointBeam { pixel, map_k: solved(&seen.map_k)? })
     };
     let beams = beams.iter().map(point).collect::<Result<Vec<_>, SolveError>>()?;
-    let of_moment = |(place, scale): (usize, f64)| {
-        let mut column = vec![0.0; degrees.len()];
-        column[place] = 1.0;
-        factors.solve(&mut column);
-        factor * scale.abs() * column[place].max(0.0).sqrt()
+    let posterior = PixelPosterior {
+        blocks: &blocks,
+        found: &found,
+        factors: &factors,
+        right: &right,
+        map_k: &map_k,
+        harmonics,
+        to_pixels: &to_pixels,
     };
-    let [mean_sigma_k, dipole_sigma_k @ ..] = moments(l_max).map(of_moment);
-    // The map's own, whatever the prior has beyond its degrees.
-    let whole = unknowns(&analysis(&map_k, l_max, &AnalysisOptions::default())?.alm);
-    let [_, dipole_k @ ..] = moments_k(&whole, l_max);
-    let drawn = |which: usize| -> Result<Sample, SolveError> {
-        // Away from the map.
-        let mut drawn = if samples.gibbs {
-            let mut turn = 0;
-            let mut sky = found.gibbs(which as u64, &mut |r| {
-                turn += 1;
-                let factors = Factors::new(&blocks, r);
-                let mut sky = right.clone();
-                factors.solve(&mut sky);
-                add(&mut sky, &draw(&factors, degrees.len(), factor, GIBBS + 16 * which + turn));
-                sky
-            });
-            subtract(&mut sky, 1.0, solution);
-            sky
-        } else {
-            draw(&factors, degrees.len(), factor, which)
-        };
-        let mut map = to_pixels(&drawn)?;
-        add(&mut map, &map_k);
-        add(&mut drawn, &whole);
-        Ok(sample(&drawn, l_max, map))
-    };
-    // A pixel holds the mean of a sky that has more than the degrees solved for.
-    let beyond_k2 = power.variance_beyond_k2(nside);
-    let columns = harmonics.transpose().to_owned();
-    let open = Mat::from_fn(columns.nrows(), pixels, |row, pixel| {
-        regularisation[degrees[row]].sqrt() * columns[(row, pixel)]
-    });
-    let open = factors.quadratic_forms(0, open);
-    let uncertainty = Uncertainty {
-        resolution_deg: open.into_iter().map(|open| resolution_deg(degrees.len() as f64, open)).collect(),
-        sigma_k: factors
-            .quadratic_forms(0, columns)
-            .into_iter()
-            .map(|variance| (factor * factor * variance + beyond_k2).sqrt())
-            .collect(),
-        mean_sigma_k,
-        dipole_k,
-        dipole_sigma_k,
-        power: power.clone(),
-        samples: (0..samples.count).map(drawn).collect::<Result<_, SolveError>>()?,
-    };
+    let uncertainty = posterior.uncertainty(nside, samples)?;
     let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;
     Ok((PixelSolution { map_k, noise_k, beams, diagnostics }, uncertainty))
 }
 
-/// A draw from the posterior, its mean taken off.
-fn draw(factors: &Factors<'_>, count: usize, factor: f64, which: usize) -> Vec<f64> {
-    let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
-    let mut draw: Vec<f64> =
-        (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
-    factors.solve_upper(&mut draw);
-    draw
+/// The equations over harmonics, solved.
+struct PixelPosterior<'a> {
+    blocks: &'a [Block<'a>],
+    found: &'a FoundPower,
+    factors: &'a Factors<'a>,
+    /// Right-hand side, less what the prior map predicts.
+    right: &'a [f64],
+    /// The map, with its prior.
+    map_k: &'a [f64],
+    /// At pixels, a column each.
+    harmonics: Mat<f64>,
+    to_pixels: ToPixels<'a>,
+}
+
+impl PixelPosterior<'_> {
+    fn uncertainty(self, nside: usize, samples: Samples) -> Result<Uncertainty, SolveError> {
+        let FoundPower { regularisation, power, .. } = self.found;
+        let (factor, l_max, count) = (power.noise_factor, regularisation.len() - 1, self.right.len());
+        let of_moment = |(place, scale): (usize, f64)| {
+            let mut column = vec![0.0; count];
+            column[place] = 1.0;
+            self.factors.solve(&mut column);
+            factor * scale.abs() * column[place].max(0.0).sqrt()
+        };
+        let [mean_sigma_k, dipole_sigma_k @ ..] = moments(l_max).map(of_moment);
+        // The map's own, whatever the prior has beyond its degrees.
+        let whole = unknowns(&analysis(self.map_k, l_max, &AnalysisOptions::default())?.alm);
+        let [_, dipole_k @ ..] = moments_k(&whole, l_max);
+        let drawn = |which: usize| -> Result<Sample, SolveError> {
+            let mut drawn = if samples.gibbs { self.gibbs(which) } else { self.draw(self.factors, which) };
+            let mut map = (self.to_pixels)(&drawn)?;
+            add(&mut map, self.map_k);
+            add(&mut drawn, &whole);
+            Ok(sample(&drawn, l_max, map))
+        };
+        let samples = (0..samples.count).map(drawn).collect::<Result<_, SolveError>>()?;
+        // A pixel holds the mean of a sky that has more than the degrees solved for.
+        let beyond_k2 = power.variance_beyond_k2(nside);
+        let roots: Vec<f64> = degrees(l_max).map(|l| regularisation[l].sqrt()).collect();
+        let columns = self.harmonics.transpose();
+        let open = Mat::from_fn(count, self.map_k.len(), |row, pixel| roots[row] * columns[(row, pixel)]);
+        let open = self.factors.quadratic_forms(0, open);
+        let variances = self.factors.quadratic_forms(0, columns.to_owned());
+        Ok(Uncertainty {
+            sigma_k: variances.iter().map(|v| (factor * factor * v + beyond_k2).sqrt()).collect(),
+            resolution_deg: open.into_iter().map(|open| resolution_deg(count as f64, open)).collect(),
+            mean_sigma_k,
+            dipole_k,
+            dipole_sigma_k,
+            power: power.clone(),
+            samples,
+        })
+    }
+
+    /// A draw from the posterior with the R of these factors, its mean taken off.
+    fn draw(&self, factors: &Factors<'_>, which: usize) -> Vec<f64> {
+        let count = self.right.len();
+        let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
+        let factor = self.found.noise_factor();
+        let mut draw: Vec<f64> =
+            (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
+        factors.solve_upper(&mut draw);
+        draw
+    }
+
+    /// A draw whose R is drawn, too, the map taken off.
+    fn gibbs(&self, which: usize) -> Vec<f64> {
+        let mut turn = 0;
+        let mut sky = self.found.gibbs(which as u64, &mut |r| {
+            turn += 1;
+            let factors = Factors::new(self.blocks, r);
+            let mut sky = self.right.to_vec();
+            factors.solve(&mut sky);
+            add(&mut sky, &self.draw(&factors, GIBBS + 16 * which + turn));
+            sky
+        });
+        subtract(&mut sky, 1.0, &self.found.solution);
+        sky
+    }
 }
 
 /// Values at pixels of coefficients.

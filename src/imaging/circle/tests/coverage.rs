@@ -7,8 +7,8 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::super::sigma::pixel_sigma_k;
 use super::*;
-use crate::imaging::power::{Block, Factors, PowerProblem};
-use crate::sky::harmonics::synthesis;
+use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem};
+use crate::sky::harmonics::{Transform, synthesis};
 use crate::units::{StreamKind, random_stream};
 
 /// Degrees that a sky may have beyond the map's.
@@ -69,8 +69,50 @@ impl Held {
     }
 }
 
+/// What draws are made of.
+struct Drawn<'a> {
+    found: &'a FoundPower,
+    factors: &'a Factors<'a>,
+    blocks: &'a [Block<'a>],
+    right: &'a [f64],
+    l_max: usize,
+    looked_at: [usize; 4],
+}
+
+impl Drawn<'_> {
+    /// Ranks the truth among draws with the power that was found, and by Gibbs sampling.
+    fn rank(&self, truth: &[f64], number: u64, normal: &mut dyn FnMut() -> f64, held: &mut [Held]) {
+        let l_max = self.l_max;
+        let mut draw = |factors: &Factors<'_>| {
+            let mut drawn: Vec<f64> = self.right.iter().map(|_| normal()).collect();
+            factors.solve_upper(&mut drawn);
+            let mut solution = self.right.to_vec();
+            factors.solve(&mut solution);
+            solution.iter_mut().zip(drawn).for_each(|(x, drawn)| *x += drawn);
+            solution
+        };
+        let plain: Vec<Vec<f64>> = (0..DRAWS).map(|_| draw(self.factors)).collect();
+        let gibbs: Vec<Vec<f64>> = (0..DRAWS as u64)
+            .map(|k| number * DRAWS as u64 + k)
+            .map(|which| self.found.gibbs(which, &mut |r| draw(&Factors::new(self.blocks, r))))
+            .collect();
+        // A pixel: harmonics at one place.
+        let nside = 2 * l_max / 5;
+        let mut point = vec![0.0; 12 * nside * nside];
+        point[4 * nside * nside] = 1.0;
+        let at = unknowns(&Transform::new(nside, l_max).unwrap().adjoint(&point).unwrap());
+        for (held, draws) in held.iter_mut().zip([&plain, &gibbs]) {
+            let values: Vec<f64> = draws.iter().map(|x| dot(&at, x)).collect();
+            held.rank(dot(&at, truth), &values);
+        }
+        for (held, l) in held[2..].iter_mut().zip(self.looked_at) {
+            let own: Vec<f64> = gibbs.iter().map(|x| own_power(x, l_max, l)).collect();
+            held.rank(own_power(truth, l_max, l), &own);
+        }
+    }
+}
+
 /// Shares of what is [`LOOKED_AT`], of so many skies with structure up to `sky_l_max`.
-#[allow(clippy::too_many_lines)] // One sky after the other.
 fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
     let nside = 2 * l_max / 5;
     let looked_at = FIFTHS.map(|fifths| (fifths * l_max / 5).max(3));
@@ -138,33 +180,9 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
         for (held, l) in held[3..7].iter_mut().zip(looked_at) {
             held.count((found.power.power_k2[l] / power(l)).ln() / found.power.sigma_ln[l]);
         }
-        let mut draw = |factors: &Factors<'_>| {
-            let mut drawn: Vec<f64> = right.iter().map(|_| normal()).collect();
-            factors.solve_upper(&mut drawn);
-            let mut solution = right.clone();
-            factors.solve(&mut solution);
-            solution.iter_mut().zip(drawn).for_each(|(x, drawn)| *x += drawn);
-            solution
-        };
-        let plain: Vec<Vec<f64>> = (0..DRAWS).map(|_| draw(&factors)).collect();
-        let gibbs: Vec<Vec<f64>> = (0..DRAWS as u64)
-            .map(|k| found.gibbs(number * DRAWS as u64 + k, &mut |r| draw(&Factors::new(&blocks, r))))
-            .collect();
-        // A pixel: harmonics at one place, without the mean that rules it.
-        let at: Vec<f64> = {
-            let mut point = vec![0.0; off_k.len()];
-            point[off_k.len() / 3] = 1.0;
-            let transform = crate::sky::harmonics::Transform::new(nside, l_max).unwrap();
-            unknowns(&transform.adjoint(&point).unwrap())
-        };
-        for (held, draws) in held[7..9].iter_mut().zip([&plain, &gibbs]) {
-            let values: Vec<f64> = draws.iter().map(|x| dot(&at, x)).collect();
-            held.rank(dot(&at, &truth), &values);
-        }
-        for (held, l) in held[9..].iter_mut().zip(looked_at) {
-            let own: Vec<f64> = gibbs.iter().map(|x| own_power(x, l_max, l)).collect();
-            held.rank(own_power(&truth, l_max, l), &own);
-        }
+        let drawn =
+            Drawn { found: &found, factors: &factors, blocks: &blocks, right: &right, l_max, looked_at };
+        drawn.rank(&truth, number, &mut normal, &mut held[7..]);
     }
     held.iter().map(Held::shares).collect()
 }
