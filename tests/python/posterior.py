@@ -1,8 +1,8 @@
 """Errors of a map with R from the data, by dense matrices over harmonics: rows of B summed over the pixels of a fine map.
 
 Reads a JSON object from standard input: `visibilities` (a table of `lunarray export visibilities`), `channel` (of summary.json), `folder` (of
-the channel's products), `l_max`, `moon_radius_m`, `fine` (nside of the
-pixels over which rows are summed) and `beyond` (whether pixels have more degrees than the map). Writes for each product the value of the program over that of the matrices, or their difference.
+the channel's products), `l_max`, `moon_radius_m`, `samples` (folder of
+`lunarray sample`), `fine` (nside of the pixels over which rows are summed) and `beyond` (whether pixels have more degrees than the map). Writes for each product the value of the program over that of the matrices, or their difference.
 Nothing but C_l and the factor of the noise is taken from the program.
 """
 
@@ -81,12 +81,14 @@ def read(name):
 
 
 found = read("map")
+sampled = healpy.read_map(f"{asked['samples']}/sigma.fits", dtype=float)
 monopole, dipole = healpy.fit_dipole(found)
 print(
     json.dumps(
         {
             "map": (np.std(found - y @ solved) / sigma.mean()).item(),
             "sigma": (read("sigma") / sigma).tolist(),
+            "sampled": ((sampled / sigma) ** 2).tolist(),
             "resolution": (read("resolution") / resolution).tolist(),
             "mask": (read("mask") == (sigma**2 < 0.5 * expected)).mean().item(),
             "measured": (sigma**2 < 0.5 * expected).mean().item(),
