@@ -8,7 +8,7 @@ use clap::Args;
 use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::receive::EventReader;
-use crate::downlink::{DownlinkError, Event, Kind};
+use crate::downlink::{DownlinkError, Event, PacketKind};
 use crate::files::{AtomicFile, IfUnfinished};
 
 /// Cut the packets of given counts out of downlink files.
@@ -37,7 +37,7 @@ pub(super) struct ExtractArgs {
 /// Packets of consecutive counts of a kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct PacketRange {
-    kind: Kind,
+    kind: PacketKind,
     from: u64,
     to: u64,
 }
@@ -118,7 +118,7 @@ fn range_of(line: &str) -> Option<PacketRange> {
     };
     let (from, to) =
         (words.next()?.parse().ok()?, words.next().map_or(Some(None), |word| word.parse().ok().map(Some))?);
-    let range = PacketRange { kind: Kind::of_apid(apid)?, from, to: to.unwrap_or(from) };
+    let range = PacketRange { kind: PacketKind::of_apid(apid)?, from, to: to.unwrap_or(from) };
     (range.from <= range.to && words.next().is_none()).then_some(range)
 }
 
@@ -130,7 +130,7 @@ mod tests {
     fn ranges_are_lines_of_apid_and_counts() {
         let found = parse("0x103 61 62\n\n258, 14 # positions\n").unwrap();
         let range = |kind, from, to| PacketRange { kind, from, to };
-        assert_eq!(found, [range(Kind::Visibilities, 61, 62), range(Kind::Ephemeris, 14, 14)]);
+        assert_eq!(found, [range(PacketKind::Visibilities, 61, 62), range(PacketKind::Ephemeris, 14, 14)]);
         for text in
             ["", "# nothing", "0x103", "0x103 5 4", "0x103 1 2 3", "0x999 1 2", "0x103 a b", "0x103 -1 2"]
         {

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::files::ProtectedInputs;
 use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
 use crate::products::draw_coverage;
@@ -43,7 +43,7 @@ pub(super) struct GapsArgs {
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     let _inputs = ProtectedInputs::of([&args.path]);
-    let survey = CoverageSurvey::of(&args.path)?;
+    let survey = CoverageSurvey::read(&args.path)?;
     print_notes(survey.notes());
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {
@@ -56,7 +56,8 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     }
     let packets: u64 = gaps.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
     let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>();
-    let lacks_data = gaps.gaps.iter().any(|gap| matches!(gap.kind, Kind::Visibilities | Kind::Ephemeris));
+    let lacks_data =
+        gaps.gaps.iter().any(|gap| matches!(gap.kind, PacketKind::Visibilities | PacketKind::Ephemeris));
     match args.fail_if {
         Some(FailIf::Any) if packets > 0 => {
             Err(format!("{packets} packets are missing; expected none").into())
@@ -134,8 +135,8 @@ fn table(gaps: &Gaps, most: usize) -> String {
 fn streams(gap: &GapReport) -> String {
     const SHOWN: usize = 3;
     let kind = match gap.kind {
-        Kind::Visibilities => String::new(),
-        Kind::Ephemeris if !gap.lost.is_empty() => format!("{}, needed by ", gap.kind),
+        PacketKind::Visibilities => String::new(),
+        PacketKind::Ephemeris if !gap.lost.is_empty() => format!("{}, needed by ", gap.kind),
         kind => return kind.to_string(),
     };
     let mut lost: Vec<_> = gap.lost.iter().collect();

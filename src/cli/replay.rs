@@ -259,7 +259,7 @@ impl ReplayArgs {
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
         let of_state = self.state.as_deref().map(|folder| {
             let source = source.clone();
-            match job.ranks().are_many() {
+            match job.ranks().is_distributed() {
                 true => source.of_state_for_ranks(folder),
                 false => source.of_state(folder),
             }
@@ -377,7 +377,7 @@ impl ReplayArgs {
             if !found[at].is_empty() {
                 return Err("--listen is given twice; expected at most one tcp:// and one udp://".into());
             }
-            found[at] = if self.allow_remote { url.addresses()? } else { url.own_addresses()? };
+            found[at] = if self.allow_remote { url.addresses()? } else { url.loopback_addresses()? };
         }
         Ok(found)
     }
@@ -392,28 +392,29 @@ impl Session<'_> {
         let until = ListenLimits { idle_s: args.idle_s, connections: args.connections };
         let listen = &config.downlink.listen;
         let mut source = SocketSource::bind(&connections, listen, until)?
-            .knowing(ground.instrument().cloned())
-            .accepting(Arc::new(move |instrument| {
+            .with_instrument(ground.instrument().cloned())
+            .with_instrument_check(Arc::new(move |instrument| {
                 let fits = settings.fits(instrument).is_ok();
                 if fits && !advised.swap(true, Ordering::Relaxed) {
                     advise(&own_config, instrument, limit);
                 }
                 fits
             }))
-            .telling(Box::new(print_listen_note));
+            .with_note_handler(Box::new(print_listen_note));
         if !datagrams.is_empty() {
             source = source.with_datagrams(&datagrams)?;
         }
         if let Some(path) = &args.stations {
-            source = source.of_stations(Stations::read(path)?);
+            source = source.with_stations(Stations::read(path)?);
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
-            (source, ground) = (source.answering(&answers), ground.answering(&answers).beginning_with_maps());
+            (source, ground) =
+                (source.with_held_answers(&answers), ground.with_answers(&answers).with_initial_snapshot());
             if !args.no_archive {
                 let bytes_max = args.archive_max.unwrap_or(ARCHIVE_BYTES_MAX);
                 let kept = ground.keep_packets(args.archive.as_deref(), bytes_max)?;
-                source = kept.iter().fold(source, |source, archive| source.keeping(archive));
+                source = kept.iter().fold(source, |source, archive| source.with_archive(archive));
             }
         }
         let addresses = source.addresses().to_vec();
@@ -438,8 +439,8 @@ impl Session<'_> {
         }
         let pace = match (args.step, args.speed) {
             (Some(StepLength(every_s)), _) => {
-                let tell = Box::new(|note: &str| say("step", &Value::Null, note));
-                Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+                let prompt = Box::new(|note: &str| say("step", &Value::Null, note));
+                Pace::Steps(Steps { every_s, requests: lines_of_input(), prompt })
             }
             (None, Speed(Some(times))) => Pace::Speed(times),
             (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),

@@ -16,7 +16,7 @@ use std::path::Path;
 
 use crate::files::read_text;
 use crate::frames::PlacedVisibilities;
-use crate::imaging::regulariser::{POWER_FILE_BYTES_MAX, power_of};
+use crate::imaging::regulariser::{POWER_FILE_BYTES_MAX, parse_power};
 use crate::imaging::solver::SolveError;
 use crate::numerics::bessel::{BesselOrders, LANES};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -49,7 +49,7 @@ pub(in crate::imaging) struct BeyondNoise {
 pub(crate) fn read_power(path: &Path) -> Result<(usize, Vec<f64>), SolveError> {
     let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
     let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
-    let (first, power_k2) = power_of(&text).map_err(failed)?;
+    let (first, power_k2) = parse_power(&text).map_err(failed)?;
     if power_k2.len() < 2 {
         return Err(failed(
             "one degree: expected two or more, the last of which tell how it goes on".to_owned(),

@@ -13,9 +13,9 @@ use prometheus_client::registry::{Registry, Unit};
 
 use super::console::Console;
 use super::status::{Phase, Status};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::downlink::transport::socket::ConnectionEnd;
-use crate::files::disk_room;
+use crate::files::disk_space;
 use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
@@ -232,8 +232,9 @@ impl Scrape {
     fn reception(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let Some(reception) = &self.status.reception else { return Ok(()) };
         let packets = || Some(Unit::Other("packets".into()));
-        let kinds =
-            |of: &dyn Fn(Kind) -> u64| Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64));
+        let kinds = |of: &dyn Fn(PacketKind) -> u64| {
+            PacketKind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64))
+        };
         let sound = kinds(&|kind| reception.kind(kind).packets);
         gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
         let missing = kinds(&|kind| reception.kind(kind).missing);
@@ -265,7 +266,7 @@ impl Scrape {
     /// Room on disks, and memory.
     fn machine(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let disks: Vec<_> =
-            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_room(path)?))).collect();
+            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_space(path)?))).collect();
         let label = |name: &str| [("folder", name.to_owned())];
         let free = disks.iter().map(|(name, [free, _])| (label(name), *free as f64));
         gauges(out, MetricInfo("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;

@@ -10,7 +10,7 @@ use std::time::Duration;
 use common::downlink::packets_of;
 use common::process::{end, listening, signal, start, wait_until};
 use common::workplace::{Workplace, fail, json, succeed};
-use lunarray::downlink::{DownlinkReader, Kind, PacketHeader};
+use lunarray::downlink::{DownlinkReader, PacketHeader, PacketKind};
 use lunarray::frames::GroundFrame;
 use lunarray::sky::fits::{ReadOptions, read_whole_map};
 use serde_json::Value;
@@ -320,7 +320,7 @@ fn parts_of_ranks_that_solved_alike_are_one_checkpoint() {
     }
     // They are of one job as far as their heads tell; that both have all sums is what is wrong with them.
     let said = fail(&replay);
-    assert!(said.contains("sums of block") && !said.contains("another state"), "{said}");
+    assert!(said.contains("sums of block") && !said.contains("a different state"), "{said}");
 }
 
 #[test]
@@ -445,7 +445,7 @@ fn interference_in_a_channel_is_told() {
 /// The channel of a packet of visibilities: the first field of its payload.
 fn channel_of(packet: &[u8]) -> Option<u16> {
     let header = PacketHeader::parse(packet)?;
-    (header.kind == Kind::Visibilities).then(|| u16::from_le_bytes([packet[22], packet[23]]))
+    (header.kind == PacketKind::Visibilities).then(|| u16::from_le_bytes([packet[22], packet[23]]))
 }
 
 #[test]

@@ -11,8 +11,8 @@ use lunarray::calibration::{CalibrationConfig, Calibrator, Completeness, Missing
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::wire::cadu::INTERLEAVES;
 use lunarray::downlink::{
-    CucTime, Decoder, DownlinkConfig, Event, FORMAT_VERSION, Format, HEADER_BYTES, Intake, Kind,
-    PacketHeader, PacketSegment, ReceptionCounters, Transmission,
+    CucTime, Decoder, DownlinkConfig, DownlinkReceiver, Event, FORMAT_VERSION, Format, HEADER_BYTES,
+    PacketHeader, PacketKind, PacketSegment, ReceptionCounters, Transmission,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
@@ -133,10 +133,10 @@ fn numbers(block: &VisibilityBlock) -> Vec<u64> {
 
 /// The numbers of the visibilities in each packet, by its count.
 fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
-    let (mut intake, mut decoder, mut found) = (Intake::new(), Decoder::new(), BTreeMap::new());
-    intake.push(sound);
-    intake.finish();
-    while let Some(event) = intake.next_event() {
+    let (mut receiver, mut decoder, mut found) = (DownlinkReceiver::new(), Decoder::new(), BTreeMap::new());
+    receiver.push(sound);
+    receiver.finish();
+    while let Some(event) = receiver.next_event() {
         let header = if let Event::Packet(packet) = &event { Some(packet.header) } else { None };
         if let Some(GroundFrame::Visibilities(block)) = decoder.accept(&event) {
             found.insert(header.unwrap().count, numbers(&block));
@@ -170,7 +170,7 @@ fn receive(arrived: &[u8]) -> Received {
     for frame in frames.into_vec() {
         calibrator.step(frame, &mut placed).unwrap();
     }
-    let completeness = calibrator.close(MissingPackets::default());
+    let completeness = calibrator.post_losses(MissingPackets::default());
     // All baselines and weights: what is placed is summed.
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let mut accumulator = Accumulator::new(map, ledger.clone());
@@ -182,12 +182,12 @@ fn receive(arrived: &[u8]) -> Received {
         accumulator.step(frame, &mut maps).unwrap();
     }
     accumulator.finish(&mut maps).unwrap();
-    let ledger = ledger.close().unwrap();
+    let ledger = ledger.balanced_report().unwrap();
     let reception = account.lock().unwrap_or_else(PoisonError::into_inner).clone();
     Received { ledger, reception, completeness, summed }
 }
 
-fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
+fn counts_of(ranges: &[PacketRange], kind: PacketKind) -> BTreeSet<u64> {
     ranges.iter().filter(|range| range.apid == kind.apid()).flat_map(PacketRange::counts).collect()
 }
 
@@ -195,7 +195,7 @@ fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
 fn hold_to_the_truth(sent: &Sent) {
     let Sent { sound, arrived, truth } = sent;
     let by_packet = visibilities_by_packet(sound);
-    let packets_lost = counts_of(&truth.packets_lost, Kind::Visibilities);
+    let packets_lost = counts_of(&truth.packets_lost, PacketKind::Visibilities);
     let all_sent: BTreeSet<u64> = by_packet.values().flatten().copied().collect();
     let of_lost = |count: &u64| by_packet[count].iter().copied();
     let lost_on_link: BTreeSet<u64> = packets_lost.iter().flat_map(of_lost).collect();
@@ -227,7 +227,7 @@ fn hold_to_the_truth(sent: &Sent) {
     }
     // Losses by the ground's count, as far as the last housekeeping received reports them.
     // Two in each pass, and the last pass may have both.
-    let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
+    let reports_lost = counts_of(&truth.packets_lost, PacketKind::Housekeeping);
     let last_reports = [2 * WINDOWS as u64 - 2, 2 * WINDOWS as u64 - 1];
     let last_report_came = !last_reports.iter().all(|report| reports_lost.contains(report));
     assert_eq!(received.completeness.complete, last_report_came && reception.instrument.packets > 0);
@@ -396,7 +396,7 @@ fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
     }
     ground.finish(&mut maps).unwrap();
     let completeness = outcome.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    (outcome.ledger.close().unwrap(), completeness)
+    (outcome.ledger.balanced_report().unwrap(), completeness)
 }
 
 /// Passes and frames that do not arrive, of each of which a ground may notice nothing.
@@ -476,7 +476,7 @@ fn a_mission_of_which_every_pass_is_cut_short_still_tells_what_is_missing() {
 
 /// A sound packet of visibilities with no payload.
 fn forged(count: u64, s: u64) -> Vec<u8> {
-    let (kind, segment, version) = (Kind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
+    let (kind, segment, version) = (PacketKind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
     let header =
         PacketHeader { kind, segment, count, time: CucTime(s << 24), version, bytes: HEADER_BYTES + 4 };
     let mut packet = header.to_bytes().to_vec();
@@ -489,7 +489,7 @@ fn forged(count: u64, s: u64) -> Vec<u8> {
 #[test]
 fn forged_packets_of_one_time_are_refused_beyond_a_number() {
     const ROOM: u64 = 100;
-    let mut collector = Collector::new(1 << 20).with_packets(ROOM);
+    let mut collector = Collector::new(1 << 20).with_packets_max(ROOM);
     let all: Vec<u8> = (0..3 * ROOM).flat_map(|k| forged(k, 5)).collect();
     for [beyond, duplicates] in [[2 * ROOM, 0], [4 * ROOM, ROOM]] {
         collector.push(&all);
@@ -503,7 +503,7 @@ fn forged_packets_of_one_time_are_refused_beyond_a_number() {
 #[test]
 fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
     const ROOM: usize = 100;
-    let mut collector = Collector::new(1 << 20).with_intervals(ROOM);
+    let mut collector = Collector::new(1 << 20).with_intervals_max(ROOM);
     let mut push = |packets: Vec<u8>| {
         collector.push(&packets);
         while collector.next_delivery(&|_| true).unwrap().is_some() {}

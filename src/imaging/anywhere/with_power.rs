@@ -1,7 +1,7 @@
 //! R from the data for maps from positions as they are: the power by the true map, the matrix of the nearest circle and true residuals.
 
 use super::refinement::chi_squares;
-use super::solve::{RefineSteps, Refined, RefinedProblem, RightHandSides};
+use super::solve::{RefineSteps, RefinedColumns, RefinedProblem, RightHandSides};
 use crate::imaging::NormalSums;
 use crate::imaging::SolveError;
 use crate::imaging::circle::degrees;
@@ -21,7 +21,7 @@ impl RefinedProblem<'_> {
         blocks: &[Block<'_>],
         right: RightHandSides<'_>,
         mut steps: RefineSteps<'_>,
-    ) -> Result<(Refined, FoundPower), SolveError> {
+    ) -> Result<(RefinedColumns, FoundPower), SolveError> {
         let circle = &self.sums.circle;
         let (degrees, counts) = (degrees(self.l_max()).collect::<Vec<usize>>(), circle.counts());
         let on_circle = PowerProblem {
@@ -33,32 +33,32 @@ impl RefinedProblem<'_> {
             power: counts.power,
             numbers: 2.0 * counts.visibilities as f64,
         };
-        let mut found = on_circle.found(None, self.inner, self.watch)?;
+        let mut found = on_circle.solve(None, self.inner, self.watch)?;
         let passes_max = self.rule.passes_max;
         let mut residuals = Vec::new();
         for round in 1.. {
             self.regularisation = Diagonal::ByDegree(found.regularisation.clone());
             self.rule.passes_max = passes_max.saturating_sub(residuals.len()).max(1);
-            let these = RefineSteps { start: steps.start.take(), passed: &mut *steps.passed };
+            let these = RefineSteps { start: steps.start.take(), save: &mut *steps.save };
             let mut refined = self.solve(right.of_rows.clone(), right.of_circle.to_vec(), these)?;
             residuals.append(&mut refined.residuals);
             let mut whole = refined.columns[0].x.clone();
             if let Some(prior) = right.prior {
                 add(&mut whole, prior);
             }
-            let factor = chi_squares(self.sums, &self.left(&whole)).all.max(1.0).sqrt();
+            let factor = chi_squares(self.sums, &self.data_residuals(&whole)).all.max(1.0).sqrt();
             let factors = Factors::new(blocks, &found.regularisation);
-            let ratio = on_circle.drawn_ratio(&self.regularisation, &factors, &found.ratio, self.watch);
+            let ratio = on_circle.sampled_ratio(&self.regularisation, &factors, &found.ratio, self.watch);
             let x = &refined.columns[0].x;
             let next = on_circle.next(&found.fit, x, (factor, &ratio))?;
             let change = next.fit.change(&found.fit).max((factor / found.noise_factor()).ln().abs());
-            let is_last = round >= ROUNDS_MAX || residuals.len() >= passes_max || !self.watch.goes_on();
+            let is_last = round >= ROUNDS_MAX || residuals.len() >= passes_max || !self.watch.may_continue();
             if change <= SETTLED || is_last {
                 // Of the R that this map has.
                 let found = on_circle.estimated(&found.fit, x, (factor, &ratio))?;
                 let iterations = residuals.len();
                 let convergence = refined.convergence.map(|last| Convergence { iterations, ..last });
-                return Ok((Refined { residuals, convergence, ..refined }, found));
+                return Ok((RefinedColumns { residuals, convergence, ..refined }, found));
             }
             steps.start = Some(refined.columns.map(|column| column.x));
             found = next;

@@ -3,7 +3,9 @@
 use super::coefficients;
 use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
 use crate::imaging::NormalSums;
-use crate::imaging::power::{Block, Covariance, Drawn, Factors, FoundPower, SAMPLE_SETTLED};
+use crate::imaging::power::{
+    Block, Factors, FoundPower, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE,
+};
 use crate::imaging::power::{Sample, Samples, Uncertainty};
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, add, dot};
@@ -110,13 +112,13 @@ impl Posterior<'_> {
         products: Products<'_>,
     ) -> Result<Vec<Sample>, SolveError> {
         let regularisation = &Diagonal::ByDegree(self.found.regularisation.clone());
-        let covariance = Covariance { products, unknowns: self.right.len(), regularisation, factors };
+        let covariance = PosteriorPrecision { products, unknowns: self.right.len(), regularisation, factors };
         let mut samples = Vec::new();
         let numbers: Vec<u64> = (0..count as u64).collect();
         for which in numbers.chunks(NOISES_TOGETHER) {
             let name = format!("samples from {} of {count}", which[0] + 1);
-            let task = self.watch.start(&name, SAMPLE_SETTLED);
-            for Drawn { whole: mut drawn, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
+            let task = self.watch.start(&name, SAMPLE_TOLERANCE);
+            for PosteriorSample { exact: mut drawn, .. } in covariance.draw(which, SAMPLE_TOLERANCE, &task) {
                 drawn.iter_mut().for_each(|value| *value *= self.found.noise_factor());
                 samples.push(self.sample(drawn)?);
             }
@@ -128,7 +130,7 @@ impl Posterior<'_> {
     fn gibbs_samples(&self, count: usize) -> Result<Vec<Sample>, SolveError> {
         let mut samples = Vec::new();
         for number in 0..count as u64 {
-            if !self.watch.goes_on() {
+            if !self.watch.may_continue() {
                 return Err(SolveError::Interrupted);
             }
             let mut turn = 0;
@@ -158,10 +160,10 @@ impl Posterior<'_> {
         let [mut sky] = columns;
         let unknowns = self.right.len();
         let covariance =
-            Covariance { products: &products, unknowns, regularisation: &regularisation, factors };
-        let task = self.watch.start(name, SAMPLE_SETTLED);
-        for Drawn { whole, .. } in covariance.draw(&[which], SAMPLE_SETTLED, &task) {
-            sky.iter_mut().zip(whole).for_each(|(sky, drawn)| *sky += self.found.noise_factor() * drawn);
+            PosteriorPrecision { products: &products, unknowns, regularisation: &regularisation, factors };
+        let task = self.watch.start(name, SAMPLE_TOLERANCE);
+        for PosteriorSample { exact, .. } in covariance.draw(&[which], SAMPLE_TOLERANCE, &task) {
+            sky.iter_mut().zip(exact).for_each(|(sky, drawn)| *sky += self.found.noise_factor() * drawn);
         }
         sky
     }

@@ -1,5 +1,5 @@
-//! How often the errors of maps hold: skies drawn from a prior and seen through the array.
-#![allow(clippy::print_stderr)] // It says what it measured.
+//! Tests the coverage of map errors with simulated skies from a prior.
+#![allow(clippy::print_stderr)] // Tests print what they measured.
 
 use std::borrow::Cow;
 
@@ -126,7 +126,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
     };
     let (wide, sums) = (of(l_max + BEYOND).order_blocks(), of(l_max));
     let (wide_blocks, order_blocks) = (wide.blocks(), sums.order_blocks());
-    // A map's matrix is a part of the sky's.
+    // The matrix of the map is a submatrix of that of the sky.
     let cut = |(block, whole): (Block<'_>, &Block<'_>)| {
         let order = block.degrees.len();
         let matrix = Cow::Owned(whole.matrix.submatrix(0, 0, order, order).to_owned());
@@ -146,9 +146,9 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
     for number in 0..skies as u64 {
         let structure = |l: usize| if l <= sky_l_max { power(l).sqrt() } else { 0.0 };
         let mut sky: Vec<f64> = sky_degrees.iter().map(|l| structure(*l) * normal()).collect();
-        // Far more than structure, and than a prior that is not free would have.
+        // Far more than the power of structure.
         sky[0] = 1e3 * power(2).sqrt();
-        // A (A + r)^-1 A is A where anything is measured.
+        // A (A + r)^-1 A equals A for measured modes.
         let mut data: Vec<f64> = sky.iter().map(|_| normal()).collect();
         noise_factors.solve_upper(&mut data);
         data.iter_mut().zip(&sky).for_each(|(noise, sky)| *noise += sky);
@@ -162,7 +162,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             power: 0.0,
             numbers: 1.0,
         };
-        let found = sought.found_in_blocks().unwrap();
+        let found = problem.solve_blocks().unwrap();
         let factors = Factors::new(&blocks, &found.regularisation);
         let sigma_k = pixel_sigma_k(&blocks, &factors, &found.ratio, nside);
         let truth = lower(&sky, l_max);
@@ -199,14 +199,14 @@ fn errors_hold_of_skies_that_end_where_the_map_does() {
     for (what, shares) in LOOKED_AT.iter().zip(&found) {
         eprintln!("{skies} skies to l = {l_max}, {what}: {shares:.3?}");
         for (share, expected) in shares.iter().zip([0.683, 0.95]) {
-            // Three standard errors, pixels of a sky counted as one; R is taken as known, which leaves out its own error: 0.03.
+            // Three standard errors, with the pixels of a sky counted as one, and 0.03 for the neglected error of R.
             let error = (expected * (1.0 - expected) / skies as f64).sqrt();
             assert!((share - expected).abs() < 3.0 * error + 0.03, "{what}: {share} {expected}");
         }
     }
 }
 
-/// What a map leaves out of the sky is in the data all the same: here little of it, as the last degrees have no more signal than noise.
+/// Degrees beyond the map contribute to the data, but little, as they have no more signal than noise.
 #[test]
 fn errors_hold_where_the_sky_has_more_degrees_than_the_map() {
     const SKIES: usize = 200;
