@@ -162,7 +162,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             power: 0.0,
             numbers: 1.0,
         };
-        let found = problem.solve_blocks().unwrap();
+        let found = sought.solve_blocks().unwrap();
         let factors = Factors::new(&blocks, &found.regularisation);
         let sigma_k = pixel_sigma_k(&blocks, &factors, &found.ratio, nside);
         let truth = lower(&sky, l_max);
