@@ -34,7 +34,7 @@ pub(super) struct ExtractArgs {
     json: bool,
 }
 
-/// Packets of consecutive counts of a kind.
+/// Packets of one kind with consecutive counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct PacketRange {
     kind: PacketKind,
@@ -91,17 +91,18 @@ pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// Ranges, one a line; empty lines and what follows `#` are left out.
+/// Parses ranges, one per line; empty lines and comments (`#`) are skipped.
 fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
-    let lines =
-        text.lines().enumerate().map(|(at, line)| (at, line.split('#').next().unwrap_or_default().trim()));
+    let lines = text
+        .lines()
+        .zip(1..)
+        .map(|(line, number)| (number, line.split('#').next().unwrap_or_default().trim()));
     let ranges: Vec<PacketRange> = lines
         .filter(|(_, line)| !line.is_empty())
-        .map(|(at, line)| {
-            range_of(line).ok_or_else(|| {
+        .map(|(number, line)| {
+            parse_range(line).ok_or_else(|| {
                 format!(
-                    "line {}: found `{line}`; expected APID, first and last count, such as 0x103 61 62",
-                    at + 1
+                    "line {number}: found `{line}`; expected APID, first and last count, such as 0x103 61 62"
                 )
             })
         })
@@ -109,7 +110,7 @@ fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
     if ranges.is_empty() { Err("no range; expected lines such as 0x103 61 62".into()) } else { Ok(ranges) }
 }
 
-fn range_of(line: &str) -> Option<PacketRange> {
+fn parse_range(line: &str) -> Option<PacketRange> {
     let mut words = line.split(|c: char| c.is_whitespace() || c == ',').filter(|word| !word.is_empty());
     let apid = words.next()?;
     let apid = match apid.strip_prefix("0x") {
