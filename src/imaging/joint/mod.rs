@@ -4,6 +4,7 @@
 //! channels are ([`Likeness`]) with the map, and solves for all of them together: maps at every channel and at frequencies between, the
 //! spectral index of every pixel, each with errors. No visibility is read again.
 
+mod amplitude;
 mod prior;
 mod solve;
 mod spectrum;
@@ -11,6 +12,7 @@ mod sums;
 #[cfg(test)]
 mod tests;
 
+pub use amplitude::RelativeAmplitude;
 pub use prior::Likeness;
 pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

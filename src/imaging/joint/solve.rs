@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::amplitude::{RelativeAmplitude, relative_amplitudes};
 use super::prior::{FREE, Likeness, Prior, View};
 use super::spectrum::{Spectra, SpectralMaps};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
@@ -74,6 +75,8 @@ pub struct Agreement {
     /// By how much chi-square rises from the first to the second, a coefficient that the channel's data decide: of the order of 1 where the
     /// joint map leaves no more than the noise of the channel's own map.
     pub strain: f64,
+    /// Amplitude of the channel's structure over that of the law through the others; `None` for fewer than five channels.
+    pub amplitude: Option<RelativeAmplitude>,
 }
 
 /// All of it.
@@ -96,6 +99,9 @@ struct Alone {
     /// `A x + R x` of its blocks over s^2: the data that the evidence is of.
     right: Vec<f64>,
 }
+
+/// A degree is measured where the data decide this share of its coefficients.
+const MEASURED: f64 = 0.95;
 
 /// Solves for the maps of all channels together.
 ///
@@ -136,7 +142,7 @@ pub fn solve_jointly(
     }
     let noise_factors: Vec<f64> = alone.iter().map(|alone| alone.power.noise_factor).collect();
     let scale = alone.iter().map(Alone::scale).collect();
-    let plain = Prior::new(all_hz, scale, Likeness { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
+    let plain = Prior::new(all_hz.clone(), scale, Likeness { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let scaled = scaled_blocks(&plain, &blocks, &noise_factors);
     let watch = watch.named("all channels").wanted(true);
     let rights: Vec<Vec<f64>> = alone.iter().map(|alone| alone.right.clone()).collect();
@@ -155,11 +161,13 @@ pub fn solve_jointly(
         let like = own.or_else(|| channels.iter().find(|channel| channel.sums.setup().l_max == view.l_max));
         like.map_or(1, |channel| channel.nside)
     };
+    let amplitudes = relative_amplitudes(&amplitudes(&all_hz, &alone));
     let mut maps = Vec::new();
     for (index, view) in views.iter().enumerate() {
         let mut map = posterior.map(view, nside_of(view))?;
         if index < prior.channels() {
-            map.agreement = Some(posterior.agreement(index, &alone[index], view));
+            let agreement = posterior.agreement(index, &alone[index], view);
+            map.agreement = Some(Agreement { amplitude: amplitudes[index], ..agreement });
         }
         maps.push(map);
     }
@@ -168,6 +176,23 @@ pub fn solve_jointly(
     maps.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     maps.dedup_by(|a, b| a.frequency_hz == b.frequency_hz);
     Ok(JointSolution { likeness, maps, spectra, convergence: posterior.convergence })
+}
+
+/// Frequency and amplitude of each channel, over degrees that all channels measure: the root mean square of their maps, whose sky is one
+/// and the same.
+fn amplitudes(frequencies_hz: &[f64], alone: &[Alone]) -> Vec<(f64, f64)> {
+    let l_max = alone.iter().map(|alone| alone.power.power_k2.len() - 1).min().unwrap_or(0);
+    let is_measured = |l: usize| {
+        let enough = |alone: &Alone| alone.power.decided[l] > MEASURED * (2 * l + 1) as f64;
+        l >= FREE && alone.iter().all(enough)
+    };
+    let measured: Vec<bool> = (0..=l_max).map(is_measured).collect();
+    let power = |alone: &Alone| -> f64 {
+        let own_l_max = alone.power.power_k2.len() - 1;
+        let squares = degrees(own_l_max).zip(&alone.solution);
+        squares.filter(|(l, _)| measured.get(*l) == Some(&true)).map(|(_, x)| x * x).sum()
+    };
+    frequencies_hz.iter().zip(alone).map(|(hz, alone)| (*hz, power(alone).sqrt())).collect()
 }
 
 impl Alone {
@@ -387,6 +412,7 @@ impl<'a> Posterior<'a> {
             chi_square_alone: before / numbers,
             chi_square: after / numbers,
             strain: (after - before) / (factor * decided.max(1.0)),
+            amplitude: None,
         }
     }
 
