@@ -1,6 +1,6 @@
 //! The open data chain of a lunar-orbit radio interferometer, from a sky to a map of it.
 //!
-//! A mission is simulated, sent down as bytes, received and mapped in one chain of calls:
+//! One chain of calls simulates a mission, sends its data down as bytes, receives and maps them:
 //!
 //! ```
 //! use lunarray::prelude::*;
@@ -32,7 +32,7 @@
 //! | simulate and map a mission | [`pipeline::Mission`] | `examples/quick_map.rs` |
 //! | map a sky of one's own | [`pipeline::Mission::set`], [`sky::fits`] | `examples/own_sky.rs` |
 //! | simulate the spacecraft, map a downlink | [`pipeline::Mission::simulate`], [`pipeline::Mission::replay`] | `examples/damaged_downlink.rs` |
-//! | watch a run, or build it from its parts | [`pipeline::Plan`], [`pipeline::run`], [`pipeline::simulate`], [`pipeline::replay`] | there |
+//! | watch a run, or build it from its parts | [`pipeline::Plan`], [`pipeline::run`], [`pipeline::simulate`], [`pipeline::replay`] | in their documentation |
 //! | read a downlink | [`downlink::Contents`], [`downlink::DownlinkReader`] | `examples/read_downlink.rs` |
 //! | calibrate in a way of one's own | [`calibration::Calibration`] | `examples/calibration_hook.rs` |
 //! | map visibilities from elsewhere | [`imaging::PixelEngine`], [`imaging::solve_pixels`] | `examples/map_from_visibilities.rs` |
@@ -44,16 +44,17 @@
 //! [`prelude`] has what most programs need.
 //!
 //! # How data pass
-//! A [`sky`] is seen by an [`mod@array`] of satellites through the beam matrix ([`response`]), sampled and correlated on board, sent down
-//! ([`downlink`]), given positions and calibrated ([`calibration`]), summed into normal equations and solved ([`imaging`]), and written out
-//! ([`products`]). The [`runtime`] moves data between stages and knows no physics; what it moves is in [`frames`]. The [`pipeline`] turns a
-//! configuration into a running graph. Spacecraft and ground share no state: the only thing that crosses is bytes.
+//! An [`mod@array`] of satellites sees a [`sky`] through the beam matrix ([`response`]), samples and correlates it on board, and
+//! sends visibilities down ([`downlink`]). The ground calibrates them ([`calibration`]), sums them into normal equations, solves
+//! these ([`imaging`]), and writes maps ([`products`]). The [`runtime`] moves data between stages and knows no physics; what it
+//! moves is in [`frames`]. The [`pipeline`] turns a configuration into a running graph. Spacecraft and ground share no state: only
+//! bytes cross.
 //!
 //! # Conventions
 //! Units are SI throughout and stand in names; temperatures are in K, visibilities in K sr. Positions are in Moon-centred ecliptic axes,
 //! times in seconds since the mission's epoch. Maps are HEALPix in RING order. "The paper" is Deng et al., arXiv:2511.18494.
 //!
-//! What is not documented here is public for the program, its tests and the Python package alone, and changes without notice.
+//! Public items that are not documented here are for the program, its tests and the Python package, and change without notice.
 
 // They panic when nobody reads any more; `cli/output.rs` has what does not.
 #![warn(clippy::print_stdout, clippy::print_stderr)]

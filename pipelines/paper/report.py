@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Writes docs/paper.md from the results of the studies of this folder.
+"""Prints the tables of docs/paper.md from the results of the studies of this folder; the words of that page are written by hand.
 
 Run from the top of the checkout after the runs and studies that the page names; needs Python, and healpy for the uniformity of noise:
 
-    python3 pipelines/paper/report.py "2 cores of an Intel Xeon" > docs/paper.md
+    python3 pipelines/paper/report.py
 
 Pictures that the page shows are copied beside it, into docs/.
 """
@@ -11,7 +11,6 @@ Pictures that the page shows are copied beside it, into docs/.
 import json
 import math
 import shutil
-import sys
 from pathlib import Path
 
 OUT = Path("out")
@@ -19,12 +18,6 @@ BOLTZMANN = 1.380649e-23
 LIGHT = 299792458.0
 # Larger pictures stay where they are.
 PICTURE_BYTES_MAX = 700_000
-
-
-def notes():
-    """By sheet: what the paper says, in our words, and where we differ."""
-    parts = (Path(__file__).parent / "notes.md").read_text().split("## ")[1:]
-    return {title.strip(): text.strip() for title, _, text in (part.partition("\n") for part in parts)}
 
 
 def load(name):
@@ -49,7 +42,7 @@ def picture(path, name, what):
     if not (OUT / path).exists():
         return ""
     if (OUT / path).stat().st_size > PICTURE_BYTES_MAX:
-        return f"\n(Its picture is `out/{path}`.)\n"
+        return ""
     shutil.copyfile(OUT / path, Path("docs") / name)
     return f"\n![{what}]({name})\n"
 
@@ -70,12 +63,7 @@ def figure(name, text, command=None, what=""):
 
 
 def full_sky():
-    return (
-        "The generated sky with small scales and sources, Galactic coordinates, logarithmic.\n"
-        + picture("sky-10mhz.png", "paper-sky.png", "the sky at 10 MHz")
-        if (OUT / "sky-10mhz.png").exists()
-        else missing(SKY)
-    )
+    return picture("sky-10mhz.png", "paper-sky.png", "the sky at 10 MHz") or missing(SKY)
 
 
 SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits --sources out/sources.csv"
@@ -101,20 +89,18 @@ def counts():
     rows = [
         [f"{s:g}", f"{sum(flux > s for flux in fluxes):,}", f"{expected(s):,.0f}"] for s in (4.36, 6, 10, 20, 40)
     ]
-    return table(["S at 154 MHz, Jy", "N(>S) of the sky", "of the counts of Franzen et al. (2019)"], rows) + picture(
-        "patch.png", "paper-patch.png", "a patch of 20 x 20 degrees with scales above 5 degrees subtracted"
+    return table(["S at 154 MHz, Jy", "N(>S) of the sky", "Franzen et al. (2019)"], rows) + picture(
+        "patch.png", "paper-patch.png", "20 x 20 degrees without scales above 5 degrees"
     )
 
 
 def spacing(n):
-    rows = []
-    for r in (2, 3, 4, 6, 10):
-        row = [str(r)]
-        for curve in n["curves"]:
-            row.append(show(curve["q0"][curve["ratio"].index(r)], "{:.4f}"))
-        rows.append(row)
-    head = ["R", *[f"R_2 = {curve['first_ratio']:g}" for curve in n["curves"]]]
-    return table(head, rows) + f"\nq0 = {n['q0']:.5f} for R = 3, R_2 = 6; independent code has 2.02479.\n"
+    curves = [curve for curve in n["curves"] if curve["first_ratio"] in (2, 6, 10)]
+    rows = [
+        [str(r), *[show(curve["q0"][curve["ratio"].index(r)], "{:.4f}") for curve in curves]] for r in (2, 3, 4, 6, 10)
+    ]
+    head = ["R", *[f"R_2 = {curve['first_ratio']:g}" for curve in curves]]
+    return table(head, rows) + f"\nq0 = {n['q0']:.5f} for R = 3, R_2 = 6.\n"
 
 
 def pair_time(n):
@@ -128,7 +114,7 @@ def pair_time(n):
         [f"b < {channel['limit_m']:.0f} m = 2 b_p", f"{channel['visibilities']:.3e}", "2.60e7 (independent)"],
         ["pairs within it", str(channel["pairs"]), "9 (independent)"],
         ["pair hours within it", f"{channel['pair_s'] / 3600:,.0f}", "-"],
-        ["time in which lambda / 8 cuts integrations", f"{100 * channel['cut_by_motion']:.1f} %", "99.3 % (independent); > 99 %"],
+        ["time in which lambda / 8 cuts integrations", f"{100 * channel['cut_by_motion']:.1f} %", "99.3 % (independent); > 99 % (Sect. 3.3)"],
     ]
     return text + table(["10 MHz, nside 64", "ours", "by others"], rows)
 
@@ -155,25 +141,19 @@ def coverage():
     for a, b in zip(ten["bands"], three["bands"]):
         rows.append([
             f"{a['latitude_deg'][0]:g} to {a['latitude_deg'][1]:g}", f"{a['pair_h']:,.0f}", f"{b['pair_h']:,.0f}",
-            f"{b['pair_h'] / a['pair_h']:.2f}", f"{a['shortest_wavelengths']:.2f}", f"{b['shortest_wavelengths']:.2f}",
+            f"{a['shortest_wavelengths']:.2f}", f"{b['shortest_wavelengths']:.2f}",
             f"{a['uv_filled']:.2f}", f"{b['uv_filled']:.2f}",
         ])
-    head = ["degrees from the ecliptic", "pair hours, 10 MHz", "3 MHz", "3 over 10 MHz", "shortest projected, wavelengths",
-            "3 MHz", "uv filled", "3 MHz"]
-    return f"`{command}`\n\n" + table(head, rows) + (
-        "\nThe paper (Sect. 4.4) has 3.3 times as much time a direction at 3 MHz as at 10, for baselines below 2 b_p of each; ours is "
-        "2.17, so we differ. At the "
-        "poles the shortest projected baseline is 100 m cos 30 deg = 2.9 wavelengths at 10 MHz, so scales above l = 18 are "
-        "missing there.\n"
-    ) + picture("figures/coverage.png", "paper-coverage.png", "coverage by direction")
+    head = ["degrees from the ecliptic", "pair hours, 10 MHz", "3 MHz", "shortest projected, wavelengths, 10 MHz", "3 MHz",
+            "uv filled, 10 MHz", "3 MHz"]
+    return f"`{command}`\n\n" + table(head, rows)
 
 
 def beam_row(n):
     return (
         f"Pair {n['pair']}, {n['length_m']:.0f} m = {n['length_bp']:.2f} b_p at {n['frequency_hz'] / 1e6:g} MHz, nside "
         f"{n['nside']}: the Moon leaves {100 * n['seen']:.1f} % of the pixels; mean square of the row there "
-        f"{n['centre_power']:.3f} at centres, {n['average_power']:.3f} averaged. Where the fringe is narrower than a pixel, the "
-        "average is small, and the centre aliases.\n"
+        f"{n['centre_power']:.3f} at centres, {n['average_power']:.3f} averaged.\n"
     )
 
 
@@ -186,7 +166,6 @@ def waterfall(n):
         f"Pair {n['pair']}, a window, {n['band_hz'][0] / 1e6:g} to {n['band_hz'][1] / 1e6:g} MHz, the sky of 10 MHz at nside "
         f"{n['nside_fine']}, averaged to {n['nside']}.\n\n"
         + table(["baseline, b_p", "visibilities", "error at centres", "averaged"], rows)
-        + "\nErrors are rms, over the rms visibility of the fine sky.\n"
     )
 
 
@@ -201,17 +180,13 @@ def sub_pixel(n):
         ])
     head = ["nside", "rows", "visibilities", *[f"N_b, b < {to} b_p" for to in (0.5, 1.0, 1.5, 2.0)], "Sigma_b, K rms",
             "Tr Sigma_b, K²"]
-    return table(head, rows) + (
-        f"\nN_b is the covariance of V - B T over {n['skies']} skies, T the means over pixels; shown is the root of its diagonal over "
-        "the rms visibility, in the class of lengths that ends there. Sigma_b is that of the map, epsilon "
-        f"{n['epsilon']:g}, from a sample of the mission's integrations.\n"
-    ) + picture("figures/sub-pixel-maps.png", "paper-sub-pixel-maps.png", "root of the diagonal of Sigma_b")
+    return table(head, rows)
 
 
-def latitudes(name, command, said):
+def latitudes(name):
     study = load(f"{name}/study.json")
     if study is None:
-        return missing(command)
+        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows, head = [], []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
@@ -219,9 +194,7 @@ def latitudes(name, command, said):
         head = [f"{band['from_deg']:g} to {band['to_deg']:g} deg" for band in bands]
         rows.append([case["figures"]["name"], show(channel["mean_k"], "{:.3e}"),
                      *[f"{100 * band['mean']:+.1f}, {100 * band['rms']:.1f}" for band in bands]])
-    return table(["case", "mean, K", *head], rows) + (
-        f"\nMean and rms of (map - input) / input, %, by distance from the ecliptic. {said}\n"
-    )
+    return table(["case", "mean, K", *head], rows)
 
 
 def basis():
@@ -233,17 +206,7 @@ def basis():
     ]
     head = ["nside 8, 10 MHz", "Tr Sigma_n, K², at 1e-4", "Tr Sigma_s", "T² Tr Sigma_s, K²", "at 2e-3", "Tr Sigma_s",
             "T² Tr Sigma_s, K²", "crossing"]
-    return (
-        "\n**Why they do not cross here.** Traces depend on the basis. A harmonic of l < 18 that no baseline reaches "
-         "stays unmeasured, so Tr Sigma_s falls slowly (to 10 at 1e-4). A mode of pixels is a step function with power "
-         "at high l, which baselines up to 2 b_p measure; no such mode is lost, and Tr Sigma_s falls as epsilon². The "
-         "paper solves for pixels. At nside 8, by `pipelines/paper/dense.py 8 10 6000` in numpy, and by both engines from the same "
-        "downlink (scaled to all windows; T = 3.80e5 K):\n\n" + table(head, rows)
-        + "\nWith the paper's basis they cross in our range, at 1e-4 for T². The crossing moves with the noise and with "
-         "the thinning, which decides which modes are measured: at nside 8 and epsilon 1e-4 Tr Sigma_s is 0.0410 from every "
-        "40th window, 0.0204 from every 40th integration and 0.0120 from every 10th. Units require T²; with the first power, as the paper writes it, numbers of K² and K are compared, which do "
-         "not cross below 0.1.\n"
-    )
+    return table(head, rows)
 
 
 # Galactic longitude and latitude of the centres of three patches: near the pole, at middle latitudes, near the plane's anticentre.
@@ -266,10 +229,10 @@ def patches():
             truth, ours = found["pieces"]
             rows.append([mhz, centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.4f}"])
             shown += picture(f"patch-{mhz}-{k + 1}.png", f"paper-patch-{mhz}-{k + 1}.png",
-                             f"input and map at {mhz} MHz around {centre} degrees, scales above 5 degrees subtracted")
+                             f"{mhz} MHz, {centre}")
     if not rows:
         return missing(patch_command("10", 0))
-    head = ["MHz", "centre, Galactic degrees", "rms of the input, K", "of the map, K", "correlation"]
+    head = ["MHz", "centre, Galactic deg", "rms of the input, K", "of the map, K", "correlation"]
     return table(head, rows) + shown
 
 
@@ -288,9 +251,7 @@ def maps():
     if not rows:
         return "Not made here yet.\n"
     head = ["MHz", "visibilities", *[f"rho_{l}" for l in (8, 16, 32, 64, 96, 128)], "noise, K rms", "minutes"]
-    return table(head, rows) + (
-        "\nrho_l with the noise's power subtracted; `regulariser identity`.\n"
-    )
+    return table(head, rows)
 
 
 def uniformity():
@@ -318,13 +279,7 @@ def uniformity():
         rows.append([f"l >= {least}", f"{np.sqrt(variance.mean()):.2e}", f"{100 * scatter:.1f}", f"{100 * own:.1f}",
                      *[f"{np.sqrt(x):.3f}" for x in inside]])
     head = ["noise at", "rms, K", "scatter, %", "its own, %", *[f"{low} to {high} deg" for low, high in bands]]
-    return f"`{command}`\n\n" + table(head, rows) + (
-        f"\nThe standard deviation of each pixel over {len(noises)} realisations at 10 MHz, nside {nside}, every 10th window: its "
-        "scatter over the sphere, the part of this that is not due to so few realisations, and its rms by distance from the ecliptic over "
-        "that of all. The paper (Sect. 5.4) finds fluctuations of some 10 %, for an epsilon that it does not give: at nside 16 they are "
-        "38, 19 and 13 % at epsilon 1e-4, 1e-3 and 2e-3. At 1e-4 noise is uniform where the array measures; beyond 60 degrees from the "
-        "ecliptic the scales that no baseline reaches (l < 18) add as much again.\n"
-    )
+    return f"`{command}`\n\n" + table(head, rows)
 
 
 def traces(name="fig15-traces"):
@@ -337,20 +292,15 @@ def traces(name="fig15-traces"):
         mean = math.sqrt(channel["power"]["input_k2"][0] / (4 * math.pi))
         found = channel["diagnostics"]["traces"]
         n, s = (None, None) if found is None else (found["sigma_n_k2"]["value"], found["sigma_s"]["value"])
-        rows.append([
-            f"{channel['diagnostics']['epsilon']:.0e}", show(n), show(s),
-            show(None if s is None else mean * s), show(None if s is None else mean**2 * s),
-        ])
-    text = table(["epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T Tr Sigma_s, K", "T² Tr Sigma_s, K²"], rows)
+        epsilon = f"{channel['diagnostics']['epsilon']:.0e}"
+        # Every decade, and the paper's.
+        if epsilon.startswith("1e") or epsilon == "2e-03":
+            rows.append([epsilon, show(n), show(s), show(None if s is None else mean**2 * s)])
+    text = table(["epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²"], rows)
     for crossing in study["crossings"]:
-        where = [
-            "nowhere in this range" if crossing[key] is None else f"at epsilon {crossing[key]:.2e}"
-            for key in ("epsilon", "epsilon_first_power")
-        ]
-        text += (
-            f"\nTr Sigma_n = T² Tr Sigma_s {where[0]}, T the mean of the input; the number of K² equals that of K in "
-            f"T Tr Sigma_s {where[1]}.\n"
-        )
+        for key, what in (("epsilon", "T²"), ("epsilon_first_power", "T")):
+            where = "nowhere in this range" if crossing[key] is None else f"at epsilon {crossing[key]:.2e}"
+            text += f"\nTr Sigma_n = {what} Tr Sigma_s {where}.\n"
     return text
 
 
@@ -363,57 +313,49 @@ def epsilon_rules(*names):
             def told(rule):
                 choice = found[rule]
                 if choice["epsilon"] is None:
-                    return "none: " + choice["note"]
+                    return "none in this range"
                 low, high = choice["open"] or (choice["epsilon"],) * 2
                 return f"{choice['epsilon']:.1e}" + (f" ({low:.0e} to {high:.0e} open)" if low < high else "")
             rows.append([f"`{name}`", f"{found['numbers']:,}", f"{found['power_a_number']:.3g}",
                          *[told(rule) for rule in ("crossing", "cross_validation", "risk", "l_curve")]])
     if not rows:
         return ""
-    head = ["study", "n", "V'N^-1V / n", "crossing for T²", "generalised cross-validation", "predictive risk", "L-curve"]
-    return "\n### epsilon by four rules\n\n" + table(head, rows) + (
-        "\n[What each rule is](engines.md#choosing-epsilon).\n"
-    )
+    head = ["study", "n", "V'N^-1V / n", "crossing for T²", "cross-validation", "predictive risk", "L-curve"]
+    return "\n### epsilon by four rules\n\n" + table(head, rows)
 
 
-def point_beams(name, said):
+def point_beams(name):
     study = load(f"{name}/study.json")
     if study is None:
         return missing(f"lunarray study pipelines/paper/{name}.toml")
-    rows = []
+    rows, head = [], []
+
+    def told(widths):
+        if not widths:
+            return "-"
+        major, minor = widths["fwhm_major_deg"], widths["fwhm_minor_deg"]
+        return f"{math.sqrt(major * minor):.2f} ({major:.2f} x {minor:.2f})"
+
     for case in study["cases"]:
         path = OUT / name / case["folder"] / "summary.json"
-        for beam in json.loads(path.read_text())["channels"][0]["point_beams"]:
-            def told(widths):
-                if not widths:
-                    return ["-", "-"]
-                major, minor = widths["fwhm_major_deg"], widths["fwhm_minor_deg"]
-                return [f"{math.sqrt(major * minor):.2f}", f"{major:.2f} x {minor:.2f}"]
-            rows.append([case["figures"]["name"], f"{beam['latitude_deg']:.1f}", *told(beam.get("solved")), *told(beam.get("processed"))])
-    head = ["case", "ecliptic latitude, deg", "FWHM, deg", "axes", "after post-processing", "axes"]
-    return table(head, rows) + f"\n{said}\n"
+        beams = json.loads(path.read_text())["channels"][0]["point_beams"]
+        head = ["case, epsilon", *[f"latitude {beam['latitude_deg']:.1f}" for beam in beams]]
+        rows.append([case["figures"]["name"], *[f"{told(b.get('solved'))}; {told(b.get('processed'))}" for b in beams]])
+    return table(head, rows)
 
 
-def thinned_crossing():
-    return (
-        "\nFrom every 40th window. This crossing lies near the paper's only by its thinning: both traces fall when data are added. A crossing "
-         "from all data at this nside has not been measured.\n"
-    )
-
-
-def correlation(name, key, ls, head, said):
+def correlation(name, ls, head):
     study = load(f"{name}/study.json")
     if study is None:
         return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
-        values = channel[key]
-        rows.append([case["figures"]["name"], f"{channel['visibilities']:,}", *[at(values, l) for l in ls]])
-    return table([head, "visibilities", *[f"{'rho' if key == 'rho' else 'SNR'}_{l}" for l in ls]], rows) + f"\n{said}\n"
+        rows.append([case["figures"]["name"], f"{channel['visibilities']:,}", *[at(channel["rho"], l) for l in ls]])
+    return table([head, "visibilities", *[f"rho_{l}" for l in ls]], rows)
 
 
-def rows_of_b(key, wanted, said):
+def rows_of_b(key, wanted):
     study = load("fig16-17-rows/study.json")
     if study is None:
         return missing("lunarray study pipelines/paper/fig16-17-rows.toml")
@@ -427,7 +369,7 @@ def rows_of_b(key, wanted, said):
         rows.append([label.removeprefix(wanted + ", "), f"{channel['visibilities']:,}",
                      *[at(channel[key], l) for l in ls]])
     name = {"rho": "rho", "snr": "SNR"}[key]
-    return table(["rows, limit", "visibilities", *[f"{name}_{l}" for l in ls]], rows) + f"\n{said}\n"
+    return table(["rows, limit", "visibilities", *[f"{name}_{l}" for l in ls]], rows)
 
 
 def sensitivity(name="fig19-sensitivity", nside=16):
@@ -448,25 +390,7 @@ def sensitivity(name="fig19-sensitivity", nside=16):
             show(None if beam.get("area_sr") is None else jansky * beam["area_sr"]),
         ])
     head = ["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel", "beam, deg", "5 sigma, Jy a beam"]
-    return table(head, rows) + (
-        ""
-    )
-
-
-def flatness():
-    """How the sensitivity of a pixel changes from 5 to 10 MHz in both studies, and which channels the larger one lacks."""
-    rise, missing_mhz = {}, []
-    for name in ("fig19-sensitivity", "fig19-nside64"):
-        study = load(f"{name}/study.json")
-        if study is None:
-            return ""
-        channels = [case["figures"]["channels"][0] for case in study["cases"]]
-        of = {round(channel["frequency_hz"] / 1e6): channel["noise_rms_k"] * channel["frequency_hz"] ** 2 for channel in channels}
-        rise[name] = of[10] / of[5]
-        missing_mhz = [str(mhz) for mhz in (2, 3, 5, 10, 20, 30) if mhz not in of]
-    text = (f"\nFrom 5 to 10 MHz sensitivity rises by {rise['fig19-nside64']:.2f}, at nside 16 by {rise['fig19-sensitivity']:.2f}: the larger the "
-            "map, the flatter.\n")
-    return text + (f"Not made here yet: {' and '.join(missing_mhz)} MHz.\n" if missing_mhz else "")
+    return table(head, rows)
 
 
 def pair_sensitivity():
@@ -495,103 +419,48 @@ def pair_sensitivity():
         rows.append([f"{f / 1e6:g}", f"{4 * small[f]['pair_s'] / 3600:,.0f}", f"{4 * large[f]['pair_s'] / 3600:,.0f}",
                      show(sigma(small[f]), "{:.1f}"), show(sigma(large[f]), "{:.1f}")])
     head = ["MHz", "pair hours, nside 16", "nside 64", "5 sigma, Jy, nside 16", "nside 64"]
-    # Independent: the paper's formula in numpy, rows averaged over pixels of nside 8, epsilon 1e-3, b < 2 b_p.
-    dense = {"5": (299, 106.1), "10": (433, 111.5), "30": (1126, 155.1)}
-    return (
-        "\n**Why it rises here.** By the radiometer equation alone, 2 k T_sys nu² / c² over sqrt(2 dnu t), with the mean sky of Cane "
-        "(1979) and t the time of all pairs within 2 b_p (`lunarray figure pair-time` with these channels), sensitivity is as the "
-        "paper says, flat above 5 MHz and better below; the more so at nside 64, where more pairs are within 2 b_p:\n\n"
-        + table(head, rows)
-        + "\nThe noise of a map is the trace of Q W (W + eps)^-2 Qt, which counts every mode alike. A dense calculation of that formula "
-        "in numpy, at nside 8, epsilon 1e-3, which shares no code with this program (`pipelines/paper/dense.py 8 MHZ 6000`):\n\n"
-        + table(
-            ["MHz", "5 sigma, Jy a pixel", "radiometer, Jy", "ratio"],
-            [[f, f"{jy:,}", f"{rad:g}", f"{jy / rad:.1f}"] for f, (jy, rad) in dense.items()],
-        )
-        + "\nIt rises by 3.8 from 5 to 30 MHz, the study by 3.2: at a fixed nside the few pairs that are left at high "
-         "frequencies measure modes less evenly, and the worst of them dominate the noise. T_sys is not the cause. At "
-         "nside 64 the radiometer alone falls by a fifth from 5 to 30 MHz.\n"
-    )
+    # By the paper's formula in numpy, nside 8, epsilon 1e-3 (`dense.py 8 MHZ 6000`): 299, 433 and 1,126 Jy a pixel at 5, 10 and 30 MHz.
+    return "\nThe radiometer equation alone:\n\n" + table(head, rows)
 
 
 def main():
-    machine = sys.argv[1] if len(sys.argv) > 1 else "an unnamed machine"
+    study = "`lunarray study pipelines/paper/{}.toml`"
     parts = [
         ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, `{CUTOUT}`", counts()),
-        ("Fig. 2: the full sky", "By the same command.", full_sky()),
+        ("Fig. 2: the full sky", "", full_sky()),
         ("Fig. 3: q0 against R and R_2", f"`{FIGURE.format('spacing')}`", figure("spacing", spacing)),
-        ("Fig. 4: time by baseline length", f"`{FIGURE.format('pair-time')}`",
-         figure("pair-time", pair_time) + "\n### Time by direction (Sect. 4.4)\n\n" + coverage()),
+        ("Fig. 4: time by baseline length", f"`{FIGURE.format('pair-time')}`", figure("pair-time", pair_time)),
+        ("Time by direction (Sect. 4.4)", "", coverage()),
         ("Fig. 5: density of u, v, w", f"`{FIGURE.format('uvw')}`", figure("uvw", uvw)),
-        ("Fig. 6: the sky reflected by the Moon", "`lunarray study pipelines/paper/fig6-reflection.toml`",
-         latitudes("fig6-reflection", "lunarray study pipelines/paper/fig6-reflection.toml",
-                   "The table is of a flat mirror, which does not show the band between the horizontal and the limb, 31.5 degrees "
-                   "lower.")),
+        ("Fig. 6: the sky reflected by the Moon", study.format("fig6-reflection"), latitudes("fig6-reflection")),
         ("Fig. 7: a row of B", f"`{FIGURE.format('rows')}`", figure("rows", beam_row)),
         ("Fig. 8: waterfalls of one pair",
-         f"`{FIGURE.format('waterfall')}`, here with `--set map.nside=8 --set spacecraft.baseline_wavelengths_max=15.7`", figure("waterfall", waterfall)),
-        ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size", "`lunarray run pipelines/paper-10mhz.toml`, "
-         "`lunarray run pipelines/paper-3mhz.toml`", maps() + "\n### Is the noise uniform?\n\n" + uniformity()),
-        ("Fig. 11: a prior of 5 degrees", "`lunarray study pipelines/paper/fig11-prior.toml`",
-         correlation("fig11-prior", "rho", (2, 4, 8, 12, 16, 32, 64, 128), "case",
-                     "")),
-        ("Fig. 12: a wrong prior", "`lunarray study pipelines/paper/fig12-wrong-prior.toml` (its head says how the priors are made)",
-         latitudes("fig12-wrong-prior", "lunarray study pipelines/paper/fig12-wrong-prior.toml",
-                   "")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted",
-         "After `lunarray run pipelines/paper-10mhz.toml --set products.smooth_fwhm_deg=1 --out out/paper-10mhz` (3 MHz alike): "
-         f"`{patch_command('10', 0)}` and so on", patches()),
-        ("Fig. 15: traces against epsilon", "`lunarray study pipelines/paper/fig15-traces.toml`",
-         traces() + "\n![rho, SNR, power and traces against epsilon](paper-fig15.png)\n" + basis()
-         + "\n### In pixels, nside 16\n\n`lunarray study pipelines/paper/fig15-pixels.toml`\n\n" + traces("fig15-pixels") + thinned_crossing()
-         + epsilon_rules("fig15-traces", "fig15-pixels")
-         + "\nCross-validation and risk know only the noise and what pixels leave of the sky: for data that are 24 times brighter than their noise they "
-           "ask for as little regularisation as the study has.\n"),
-        ("Fig. 16: rows at centres and averaged, rho_l without noise",
-         "`lunarray study pipelines/paper/fig16-17-rows.toml`",
-         rows_of_b("rho", "no noise", "Ours agrees at nside 16. Many windows matter more than many integrations of each: every 4th is half a "
-         "wavelength from the last.")
-         + "\n### At nside 32\n\n`lunarray study pipelines/paper/fig16-nside32.toml` (`map.matrix = \"free\"`)\n\n"
-         + correlation("fig16-nside32", "rho", (8, 16, 20, 24, 32, 48, 64), "limit, rows",
-                       "At this size, too, averaged rows are the same whatever the limit: 0.99 or more from l = 20 to 48 at b_p over "
-                       "2, b_p and 2 b_p. Rows at centres are nearly as good below b_p over 2 up to l = 32, lose a tenth at b_p, half at 2 "
-                       "b_p, and most at 4 b_p. Iterations end at a residual of 1e-4, averaged ones of b_p over 2 after 300 products at "
-                       "5e-4. Averaged rows of 2 b_p took 3,392 s on one of two cores beside other work; those of 4 b_p were left "
-                       "after 42 products.")
-         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig16-nside64.toml` (`map.matrix = \"free\"`)\n\n"
-         + correlation("fig16-nside64", "rho", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows",
-                       "At the paper's size, too, averaged rows keep 0.98 and more from l = 24 to 80 below b_p over 2, where rows at centres end at "
-                       "0.93; at b_p these lose 6 to 8 % at l = 24 to 48, a sixth at 64 and half at 128.")),
-        ("Fig. 17: the same, SNR_l with thermal noise", "`lunarray study pipelines/paper/fig16-17-rows.toml`",
-         rows_of_b("snr", "thermal noise", "Averaged rows gain with baselines up to 2 b_p and keep it up to 4 b_p (2.5, 3.2, 3.4 at l = 24); rows at "
-         "centres lose from b_p on (2.8, 1.5, 1.1). These take long baselines for better measured than they are, so "
-         "that single degrees of a wrong map have a high SNR_l (15.9 at l = 8).")),
-        ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", "`lunarray study pipelines/paper/fig18-epsilon.toml`",
-         correlation("fig18-epsilon", "rho", (8, 16, 32, 64, 96, 128), "epsilon",
-                     "")),
-        ("Fig. 19: sensitivity against frequency", "`lunarray study pipelines/paper/fig19-sensitivity.toml`",
-         sensitivity() + pair_sensitivity()
-         + "\n### At nside 64\n\n`lunarray study pipelines/paper/fig19-nside64.toml`, from every 40th window\n\n"
-         + sensitivity("fig19-nside64", 64) + flatness()),
-        ("FWHM after post-processing", "`lunarray study pipelines/paper/beams.toml`",
-         point_beams("beams", "At nside 16 and smoothed to 4 degrees, where the paper's 1.3 at nside 64 and 1 degree would be 5.2. In pixels it is "
-                     "4.5 to 5.0 in all directions; harmonics of equal weight to l = 40 have 5.4 to 6.5.")
-         + "\n### At nside 64\n\n`lunarray study pipelines/paper/beams-nside64.toml`\n\n"
-         + point_beams("beams-nside64", "In harmonics to l = 160, from every tenth window: the same width in all directions, 1.58 degrees by theory for a "
-                       "beam that keeps all degrees up to 160.")),
-        ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
+         f"`{FIGURE.format('waterfall')}`, with `--set map.nside=8 --set spacecraft.baseline_wavelengths_max=15.7`",
+         figure("waterfall", waterfall)),
+        ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
+         "`lunarray run pipelines/paper-10mhz.toml`, `lunarray run pipelines/paper-3mhz.toml`", maps()),
+        ("Is the noise uniform?", "", uniformity()),
+        ("Fig. 11: a prior of 5 degrees", study.format("fig11-prior"),
+         correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
+        ("Fig. 12: a wrong prior", study.format("fig12-wrong-prior"), latitudes("fig12-wrong-prior")),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command('10', 0)}` and so on", patches()),
+        ("Fig. 15: traces against epsilon", study.format("fig15-traces"), traces() + "\n" + basis()),
+        ("In pixels, nside 16", study.format("fig15-pixels"), traces("fig15-pixels") + epsilon_rules("fig15-traces", "fig15-pixels")),
+        ("Fig. 16: rows at centres and averaged, rho_l without noise", study.format("fig16-17-rows"), rows_of_b("rho", "no noise")),
+        ("At nside 32", study.format("fig16-nside32"), correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
+        ("At nside 64", study.format("fig16-nside64"),
+         correlation("fig16-nside64", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows")),
+        ("Fig. 17: the same, SNR_l with thermal noise", study.format("fig16-17-rows"), rows_of_b("snr", "thermal noise")),
+        ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", study.format("fig18-epsilon"),
+         correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
+        ("Fig. 19: sensitivity against frequency", study.format("fig19-sensitivity"), sensitivity() + pair_sensitivity()),
+        ("Fig. 19 at nside 64", study.format("fig19-nside64"), sensitivity("fig19-nside64", 64)),
+        ("FWHM after post-processing", study.format("beams"), point_beams("beams")),
+        ("FWHM at nside 64", study.format("beams-nside64"), point_beams("beams-nside64")),
+        ("Appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
     ]
-    print("# The paper, figure by figure\n")
-    print("What arXiv:2511.18494 says (in our words, with its section), the command, our numbers, and where and why they differ. All "
-          "maps are with R = epsilon W_max I (`regulariser identity`), as the paper's. Written by "
-          f"`pipelines/paper/report.py` from results on {machine}; Fig. 19 at full size was added by hand. Sizes are in "
-          "the study files, which say where they are smaller than the paper's; each study draws `study.png`. The sky is generated, with the paper's "
-          "small scales and sources; the paper's is ULSA.\n")
-    said = notes()
     for title, command, text in parts:
-        print(f"## {title}\n\n{said.pop(title)}\n\n{command}\n\n{text}")
-    if said:
-        sys.exit(f"error: notes on no sheet: {list(said)}")
+        print(f"## {title}\n\n{command}\n\n{text}" if command else f"## {title}\n\n{text}")
 
 
 if __name__ == "__main__":

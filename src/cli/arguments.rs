@@ -30,11 +30,10 @@ pub(super) struct PipelineArgs {
     /// Downlink format, in place of the file's: plain space packets, or coded transfer frames (CADUs).
     #[arg(long, value_name = "packets|cadu")]
     format: Option<String>,
-    /// Channels to map, numbered from 0, such as 0-4,7; all if not given. The others are counted as left out.
+    /// Channels to map, from 0, such as 0-4,7; by default all. The others are counted as left out.
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
-    /// Greatest memory that the estimate may come to, with a unit, such as 8GB or 16GiB; what the machine has available
-    /// if not given.
+    /// Maximum memory, by the estimate, with a unit, such as 8GB or 16GiB; by default what the machine has available.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
 }
@@ -103,7 +102,7 @@ pub(super) fn frame(text: &str) -> Result<Frame, String> {
 /// The map file of an existing state.
 #[derive(Debug, Args)]
 pub(super) struct StateMapArgs {
-    /// Map file (TOML) with which the state was made; the settings that the state itself holds if none is given.
+    /// Map file (TOML) with which the state was made; by default the settings that the state holds.
     #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
     /// Replace one setting, for example --set map.nside=8; may be repeated.

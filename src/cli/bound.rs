@@ -11,8 +11,8 @@ use crate::sky::fits::{check_frequencies, read_known_sky};
 
 /// Print how well gains, clocks and positions of a planned array can be known after one pass.
 ///
-/// The Cramer-Rao bound: least standard deviations that any calibration on a known sky can have, with the array, integrations
-/// and channels of the pipeline, noise of the sky's power, and the parameters and priors of its section [calibrate].
+/// The Cramer-Rao bound is the least standard deviation that any calibration on a known sky can have: here with the array,
+/// integrations and channels of the pipeline, noise of the sky's power, and the parameters and priors of its section [calibrate].
 ///
 /// Example: lunarray bound mission.toml --model model.fits
 #[derive(Debug, Args)]

@@ -15,12 +15,11 @@ use crate::units::Dimension;
 
 /// Compare a map with the truth, degree by degree; or runs with one another.
 ///
-/// Of two maps, both are HEALPix FITS maps in K; they are converted to ecliptic axes and to the coarser of the two resolutions.
-/// rho_l = C_l^X / sqrt(C_l^in C_l^re) is the correlation of map and truth at degree l, whatever the scale of the map;
-/// with a noise-only map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws these curves, and the relative error
-/// (map - truth) / truth over the sky.
+/// Two maps are HEALPix FITS maps in K; they are converted to ecliptic axes and to the coarser of the two resolutions. rho_l =
+/// C_l^X / sqrt(C_l^in C_l^re) is the correlation of map and truth at degree l, whatever the scale of the map; with a noise-only
+/// map, SNR_l = C_l^X / sqrt(C_l^in C_l^ns). Draws these curves, and the relative error (map - truth) / truth over the sky.
 ///
-/// Of output folders of runs, prints their figures as a table (CSV) and draws their curves over one another.
+/// For output folders of runs, it prints their figures as a table (CSV) and draws their curves over one another.
 ///
 /// Examples: lunarray compare map.fits input.fits --noise noise.fits;
 /// lunarray compare out/first out/second out/third --plot curves.png

@@ -36,8 +36,8 @@ const LAST_WAIT: Duration = Duration::from_secs(5);
 /// Whether and where a command writes its events.
 #[derive(Debug, Args)]
 pub(super) struct EventsArgs {
-    /// Write progress and events, one JSON object a line, to this file, which is replaced, or with - to standard output, which then
-    /// holds nothing else. The last line has the summary.
+    /// Write progress and events to this file, one JSON object a line; the file is replaced. With - they go to standard output,
+    /// which then holds nothing else. The last line has the summary.
     #[arg(long, value_name = "FILE|-")]
     events: Option<PathBuf>,
 }

@@ -8,9 +8,8 @@ use crate::units::echo;
 
 /// Explain keys of pipeline files: their defaults, units and meaning.
 ///
-/// Takes whole keys (map.epsilon), sections (map), or a part of a name (epsilon), which finds all keys that contain it, or else
-/// all whose explanation does (regularisation).
-/// Without one it lists the sections.
+/// Takes keys (map.epsilon), sections (map), or a word (epsilon): it finds all keys whose names contain it, or else all whose
+/// explanation does. Without one it lists the sections.
 ///
 /// Example: lunarray explain map.epsilon
 #[derive(Debug, Args)]
@@ -21,7 +20,7 @@ pub(super) struct ExplainArgs {
     /// Print one JSON object per line: key, default (as TOML), about, only_with (when it has an effect), everyday.
     #[arg(long)]
     json: bool,
-    /// Print all keys as a page of Markdown, a table a section: docs/keys.md is one.
+    /// Print the page docs/keys.md: the everyday keys as a table of Markdown.
     #[arg(long, conflicts_with_all = ["json", "keys"])]
     markdown: bool,
 }
@@ -71,61 +70,26 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
     all.iter().any(|described| described.key.starts_with(&inside))
 }
 
-/// All keys as a page of Markdown: those for every day first, then all others, section by section.
+/// The page `docs/keys.md`: a table of the keys for every day, and the reference with all of them, which mdBook includes.
 fn page_of(all: &[KeyDescription]) -> String {
-    let mut page = "# All keys\n\nEvery key of a pipeline file with its default; a file names only those that it changes. Units stand at \
-                    the end of names. Written by `lunarray explain --markdown`.\n\n## For every day\n"
+    let mut page = "# All keys\n\n\
+        A pipeline file names only the keys that it changes. Units stand at the end of names. `lunarray explain KEY` explains keys, \
+        sections, or all keys with\na word in them. Written by `lunarray explain --markdown`.\n\n\
+        ## For every day\n\n| key | |\n|---|---|\n"
         .to_owned();
-    page.push_str(TABLE);
     for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
-        put_row(&mut page, &described.key, described, None);
+        let KeyDescription { key, default, about, only_with, .. } = described;
+        let default = default.as_ref().map_or_else(String::new, |text| format!(" = {text}"));
+        // Its own condition is the last of the list.
+        let condition = only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."));
+        page.push_str(&format!("| `{key}{default}` | {}{condition} |\n", in_a_cell(about)));
     }
-    page.push_str("\n## For experts\n");
-    let mut told: Vec<(String, Vec<String>)> = Vec::new();
-    for section in all.iter().filter(|described| is_section(all, &described.key)) {
-        let inside = format!("{}.", section.key);
-        let rows: Vec<(&str, &KeyDescription)> = all
-            .iter()
-            .filter(|described| !described.everyday && !is_section(all, &described.key))
-            .filter_map(|described| Some((described.key.strip_prefix(&inside)?, described)))
-            .filter(|(name, _)| !name.contains('.'))
-            .collect();
-        let names: Vec<String> =
-            rows.iter().map(|(name, described)| format!("{name} {}", described.about)).collect();
-        let (key, about) = (&section.key, in_a_cell(&section.about));
-        if let Some((first, _)) = told.iter().find(|(_, others)| *others == names && names.len() > 1) {
-            let condition = condition_of(section);
-            page.push_str(&format!("\n- `{key}`, with the keys of `{first}`: {about}{condition}\n"));
-            continue;
-        }
-        // A condition that all keys share is told once.
-        let shared = rows.first().map(|(_, first)| *first);
-        let shared = shared.filter(|first| rows.iter().all(|(_, row)| row.only_with == first.only_with));
-        let head = shared.unwrap_or(section);
-        page.push_str(&format!("\n### {key}\n\n{about}{}\n", condition_of(head)));
-        if !rows.is_empty() {
-            page.push_str(TABLE);
-            rows.iter().for_each(|(name, described)| put_row(&mut page, name, described, Some(head)));
-            told.push((section.key.clone(), names));
-        }
-    }
+    page.push_str(
+        "\n## All, with those for experts\n\n\
+        The file `pipelines/reference.toml`, also printed by `lunarray config --print reference`:\n\n\
+        ```toml\n{{#include ../pipelines/reference.toml}}\n```\n",
+    );
     page
-}
-
-const TABLE: &str = "\n| key | default | |\n|---|---|---|\n";
-
-/// A row of a table. A condition that stands above the table is left out.
-fn put_row(page: &mut String, name: &str, described: &KeyDescription, head: Option<&KeyDescription>) {
-    let default = described.default.as_ref().map_or_else(|| "none".to_owned(), |text| format!("`{text}`"));
-    let about = in_a_cell(&described.about);
-    let said = head.is_some_and(|head| head.only_with == described.only_with);
-    let condition = if said { String::new() } else { condition_of(described) };
-    page.push_str(&format!("| `{name}` | {default} | {about}{condition} |\n"));
-}
-
-/// Its own condition: the last of the list.
-fn condition_of(described: &KeyDescription) -> String {
-    described.only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."))
 }
 
 /// A text with what would end a cell, or begin a tag, escaped.
@@ -153,10 +117,8 @@ const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 
 /// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.
 ///
-/// Without options these are the everyday keys with their defaults, units and meanings; --all adds those for experts. A pipeline
-/// file needs only the keys that it changes. The quicklook is what `lunarray run` runs without a file. The reference has the keys for
-/// experts as comments. The schema of summary.json (JSON Schema 2020-12) names all its
-/// fields.
+/// Without options it prints the everyday keys with their defaults and meanings; --all adds those for experts. A pipeline file
+/// needs only the keys that it changes.
 ///
 /// Example: lunarray config --print quicklook > my.toml
 #[derive(Debug, Args)]

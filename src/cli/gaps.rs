@@ -14,11 +14,11 @@ use crate::products::draw_coverage;
 
 /// List missing packets, and what they would add to the map.
 ///
-/// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what
-/// their recovery would add: their weight relative to that in the map of the same channel, in the mean over channels. Request
-/// the given range of packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap
-/// is estimated from that of a whole window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities that need them.
-/// Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
+/// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what their
+/// recovery would add: their weight over that in the map of the same channel, averaged over channels. Request the given range of
+/// packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap is estimated from that of a
+/// whole window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities
+/// that need them. Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
 ///
 /// Example: lunarray gaps state/ --most 5 --picture coverage.png
 #[derive(Debug, Args)]
@@ -29,8 +29,8 @@ pub(super) struct GapsArgs {
     /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]
     most: usize,
-    /// Fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many percent, of which 0 is for
-    /// any visibilities or positions; for scripts.
+    /// For scripts: fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many
+    /// percent; 0 for any visibilities or positions.
     #[arg(long, value_name = "any|PERCENT", value_parser = fail_if)]
     fail_if: Option<FailIf>,
     /// Write a picture (PNG) of integration time over mission time, channel by channel.

@@ -15,10 +15,10 @@ use crate::units::{Dimension, all_pairs};
 
 /// Print satellite positions, whether the array observes, and the integration time of each pair.
 ///
-/// Positions are Moon-centred on ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole), m. The baseline
-/// of a pair is r_i - r_j. The array observes while the Moon hides the Earth. Orbits of files have dates, by which the Earth and the Sun
-/// are where they are then; other missions have an idealised Earth on a circle in the ecliptic. A time for which the orbits say nothing
-/// is an error.
+/// Positions are Moon-centred on ecliptic axes (x to ecliptic longitude 0, z to the north ecliptic pole), m. The baseline of a
+/// pair is r_i - r_j. The array observes while the Moon hides the Earth. Orbits of files have dates, and the Earth and the Sun
+/// are where they are then; other missions have an idealised Earth on a circle in the ecliptic. A time outside the orbits is an
+/// error.
 ///
 /// Example: lunarray geometry --at 0 12h 7d --freq-hz 3e6
 #[derive(Debug, Args)]

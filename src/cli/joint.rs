@@ -20,11 +20,11 @@ use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
 /// Most samples: each is in memory for every channel.
 const COUNT_MAX: u64 = 1_000;
 
-/// Make maps of several channels together: each sees what its neighbours see.
+/// Make maps of several channels together, each with what its neighbours see.
 ///
-/// The sky's structure changes slowly with frequency. How alike the channels are is estimated from their data, and R follows from it, so that
-/// scales which one frequency hardly sees come from those that see them. Takes the sums of one state or of several, of different nside if
-/// need be; no visibility is read again, and the states stay as they are.
+/// The sky's structure changes slowly with frequency. The data say how alike the channels are, and R follows from it: scales that
+/// one frequency hardly sees come from those that see them. Takes the sums of one state or of several, whose nside may differ; no
+/// visibility is read again, and the states stay as they are.
 ///
 /// Leaves in the output folder for each channel, and each frequency of --at, map.fits (temperature and standard deviation, K) and a picture;
 /// spectra.fits (spectral index, curvature, and their standard deviations); and joint.json: means with errors, how alike the channels are,
@@ -36,7 +36,7 @@ pub(super) struct JointArgs {
     /// State folders of `lunarray replay --state`, with maps over harmonics (map.engine = "harmonic").
     #[arg(value_name = "DIR", required = true)]
     states: Vec<PathBuf>,
-    /// A frequency between the channels at which a map is made, too: Hz, or with a unit, such as 6MHz. May be repeated.
+    /// Make a map at this frequency between the channels, too: Hz, or with a unit, such as 6MHz. May be repeated.
     #[arg(long, value_name = "FREQUENCY", value_parser = frequency_hz)]
     at: Vec<f64>,
     /// Draws from which errors of means and spectra are taken.

@@ -80,8 +80,7 @@ use crate::units::InvalidValue;
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
 struct Cli {
-    /// Form of what is said on standard error: text for people, or one JSON object a line with time (UTC), level, event, message and
-    /// fields for programs.
+    /// Format of messages on standard error: text, or json: one object a line with time (UTC), level, event, message and fields.
     #[arg(
         long,
         global = true,

@@ -11,11 +11,10 @@ use crate::pipeline::{Config, use_threads, with_gains};
 
 /// Give the data of a state other gains.
 ///
-/// Visibilities of the files are taken out of the sums under the gains that they were added with, and added under the new
-/// ones; both are exact, so that the sums are those of a new state made with the new gains. Packets to which the new gains do
-/// what the old ones did need not be in the files, all others have to be. The state then belongs to the new gains: later data
-/// are replayed with the same --calibration. Its number of calibrations grows by one. If interrupted, the folder holds either
-/// the old state or the new one.
+/// Visibilities of the files are taken out of the sums under the gains that they were added with, and added under the new ones;
+/// both are exact, so that the sums are those of a new state made with the new gains. All packets whose gains change have to be
+/// in the files. The state then belongs to the new gains: later data are replayed with the same --calibration. Its number of
+/// calibrations grows by one. If interrupted, the folder holds either the old state or the new one.
 ///
 /// Example: lunarray recalibrate pass.ccsds --state state/ --old-calibration old/gains.json --calibration new/gains.json
 #[derive(Debug, Args)]

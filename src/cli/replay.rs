@@ -54,9 +54,9 @@ pub(super) struct ReplayArgs {
     /// Downlink files in the order of time.
     #[arg(required_unless_present_any = ["state", "listen"], value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
-    /// Map file (TOML): settings of the ground segment. If not given, those of the state, if it has any; of the run that made
-    /// the downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; then the defaults of
-    /// `lunarray config`.
+    /// Map file (TOML): settings of the ground segment. Without it they are those of the state; else those of the run that made
+    /// the downlink, if its pipeline.toml lies beside the first FILE or it was the quicklook; else the defaults of `lunarray
+    /// config`.
     #[arg(long, value_name = "MAP.toml", value_parser = input_path())]
     map: Option<PathBuf>,
     /// Gains that `lunarray calibrate` found: as calibration.hook = "antenna-gains" with calibration.gains_file.
@@ -72,16 +72,16 @@ pub(super) struct ReplayArgs {
     /// Number of visibilities between two checkpoints of the state; the end always writes one.
     #[arg(long, value_name = "NUMBER", default_value_t = 1_000_000, requires = "state")]
     checkpoint_every: u64,
-    /// Folder of the raw archive, where a ground that listens keeps every packet on disk before it answers `taken`: the folder
-    /// `archive` in that of the state if not given. `lunarray rebuild` makes a new state of it.
+    /// Folder of the raw archive, where a ground that listens keeps every packet on disk before it answers `taken`; by default
+    /// the folder `archive` of the state. `lunarray rebuild` makes a new state of it.
     #[arg(long, value_name = "DIR", requires_all = ["state", "listen"])]
     archive: Option<PathBuf>,
     /// Keep no raw archive: what came after the last checkpoint is then lost when the ground is killed, although it was answered
     /// with `taken`.
     #[arg(long, requires_all = ["state", "listen"], conflicts_with = "archive")]
     no_archive: bool,
-    /// Greatest size of the raw archive, with a unit, such as 20GB; beyond it the oldest segments go, once two checkpoints hold
-    /// them. 64 GiB if not given.
+    /// Maximum size of the raw archive, with a unit, such as 20GB; by default 64 GiB. Beyond it the oldest segments are deleted,
+    /// once two checkpoints hold them.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes, requires_all = ["state", "listen"])]
     archive_max: Option<u64>,
     /// Capacity of the hold buffer for visibilities without positions, bytes; when it is full, the oldest are flagged.
@@ -120,8 +120,7 @@ pub(super) struct ReplayArgs {
     /// Mission time between snapshot maps: a number with an optional unit s, h or d, such as 7d; 0 for the final map only.
     #[arg(long, value_name = "TIME", value_parser = not_negative_s)]
     snapshot_every: Option<f64>,
-    /// Channels to map, numbered from 0 in the order of the instrument, such as 0-4,7; all if not given. The others are counted as
-    /// left out.
+    /// Channels to map, from 0 in the order of the instrument, such as 0-4,7; by default all. The others are counted as left out.
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
     /// Map the channels in groups and read the files once a group: as many channels at a time as memory allows (auto), or this
@@ -129,8 +128,7 @@ pub(super) struct ReplayArgs {
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["live", "pace", "state"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     groups: Option<GroupSize>,
-    /// Greatest memory for the sums of all channels, with a unit, such as 8GB or 16GiB; what the machine has available if
-    /// not given.
+    /// Maximum memory for the sums of all channels, with a unit, such as 8GB or 16GiB; by default what the machine has available.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
     /// Share the sums of each map of the harmonic engine with the other ranks of an MPI job: mpirun -n 4 lunarray replay --mpi ...

@@ -31,7 +31,7 @@ use crate::pipeline::{
 pub(super) struct RunArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Output folder for the products; out/NAME if not given.
+    /// Output folder for the products; by default out/NAME.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: Option<PathBuf>,
     /// Print the summary as one JSON object instead of tables.

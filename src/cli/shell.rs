@@ -41,7 +41,7 @@ pub(super) fn completions(args: &CompletionsArgs, mut command: Command) -> Comma
 
 /// Write manual pages, one a command.
 ///
-/// `man -l FOLDER/lunarray.1` shows the first of them; packagers put them into a folder of the manual's section 1.
+/// `man -l FOLDER/lunarray.1` shows the first of them; packages put them into section 1 of the manual.
 ///
 /// Example: lunarray man --out man1/
 #[derive(Debug, Args)]

@@ -22,17 +22,18 @@ use crate::pipeline::{
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
 ///
-/// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the visibilities: all that
-/// `lunarray replay` needs. A file that a failure leaves incomplete has the extension .partial. Ctrl-C ends the simulation
-/// after the windows in progress, or without them if they take long (runtime.grace_s), and leaves a valid file; none
-/// before the first window.
+/// The downlink holds CCSDS space packets with the instrument description, the ephemeris and the visibilities: all that `lunarray
+/// replay` needs. A file that a failure leaves incomplete has the extension .partial. Ctrl-C ends the simulation after the
+/// windows in progress, or without them if they take longer than runtime.grace_s, and leaves a valid file, or none before the
+/// first window.
 ///
 /// Example: lunarray simulate pipelines/quicklook.toml --out sky.ccsds
 #[derive(Debug, Args)]
 pub(super) struct SimulateArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Downlink file to write; - for standard output, as input of another program. True values of errors are then written nowhere.
+    /// Downlink file to write; - for standard output, as input of another program. The truth about errors of the instrument is
+    /// then not written.
     #[arg(short, long, value_name = "FILE|-", required_unless_present = "send")]
     out: Option<PathBuf>,
     /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
@@ -50,8 +51,8 @@ pub(super) struct SimulateArgs {
     /// Maximum rate, bytes/s; 0 for no limit.
     #[arg(long, value_name = "NUMBER", default_value_t = 0.0, requires = "send", value_parser = rate)]
     bytes_per_s: f64,
-    /// Wait until a checkpoint on the ground's disk holds the whole downlink, and send it again, from its beginning, to a ground that
-    /// was ended before and is back within --connect-s. Needs a ground with --state; what is sent again is at most 16 MiB.
+    /// Wait until a checkpoint on the ground's disk holds the whole downlink. If the ground ends before that and is back within
+    /// --connect-s, send it all again. Needs a ground with --state, and a downlink of at most 16 MiB to be sent again.
     #[arg(long, requires = "send")]
     held: bool,
     /// File with the line NAME TOKEN of the station that sends, for a ground with --stations. Nobody else may be able to read it.

@@ -22,9 +22,9 @@ use crate::units::Dimension;
 /// coordinates: the sky that `lunarray run` observes with the same pipeline file, seed and settings. The same seed gives
 /// the same sky at every frequency and nside.
 ///
-/// With --like, writes instead a sky with the mean and the angular power of another map, and a given correlation with it at
-/// every degree: a wrong prior. With --extrapolate-from, writes what a power of frequency makes of the sky at another frequency:
-/// a wrong model, as gas absorbs below 10 MHz.
+/// With --like it writes a wrong prior instead: a sky with the mean and the angular power of another map, and a given correlation
+/// with it at every degree. With --extrapolate-from it writes a wrong model: the sky of another frequency times a power of
+/// frequency, although gas absorbs below 10 MHz.
 ///
 /// Examples: lunarray sky --freq-hz 10e6 --out sky.fits; lunarray sky --like sky.fits --correlation 0.8 --out wrong.fits
 #[derive(Debug, Args)]

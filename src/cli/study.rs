@@ -18,16 +18,18 @@ use crate::products::{EpsilonChoice, EpsilonChoices};
 
 /// Run a pipeline at every combination of some settings, and show the results side by side.
 ///
-/// A study names a pipeline file and axes: a key with values, or named cases of several settings. Cases that differ only
-/// in the ground segment share one simulation, and those that differ only in epsilon or prior share their sums. Leaves the
-/// products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l, C_l,
-/// and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing, and epsilon as cross-
-/// validation, predictive risk and L-curve choose it (epsilons.csv, epsilons.png). With
-/// `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of C_l and of pixels
-/// (`covariance_at_deg`). With
-/// `calibrated = true` each case is made twice, from the data as sent and with gains that are found from them; cases with errors of the
-/// instrument are compared with the one without. Cases that are finished are not made again: to resume after an interruption, repeat
-/// the command.
+/// A study names a pipeline file and axes: a key with values, or named cases of several settings. Cases that differ only in the
+/// ground segment share one simulation, and those that differ only in epsilon or prior share their sums.
+///
+/// Leaves the products of every case, tables (study.csv, spectra.csv, study.json) and overlaid curves (study.png): rho_l, SNR_l,
+/// C_l, and, with map.trace_probes, the traces of thermal noise and imperfection against epsilon, with their crossing, and
+/// epsilon as cross-validation, predictive risk and L-curve choose it (epsilons.csv, epsilons.png).
+///
+/// With `realisations = N` each case is made for N realisations of noise and random errors, for maps of sigma and covariances of
+/// C_l and of pixels (`covariance_at_deg`). With `calibrated = true` each case is made twice, from the data as sent and with
+/// gains that are found from them; cases with errors of the instrument are compared with the one without.
+///
+/// To resume after an interruption, repeat the command: finished cases are not made again.
 ///
 /// Example: lunarray study pipelines/paper/fig15-traces.toml --out out/fig15
 #[derive(Debug, Args)]
@@ -35,7 +37,7 @@ pub(super) struct StudyArgs {
     /// Study file (TOML).
     #[arg(value_name = "STUDY.toml")]
     study: PathBuf,
-    /// Output folder; out/NAME if not given.
+    /// Output folder; by default out/NAME.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: Option<PathBuf>,
     /// Replace one setting in all cases, for example --set map.nside=16; may be repeated.
@@ -44,8 +46,7 @@ pub(super) struct StudyArgs {
     /// Keep the downlinks and states that cases share, so that cases can be added without simulating again.
     #[arg(long)]
     keep: bool,
-    /// Greatest memory that the estimate of a case may come to, with a unit, such as 8GB or 16GiB; what the machine has
-    /// available if not given.
+    /// Maximum memory of a case, by the estimate, with a unit, such as 8GB or 16GiB; by default what the machine has available.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
     /// Print the results as one JSON object instead of a table.

@@ -32,7 +32,7 @@ const PRINTED: (u16, u16) = (120, 50);
 
 /// Show a running command in this terminal.
 ///
-/// Reads what `run`, `replay` or `simulate` tells with `--serve`: stages with their queues, the ledger, reception, maps and
+/// Shows what `run`, `replay` or `simulate` serves with `--serve`: stages with their queues, the ledger, reception, maps and
 /// their correlation with the input. It only looks. q or Ctrl-C ends it, and the run goes on.
 ///
 /// Example: lunarray top 8080

@@ -26,36 +26,14 @@
 //! [`PacketReceiver::push`]. It adds and removes idle packets by itself.
 //!
 //! # A packet
-//! | byte | field | |
-//! |---|---|---|
-//! | 0-5 | primary header | telemetry, secondary header present, APID of the [`Kind`]; segmentation flags, low 14 bits of the packet count; length |
-//! | 6-13 | secondary header | CUC time, P-field 0x1F: TAI since 1958-01-01, 4 + 3 bytes; the creation time of the packet, which never decreases |
-//! | 14 | magic | 0x4C |
-//! | 15 | version | [`FORMAT_VERSION`] |
-//! | 16-19 | packet count, bits 14-45 | the count of 46 bits never wraps, so a gap is never ambiguous |
-//! | 20-21 | header checksum | CRC-16 (0x1021, start 0xFFFF) of bytes 0-19 |
-//! | 22.. | payload, or a segment of it | |
-//! | last 4 | packet checksum | CRC-32C of everything before it, big-endian |
+//! `docs/packets.md` specifies packets and their payloads to the byte. Each packet of visibilities can be decoded alone; other
+//! payloads are segmented if they exceed a packet. The count of packets has 46 bits and never wraps, so a gap is never ambiguous.
 //!
-//! Headers are big-endian as in CCSDS, payloads little-endian. A payload is a bincode-2 record of fixed width,
-//! followed by raw arrays:
+//! A pass begins, after the instrument description, and ends with a report of the spacecraft's counts (housekeeping) at its end,
+//! so that a pass that is cut short still tells how much it held. The reports of the last pass hold until 2^32 s, the end of the
+//! range of times: a ledger is complete only with one of them.
 //!
-//! | kind | record | arrays |
-//! |---|---|---|
-//! | instrument | name (u64 length, UTF-8), epoch_tai_s f64, moon_radius_m f64, satellites u8, response u8 (plus 128 without thermal noise), seed u64, configuration_hash u64, channels u16 | channels x (frequency_hz, width_hz) f64; with a spectrometer also low_hz, width_hz, channels f64 |
-//! | ephemeris | start_ticks i64, step_ticks u32, satellites u8, nodes u32 | nodes x satellites x 3 positions f64, m |
-//! | visibilities | channel u16, i u8, j u8, start_ticks i64, count u32 | count each: offset_ticks u32, duration_ticks u32, value (re, im) f32 x 2, weight f32, flags u8 |
-//! | housekeeping | time_ticks i64, sampled u64, dropped u64 | |
-//!
-//! A pass begins, after the instrument description, and ends with a report of the spacecraft's counts (housekeeping). Both
-//! say the same, so that a pass that is cut short still tells how much it held. The reports of the last pass hold until
-//! 2^32 s, the end of the range of times: a ledger is complete only with one of them. Files made before this have a
-//! report only at the end of each pass, and none that is the last.
-//!
-//! Each packet of visibilities can be decoded alone. Other payloads are segmented if they exceed a packet.
-//!
-//! The header has a checksum of its own: so a damaged packet can be told from noise, and its loss has a kind, a time
-//! and a count.
+//! The header has a checksum of its own, so that the loss of a damaged packet has a kind, a time and a count.
 
 mod config;
 pub(crate) mod error;

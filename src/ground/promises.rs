@@ -1,4 +1,4 @@
-//! What senders are told of checkpoints.
+//! Answers to senders about checkpoints.
 
 use crate::downlink::transport::socket::HeldAnswers;
 

@@ -1,4 +1,4 @@
-//! Bytes to frames, for those who want frames and no sums.
+//! Bytes to frames, without sums.
 
 use std::sync::{Arc, Mutex, PoisonError};
 

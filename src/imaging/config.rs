@@ -109,7 +109,7 @@ keys! {
         /// "file" take 1e-4 without it.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
-        /// Regulariser R: "data", 1 / C_l of the sky as found from the data (default); "identity", epsilon W_max I, the paper's
+        /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's
         /// (default with epsilon, map.refine, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also {
         /// degree = 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a
         /// channel.

@@ -2,11 +2,13 @@
 //! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R_l = 1 / C_l`, C_l the sky's angular power as the data have it ([`SkyPower`]);
 //! or `R = epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4), or another [`Regulariser`].
 //!
-//! A folder holds one map method, its sums and their solution: `pixel` forms the matrix itself (or makes its rows again for each product);
-//! [`circle`] holds what makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines
-//! its maps with rows at the true positions; `joint` solves for several channels of its sums together. `exact` is what they share to sum: integers, whose bits depend on the visibilities in them alone,
-//! and the format of checkpoints. `solver` is what they share to solve: conjugate gradients, eigenvalues, traces. `stage` holds the two stages of the
-//! pipeline, [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
+//! Each map method is a folder, with its sums and their solution. `pixel` forms the matrix itself, or makes its rows again for each
+//! product; [`circle`] makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines its
+//! maps with rows at the true positions; `joint` solves for several channels of its sums together.
+//!
+//! Methods share `exact` (sums as integers, whose bits depend only on which visibilities are in them, and checkpoints), `solver`
+//! (conjugate gradients, eigenvalues, traces) and `power` (the sky's angular power). `stage` holds the two stages of the pipeline,
+//! [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
 mod antennas;
 #[doc(hidden)]

@@ -1,5 +1,5 @@
-//! General mathematics that several rooms use: quadrature, interpolation, special functions, statistics. Knows no physics and uses nothing
-//! of the crate.
+//! General mathematics that several folders use: quadrature, interpolation, special functions, statistics. Knows no physics and
+//! uses nothing of the crate.
 
 pub(crate) mod bessel;
 pub(crate) mod chebyshev;

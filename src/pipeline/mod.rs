@@ -1,7 +1,7 @@
 //! From a configuration to a running graph: parse, validate, build, run.
 //!
-//! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it. Of its rooms
-//! each uses only those before it: `config`, `cost`, `graph`, `jobs`.
+//! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it. Its folders
+//! `config`, `cost`, `graph` and `jobs` each use only those before them.
 
 mod config;
 mod cost;

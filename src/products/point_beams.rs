@@ -1,4 +1,4 @@
-//! What a map makes of points: effective beams in some directions, with their widths.
+//! Effective beams in given directions, from the maps of points, with their widths.
 
 use std::fmt::Write;
 

@@ -1,4 +1,4 @@
-//! The hook for those who look on: every map, as it is published.
+//! A hook that sees every map as it is published.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};

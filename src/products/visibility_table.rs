@@ -1,4 +1,4 @@
-//! The visibilities of a downlink file as a table, for those who work on them elsewhere.
+//! The visibilities of a downlink file as a table for other programs.
 
 use std::io::{self, BufWriter, Write};
 use std::path::Path;

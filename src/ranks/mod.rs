@@ -1,9 +1,8 @@
-//! Processes that share the sums of a map, and what they tell one another: the ranks of an MPI job (`--mpi`, feature `mpi`).
+//! The ranks of an MPI job (`--mpi`, feature `mpi`): processes that share the sums of a map, and what they exchange.
 //!
 //! Each rank runs the whole chain and holds a part of the sums. Ranks exchange integers alone, never floats, whose sums would
-//! depend on how many ranks there are. All of them ask each other the same questions in the same order, from one thread at a
-//! time, and wait for all the others to do so. A rank that leaves early would be waited for in vain: it ends the job
-//! ([`RankJob::abort`]).
+//! depend on the number of ranks. All make the same collective calls in the same order, from one thread at a time. The others
+//! would wait for ever for a rank that leaves early: it ends the job ([`RankJob::abort`]).
 
 mod error;
 mod job;

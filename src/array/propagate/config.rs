@@ -22,7 +22,7 @@ pub enum StationKeeping {
 keys! {
     /// Orbits by numerical integration of the forces, from the formation's state at the epoch or from `array.kepler`.
     pub struct PropagateConfig {
-        /// Length of the integration; 0 for none.
+        /// Days for which orbits are integrated in the Moon's field; 0 for none.
         everyday days: f64 = 0.0;
         /// Degree and order of the Moon's field: 0, or 2 to 16.
         #[only_with("array.propagate.days > 0")]

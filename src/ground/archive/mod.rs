@@ -38,11 +38,10 @@
 //! the spans of open ones.
 //!
 //! # Size
-//! The journal takes some 95 bytes a packet of visibilities in a checkpoint and 300 in memory: of 26 million, in packets
-//! of 215 as windows give them, 12 MB and 36 MB a channel, of 550 MB of downlink. Held packets take up to `wait_bytes` in
-//! either. With or without an archive, positions take 9 kB a window, of at most 8192 windows, more than two years: 72 MB;
-//! and a packet of visibilities takes some 100 bytes more, 60 in the received set, which grows with the number of creation
-//! times, and 20 to 40 in the set of blocks, which doubles when it grows.
+//! The journal takes some 95 bytes a packet of visibilities in a checkpoint and 300 in memory: 12 and 36 MB a channel of 26
+//! million visibilities, in packets of 215. Held packets take up to `wait_bytes` in either. With or without an archive, memory
+//! holds positions, 9 kB a window for at most 8192 windows (72 MB, more than two years), and some 100 bytes a packet of
+//! visibilities: 60 in the received set and 20 to 40 in the set of blocks.
 //!
 //! # The raw archive
 //! A ground that listens keeps every packet that it accepts in `archive/` beside its checkpoints before it answers `taken`

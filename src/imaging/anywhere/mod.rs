@@ -1,4 +1,4 @@
-//! Maps with rows at the true positions: visibilities are held one by one, and the circle's map is refined.
+//! Maps with rows of B at the true positions: keeps every visibility, and refines the map of the nearest circle.
 
 mod archive;
 mod archived;

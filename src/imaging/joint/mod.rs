@@ -1,4 +1,4 @@
-//! Maps of several channels at once: what one frequency does not see, its neighbours tell.
+//! Maps of several channels at once: scales that one frequency does not see come from its neighbours.
 //!
 //! The sky's structure changes slowly with frequency. [`solve_jointly`] takes the sums of each channel as they are, estimates how alike the
 //! channels are ([`Likeness`]) with the map, and solves for all of them together: maps at every channel and at frequencies between, the

@@ -1,10 +1,10 @@
 //! Rows of B over spherical harmonics for satellites at any positions.
 //!
 //! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
-//! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the
-//! two agree. Along a track the rows of a pair change slowly, so that few are computed and the others interpolated
-//! (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. [`GeneralRows::plan_direct`]
-//! computes each row, the reference for the other.
+//! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the rows are those of
+//! [`crate::response::harmonic`]. Along a track the rows of a pair change slowly, so that few are computed and the others
+//! interpolated (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. As a reference
+//! [`GeneralRows::plan_direct`] computes each row.
 //!
 //! Antennas of a pair may have any response that is a polynomial in the direction ([`PairResponse`]), and visibilities may be averages over
 //! their integrations ([`GeneralRows::plan_of`]).
