@@ -67,7 +67,7 @@ impl Provenance {
             Card::text("ENGINE", engine(map.engine), "unknowns of the solution"),
         ];
         match map.engine {
-            EngineKind::Pixel => {
+            EngineKind::Pixel | EngineKind::Auto => {
                 let rows = format!("{:?}", map.rows).to_lowercase();
                 cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
                 if let Some(convergence) = solution.diagnostics.convergence {
@@ -188,7 +188,7 @@ fn antenna(response: AntennaResponse) -> &'static str {
 
 fn engine(engine: EngineKind) -> &'static str {
     match engine {
-        EngineKind::Pixel => "pixel",
+        EngineKind::Pixel | EngineKind::Auto => "pixel",
         EngineKind::Harmonic => "harmonic",
     }
 }

@@ -337,7 +337,7 @@ impl Accumulator {
                     let most = refine.visibilities_max;
                     Engine::Archive(Box::new(VisibilityArchive::restore(from, folder, most)?))
                 }
-                EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
+                EngineKind::Pixel | EngineKind::Auto => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
@@ -612,7 +612,7 @@ fn engine(
                 visibilities_max: config.refine.visibilities_max,
             })?)))
         }
-        EngineKind::Pixel => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
+        EngineKind::Pixel | EngineKind::Auto => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
             nside: config.nside,
             frequency_hz,
             method: config.rows,

@@ -208,6 +208,7 @@ impl ConfigSource {
         if reading.config.name.is_empty() {
             reading.config.name = self.default_name();
         }
+        reading.config.choose_engine();
         let of_values = problems_of(&reading.config);
         let told = reading.tell(of_values, bad_overrides);
         match told.is_empty() {
@@ -277,7 +278,7 @@ fn set<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigErro
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::imaging::MapConfig;
+    use crate::imaging::{EngineKind, MapConfig};
 
     fn with(overrides: &[&str]) -> Result<Config, ConfigError> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
@@ -287,6 +288,22 @@ mod tests {
     #[test]
     fn the_embedded_pipeline_is_good() {
         assert!(ConfigSource::default().load().is_ok());
+    }
+
+    /// The default pipeline is for any orbits: its engine is one that they allow.
+    #[test]
+    fn the_embedded_pipeline_takes_any_orbits() {
+        let cases: [(&[&str], EngineKind); 4] = [
+            (&[], EngineKind::Harmonic),
+            (&["array.eccentricity=0.01"], EngineKind::Pixel),
+            (&["array.cross_track_ratio=0.1"], EngineKind::Pixel),
+            (&["array.eccentricity=0.01", "map.refine.passes_max=3"], EngineKind::Harmonic),
+        ];
+        for (overrides, engine) in cases {
+            let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+            let config = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap();
+            assert_eq!(config.map.engine, engine, "{config:?}");
+        }
     }
 
     #[test]
