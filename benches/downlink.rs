@@ -294,7 +294,7 @@ impl Stage for Door {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), GroundError> {
-        black_box(self.calibrator.close(MissingPackets::default()));
+        black_box(self.calibrator.post_losses(MissingPackets::default()));
         Ok(())
     }
 }
@@ -349,7 +349,7 @@ fn replay(bytes: &[u8], sent: u64) {
         let sums = graph.stage("ground", 1, bytes, ground);
         graph.sink("end", sums, End(0, PhantomData));
         run(graph);
-        outcome.ledger.close().unwrap().accumulated
+        outcome.ledger.balanced_report().unwrap().accumulated
     };
     let time = |run: &dyn Fn() -> u64| {
         let start = Instant::now();

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::AntennaResponse;
-use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsSetup};
+use lunarray::response::general::{GeneralRows, ObservationDetails, PairResponse, RowsSetup, TimedPair};
 use lunarray::response::pixel::{Directions, PairGeometry, SatelliteAntenna, sky_sums};
 use lunarray::sky::harmonics::Alm;
 use lunarray::sky::healpix::{pixel_area_sr, pixel_directions};
@@ -33,7 +33,7 @@ fn position_m(array: &Array, n: usize, t_s: f64) -> Vec3 {
     add(scale(1.0 + 20e3 / 2037.1e3 * phase.cos(), circle_m), scale(across_m, array.normal_hat(n, t_s)))
 }
 
-fn day(array: &Array) -> Vec<PairAt> {
+fn day(array: &Array) -> Vec<TimedPair> {
     let mut out = Vec::new();
     for i in 0..8_u8 {
         for j in i + 1..8 {
@@ -47,7 +47,7 @@ fn day(array: &Array) -> Vec<PairAt> {
                         break;
                     }
                     let pair = Pair { i, j };
-                    out.push(PairAt { pair, time_s: t_s, r_i_m, r_j_m });
+                    out.push(TimedPair { pair, time_s: t_s, r_i_m, r_j_m });
                     // As far as a fringe at the horizon turns by an eighth of its wavelength.
                     t_s += (0.125 * 8248.68 / TAU / wavelengths).clamp(0.5, 60.0);
                 }
@@ -69,7 +69,7 @@ fn rms(values: impl Iterator<Item = Complex64>) -> f64 {
 }
 
 /// Products for a map and its noise map with averages over integrations and with antennas that differ, against those without, in turn.
-fn what_more_costs(at: &[PairAt], setup: RowsSetup, skies: &[Alm]) {
+fn what_more_costs(at: &[TimedPair], setup: RowsSetup, skies: &[Alm]) {
     let duration_s: Vec<f32> = at
         .iter()
         .map(|at| {
@@ -94,19 +94,19 @@ fn what_more_costs(at: &[PairAt], setup: RowsSetup, skies: &[Alm]) {
         ("averages of dipoles with patterns", 6, true, AntennaResponse::DipoleNormal, 0.05),
     ] {
         let response = |k: usize| {
-            let PairAt { pair, r_i_m, r_j_m, .. } = at[k];
+            let TimedPair { pair, r_i_m, r_j_m, .. } = at[k];
             let pair = [(pair.i, r_i_m), (pair.j, r_j_m)];
             let [a, b] = pair.map(|(satellite, r_m)| antenna(elements, distortion, satellite, r_m));
             PairResponse::of_antennas([&a, &b])
         };
-        let observed = Observed {
+        let observed = ObservationDetails {
             duration_s: if averages { &duration_s } else { &[] },
             response: if degree > 0 { Some(&response) } else { None },
         };
         let rows = GeneralRows::new(setup);
         let plan = rows.plan(at).unwrap();
         let more = GeneralRows::new(RowsSetup { polynomial_degree: degree, ..setup });
-        let more_plan = more.plan_of(at, &observed).unwrap();
+        let more_plan = more.plan_with(at, &observed).unwrap();
         let mut ratios = Vec::new();
         let mut more_s = Vec::new();
         for _ in 0..3 {
@@ -179,7 +179,7 @@ fn main() {
     }
     // A pass as it is turned: every 50th visibility, each row for itself.
     let some: Vec<usize> = (0..at.len()).step_by(50).collect();
-    let few: Vec<PairAt> = some.iter().map(|&k| at[k]).collect();
+    let few: Vec<TimedPair> = some.iter().map(|&k| at[k]).collect();
     let direct = rows.plan_direct(&few).unwrap();
     let (_, exact) = seconds(|| rows.forward(&direct, &skies));
     let error = rms(some.iter().zip(&exact[0]).map(|(&k, exact)| values[0][k] - exact));

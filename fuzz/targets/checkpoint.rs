@@ -21,7 +21,7 @@ fn state(data: &[u8], map: &MapConfig) {
     file.extend(u64::from(u16::from_le_bytes(*length)).to_le_bytes());
     file.extend(body);
     file.extend(crc_fast::checksum(Crc64Nvme, &file).to_le_bytes());
-    if let Ok(survey) = CoverageSurvey::of_bytes(&file, map) {
+    if let Ok(survey) = CoverageSurvey::from_bytes(&file, map) {
         let gaps = survey.gaps();
         for gap in &gaps.gaps {
             assert!(gap.from <= gap.to);

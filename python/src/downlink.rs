@@ -9,7 +9,7 @@ use lunarray::products::{VisibilityRow, VisibilityTable, jansky_per_k_sr};
 use lunarray::response::harmonic::GeometryLimits;
 use lunarray::runtime::Cancel;
 use lunarray::units::ChannelId;
-use lunarray::units::time_scales::tai_less_utc_s;
+use lunarray::units::time_scales::tai_minus_utc_s;
 use lunarray::units::vector::{Vec3, sub};
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
@@ -27,7 +27,7 @@ const FROM_1958_NS: i128 = 4383 * 86_400 * 1_000_000_000;
 pub(crate) fn inspect(py: Python<'_>, path: PathBuf) -> PyResult<String> {
     wait_to_read(py, &Cancel::new(), move || {
         let mut survey = GeometrySurvey::new(GeometryLimits::default());
-        let contents = Contents::read_with(&path, &mut |frame| survey.see(frame))?;
+        let contents = Contents::read_with(&path, &mut |frame| survey.add(frame))?;
         let mut value = serde_json::to_value(&contents)?;
         if let Some(object) = value.as_object_mut() {
             object.insert("geometry".to_owned(), serde_json::to_value(survey.finish())?);
@@ -135,7 +135,7 @@ fn put(bytes: &mut Vec<u8>, row: &VisibilityRow, epoch_ns: i128, frequency_hz: f
     bytes.extend((row.middle_half_us as f64 * 0.5e-6).to_ne_bytes());
     bytes.extend(tai_ns.to_ne_bytes());
     // `datetime64` has no second 60: a leap second is that of the next midnight.
-    let behind_ns = tai_less_utc_s(tai_ns.div_euclid(1_000_000_000)) * 1_000_000_000;
+    let behind_ns = tai_minus_utc_s(tai_ns.div_euclid(1_000_000_000)) * 1_000_000_000;
     bytes.extend(tai_ns.saturating_sub(behind_ns).to_ne_bytes());
     bytes.extend((f64::from(row.duration_us) * 1e-6).to_ne_bytes());
     bytes.extend([row.pair.i + 1, row.pair.j + 1, row.flags.0, 0]);

@@ -1,9 +1,9 @@
-//! Scaled baselines, which stand for another frequency.
+//! Scaling of baselines, which is equivalent to a change of frequency.
 
 use crate::units::vector::{Vec3, add, norm, scale, sub};
 
-/// Moves two positions (m) along their circle about the Moon until their distance is `factor` times as long: they then
-/// have the fringes that the pair has at `factor` times the frequency.
+/// Moves two positions (m) along their circle about the Moon until their distance is `factor` times as long. They
+/// then have the fringes of the original pair at `factor` times the frequency.
 ///
 /// The Moon's limb moves by half the added length: 2e-5 rad for 100 km and a factor of 1.0008, 8 kHz at 10 MHz.
 #[must_use]
@@ -30,7 +30,7 @@ mod tests {
         for factor in [0.9, 1.0, 1.0004, 1.5] {
             let (i_m, j_m) = scaled_baseline(r_i_m, r_j_m, factor);
             let (was_m, is_m) = (sub(r_i_m, r_j_m), sub(i_m, j_m));
-            // Nanometres of rounding in 2000 km.
+            // Rounding of 2000 km is some nanometres.
             assert!(norm(sub(is_m, scale(factor, was_m))) < 1e-8);
             assert!((norm(i_m) - norm(r_i_m)).abs() < 1e-8 && (norm(j_m) - norm(r_j_m)).abs() < 1e-8);
         }

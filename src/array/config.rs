@@ -15,7 +15,7 @@ use crate::units::{Checks, InvalidValue, MAX_SATELLITES, keys};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum NodeMotion {
-    /// Westward, as lunar J2 makes it for a prograde orbit.
+    /// Westward, as caused by lunar J2 for a prograde orbit.
     #[default]
     Regress,
     /// Eastward.
@@ -77,11 +77,12 @@ keys! {
     }
 }
 
-/// What grows by the same factor from daughter to daughter.
+/// Quantity that grows by the same factor from daughter to daughter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Spacing {
-    /// The distance to the daughter before (the paper, Sect. 2): more daughters lie between the third and the last.
+    /// The distance to the preceding daughter (the paper, Sect. 2): more daughters lie between the third and the
+    /// last.
     #[default]
     Steps,
     /// The arc to daughter 1: more daughters lie close to the first two as well.
@@ -109,69 +110,69 @@ keys! {
     }
 }
 
-/// Why there is no such array.
+/// Error of an array.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ArrayError {
-    /// A value of the configuration that is not accepted.
+    /// A value of the configuration is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
-    /// A file of an orbit that cannot be used.
+    /// An orbit file cannot be used.
     #[error("{}: {what}", path.display())]
     Oem {
         /// The file.
         path: PathBuf,
-        /// What was found there, and what was expected.
+        /// Problem in the file, and what was expected.
         what: String,
     },
-    /// A time at which positions are not known.
+    /// Positions are not known at a time.
     #[error(
         "t = {t_s} s: expected a time at which positions are known, {:.3} s to {:.3} s after the mission's epoch{}", known_s[0],
-        known_s[1], epoch_said(*epoch_tai_s)
+        known_s[1], epoch_text(*epoch_tai_s)
     )]
     NotKnown {
         /// The time, s after the mission's epoch.
         t_s: f64,
-        /// First and last that are known, s.
+        /// First and last time at which positions are known, s.
         known_s: [f64; 2],
-        /// The epoch, if the orbits have dates: TAI seconds since 1958.
+        /// Epoch, if the orbits have dates: TAI seconds since 1958.
         epoch_tai_s: Option<f64>,
     },
-    /// A propagated satellite that does not stay in orbit.
+    /// A propagated satellite leaves its orbit.
     #[error(
         "array.propagate: satellite {satellite} is {:.1} km from the Moon's centre after {day:.2} days; expected orbits above \
          the surface: a higher one, fewer days, or station keeping of the orbit", radius_m / 1e3
     )]
     Strays {
-        /// Which, from 1.
+        /// Number of the satellite, from 1.
         satellite: usize,
-        /// When, days after the epoch.
+        /// Time, days after the epoch.
         day: f64,
-        /// How far from the Moon's centre it is, m.
+        /// Distance from the Moon's centre, m.
         radius_m: f64,
     },
-    /// Satellites that are not apart.
+    /// Two satellites have the same position.
     #[error(
         "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
     )]
     OnePlace {
-        /// One of them, from 1.
+        /// The first one, from 1.
         first: usize,
-        /// The other.
+        /// The second one, from 1.
         second: usize,
     },
-    /// Daughters that meet.
+    /// Two daughters meet.
     #[error(
-        "array: daughters {} and {} would meet, or change places, as the formation breathes: their arcs behind daughter 1 go \
+        "array: daughters {} and {} would meet, or overtake each other, as the formation breathes: their arcs behind daughter 1 go \
          from {} m and {} m to {} m and {} m; expected ascending arcs at all times", first, first + 1, wide_m[0],
         wide_m[1], narrow_m[0], narrow_m[1]
     )]
     Meeting {
-        /// The first of the two, from 1.
+        /// The first one, from 1.
         first: usize,
-        /// Their greatest arcs, m.
+        /// Maximum arcs of both, m.
         wide_m: [f64; 2],
-        /// Their smallest arcs, m.
+        /// Minimum arcs of both, m.
         narrow_m: [f64; 2],
     },
     /// No geometric progression of spacings fits.
@@ -191,16 +192,16 @@ pub enum ArrayError {
     },
 }
 
-fn epoch_said(epoch_tai_s: Option<f64>) -> String {
-    let said = |tai_s| format!(", which is {} UTC", utc_text(tai_s));
-    epoch_tai_s.map(said).unwrap_or_default()
+fn epoch_text(epoch_tai_s: Option<f64>) -> String {
+    let utc_suffix = |tai_s| format!(", which is {} UTC", utc_text(tai_s));
+    epoch_tai_s.map(utc_suffix).unwrap_or_default()
 }
 
-/// Greatest radius or altitude that is accepted, m: the Moon's sphere of influence has 6.6e7 m.
+/// Maximum accepted radius or altitude, m: the Moon's sphere of influence has 6.6e7 m.
 const ORBIT_M_MAX: f64 = 1e8;
 
 impl ArrayConfig {
-    /// Whether satellites have orbits of their own, in place of a formation on one.
+    /// Whether each satellite has its own orbit, instead of a formation on one.
     #[must_use]
     #[doc(hidden)]
     pub fn has_own_orbits(&self) -> bool {
@@ -214,11 +215,11 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// Checks the keys of dates, which orbits of files bring themselves.
+    /// Checks the keys of dates, which orbit files replace.
     fn check_dates(&self, checks: &mut Checks) {
         let epoch = &self.oem_epoch;
-        // A second 60 is for the files' time system to judge.
-        let is_date = |scale| Tai::read(epoch, scale).is_some();
+        // Whether a second 60 exists depends on the files' time system.
+        let is_date = |scale| Tai::parse(epoch, scale).is_some();
         let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
         let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
         checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
@@ -235,10 +236,15 @@ impl ArrayConfig {
         let breathing = &self.breathing;
         let count = self.satellites as f64;
         checks.number("satellites", count, (3..=MAX_SATELLITES).contains(&self.satellites), "3 to 64");
-        // As far away the Moon no longer holds them.
+        // At larger distances the Moon does not hold satellites.
         for (key, value) in [("moon_radius_m", self.moon_radius_m), ("altitude_m", self.altitude_m)] {
             let inside = value > 0.0 && value <= ORBIT_M_MAX;
-            checks.number(key, value, inside, "above 0 and at most 1e8 m, beyond which the Earth takes over");
+            checks.number(
+                key,
+                value,
+                inside,
+                "above 0 and at most 1e8 m, within the Moon's sphere of influence",
+            );
         }
         for (key, value) in [
             ("breathing.first_spacing_m_min", breathing.first_spacing_m_min),
@@ -257,7 +263,7 @@ impl ArrayConfig {
             checks.number(key, period, period >= 100.0, "at least 100 s");
         }
         let period = self.orbital_period_s;
-        // Bounds the number of windows in the longest mission to a million.
+        // The limit bounds the number of windows in the longest mission to a million.
         checks.number("orbital_period_s", period, period >= 1e3, "at least 1000 s");
         let inclination = self.inclination_deg;
         checks.number("inclination_deg", inclination, (0.0..=180.0).contains(&inclination), "0 to 180");
@@ -294,7 +300,7 @@ impl ArrayConfig {
         checks.number("breathing.span_m_max", span_m, inside, expected);
     }
 
-    /// Checks orbits that are given one by one, by elements or in files.
+    /// Checks orbits given for each satellite, by elements or in files.
     fn check_own_orbits(&self, checks: &mut Checks) {
         let (arcs, orbits, files) = (self.arcs_m.len(), self.kepler.len(), self.oem.len());
         let given = format_args!("({orbits} orbits)");
@@ -310,11 +316,11 @@ impl ArrayConfig {
         checks.require("oem", given, one, "none where array.propagate.days is given");
     }
 
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All invalid values; empty if there are none.
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array");
+        let mut checks = Checks::new("array");
         self.check_orbit(&mut checks);
         self.check_ellipse(&mut checks);
         self.check_arcs(&mut checks);

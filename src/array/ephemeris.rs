@@ -13,16 +13,16 @@ use crate::frames::EphemerisSegment;
 use crate::units::vector::Vec3;
 use crate::units::{MissionTime, TICKS_PER_SECOND};
 
-/// Nodes of one interpolation.
+/// Number of nodes of an interpolation.
 const NODES: usize = 8;
 
-/// Segments examined for one time: the latest that start before it, as a few may overlap.
+/// Number of segments examined for one time: the latest that start before it, as a few may overlap.
 const OVERLAPPING_MAX: usize = 8;
 
 /// The ephemeris of `array` from `start` to `end`, in segments without a turnaround of the formation inside, each of at
 /// least eight nodes at most `step_s_max` apart.
 ///
-/// Covers every time from `start` to `end`; segments may extend beyond by less than a step.
+/// The segments cover every time from `start` to `end`; they may extend beyond by less than a step.
 #[must_use]
 pub fn segments_for(
     array: &Array,
@@ -41,7 +41,7 @@ pub fn segments_for(
     segments
 }
 
-/// The tick of the first turnaround of a formation after `from`, which may itself be one.
+/// Tick of the first turnaround of a formation after `from`, which may itself be one.
 fn turnaround_after(array: &Array, from: MissionTime) -> Option<MissionTime> {
     let formation = array.breathing()?;
     let next_after =
@@ -75,16 +75,16 @@ fn segment(
     EphemerisSegment { start: first, step_ticks: step as u32, satellites: satellites as u8, positions_m }
 }
 
-/// Outcome of offering a segment to an [`Ephemeris`].
+/// Outcome of inserting a segment into an [`Ephemeris`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Insertion {
-    /// It is in the table.
+    /// It was inserted.
     New,
-    /// It was there before.
+    /// It was in the table before.
     Repeated,
-    /// Another one that begins at the same time was there before, and stays.
+    /// Another segment that starts at the same time is in the table, and stays.
     Contradictory,
-    /// The table is full of later ones.
+    /// The table is full of later segments.
     TooOld,
     /// It has fewer than eight nodes, or no step.
     Unusable,
@@ -98,14 +98,14 @@ pub struct Ephemeris {
 }
 
 impl Default for Ephemeris {
-    /// Room for 1024 segments: ten weeks of windows, some 10 MB with eight satellites.
+    /// Creates a table for 1024 segments: ten weeks of windows, some 10 MB with eight satellites.
     fn default() -> Self {
         Self::new(1024)
     }
 }
 
 impl Ephemeris {
-    /// An empty table with room for `segments_max` segments; beyond them the earliest are dropped.
+    /// Creates an empty table for `segments_max` segments, of which the earliest are dropped first.
     #[must_use]
     pub fn new(segments_max: usize) -> Self {
         Self { segments: BTreeMap::new(), segments_max: segments_max.max(1) }
@@ -190,8 +190,8 @@ impl Ephemeris {
         Some(position_m)
     }
 
-    /// The segment valid at a time, the one of latest start that covers it, and the time up to which it is valid. A
-    /// function of the time and the table only.
+    /// Segment valid at a time, the latest that covers it, and the time up to which it is valid. Depends on the time
+    /// and the table only.
     pub(super) fn valid_at(&self, time: MissionTime) -> ValidSegment<'_> {
         let before = self.segments.range(..=time).rev().take(OVERLAPPING_MAX);
         let segment = before.map(|(_, segment)| segment).find(|segment| segment.covers(time));
@@ -209,12 +209,12 @@ pub(super) struct ValidSegment<'a> {
     pub(super) last: MissionTime,
 }
 
-/// The interpolating polynomials of some satellites from one node of a segment to the next.
+/// Interpolating polynomials of some satellites from one node of a segment to the next.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Piece<const N: usize> {
-    /// Middle between the two nodes, half ticks after the mission epoch.
+    /// Time of the middle between the two nodes, half ticks after the mission epoch.
     pub(super) middle_half_ticks: i64,
-    /// Half of the time between them, half ticks.
+    /// Half the time between them, half ticks.
     pub(super) reach_half_ticks: i64,
     steps_per_half_tick: f64,
     /// Coefficient of each power of the steps after the middle, for each coordinate.
@@ -222,8 +222,8 @@ pub(super) struct Piece<const N: usize> {
 }
 
 impl<const N: usize> Piece<N> {
-    /// The piece valid at a time; the first and last piece of a segment extrapolate. `None` if the segment has fewer
-    /// than eight nodes or lacks a satellite.
+    /// Computes the piece valid at a time; the first and last piece of a segment extrapolate. `None` if the segment
+    /// has fewer than eight nodes or lacks a satellite.
     pub(super) fn at(segment: &EphemerisSegment, half_ticks: i64, satellites: [usize; N]) -> Option<Self> {
         const MONOMIALS: [[[f64; NODES]; NODES]; NODES - 1] = monomials();
         let known = usize::from(segment.satellites);
@@ -283,7 +283,8 @@ const fn monomials() -> [[[f64; NODES]; NODES]; NODES - 1] {
             let (mut k, mut degree) = (0, 0);
             while k < NODES {
                 if k != m {
-                    // Times `(s - o - 1/2) + (o + 1/2 - k)`; exact but for the scale: halves of whole numbers.
+                    // The factor is `(s - o - 1/2) + (o + 1/2 - k)`; exact except for the scale, as all terms are
+                    // halves of integers.
                     let shift = o as f64 + 0.5 - k as f64;
                     degree += 1;
                     let mut power = degree;
@@ -339,7 +340,7 @@ mod tests {
         table
     }
 
-    /// Greatest error over a window between its nodes, m.
+    /// Maximum error over a window between its nodes, m.
     fn worst_m(array: &Array, start_s: f64, end_s: f64) -> f64 {
         let table = table(array, start_s, end_s);
         let count = 20_011;
@@ -394,13 +395,13 @@ mod tests {
                 assert!(worst_m < 1e-5, "{before_s} s before {turnaround_s}: {worst_m}");
             }
         }
-        // Without parting there, the jump of 0.2 m/s over a step of a minute would cost more than a metre.
+        // Without a division there, the jump of 0.2 m/s over a step of a minute would cost more than a metre.
         let (start_s, end_s) = (7.0 * DAY_S - 2_000.0, 7.0 * DAY_S + 750.0);
         assert_eq!(table(&array, start_s, end_s).len(), 2);
     }
 
     #[test]
-    fn quick_breathing_parts_a_window_often() {
+    fn fast_breathing_divides_a_window_often() {
         let breathing = BreathingConfig { period_s: 777.777_777_7, ..Default::default() };
         let array = Array::new(&ArrayConfig { breathing, ..Default::default() }).unwrap();
         // Both ends of a segment are turnarounds here: the one node beyond is less than 8 ticks off, in
@@ -414,7 +415,7 @@ mod tests {
     #[test]
     fn an_interval_is_covered_without_a_gap() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
-        // Parted at the turnaround.
+        // The interval is divided at the turnaround.
         let turnaround_s = 7.0 * DAY_S;
         let mut table = table(&array, turnaround_s - 1000.0, turnaround_s + 1000.0);
         let covers = |table: &Ephemeris, from_s: f64, to_s: f64| {
@@ -444,7 +445,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_is_bounded_and_keeps_what_it_knew() {
+    fn the_table_is_bounded_and_keeps_its_segments() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let segment =
             |start: i64| segments_for(&array, MissionTime(start), MissionTime(start + 1_000), 60.0).remove(0);

@@ -8,10 +8,10 @@ use super::state::SatelliteState;
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::{Checks, InvalidValue};
 
-/// States of a stretch, at least: as many as its interpolation takes.
+/// Minimum number of states of a stretch: as many as interpolation needs.
 const STATES_MIN: f64 = 4.0;
 
-/// How orbits are written as OEM files.
+/// Settings for writing orbits as OEM files.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OemExport {
     epoch: Tai,
@@ -19,17 +19,17 @@ pub struct OemExport {
     step_s: f64,
 }
 
-/// Years of dates that are written, TAI since 1970, s: 1972 to 2200. UTC begins with 1972.
+/// Accepted dates, TAI since 1970, s: 1972 to 2200. UTC starts with 1972.
 const DATES_1958_S: [f64; 2] = [4.42e8, 7.64e9];
 
 impl OemExport {
-    /// Files of a mission whose epoch is `epoch_tai_s` (TAI since 1958-01-01), that end `until_s` later, with states at most `step_s`
-    /// apart.
+    /// Creates the settings of a mission whose epoch is `epoch_tai_s` (TAI since 1958-01-01). Files end `until_s`
+    /// later, with states at most `step_s` apart.
     ///
     /// # Errors
-    /// The first of them that is not accepted.
+    /// The first value that is not accepted.
     pub fn new(epoch_tai_s: f64, until_s: f64, step_s: f64) -> Result<Self, InvalidValue> {
-        let mut checks = Checks::of("");
+        let mut checks = Checks::new("");
         let [from_s, to_s] = DATES_1958_S;
         let expected = "TAI since 1958, s, of the years 1972 to 2200";
         checks.number("epoch", epoch_tai_s, (from_s..to_s).contains(&epoch_tai_s), expected);
@@ -42,7 +42,7 @@ impl OemExport {
         checks.number("--step", step_s, (1.0..=600.0).contains(&step_s), "1 s to 600 s");
         match checks.finish().into_iter().next() {
             Some(problem) => Err(problem),
-            None => Ok(Self { epoch: Tai::from_1958_s(epoch_tai_s), until_s, step_s }),
+            None => Ok(Self { epoch: Tai::from_seconds_since_1958(epoch_tai_s), until_s, step_s }),
         }
     }
 
@@ -51,11 +51,12 @@ impl OemExport {
         self.epoch.plus_s(time_s).text(TimeScale::Utc, 9)
     }
 
-    /// The file of one satellite (from 0), and the number of its states.
+    /// Text of the file of one satellite (from 0), and the number of its states.
     ///
-    /// Positions to a micrometre and velocities to a nanometre a second, on the axes of EME2000, in stretches between which the velocity
-    /// jumps: where a formation turns round, or station keeping acts. Orbits of tables are written at their own states, as long as
-    /// they last. Dates are UTC to a nanosecond; a comment says so where the Earth of the mission is idealised.
+    /// Positions are written to a micrometre and velocities to a nanometre per second, on the axes of EME2000, in
+    /// stretches between which the velocity jumps: at turnarounds of a formation, and at station keeping. Tabulated
+    /// orbits are written at their own states, as long as they last. Dates are UTC to a nanosecond; a comment says so
+    /// if the Earth of the mission is idealised.
     #[must_use]
     pub fn text(&self, array: &Array, satellite: usize) -> (String, usize) {
         let stretches = array.stretches(satellite).unwrap_or_else(|| self.sampled(array, satellite));
@@ -110,7 +111,7 @@ impl OemExport {
                     if k as f64 == steps { to_s } else { from_s + (to_s - from_s) * k as f64 / steps };
                 let mut state = array.state(satellite, time_s);
                 if k as f64 == steps {
-                    // The velocity before it jumps.
+                    // The velocity before the jump.
                     state = SatelliteState {
                         velocity_m_s: array.state(satellite, time_s - 1e-6).velocity_m_s,
                         ..state
@@ -125,7 +126,7 @@ impl OemExport {
     }
 }
 
-/// A .. Z, AA, AB, .. for numbers from 0.
+/// Letters A .. Z, AA, AB, .. for numbers from 0.
 fn letters(number: usize) -> String {
     let letter = |k: usize| char::from(b'A' + (k % 26) as u8);
     let high = if number < 26 { String::new() } else { letter(number / 26 - 1).to_string() };
@@ -143,14 +144,14 @@ mod tests {
     const EPOCH_TAI_S: f64 = 26_662.0 * DAY_S;
 
     #[test]
-    fn what_is_written_is_read_again_to_a_millimetre() {
+    fn written_files_are_read_again_to_a_millimetre() {
         let formation = ArrayConfig { satellites: 3, arcs_m: vec![2e3, 9e3], ..ArrayConfig::default() };
         let shaped = ArrayConfig { eccentricity: 0.02, cross_track_ratio: 0.1, ..formation.clone() };
         let propagate = PropagateConfig { days: 10.0, keep_every_days: 3.0, ..PropagateConfig::default() };
         let propagated = ArrayConfig { propagate, ..shaped.clone() };
         for config in [formation, shaped, propagated] {
             let array = Array::new(&config).unwrap();
-            // Half a minute before midnight UTC, 37 s behind TAI.
+            // The epoch is half a minute before midnight UTC, 37 s behind TAI.
             assert!(
                 OemExport::new(EPOCH_TAI_S, DAY_S, 120.0)
                     .unwrap()
@@ -172,7 +173,7 @@ mod tests {
             assert!(span[0] == 0.0 && span[1] >= 10.0 * DAY_S && span[1] < 10.01 * DAY_S, "{span:?}");
             assert_eq!((array.epoch_tai_s(), again.epoch_tai_s()), (None, Some(EPOCH_TAI_S)));
             for k in 0..2_000 {
-                // Through a turnaround after seven days, and through station keeping.
+                // The times include a turnaround after seven days, and station keeping.
                 let t_s = 431.7 * f64::from(k);
                 for n in 0..3 {
                     let [was, is] = [&array, &again].map(|array| array.state(n, t_s));
@@ -184,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_told() {
+    fn values_that_cannot_be_written_are_refused() {
         for (epoch_tai_s, until_s, step_s, told) in [
             (0.0, 1e5, 60.0, "epoch"),
             (f64::NAN, 1e5, 60.0, "epoch"),

@@ -2,11 +2,11 @@
 
 use super::config::{ArrayConfig, ArrayError, Spacing};
 
-/// Greatest arcs by which the daughters trail daughter 1, and their breathing: the arcs shrink linearly to `s_n / R_n` in
-/// half a period, and grow back (the paper, Sect. 2).
+/// Maximum arcs by which the daughters trail daughter 1, and their breathing: the arcs shrink linearly to `s_n / R_n`
+/// in half a period, and grow back (the paper, Sect. 2).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Formation {
-    /// The progression from which the arcs were made, if they were.
+    /// Progression of the arcs, if they follow one.
     pub progression: Option<Progression>,
     arc_m_max: Vec<f64>,
     shrink: Vec<f64>,
@@ -25,10 +25,10 @@ pub struct Progression {
 }
 
 impl Progression {
-    /// The progression of a configuration, from daughter 2 at its distance to the last one at the whole span.
+    /// Computes the progression of a configuration, from daughter 2 at its distance to the last one at the full span.
     ///
     /// # Errors
-    /// [`ArrayError::Progression`] when none meets the spacings.
+    /// [`ArrayError::Progression`] if none meets the spacings.
     pub fn new(config: &ArrayConfig) -> Result<Self, ArrayError> {
         let breathing = &config.breathing;
         let first_m = breathing.first_ratio * breathing.first_spacing_m_min;
@@ -36,7 +36,7 @@ impl Progression {
         let span_m = breathing.span_m_max;
         let refused = || ArrayError::Progression { satellites: config.satellites, first_m, second_m, span_m };
         let steps = config.satellites.saturating_sub(2);
-        // Three daughters have one step, from the second to the span: nothing is left to choose.
+        // Three daughters have one step, from the second to the span, which leaves no choice.
         if breathing.growing == Spacing::Arcs || steps < 2 {
             let step_ratio = (span_m / first_m).powf(1.0 / steps.max(1) as f64);
             let rises = step_ratio.is_finite() && step_ratio > 1.0;
@@ -61,10 +61,10 @@ impl Progression {
 }
 
 impl Formation {
-    /// The formation of a configuration.
+    /// Creates the formation of a configuration.
     ///
     /// # Errors
-    /// [`ArrayError::Progression`] when no progression meets the spacings; [`ArrayError::Meeting`] when daughters meet.
+    /// [`ArrayError::Progression`] if no progression meets the spacings; [`ArrayError::Meeting`] if daughters meet.
     pub fn new(config: &ArrayConfig) -> Result<Self, ArrayError> {
         let breathing = &config.breathing;
         let progression = if config.arcs_m.is_empty() { Some(Progression::new(config)?) } else { None };
@@ -74,7 +74,7 @@ impl Formation {
         };
         let ratio = |n: usize| if n == 1 { breathing.first_ratio } else { breathing.ratio };
         let narrow_m = |n: usize| arc_m_max[n] / ratio(n);
-        // Arcs are linear in between.
+        // Arcs are linear in time between these extremes.
         for n in 1..arc_m_max.len() {
             let (wide_m, narrow_m) = ([arc_m_max[n - 1], arc_m_max[n]], [narrow_m(n - 1), narrow_m(n)]);
             if [wide_m, narrow_m].iter().any(|[before, after]| before >= after) {
@@ -114,17 +114,17 @@ impl Formation {
         }
     }
 
-    /// The first instant after `t_s` at which the daughters' speeds change, s.
+    /// First instant after `t_s` at which the daughters' speeds change, s.
     #[must_use]
     pub fn next_turnaround_s(&self, t_s: f64) -> f64 {
         let half_s = 0.5 * self.period_s;
         let number = (t_s / half_s).floor() + 1.0;
-        // The quotient of a turnaround may be rounded to below its number.
+        // The quotient of a turnaround may be rounded to below its integer.
         if number * half_s > t_s { number * half_s } else { (number + 1.0) * half_s }
     }
 }
 
-/// The q > 1 with (q^steps - 1) / (q - 1) = `sum`, by bisection; the left side rises with q.
+/// The q > 1 with (q^steps - 1) / (q - 1) = `sum`, by bisection; the left side increases with q.
 fn step_ratio(steps: usize, sum: f64) -> Option<f64> {
     let steps = i32::try_from(steps).ok()?;
     let series = |q: f64| (0..steps).rev().fold(0.0, |acc, _| acc * q + 1.0);

@@ -1,4 +1,4 @@
-//! The adaptive integration time.
+//! Adaptive integration time.
 
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
@@ -6,9 +6,9 @@ use crate::units::vector::{Vec3, norm, sub};
 /// Limits of the integration time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct IntegrationRule {
-    /// Longest integration, s.
+    /// Maximum integration time, s.
     pub duration_s_max: f64,
-    /// Wavelengths the baseline may move in one integration.
+    /// Maximum motion of the baseline in one integration, wavelengths.
     pub motion_wavelengths_max: f64,
 }
 

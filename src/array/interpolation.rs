@@ -1,17 +1,18 @@
-//! How well tabulated positions are interpolated, from the positions alone.
+//! Interpolation error of tabulated positions, from the positions alone.
 //!
-//! The polynomial through eight nodes errs by `d8r/dt8 h^8 / 8! s (s-1) .. (s-7)` (Abramowitz and Stegun 25.2.27), and the eighth
-//! difference of nine nodes is `h^8 d8r/dt8` at a time among them. So the orbit's own ninth node tells the error.
+//! The polynomial through eight nodes errs by `d8r/dt8 h^8 / 8! s (s-1) .. (s-7)` (Abramowitz and Stegun 25.2.27),
+//! and the eighth difference of nine nodes is `h^8 d8r/dt8` at a time among them. So a ninth node of the orbit
+//! determines the error.
 
 use crate::frames::EphemerisSegment;
 use crate::units::vector::{Vec3, norm};
 
-/// Nodes of one interpolation.
+/// Number of nodes of an interpolation.
 const NODES: usize = 8;
 
-/// Greatest error of the positions of a segment between its nodes, m, as far as its nodes tell: of motion that is as smooth between
-/// nodes as over nine of them. A segment of eight nodes has no ninth: what is said then is the error of seven of them, some ten times
-/// that of eight for orbits in steps of minutes. `None` of a segment that is too short.
+/// Estimated maximum error of the positions of a segment between its nodes, m, for motion that is as smooth between
+/// nodes as over nine of them. For a segment of eight nodes it is the error of seven nodes, some ten times that of
+/// eight for orbits in steps of minutes. `None` for a segment that is too short.
 #[must_use]
 pub fn interpolation_error_m(segment: &EphemerisSegment) -> Option<f64> {
     let (nodes, satellites) = (segment.nodes(), usize::from(segment.satellites));
@@ -36,7 +37,7 @@ pub fn interpolation_error_m(segment: &EphemerisSegment) -> Option<f64> {
             // The nodes that the interpolation goes through.
             let first = interval.saturating_sub(points / 2 - 1).min(nodes - points);
             let peak = peaks[(interval - first).min(points - 2)];
-            // They are the first or the last of those of either difference.
+            // They are the first or the last nodes of either difference.
             let of_both = first.saturating_sub(1)..(first + 1).min(differences_m.len());
             let most_m = differences_m[of_both].iter().fold(0.0, |most, m| f64::max(most, *m));
             worst_m = worst_m.max(peak * most_m);
@@ -55,9 +56,9 @@ fn binomials(order: usize) -> Vec<f64> {
     row
 }
 
-/// Greatest `|s (s-1) .. (s-n+1)| / n!` between nodes o and o + 1 of n, by o.
+/// Maximum of `|s (s-1) .. (s-n+1)| / n!` between nodes o and o + 1 of n, by o.
 fn peaks(points: usize) -> Vec<f64> {
-    // The extremum of a step is flat: a part of 4e-4 of it is lost between 64 places.
+    // The extremum of a step is flat: 64 samples miss at most a fraction of 4e-4.
     const PLACES: usize = 64;
     let product = |s: f64| (0..points).map(|k| (s - k as f64) / (k + 1) as f64).product::<f64>().abs();
     let peak = |o: usize| {
@@ -74,7 +75,7 @@ mod tests {
     use crate::units::MissionTime;
     use crate::units::vector::sub;
 
-    /// Segments of a table, and the greatest error of interpolation against the array itself.
+    /// Maximum error of the interpolation of a segment against the array itself.
     fn measured_m(array: &Array, segment: &EphemerisSegment) -> f64 {
         let mut table = Ephemeris::default();
         table.insert(segment.clone());
@@ -103,9 +104,9 @@ mod tests {
     }
 
     #[test]
-    fn nodes_tell_the_error_that_is_measured() {
+    fn the_estimated_error_is_the_measured_one() {
         let circle = Array::new(&ArrayConfig::default()).unwrap();
-        // Steps from a quarter of what packets have to ten times that, where f64 does not hide the error.
+        // Steps range from a quarter of those in packets to ten times that, where rounding does not hide the error.
         for (array, step_s, span_s) in [
             (&circle, 240.0, 7200.0),
             (&circle, 600.0, 7200.0),
@@ -123,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_of_a_window_say_micrometres_and_a_jump_shows() {
+    fn errors_in_a_window_are_micrometres_and_a_jump_is_found() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let mut segment = segments_for(&array, MissionTime(0), MissionTime(2_751_300_000), 60.0).remove(0);
         // 1.1 um by the formula at the ends, and what roundings of 2e-10 m and times make of it.
@@ -136,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn eight_nodes_say_no_less_than_the_error_and_fewer_say_nothing() {
+    fn eight_nodes_give_an_upper_limit_and_fewer_none() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let mut segment = segments_for(&array, MissionTime(0), MissionTime(1_000_000), 60.0).remove(0);
         assert_eq!(segment.nodes(), 8);

@@ -1,4 +1,4 @@
-//! Kepler orbits: an ellipse for each satellite, whose plane and line of apsides may turn at constant rates.
+//! Kepler orbits: an ellipse for each satellite, whose plane and line of apsides may rotate at constant rates.
 
 use std::f64::consts::TAU;
 
@@ -9,10 +9,10 @@ use crate::units::constants::{DAY_S, MOON_GM_M3_S2};
 use crate::units::vector::{Vec3, add, cross, scale};
 use crate::units::{Checks, InvalidValue};
 
-/// Greatest semi-major axis, m: the Moon's sphere of influence is 66,000 km.
+/// Maximum semi-major axis, m: the Moon's sphere of influence is 66,000 km.
 const SEMI_MAJOR_AXIS_M_MAX: f64 = 6.6e7;
 
-/// Most steps of Newton's method: some five are usual, and a dozen for eccentricities near one.
+/// Maximum number of Newton iterations: five are usual, and a dozen for eccentricities near one.
 const STEPS_MAX: usize = 64;
 
 /// Elements of one satellite's orbit about the Moon at the mission epoch, on ecliptic axes.
@@ -31,18 +31,18 @@ pub struct KeplerElements {
     pub periapsis_deg: f64,
     /// Mean anomaly, degrees.
     pub mean_anomaly_deg: f64,
-    /// Motion of the node, degrees a day.
+    /// Rate of the node, degrees per day.
     #[serde(default)]
     pub node_rate_deg_per_day: f64,
-    /// Motion of the argument of the periapsis, degrees a day.
+    /// Rate of the argument of the periapsis, degrees per day.
     #[serde(default)]
     pub periapsis_rate_deg_per_day: f64,
 }
 
 impl KeplerElements {
-    /// What is wrong with the elements of satellite `index`, from 0, above a Moon of a radius; empty if they are good.
+    /// Invalid elements of satellite `index`, from 0, above a Moon of a radius; empty if there are none.
     pub(super) fn problems(&self, index: usize, moon_radius_m: f64) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array");
+        let mut checks = Checks::new("array");
         let key = |name: &str| format!("kepler[{index}].{name}");
         let eccentricity = self.eccentricity;
         let bound = (0.0..1.0).contains(&eccentricity);
@@ -73,13 +73,13 @@ impl KeplerElements {
     }
 }
 
-/// The motion that some elements describe.
+/// Motion on an orbit with given elements.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct KeplerOrbit {
     axes_m: [f64; 2],
     eccentricity: f64,
     inclination_rad: f64,
-    /// Mean anomaly, argument of the periapsis and node: at the epoch, rad, and their rates, rad/s.
+    /// Mean anomaly, argument of the periapsis and node: values at the epoch, rad, and their rates, rad/s.
     anomaly: [f64; 2],
     periapsis: [f64; 2],
     node: [f64; 2],
@@ -90,7 +90,7 @@ impl KeplerOrbit {
         Self::about(elements, MOON_GM_M3_S2)
     }
 
-    /// The motion about a mass of this GM, m^3/s^2.
+    /// Creates the motion about a mass with this GM, m^3/s^2.
     pub(super) fn about(elements: &KeplerElements, gm_m3_s2: f64) -> Self {
         let &KeplerElements { semi_major_axis_m: axis_m, eccentricity, .. } = elements;
         let rate = |deg_per_day: f64| deg_per_day.to_radians() / DAY_S;
@@ -145,15 +145,15 @@ impl KeplerOrbit {
             [-cos_o * sin_w - sin_o * cos_w * cos_i, -sin_o * sin_w + cos_o * cos_w * cos_i, cos_w * sin_i];
         let in_space = |[x, y]: [f64; 2]| add(scale(x, to_periapsis), scale(y, beside));
         let position_m = in_space(plane_m);
-        // The line of apsides turns about the orbit's normal, the node about the pole.
+        // The line of apsides rotates about the orbit's normal, the node about the pole.
         let turning = add(scale(self.periapsis[1], self.normal_hat(t_s)), [0.0, 0.0, self.node[1]]);
         SatelliteState { position_m, velocity_m_s: add(in_space(plane_m_s), cross(turning, position_m)) }
     }
 }
 
-/// E of `E - e sin E = M`, by Newton's method.
+/// Solves `E - e sin E = M` for E by Newton's method.
 pub(super) fn eccentric_anomaly(mean_rad: f64, eccentricity: f64) -> f64 {
-    // From -pi to pi, where the start converges for every ellipse.
+    // M is reduced to -pi to pi, where the start converges for every ellipse.
     let mean = mean_rad - TAU * (mean_rad / TAU).round();
     let mut anomaly = if eccentricity > 0.8 { std::f64::consts::PI.copysign(mean) } else { mean };
     for _ in 0..STEPS_MAX {
@@ -184,7 +184,7 @@ mod tests {
         periapsis_rate_deg_per_day: 0.0,
     };
 
-    /// The same motion by its equation: `r'' = -GM r / r^3`, in steps of Runge and Kutta's fourth order.
+    /// The same motion by integration of `r'' = -GM r / r^3` with the fourth-order Runge-Kutta method.
     fn integrated(start: SatelliteState, to_s: f64, steps: usize) -> SatelliteState {
         let h = to_s / steps as f64;
         let pull = |r: Vec3| scale(-MOON_GM_M3_S2 / norm(r).powi(3), r);
@@ -210,7 +210,8 @@ mod tests {
             for part in [0.3, 0.77, 1.6] {
                 let t_s = part * orbit.period_s();
                 let (found, expected) = (orbit.state(t_s), integrated(start, t_s, 200_000));
-                // The integration's own error: h^4 of its 1e5 steps an orbit, more at a close periapsis, and rounding.
+                // The tolerance is the integration's own error: h^4 of its 1e5 steps per orbit, more at a close
+                // periapsis, and rounding.
                 assert!(norm(sub(found.position_m, expected.position_m)) < 1e-2, "{eccentricity} {part}");
                 assert!(norm(sub(found.velocity_m_s, expected.velocity_m_s)) < 1e-5, "{eccentricity} {part}");
             }
@@ -218,10 +219,10 @@ mod tests {
     }
 
     #[test]
-    fn elements_mean_what_their_names_say() {
+    fn elements_have_their_standard_meaning() {
         let orbit = KeplerOrbit::new(&KeplerElements { mean_anomaly_deg: 0.0, ..ELEMENTS });
         let SatelliteState { position_m, velocity_m_s } = orbit.state(0.0);
-        // At periapsis: a (1 - e) away, and as fast as vis viva says.
+        // At periapsis the distance is a (1 - e), and the speed follows from the vis-viva equation.
         assert!((norm(position_m) - 1.875e6).abs() < 1e-6);
         let speed_m_s = (MOON_GM_M3_S2 * (2.0 / 1.875e6 - 1.0 / 2.5e6)).sqrt();
         assert!((norm(velocity_m_s) - speed_m_s).abs() < 1e-9);
@@ -230,13 +231,13 @@ mod tests {
         // The node lies 70 degrees before it, at a longitude of 40 degrees.
         let (sin, cos) = 40_f64.to_radians().sin_cos();
         assert!((dot(unit(position_m), [cos, sin, 0.0]) - 70_f64.to_radians().cos()).abs() < 1e-12);
-        // Height above the ecliptic: sin i sin of the argument.
+        // The sine of the latitude is sin i times the sine of the argument.
         let height = 50_f64.to_radians().sin() * 70_f64.to_radians().sin();
         assert!((unit(position_m)[2] - height).abs() < 1e-12);
     }
 
     #[test]
-    fn planes_and_apsides_turn_as_told() {
+    fn planes_and_apsides_rotate_at_the_given_rates() {
         let turning =
             KeplerElements { node_rate_deg_per_day: -0.75, periapsis_rate_deg_per_day: 1.25, ..ELEMENTS };
         let orbit = KeplerOrbit::new(&turning);
@@ -258,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_round_ellipse_is_the_circle() {
+    fn an_ellipse_without_eccentricity_is_the_circle() {
         let circle = ArrayConfig::default();
         let axis_m = circle.moon_radius_m + circle.altitude_m;
         let period_s = TAU / (MOON_GM_M3_S2 / axis_m.powi(3)).sqrt();
@@ -270,7 +271,7 @@ mod tests {
             node_longitude_deg: 0.0,
             periapsis_deg: 0.0,
             mean_anomaly_deg: -(arc_m / axis_m).to_degrees(),
-            // Once in 1.3 years, backwards.
+            // One revolution in 1.3 years, backwards.
             node_rate_deg_per_day: -360.0 / (1.3 * 365.25),
             periapsis_rate_deg_per_day: 0.0,
         };
@@ -286,7 +287,7 @@ mod tests {
         };
         let (found, expected) = (windows(&array), windows(&circle));
         assert!(found.len() > 10 && found.len() == expected.len());
-        // Both search to a tick.
+        // Both searches are exact to a tick.
         assert!(found.iter().zip(&expected).all(|(found, expected)| (found - expected).abs() < 3e-6));
     }
 
@@ -340,7 +341,7 @@ mod tests {
         for n in 0..3 {
             let [before, at, after] = [-1.0, 0.0, 1.0].map(|s| array.state(n, 3e5 + s));
             let rate = scale(0.5, sub(after.position_m, before.position_m));
-            // As above: h^2 / 6 of the third derivative.
+            // The error is h^2 / 6 of the third derivative, as above.
             assert!(norm(sub(rate, at.velocity_m_s)) < 1e-3, "{n}");
         }
     }

@@ -50,4 +50,4 @@ pub use state::SatelliteState;
 #[doc(hidden)]
 pub use track::{orbit_normal_hat, tilted_axes, track_axes, track_offset_m};
 #[doc(hidden)]
-pub use windows::{EarthShadow, ObservingWindows, earth_in_sight_s};
+pub use windows::{EarthOccultation, ObservingWindows, earth_in_sight_s};

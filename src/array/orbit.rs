@@ -14,10 +14,10 @@ use crate::units::constants::DAY_S;
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
-/// Nearest that two satellites may be at the epoch, m.
-const APART_M: f64 = 1.0;
+/// Minimum distance of two satellites at the epoch, m.
+const DISTANCE_M_MIN: f64 = 1.0;
 
-/// An orbit of one satellite.
+/// Orbit of one satellite.
 #[derive(Clone, Debug, PartialEq)]
 enum OwnOrbit {
     Kepler(KeplerOrbit),
@@ -68,13 +68,13 @@ impl OwnOrbit {
     }
 }
 
-/// A formation on an ellipse, in planes that are inclined to each other.
+/// Deviation of a formation from a common circle: an ellipse, and inclined planes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Shape {
     eccentricity: f64,
     /// Argument of the periapsis at the epoch, rad, and its rate, rad/s.
     periapsis: [f64; 2],
-    /// Distance across the track at its greatest, in units of that along it.
+    /// Ratio of the maximum distance across the track to that along it.
     cross_track_ratio: f64,
 }
 
@@ -110,11 +110,11 @@ impl Shape {
 /// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
-    /// The formation on one orbit, if there is one.
+    /// Formation on one orbit, if there is one.
     formation: Option<Formation>,
-    /// Departure from a circle.
+    /// Deviation from a common circle.
     shape: Option<Shape>,
-    /// Orbits of their own; none for a formation.
+    /// Separate orbits of the satellites; empty for a formation.
     own: Vec<OwnOrbit>,
     orbit_radius_m: f64,
     moon_radius_m: f64,
@@ -124,14 +124,14 @@ pub struct Array {
     node_rad: f64,
     node_rate_rad_s: f64,
     earth: Earth,
-    /// Epoch of orbits that have dates.
+    /// Epoch of orbits with dates.
     epoch: Option<Tai>,
-    /// Content of orbit files that is not used.
+    /// Notes on content of orbit files that is not used.
     notes: Vec<String>,
 }
 
 impl Array {
-    /// The array of a configuration.
+    /// Creates the array of a configuration.
     ///
     /// # Errors
     /// The first of [`ArrayConfig::problems`], or a formation that cannot be built.
@@ -141,7 +141,7 @@ impl Array {
         }
         let rate = TAU / config.precession_period_s;
         let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
-        require_apart(&kepler)?;
+        require_distinct(&kepler)?;
         let (mut epoch, mut notes) = (None, Vec::new());
         let own: Vec<OwnOrbit> = if config.propagate.is_on() {
             propagate::orbits(config)?.into_iter().map(OwnOrbit::Table).collect()
@@ -176,21 +176,21 @@ impl Array {
         })
     }
 
-    /// First and last mission time, s, between which positions are known without a gap; `None` if that is always. Positions at other
-    /// times are not numbers.
+    /// First and last mission time, s, between which positions are known without a gap; `None` if they are always
+    /// known. Positions at other times are NaN.
     #[must_use]
     pub fn known_s(&self) -> Option<[f64; 2]> {
         known_s(&self.own)
     }
 
-    /// Requires that positions are known at a time, s.
+    /// Checks that positions are known at a time, s.
     ///
     /// # Errors
     /// [`ArrayError::NotKnown`] beyond [`Self::known_s`].
     #[doc(hidden)]
     pub fn require_known(&self, t_s: f64) -> Result<(), ArrayError> {
         match self.known_s() {
-            // Dates of files are to a microsecond.
+            // Dates in files are given to a microsecond.
             Some([from_s, until_s]) if !(from_s - 1e-6..=until_s + 1e-6).contains(&t_s) => {
                 Err(ArrayError::NotKnown { t_s, known_s: [from_s, until_s], epoch_tai_s: self.epoch_tai_s() })
             }
@@ -198,21 +198,22 @@ impl Array {
         }
     }
 
-    /// Epoch of a mission whose orbits have dates: TAI seconds since 1958-01-01; `None` if the configuration is to say.
+    /// Epoch of a mission whose orbits have dates: TAI seconds since 1958-01-01; `None` if the configuration
+    /// determines it.
     #[doc(hidden)]
     #[must_use]
     pub fn epoch_tai_s(&self) -> Option<f64> {
-        self.epoch.map(Tai::from_1958)
+        self.epoch.map(Tai::seconds_since_1958)
     }
 
-    /// Content of orbit files that is not used.
+    /// Notes on content of orbit files that is not used.
     #[doc(hidden)]
     #[must_use]
     pub fn notes(&self) -> &[String] {
         &self.notes
     }
 
-    /// Memory of the states of orbits that are given by tables (files, or what was propagated), bytes. Clones share it.
+    /// Memory for the states of tabulated orbits (from files or propagation), bytes. Clones share it.
     #[must_use]
     #[doc(hidden)]
     pub fn table_bytes(&self) -> u64 {
@@ -223,7 +224,7 @@ impl Array {
         self.own.iter().map(bytes).sum()
     }
 
-    /// The states through which the orbit of satellite `n` (from 0) goes, if it is given by a table.
+    /// Tabulated states of the orbit of satellite `n` (from 0), if there are any.
     pub(super) fn stretches(&self, n: usize) -> Option<Vec<OrbitArc>> {
         match self.own.get(n) {
             Some(OwnOrbit::Table(orbit)) => Some(orbit.stretches()),
@@ -257,7 +258,7 @@ impl Array {
         self.own.first().map_or(self.inclination_rad, OwnOrbit::inclination_rad)
     }
 
-    /// Greatest distance of a satellite from the Moon's centre, m.
+    /// Maximum distance of a satellite from the Moon's centre, m.
     #[must_use]
     #[doc(hidden)]
     pub fn farthest_m(&self) -> f64 {
@@ -321,8 +322,8 @@ impl Array {
         }
     }
 
-    /// State of a daughter on an ellipse: it trails daughter 1 by `arc / a` of mean anomaly, in a plane whose inclination
-    /// differs by `cross_track_ratio` of that.
+    /// State of a daughter on an ellipse: it trails daughter 1 by `arc / a` of mean anomaly, in a plane whose
+    /// inclination differs by `cross_track_ratio` times that angle.
     fn shaped_state(&self, shape: &Shape, (arc_m, arc_rate_m_s): (f64, f64), t_s: f64) -> SatelliteState {
         let (axis_m, e) = (self.orbit_radius_m, shape.eccentricity);
         let [periapsis, periapsis_rate] = [shape.periapsis[0] + shape.periapsis[1] * t_s, shape.periapsis[1]];
@@ -345,7 +346,7 @@ impl Array {
             add(scale(x * cos_w - y * sin_w, node_hat), scale(x * sin_w + y * cos_w, across_hat))
         };
         let position_m = in_space(plane_m);
-        // The line of apsides turns about the orbit's normal, the plane about its node, the node about the pole.
+        // The line of apsides rotates about the orbit's normal, the plane about its node, the node about the pole.
         let turning = add(
             add(scale(periapsis_rate, normal_hat), scale(inclination_rate, node_hat)),
             [0.0, 0.0, self.node_rate_rad_s],
@@ -404,8 +405,8 @@ impl Array {
         self.state(n, t_s).position_m
     }
 
-    /// Direction of the Earth from the Moon's centre: by the date where orbits have dates (to 0.004 degrees from 2020 to 2040), else of
-    /// an idealised Earth on a circle in the ecliptic.
+    /// Direction of the Earth from the Moon's centre: by its ephemeris if orbits have dates (to 0.004 degrees from
+    /// 2020 to 2040), else an idealised Earth on a circle in the ecliptic.
     #[must_use]
     pub fn earth_hat(&self, t_s: f64) -> Vec3 {
         self.earth.hat(t_s)
@@ -454,7 +455,7 @@ impl Array {
     }
 }
 
-/// From when to when all of some orbits are known, s; `None` if that is always.
+/// Interval in which all of some orbits are known, s; `None` if they are always known.
 fn known_s(orbits: &[OwnOrbit]) -> Option<[f64; 2]> {
     let spans = orbits.iter().filter_map(|orbit| match orbit {
         OwnOrbit::Table(orbit) => Some(orbit.span_s()),
@@ -463,12 +464,12 @@ fn known_s(orbits: &[OwnOrbit]) -> Option<[f64; 2]> {
     spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
 }
 
-/// Requires that no two satellites are at one place at the epoch.
-fn require_apart(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
-    let places: Vec<Vec3> = orbits.iter().map(|orbit| orbit.state(0.0).position_m).collect();
-    for (second, place) in places.iter().enumerate() {
-        let near = |other: &Vec3| norm(sub(*place, *other)) < APART_M;
-        if let Some(first) = places[..second].iter().position(near) {
+/// Checks that no two satellites have the same position at the epoch.
+fn require_distinct(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
+    let positions: Vec<Vec3> = orbits.iter().map(|orbit| orbit.state(0.0).position_m).collect();
+    for (second, position) in positions.iter().enumerate() {
+        let coincides = |other: &Vec3| norm(sub(*position, *other)) < DISTANCE_M_MIN;
+        if let Some(first) = positions[..second].iter().position(coincides) {
             return Err(ArrayError::OnePlace { first: first + 1, second: second + 1 });
         }
     }

@@ -1,4 +1,4 @@
-//! Placing of visibilities: adds the positions of the two satellites.
+//! Placing of visibilities: addition of the positions of both satellites.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,23 +10,23 @@ use super::ephemeris::{Ephemeris, Piece};
 use crate::frames::{PlacedVisibilities, VisibilityBlock, VisibilityReason};
 use crate::units::MissionTime;
 
-/// Counts of the visibilities of a block by result; they add up to the block.
+/// Numbers of visibilities of a block by result; their sum is that of the block.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PlacingCounts {
-    /// Placed.
+    /// Number placed.
     pub placed: u64,
-    /// Skipped because of a flag, by the reason of the first one.
+    /// Number skipped because of a flag, by the reason of the first flag.
     pub flagged: BTreeMap<VisibilityReason, u64>,
-    /// Skipped because no ephemeris covers their time.
+    /// Number skipped because no ephemeris covers their time.
     pub without_ephemeris: u64,
 }
 
 impl Ephemeris {
-    /// The good visibilities of a block with the positions of their two satellites at the middle of each integration,
-    /// and the counts.
+    /// Places the good visibilities of a block: adds the positions of their two satellites at the middle of each
+    /// integration. Also returns the counts.
     ///
-    /// `frequency_hz` is that of the block's channel. The result is a function of each visibility's own
-    /// time: it does not depend on how blocks are split.
+    /// `frequency_hz` is that of the block's channel. The result for a visibility depends only on its own time, not
+    /// on how blocks are divided.
     #[must_use]
     #[doc(hidden)]
     pub fn place(&self, block: &VisibilityBlock, frequency_hz: f64) -> (PlacedVisibilities, PlacingCounts) {
@@ -46,7 +46,7 @@ impl Ephemeris {
         (out, counts)
     }
 
-    /// The counts of [`Self::place`] alone, and the mission time of the middle of the first visibility that it places, s.
+    /// Counts as of [`Self::place`], and the mission time of the middle of the first visibility that it places, s.
     #[must_use]
     #[doc(hidden)]
     pub fn count(&self, block: &VisibilityBlock) -> (PlacingCounts, Option<f64>) {
@@ -57,7 +57,7 @@ impl Ephemeris {
         (counts, first.map(|k| middle_half_ticks(block, k) as f64 / 2e6))
     }
 
-    /// Hands all runs of good visibilities to `take`, each with the piece of the ephemeris that is valid for all of it.
+    /// Calls `take` with each run of good visibilities and the piece of the ephemeris that is valid for all of it.
     fn runs(&self, block: &VisibilityBlock, take: &mut dyn FnMut(Range<usize>, &Piece<2>)) -> PlacingCounts {
         let mut counts = PlacingCounts::default();
         let mut from = 0;
@@ -67,8 +67,8 @@ impl Ephemeris {
         counts
     }
 
-    /// The visibilities from `from` on that share its piece of the ephemeris (or its reason for being skipped); returns the index of
-    /// the first that does not.
+    /// Finds the visibilities from `from` on that share its piece of the ephemeris (or its reason for being skipped);
+    /// returns the index of the first that does not.
     fn run(
         &self,
         block: &VisibilityBlock,
@@ -86,7 +86,7 @@ impl Ephemeris {
         let satellites = [block.pair.i, block.pair.j].map(usize::from);
         let piece = valid.segment.and_then(|segment| Piece::at(segment, half_ticks, satellites));
         if let Some(piece) = &piece {
-            // The first and last pieces extend beyond their nodes: they are valid at this time in any case.
+            // The first and last pieces extend beyond their nodes, and are valid at this time.
             let end = (piece.middle_half_ticks + piece.reach_half_ticks - 1).max(half_ticks);
             holds[1] = holds[1].min(end);
         }
@@ -108,8 +108,8 @@ impl Ephemeris {
 
 /// Appends the visibilities in `range`; `piece` is valid for all of them.
 ///
-/// Plain loops compile for wide registers, which closures in iterators do not. No multiplication is fused with an
-/// addition, so that every target gives the same bits.
+/// Simple loops are vectorised, which closures in iterators are not. No multiplication is fused with an addition, so
+/// that every target gives the same bits.
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2"))]
 fn extend(out: &mut PlacedVisibilities, block: &VisibilityBlock, range: Range<usize>, piece: &Piece<2>) {
     let (from, to) = (out.time_s.len(), out.time_s.len() + range.len());

@@ -1,4 +1,4 @@
-//! Where a satellite is and how it moves.
+//! State of a satellite.
 
 use crate::units::vector::Vec3;
 

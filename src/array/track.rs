@@ -17,8 +17,8 @@ pub fn track_offset_m(r_m: Vec3, normal_hat: Vec3, offset_m: [f64; 3]) -> Vec3 {
     add(add(parts[0], parts[1]), parts[2])
 }
 
-/// Axis of an antenna that leans from the orbit's normal by an angle (deg) towards the track's direction, and by one away from the
-/// Moon; and the direction across it that is nearest to the track's.
+/// Axis of an antenna that is tilted from the orbit's normal by an angle (deg) towards the track and by another away
+/// from the Moon; and the perpendicular direction nearest to the track.
 #[must_use]
 pub fn tilted_axes(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> [Vec3; 2] {
     let [along, normal, up] = track_axes(r_m, normal_hat);
@@ -27,7 +27,7 @@ pub fn tilted_axes(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2
     [axis, unit(sub(along, scale(dot(along, axis), axis)))]
 }
 
-/// Normal of an orbit from two positions a short time apart; `None` if they are in line with the Moon's centre.
+/// Normal of an orbit from two positions a short time apart; `None` if they are collinear with the Moon's centre.
 #[must_use]
 pub fn orbit_normal_hat(r_before_m: Vec3, r_after_m: Vec3) -> Option<Vec3> {
     let normal = cross(r_before_m, r_after_m);

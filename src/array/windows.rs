@@ -4,15 +4,15 @@ use super::orbit::Array;
 use crate::frames::ObservingWindow;
 use crate::units::{MissionTime, Pair};
 
-/// Steps an orbit of the search for a limb crossing; a window is a third of an orbit.
+/// Number of steps per orbit in the search for a limb crossing; a window is a third of an orbit.
 const STEPS_PER_ORBIT: f64 = 64.0;
 
-/// As many for an ellipse, on which the Moon may hide the Earth for a short part of an orbit.
+/// Number of steps per orbit for an ellipse, on which the Moon may hide the Earth for a short part of an orbit.
 const STEPS_PER_ELLIPSE: f64 = 1024.0;
 
-/// Observing windows in order of time: the intervals in which the Earth is hidden from daughter 1.
+/// Iterator over observing windows in order of time: the intervals in which the Earth is hidden from daughter 1.
 ///
-/// Only whole windows: one in progress at `from_s` or at `until_s` is skipped.
+/// A window in progress at `from_s` or at `until_s` is skipped.
 #[derive(Clone, Debug)]
 pub struct ObservingWindows<'a> {
     array: &'a Array,
@@ -22,13 +22,13 @@ pub struct ObservingWindows<'a> {
 }
 
 impl<'a> ObservingWindows<'a> {
-    /// The windows of `array` between two times, s.
+    /// Creates an iterator over the windows of `array` between two times, s.
     #[must_use]
     pub fn new(array: &'a Array, from_s: f64, until_s: f64) -> Self {
         Self { array, now_s: from_s, until_s, index: 0 }
     }
 
-    /// The next time after `now_s` at which the Earth sets (`hides`) or rises.
+    /// Next time after `now_s` at which the Earth sets (`hides`) or rises.
     fn next_edge_s(&self, mut now_s: f64, hides: bool) -> Option<f64> {
         let steps = if self.array.formation().is_some() { STEPS_PER_ORBIT } else { STEPS_PER_ELLIPSE };
         let step_s = self.array.orbital_period_s() / steps;
@@ -48,31 +48,31 @@ impl<'a> ObservingWindows<'a> {
     }
 }
 
-/// When the Earth is hidden from each daughter during an observing window.
+/// Occultation of the Earth by the Moon, as seen from each daughter during an observing window.
 ///
-/// A window is daughter 1's. Those that trail her see the Earth set later, the last of the fiducial array by 64 s at most
-/// (100 km of arc at 1.55 km/s), and rise later.
+/// A window is defined by daughter 1. Daughters that trail it see the Earth set later, the last one of the fiducial
+/// array by at most 64 s (100 km of arc at 1.55 km/s), and rise later.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct EarthShadow {
-    /// By daughter: first and last tick.
+pub struct EarthOccultation {
+    /// First and last tick, by daughter.
     spans: Vec<[MissionTime; 2]>,
 }
 
-impl EarthShadow {
-    /// The spans of all daughters within `window`. A daughter from which the Earth is hidden at neither end nor in the middle
-    /// of it counts as not in the shadow at all.
+impl EarthOccultation {
+    /// Finds the occultations of all daughters within `window`. A daughter from which the Earth is hidden neither at
+    /// an end nor in the middle of the window counts as never in occultation.
     #[must_use]
     pub fn new(array: &Array, window: ObservingWindow) -> Self {
         let [start_s, end_s] = [window.start, window.end].map(MissionTime::seconds);
         let span = |n: usize| {
-            // The window's own edges are hers, to the tick.
+            // The window's own edges are those of daughter 1, to the tick.
             if n == 0 {
                 return [window.start, window.end];
             }
             let is_hidden = |t_s: f64| array.earth_depth_of_m(n, t_s) > 0.0;
             let inside = [start_s, end_s, 0.5 * (start_s + end_s)].into_iter().find(|t_s| is_hidden(*t_s));
             let Some(inside_s) = inside else { return [window.end, window.start] };
-            // Whole ticks within the shadow.
+            // Whole ticks within the occultation.
             let from = match is_hidden(start_s) {
                 true => window.start,
                 false => MissionTime::from_seconds(bisect(start_s, inside_s, is_hidden)).plus_ticks(1),
@@ -111,7 +111,7 @@ pub fn earth_in_sight_s(array: &Array, from_s: f64, until_s: f64) -> f64 {
     sight_s
 }
 
-/// The point between `before` and `after` at which `is_past` becomes true, to one tick.
+/// Time between `before` and `after` at which `is_past` becomes true, to one tick.
 fn bisect(mut before: f64, mut after: f64, is_past: impl Fn(f64) -> bool) -> f64 {
     while after - before > 1e-7 {
         let middle = 0.5 * (before + after);

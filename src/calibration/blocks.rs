@@ -1,4 +1,4 @@
-//! Which blocks of visibilities have been received, and how many visibilities of each window.
+//! Record of received blocks of visibilities, and visibility counts by window.
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
@@ -9,8 +9,8 @@ use crate::frames::{Housekeeping, VisibilityBlock, VisibilityReason};
 use crate::runtime::Ledger;
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Most reports that are kept: a dozen times those of a mission of 1.3 years, with one an orbit. Bounds what a forger's
-/// reports cost.
+/// Maximum number of reports kept: twelve times what a mission of 1.3 years makes at one per orbit. Bounds the memory
+/// that forged reports can take.
 const REPORTS_MAX: usize = 1 << 16;
 
 /// Identity of a block of visibilities. A block is used once, however often it is received.
@@ -34,37 +34,38 @@ impl BlockKey {
     }
 }
 
-/// The blocks that have been received, and the spacecraft's reports of its own counts.
+/// Received blocks, and the spacecraft's reports of its own counts.
 ///
-/// A function of what was inserted, not of the order.
+/// Independent of the order of insertion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReceivedBlocks {
     used: HashSet<BlockKey>,
-    /// Visibilities by the start of their window.
+    /// Number of visibilities, by the start of their window.
     by_window: BTreeMap<MissionTime, u64>,
-    /// Visibilities that were received with values that cannot be used, by the start of their window.
+    /// Number of visibilities received with unusable values, by the start of their window.
     bad_by_window: BTreeMap<MissionTime, u64>,
-    /// Reports that differ, by time, visibilities sampled and dropped.
+    /// Distinct reports: (time, visibilities sampled, visibilities dropped).
     reports: BTreeSet<(MissionTime, u64, u64)>,
 }
 
-/// Packets of visibilities that are known to be missing: each held at least one.
+/// Packets of visibilities known to be missing. Each held at least one visibility.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MissingPackets {
-    /// All of them.
+    /// All missing packets.
     pub all: u64,
-    /// Those made after the time of the latest report.
+    /// Missing packets made after the time of the latest report.
     pub unreported: u64,
 }
 
 /// Whether the counts of a ledger are known to be complete.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Completeness {
-    /// Whether all that the spacecraft sampled is in the ledger.
+    /// Whether every visibility that the spacecraft sampled is in the ledger.
     pub complete: bool,
-    /// Mission time, s, up to which all that it sampled is in the ledger; `None` without a report, or for all time.
+    /// Mission time, s, up to which the ledger is complete; `None` without a report, or if it is complete for all
+    /// time.
     pub until_s: Option<f64>,
-    /// Reports that contradict the others, or the visibilities received, and were not used.
+    /// Reports not used because they contradict the others, or the visibilities received.
     pub reports_contradictory: u64,
     /// Why the ledger is not known to be complete.
     pub reasons: Vec<&'static str>,
@@ -97,50 +98,58 @@ impl ReceivedBlocks {
         add(&mut self.by_window, window, visibilities);
     }
 
-    /// Counts visibilities that were received with values that cannot be used.
+    /// Counts visibilities received with unusable values.
     pub fn count_bad(&mut self, window: MissionTime, visibilities: u64) {
         add(&mut self.bad_by_window, window, visibilities);
     }
 
-    /// Takes a report of the spacecraft. Reports of one mission do not contradict each other; which ones hold is decided
-    /// when the counts are closed.
+    /// Records a report of the spacecraft. [`Self::latest_report`] decides which reports are used.
     pub fn report(&mut self, report: Housekeeping) {
         if self.reports.len() < REPORTS_MAX {
             self.reports.insert((report.time, report.sampled, report.dropped));
         }
     }
 
-    /// Visibilities received that can be used.
+    /// Number of usable visibilities received.
     #[must_use]
     pub fn visibilities(&self) -> u64 {
         sum(self.by_window.values())
     }
 
-    /// The latest of the reports that hold, and the number of those that do not.
+    /// The latest accepted report, and the number of rejected ones.
     ///
-    /// The counts only grow, at one time they have one value, and what was received was sampled. Of reports that
-    /// contradict each other the greatest number that agree hold; where that leaves a choice, those that claim least.
+    /// Genuine counts only grow, have one value at one time, and cover what was received. The largest mutually
+    /// consistent set of reports is accepted; among sets of equal size, the one with the lowest counts.
     #[must_use]
     pub fn latest_report(&self) -> (Option<Housekeeping>, u64) {
         let covers_received = |&(time, sampled, dropped): &(MissionTime, u64, u64)| {
             sampled.saturating_sub(dropped) >= sum(self.by_window.range(..time).map(|(_, count)| count))
         };
-        let known: Vec<_> = self.reports.iter().copied().filter(covers_received).collect();
-        let sampled = longest_rise(&known, |&(time, sampled, _)| (time, sampled));
-        let kept = longest_rise(&sampled, |&(time, _, dropped)| (time, dropped));
-        let latest = kept.last().map(|&(time, sampled, dropped)| Housekeeping { time, sampled, dropped });
-        (latest, (self.reports.len() - kept.len()) as u64)
+        let possible: Vec<_> = self.reports.iter().copied().filter(covers_received).collect();
+        let consistent_in_sampled =
+            longest_nondecreasing_subsequence(&possible, |&(time, sampled, _)| (time, sampled));
+        let consistent =
+            longest_nondecreasing_subsequence(&consistent_in_sampled, |&(time, _, dropped)| (time, dropped));
+        let latest =
+            consistent.last().map(|&(time, sampled, dropped)| Housekeeping { time, sampled, dropped });
+        (latest, (self.reports.len() - consistent.len()) as u64)
     }
 
-    /// Posts what was sampled and what was lost before the ground received it; returns whether that is known to be all.
-    pub(super) fn close(&self, ledger: &Ledger<VisibilityReason>, packets: MissingPackets) -> Completeness {
+    /// Posts to the ledger the visibilities sampled, and those lost before reception; returns whether the counts are
+    /// complete.
+    pub(super) fn post_losses(
+        &self,
+        ledger: &Ledger<VisibilityReason>,
+        packets: MissingPackets,
+    ) -> Completeness {
         let (latest, reports_contradictory) = self.latest_report();
         let (time, sampled, dropped) = latest
             .map_or((MissionTime(i64::MIN), 0, 0), |latest| (latest.time, latest.sampled, latest.dropped));
-        let before = |counts: &BTreeMap<MissionTime, u64>| sum(counts.range(..time).map(|(_, count)| count));
-        let counted = before(&self.by_window).saturating_add(before(&self.bad_by_window));
+        let sum_before =
+            |counts: &BTreeMap<MissionTime, u64>| sum(counts.range(..time).map(|(_, count)| count));
+        let counted = sum_before(&self.by_window).saturating_add(sum_before(&self.bad_by_window));
         let missing = sampled.saturating_sub(dropped).saturating_sub(counted);
-        // The last report is exact.
+        // The mission's last report is exact.
         let is_last = latest.is_some_and(|latest| latest.is_last());
         let at_least = if is_last { 0 } else { packets.unreported.max(packets.all.saturating_sub(missing)) };
         for (reason, count) in [
@@ -149,10 +158,10 @@ impl ReceivedBlocks {
             (VisibilityReason::NotReceived, missing),
             (VisibilityReason::NotReceivedAtLeast, at_least),
         ] {
-            ledger.sampled(count);
-            ledger.left_out(reason, count);
+            ledger.add_sampled(count);
+            ledger.add_left_out(reason, count);
         }
-        ledger.sampled(self.visibilities());
+        ledger.add_sampled(self.visibilities());
         let last_reports = self.reports.range((Housekeeping::FOREVER, 0, 0)..).count();
         let reasons = match latest {
             None => vec!["no report of the spacecraft's counts was received"],
@@ -180,36 +189,39 @@ fn sum<'a>(counts: impl Iterator<Item = &'a u64>) -> u64 {
     counts.fold(0, |sum, &count| sum.saturating_add(count))
 }
 
-/// The longest part of a sorted list in which the count never falls and has one value at each time; of several, one with
-/// the lowest end.
-fn longest_rise<T: Copy>(sorted: &[T], of: impl Fn(&T) -> (MissionTime, u64)) -> Vec<T> {
-    // By length less one: the place of the item with the lowest count in which a rise of that length can end.
+/// Longest subsequence of a sorted list whose counts never fall, with at most one item per time; among several, one
+/// with the lowest last count.
+fn longest_nondecreasing_subsequence<T: Copy>(
+    sorted: &[T],
+    key: impl Fn(&T) -> (MissionTime, u64),
+) -> Vec<T> {
+    // ends[n]: index of the item with the lowest count that can end a subsequence of length n + 1.
     let mut ends: Vec<usize> = Vec::new();
-    let mut before: Vec<Option<usize>> = vec![None; sorted.len()];
-    let mut at = 0;
-    while at < sorted.len() {
-        let (time, _) = of(&sorted[at]);
-        let same = sorted[at..].iter().take_while(|item| of(item).0 == time).count();
-        // All of one time extend rises that end earlier, so that no two of them are in one rise unless they are equal.
-        let lengths: Vec<usize> = (at..at + same)
-            .map(|k| ends.partition_point(|&end| of(&sorted[end]).1 <= of(&sorted[k]).1))
+    let mut predecessor: Vec<Option<usize>> = vec![None; sorted.len()];
+    let mut start = 0;
+    while start < sorted.len() {
+        let (time, _) = key(&sorted[start]);
+        let same_time = sorted[start..].iter().take_while(|item| key(item).0 == time).count();
+        // Items of equal time all extend subsequences of earlier items, so that no subsequence contains two of them.
+        let lengths: Vec<usize> = (start..start + same_time)
+            .map(|k| ends.partition_point(|&end| key(&sorted[end]).1 <= key(&sorted[k]).1))
             .collect();
-        for (k, &length) in (at..).zip(&lengths) {
-            before[k] = length.checked_sub(1).map(|shorter| ends[shorter]);
+        for (k, &length) in (start..).zip(&lengths) {
+            predecessor[k] = length.checked_sub(1).map(|shorter| ends[shorter]);
         }
-        for (k, length) in (at..).zip(lengths) {
+        for (k, length) in (start..).zip(lengths) {
             match ends.get_mut(length) {
-                Some(end) if of(&sorted[*end]).1 > of(&sorted[k]).1 => *end = k,
+                Some(end) if key(&sorted[*end]).1 > key(&sorted[k]).1 => *end = k,
                 Some(_) => {}
                 None => ends.push(k),
             }
         }
-        at += same;
+        start += same_time;
     }
-    let mut rise: Vec<T> =
-        std::iter::successors(ends.last().copied(), |&k| before[k]).map(|k| sorted[k]).collect();
-    rise.reverse();
-    rise
+    let mut subsequence: Vec<T> =
+        std::iter::successors(ends.last().copied(), |&k| predecessor[k]).map(|k| sorted[k]).collect();
+    subsequence.reverse();
+    subsequence
 }
 
 #[cfg(test)]
@@ -237,9 +249,9 @@ mod tests {
         unreported: u64,
     ) -> (crate::runtime::LedgerReport<VisibilityReason>, Completeness) {
         let ledger = Ledger::new();
-        let completeness = blocks.close(&ledger, MissingPackets { all, unreported });
-        ledger.accumulated(blocks.visibilities());
-        (ledger.close().unwrap(), completeness)
+        let completeness = blocks.post_losses(&ledger, MissingPackets { all, unreported });
+        ledger.add_accumulated(blocks.visibilities());
+        (ledger.balanced_report().unwrap(), completeness)
     }
 
     #[test]
@@ -250,7 +262,7 @@ mod tests {
                 let counts = [VisibilityReason::NotReceived, VisibilityReason::NotReceivedAtLeast];
                 (counts.map(|reason| ledger.count(reason)), completeness.complete, completeness.until_s)
             };
-        // Nothing but gaps is known.
+        // Without a report only gaps are known.
         assert_eq!(lost(closed(&received(&[]), 3, 3)), ([0, 3], false, None));
         // Of the first window the loss is exact; two packets are missing after it.
         let first = report(900, 100, 0);
@@ -287,14 +299,14 @@ mod tests {
     }
 
     #[test]
-    fn forged_counts_close() {
+    fn counts_of_forged_reports_do_not_overflow() {
         let blocks = received(&[report(5, u64::MAX, 0), report(9, u64::MAX, u64::MAX), report(-7, 0, 0)]);
         let ledger = Ledger::new();
-        blocks.close(&ledger, MissingPackets { all: 1 << 46, unreported: 1 << 46 });
+        blocks.post_losses(&ledger, MissingPackets { all: 1 << 46, unreported: 1 << 46 });
     }
 
     #[test]
-    fn what_is_kept_of_forged_reports_is_bounded() {
+    fn memory_of_forged_reports_is_bounded() {
         let mut blocks = ReceivedBlocks::default();
         for k in 0..2 * REPORTS_MAX {
             blocks.report(report(k as i64, (k % 7) as u64, 0));
@@ -303,24 +315,24 @@ mod tests {
         assert!(blocks.latest_report().0.is_some());
     }
 
-    /// The length of the longest rise, by trying all parts.
+    /// Length of the longest valid subsequence, by trying all subsequences.
     fn longest(items: &[(MissionTime, u64)]) -> usize {
-        let is_rise = |part: &[(MissionTime, u64)]| {
+        let is_valid = |part: &[(MissionTime, u64)]| {
             part.windows(2).all(|two| two[0].0 < two[1].0 && two[0].1 <= two[1].1)
         };
         let parts = (0..1_u32 << items.len()).map(|bits| -> Vec<_> {
             items.iter().enumerate().filter(|(k, _)| bits >> k & 1 == 1).map(|(_, item)| *item).collect()
         });
-        parts.filter(|part| is_rise(part)).map(|part| part.len()).max().unwrap_or(0)
+        parts.filter(|part| is_valid(part)).map(|part| part.len()).max().unwrap_or(0)
     }
 
     proptest! {
         #[test]
-        fn a_rise_is_a_rise_and_the_longest(items in proptest::collection::btree_set((0..8_i64, 0..6_u64), 0..11)) {
+        fn the_longest_nondecreasing_subsequence_is_valid_and_maximal(items in proptest::collection::btree_set((0..8_i64, 0..6_u64), 0..11)) {
             let sorted: Vec<_> = items.into_iter().map(|(time, count)| (MissionTime(time), count)).collect();
-            let rise = longest_rise(&sorted, |item| *item);
-            prop_assert!(rise.windows(2).all(|two| two[0].0 < two[1].0 && two[0].1 <= two[1].1));
-            prop_assert_eq!(rise.len(), longest(&sorted));
+            let subsequence = longest_nondecreasing_subsequence(&sorted, |item| *item);
+            prop_assert!(subsequence.windows(2).all(|two| two[0].0 < two[1].0 && two[0].1 <= two[1].1));
+            prop_assert_eq!(subsequence.len(), longest(&sorted));
         }
     }
 }

@@ -7,22 +7,22 @@ use serde::{Deserialize, Serialize};
 use super::{AntennaGains, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck};
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Most sub-bands of a channel.
+/// Maximum number of sub-bands of a channel.
 const SUB_BANDS_MAX: usize = 64;
 
-/// Accepted values, for messages.
+/// Accepted numbers of bits, for messages.
 const QUANTISER_BITS: &str = "0 for none, 1, 2 or 4";
 
 /// Choice of the calibration hook.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum CalibrationHook {
-    /// None.
+    /// No correction.
     #[default]
     Identity,
     /// Complex gains of every antenna, from a file.
     AntennaGains,
-    /// Gains that are found from the data, pass by pass, by the settings of `[calibrate]`.
+    /// Gains found from the data, pass by pass, with the settings of `[calibrate]`.
     Solve,
 }
 
@@ -47,24 +47,24 @@ impl CalibrationConfig {
     /// All invalid values; empty if there are none. Does not open the gains file.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibration");
+        let mut checks = Checks::new("calibration");
         let bits = self.quantiser_bits;
         checks.require("quantiser_bits", bits, bits == 0 || VanVleck::new(bits).is_ok(), QUANTISER_BITS);
         checks.require(
             "quantiser_bits",
             bits,
             bits == 0 || self.sub_bands <= 1,
-            "0 with sub-bands: what a quantiser does to a correlation at one lag is spread over them",
+            "0 with sub_bands above 1: the correction is for whole channels, and a quantiser's effect spreads over all sub-bands",
         );
         let sub_bands = self.sub_bands;
         checks.require("sub_bands", sub_bands, (1..=SUB_BANDS_MAX).contains(&sub_bands), "1 to 64");
         let single = self.hook != CalibrationHook::Solve || sub_bands == 1;
-        let expected = "1 with hook = \"solve\": gains are of channels as they are sent";
+        let expected = "1 with hook = \"solve\", which finds gains for the channels as they are sent";
         checks.require("sub_bands", sub_bands, single, expected);
         let expected = match (self.hook, &self.gains_file) {
             (CalibrationHook::AntennaGains, None) => "the path of a file, for hook = \"antenna-gains\"",
             (CalibrationHook::Identity | CalibrationHook::Solve, Some(_)) => {
-                "no such key, or hook = \"antenna-gains\""
+                "no such key, or hook = \"antenna-gains\", which reads it"
             }
             _ => return checks.finish(),
         };
@@ -76,7 +76,7 @@ impl CalibrationConfig {
     /// The van Vleck correction, if any.
     ///
     /// # Errors
-    /// A number of bits without a correction.
+    /// The number of bits has no correction.
     pub fn van_vleck(&self) -> Result<Option<VanVleck>, CalibrationError> {
         if self.quantiser_bits == 0 {
             return Ok(None);
@@ -91,8 +91,8 @@ impl CalibrationConfig {
         })
     }
 
-    /// The calibration; `folder` is that of the configuration. Gains that are to be found are not known: what applies them is a
-    /// ground with [`SolvedGains`].
+    /// Builds the calibration. `folder` is the folder of the configuration file. With hook `solve` the gains are
+    /// still unknown: a ground station with [`SolvedGains`] finds and applies them.
     ///
     /// # Errors
     /// The first of [`CalibrationConfig::problems`], or an invalid gains file.

@@ -10,10 +10,10 @@ use crate::units::{Dimension, InvalidValue, Pair};
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CalibrationError {
-    /// A value of the configuration that is not accepted.
+    /// A value of the configuration is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
-    /// A block whose arrays are not of one length, as it came or as a hook left it.
+    /// The arrays of a block have unequal lengths, as received or after a hook.
     #[error(transparent)]
     Lengths(#[from] crate::frames::UnequalLengths),
     /// The gains file cannot be read.
@@ -21,32 +21,32 @@ pub enum CalibrationError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The gains file is not TOML or JSON of the expected shape.
+    /// The gains file is not TOML or JSON of the expected structure.
     #[error("gains file {}: {message}", path.display())]
     Syntax {
         /// The file.
         path: PathBuf,
-        /// Where and what, from the parser.
+        /// Message of the parser, with the place.
         message: String,
     },
     /// The gains file holds invalid values.
-    #[error("gains file {}: {}", path.display(), list(problems))]
+    #[error("gains file {}: {}", path.display(), joined(problems))]
     Values {
         /// The file.
         path: PathBuf,
-        /// Everything that is wrong with it.
+        /// All invalid values.
         problems: Vec<InvalidValue>,
     },
-    /// Invalid gains, not from a file.
-    #[error("gains: {}", list(problems))]
+    /// Gains that do not come from a file are invalid.
+    #[error("gains: {}", joined(problems))]
     Gains {
-        /// Everything that is wrong with them.
+        /// All invalid values.
         problems: Vec<InvalidValue>,
     },
-    /// A channel without gains.
+    /// A channel has no gains.
     #[error(
         "no gains within {} of the channel at {}, the nearest are for {}; add them to the gains file or leave the channel out",
         Dimension::Frequency.show(*tolerance_hz), Dimension::Frequency.show(*frequency_hz), Dimension::Frequency.show(*nearest_hz)
@@ -59,27 +59,27 @@ pub enum CalibrationError {
         /// Largest distance that is accepted, Hz.
         tolerance_hz: f64,
     },
-    /// Channels that are not adjoining sub-bands.
+    /// The channels are not adjoining sub-bands.
     #[error(
         "calibration.sub_bands = {sub_bands}: expected the number of adjoining sub-bands of each channel in the \
          downlink, which has {channels} channels"
     )]
     SubBands {
-        /// Number configured.
+        /// Configured number of sub-bands.
         sub_bands: usize,
-        /// Channels of the downlink.
+        /// Number of channels of the downlink.
         channels: usize,
     },
-    /// A map of the known sky that cannot be read.
+    /// A map of the known sky cannot be read.
     #[error(transparent)]
     ModelFile(#[from] crate::sky::fits::FitsError),
-    /// A map of the known sky that cannot be used.
+    /// A map of the known sky cannot be used.
     #[error("map of calibrate.model_files or --model: {0}")]
     ModelMap(#[from] crate::sky::MapError),
-    /// Positions that the model of the known sky does not cover.
+    /// The model of the known sky does not cover the positions.
     #[error(transparent)]
     Model(#[from] crate::response::model::ModelError),
-    /// A satellite without gains.
+    /// A satellite has no gains.
     #[error("no gains for pair {pair}: the gains file has {satellites} satellites; is it for this array?")]
     Satellite {
         /// The pair.
@@ -89,12 +89,12 @@ pub enum CalibrationError {
     },
 }
 
-/// Most problems of a file that are told one by one; a mistake in one gain is often made in all of them.
-const TOLD_MAX: usize = 5;
+/// Maximum number of listed problems: a mistake in one gain is often made in all.
+const LISTED_MAX: usize = 5;
 
-fn list(problems: &[InvalidValue]) -> String {
-    let lines: Vec<String> = problems.iter().take(TOLD_MAX).map(ToString::to_string).collect();
-    let more = match problems.len().saturating_sub(TOLD_MAX) {
+fn joined(problems: &[InvalidValue]) -> String {
+    let lines: Vec<String> = problems.iter().take(LISTED_MAX).map(ToString::to_string).collect();
+    let more = match problems.len().saturating_sub(LISTED_MAX) {
         0 => String::new(),
         more => format!("; and {more} more"),
     };

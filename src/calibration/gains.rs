@@ -10,17 +10,17 @@ use crate::frames::PlacedVisibilities;
 use crate::units::Pair;
 use crate::units::vector::sub;
 
-/// Complex voltage gains of every antenna, by channel and time.
+/// Division by complex voltage gains of every antenna, by channel and time.
 ///
 /// With E'_i = g_i E_i and V_ij = <E_i conj(E_j)>, the scalar case of the measurement equation
 /// (Hamaker, Bregman & Sault 1996, A&AS 117, 137; Smirnov 2011, A&A 527, A106, Sect. 1.6):
 ///
 /// - V'_ij = g_i conj(g_j) V_ij, so V_ij = V'_ij / c with c = g_i conj(g_j);
-/// - noise of variance s^2 in each part becomes s^2 / |c|^2 in each, for division by c turns and scales
+/// - noise of variance s^2 in each of the real and imaginary part becomes s^2 / |c|^2, as division by c rotates and scales
 ///   a circular distribution; so the weight, its inverse, is multiplied by |c|^2.
 ///
 /// Between solutions at t_0 and t_1, with u = (t - t_0) / (t_1 - t_0), a gain is
-/// g_0 exp(u ln(g_1 / g_0)), ln the principal value: log amplitude and phase are linear. That holds
+/// g_0 exp(u ln(g_1 / g_0)), ln the principal value: log amplitude and phase are linear. This is right
 /// while the phase turns by less than pi from one solution to the next.
 #[derive(Clone, Debug)]
 pub struct AntennaGains {
@@ -31,15 +31,15 @@ pub struct AntennaGains {
     positions: Vec<PositionSolution>,
 }
 
-/// Gains of one channel, ready for interpolation.
+/// Gains of one channel, prepared for interpolation.
 #[derive(Clone, Debug)]
 struct ChannelTable {
     frequency_hz: f64,
-    /// Times of the solutions, s; increasing, at least one.
+    /// Times of the solutions, s; increasing and not empty.
     time_s: Vec<f64>,
-    /// Gains: solution after solution, one a satellite.
+    /// Gains, solution after solution, one for each satellite.
     gain: Vec<Complex64>,
-    /// ln(g_1 / g_0) to the next solution; one solution less.
+    /// ln(g_1 / g_0) to the next solution; one solution fewer than `gain`.
     log_step: Vec<Complex64>,
 }
 
@@ -47,7 +47,7 @@ impl AntennaGains {
     /// Reads a file of gains.
     ///
     /// # Errors
-    /// [`CalibrationError`]: the file cannot be read or parsed, or all invalid values.
+    /// [`CalibrationError`] if the file cannot be read or parsed, or with all its invalid values.
     pub fn read(path: &Path) -> Result<Self, CalibrationError> {
         Self::new(&GainsFile::read(path)?).map_err(|error| match error {
             CalibrationError::Gains { problems } => {
@@ -57,7 +57,7 @@ impl AntennaGains {
         })
     }
 
-    /// Gains that are already in memory.
+    /// Uses gains that are already in memory.
     ///
     /// # Errors
     /// [`CalibrationError::Gains`] with all invalid values.
@@ -95,7 +95,7 @@ impl AntennaGains {
         Ok(table.factor(self.interpolation, self.satellites, pair, time_s))
     }
 
-    /// Takes the errors of positions off those of a pair.
+    /// Subtracts the solved position errors from the positions of a pair.
     fn correct_positions(&self, block: &mut PlacedVisibilities) {
         // An auto-correlation has no position.
         if self.positions.is_empty() || block.pair.i == block.pair.j {
@@ -104,36 +104,36 @@ impl AntennaGains {
         let [i, j] = [block.pair.i, block.pair.j].map(usize::from);
         for (k, &time_s) in block.time_s.iter().enumerate() {
             let next = self.positions.partition_point(|position| position.from_s <= time_s);
-            let known = next.checked_sub(1).and_then(|at| self.positions.get(at));
-            let Some(known) = known.filter(|known| time_s <= known.until_s) else { continue };
+            let latest = next.checked_sub(1).and_then(|index| self.positions.get(index));
+            let Some(position) = latest.filter(|latest| time_s <= latest.until_s) else { continue };
             for (r_m, n) in [(&mut block.r_i_m[k], i), (&mut block.r_j_m[k], j)] {
-                *r_m = sub(*r_m, track_offset_m(*r_m, known.normals_hat[n], known.offsets_m[n]));
+                *r_m = sub(*r_m, track_offset_m(*r_m, position.normals_hat[n], position.offsets_m[n]));
             }
         }
     }
 
-    /// Whether it corrects positions anywhere.
+    /// Whether positions are corrected at any time.
     #[must_use]
-    pub fn moves(&self) -> bool {
+    pub fn corrects_positions(&self) -> bool {
         !self.positions.is_empty()
     }
 
-    /// Whether it does to visibilities of a pair between two times (s) exactly what `other` does; it may say no where
-    /// nothing differs.
+    /// Whether `self` and `other` change visibilities of a pair between two times (s) identically. May return `false`
+    /// where nothing differs.
     #[must_use]
-    pub fn does_as(&self, other: &Self, frequency_hz: f64, pair: Pair, span_s: [f64; 2]) -> bool {
+    pub fn is_equivalent(&self, other: &Self, frequency_hz: f64, pair: Pair, span_s: [f64; 2]) -> bool {
         let tables = (self.table(frequency_hz, pair), other.table(frequency_hz, pair));
-        let (Ok(ours), Ok(theirs)) = tables else { return false };
+        let (Ok(own), Ok(others)) = tables else { return false };
         self.interpolation == other.interpolation
-            && ours.rows(self.satellites, pair, span_s).eq(theirs.rows(other.satellites, pair, span_s))
-            && self.moves_within(span_s).eq(other.moves_within(span_s))
+            && own.rows(self.satellites, pair, span_s).eq(others.rows(other.satellites, pair, span_s))
+            && self.positions_within(span_s).eq(other.positions_within(span_s))
     }
 
-    fn moves_within(&self, [from_s, until_s]: [f64; 2]) -> impl Iterator<Item = &PositionSolution> {
+    fn positions_within(&self, [from_s, until_s]: [f64; 2]) -> impl Iterator<Item = &PositionSolution> {
         self.positions.iter().filter(move |position| position.from_s <= until_s && position.until_s >= from_s)
     }
 
-    /// The table for a channel, after checking that it has both satellites.
+    /// Returns the table of a channel, after checking that it has both satellites.
     fn table(&self, frequency_hz: f64, pair: Pair) -> Result<&ChannelTable, CalibrationError> {
         if usize::from(pair.i.max(pair.j)) >= self.satellites {
             return Err(CalibrationError::Satellite { pair, satellites: self.satellites });
@@ -158,39 +158,39 @@ impl ChannelTable {
         Self { frequency_hz, time_s, log_step: log_step.collect(), gain }
     }
 
-    /// Times and gains of a pair that matter between two times.
+    /// Solutions of a pair (time and both gains) that determine its gains between two times.
     fn rows(
         &self,
         satellites: usize,
         pair: Pair,
         [from_s, until_s]: [f64; 2],
     ) -> impl Iterator<Item = (f64, Complex64, Complex64)> {
-        let later = |time_s: f64| self.time_s.partition_point(|&t| t <= time_s);
-        let rows = later(from_s).saturating_sub(1)..(later(until_s) + 1).min(self.time_s.len());
+        let count_until = |time_s: f64| self.time_s.partition_point(|&t| t <= time_s);
+        let rows = count_until(from_s).saturating_sub(1)..(count_until(until_s) + 1).min(self.time_s.len());
         let gain = move |row: usize, n: u8| self.gain[row * satellites + usize::from(n)];
         rows.map(move |row| (self.time_s[row], gain(row, pair.i), gain(row, pair.j)))
     }
 
     fn factor(&self, interpolation: Interpolation, satellites: usize, pair: Pair, time_s: f64) -> Complex64 {
         let (i, j) = (usize::from(pair.i), usize::from(pair.j));
-        let at = |table: &[Complex64], row: usize| {
-            // A product of two gains, or of two ratios of gains, is a sum of their logarithms.
+        let row_of_pair = |table: &[Complex64], row: usize| {
+            // The gains of both satellites, or the logarithmic steps, the second conjugated.
             (table[row * satellites + i], table[row * satellites + j].conj())
         };
-        let later = self.time_s.partition_point(|&t| t <= time_s);
-        let row = later.saturating_sub(1);
-        let (g_i, g_j) = at(&self.gain, row);
-        if later == 0 || later == self.time_s.len() || time_s == self.time_s[row] {
+        let next = self.time_s.partition_point(|&t| t <= time_s);
+        let row = next.saturating_sub(1);
+        let (g_i, g_j) = row_of_pair(&self.gain, row);
+        if next == 0 || next == self.time_s.len() || time_s == self.time_s[row] {
             return g_i * g_j;
         }
-        let u = (time_s - self.time_s[row]) / (self.time_s[later] - self.time_s[row]);
+        let u = (time_s - self.time_s[row]) / (self.time_s[next] - self.time_s[row]);
         match interpolation {
             Interpolation::LogLinear => {
-                let (log_i, log_j) = at(&self.log_step, row);
+                let (log_i, log_j) = row_of_pair(&self.log_step, row);
                 g_i * g_j * (u * (log_i + log_j)).exp()
             }
             Interpolation::Nearest => {
-                let (g_i, g_j) = at(&self.gain, if u > 0.5 { later } else { row });
+                let (g_i, g_j) = row_of_pair(&self.gain, if u > 0.5 { next } else { row });
                 g_i * g_j
             }
         }
@@ -211,7 +211,7 @@ impl Calibration for AntennaGains {
             let factor = table.factor(self.interpolation, self.satellites, pair, block.time_s[k]);
             let power = factor.norm_sqr();
             let weight = block.weight[k] * power;
-            // Normal: neither zero nor infinite nor so small that digits are gone.
+            // A normal number is neither zero nor infinite, nor so small that digits are lost.
             if !(power.is_normal() && weight.is_normal()) {
                 continue;
             }

@@ -8,14 +8,14 @@ use super::CalibrationError;
 use crate::files::read_text;
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, shortened};
 
-/// Longest file, bytes: gains of all channels in a month of passes take some megabytes.
+/// Maximum size of a file, bytes: gains of all channels in a month of passes take some megabytes.
 const BYTES_MAX: u64 = 1 << 30;
 
-/// Longest line of a message that is repeated whole, characters.
+/// Maximum length of a line of a parser's message, characters.
 const LINE_CHARS: usize = 300;
 
-/// An error of a parser, which may quote lines of any length.
-fn message(error: impl std::fmt::Display) -> String {
+/// Text of a parser's error, with lines of bounded length: it may quote the file.
+fn parser_message(error: impl std::fmt::Display) -> String {
     let text = error.to_string();
     text.lines().map(|line| shortened(line.trim_end(), LINE_CHARS)).collect::<Vec<_>>().join("\n")
 }
@@ -37,8 +37,8 @@ pub enum Interpolation {
 #[doc = include_str!("gains_example.toml")]
 /// ```
 ///
-/// Before the first and after the last solution that one applies. A gain of zero or (in TOML) `nan` marks a satellite
-/// as unusable at that time.
+/// The first solution applies to all earlier times, the last to all later ones. A gain of zero or (in TOML) `nan`
+/// marks a satellite as unusable at that time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GainsFile {
@@ -46,31 +46,31 @@ pub struct GainsFile {
     #[serde(default)]
     pub interpolation: Interpolation,
     /// Largest difference between the frequencies of a channel and of the gains that it uses, Hz.
-    #[serde(default = "half_a_channel_hz")]
+    #[serde(default = "half_channel_hz")]
     pub frequency_tolerance_hz: f64,
     /// Gains by channel, in any order.
     pub channels: Vec<ChannelGains>,
-    /// Errors of the positions in packets, by time; none where there is no entry.
+    /// Errors of the positions in packets, by time; positions are not corrected where there is no entry.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub positions: Vec<PositionSolution>,
 }
 
-/// Errors of the positions of all satellites over an interval: what packets say less what was flown.
+/// Position errors of all satellites over an interval: reported minus true.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PositionSolution {
-    /// Start of the interval, s since the mission epoch; after the end of the one before.
+    /// Start of the interval, s since the mission epoch; not before the end of the preceding interval.
     pub from_s: f64,
-    /// Its end, s.
+    /// End of the interval, s.
     pub until_s: f64,
-    /// Normal of every satellite's orbit: a unit vector on ecliptic axes.
+    /// Normal of every satellite's orbit: unit vectors on ecliptic axes.
     pub normals_hat: Vec<[f64; 3]>,
-    /// Error of every satellite along its track, along the normal, and away from the Moon, m.
+    /// Position error of every satellite along its track, along the normal, and away from the Moon, m.
     pub offsets_m: Vec<[f64; 3]>,
 }
 
-/// Half the width of the paper's channels, Hz.
-fn half_a_channel_hz() -> f64 {
+/// Half the width of a channel of the DSL mission, Hz.
+fn half_channel_hz() -> f64 {
     4e3
 }
 
@@ -95,7 +95,7 @@ pub struct GainSolution {
 }
 
 impl GainsFile {
-    /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check its values.
+    /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check the values.
     ///
     /// # Errors
     /// [`CalibrationError::Read`] and [`CalibrationError::Syntax`].
@@ -103,18 +103,18 @@ impl GainsFile {
         let text = read_text(path, BYTES_MAX)
             .map_err(|source| CalibrationError::Read { path: path.to_owned(), source })?;
         let parsed = if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("json")) {
-            serde_json::from_str(&text).map_err(message)
+            serde_json::from_str(&text).map_err(parser_message)
         } else {
-            toml::from_str(&text).map_err(message)
+            toml::from_str(&text).map_err(parser_message)
         };
         parsed.map_err(|message| CalibrationError::Syntax { path: path.to_owned(), message })
     }
 
-    /// Everything that is wrong with the values; empty if they are good.
+    /// All invalid values; empty if there are none.
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("");
+        let mut checks = Checks::new("");
         let tolerance_hz = self.frequency_tolerance_hz;
         let expected = "a finite number of at least 0";
         checks.number("frequency_tolerance_hz", tolerance_hz, tolerance_hz >= 0.0, expected);
@@ -129,14 +129,14 @@ impl GainsFile {
             checks.require(&frequency_key, frequency_hz, is_new, "every frequency once");
             channel.check(&key, satellites, &mut checks);
         }
-        let mut before_s = f64::NEG_INFINITY;
+        let mut previous_s = f64::NEG_INFINITY;
         for (index, position) in self.positions.iter().enumerate() {
             let key = format!("positions[{index}]");
             let [from_s, until_s] = [position.from_s, position.until_s];
-            let expected = "a finite time, not before the end of the one before";
-            checks.number(format!("{key}.from_s"), from_s, from_s >= before_s, expected);
+            let expected = "a finite time, not before until_s of the preceding entry";
+            checks.number(format!("{key}.from_s"), from_s, from_s >= previous_s, expected);
             checks.number(format!("{key}.until_s"), until_s, until_s > from_s, "a finite time after from_s");
-            before_s = before_s.max(until_s);
+            previous_s = previous_s.max(until_s);
             for (name, list) in [("normals_hat", &position.normals_hat), ("offsets_m", &position.offsets_m)] {
                 let key = format!("{key}.{name}");
                 let found = format!("({} satellites)", list.len());
@@ -163,21 +163,21 @@ impl GainsFile {
 
 impl ChannelGains {
     fn check(&self, key: &str, satellites: usize, checks: &mut Checks) {
-        let some = !self.solutions.is_empty();
-        checks.require(format!("{key}.solutions"), "[]", some, "at least one solution");
-        let mut before_s = f64::NEG_INFINITY;
+        let is_nonempty = !self.solutions.is_empty();
+        checks.require(format!("{key}.solutions"), "[]", is_nonempty, "at least one solution");
+        let mut previous_s = f64::NEG_INFINITY;
         for (index, solution) in self.solutions.iter().enumerate() {
             let key = format!("{key}.solutions[{index}]");
             let time_s = solution.time_s;
-            let expected = "a finite time after the one before";
-            checks.number(format!("{key}.time_s"), time_s, time_s > before_s, expected);
-            before_s = before_s.max(time_s);
+            let expected = "a finite time after that of the preceding solution";
+            checks.number(format!("{key}.time_s"), time_s, time_s > previous_s, expected);
+            previous_s = previous_s.max(time_s);
             let count = solution.gains.len();
             let (gains_key, found) = (format!("{key}.gains"), format!("({count} satellites)"));
-            let some = (2..=MAX_SATELLITES).contains(&count);
-            checks.require(&gains_key, &found, some, "2 to 64 satellites");
-            let same = !some || count == satellites;
-            checks.require(&gains_key, &found, same, "as many satellites as in the first solution");
+            let is_accepted = (2..=MAX_SATELLITES).contains(&count);
+            checks.require(&gains_key, &found, is_accepted, "2 to 64 satellites");
+            let is_equal = !is_accepted || count == satellites;
+            checks.require(&gains_key, &found, is_equal, "as many satellites as in the first solution");
         }
     }
 }
@@ -199,7 +199,7 @@ mod tests {
         "[[channels]]\nfrequency_hz = 1e7\nsolutions = [{ time_s = 5, gains = [[1, 0], [0.5, -2]] }]";
 
     #[test]
-    fn toml_and_json_say_the_same() {
+    fn toml_and_json_are_equivalent() {
         let json = r#"{"channels": [{"frequency_hz": 1e7,
                        "solutions": [{"time_s": 5, "gains": [[1, 0], [0.5, -2]]}]}]}"#;
         let (from_toml, from_json) = (read("a.toml", TOML).unwrap(), read("a.JSON", json).unwrap());
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_keys_and_foreign_files_are_refused() {
+    fn unknown_keys_and_other_files_are_refused() {
         for text in [&format!("gain = 1\n{TOML}"), "", "SIMPLE  =  T", "channels = 3"] {
             let error = read("a.toml", text).unwrap_err();
             assert!(matches!(error, CalibrationError::Syntax { .. }), "{error}");
@@ -225,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_wrong_is_said_at_once() {
+    fn all_invalid_values_are_reported_at_once() {
         let text = "frequency_tolerance_hz = -1\n\
             [[channels]]\nfrequency_hz = 1e7\n\
             solutions = [{ time_s = 5, gains = [[1, 0], [1, 0]] }, { time_s = 5, gains = [[1, 0]] }]\n\
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_of_many_mistakes_are_told() {
+    fn only_the_first_of_many_mistakes_are_listed() {
         let solutions: Vec<String> =
             (0..30).map(|k| format!("{{ time_s = {k}, gains = [[1, 0]] }}")).collect();
         let text = format!("[[channels]]\nfrequency_hz = 1e7\nsolutions = [{}]", solutions.join(", "));

@@ -1,13 +1,12 @@
 //! Calibration: from received visibilities to placed, corrected and weighted ones.
 //!
-//! The [`Calibrator`] gives visibilities their positions and applies corrections in order: [`VanVleck`] undoes the effect
-//! of coarse quantisers on correlations; a [`Calibration`] turns them into what ideal antennas would have measured
-//! ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file, and corrects positions); [`SubBands`] combines sub-bands
-//! of a channel. [`CalibrationConfig`] chooses. The [`solver`] finds the gains of such a file from the data;
-//! [`SolvedGains`] are those that a ground finds while the data arrive.
+//! The [`Calibrator`] gives visibilities their positions and applies corrections in order: [`VanVleck`] undoes the
+//! effect of coarse quantisers on correlations; a [`Calibration`] turns them into what ideal antennas would have
+//! measured ([`Identity`] changes nothing, [`AntennaGains`] divides by complex gains from a file and corrects
+//! positions); [`SubBands`] combines sub-bands of a channel. [`CalibrationConfig`] selects the corrections. The
+//! [`solver`] finds gains from the data; [`SolvedGains`] holds those that a ground station finds while data arrive.
 //!
-//! Uses [`crate::frames`] and [`crate::array`]. Every block is used once; every visibility that is left out is in the
-//! ledger with its reason.
+//! Each block is used once. Each visibility left out is in the ledger with its reason.
 
 mod autos;
 mod blocks;
@@ -48,7 +47,7 @@ use crate::frames::{Instrument, PlacedVisibilities, VisibilityReason};
 /// ```
 /// use lunarray::prelude::*;
 ///
-/// /// Takes out a gain that all satellites share.
+/// /// Divides by a gain that all satellites share.
 /// struct CommonGain(f64);
 ///
 /// impl Calibration for CommonGain {
@@ -83,7 +82,7 @@ pub trait Calibration: Send {
     /// Name as in the configuration.
     fn name(&self) -> &'static str;
 
-    /// Takes the description of the instrument; returns the description after calibration.
+    /// Accepts the description of the instrument, and returns the description after calibration.
     ///
     /// # Errors
     /// [`CalibrationError`] if the calibration was not made for this instrument.
@@ -91,32 +90,32 @@ pub trait Calibration: Send {
         Ok(instrument.clone())
     }
 
-    /// Corrects values and weights of a block, and removes what cannot be corrected. Keeps the order and the equal
-    /// lengths of the arrays.
+    /// Corrects values and weights of a block, and removes visibilities that cannot be corrected. Keeps the order and
+    /// the equal lengths of the arrays.
     ///
     /// # Errors
-    /// [`CalibrationError`] if the calibration was not made for this block. Bad data is not an error but counted in the
-    /// report.
+    /// [`CalibrationError`] if the calibration was not made for this block. Bad data are no error: the report counts
+    /// them.
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError>;
 
-    /// Whether it leaves every block as it is.
+    /// Whether the calibration changes no block.
     fn is_identity(&self) -> bool {
         false
     }
 }
 
-/// What became of the visibilities of a block.
+/// Number of visibilities of a block that were kept and removed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[must_use]
 pub struct CalibrationReport {
-    /// Corrected, or good as they were.
+    /// Visibilities kept, corrected or unchanged.
     pub kept: usize,
-    /// Removed: a gain is zero, not finite, or so small or large that nothing is left.
+    /// Visibilities removed, because a gain is zero, not finite, or so small or large that no digits are left.
     pub unusable_gain: usize,
 }
 
 impl CalibrationReport {
-    /// Reason and number of those removed, for a ledger; zeros included.
+    /// Reason and number of removed visibilities, zeros included, for a ledger.
     #[must_use]
     #[doc(hidden)]
     pub fn removed(&self) -> [(VisibilityReason, usize); 1] {
@@ -124,7 +123,7 @@ impl CalibrationReport {
     }
 }
 
-/// Changes nothing.
+/// Calibration that changes nothing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Identity;
 

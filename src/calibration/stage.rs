@@ -15,15 +15,15 @@ use crate::frames::{
 use crate::runtime::{Ledger, Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Places visibilities by the ephemeris packets alone and passes them through the calibration hook. What cannot be used
-/// is flagged in the ledger with its reason.
+/// Stage that places visibilities by the ephemeris packets alone, and applies the calibration. Visibilities that
+/// cannot be used are in the ledger with their reason.
 ///
-/// At the end the ledger is closed against the spacecraft's own counts: sampled less dropped less received is what the
-/// link lost. Visibilities after the latest report count as sampled when received; of what else was sampled then only
-/// missing packets are known, and the ledger is not known to be complete.
+/// At the end the ledger is compared with the spacecraft's own counts: sampled minus dropped minus received is what
+/// the link lost. Visibilities after the latest report count as sampled when received; of others sampled since then
+/// only missing packets are known, so the ledger is not known to be complete.
 pub struct Calibrator {
     van_vleck: Option<VanVleck>,
-    /// Auto-correlations, if they are kept.
+    /// Auto-correlations; `None` if they are not kept.
     autos: Option<AutoTable>,
     calibration: Box<dyn Calibration>,
     ledger: Ledger<VisibilityReason>,
@@ -35,7 +35,7 @@ pub struct Calibrator {
 }
 
 impl Calibrator {
-    /// A stage that posts to `ledger`.
+    /// Creates a stage that posts to `ledger`.
     #[must_use]
     pub fn new(calibration: Box<dyn Calibration>, ledger: Ledger<VisibilityReason>) -> Self {
         Self {
@@ -50,35 +50,36 @@ impl Calibrator {
         }
     }
 
-    /// Visibilities of other channels are counted and left out, where calibration would not remove any; `None` for no others.
+    /// Calibrates only the channels of `group`, or all if `None`. Visibilities of other channels are counted as left
+    /// out, where calibration would not remove any.
     #[must_use]
     #[doc(hidden)]
-    pub fn of_group(self, group: Option<BTreeSet<ChannelId>>) -> Self {
+    pub fn with_group(self, group: Option<BTreeSet<ChannelId>>) -> Self {
         Self { group, ..self }
     }
 
-    /// Corrects the quantiser's effect on correlations first.
+    /// Undoes the quantiser's effect on correlations before calibration.
     #[must_use]
     #[doc(hidden)]
     pub fn with_van_vleck(self, van_vleck: Option<VanVleck>) -> Self {
         Self { van_vleck, ..self }
     }
 
-    /// Keeps auto-correlations, each once, by channel, daughter and time; without this they are flagged.
+    /// Keeps auto-correlations, each once, by channel, daughter and time; otherwise they are flagged.
     #[must_use]
     #[doc(hidden)]
     pub fn with_autos(self) -> Self {
         Self { autos: Some(AutoTable::default()), ..self }
     }
 
-    /// Keeps positions of `segments_max` segments.
+    /// Sets the maximum number of ephemeris segments kept.
     #[must_use]
     #[doc(hidden)]
     pub fn with_segments(self, segments_max: usize) -> Self {
         Self { ephemeris: Ephemeris::new(segments_max), ..self }
     }
 
-    /// Resumes with an instrument, positions, auto-correlations and received blocks of earlier sessions.
+    /// Resumes with the instrument, positions, auto-correlations and received blocks of earlier sessions.
     ///
     /// If the calibration refuses the instrument, it does so again with the first visibilities.
     #[must_use]
@@ -99,20 +100,20 @@ impl Calibrator {
         Self { instrument, autos: Some(autos), blocks, ..self }
     }
 
-    /// Positions.
+    /// The ephemeris received so far.
     #[must_use]
     pub fn ephemeris(&self) -> &Ephemeris {
         &self.ephemeris
     }
 
-    /// Blocks received.
+    /// Record of received blocks.
     #[must_use]
     #[doc(hidden)]
     pub fn blocks(&self) -> &ReceivedBlocks {
         &self.blocks
     }
 
-    /// Removes a segment of positions.
+    /// Removes the ephemeris segment that starts at `start`.
     #[doc(hidden)]
     pub fn remove_segment(&mut self, start: MissionTime) {
         self.ephemeris.remove(start);
@@ -132,7 +133,8 @@ impl Calibrator {
         known.map(|(autos, instrument)| autos.list(instrument)).unwrap_or_default()
     }
 
-    /// Visibilities of a block, placed and calibrated, without any effect on the ledger or the received blocks.
+    /// Returns the visibilities of a block, placed and calibrated, without changing the ledger or the received
+    /// blocks.
     ///
     /// # Errors
     /// As [`Calibrator::accept`].
@@ -159,13 +161,13 @@ impl Calibrator {
         Ok(placed.zip(autos).map_or(0, |(placed, autos)| autos.remove(&placed)))
     }
 
-    /// Takes the next frame; returns what is to be accumulated of it.
+    /// Processes the next frame; returns what is to be accumulated.
     ///
     /// # Errors
     /// [`CalibrationError`] if calibration was not made for this instrument, or the arrays of a block have unequal lengths.
     pub fn accept(&mut self, frame: GroundFrame) -> Result<Option<PlacedFrame>, CalibrationError> {
         match frame {
-            // The decoder reports descriptions that contradict the first.
+            // The decoder reports descriptions that contradict the first one.
             GroundFrame::Instrument(_) if self.instrument.is_some() => Ok(None),
             GroundFrame::Instrument(instrument) => {
                 let calibrated = self.calibration.describe(&instrument)?;
@@ -173,7 +175,7 @@ impl Calibrator {
                 Ok(Some(PlacedFrame::Instrument(calibrated)))
             }
             GroundFrame::Ephemeris(segment) => {
-                // Whatever becomes of it, visibilities without positions are counted one by one.
+                // If it is not inserted, visibilities without positions are counted individually.
                 self.ephemeris.insert(segment);
                 Ok(None)
             }
@@ -185,32 +187,32 @@ impl Calibrator {
         }
     }
 
-    /// Counts visibilities that were received and that the next session will add.
+    /// Counts visibilities that were received now and are accumulated in the next session.
     #[doc(hidden)]
-    pub fn leave_for_later(&mut self, block: &VisibilityBlock) {
+    pub fn count_for_next_session(&mut self, block: &VisibilityBlock) {
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(block) else { return };
         if self.blocks.insert(key) {
             self.blocks.count(block.start, count);
-            self.ledger.left_out(VisibilityReason::NextSession, count);
+            self.ledger.add_left_out(VisibilityReason::NextSession, count);
         } else {
-            self.ledger.sampled(count);
-            self.ledger.left_out(VisibilityReason::Duplicate, count);
+            self.ledger.add_sampled(count);
+            self.ledger.add_left_out(VisibilityReason::Duplicate, count);
         }
     }
 
-    /// Counts visibilities that the decoder left out of a block whose window starts at `window`, because their values
-    /// cannot be used.
+    /// Counts visibilities that the decoder left out of a block in the window that starts at `window`, because their
+    /// values are unusable.
     #[doc(hidden)]
     pub fn count_bad(&mut self, window: MissionTime, visibilities: u64) {
         self.blocks.count_bad(window, visibilities);
     }
 
-    /// Posts to the ledger what was sampled, and what was lost before it was received; returns whether that is known to
-    /// be all.
+    /// Posts to the ledger the visibilities sampled, and those lost before reception; returns whether the counts are
+    /// complete.
     #[doc(hidden)]
-    pub fn close(&self, missing: MissingPackets) -> Completeness {
-        self.blocks.close(&self.ledger, missing)
+    pub fn post_losses(&self, missing: MissingPackets) -> Completeness {
+        self.blocks.post_losses(&self.ledger, missing)
     }
 
     fn accept_visibilities(
@@ -221,14 +223,14 @@ impl Calibrator {
         let count = block.len() as u64;
         let Some(key) = BlockKey::of(&block) else { return Ok(None) };
         if !self.blocks.insert(key) {
-            self.ledger.sampled(count);
-            self.ledger.left_out(VisibilityReason::Duplicate, count);
+            self.ledger.add_sampled(count);
+            self.ledger.add_left_out(VisibilityReason::Duplicate, count);
             return Ok(None);
         }
         self.blocks.count(block.start, count);
         if block.pair.i != block.pair.j {
-            if self.is_elsewhere(&block) {
-                return Ok(self.count_elsewhere(&block).map(PlacedFrame::Elsewhere));
+            if self.is_not_imaged(&block) {
+                return Ok(self.count_not_imaged(&block).map(PlacedFrame::Elsewhere));
             }
             let placed = self.place(block)?.filter(|placed| !placed.is_empty());
             return Ok(placed.map(PlacedFrame::Visibilities));
@@ -239,7 +241,7 @@ impl Calibrator {
         Ok(None)
     }
 
-    /// Calibrated auto-correlations of one daughter; `None` if no instrument is known.
+    /// Returns the calibrated auto-correlations of one daughter; `None` if no instrument is known.
     fn calibrate_autos(
         &mut self,
         mut block: VisibilityBlock,
@@ -263,7 +265,7 @@ impl Calibrator {
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
             duration_s: Vec::new(),
         };
-        // The spectrometer is not one of the antennas whose gains are known.
+        // The spectrometer is not one of the antennas with gains.
         if !self.is_spectrum(block.pair) {
             self.calibrate(&mut placed)?;
         }
@@ -274,24 +276,24 @@ impl Calibrator {
 
     fn keep_autos(&mut self, placed: &PlacedVisibilities) {
         let Some(autos) = &mut self.autos else {
-            self.ledger.left_out(VisibilityReason::Auto, placed.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::Auto, placed.len() as u64);
             return;
         };
         let insertion = autos.insert(placed, AUTOS_MAX);
-        self.ledger.accumulated(insertion.kept);
-        self.ledger.left_out(VisibilityReason::AutoTableFull, insertion.beyond);
-        self.ledger.left_out(VisibilityReason::AutoRepeated, insertion.duplicates);
+        self.ledger.add_accumulated(insertion.kept);
+        self.ledger.add_left_out(VisibilityReason::AutoTableFull, insertion.refused);
+        self.ledger.add_left_out(VisibilityReason::AutoRepeated, insertion.duplicates);
     }
 
     fn is_spectrum(&self, pair: Pair) -> bool {
         self.instrument.as_ref().is_some_and(|instrument| instrument.is_spectrum(pair))
     }
 
-    /// Corrects a block for its quantiser; returns its channel, if the instrument is known and has it.
+    /// Undoes a block's quantisation; returns its channel, if the instrument is known and has it.
     fn prepare(&self, block: &mut VisibilityBlock) -> Option<Channel> {
         let channel = self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair));
         let Some(channel) = channel else {
-            self.ledger.left_out(VisibilityReason::NoInstrument, block.len() as u64);
+            self.ledger.add_left_out(VisibilityReason::NoInstrument, block.len() as u64);
             return None;
         };
         // The spectrometer has no sample quantiser.
@@ -303,7 +305,7 @@ impl Calibrator {
         Some(channel)
     }
 
-    fn is_elsewhere(&self, block: &VisibilityBlock) -> bool {
+    fn is_not_imaged(&self, block: &VisibilityBlock) -> bool {
         let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&block.channel));
         let is_known =
             || self.instrument.as_ref().and_then(|i| i.channel_of(block.channel, block.pair)).is_some();
@@ -311,9 +313,9 @@ impl Calibrator {
     }
 
     /// Posts what would become of a block of two daughters; `None` if nothing of it would be left.
-    fn count_elsewhere(&self, block: &VisibilityBlock) -> Option<CountedVisibilities> {
+    fn count_not_imaged(&self, block: &VisibilityBlock) -> Option<CountedVisibilities> {
         let (placing, first_s) = self.ephemeris.count(block);
-        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         first_s.map(|first_s| CountedVisibilities { first_s, visibilities: placing.placed })
     }
@@ -322,7 +324,7 @@ impl Calibrator {
     fn place(&mut self, mut block: VisibilityBlock) -> Result<Option<PlacedVisibilities>, CalibrationError> {
         let Some(channel) = self.prepare(&mut block) else { return Ok(None) };
         let (mut placed, placing) = self.ephemeris.place(&block, channel.frequency_hz);
-        self.ledger.left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
+        self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
         Ok(Some(placed))
@@ -332,14 +334,14 @@ impl Calibrator {
         let calibrated = self.calibration.apply(placed)?;
         placed.check_lengths()?;
         for (reason, count) in calibrated.removed() {
-            self.ledger.left_out(reason, count as u64);
+            self.ledger.add_left_out(reason, count as u64);
         }
         Ok(())
     }
 
     fn post_flagged(&self, flagged: BTreeMap<VisibilityReason, u64>) {
         for (reason, count) in flagged {
-            self.ledger.left_out(reason, count);
+            self.ledger.add_left_out(reason, count);
         }
     }
 }
@@ -357,7 +359,7 @@ impl Stage for Calibrator {
     }
 
     fn finish(&mut self, _: &mut Outlet<PlacedFrame>) -> Result<(), CalibrationError> {
-        self.close(MissingPackets::default());
+        self.post_losses(MissingPackets::default());
         Ok(())
     }
 

@@ -5,21 +5,21 @@ use crate::array::scaled_baseline;
 use crate::frames::{Channel, Instrument, PlacedVisibilities};
 use crate::units::ChannelId;
 
-/// Combines successive channels of the downlink into one, after another calibration.
+/// Calibration that combines successive channels of the downlink into one, after another calibration.
 ///
-/// A visibility depends on the baseline in wavelengths: at nu_k and baseline b it is that of the channel's centre nu
-/// with a baseline b nu_k / nu. The two positions are moved apart, or together, on their circle about the Moon until
-/// the chord is that long. The Moon's limb is then displaced by half of what was added, `|b| W / (4 nu r)` at most
-/// for a channel of width W: 1e-5 rad for 100 km at 10 MHz, 5e-4 rad at 0.2 MHz.
+/// A visibility depends on the baseline in wavelengths: at frequency nu_k and baseline b it equals the visibility at
+/// the channel's centre nu with baseline b nu_k / nu. The two positions are moved on their circle about the Moon
+/// until the chord has that length. This displaces the Moon's limb by half the change of the baseline, at most `|b| W
+/// / (4 nu r)` for a channel of width W: 1e-5 rad for 100 km at 10 MHz, 5e-4 rad at 0.2 MHz.
 pub struct SubBands {
     inner: Box<dyn Calibration>,
     count: usize,
-    /// The channels made of sub-bands.
+    /// Combined channels.
     channels: Vec<Channel>,
 }
 
 impl SubBands {
-    /// Makes one channel of each `count` (at least 1) that `inner` has calibrated.
+    /// Combines each `count` (at least 1) channels that `inner` has calibrated into one.
     #[must_use]
     pub fn new(inner: Box<dyn Calibration>, count: usize) -> Self {
         Self { inner, count: count.max(1), channels: Vec::new() }
@@ -34,27 +34,28 @@ impl Calibration for SubBands {
     fn describe(&mut self, instrument: &Instrument) -> Result<Instrument, CalibrationError> {
         let instrument = self.inner.describe(instrument)?;
         let channels = &instrument.channels;
-        let whole = |bands: &[Channel]| {
+        let combined = |bands: &[Channel]| {
             let count = bands.len() as f64;
             let frequency_hz = bands.iter().map(|band| band.frequency_hz).sum::<f64>() / count;
             Channel { frequency_hz, width_hz: bands.iter().map(|band| band.width_hz).sum() }
         };
-        let adjoin = |bands: &[Channel]| {
+        let are_adjoining = |bands: &[Channel]| {
             let step_hz = |k: usize| bands[k].frequency_hz - bands[k - 1].frequency_hz;
             (1..bands.len()).all(|k| (step_hz(k) / bands[k].width_hz - 1.0).abs() < 1e-3)
         };
-        let fit = channels.len().is_multiple_of(self.count) && channels.chunks(self.count).all(adjoin);
-        if !fit {
+        let is_divisible =
+            channels.len().is_multiple_of(self.count) && channels.chunks(self.count).all(are_adjoining);
+        if !is_divisible {
             return Err(CalibrationError::SubBands { sub_bands: self.count, channels: channels.len() });
         }
-        self.channels = channels.chunks(self.count).map(whole).collect();
+        self.channels = channels.chunks(self.count).map(combined).collect();
         Ok(Instrument { channels: self.channels.clone(), ..instrument })
     }
 
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
         let report = self.inner.apply(block)?;
         if block.pair.i == block.pair.j {
-            // Auto-correlations are kept by sub-band: a spectrum.
+            // Auto-correlations keep their sub-bands, as a spectrum.
             return Ok(report);
         }
         let index = usize::from(block.channel.0) / self.count;
@@ -99,12 +100,12 @@ mod tests {
     }
 
     #[test]
-    fn fringes_of_a_sub_band_are_those_of_the_channel_at_the_positions_given_for_it() {
+    fn moved_positions_have_the_fringes_of_the_sub_band() {
         let mut bands = SubBands::new(Box::new(Identity), 2);
-        let whole =
+        let combined =
             bands.describe(&instrument(&[[9e5, 2e5], [1.1e6, 2e5], [1.9e6, 2e5], [2.1e6, 2e5]])).unwrap();
         let expected = [(1e6, 4e5), (2e6, 4e5)];
-        for (channel, (frequency_hz, width_hz)) in whole.channels.iter().zip(expected) {
+        for (channel, (frequency_hz, width_hz)) in combined.channels.iter().zip(expected) {
             assert!((channel.frequency_hz - frequency_hz).abs() < 1e-6);
             assert!((channel.width_hz - width_hz).abs() < 1e-6);
         }
@@ -126,7 +127,10 @@ mod tests {
                 duration_s: Vec::new(),
             };
             assert_eq!(bands.apply(&mut block).unwrap().kept, 1);
-            assert_eq!((block.channel, block.frequency_hz), (ChannelId(1), whole.channels[1].frequency_hz));
+            assert_eq!(
+                (block.channel, block.frequency_hz),
+                (ChannelId(1), combined.channels[1].frequency_hz)
+            );
             assert_eq!(block.band, channel - 2);
             // Any direction has the same phase; rounding of 2e6 m leaves some 1e-9 m.
             for n_hat in [[1.0, 0.0, 0.0], [0.0, 0.6, -0.8], [0.6, 0.48, 0.64]] {
@@ -142,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn channels_that_are_no_sub_bands_are_refused() {
+    fn channels_that_do_not_adjoin_are_refused() {
         for channels in [&[[1e6, 4e3], [1.004e6, 4e3], [1.008e6, 4e3]][..], &[[1e6, 4e3], [1.005e6, 4e3]]] {
             let mut bands = SubBands::new(Box::new(Identity), 2);
             let refused = bands.describe(&instrument(channels));

@@ -6,18 +6,18 @@ use thiserror::Error;
 
 use crate::frames::VisibilityBlock;
 
-/// Steps of the table over the angle whose sine is a correlation.
+/// Number of steps of the table over the angle whose sine is the correlation.
 const STEPS: usize = 512;
 
-/// A number of bits without a correction.
+/// The number of bits has no correction.
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq)]
 #[error("calibration.quantiser_bits = {0}: expected 0 for none, 1, 2 or 4")]
 pub struct QuantiserBitsError(pub u32);
 
-/// The relation between correlations before and after quantisers of equal levels.
+/// Relation between correlations before and after quantisation with equal levels.
 ///
-/// Two Gaussian parts of correlation rho, quantised by levels q with thresholds t_k a step h apart, have
-/// `d<q q'>/d rho = h^2 sum over k, l of phi(t_k, t_l; rho)`, phi the density of the two (Price's theorem;
+/// Two Gaussian variables of correlation rho, quantised to q with thresholds t_k a step h apart, have
+/// `d<q q'>/d rho = h^2 sum over k, l of phi(t_k, t_l; rho)`, phi their joint density (Price's theorem;
 /// Thompson, Moran & Swenson 2017, Sect. 8.3; van Vleck & Middleton 1966 for one bit, where it is
 /// `2/pi asin rho`). With rho = sin(theta) the integrand has no pole.
 #[derive(Clone, Debug)]
@@ -29,11 +29,11 @@ pub struct VanVleck {
 }
 
 impl VanVleck {
-    /// The relation for 1, 2 or 4 bits at the levels of least loss: steps of 0.9957 and 0.3352 standard
+    /// Computes the relation for 1, 2 or 4 bits at the levels of least loss: steps of 0.9957 and 0.3352 standard
     /// deviations (Thompson, Moran & Swenson, Table 8.2); for one bit, levels of one deviation.
     ///
     /// # Errors
-    /// Any other number of bits.
+    /// The number of bits is none of these.
     pub fn new(bits: u32) -> Result<Self, QuantiserBitsError> {
         let step = match bits {
             1 => 2.0,
@@ -59,7 +59,7 @@ impl VanVleck {
         let mut total = 0.0;
         for k in 0..STEPS {
             let from = h * k as f64;
-            // Gauss's rule of three points: the integrand is never evaluated at the end, where cos is 0.
+            // Three-point Gauss rule: the integrand is never evaluated at the end, where cos is 0.
             let at = |x: f64| slope(from + h * (0.5 + 0.5 * x));
             let root = 0.6_f64.sqrt();
             total += h * (5.0 * at(-root) + 8.0 * at(0.0) + 5.0 * at(root)) / 18.0;
@@ -71,40 +71,40 @@ impl VanVleck {
         Ok(Self { quantised, power_ratio: total })
     }
 
-    /// Correlation of the quantised for a correlation from -1 to 1.
+    /// Correlation after quantisation, for a correlation from -1 to 1.
     #[must_use]
     pub fn forward(&self, correlation: f64) -> f64 {
-        let place = correlation.abs().min(1.0).asin() / FRAC_PI_2 * STEPS as f64;
-        let k = (place as usize).min(STEPS - 1);
+        let position = correlation.abs().min(1.0).asin() / FRAC_PI_2 * STEPS as f64;
+        let k = (position as usize).min(STEPS - 1);
         let (low, high) = (self.quantised[k], self.quantised[k + 1]);
-        (low + (place - k as f64) * (high - low)).copysign(correlation)
+        (low + (position - k as f64) * (high - low)).copysign(correlation)
     }
 
-    /// Correlation before the quantiser for one after it, from -1 to 1; noise beyond is taken as +-1.
+    /// Correlation before quantisation, for one after it from -1 to 1; noise beyond counts as +-1.
     #[must_use]
     pub fn inverse(&self, quantised: f64) -> f64 {
-        let wanted = quantised.abs().min(1.0);
-        let k = self.quantised.partition_point(|value| *value <= wanted).clamp(1, STEPS) - 1;
+        let target = quantised.abs().min(1.0);
+        let k = self.quantised.partition_point(|value| *value <= target).clamp(1, STEPS) - 1;
         let (low, high) = (self.quantised[k], self.quantised[k + 1]);
-        let place = k as f64 + (wanted - low) / (high - low);
-        (FRAC_PI_2 * place / STEPS as f64).sin().copysign(quantised)
+        let position = k as f64 + (target - low) / (high - low);
+        (FRAC_PI_2 * position / STEPS as f64).sin().copysign(quantised)
     }
 
-    /// Corrects a block in place, real and imaginary parts each for itself, and its weights to those of the
-    /// corrected values. `width_hz` is the channel's.
+    /// Corrects the values of a block in place, real and imaginary parts separately, and sets its weights to those of
+    /// the corrected values. `width_hz` is the channel's width.
     ///
-    /// The daughters' powers follow from the mother's weights, `2 n / (P_i P_j)`, where n is taken as all samples of
-    /// the integration.
+    /// The daughters' powers follow from the mother's weights, `2 n / (P_i P_j)`, with n all samples of the
+    /// integration.
     pub fn apply(&self, block: &mut VisibilityBlock, width_hz: f64) {
         if block.pair.i == block.pair.j {
-            // Powers have no correlation coefficient; they are scaled by the power ratio.
+            // Powers are only scaled by the power ratio.
             for (value, weight) in block.value_k_sr.iter_mut().zip(&mut block.weight) {
                 *value /= self.power_ratio as f32;
                 *weight *= self.power_ratio.powi(2) as f32;
             }
             return;
         }
-        let weak = self.quantised[1] / (FRAC_PI_2 / STEPS as f64).sin();
+        let weak_slope = self.quantised[1] / (FRAC_PI_2 / STEPS as f64).sin();
         for k in 0..block.value_k_sr.len() {
             let samples = width_hz * f64::from(block.duration_ticks[k]) * 1e-6;
             let power = (2.0 * samples / f64::from(block.weight[k])).sqrt();
@@ -113,8 +113,8 @@ impl VanVleck {
                 |part: f32| (self.inverse(f64::from(part) / power) * power / self.power_ratio) as f32;
             value.re = corrected(value.re);
             value.im = corrected(value.im);
-            // Noise of weak correlations grows as they do.
-            block.weight[k] *= ((weak * self.power_ratio).powi(2)) as f32;
+            // The correction scales the noise of weak correlations as it scales them.
+            block.weight[k] *= ((weak_slope * self.power_ratio).powi(2)) as f32;
         }
     }
 }
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn powers_are_those_of_the_levels() {
+    fn the_power_ratio_is_that_of_the_levels() {
         // 2 bits: levels +-1/2 and +-3/2 of 0.9957; the outer two with the probability of |x| > 0.9957, 0.31940.
         let expected = 0.9957_f64.powi(2) * (0.25 + 2.0 * 0.319_396);
         let found = VanVleck::new(2).unwrap().power_ratio;
@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_comes_back_and_its_noise_with_it() {
+    fn a_block_is_restored_with_its_noise() {
         let relation = VanVleck::new(2).unwrap();
         // Powers of 3 before the quantiser, 1 s of 8 kHz.
         let power = 3.0 * relation.power_ratio;

@@ -259,8 +259,8 @@ impl TimeOfMission {
 /// A time such as `7d`, or a date such as `2027-01-08T12:00:00` (TAI) or `2027-01-08T12:00:00Z` (UTC).
 pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
     let scale = if text.ends_with('Z') { TimeScale::Utc } else { TimeScale::Tai };
-    match Tai::read(text, scale) {
-        Some(time) => Ok(TimeOfMission::Tai(time.from_1958())),
+    match Tai::parse(text, scale) {
+        Some(time) => Ok(TimeOfMission::Tai(time.seconds_since_1958())),
         None => time_s(text).map(TimeOfMission::Since).map_err(|expected| {
             format!(
                 "{expected}; or a date, TAI such as 2027-01-08T12:00:37, or UTC such as 2027-01-08T12:00:00Z"

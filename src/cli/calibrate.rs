@@ -26,7 +26,7 @@ pub(super) struct CalibrateArgs {
     /// Downlink files in the order of time.
     #[arg(required = true, value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
-    /// HEALPix map of the sky in K; one a channel of the downlink, in their order; calibrate.model_files if not given.
+    /// HEALPix map of the sky in K; one for each channel of the downlink, in their order; calibrate.model_files if not given.
     #[arg(long, value_name = "MAP.fits", num_args = 1..)]
     model: Vec<PathBuf>,
     /// Map file (TOML): settings of the ground segment; the defaults of pipelines/reference.toml if not given.

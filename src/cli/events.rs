@@ -71,7 +71,7 @@ impl Events {
     /// The run begins, or a further pass of it.
     pub(super) fn watch(&self, watched: &Watched) {
         let Some(writer) = &self.writer else { return };
-        watched.maps.join(Box::new(writer.viewer()));
+        watched.maps.add_viewer(Box::new(writer.viewer()));
         writer.send(Message::Watch(Box::new(watched.clone())));
     }
 
@@ -395,7 +395,7 @@ fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<
         let counters = ground.reception.lock();
         Box::new(counters.unwrap_or_else(std::sync::PoisonError::into_inner).clone())
     });
-    let solving = watched.solving.now().map(|solving| SolveCount {
+    let solving = watched.solving.progress().map(|solving| SolveCount {
         what: solving.what,
         iteration: solving.iteration,
         residual: solving.residual,

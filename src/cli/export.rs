@@ -317,8 +317,8 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
             )
             .into());
         }
-        (Some(date), None) => match Tai::read(date, TimeScale::Utc) {
-            Some(time) => time.from_1958(),
+        (Some(date), None) => match Tai::parse(date, TimeScale::Utc) {
+            Some(time) => time.seconds_since_1958(),
             None => {
                 return Err(
                     format!("--epoch {date}: expected a date, UTC, such as 2030-01-31T12:00:00").into()

@@ -43,7 +43,7 @@ pub(super) struct GapsArgs {
 
 pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     let _inputs = ProtectedInputs::of([&args.path]);
-    let survey = CoverageSurvey::of(&args.path)?;
+    let survey = CoverageSurvey::read(&args.path)?;
     print_notes(survey.notes());
     let gaps = survey.gaps();
     if let Some(path) = &args.picture {

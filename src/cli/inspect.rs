@@ -39,7 +39,7 @@ struct Inspection<'a> {
 
 pub(super) fn execute(args: &InspectArgs) -> CommandResult {
     let mut survey = GeometrySurvey::new(GeometryLimits::default());
-    let contents = Contents::read_with(&args.file, &mut |frame| survey.see(frame))?;
+    let contents = Contents::read_with(&args.file, &mut |frame| survey.add(frame))?;
     let geometry = survey.finish();
     if args.json {
         print_json_line(&Inspection { contents: &contents, geometry: &geometry })?;

@@ -25,7 +25,7 @@ impl Job {
     /// Joins the job that the process was started in, if that is wanted.
     pub(super) fn join(is_wanted: bool) -> Result<Self, RanksError> {
         if !is_wanted {
-            return Ok(Self { job: None, ranks: Ranks::one() });
+            return Ok(Self { job: None, ranks: Ranks::single() });
         }
         let (job, ranks) = RankJob::start()?;
         Ok(Self { job: Some(job), ranks })
@@ -53,8 +53,10 @@ impl Job {
         ended: &Result<T, impl std::fmt::Display>,
         interrupt: &Interrupt,
     ) -> Option<Completion> {
-        let error =
-            ended.as_ref().err().filter(|_| self.ranks.are_many() && interrupt.cancel().is_cancelled())?;
+        let error = ended
+            .as_ref()
+            .err()
+            .filter(|_| self.ranks.is_distributed() && interrupt.cancel().is_cancelled())?;
         match log::is_json() {
             true => log::log_json(Level::Error, "error", &Value::Null, Some(&error.to_string())),
             false => log::print_line(format_args!("error: {error}")),
@@ -64,7 +66,7 @@ impl Job {
 
     /// Ends what `work` has begun: in order once all ranks have done theirs, else all of them at once.
     pub(super) fn conclude(self, result: CommandResult) -> CommandResult {
-        let Some(job) = self.job.filter(|_| self.ranks.are_many()) else { return result };
+        let Some(job) = self.job.filter(|_| self.ranks.is_distributed()) else { return result };
         let code = match result {
             Ok(Completion::Done) => return Ok(Completion::Done),
             Ok(Completion::Interrupted(code)) => code,

@@ -10,7 +10,7 @@ use super::output::{CommandError, CommandResult, Completion, print_json_line, pr
 use super::progress::while_solving;
 use crate::files::write_atomically;
 use crate::imaging::SolveWatch;
-use crate::imaging::joint::{Agreement, JointMap, JointRequest, JointSolution, Likeness, SpectralMaps};
+use crate::imaging::joint::{Agreement, Correlation, JointMap, JointRequest, JointSolution, SpectralMaps};
 use crate::pipeline::{solve_states_jointly, use_threads};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, View, draw_map};
 use crate::sky::Frame;
@@ -55,7 +55,7 @@ pub(super) struct JointArgs {
 #[derive(Serialize)]
 struct Report {
     /// How alike the channels are.
-    likeness: Likeness,
+    likeness: Correlation,
     /// Products of the iteration, and its residual.
     iterations: usize,
     residual: f64,
@@ -178,7 +178,7 @@ fn write_spectra(path: &Path, found: &SpectralMaps) -> Result<(), CommandError> 
 }
 
 fn text(report: &Report) -> String {
-    let Likeness { length, own_share } = report.likeness;
+    let Correlation { length, own_share } = report.likeness;
     let mut lines = vec![format!(
         "channels stay alike over {length:.2} e-foldings of frequency; {:.2} % of the power is each channel's own",
         100.0 * own_share

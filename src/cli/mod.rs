@@ -158,14 +158,14 @@ fn exit_code(error: &(dyn std::error::Error + 'static)) -> u8 {
 
 fn is_configuration(error: &(dyn std::error::Error + 'static)) -> bool {
     let is_of_ground = |error: &GroundError| {
-        use GroundError::{FilesOfState, MergedIntoPart, NamedTwice, Occupied, Settings};
+        use GroundError::{FilesOfState, GivenTwice, MergeIntoPart, Occupied, Settings};
         matches!(
             error,
             Settings { .. }
                 | FilesOfState { .. }
                 | Occupied { .. }
-                | NamedTwice { .. }
-                | MergedIntoPart { .. }
+                | GivenTwice { .. }
+                | MergeIntoPart { .. }
         )
     };
     let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {

@@ -56,7 +56,7 @@ impl Progress {
         let (stop, stopped) = channel();
         let cancel = cancel.clone();
         if is_json() {
-            watched.maps.join(Box::new(LogViewer));
+            watched.maps.add_viewer(Box::new(LogViewer));
         }
         let thread = std::thread::spawn(move || {
             let mut shown = ProgressView::new(total);
@@ -102,7 +102,7 @@ pub(super) fn while_solving<T>(watch: &SolveWatch, work: impl FnOnce() -> T) -> 
         scope.spawn(move || {
             let mut shown = ProgressView::new(0);
             while matches!(stopped.recv_timeout(LINE_EVERY), Err(RecvTimeoutError::Timeout)) {
-                if let Some(solving) = watch.now() {
+                if let Some(solving) = watch.progress() {
                     let Solving { what, iteration, residual, target, .. } = &solving;
                     let fields =
                         json!({ "what": what, "iteration": iteration, "residual": residual, "target": target });
@@ -350,7 +350,7 @@ impl ProgressView {
         if let Some(listening) = &watched.listening {
             message.insert(0, self.senders(&listening.status));
         }
-        if let Some(solving) = watched.solving.now() {
+        if let Some(solving) = watched.solving.progress() {
             message.push(self.solution(&solving));
         }
         if let Some(saving) = watched

@@ -259,7 +259,7 @@ impl ReplayArgs {
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
         let of_state = self.state.as_deref().map(|folder| {
             let source = source.clone();
-            match job.ranks().are_many() {
+            match job.ranks().is_distributed() {
                 true => source.of_state_for_ranks(folder),
                 false => source.of_state(folder),
             }
@@ -409,7 +409,8 @@ impl Session<'_> {
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
-            (source, ground) = (source.answering(&answers), ground.answering(&answers).beginning_with_maps());
+            (source, ground) =
+                (source.answering(&answers), ground.with_answers(&answers).with_initial_snapshot());
             if !args.no_archive {
                 let bytes_max = args.archive_max.unwrap_or(ARCHIVE_BYTES_MAX);
                 let kept = ground.keep_packets(args.archive.as_deref(), bytes_max)?;

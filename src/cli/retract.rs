@@ -51,7 +51,7 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
     let config = config.ground(WAIT_BYTES);
     let (found, notes) = Ground::retract(&args.state, &args.files, span, &config)?;
     print_notes(notes.iter().map(String::as_str));
-    print_notes(found.named.iter().map(|refused| {
+    print_notes(found.refused_packets.iter().map(|refused| {
         format!("packet {} of {} was not removed: {}", refused.count, refused.kind, refused.reason)
     }));
     if args.json {
@@ -62,7 +62,7 @@ pub(super) fn execute(args: &RetractArgs) -> CommandResult {
         "Removed {} packets from {}; {} of them were in the hold buffer; {} of their {} visibilities were in the sums",
         found.packets,
         args.state.display(),
-        found.waited,
+        found.held,
         found.accumulated,
         found.visibilities,
     );

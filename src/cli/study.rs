@@ -191,7 +191,7 @@ fn table(summary: &StudySummary) -> String {
 
 /// epsilon as each rule chooses it, a line a rule.
 fn told_epsilons(choices: &EpsilonChoices) -> Vec<String> {
-    let at = format!("{}, {:.3} MHz", choices.of, choices.frequency_hz / 1e6);
+    let at = format!("{}, {:.3} MHz", choices.run_label, choices.frequency_hz / 1e6);
     let rules = [
         ("crossing of the traces", &choices.crossing),
         ("generalised cross-validation", &choices.cross_validation),
@@ -200,13 +200,13 @@ fn told_epsilons(choices: &EpsilonChoices) -> Vec<String> {
     ];
     let told = |(rule, choice): (&str, &EpsilonChoice)| {
         let chosen = choice.epsilon.map_or_else(|| "none".to_owned(), |epsilon| format!("{epsilon:.2e}"));
-        let open = choice.open.filter(|[low, high]| low < high);
+        let open = choice.range.filter(|[low, high]| low < high);
         let open =
-            open.map_or_else(String::new, |[low, high]| format!(", {low:.0e} to {high:.0e} within the bars"));
+            open.map_or_else(String::new, |[low, high]| format!(", {low:.0e} to {high:.0e} not excluded"));
         let note = choice.note.as_ref().map_or_else(String::new, |note| format!(" ({note})"));
         format!("epsilon by {rule}: {chosen}{open}{note}")
     };
-    std::iter::once(format!("{at}: V'N^-1V is {:.3e} a number", choices.power_a_number))
+    std::iter::once(format!("{at}: V'N^-1V is {:.3e} per datum", choices.power_per_datum))
         .chain(rules.map(told))
         .collect()
 }

@@ -1,10 +1,10 @@
-//! The frequency bins of a channel and the epochs of its samples: sizes that the folder shares.
+//! Frequency bins of a channel and epochs of its samples.
 
-/// Frequency bins over the channel.
+/// Number of frequency bins over the channel.
 pub const BINS: usize = 128;
-/// Samples from one epoch to the next.
+/// Number of samples from one epoch to the next.
 pub const HOP: usize = BINS / 2;
-/// Bins on one side of the channel's centre that are processed together: one register of the widest kind.
+/// Number of bins on one side of the channel's centre that are processed together: one register of the widest kind.
 pub(super) const HALF: usize = 16;
 
 /// Frequency of a bin relative to the channel's centre, in channel widths.

@@ -105,8 +105,8 @@ fn set<S: Simd, const P: usize>(element: &mut [f32; TILE], values: TileRegisters
     S::as_mut_simd_f32s(element).0.copy_from_slice(values.as_flattened());
 }
 
-/// Turns what is left of a daughter's power into the pivot, and returns its inverse. The imaginary part of the diagonal,
-/// which is zero, stores the original power.
+/// Converts the remainder of a daughter's power into the pivot, and returns its inverse. The imaginary part of the
+/// diagonal, which is zero, stores the original power.
 #[inline(always)]
 fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileRegisters<S, P> {
     let at = element(j, j);
@@ -129,7 +129,7 @@ fn pivot<S: Simd, const P: usize>(simd: S, tile: &mut Tile, j: usize) -> TileReg
     inverse
 }
 
-/// Computes element (i, j) from those before it, and returns what is left of daughter i's power.
+/// Computes element (i, j) from those before it, and returns the remainder of daughter i's power.
 #[inline(always)]
 fn row<S: Simd, const P: usize>(
     simd: S,

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Bits that stand for samples that are not quantised.
+/// Number of bits that denotes samples without quantisation.
 pub const FLOAT_BITS: u32 = 32;
 
 keys! {
@@ -58,22 +58,22 @@ keys! {
 }
 
 impl DaughtersConfig {
-    /// Everything that is wrong with the section for channels of a width; empty if it is good.
+    /// All invalid values for channels of a width; empty if there are none.
     #[must_use]
     pub fn problems(&self, channel_width_hz: f64) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("daughters");
+        let mut checks = Checks::new("daughters");
         let bits = f64::from(self.bits);
         checks.number("bits", bits, [1, 2, 4, 8, FLOAT_BITS].contains(&self.bits), "1, 2, 4, 8 or 32");
         let level = self.level_time_constant_s;
         checks.number("level_time_constant_s", level, (1e-3..=1e6).contains(&level), "0.001 s to 1e6 s");
         let block = self.block_samples;
-        let fits = block.is_power_of_two() && (256..=65_536).contains(&block);
-        checks.number("block_samples", block as f64, fits, "a power of two from 256 to 65536");
+        let is_accepted = block.is_power_of_two() && (256..=65_536).contains(&block);
+        checks.number("block_samples", block as f64, is_accepted, "a power of two from 256 to 65536");
         let rate = self.link_bits_per_s_max;
         checks.number("link_bits_per_s_max", rate, rate >= 0.0, "bit/s, or 0 for no limit");
         let buffer = self.link_buffer_bytes;
-        let fits = (4096..=1 << 32).contains(&buffer);
-        checks.number("link_buffer_bytes", buffer as f64, fits, "4096 bytes to 4 GiB");
+        let is_accepted = (4096..=1 << 32).contains(&buffer);
+        checks.number("link_buffer_bytes", buffer as f64, is_accepted, "4096 bytes to 4 GiB");
         let d = &self.tones;
         for (key, power) in
             [("tones.interference_k_sr", d.interference_k_sr), ("tones.calibration_k_sr", d.calibration_k_sr)]
@@ -87,15 +87,20 @@ impl DaughtersConfig {
             ("tones.interference_offset_hz", d.interference_offset_hz),
             ("tones.calibration_offset_hz", d.calibration_offset_hz),
         ] {
-            let inside = offset_hz.abs() <= 0.5 * channel_width_hz;
-            checks.number(key, offset_hz, inside, "at most half of spacecraft.channel_width_hz either way");
+            let is_in_channel = offset_hz.abs() <= 0.5 * channel_width_hz;
+            checks.number(
+                key,
+                offset_hz,
+                is_in_channel,
+                "at most half of spacecraft.channel_width_hz either way",
+            );
         }
         let phase_rad = d.calibration_phase_rad;
         checks.number("tones.calibration_phase_rad", phase_rad, true, "a finite number");
         checks.finish()
     }
 
-    /// Rate that the samples of all daughters need, bit/s: daughters x channels x width x 2 x bits.
+    /// Data rate of the samples of all daughters, bit/s: daughters x channels x width x 2 x bits.
     #[must_use]
     pub fn rate_bits_per_s(&self, satellites: usize, channels: usize, width_hz: f64) -> f64 {
         (satellites * channels) as f64 * width_hz * 2.0 * f64::from(self.bits)

@@ -30,7 +30,7 @@ pub struct Epochs {
     pub count: usize,
 }
 
-/// Where the visibilities V_ji of one pair are stored, as an expansion over the channel.
+/// Location of the visibilities V_ji of one pair, as an expansion over the channel.
 pub(super) struct PairSeries {
     pub(super) pair: Pair,
     /// Basis functions of frequency.
@@ -107,7 +107,7 @@ fn shared<K: Copy + Eq + std::hash::Hash, T: ?Sized>(
     table
 }
 
-/// Which covariances to predict.
+/// Inputs of a prediction of covariances.
 pub struct CovarianceRequest<'a> {
     /// The array.
     pub array: &'a Array,
@@ -164,7 +164,7 @@ impl Covariances {
             positions.extend((0..self.daughters).map(|daughter| DaughterPosition {
                 r_m: request.array.position_m(daughter, t_s),
                 normal_hat,
-                at: Some((daughter as u8, t_s)),
+                daughter_time: Some((daughter as u8, t_s)),
             }));
         }
         let mut powers = vec![0.0; positions.len()];
@@ -261,7 +261,7 @@ impl PairGrid {
             r_i_m: place(self.pair.i, t_s),
             r_j_m: place(self.pair.j, t_s),
             span_rad: 0.0,
-            at: Some((self.pair, t_s)),
+            pair_time: Some((self.pair, t_s)),
         };
         let positions: Vec<PairPosition> = self.instants_s(request.epochs).map(position).collect();
         let half = 0.5 * request.channel.width_hz / request.channel.frequency_hz;

@@ -15,21 +15,21 @@ use crate::units::vector::dot;
 use crate::units::{StreamKind, random_stream};
 
 impl Tones {
-    /// Whether any is added.
+    /// Whether any tone is added.
     #[must_use]
     #[doc(hidden)]
     pub fn are_on(&self) -> bool {
         self.interference_k_sr > 0.0 || self.calibration_k_sr > 0.0
     }
 
-    /// So that what is not set changes no hash of a configuration.
+    /// Whether the section has its defaults, which are left out of a configuration's hash.
     pub(super) fn is_none(&self) -> bool {
         *self == Self::default()
     }
 }
 
 impl Response {
-    /// The response of a daughter in a channel (numbers from 0) with the errors of the instrument at a time.
+    /// Response of a daughter in a channel (numbers from 0) at a time, with the errors of the instrument.
     pub(super) fn with_errors(
         pass: &PassErrors,
         (daughter, number): (usize, usize),
@@ -56,7 +56,7 @@ pub(super) struct BlockTones<'a> {
     pub seed: u64,
     /// Errors of the instrument.
     pub pass: Option<&'a PassErrors>,
-    /// Number of the channel, from 0.
+    /// Index of the channel.
     pub number: usize,
 }
 

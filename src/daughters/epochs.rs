@@ -3,8 +3,10 @@
 use super::nodes::BandInterpolation;
 use crate::units::arithmetic::fused;
 
-/// Number of epochs and of values that are interpolated together.
+/// Number of epochs that are interpolated together.
 pub(super) const EPOCHS: usize = 4;
+
+/// Number of values that are interpolated together.
 pub(super) const COLUMNS: usize = 8;
 
 /// Weights of the instants at each epoch: interpolation, corrected for the blending of epochs. Rows of zeros pad the
@@ -18,11 +20,11 @@ pub(super) fn time_matrix(instants: usize, count: usize) -> Vec<f32> {
     for (k, row) in weights.chunks_exact_mut(instants).enumerate() {
         interpolation.weights(-1.0 + step * k as f64, row);
     }
-    let sharpened = |k: usize| {
-        let (before, here, after) = (weights[k - instants], weights[k], weights[k + instants]);
-        (here - flattening * (after - 2.0 * here + before)) as f32
+    let flattening_corrected = |k: usize| {
+        let (before, current, after) = (weights[k - instants], weights[k], weights[k + instants]);
+        (current - flattening * (after - 2.0 * current + before)) as f32
     };
-    let mut matrix: Vec<f32> = (instants..(count + 1) * instants).map(sharpened).collect();
+    let mut matrix: Vec<f32> = (instants..(count + 1) * instants).map(flattening_corrected).collect();
     matrix.resize(count.next_multiple_of(EPOCHS) * instants, 0.0);
     matrix
 }
@@ -34,7 +36,7 @@ pub(super) fn combine(weights: &[f32], rows: &[f32], width: usize, out: &mut [f3
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let count = rows.len() / width;
-    // The very last row may lack its padding.
+    // The last row may lack its padding.
     for (out, weights) in out.chunks_mut(EPOCHS * stride).zip(weights.chunks_exact(EPOCHS * count)) {
         let (first, rest) = weights.split_at(count);
         let (second, rest) = rest.split_at(count);

@@ -1,4 +1,4 @@
-//! The links from the daughters to the mother.
+//! Links from the daughters to the mother.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -39,11 +39,12 @@ impl LinkCounts {
     }
 }
 
-/// Sends blocks at a limited rate; each daughter has a link and a bounded transmit buffer. When a block does not fit, the
-/// drop policy decides which block is dropped and counted.
+/// Stage that sends blocks at a limited rate: each daughter has a link and a bounded transmit buffer. When a block
+/// does not fit, the drop policy decides which block is dropped and counted.
 ///
-/// After a window the links keep sending until one orbit has passed since its start, which is about when the next one
-/// begins. Blocks still queued then are dropped by the same policy. The frame that ends the window follows the last block.
+/// After a window the links continue until one orbit has passed since its start, which is about when the next window
+/// begins. Blocks still queued then are dropped by the same policy. The frame that ends the window follows the last
+/// block.
 pub struct SampleLink {
     rate_bits_per_s: f64,
     /// Time from a window's start within which its samples must be sent, s.
@@ -66,7 +67,7 @@ struct Buffer {
 }
 
 impl SampleLink {
-    /// The links of an array's daughters, which update `counts` as they go.
+    /// Creates the links of an array's daughters, which update `counts` while they run.
     #[must_use]
     pub fn new(config: &DaughtersConfig, array: &Array, counts: Arc<Mutex<LinkCounts>>) -> Self {
         let daughters = array.satellites();
@@ -88,7 +89,7 @@ impl SampleLink {
         let sent = if self.rate_bits_per_s <= 0.0 {
             blocks
         } else {
-            // The channels take turns at being first, so that a full buffer costs all of them the same.
+            // Channels take turns at being first, so that a full buffer costs all of them the same.
             let first = blocks.first().map_or(0, |block| block.number) % blocks.len().max(1) as u64;
             blocks.rotate_left(first as usize);
             let mut sent = Vec::new();
@@ -111,7 +112,7 @@ impl SampleLink {
             counts.count_dropped(samples);
             return;
         };
-        buffer.work_until(block.time, self.rate_bits_per_s, sent);
+        buffer.send_until(block.time, self.rate_bits_per_s, sent);
         if self.policy == DropPolicy::Oldest {
             while buffer.bits + bits > self.capacity_bits
                 && let Some(samples) = buffer.drop_oldest()
@@ -128,8 +129,8 @@ impl SampleLink {
         counts.waiting_bits_max = counts.waiting_bits_max.max(buffer.bits);
     }
 
-    /// Flushes the buffers after a window: sends what there is time for, in the order of block numbers, as the daughters
-    /// send in parallel, and drops the rest.
+    /// Flushes the buffers after a window: sends blocks while there is time, in the order of block numbers, as the
+    /// daughters send in parallel, and drops the others.
     fn flush(&mut self, out: &mut Outlet<SpaceFrame>) {
         let until = self
             .window
@@ -149,7 +150,7 @@ impl SampleLink {
                     counts.count_dropped(samples);
                 }
             }
-            buffer.work_until(until, self.rate_bits_per_s, &mut sent);
+            buffer.send_until(until, self.rate_bits_per_s, &mut sent);
             for block in &buffer.queue {
                 counts.count_dropped(block.samples.len() as u64);
             }
@@ -168,7 +169,7 @@ impl SampleLink {
 
 impl Buffer {
     /// Adds the blocks that leave by `time` to `sent`.
-    fn work_until(&mut self, time: MissionTime, rate_bits_per_s: f64, sent: &mut Vec<SampleBlock>) {
+    fn send_until(&mut self, time: MissionTime, rate_bits_per_s: f64, sent: &mut Vec<SampleBlock>) {
         let mut budget = self.budget(time, rate_bits_per_s);
         self.now = Some(time);
         while let Some(first) = self.queue.front() {
@@ -285,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_link_drops_what_its_policy_says_and_counts_it() {
+    fn a_slow_link_drops_by_its_policy_and_counts() {
         // One block leaves in 0.2 s, two fit the buffer.
         for (policy, expected) in [
             (DropPolicy::Newest, vec![0, 1, 2, 4, 6, 8, 10]),
@@ -301,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_window_only_what_there_is_time_for_leaves() {
+    fn after_a_window_blocks_are_sent_for_one_orbit() {
         // An orbit lasts 8248.68 s, all of it after the first block: 82 kbit, five blocks of 16 kbit.
         for (policy, expected) in
             [(DropPolicy::Newest, vec![0, 1, 2, 3, 4]), (DropPolicy::Oldest, vec![0, 8, 9, 10, 11])]

@@ -1,11 +1,11 @@
-//! The daughters: the sample-level simulation of the receiving satellites, up to their link to the mother.
+//! Sample-level simulation of the daughters, up to their link to the mother.
 //!
 //! [`Sampler`] is the source. For each channel it draws complex Gaussian samples of all daughters at once, at the
-//! channel's own width (8 kHz). Their covariance is that of a [`crate::response::model::VisibilityModel`] as the array
-//! moves, plus receiver noise (`covariance`, `synthesis`). Each daughter then applies its instrumental errors
-//! ([`InstrumentErrors`], for either fidelity), [`Tones`], level control and quantiser. [`SampleLink`] carries the blocks to the mother at a limited rate.
+//! channel's own width (8 kHz). Their covariance is that of a [`crate::response::model::VisibilityModel`] as the
+//! array moves, plus receiver noise (`covariance`, `synthesis`). Each daughter then applies its instrumental errors
+//! ([`InstrumentErrors`], for both fidelities), [`Tones`], level control and quantiser. [`SampleLink`] carries the
+//! blocks to the mother at a limited rate.
 //!
-//! May use [`crate::frames`], [`crate::array`], [`crate::response`] and [`crate::runtime`]; never the mother.
 //! Samples depend on the seed alone, not on the number of threads or the size of queues.
 
 mod bins;

@@ -26,9 +26,9 @@ fn sweep_max(nodes: usize) -> f64 {
 
 /// Number of nodes for a phase sweep of +-`z`.
 pub(super) fn nodes_for(z: f64) -> usize {
-    let enough = |&nodes: &usize| sweep_max(nodes) >= z;
-    let most = z.ceil().max(0.0) as usize + 5;
-    [3, 5, 6].into_iter().find(enough).unwrap_or(most)
+    let is_sufficient = |&nodes: &usize| sweep_max(nodes) >= z;
+    let nodes_max = z.ceil().max(0.0) as usize + 5;
+    [3, 5, 6].into_iter().find(is_sufficient).unwrap_or(nodes_max)
 }
 
 /// Position of a node in -1..1.
@@ -51,28 +51,32 @@ impl BandInterpolation {
             let mut row = Vec::with_capacity(i + 1);
             for j in 0..=i {
                 let other = factor.get(j).unwrap_or(&row);
-                let done: f64 = row.iter().zip(other).map(|(a, b)| a * b).sum();
-                let left = kernel(nodes, node(i, nodes) - node(j, nodes)) - done;
+                let sum_before: f64 = row.iter().zip(other).map(|(a, b)| a * b).sum();
+                let remainder = kernel(nodes, node(i, nodes) - node(j, nodes)) - sum_before;
                 // The ridge keeps pivots positive; rounding is 1e-16 of the diagonal.
-                row.push(if i == j { (left + RIDGE).max(RIDGE * RIDGE).sqrt() } else { left / other[j] });
+                row.push(if i == j {
+                    (remainder + RIDGE).max(RIDGE * RIDGE).sqrt()
+                } else {
+                    remainder / other[j]
+                });
             }
             factor.push(row);
         }
         Self { nodes, factor }
     }
 
-    /// The weights at `x`; they sum to one.
+    /// Weights at `x`; they sum to one.
     pub(super) fn weights(&self, x: f64, weights: &mut [f64]) {
         for (k, weight) in weights.iter_mut().enumerate() {
             *weight = kernel(self.nodes, x - node(k, self.nodes));
         }
         for (i, row) in self.factor.iter().enumerate() {
-            let done: f64 = row[..i].iter().zip(&*weights).map(|(a, b)| a * b).sum();
-            weights[i] = (weights[i] - done) / row[i];
+            let sum_before: f64 = row[..i].iter().zip(&*weights).map(|(a, b)| a * b).sum();
+            weights[i] = (weights[i] - sum_before) / row[i];
         }
         for i in (0..self.nodes).rev() {
-            let done: f64 = (i + 1..self.nodes).map(|k| self.factor[k][i] * weights[k]).sum();
-            weights[i] = (weights[i] - done) / self.factor[i][i];
+            let sum_before: f64 = (i + 1..self.nodes).map(|k| self.factor[k][i] * weights[k]).sum();
+            weights[i] = (weights[i] - sum_before) / self.factor[i][i];
         }
         let sum: f64 = weights.iter().sum();
         for weight in weights {

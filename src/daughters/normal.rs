@@ -5,10 +5,10 @@ use rand::Rng;
 
 use crate::units::arithmetic::{cos_sin_turns, fused, polynomial};
 
-/// Deviates made at once.
+/// Number of deviates of a chunk.
 pub(super) const CHUNK: usize = 64;
 
-/// Random bytes of a chunk.
+/// Random bytes for a chunk.
 pub(super) type Bytes = [[u8; 4]; 2 * CHUNK];
 
 /// Fills `re` and `im` (of equal numbers of chunks) with complex normal deviates of variance one: 1/2 in each part.
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn tails_are_as_heavy_as_they_should_be_to_five_deviations() {
+    fn tails_are_gaussian_to_five_deviations() {
         const COUNT: usize = 1 << 20;
         const ROUNDS: usize = 64;
         // Two-sided probability beyond k standard deviations: 1 - erf(k / sqrt 2), as tabulated.

@@ -18,22 +18,22 @@ fn spacing(bits: u32) -> f64 {
     }
 }
 
-/// The quantiser of one channel of one daughter, with its level control.
+/// Quantiser of one channel of one daughter, with its level control.
 #[derive(Clone, Debug)]
 pub struct Quantiser {
     bits: u32,
     /// Fraction of the step towards a block's power that the level control takes.
-    following: f64,
+    level_gain: f64,
     /// Power estimate that sets the level, K sr.
     power: Option<f64>,
 }
 
 impl Quantiser {
-    /// A quantiser of `bits` (1, 2, 4, 8, or 32 for none) whose level control follows the power of blocks of
+    /// Creates a quantiser of `bits` (1, 2, 4, 8, or 32 for none) whose level control follows the power of blocks of
     /// `block_s` with a time constant, s.
     #[must_use]
     pub fn new(bits: u32, block_s: f64, time_constant_s: f64) -> Self {
-        Self { bits, following: 1.0 - (-block_s / time_constant_s).exp(), power: None }
+        Self { bits, level_gain: 1.0 - (-block_s / time_constant_s).exp(), power: None }
     }
 
     /// Quantises a block of samples (sqrt(K sr)) and counts the parts out of range. Earlier blocks set the level; the first
@@ -44,14 +44,14 @@ impl Quantiser {
         }
         let measured = (square(re) + square(im)) / re.len() as f64;
         let power = self.power.unwrap_or(measured);
-        self.power = Some(power + self.following * (measured - power));
-        // Silence has no level; any step does.
+        self.power = Some(power + self.level_gain * (measured - power));
+        // Without power any step is right.
         let step = (spacing(self.bits) * (0.5 * power).sqrt()).max(f64::from(f32::MIN_POSITIVE)) as f32;
         let half = 1_i32 << (self.bits - 1);
         let (mut re_codes, mut im_codes) = (vec![0; re.len()], vec![0; im.len()]);
-        let beyond = encode(re, step, half, &mut re_codes) + encode(im, step, half, &mut im_codes);
+        let out_of_range = encode(re, step, half, &mut re_codes) + encode(im, step, half, &mut im_codes);
         // A sign cannot be out of range.
-        let saturated = if self.bits == 1 { 0 } else { beyond };
+        let saturated = if self.bits == 1 { 0 } else { out_of_range };
         (Samples::Codes { bits: self.bits as u8, step, re: re_codes, im: im_codes }, saturated)
     }
 }
@@ -78,14 +78,14 @@ fn encode(values: &[f32], step: f32, half: i32, codes: &mut [i8]) -> u32 {
     const UP: f32 = 256.0;
     const REST: u32 = 15;
     let (scale, limit) = (1.0 / step, half as f32);
-    let mut beyond = 0_u32;
+    let mut out_of_range = 0_u32;
     for (code, value) in codes.iter_mut().zip(values) {
         let level = (value * scale).max(-limit).min(limit - 0.5);
         let whole = (level + (limit + UP)).to_bits() >> REST;
         *code = (whole as u8).wrapping_sub(half as u8).cast_signed();
-        beyond += u32::from(value.abs() * scale > limit);
+        out_of_range += u32::from(value.abs() * scale > limit);
     }
-    beyond
+    out_of_range
 }
 
 #[cfg(test)]
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_are_levels_and_what_is_beyond_is_counted() {
+    fn codes_are_levels_and_values_out_of_range_are_counted() {
         // Power 2: a standard deviation of 1 in each part.
         let mut values: Vec<f32> = (0..1000).map(|k| if k % 2 == 0 { 1.0 } else { -1.0 }).collect();
         (values[0], values[1], values[2], values[3]) = (0.1, -0.1, 1.9, -2.1);

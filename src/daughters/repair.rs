@@ -25,7 +25,7 @@ impl Repairs {
         Self { elements: (order * (order - 1) / 2 * TILE) as u64, ..Self::default() }
     }
 
-    /// Adds the statistics of another part.
+    /// Adds other statistics.
     pub fn add(&mut self, other: Self) {
         self.elements += other.elements;
         self.changed += other.changed;
@@ -33,7 +33,7 @@ impl Repairs {
     }
 }
 
-/// As [`crate::daughters::colour::Factor`], for a C that need not be positive semidefinite.
+/// Cholesky factors as by [`crate::daughters::colour::Factor`], for a C that need not be positive semidefinite.
 ///
 /// Rounding and interpolation can leave C slightly indefinite. A daughter then has less power left than its correlation
 /// with another needs; that correlation is reduced to fit. Powers do not change, and no correlation changes by more
@@ -65,15 +65,15 @@ pub(super) fn factor(tile: &mut Tile, order: usize) -> Repairs {
                     im[t] = fused::<FMA>(-a_im[t], b_re[t], fused::<FMA>(a_re[t], b_im[t], im[t]));
                 }
             }
-            let mut lacking = 0_u32;
+            let mut deficient = 0_u32;
             for t in 0..TILE {
                 re[t] *= inverse[t];
                 im[t] *= inverse[t];
-                let asked = re[t] * re[t] + im[t] * im[t];
-                lacking += u32::from(asked > left[i][t]);
-                left[i][t] -= asked;
+                let needed = re[t] * re[t] + im[t] * im[t];
+                deficient += u32::from(needed > left[i][t]);
+                left[i][t] -= needed;
             }
-            if lacking > 0 {
+            if deficient > 0 {
                 shrink(
                     [&mut re, &mut im],
                     &mut left[i],
@@ -99,11 +99,11 @@ fn shrink(
         if left[t] >= 0.0 {
             continue;
         }
-        let asked = re[t] * re[t] + im[t] * im[t];
-        let there = (left[t] + asked).max(0.0);
+        let needed = re[t] * re[t] + im[t] * im[t];
+        let there = (left[t] + needed).max(0.0);
         left[t] = 0.0;
-        let scale = (there / asked).sqrt();
-        let change = unit(t) * asked.sqrt() * (1.0 - scale);
+        let scale = (there / needed).sqrt();
+        let change = unit(t) * needed.sqrt() * (1.0 - scale);
         repairs.changed += u64::from(change > CHANGE_COUNTED);
         repairs.change_max = repairs.change_max.max(change);
         re[t] *= scale;

@@ -1,4 +1,4 @@
-//! The source of the space segment in sample fidelity: samples of all daughters and channels, window by window.
+//! Source of the space segment in sample fidelity: samples of all daughters and channels, window by window.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -18,11 +18,11 @@ use crate::response::model::{ModelError, VisibilityModel};
 use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 
-/// Samples made from one prediction: 2 s at 8 kHz. Longer chunks need fewer predictions of slow fringes, shorter ones
-/// a shorter sum over instants at each epoch.
+/// Number of samples made from one prediction: 2 s at 8 kHz. Longer chunks need fewer predictions of slow fringes,
+/// shorter ones a shorter sum over instants at each epoch.
 const CHUNK_SAMPLES: usize = 1 << 14;
 
-/// The array, and the sky that the daughters receive.
+/// Array and sky that determine the samples.
 pub struct Scene {
     /// The array.
     pub array: Arc<Array>,
@@ -47,9 +47,10 @@ pub struct SamplerCounts {
     pub repairs: Repairs,
 }
 
-/// Samples observing windows in chunks of all channels and daughters. It makes a chunk while it sends the one before.
+/// Source that samples observing windows in chunks of all channels and daughters. It makes a chunk while it sends the
+/// one before.
 ///
-/// Windows are cut to whole hops of 64 samples. The same seed gives the same samples, whatever the number of threads.
+/// Windows are cut to whole hops of 64 samples. The same seed gives the same samples for any number of threads.
 pub struct Sampler {
     scene: Scene,
     config: DaughtersConfig,
@@ -82,14 +83,14 @@ struct WindowProgress {
     samples: usize,
     /// Samples made so far.
     done: usize,
-    /// The chunk that is made but not sent.
+    /// A complete chunk that is not sent yet.
     ready: Option<Chunk>,
     /// Quantisers by channel and daughter.
     quantisers: Vec<Vec<Quantiser>>,
 }
 
 impl Sampler {
-    /// A sampler of `windows` of a scene, which updates `counts` as it goes.
+    /// Creates a sampler of `windows` of a scene, which updates `counts` while it runs.
     #[must_use]
     pub fn new(
         scene: Scene,
@@ -181,11 +182,11 @@ impl Sampler {
             };
         let made: Vec<Result<_, ModelError>> = asked.with_max_len(1).map(job).collect();
         progress.done += samples;
-        // The first error in channel order, whichever thread met one first.
+        // The first error in channel order, independent of the order of threads.
         made.into_iter().collect()
     }
 
-    /// A spare workspace or a new one; its contents are undefined, and it returns to `spare` after use.
+    /// Takes a spare workspace or a new one. Its contents are undefined; it returns to `spare` after use.
     fn workspace(&self) -> ChannelWorkspace {
         let spare = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop();
         spare.unwrap_or_else(|| {
@@ -229,7 +230,7 @@ pub(crate) fn sample_ticks(samples: u64, width_hz: f64) -> i64 {
     (samples as f64 / width_hz * TICKS_PER_SECOND as f64).round() as i64
 }
 
-/// The work on one channel in one chunk.
+/// Inputs of the work on one channel in one chunk.
 struct ChannelWork<'a> {
     sampler: &'a Sampler,
     id: ChannelId,
@@ -296,7 +297,7 @@ impl ChannelWork<'_> {
         synthesis.draw(covariances, epoch, key, &responses, draft, out)
     }
 
-    /// The block of one daughter that ends `made` samples into the chunk.
+    /// Makes the block of one daughter that ends `made` samples into the chunk.
     fn block(
         &self,
         daughter: usize,
@@ -357,7 +358,7 @@ impl Source for Sampler {
         Ok(Flow::Continue)
     }
 
-    /// An interrupted window ends where its samples end.
+    /// Closes an interrupted window where its samples end.
     fn finish(&mut self, out: &mut Outlet<SpaceFrame>) -> Result<(), ModelError> {
         if let Some(mut progress) = self.current.take() {
             if let Some(ready) = progress.ready.take() {

@@ -1,4 +1,4 @@
-//! Draws samples of all daughters in one channel with the covariance of the model.
+//! Drawing of samples of all daughters in one channel with the covariance of the model.
 //!
 //! Every `HOP` samples a spectrum of `BINS` frequencies is drawn, coloured with the factor of the covariance at
 //! each frequency, transformed to `BINS` samples and blended with its neighbours by windows whose squares
@@ -30,7 +30,7 @@ use crate::units::{StreamKind, random_stream};
 
 const TILES: usize = BINS / TILE;
 
-/// The tables of the synthesis, common to all channels.
+/// Tables of the synthesis, common to all channels.
 pub struct SampleSynthesis {
     arch: Arch,
     fft: Arc<dyn Fft<f32>>,
@@ -55,7 +55,7 @@ impl Response {
 /// Samples of one daughter: real parts, imaginary parts.
 pub type Planes = [Vec<f32>; 2];
 
-/// Where samples of all daughters are written.
+/// Destination of samples of all daughters.
 pub struct SampleSlot<'a> {
     /// Planes by daughter.
     pub planes: &'a mut [Planes],
@@ -63,7 +63,7 @@ pub struct SampleSlot<'a> {
     pub first: usize,
 }
 
-/// Memory for the samples of all daughters, and the overlap from one epoch to the next.
+/// Memory for the samples of all daughters, and the overlap between epochs.
 pub struct Draft {
     daughters: usize,
     bytes: Bytes,
@@ -146,7 +146,7 @@ impl SampleSynthesis {
             let noise = [&re[group..], &im[group..]];
             on_tile(self.arch, ApplyFactor { tile, noise, stride: TILES, x: coloured });
             for (spectrum, coloured) in spectra.chunks_exact_mut(BINS).zip(coloured) {
-                spread(coloured, group, spectrum);
+                copy_to_spectrum(coloured, group, spectrum);
             }
         }
         for (spectrum, response) in draft.spectra.chunks_exact_mut(BINS).zip(responses) {
@@ -175,7 +175,7 @@ impl SampleSynthesis {
 
 /// Copies the signal of a group of bins and its mirror image into the spectrum.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2", "aarch64+neon"))]
-fn spread([re, im]: &[[f32; TILE]; 2], group: usize, spectrum: &mut [Complex32]) {
+fn copy_to_spectrum([re, im]: &[[f32; TILE]; 2], group: usize, spectrum: &mut [Complex32]) {
     let (below, above) = spectrum.split_at_mut(BINS / 2);
     let above = &mut above[BINS / 2 - (group + 1) * HALF..][..HALF];
     for (k, out) in below[group * HALF..][..HALF].iter_mut().enumerate() {

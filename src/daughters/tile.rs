@@ -1,10 +1,10 @@
-//! Covariance matrices at many frequencies at a time, and how SIMD code runs over them.
+//! Covariance matrices at many frequencies, and dispatch of SIMD code over them.
 
 use pulp::{Arch, Simd, WithSimd};
 
 use super::bins::HALF;
 
-/// Frequencies that are processed together: `HALF` below the channel's centre, and their mirror images above it.
+/// Number of frequencies processed together: `HALF` below the channel's centre, and their mirror images above it.
 pub(super) const TILE: usize = 2 * HALF;
 
 /// Smallest pivot of a covariance matrix, as a fraction of its diagonal: the rounding of `f32` lies below it.
@@ -32,7 +32,7 @@ impl Tile {
 /// A computation on the frequencies of a tile.
 pub(super) trait TileKernel {
     type Output;
-    /// Runs it; `P` registers hold one side of the channel.
+    /// Runs the computation; `P` registers hold one side of the channel.
     fn run<S: Simd, const P: usize>(self, simd: S) -> Self::Output;
 }
 

@@ -44,7 +44,7 @@ impl DownlinkConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("downlink");
+        let mut checks = Checks::new("downlink");
         let bytes = self.packet_bytes_max;
         let good = (PACKET_BYTES_MIN..=PACKET_BYTES_MAX).contains(&bytes);
         checks.require("packet_bytes_max", bytes, good, "256 to 65542");

@@ -1,5 +1,4 @@
-//! Baselines of all pairs over the mission: their lengths, their parts across the track and upwards, and the altitudes of the
-//! satellites.
+//! Baselines of all pairs over the mission: lengths, cross-track and radial components, and altitudes of the satellites.
 
 use std::fmt::Write;
 
@@ -15,11 +14,11 @@ use crate::units::constants::DAY_S;
 use crate::units::vector::{dot, norm, sub};
 use crate::units::{Pair, all_pairs};
 
-/// Windows that are looked at, at most; they are spread evenly over the mission.
+/// Maximum number of windows, evenly spaced over the mission.
 const WINDOWS_MAX: usize = 500;
-/// Instants of a window, its ends among them.
-const INSTANTS: usize = 9;
-/// Pairs that are drawn, at most: those of the first satellite with the others.
+/// Number of time samples per window, including both ends.
+const SAMPLES: usize = 9;
+/// Maximum number of curves. Only pairs with the first satellite are drawn.
 const CURVES_MAX: usize = 10;
 
 #[derive(Serialize)]
@@ -28,16 +27,15 @@ struct BaselineNumbers {
     windows: usize,
     /// Shortest and longest baseline, m.
     length_m: [f64; 2],
-    /// Greatest part of a baseline along the normal of the first satellite's orbit, m, and in units of its length.
+    /// Maximum component of a baseline along the orbit normal of the first satellite, m, and relative to its length.
     across_m_max: f64,
     across_share_max: f64,
-    /// Greatest difference of two satellites' radii, m.
+    /// Maximum difference of the orbital radii of two satellites, m.
     radial_m_max: f64,
     /// Lowest and highest altitude, m.
     altitude_m: [f64; 2],
 }
 
-/// A pair in a window: extremes.
 #[derive(Clone, Copy)]
 struct Extremes {
     length_m: [f64; 2],
@@ -52,25 +50,26 @@ struct WindowExtremes {
     altitude_m: [f64; 2],
 }
 
-fn look(plan: &Plan, pairs: &[Pair], window: ObservingWindow) -> WindowExtremes {
+fn extremes_of(plan: &Plan, pairs: &[Pair], window: ObservingWindow) -> WindowExtremes {
     let array = &plan.array;
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
-    let none = Extremes { length_m: [f64::INFINITY, 0.0], across_m: 0.0, across_share: 0.0, radial_m: 0.0 };
+    let initial =
+        Extremes { length_m: [f64::INFINITY, 0.0], across_m: 0.0, across_share: 0.0, radial_m: 0.0 };
     let mut out = WindowExtremes {
         day: 0.5 * (start_s + end_s) / DAY_S,
-        pairs: vec![none; pairs.len()],
+        pairs: vec![initial; pairs.len()],
         altitude_m: [f64::INFINITY, f64::NEG_INFINITY],
     };
-    for instant in 0..INSTANTS {
-        let t_s = start_s + (end_s - start_s) * instant as f64 / (INSTANTS - 1) as f64;
-        let places: Vec<_> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
+    for sample in 0..SAMPLES {
+        let t_s = start_s + (end_s - start_s) * sample as f64 / (SAMPLES - 1) as f64;
+        let positions_m: Vec<_> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
         let normal_hat = array.normal_hat(0, t_s);
-        for place in &places {
-            let altitude_m = norm(*place) - array.moon_radius_m();
+        for position_m in &positions_m {
+            let altitude_m = norm(*position_m) - array.moon_radius_m();
             out.altitude_m = [out.altitude_m[0].min(altitude_m), out.altitude_m[1].max(altitude_m)];
         }
         for (found, pair) in out.pairs.iter_mut().zip(pairs) {
-            let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| places[usize::from(n)]);
+            let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| positions_m[usize::from(n)]);
             let baseline_m = sub(r_i_m, r_j_m);
             let length_m = norm(baseline_m);
             let across_m = dot(baseline_m, normal_hat).abs();
@@ -89,30 +88,30 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     let pairs = all_pairs(plan.array.satellites());
     let step = plan.windows.len().div_ceil(WINDOWS_MAX).max(1);
     let chosen: Vec<ObservingWindow> = plan.windows.iter().step_by(step).copied().collect();
-    let windows: Vec<WindowExtremes> = chosen.par_iter().map(|window| look(plan, &pairs, *window)).collect();
+    let windows: Vec<WindowExtremes> =
+        chosen.par_iter().map(|window| extremes_of(plan, &pairs, *window)).collect();
     let all = || windows.iter().flat_map(|window| &window.pairs);
-    let least = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::INFINITY, f64::min);
-    let most = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::NEG_INFINITY, f64::max);
+    let minimum = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::INFINITY, f64::min);
+    let maximum = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::NEG_INFINITY, f64::max);
     let numbers = BaselineNumbers {
         satellites: plan.array.satellites(),
         windows: windows.len(),
         length_m: [
-            least(&mut all().map(|pair| pair.length_m[0])),
-            most(&mut all().map(|pair| pair.length_m[1])),
+            minimum(&mut all().map(|pair| pair.length_m[0])),
+            maximum(&mut all().map(|pair| pair.length_m[1])),
         ],
-        across_m_max: most(&mut all().map(|pair| pair.across_m)),
-        across_share_max: most(&mut all().map(|pair| pair.across_share)),
-        radial_m_max: most(&mut all().map(|pair| pair.radial_m)),
+        across_m_max: maximum(&mut all().map(|pair| pair.across_m)),
+        across_share_max: maximum(&mut all().map(|pair| pair.across_share)),
+        radial_m_max: maximum(&mut all().map(|pair| pair.radial_m)),
         altitude_m: [
-            least(&mut windows.iter().map(|window| window.altitude_m[0])),
-            most(&mut windows.iter().map(|window| window.altitude_m[1])),
+            minimum(&mut windows.iter().map(|window| window.altitude_m[0])),
+            maximum(&mut windows.iter().map(|window| window.altitude_m[1])),
         ],
     };
     let mut csv = "day,i,j,length_m_min,length_m_max,across_m_max,radial_m_max\n".to_owned();
     for window in &windows {
         for (pair, found) in pairs.iter().zip(&window.pairs) {
             let [shortest_m, longest_m] = found.length_m;
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{:.4},{},{},{shortest_m:.3},{longest_m:.3},{:.3},{:.3}",
@@ -125,8 +124,8 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
         }
     }
     let shown = || pairs.iter().enumerate().filter(|(_, pair)| pair.i == 0).take(CURVES_MAX);
-    let curves = |of: &dyn Fn(&Extremes) -> f64| -> Vec<Curve> {
-        let points = |k: usize| windows.iter().map(|window| (window.day, of(&window.pairs[k]))).collect();
+    let curves = |value: &dyn Fn(&Extremes) -> f64| -> Vec<Curve> {
+        let points = |k: usize| windows.iter().map(|window| (window.day, value(&window.pairs[k]))).collect();
         let curve = |(k, pair): (usize, &Pair)| Curve {
             label: format!("{}-{}", pair.i + 1, pair.j + 1),
             points: points(k),
@@ -134,10 +133,10 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
         };
         shown().map(curve).collect()
     };
-    let altitude = |place: usize, label: &str| Curve {
+    let altitude = |index: usize, label: &str| Curve {
         label: label.to_owned(),
-        points: windows.iter().map(|window| (window.day, window.altitude_m[place] / 1e3)).collect(),
-        dashed: place == 0,
+        points: windows.iter().map(|window| (window.day, window.altitude_m[index] / 1e3)).collect(),
+        dashed: index == 0,
     };
     let day = || Axis { label: "day".to_owned(), ..Axis::default() };
     let axis = |label: &str, log: bool| Axis { label: label.to_owned(), log, ..Axis::default() };
@@ -150,8 +149,8 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     };
     let plots = [
         plot("longest in each window", axis("baseline (m)", true), curves(&|pair| pair.length_m[1])),
-        plot("greatest part across the track", axis("m", false), curves(&|pair| pair.across_m)),
-        plot("greatest difference of radii", axis("m", false), curves(&|pair| pair.radial_m)),
+        plot("largest cross-track component", axis("m", false), curves(&|pair| pair.across_m)),
+        plot("largest difference of orbital radii", axis("m", false), curves(&|pair| pair.radial_m)),
         plot(
             "altitudes of all satellites",
             axis("altitude (km)", false),

@@ -1,4 +1,4 @@
-//! What the array sees of each direction: time of pairs, visibilities, projected baselines (the paper, Sect. 3.3).
+//! Coverage by direction: observing time of pairs, visibilities and projected baselines (the paper, Sect. 3.3).
 
 use std::f64::consts::FRAC_PI_2;
 use std::fmt::Write;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::error::FigureError;
-use super::exposure::{Instant, gather, limit_m};
+use super::exposure::{TimeSample, gather, limit_m};
 use super::output::FigureParts;
 use crate::array::{hidden_by_moon, integration_time_s};
 use crate::pipeline::Plan;
@@ -19,15 +19,14 @@ use crate::sky::healpix::pixel_directions;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, cross, dot, norm, scale, sub};
 
-/// nside of the maps: the horizon is wide, and pixels of 7 degrees are small against it.
+/// nside of the maps. Pixels of 7 degrees are small compared with the visible part of the sky.
 const NSIDE: usize = 8;
-/// Distance of instants, s: a daughter turns by five degrees.
+/// Time step, s, in which a daughter moves by five degrees.
 const STEP_S: f64 = 120.0;
 /// Cells along a side of the plane of projected baselines.
 const CELLS: usize = 32;
-/// Words of 64 cells.
 const WORDS: usize = CELLS * CELLS / 64;
-/// Latitudes of the bands that are told: from the ecliptic to the pole, degrees.
+/// Edges of the latitude bands, from the ecliptic to the pole, degrees.
 const BANDS_DEG: [[f64; 2]; 6] =
     [[0.0, 15.0], [15.0, 30.0], [30.0, 45.0], [45.0, 60.0], [60.0, 75.0], [75.0, 90.0]];
 
@@ -35,7 +34,7 @@ const BANDS_DEG: [[f64; 2]; 6] =
 struct CoverageNumbers {
     nside: usize,
     channels: Vec<ChannelCoverageNumbers>,
-    /// Time of the first channel over that of each, by direction: least, mean, greatest.
+    /// Minimum, mean and maximum over directions of the time of the first channel relative to each channel.
     first_over_channel: Vec<[f64; 3]>,
 }
 
@@ -44,7 +43,7 @@ struct ChannelCoverageNumbers {
     frequency_hz: f64,
     limit_m: f64,
     limit_wavelengths: f64,
-    /// Means over the sky, and the least and the greatest.
+    // Mean, minimum and maximum over the sky.
     pair_h: [f64; 3],
     visibilities: [f64; 3],
     shortest_wavelengths: [f64; 3],
@@ -52,7 +51,7 @@ struct ChannelCoverageNumbers {
     bands: Vec<BandNumbers>,
 }
 
-/// Means over directions at a distance from the ecliptic, both north and south.
+/// Means over directions in a latitude band, north and south.
 #[derive(Serialize)]
 struct BandNumbers {
     latitude_deg: [f64; 2],
@@ -62,13 +61,12 @@ struct BandNumbers {
     uv_filled: f64,
 }
 
-/// A direction with axes of its plane.
-struct Place {
+/// A direction with the axes of its tangent plane.
+struct Direction {
     n_hat: Vec3,
     axes: [Vec3; 2],
 }
 
-/// Counts of one channel by direction.
 #[derive(Clone)]
 struct ChannelMaps {
     limit_m: f64,
@@ -98,7 +96,7 @@ impl ChannelMaps {
         }
     }
 
-    /// Hours, visibilities, shortest projected baseline in wavelengths, and the filled share of the plane.
+    /// Hours, visibilities, shortest projected baseline in wavelengths, and filled fraction of the uv plane.
     fn columns(&self, frequency_hz: f64) -> [Vec<f64>; 4] {
         let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
         let inside = (0..CELLS * CELLS).filter(|&cell| is_inside(cell)).count() as f64;
@@ -113,16 +111,16 @@ impl ChannelMaps {
     }
 }
 
-fn add(maps: &mut [ChannelMaps], plan: &Plan, places: &[Place], instant: &Instant<'_>) {
+fn add(maps: &mut [ChannelMaps], plan: &Plan, directions: &[Direction], sample: &TimeSample<'_>) {
     let moon_m = plan.array.moon_radius_m();
-    let sees: Vec<Vec<bool>> = instant
+    let sees: Vec<Vec<bool>> = sample
         .states
         .iter()
-        .map(|state| places.iter().map(|p| !hidden_by_moon(state.position_m, p.n_hat, moon_m)).collect())
+        .map(|state| directions.iter().map(|p| !hidden_by_moon(state.position_m, p.n_hat, moon_m)).collect())
         .collect();
-    for pair in instant.pairs {
+    for pair in sample.pairs {
         let [i, j] = [pair.i, pair.j].map(usize::from);
-        let (a, b) = (instant.states[i], instant.states[j]);
+        let (a, b) = (sample.states[i], sample.states[j]);
         let baseline_m = sub(a.position_m, b.position_m);
         let square_m2 = dot(baseline_m, baseline_m);
         for (maps, schedule) in maps.iter_mut().zip(&plan.schedules) {
@@ -132,17 +130,17 @@ fn add(maps: &mut [ChannelMaps], plan: &Plan, places: &[Place], instant: &Instan
             let dt_s =
                 integration_time_s(schedule.rule, schedule.frequency_hz, a.velocity_m_s, b.velocity_m_s);
             let per_m = 0.5 * CELLS as f64 / maps.limit_m;
-            for (k, place) in places.iter().enumerate().filter(|&(k, _)| sees[i][k] && sees[j][k]) {
-                maps.pair_s[k] += instant.length_s;
-                maps.visibilities[k] += instant.length_s / dt_s;
-                let along_m = dot(baseline_m, place.n_hat);
+            for (k, direction) in directions.iter().enumerate().filter(|&(k, _)| sees[i][k] && sees[j][k]) {
+                maps.pair_s[k] += sample.length_s;
+                maps.visibilities[k] += sample.length_s / dt_s;
+                let along_m = dot(baseline_m, direction.n_hat);
                 let across_m2 = square_m2 - along_m * along_m;
                 maps.shortest_square_m2[k] = maps.shortest_square_m2[k].min(across_m2);
-                let u = place.axes.map(|axis| per_m * dot(baseline_m, axis));
+                let u = direction.axes.map(|axis| per_m * dot(baseline_m, axis));
                 for sign in [1.0, -1.0] {
                     let [x, y] = u.map(|u| {
-                        let place = sign * u + 0.5 * CELLS as f64;
-                        (place.max(0.0) as usize).min(CELLS - 1)
+                        let cell = sign * u + 0.5 * CELLS as f64;
+                        (cell.max(0.0) as usize).min(CELLS - 1)
                     });
                     let cell = y * CELLS + x;
                     if is_inside(cell) {
@@ -154,22 +152,22 @@ fn add(maps: &mut [ChannelMaps], plan: &Plan, places: &[Place], instant: &Instan
     }
 }
 
-/// Whether the centre of a cell lies within the limit.
+/// Whether the centre of a cell is within the limit.
 fn is_inside(cell: usize) -> bool {
-    let at = |k: usize| 2.0 * (k as f64 + 0.5) / CELLS as f64 - 1.0;
-    at(cell % CELLS).hypot(at(cell / CELLS)) < 1.0
+    let coordinate = |k: usize| 2.0 * (k as f64 + 0.5) / CELLS as f64 - 1.0;
+    coordinate(cell % CELLS).hypot(coordinate(cell / CELLS)) < 1.0
 }
 
 pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureError> {
-    let places: Vec<Place> = pixel_directions(NSIDE).into_iter().map(place).collect();
+    let directions: Vec<Direction> = pixel_directions(NSIDE).into_iter().map(with_axes).collect();
     let empty = || -> Vec<ChannelMaps> {
-        (0..plan.schedules.len()).map(|k| ChannelMaps::new(limit_m(plan, k), places.len())).collect()
+        (0..plan.schedules.len()).map(|k| ChannelMaps::new(limit_m(plan, k), directions.len())).collect()
     };
     let maps = gather(
         plan,
         STEP_S,
         empty,
-        |maps, instant| add(maps, plan, &places, instant),
+        |maps, sample| add(maps, plan, &directions, sample),
         |maps, other| maps.iter_mut().zip(&other).for_each(|(to, from)| to.merge(from)),
     );
     if let Some(bare) = maps.iter().find(|maps| maps.pair_s.iter().all(|&s| s == 0.0)) {
@@ -184,53 +182,57 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
     let numbers = CoverageNumbers {
         nside: NSIDE,
         channels: channels
-            .map(|((maps, schedule), columns)| channel(maps.limit_m, schedule.frequency_hz, columns, &places))
+            .map(|((maps, schedule), columns)| {
+                channel_numbers(maps.limit_m, schedule.frequency_hz, columns, &directions)
+            })
             .collect(),
         first_over_channel: columns
             .iter()
-            .map(|of| {
-                let ratio: Vec<f64> = columns[0][0].iter().zip(&of[0]).map(|(a, b)| a / b).collect();
-                let [mean, least, greatest] = spread(&ratio);
-                [least, mean, greatest]
+            .map(|channel| {
+                let ratio: Vec<f64> = columns[0][0].iter().zip(&channel[0]).map(|(a, b)| a / b).collect();
+                let [mean, minimum, maximum] = mean_and_range(&ratio);
+                [minimum, mean, maximum]
             })
             .collect(),
     };
-    let mut more = Vec::new();
+    let mut extra_files = Vec::new();
     for (columns, channel) in columns.iter().zip(&numbers.channels) {
-        more.push(write_maps(columns, channel.frequency_hz, folder)?);
+        extra_files.push(write_maps(columns, channel.frequency_hz, folder)?);
     }
     let picture = draw(&columns, &numbers)?;
-    Ok(FigureParts { more, ..FigureParts::new(&numbers, table(&numbers, &columns, &places), picture) })
+    Ok(FigureParts {
+        extra_files,
+        ..FigureParts::new(&numbers, table(&numbers, &columns, &directions), picture)
+    })
 }
 
-/// Axes across a direction; pixel centres are never poles.
-fn place(n_hat: Vec3) -> Place {
+/// Adds the axes of the tangent plane to a direction. Pixel centres are never at a pole.
+fn with_axes(n_hat: Vec3) -> Direction {
     let east = cross([0.0, 0.0, 1.0], n_hat);
     let east = scale(1.0 / norm(east), east);
-    Place { n_hat, axes: [east, cross(n_hat, east)] }
+    Direction { n_hat, axes: [east, cross(n_hat, east)] }
 }
 
-/// Mean, least and greatest.
-fn spread(values: &[f64]) -> [f64; 3] {
+fn mean_and_range(values: &[f64]) -> [f64; 3] {
     let mean = values.iter().sum::<f64>() / values.len() as f64;
-    let least = values.iter().copied().fold(f64::INFINITY, f64::min);
-    let greatest = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    [mean, least, greatest]
+    let minimum = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let maximum = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [mean, minimum, maximum]
 }
 
-fn channel(
+fn channel_numbers(
     limit_m: f64,
     frequency_hz: f64,
     columns: &[Vec<f64>; 4],
-    places: &[Place],
+    directions: &[Direction],
 ) -> ChannelCoverageNumbers {
     let band = |latitude_deg: [f64; 2]| {
         let mean = |column: &Vec<f64>| {
             let within = |n_hat: Vec3| {
-                let latitude_deg_here = (FRAC_PI_2 - n_hat[2].abs().acos()).to_degrees();
-                (latitude_deg[0]..latitude_deg[1]).contains(&latitude_deg_here)
+                let pixel_latitude_deg = (FRAC_PI_2 - n_hat[2].abs().acos()).to_degrees();
+                (latitude_deg[0]..latitude_deg[1]).contains(&pixel_latitude_deg)
             };
-            let values = places.iter().zip(column).filter(|(place, _)| within(place.n_hat));
+            let values = directions.iter().zip(column).filter(|(direction, _)| within(direction.n_hat));
             let (sum, count) = values.fold((0.0, 0.0), |(sum, count), (_, v)| (sum + v, count + 1.0));
             sum / count
         };
@@ -238,7 +240,7 @@ fn channel(
         BandNumbers { latitude_deg, pair_h, visibilities, shortest_wavelengths, uv_filled }
     };
     let [pair_h, visibilities, shortest_wavelengths, uv_filled] =
-        columns.each_ref().map(|column| spread(column));
+        columns.each_ref().map(|column| mean_and_range(column));
     ChannelCoverageNumbers {
         frequency_hz,
         limit_m,
@@ -251,15 +253,14 @@ fn channel(
     }
 }
 
-fn table(numbers: &CoverageNumbers, columns: &[[Vec<f64>; 4]], places: &[Place]) -> String {
+fn table(numbers: &CoverageNumbers, columns: &[[Vec<f64>; 4]], directions: &[Direction]) -> String {
     let mut csv =
         "frequency_hz,pixel,longitude_deg,latitude_deg,pair_h,visibilities,shortest_wavelengths,uv_filled\n"
             .to_owned();
     for (channel, [hours, visibilities, shortest, filled]) in numbers.channels.iter().zip(columns) {
-        for (k, Place { n_hat: [x, y, z], .. }) in places.iter().enumerate() {
+        for (k, Direction { n_hat: [x, y, z], .. }) in directions.iter().enumerate() {
             let longitude_deg = y.atan2(*x).to_degrees().rem_euclid(360.0);
             let latitude_deg = z.asin().to_degrees();
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{},{k},{longitude_deg:.4},{latitude_deg:.4},{:.4},{:.0},{:.4},{:.4}",
@@ -293,10 +294,10 @@ fn draw(
     numbers: &CoverageNumbers,
 ) -> Result<crate::products::pictures::Picture, FigureError> {
     let kinds = [
-        ("time of pairs", "h"),
+        ("observing time of pairs", "h"),
         ("visibilities", ""),
         ("shortest projected baseline", "wavelengths"),
-        ("filled share of the uv plane", ""),
+        ("filled fraction of the uv plane", ""),
     ];
     let mut panels = Vec::new();
     for (kind, (what, unit)) in kinds.into_iter().enumerate() {

@@ -10,61 +10,61 @@ use crate::response::pixel::ResponseError;
 use crate::sky::MapError;
 use crate::units::Pair;
 
-/// Why a figure could not be made.
+/// Errors of figures.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum FigureError {
-    /// No figure of this name.
-    #[error("figure `{name}`: expected one of {}", FIGURES.join(", "))]
+    /// An unknown figure.
+    #[error("unknown figure `{name}`; expected one of {}", FIGURES.join(", "))]
     Unknown {
-        /// Name asked for.
+        /// Requested name.
         name: String,
     },
     /// A pair that the array does not have.
-    #[error("pair {pair}: the array has {satellites} satellites")]
+    #[error("pair {pair}: the array has only {satellites} satellites; expected two of these")]
     NoPair {
-        /// Pair asked for.
+        /// Requested pair.
         pair: Pair,
-        /// Satellites of the array.
+        /// Number of satellites of the array.
         satellites: usize,
     },
-    /// A time for which no positions are known.
-    #[error("--at {at_s} s: positions are known from {} s to {} s", known_s[0], known_s[1])]
+    /// A time that the ephemeris does not cover.
+    #[error("--at {at_s} s: expected a time covered by the ephemeris, {} s to {} s", known_s[0], known_s[1])]
     NoTime {
-        /// Time asked for, s.
+        /// Requested time, s.
         at_s: f64,
-        /// First and last time known, s.
+        /// First and last time of the ephemeris, s.
         known_s: [f64; 2],
     },
-    /// A figure that needs the formation's progression.
+    /// A figure that needs a formation with a geometric progression.
     #[error(
-        "figure spacing: q0 is a property of a formation on a circle; expected no array.arcs_m, array.kepler or array.oem"
+        "figure spacing: q0 is defined only for a formation on a circular orbit; expected no array.arcs_m, array.kepler or array.oem"
     )]
     NoProgression,
-    /// No baseline within the limit.
+    /// An array without a baseline within the limit of the map.
     #[error(
-        "no baseline is shorter than the limit of {limit_m:.0} m; raise map.baseline_bp_max or lower map.nside"
+        "no baseline is shorter than the limit of {limit_m:.0} m; increase map.baseline_bp_max or decrease map.nside"
     )]
     NoBaseline {
-        /// The limit, m.
+        /// Limit on the baseline, m.
         limit_m: f64,
     },
-    /// The array.
+    /// An error of the array.
     #[error(transparent)]
     Array(#[from] ArrayError),
-    /// A map.
+    /// An error of a map.
     #[error(transparent)]
     Map(#[from] MapError),
-    /// Rows of the beam matrix.
+    /// An error in the rows of the beam matrix.
     #[error(transparent)]
     Response(#[from] ResponseError),
-    /// The sky.
+    /// An error of the generated sky.
     #[error(transparent)]
     Sky(#[from] crate::sky::generated::GeneratedSkyError),
-    /// The simulated sky of the plan.
+    /// An error in the sky of the plan.
     #[error(transparent)]
     Pipeline(#[from] PipelineError),
-    /// A picture or file.
+    /// A file that cannot be written.
     #[error(transparent)]
     Products(#[from] ProductsError),
     /// A picture that cannot be drawn.

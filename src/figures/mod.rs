@@ -1,7 +1,7 @@
-//! Figures of an array and its beam matrix that need no map: where baselines lie, for how long, and what pixels do to them.
+//! Figures of an array and its beam matrix that need no map: baselines, coverage, and the effects of pixels.
 //!
-//! Each is a picture, a table and a few numbers, computed from a [`Plan`]; the figures of the paper are among them. Maps and
-//! their spectra are [`crate::products`], series of them studies ([`crate::pipeline::Study`]). May use every folder before it.
+//! Each consists of a picture, a table and a few numbers, computed from a [`Plan`]; figures of the paper are among them. Maps and
+//! their spectra are in [`crate::products`], series of maps in studies ([`crate::pipeline::Study`]).
 
 mod baselines;
 mod coverage;
@@ -19,7 +19,7 @@ mod waterfall;
 use std::path::Path;
 
 pub use error::FigureError;
-pub use output::MadeFigure;
+pub use output::FigureFiles;
 pub use request::{FIGURES, FigureRequest};
 
 use crate::pipeline::Plan;
@@ -27,9 +27,9 @@ use crate::pipeline::Plan;
 /// Makes a figure and writes `NAME.png`, `NAME.csv` and `NAME.json` into `folder`.
 ///
 /// # Errors
-/// An unknown name, a pair that the array does not have, a figure that this array does not have, or files that cannot be
+/// An unknown name, a pair that the array does not have, a figure that this array does not have, or a file that cannot be
 /// written.
-pub fn make_figure(request: &FigureRequest, plan: &Plan, folder: &Path) -> Result<MadeFigure, FigureError> {
+pub fn make_figure(request: &FigureRequest, plan: &Plan, folder: &Path) -> Result<FigureFiles, FigureError> {
     let made = match request.name.as_str() {
         "spacing" => spacing::make(plan)?,
         "baselines" => baselines::make(plan)?,

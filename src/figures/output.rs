@@ -1,4 +1,4 @@
-//! What a figure leaves behind.
+//! Writes the files of a figure.
 
 use std::path::{Path, PathBuf};
 
@@ -12,35 +12,36 @@ use crate::products::pictures::Picture;
 
 /// A figure that has been written.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct MadeFigure {
-    /// Its name.
+pub struct FigureFiles {
+    /// Name of the figure.
     pub figure: String,
-    /// Its content in numbers.
     pub numbers: Value,
-    /// Its files.
+    /// Paths of the files.
     pub files: Vec<PathBuf>,
 }
 
 /// A figure before it is written.
 pub(super) struct FigureParts {
-    /// Its content in numbers.
     pub numbers: Value,
-    /// Its table (CSV).
     pub csv: String,
-    /// Its picture.
     pub picture: Picture,
-    /// Files that have been written already.
-    pub more: Vec<PathBuf>,
+    /// Paths of files that have been written already.
+    pub extra_files: Vec<PathBuf>,
 }
 
 impl FigureParts {
-    /// A figure of one picture and table; the numbers must have a JSON form.
+    /// A figure of one picture and one table. The numbers must be serialisable as JSON.
     pub fn new(numbers: &impl Serialize, csv: String, picture: Picture) -> Self {
-        Self { numbers: serde_json::to_value(numbers).unwrap_or_default(), csv, picture, more: Vec::new() }
+        Self {
+            numbers: serde_json::to_value(numbers).unwrap_or_default(),
+            csv,
+            picture,
+            extra_files: Vec::new(),
+        }
     }
 
     /// Writes picture, table and numbers into `folder`.
-    pub fn write(self, name: &str, folder: &Path) -> Result<MadeFigure, FigureError> {
+    pub fn write(self, name: &str, folder: &Path) -> Result<FigureFiles, FigureError> {
         let path = |ending: &str| folder.join(format!("{name}.{ending}"));
         let encoded = |error: serde_json::Error| ProductsError::Encode {
             path: path("json"),
@@ -52,7 +53,7 @@ impl FigureParts {
         }
         self.picture.write(&path("png"))?;
         self.picture.write(&path("svg"))?;
-        let files = ["png", "svg", "csv", "json"].map(path).into_iter().chain(self.more).collect();
-        Ok(MadeFigure { figure: name.to_owned(), numbers: self.numbers, files })
+        let files = ["png", "svg", "csv", "json"].map(path).into_iter().chain(self.extra_files).collect();
+        Ok(FigureFiles { figure: name.to_owned(), numbers: self.numbers, files })
     }
 }

@@ -1,11 +1,11 @@
-//! Time that pairs observe at each baseline length, and the visibilities that it makes (the paper, Fig. 4).
+//! Observing time of pairs by baseline length, and the number of visibilities (the paper, Fig. 4).
 
 use std::fmt::Write;
 
 use serde::Serialize;
 
 use super::error::FigureError;
-use super::exposure::{Instant, gather, limit_m};
+use super::exposure::{TimeSample, gather, limit_m};
 use super::output::FigureParts;
 use crate::array::integration_time_s;
 use crate::pipeline::Plan;
@@ -13,21 +13,21 @@ use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 use crate::units::all_pairs;
 use crate::units::vector::{norm, sub};
 
-/// Length of the first bin's beginning, m; those of all others follow.
+/// Lower edge of the first bin of baseline length, m.
 const FIRST_M: f64 = 50.0;
-/// Bins in a factor of ten.
+/// Number of bins per decade.
 const PER_DECADE: f64 = 20.0;
-/// Bins: up to 500 km.
+/// Number of bins, up to 500 km.
 const BINS: usize = 80;
-/// Distance of instants, s; lengths change by millimetres in a second.
+/// Time step, s. Lengths change slowly, by millimetres per second.
 const STEP_S: f64 = 60.0;
 
 #[derive(Serialize)]
 struct PairTimeNumbers {
-    /// Observing windows, and their sum.
+    /// Number of observing windows, and their total duration.
     windows: usize,
     observed_s: f64,
-    /// Sum over pairs, without those that see the Earth.
+    /// Observing time summed over pairs, without pairs that see the Earth if these are flagged.
     pair_s: f64,
     shortest_m: f64,
     longest_m: f64,
@@ -45,23 +45,23 @@ struct LengthBin {
 #[derive(Serialize)]
 struct ChannelTime {
     frequency_hz: f64,
-    /// Longest baseline of the map, m and wavelengths.
+    /// Limit on the baselines of the map, m and wavelengths.
     limit_m: f64,
     limit_wavelengths: f64,
-    /// Pairs that are within it at some time.
+    /// Number of pairs that are within the limit at some time.
     pairs: usize,
-    /// Their time within it.
+    /// Observing time within the limit.
     pair_s: f64,
     visibilities: f64,
-    /// Of all baselines.
+    /// Number of visibilities without the limit.
     visibilities_all: f64,
-    /// Share of the time of all pairs in which the baseline's motion cuts integrations short.
+    /// Fraction of the observing time in which the motion of the baseline shortens integrations.
     cut_by_motion: f64,
-    /// By length, as in `bins`.
+    /// Number of visibilities by length, as in `bins`.
     visibilities_by_length: Vec<f64>,
 }
 
-/// Counts of a part of the windows.
+/// Partial sums over windows.
 struct Counts {
     bins_s: Vec<f64>,
     pair_s: f64,
@@ -98,28 +98,28 @@ impl Counts {
         }
     }
 
-    fn add(&mut self, plan: &Plan, limits_m: &[f64], instant: &Instant<'_>) {
-        self.observed_s += instant.length_s;
-        let all = all_pairs(instant.states.len());
-        for pair in instant.pairs {
-            let [i, j] = [pair.i, pair.j].map(|n| instant.states[usize::from(n)]);
+    fn add(&mut self, plan: &Plan, limits_m: &[f64], sample: &TimeSample<'_>) {
+        self.observed_s += sample.length_s;
+        let all = all_pairs(sample.states.len());
+        for pair in sample.pairs {
+            let [i, j] = [pair.i, pair.j].map(|n| sample.states[usize::from(n)]);
             let length_m = norm(sub(i.position_m, j.position_m));
             let bin = bin_of(length_m);
-            self.pair_s += instant.length_s;
-            self.bins_s[bin] += instant.length_s;
+            self.pair_s += sample.length_s;
+            self.bins_s[bin] += sample.length_s;
             self.range_m = [self.range_m[0].min(length_m), self.range_m[1].max(length_m)];
             let number = all.iter().position(|other| other == pair).unwrap_or(0);
             for ((counts, schedule), limit_m) in self.channels.iter_mut().zip(&plan.schedules).zip(limits_m) {
                 let rule = schedule.rule;
                 let dt_s = integration_time_s(rule, schedule.frequency_hz, i.velocity_m_s, j.velocity_m_s);
-                let count = instant.length_s / dt_s;
+                let count = sample.length_s / dt_s;
                 counts.all += count;
                 counts.by_length[bin] += count;
                 if dt_s < rule.duration_s_max {
-                    counts.cut += instant.length_s;
+                    counts.cut += sample.length_s;
                 }
                 if length_m < *limit_m {
-                    counts.pair_s += instant.length_s;
+                    counts.pair_s += sample.length_s;
                     counts.within += count;
                     counts.seen[number] = true;
                 }
@@ -128,8 +128,8 @@ impl Counts {
     }
 
     fn merge(&mut self, other: Self) {
-        let join = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
-        join(&mut self.bins_s, &other.bins_s);
+        let add = |to: &mut [f64], from: &[f64]| to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+        add(&mut self.bins_s, &other.bins_s);
         self.pair_s += other.pair_s;
         self.observed_s += other.observed_s;
         self.range_m = [self.range_m[0].min(other.range_m[0]), self.range_m[1].max(other.range_m[1])];
@@ -138,15 +138,15 @@ impl Counts {
             to.within += from.within;
             to.all += from.all;
             to.cut += from.cut;
-            join(&mut to.by_length, &from.by_length);
+            add(&mut to.by_length, &from.by_length);
             to.seen.iter_mut().zip(from.seen).for_each(|(to, from)| *to |= from);
         }
     }
 }
 
 fn bin_of(length_m: f64) -> usize {
-    let place = (length_m / FIRST_M).log10() * PER_DECADE;
-    (place.max(0.0) as usize).min(BINS - 1)
+    let bin = (length_m / FIRST_M).log10() * PER_DECADE;
+    (bin.max(0.0) as usize).min(BINS - 1)
 }
 
 fn edge_m(bin: usize) -> f64 {
@@ -160,7 +160,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
         plan,
         STEP_S,
         || Counts::new(limits_m.len(), pairs),
-        |counts, instant| counts.add(plan, &limits_m, instant),
+        |counts, sample| counts.add(plan, &limits_m, sample),
         Counts::merge,
     );
     let bin = |(k, &pair_s): (usize, &f64)| LengthBin { from_m: edge_m(k), to_m: edge_m(k + 1), pair_s };
@@ -195,7 +195,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
 fn table(numbers: &PairTimeNumbers) -> String {
     let mut csv = "from_m,to_m,pair_s".to_owned();
     for channel in &numbers.channels {
-        // Writing to a string cannot fail.
         let _ = write!(csv, ",visibilities_{}hz", channel.frequency_hz);
     }
     csv.push('\n');
@@ -215,7 +214,7 @@ fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
         log: true,
         limits: Some((0.95 * numbers.shortest_m, numbers.longest_m)),
     };
-    // A step over every bin.
+    // Both ends of every bin, for a step curve.
     let steps = |value: &dyn Fn(usize, &LengthBin) -> f64| {
         let corners =
             |(k, bin): (usize, &LengthBin)| [(bin.from_m, value(k, bin)), (bin.to_m, value(k, bin))];
@@ -232,7 +231,7 @@ fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
     });
     [
         Plot {
-            title: format!("Time of all pairs, {} windows", numbers.windows),
+            title: format!("Observing time of all pairs, {} windows", numbers.windows),
             x: x.clone(),
             y: Axis { label: "pair hours per metre".to_owned(), log: true, limits: None },
             curves: vec![curve(String::new(), steps(&density))],
@@ -241,7 +240,7 @@ fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
         Plot {
             title: "Visibilities".to_owned(),
             x,
-            y: Axis { label: "in a twentieth of a decade".to_owned(), log: true, limits: None },
+            y: Axis { label: "per twentieth of a decade".to_owned(), log: true, limits: None },
             curves: by_channel.collect(),
             levels: Vec::new(),
         },

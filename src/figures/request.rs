@@ -1,18 +1,18 @@
-//! Which figure is asked for.
+//! Selects a figure.
 
 use crate::units::Pair;
 
-/// The figures by name.
+/// Names of the figures.
 pub const FIGURES: [&str; 8] =
     ["spacing", "baselines", "pair-time", "uvw", "coverage", "rows", "waterfall", "sub-pixel"];
 
-/// Which figure to make, and of what.
+/// The figure to make, with its options.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FigureRequest {
     /// One of [`FIGURES`].
     pub name: String,
-    /// Pair of `rows` and `waterfall`; one that suits the map if `None`.
+    /// Pair of `rows` and `waterfall`; `None` for the one closest to twice the baseline b_p.
     pub pair: Option<Pair>,
-    /// Time of `rows` and `waterfall`, s; the middle of the first window if `None`.
+    /// Time of `rows` and `waterfall`, s; `None` for the middle of the first window.
     pub at_s: Option<f64>,
 }

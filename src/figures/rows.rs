@@ -1,4 +1,4 @@
-//! A row of the beam matrix: at pixel centres and averaged over pixels (the paper, Fig. 7).
+//! A row of the beam matrix, at pixel centres and averaged over pixels (the paper, Fig. 7).
 
 use std::fmt::Write;
 
@@ -24,27 +24,27 @@ struct RowNumbers {
     r_i_m: Vec3,
     r_j_m: Vec3,
     length_m: f64,
-    /// In units of b_p = lambda / theta_p.
+    /// Length in units of b_p = lambda / theta_p.
     length_bp: f64,
-    /// Share of pixels that the Moon does not hide.
+    /// Fraction of pixels that the Moon does not occult.
     seen: f64,
-    /// Mean square of the row over the pixels that are seen.
+    /// Mean square of the row over visible pixels.
     centre_power: f64,
     average_power: f64,
 }
 
-/// Where a pair is, at which the figure looks.
+/// Geometry of a pair at a time.
 pub(super) struct PairMoment {
     pub pair: Pair,
     pub t_s: f64,
     pub geometry: PairGeometry,
     pub length_m: f64,
-    /// In units of b_p.
+    /// Length in units of b_p.
     pub length_bp: f64,
 }
 
 impl PairMoment {
-    /// The pair and time asked for, at the frequency of the first channel; by default the middle of the first window, and
+    /// The requested pair and time, at the frequency of the first channel. The defaults are the middle of the first window, and
     /// the pair whose baseline is closest to 2 b_p.
     pub fn new(plan: &Plan, request: &FigureRequest) -> Result<Self, FigureError> {
         let satellites = plan.array.satellites();
@@ -57,7 +57,7 @@ impl PairMoment {
         }
         let frequency_hz = plan.schedules[0].frequency_hz;
         let bp_m = SPEED_OF_LIGHT_M_S / frequency_hz / pixel_area_sr(plan.config.map.nside).sqrt();
-        let of = |pair: Pair| {
+        let moment_of = |pair: Pair| {
             let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| plan.array.position_m(n.into(), t_s));
             let length_m = norm(sub(r_i_m, r_j_m));
             let geometry = PairGeometry {
@@ -73,23 +73,23 @@ impl PairMoment {
             if usize::from(pair.j) >= satellites {
                 return Err(FigureError::NoPair { pair, satellites });
             }
-            return Ok(of(pair));
+            return Ok(moment_of(pair));
         }
-        let off = |look: &Self| (look.length_bp / 2.0).ln().abs();
-        let looks = all_pairs(satellites).into_iter().map(of);
-        let best = looks.min_by(|a, b| off(a).total_cmp(&off(b)));
+        let distance = |moment: &Self| (moment.length_bp / 2.0).ln().abs();
+        let moments = all_pairs(satellites).into_iter().map(moment_of);
+        let best = moments.min_by(|a, b| distance(a).total_cmp(&distance(b)));
         best.ok_or(FigureError::NoBaseline { limit_m: 2.0 * bp_m })
     }
 }
 
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
-    let look = PairMoment::new(plan, request)?;
+    let moment = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
     let row = |method: PixelMethod| -> Result<[Vec<f64>; 2], FigureError> {
         let maker = RowMaker::new(nside, method)?;
-        maker.prepare(&look.geometry);
+        maker.prepare(&moment.geometry);
         let (mut re, mut im) = (vec![0.0_f64; maker.pixels()], vec![0.0_f64; maker.pixels()]);
-        maker.fill(&look.geometry, 1.0, &mut re, &mut im);
+        maker.fill(&moment.geometry, 1.0, &mut re, &mut im);
         Ok([re, im])
     };
     let (centre, average) = (row(PixelMethod::Centre)?, row(PixelMethod::Average)?);
@@ -98,21 +98,20 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     let seen: Vec<usize> = (0..pixels).filter(|&k| square(&centre, k) > 0.0).collect();
     let power = |row: &[Vec<f64>; 2]| seen.iter().map(|&k| square(row, k)).sum::<f64>() / seen.len() as f64;
     let numbers = RowNumbers {
-        frequency_hz: look.geometry.frequency_hz,
+        frequency_hz: moment.geometry.frequency_hz,
         nside,
-        pair: look.pair.to_string(),
-        t_s: look.t_s,
-        r_i_m: look.geometry.r_i_m,
-        r_j_m: look.geometry.r_j_m,
-        length_m: look.length_m,
-        length_bp: look.length_bp,
+        pair: moment.pair.to_string(),
+        t_s: moment.t_s,
+        r_i_m: moment.geometry.r_i_m,
+        r_j_m: moment.geometry.r_j_m,
+        length_m: moment.length_m,
+        length_bp: moment.length_bp,
         seen: seen.len() as f64 / pixels as f64,
         centre_power: power(&centre),
         average_power: power(&average),
     };
     let mut csv = "pixel,centre_re,centre_im,average_re,average_im\n".to_owned();
     for k in 0..pixels {
-        // Writing to a string cannot fail.
         let _ = writeln!(
             csv,
             "{k},{:.7},{:.7},{:.7},{:.7}",

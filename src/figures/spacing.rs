@@ -1,4 +1,4 @@
-//! The ratio q0 of the formation's steps against the ratios R and R_2 of its breathing (the paper, Sect. 2 and Fig. 3).
+//! The step ratio q0 of the formation against the ratios R and R_2 of its breathing (the paper, Sect. 2 and Fig. 3).
 
 use std::fmt::Write;
 
@@ -10,9 +10,9 @@ use crate::array::Progression;
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 
-/// Ratios R_2 of the curves.
+/// Values of R_2, one for each curve.
 const FIRST_RATIOS: [f64; 5] = [2.0, 4.0, 6.0, 8.0, 10.0];
-/// R from 1 to 10.
+/// Number of values of R, from 1 to 10.
 const RATIO_STEPS: usize = 91;
 
 #[derive(Serialize)]
@@ -22,7 +22,7 @@ struct SpacingNumbers {
     q0: f64,
     scale_m: f64,
     offset_m: f64,
-    /// Curves of q0 over R, one for each R_2.
+    /// Curves of q0 against R, one for each R_2.
     curves: Vec<SpacingCurve>,
 }
 
@@ -30,7 +30,7 @@ struct SpacingNumbers {
 struct SpacingCurve {
     first_ratio: f64,
     ratio: Vec<f64>,
-    /// `None` where no progression meets the spacings.
+    /// Values of q0; `None` if no progression has these spacings.
     q0: Vec<Option<f64>>,
 }
 
@@ -39,7 +39,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     if !config.arcs_m.is_empty() || plan.array.formation().is_none() {
         return Err(FigureError::NoProgression);
     }
-    let own = Progression::new(config)?;
+    let configured = Progression::new(config)?;
     let q0 = |ratio: f64, first_ratio: f64| {
         let mut config = config.clone();
         (config.breathing.ratio, config.breathing.first_ratio) = (ratio, first_ratio);
@@ -56,16 +56,15 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     let numbers = SpacingNumbers {
         ratio: breathing.ratio,
         first_ratio: breathing.first_ratio,
-        q0: own.step_ratio,
-        scale_m: own.scale_m,
-        offset_m: own.offset_m,
+        q0: configured.step_ratio,
+        scale_m: configured.scale_m,
+        offset_m: configured.offset_m,
         curves,
     };
     let mut csv = "ratio,first_ratio,q0\n".to_owned();
     for curve in &numbers.curves {
         for (ratio, q0) in curve.ratio.iter().zip(&curve.q0) {
             let q0 = q0.map_or_else(String::new, |q0| format!("{q0:.10}"));
-            // Writing to a string cannot fail.
             let _ = writeln!(csv, "{ratio},{},{q0}", curve.first_ratio);
         }
     }
@@ -81,12 +80,12 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
             breathing.span_m_max / 1e3,
             breathing.ratio,
             breathing.first_ratio,
-            own.step_ratio
+            configured.step_ratio
         ),
         x: Axis { label: "R".to_owned(), ..Axis::default() },
         y: Axis { label: "q_{0}".to_owned(), ..Axis::default() },
         curves: numbers.curves.iter().map(drawn).collect(),
-        levels: vec![own.step_ratio],
+        levels: vec![configured.step_ratio],
     };
     let picture = draw_plots("", &[plot], 1)?;
     Ok(FigureParts::new(&numbers, csv, picture))

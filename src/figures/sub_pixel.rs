@@ -1,9 +1,9 @@
-//! Sub-pixel noise: what the structure of the sky within pixels does to visibilities and to the map (the paper's appendix and
+//! Sub-pixel noise: the effect of structure of the sky within pixels on visibilities and on the map (the paper, appendix and
 //! Fig. 20).
 //!
-//! A map of pixels predicts `B T`, T the means over pixels, where the sky gives `V`. The difference `b = V - B T` has the
-//! covariance `N_b = <b bt>`, and the map the covariance `Sigma_b = A N_b At` with `A = (BtN^-1B + R)^-1 BtN^-1`. Both are means
-//! over skies of other seeds; told are the roots of their diagonals.
+//! A pixel map predicts `B T`, with T the means over pixels, while the sky gives `V`. The difference `b = V - B T` has the
+//! covariance `N_b = <b bt>`, and the map has `Sigma_b = A N_b At` with `A = (BtN^-1B + R)^-1 BtN^-1`. Both are averaged over
+//! skies with different seeds. The figure shows the square roots of their diagonals.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -29,15 +29,15 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::norm;
 use crate::units::{ChannelId, all_pairs};
 
-/// Resolutions of the maps.
+/// nside of the maps.
 const NSIDES: [usize; 2] = [8, 16];
-/// Skies over which the covariances are means.
+/// Number of skies over which covariances are averaged.
 const SKIES: u64 = 6;
-/// Most visibilities, from windows spread over the mission.
+/// Maximum number of visibilities, from windows evenly spaced over the mission.
 const VISIBILITIES_MAX: usize = 3000;
-/// Edges of the classes of baselines, in units of b_p.
+/// Edges of the classes of baseline length, in units of b_p.
 const CLASSES_BP: [f64; 9] = [0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0];
-/// Steps of the power iteration for W_max.
+/// Number of steps of the power iteration for W_max.
 const POWER_STEPS: usize = 100;
 
 #[derive(Serialize)]
@@ -55,9 +55,9 @@ struct SubPixelCase {
     rows: &'static str,
     windows: usize,
     visibilities: usize,
-    /// Root of the mean diagonal of N_b, K sr, and relative to the rms visibility and to the thermal noise, by length.
+    /// Square root of the mean diagonal of N_b by baseline length.
     classes: Vec<SubPixelClass>,
-    /// Root of the mean diagonal of Sigma_b, K.
+    /// Square root of the mean diagonal of Sigma_b, K.
     sigma_b_k: f64,
     tr_sigma_b_k2: f64,
     /// Mean of the sky, K.
@@ -72,20 +72,22 @@ struct SubPixelClass {
     to_bp: f64,
     count: usize,
     rms_k_sr: f64,
+    /// Relative to the rms visibility.
     of_visibility: f64,
+    /// Relative to the thermal noise.
     of_noise: f64,
 }
 
-/// Visibilities of a resolution.
-struct Sample {
+/// Sampled visibilities for one nside.
+struct VisibilitySample {
     windows: usize,
     pairs: Vec<PairGeometry>,
     dt_s: Vec<f64>,
     length_bp: Vec<f64>,
 }
 
-impl Sample {
-    /// Integrations of windows in equal steps through the mission, as the schedule has them, up to the map's limit.
+impl VisibilitySample {
+    /// Scheduled integrations of evenly spaced windows, up to the baseline limit of the map.
     fn new(plan: &Plan, nside: usize) -> Result<Self, FigureError> {
         let frequency_hz = plan.schedules[0].frequency_hz;
         let bp_m = SPEED_OF_LIGHT_M_S / frequency_hz / pixel_area_sr(nside).sqrt();
@@ -105,9 +107,10 @@ impl Sample {
         for &window in plan.windows.iter().step_by(every) {
             sample.windows += 1;
             for &pair in &pairs {
-                for one in schedule.integrations(&plan.array, window, pair) {
-                    let middle = i64::from(one.offset_ticks) + i64::from(one.duration_ticks / 2);
-                    let t_s = window.start.plus_ticks(middle).seconds();
+                for integration in schedule.integrations(&plan.array, window, pair) {
+                    let midpoint_ticks =
+                        i64::from(integration.offset_ticks) + i64::from(integration.duration_ticks / 2);
+                    let t_s = window.start.plus_ticks(midpoint_ticks).seconds();
                     let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| plan.array.position_m(n.into(), t_s));
                     let geometry = PairGeometry {
                         r_i_m,
@@ -120,7 +123,7 @@ impl Sample {
                         .length_bp
                         .push(norm(geometry.baseline_wavelengths()) * pixel_area_sr(nside).sqrt());
                     sample.pairs.push(geometry);
-                    sample.dt_s.push(f64::from(one.duration_ticks) * 1e-6);
+                    sample.dt_s.push(f64::from(integration.duration_ticks) * 1e-6);
                 }
             }
         }
@@ -134,7 +137,7 @@ impl Sample {
 pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureError> {
     let mut cases = Vec::new();
     for nside in NSIDES {
-        cases.extend(of_nside(plan, nside)?);
+        cases.extend(cases_for_nside(plan, nside)?);
     }
     let numbers = SubPixelNumbers {
         frequency_hz: plan.schedules[0].frequency_hz,
@@ -145,7 +148,6 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
     let mut csv = "nside,rows,from_bp,to_bp,count,rms_k_sr,of_visibility,of_noise\n".to_owned();
     for case in &numbers.cases {
         for class in &case.classes {
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{},{},{},{},{},{:.5e},{:.5e},{:.5e}",
@@ -163,20 +165,19 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
     let maps = folder.join("sub-pixel-maps.png");
     draw_maps(&numbers)?.write(&maps)?;
     let picture = draw_plots("", &[plot(&numbers)], 1)?;
-    Ok(FigureParts { more: vec![maps], ..FigureParts::new(&numbers, csv, picture) })
+    Ok(FigureParts { extra_files: vec![maps], ..FigureParts::new(&numbers, csv, picture) })
 }
 
 fn epsilon(plan: &Plan) -> f64 {
     plan.config.map.epsilon().get(0).unwrap_or(1e-4)
 }
 
-/// Both methods at one resolution.
-fn of_nside(plan: &Plan, nside: usize) -> Result<Vec<SubPixelCase>, FigureError> {
-    let sample = Sample::new(plan, nside)?;
+fn cases_for_nside(plan: &Plan, nside: usize) -> Result<Vec<SubPixelCase>, FigureError> {
+    let sample = VisibilitySample::new(plan, nside)?;
     let nside_fine = CHILDREN * nside;
     let directions = Directions::from(pixel_directions(nside_fine).as_slice());
     let frequency_hz = plan.schedules[0].frequency_hz;
-    // Each sky: its visibilities, and its means over pixels.
+    // Visibilities and pixel means of each sky.
     let mut skies = Vec::new();
     for number in 0..SKIES {
         let seed = plan.config.seed.wrapping_add(number);
@@ -194,14 +195,14 @@ fn of_nside(plan: &Plan, nside: usize) -> Result<Vec<SubPixelCase>, FigureError>
         .map(|(name, method)| {
             let rows = rows(&sample, nside, method)?;
             let (epsilon, sample) = (epsilon(plan), &sample);
-            let seen = CaseInputs { epsilon, sample, sigma_k_sr: &sigma_k_sr, skies: &skies, rows: &rows };
-            Ok(SubPixelCase { rows: name, nside, nside_fine, ..seen.case() })
+            let inputs = CaseInputs { epsilon, sample, sigma_k_sr: &sigma_k_sr, skies: &skies, rows: &rows };
+            Ok(SubPixelCase { rows: name, nside, nside_fine, ..inputs.case() })
         })
         .collect()
 }
 
-/// Thermal noise of the parts of each visibility.
-fn noise_k_sr(plan: &Plan, sample: &Sample, sky: &SkyMap) -> Result<Vec<f64>, FigureError> {
+/// Thermal noise of the real and imaginary part of each visibility.
+fn noise_k_sr(plan: &Plan, sample: &VisibilitySample, sky: &SkyMap) -> Result<Vec<f64>, FigureError> {
     let singles: Vec<SingleGeometry> = sample
         .pairs
         .iter()
@@ -221,15 +222,15 @@ fn noise_k_sr(plan: &Plan, sample: &Sample, sky: &SkyMap) -> Result<Vec<f64>, Fi
         receiver_noise_k_sr: spacecraft.receiver_k_sr(),
         response: plan.instrument.response,
     };
-    // As the baselines, of the first channel.
+    // Of the first channel, like the baselines.
     let sigma = |(power, dt_s): (f64, &f64)| {
         noise.sigma_k_sr(ChannelId(0), [power; 2], spacecraft.channel_width_hz, *dt_s)
     };
     Ok(powers.into_iter().zip(&sample.dt_s).map(sigma).collect())
 }
 
-/// Rows of B with the pixels' area: real parts, then imaginary parts, a column a part.
-fn rows(sample: &Sample, nside: usize, method: PixelMethod) -> Result<Mat<f64>, FigureError> {
+/// Transposed rows of B including the pixel area, with one column per real or imaginary part, alternating.
+fn rows(sample: &VisibilitySample, nside: usize, method: PixelMethod) -> Result<Mat<f64>, FigureError> {
     let maker = RowMaker::new(nside, method)?;
     sample.pairs.iter().for_each(|pair| maker.prepare(pair));
     let area_sr = pixel_area_sr(nside);
@@ -242,20 +243,19 @@ fn rows(sample: &Sample, nside: usize, method: PixelMethod) -> Result<Mat<f64>, 
     Ok(Mat::from_fn(maker.pixels(), 2 * rows.len(), |pixel, k| rows[k / 2][k % 2][pixel]))
 }
 
-/// What a case is made from.
 struct CaseInputs<'a> {
     epsilon: f64,
-    sample: &'a Sample,
+    sample: &'a VisibilitySample,
     sigma_k_sr: &'a [f64],
     skies: &'a [(Vec<[f64; 2]>, SkyMap)],
-    /// Transposed: a column a part of a visibility.
+    /// Transposed rows of B, with one column per part of a visibility.
     rows: &'a Mat<f64>,
 }
 
 impl CaseInputs<'_> {
     fn case(&self) -> SubPixelCase {
         let (pixels, parts) = (self.rows.nrows(), self.rows.ncols());
-        // b of every sky, a column a sky.
+        // The errors b, with one column per sky.
         let columns: Vec<Vec<f64>> = self
             .skies
             .iter()
@@ -268,13 +268,13 @@ impl CaseInputs<'_> {
         let weight = |k: usize| self.sigma_k_sr[k / 2].powi(-2);
         let weighted = Mat::from_fn(pixels, parts, |pixel, k| self.rows[(pixel, k)] * weight(k));
         let mut normal = &weighted * self.rows.transpose();
-        let eps = self.epsilon * largest(&normal);
+        let regularisation = self.epsilon * largest_eigenvalue(&normal);
         for pixel in 0..pixels {
-            normal[(pixel, pixel)] += eps;
+            normal[(pixel, pixel)] += regularisation;
         }
         let errors = Mat::from_fn(parts, columns.len(), |k, sky| columns[sky][k]);
         let right = &weighted * &errors;
-        // R makes it positive definite; its eigenvalues are at least eps.
+        // R makes the matrix positive definite.
         let solved = match normal.llt(Side::Lower) {
             Ok(factor) => factor.solve(&right),
             Err(_) => Mat::from_fn(pixels, columns.len(), |_, _| f64::NAN),
@@ -312,7 +312,7 @@ impl CaseInputs<'_> {
                 let [re, im] = self.skies[sky].0[k];
                 re * re + im * im
             };
-            // The noise of both parts together.
+            // Relative to the noise of both parts.
             let noisy = |sky: usize, k: usize| error(sky, k) / 2.0 / self.sigma_k_sr[k].powi(2);
             let rms_k_sr = mean(&error);
             (!members.is_empty()).then(|| SubPixelClass {
@@ -328,8 +328,8 @@ impl CaseInputs<'_> {
     }
 }
 
-/// Largest eigenvalue of a symmetric matrix, by power iteration.
-fn largest(matrix: &Mat<f64>) -> f64 {
+/// The largest eigenvalue of a symmetric matrix, by power iteration.
+fn largest_eigenvalue(matrix: &Mat<f64>) -> f64 {
     let order = matrix.nrows();
     let mut vector = Mat::from_fn(order, 1, |k, _| 1.0 + 0.5 * (k as f64).sin());
     let mut value = 0.0;
@@ -376,7 +376,7 @@ fn draw_maps(numbers: &SubPixelNumbers) -> Result<crate::products::pictures::Pic
         })
         .collect();
     let sheet = Sheet {
-        title: "Root of the diagonal of Sigma_{b}".to_owned(),
+        title: "Square root of the diagonal of Sigma_{b}".to_owned(),
         subtitle: format!("epsilon {:e}, {} skies", numbers.epsilon, numbers.skies),
         columns: 2,
         width_px: 1800,
@@ -392,7 +392,7 @@ mod tests {
 
     #[test]
     fn covariances_of_orthogonal_rows_are_known() {
-        // Twelve pixels and six visibilities whose parts see a pixel each, by r_k; two skies.
+        // Twelve pixels and six visibilities, each part of which measures one pixel times r_k; two skies.
         let r = |k: usize| 1.0 + 0.25 * k as f64;
         let rows = Mat::from_fn(12, 12, |pixel, k| if pixel == k { r(k) } else { 0.0 });
         let geometry = PairGeometry {
@@ -402,38 +402,38 @@ mod tests {
             moon_radius_m: 1.7e6,
             response: AntennaResponse::Isotropic,
         };
-        let sample = Sample {
+        let sample = VisibilitySample {
             windows: 1,
             pairs: vec![geometry; 6],
             dt_s: vec![1.0; 6],
             length_bp: vec![0.1, 0.1, 0.1, 1.9, 1.9, 1.9],
         };
-        // What visibilities have beyond B T: one and two in every part of the first three, three and four in the others.
-        let beyond = |sky: usize, k: usize| (1 + sky + if k < 6 { 0 } else { 2 }) as f64;
+        // The errors b of the two skies: 1 and 2 in every part of the first three visibilities, 3 and 4 in the others.
+        let error = |sky: usize, k: usize| (1 + sky + if k < 6 { 0 } else { 2 }) as f64;
         let coarse = |sky: usize| {
             SkyMap::new(Frame::Ecliptic, (0..12).map(|p| 5.0 + (p * (sky + 1)) as f64).collect()).unwrap()
         };
         let skies: Vec<(Vec<[f64; 2]>, SkyMap)> = (0..2)
             .map(|sky| {
                 let map = coarse(sky);
-                let part = |k: usize| r(k) * map.values()[k] + beyond(sky, k);
+                let part = |k: usize| r(k) * map.values()[k] + error(sky, k);
                 ((0..6).map(|v| [part(2 * v), part(2 * v + 1)]).collect(), map)
             })
             .collect();
-        let seen =
+        let inputs =
             CaseInputs { epsilon: 0.1, sample: &sample, sigma_k_sr: &[0.5; 6], skies: &skies, rows: &rows };
-        let found = seen.case();
+        let found = inputs.case();
         // A = r / sigma^2 / (r^2 / sigma^2 + epsilon W_max), W_max = r_11^2 / sigma^2.
         for (k, found) in found.map_k.iter().enumerate() {
             let gain = r(k) / (r(k).powi(2) + 0.1 * r(11).powi(2));
-            let mean_square = 0.5 * (beyond(0, k).powi(2) + beyond(1, k).powi(2));
+            let mean_square = 0.5 * (error(0, k).powi(2) + error(1, k).powi(2));
             // The power iteration for W_max stops at 1e-6 or better, as its second eigenvalue is 0.87 of it.
             assert!((found / (gain * mean_square.sqrt()) - 1.0).abs() < 1e-6, "{k}: {found}");
         }
-        // Two parts a visibility: the means of 1, 4 and of 9, 16, twice.
+        // With two parts per visibility, twice the means of 1, 4 and of 9, 16.
         let [near, far] = &found.classes[..] else { panic!("{} classes", found.classes.len()) };
         assert!((near.rms_k_sr - 5_f64.sqrt()).abs() < 1e-12 && (far.rms_k_sr - 5.0).abs() < 1e-12);
-        // In units of a sigma of 0.5 a part.
+        // In units of a sigma of 0.5 per part.
         assert!((near.of_noise - 2.5_f64.sqrt() / 0.5).abs() < 1e-12);
         assert_eq!((near.count, far.count), (3, 3));
     }

@@ -1,35 +1,34 @@
-//! Where baselines lie in the space of u, v, w on ecliptic axes, and for how long (the paper, Fig. 5).
+//! Observing time by baseline in the uvw space, on ecliptic axes (the paper, Fig. 5).
 
 use std::fmt::Write;
 
 use serde::Serialize;
 
 use super::error::FigureError;
-use super::exposure::{Instant, gather, limit_m};
+use super::exposure::{TimeSample, gather, limit_m};
 use super::output::FigureParts;
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, ColourScale, Palette, Raster, Scaling, draw_rasters};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, dot, scale, sub};
 
-/// Cells along a side.
 const CELLS: usize = 161;
-/// Distance of instants, s: a baseline turns by half a degree.
+/// Time step, s, in which a baseline rotates by half a degree.
 const STEP_S: f64 = 12.0;
-/// The planes: horizontal and vertical axis.
+/// Horizontal and vertical axis of each plane.
 const PLANES: [(usize, usize); 3] = [(0, 1), (0, 2), (1, 2)];
 const NAMES: [&str; 3] = ["u", "v", "w"];
 
 #[derive(Serialize)]
 struct UvwNumbers {
     frequency_hz: f64,
-    /// Longest baseline, wavelengths: half a side of the planes.
+    /// Limit on the baselines, wavelengths, which is half the side of the planes.
     limit_wavelengths: f64,
     pair_s: f64,
-    /// Greatest |w| / b, and the mean of its square over time.
+    /// Maximum of |w| / b, and mean of its square over time.
     w_share_max: f64,
     w_share_square_mean: f64,
-    /// Share of cells of each plane within the limit that some baseline meets.
+    /// Fraction of the cells of each plane within the limit that are crossed by a baseline.
     filled: [f64; 3],
 }
 
@@ -46,23 +45,23 @@ impl Counts {
         Self { planes_s, pair_s: 0.0, w_max: 0.0, w_square_s: 0.0 }
     }
 
-    fn add(&mut self, instant: &Instant<'_>, limit_m: f64) {
-        for pair in instant.pairs {
-            let [i, j] = [pair.i, pair.j].map(|n| instant.states[usize::from(n)].position_m);
+    fn add(&mut self, sample: &TimeSample<'_>, limit_m: f64) {
+        for pair in sample.pairs {
+            let [i, j] = [pair.i, pair.j].map(|n| sample.states[usize::from(n)].position_m);
             let baseline_m = sub(i, j);
             let square = dot(baseline_m, baseline_m);
             if square >= limit_m * limit_m {
                 continue;
             }
             let w_share = baseline_m[2].abs() / square.sqrt();
-            self.pair_s += instant.length_s;
+            self.pair_s += sample.length_s;
             self.w_max = self.w_max.max(w_share);
-            self.w_square_s += instant.length_s * w_share * w_share;
-            // A visibility is known at both signs.
+            self.w_square_s += sample.length_s * w_share * w_share;
+            // The conjugate visibility is at the opposite baseline.
             for sign in [1.0, -1.0] {
                 let u = scale(sign / limit_m, baseline_m);
                 for (plane_s, (x, y)) in self.planes_s.iter_mut().zip(PLANES) {
-                    plane_s[cell(u, y) * CELLS + cell(u, x)] += 0.5 * instant.length_s;
+                    plane_s[cell(u, y) * CELLS + cell(u, x)] += 0.5 * sample.length_s;
                 }
             }
         }
@@ -78,21 +77,21 @@ impl Counts {
     }
 }
 
-/// Cell of a component, which lies between -1 and 1.
+/// Cell index of a component between -1 and 1.
 fn cell(u: Vec3, axis: usize) -> usize {
     ((0.5 * (u[axis] + 1.0) * CELLS as f64) as usize).min(CELLS - 1)
 }
 
-/// Whether the centre of a cell lies within the limit.
+/// Whether the centre of a cell is within the limit.
 fn is_inside(k: usize) -> bool {
-    let at = |cell: usize| 2.0 * (cell as f64 + 0.5) / CELLS as f64 - 1.0;
-    at(k % CELLS).hypot(at(k / CELLS)) < 1.0
+    let coordinate = |cell: usize| 2.0 * (cell as f64 + 0.5) / CELLS as f64 - 1.0;
+    coordinate(k % CELLS).hypot(coordinate(k / CELLS)) < 1.0
 }
 
 pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     let limit_m = limit_m(plan, 0);
     let counts =
-        gather(plan, STEP_S, Counts::new, |counts, instant| counts.add(instant, limit_m), Counts::merge);
+        gather(plan, STEP_S, Counts::new, |counts, sample| counts.add(sample, limit_m), Counts::merge);
     if counts.pair_s == 0.0 {
         return Err(FigureError::NoBaseline { limit_m });
     }
@@ -114,7 +113,6 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     for (plane_s, (x, y)) in counts.planes_s.iter().zip(PLANES) {
         let at = |cell: usize| limit_wavelengths * (2.0 * (cell as f64 + 0.5) / CELLS as f64 - 1.0);
         for (k, pair_s) in plane_s.iter().enumerate().filter(|(_, pair_s)| **pair_s > 0.0) {
-            // Writing to a string cannot fail.
             let _ = writeln!(
                 csv,
                 "{}{},{:.3},{:.3},{pair_s:.1}",
@@ -125,7 +123,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
             );
         }
     }
-    // Cells that no baseline meets are no numbers.
+    // Empty cells are NaN, which is drawn in grey.
     let hours: Vec<Vec<f64>> = counts
         .planes_s
         .iter()
@@ -148,7 +146,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
             values,
             columns: CELLS,
             scale,
-            unit: "pair hours a cell".to_owned(),
+            unit: "pair hours per cell".to_owned(),
         })
         .collect();
     let title = format!("Baselines at {} MHz on ecliptic axes; grey: none", frequency_hz / 1e6);

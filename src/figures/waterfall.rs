@@ -1,5 +1,5 @@
-//! Visibilities of one pair over time and frequency: of the fine sky, and of the sky in pixels of the map by averaged rows
-//! and by rows at pixel centres (the paper, Fig. 8).
+//! Visibilities of one pair over time and frequency, for the fine sky, and for the sky in pixels of the map with averaged rows
+//! and with rows at pixel centres (the paper, Fig. 8).
 
 use std::fmt::Write;
 
@@ -20,21 +20,18 @@ use crate::sky::{Frame, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
-/// Times through the window.
 const TIMES: usize = 60;
-/// Frequencies of the waterfall.
 const FREQUENCIES: usize = 60;
-/// Lowest and highest frequency in units of the channel's.
+/// Lowest and highest frequency relative to the channel.
 const BAND: [f64; 2] = [0.1, 3.0];
-/// Largest nside of the fine sky.
 const FINE_NSIDE_MAX: usize = 1024;
-/// Edges of the classes of baselines whose errors are told, in units of b_p.
+/// Edges of the classes of baseline length, in units of b_p.
 const CLASSES_BP: [f64; 6] = [0.0, 0.5, 1.0, 2.0, 4.0, f64::INFINITY];
 
 #[derive(Serialize)]
 struct WaterfallNumbers {
     pair: String,
-    /// Beginning and end of the window, s.
+    /// Start and end of the window, s.
     window_s: [f64; 2],
     /// Lowest and highest frequency, Hz.
     band_hz: [f64; 2],
@@ -43,40 +40,40 @@ struct WaterfallNumbers {
     classes: Vec<ErrorClass>,
 }
 
-/// Errors of the visibilities of a class of baselines, relative to the rms of those of the fine sky.
+/// Errors of the visibilities in a class of baseline length, relative to the rms of the fine sky's visibilities.
 #[derive(Serialize)]
 struct ErrorClass {
     from_bp: f64,
-    /// Absent for the last, which has no end.
+    /// Upper edge; absent for the last class.
     to_bp: Option<f64>,
     count: usize,
     centre: f64,
     average: f64,
 }
 
-/// One visibility of the waterfall, three times.
+/// One cell of the waterfall, with the visibilities of three methods.
 struct Cell {
     t_s: f64,
     frequency_hz: f64,
     length_bp: f64,
-    /// Of the fine sky, by averaged rows, by rows at centres, K sr.
+    /// Visibilities of the fine sky, with averaged rows, and with rows at pixel centres, K sr.
     values: [Complex64; 3],
 }
 
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
-    let look = PairMoment::new(plan, request)?;
+    let moment = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
     let nside_fine = (CHILDREN * nside).min(FINE_NSIDE_MAX).max(nside);
-    let frequency_hz = look.geometry.frequency_hz;
-    // One sky for all frequencies, so that the fringes alone differ.
+    let frequency_hz = moment.geometry.frequency_hz;
+    // One sky for all frequencies, so that only the fringes differ.
     let sky = generate(&plan.config.sky.generated, frequency_hz, nside_fine, plan.config.seed)?;
     let fine = SkyMap::new(Frame::Ecliptic, sky)?;
     let window =
-        plan.windows.iter().find(|window| window.end.seconds() > look.t_s).unwrap_or(&plan.windows[0]);
+        plan.windows.iter().find(|window| window.end.seconds() > moment.t_s).unwrap_or(&plan.windows[0]);
     let [start_s, end_s] = [window.start, window.end].map(|time| time.seconds());
-    let cells = cells(plan, &look, &fine, [start_s, end_s])?;
+    let cells = cells(plan, &moment, &fine, [start_s, end_s])?;
     let numbers = WaterfallNumbers {
-        pair: look.pair.to_string(),
+        pair: moment.pair.to_string(),
         window_s: [start_s, end_s],
         band_hz: BAND.map(|factor| factor * frequency_hz),
         nside,
@@ -86,7 +83,6 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     let mut csv =
         "t_s,frequency_hz,length_bp,fine_re,fine_im,average_re,average_im,centre_re,centre_im\n".to_owned();
     for Cell { t_s, frequency_hz, length_bp, values: [fine, average, centre] } in &cells {
-        // Writing to a string cannot fail.
         let _ = writeln!(
             csv,
             "{t_s:.3},{frequency_hz:.0},{length_bp:.4},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e},{:.6e}",
@@ -97,10 +93,10 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     Ok(FigureParts::new(&numbers, csv, picture))
 }
 
-/// The waterfall, frequency by frequency at each time.
+/// The cells of the waterfall, by time and then by frequency.
 fn cells(
     plan: &Plan,
-    look: &PairMoment,
+    moment: &PairMoment,
     fine: &SkyMap,
     [start_s, end_s]: [f64; 2],
 ) -> Result<Vec<Cell>, FigureError> {
@@ -118,34 +114,35 @@ fn cells(
         count: FREQUENCIES,
     };
     let factor = |k: usize| 1.0 + comb.first + comb.step * k as f64;
-    // Tables are built before tasks ask for them.
+    // Builds tables before the parallel tasks need them.
     for k in 0..FREQUENCIES {
-        let geometry = PairGeometry { frequency_hz: factor(k) * look.geometry.frequency_hz, ..look.geometry };
+        let geometry =
+            PairGeometry { frequency_hz: factor(k) * moment.geometry.frequency_hz, ..moment.geometry };
         makers[0].prepare(&geometry);
     }
-    let at = |n: usize| -> Result<Vec<Cell>, FigureError> {
+    let cells_at = |n: usize| -> Result<Vec<Cell>, FigureError> {
         let t_s = start_s + (n as f64 + 0.5) / TIMES as f64 * (end_s - start_s);
-        let [r_i_m, r_j_m] = [look.pair.i, look.pair.j].map(|n| plan.array.position_m(n.into(), t_s));
-        let geometry = PairGeometry { r_i_m, r_j_m, ..look.geometry };
+        let [r_i_m, r_j_m] = [moment.pair.i, moment.pair.j].map(|n| plan.array.position_m(n.into(), t_s));
+        let geometry = PairGeometry { r_i_m, r_j_m, ..moment.geometry };
         let length_m = norm(sub(r_i_m, r_j_m));
-        let of_fine = comb_sums(&[geometry], comb, &directions, &fine_k, pixel_area_sr(fine.nside()))?;
+        let fine_values = comb_sums(&[geometry], comb, &directions, &fine_k, pixel_area_sr(fine.nside()))?;
         let mut row = [vec![0.0_f64; makers[0].pixels()], vec![0.0_f64; makers[0].pixels()]];
-        let of_rows = |maker: &RowMaker, geometry: &PairGeometry, [re, im]: &mut [Vec<f64>; 2]| {
+        let from_rows = |maker: &RowMaker, geometry: &PairGeometry, [re, im]: &mut [Vec<f64>; 2]| {
             maker.fill(geometry, pixel_area_sr(nside), re, im);
             let sum = |part: &[f64]| part.iter().zip(coarse.values()).map(|(b, t)| b * t).sum::<f64>();
             Complex64::new(sum(re), sum(im))
         };
         Ok((0..FREQUENCIES)
             .map(|k| {
-                let frequency_hz = factor(k) * look.geometry.frequency_hz;
+                let frequency_hz = factor(k) * moment.geometry.frequency_hz;
                 let geometry = PairGeometry { frequency_hz, ..geometry };
-                let [average, centre] = makers.each_ref().map(|maker| of_rows(maker, &geometry, &mut row));
+                let [average, centre] = makers.each_ref().map(|maker| from_rows(maker, &geometry, &mut row));
                 let length_bp = length_m * frequency_hz / SPEED_OF_LIGHT_M_S * bp_per_wavelength;
-                Cell { t_s, frequency_hz, length_bp, values: [of_fine[k], average, centre] }
+                Cell { t_s, frequency_hz, length_bp, values: [fine_values[k], average, centre] }
             })
             .collect())
     };
-    let columns: Vec<Vec<Cell>> = (0..TIMES).into_par_iter().map(at).collect::<Result<_, _>>()?;
+    let columns: Vec<Vec<Cell>> = (0..TIMES).into_par_iter().map(cells_at).collect::<Result<_, _>>()?;
     Ok(columns.into_iter().flatten().collect())
 }
 

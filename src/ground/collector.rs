@@ -1,145 +1,92 @@
-//! Bytes to frames: every packet once, across files and sessions.
+//! Turns bytes into frames, and delivers every packet once across files and sessions.
 
 use std::collections::VecDeque;
 use std::path::Path;
 
-use bincode::{Decode, Encode};
-
-use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, Sent};
+use super::collector_state::{CollectorState, CollectorView, headers};
+use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, SendingKey};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, DecoderState, Event, Intake, PacketInsertion, PacketReading, ReceivedSet,
-    ReceptionCounters,
+    ByteFeed, Decoder, Event, Intake, PacketInsertion, PacketReading, ReceivedSet, ReceptionCounters,
 };
 use crate::downlink::wire::payload::visibilities_outline;
 use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 
-/// What a checkpoint keeps of a collector: the packets it holds, and its instrument. Packets that were delivered are in
-/// the journal.
-#[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
-pub struct CollectorState {
-    held: HoldBuffer,
-    decoder: DecoderState,
-}
-
-/// A [`CollectorState`] to be written, without a copy of the held packets.
-#[derive(Clone, Debug, PartialEq, Encode)]
-pub struct CollectorView<'a> {
-    held: &'a HoldBuffer,
-    decoder: DecoderState,
-}
-
-impl CollectorState {
-    /// The state of a collector that has received nothing.
-    #[must_use]
-    pub(super) fn new(wait_bytes: u64) -> Self {
-        Self { held: HoldBuffer::new(wait_bytes), decoder: DecoderState::default() }
-    }
-
-    /// The instrument, if it is known.
-    pub(super) fn instrument(&self) -> Option<&Instrument> {
-        self.decoder.instrument()
-    }
-
-    /// Adds the packets that another collector holds, without those already delivered.
-    pub(super) fn merge(
-        &mut self,
-        other: Self,
-        is_delivered: impl Fn(&PacketHeader) -> bool,
-    ) -> Result<(), DownlinkError> {
-        if !self.decoder.merge(other.decoder) {
-            return Err(DownlinkError::OtherInstrument { offset: 0 });
-        }
-        for packet in other.held.packets() {
-            if self.held.get(&packet.header).is_none() {
-                self.held.insert(packet.clone());
-            }
-        }
-        for header in headers(&self.held).iter().filter(|header| is_delivered(header)) {
-            self.held.remove(header);
-        }
-        Ok(())
-    }
-
-    /// Whether the state is reachable by a collector; a forged checkpoint may hold anything.
-    #[must_use]
-    pub fn is_sound(&self) -> bool {
-        self.held.is_sound()
-    }
-}
-
 /// A packet that was delivered.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DeliveredPacket {
-    /// Its headers.
+    /// The headers of the packet.
     pub header: PacketHeader,
-    /// Its checksum.
-    pub check: u32,
-    /// Its contribution to the counters.
-    pub reading: PacketReading,
+    /// The checksum of the packet.
+    pub checksum: u32,
+    /// The contribution of the packet to the counters.
+    pub counts: PacketReading,
 }
 
-/// Most intervals of the received set of a kind: packets of consecutive counts made at one time are one. A pass has a few,
-/// so a mission of 30 channels over 1.3 years has some tens of thousands, and 300,000 if a tenth of its packets are
-/// lost. Some 100 MB a kind, whatever a forger sends.
+/// Maximum number of intervals in the received set of a kind, some 100 MB. An interval is a run of consecutive counts with the
+/// same creation time. A mission of 30 channels over 1.3 years has some tens of thousands, and 300,000 if a tenth of
+/// its packets are lost.
 const INTERVALS_MAX: usize = 1 << 20;
 
-/// Most packets of a state: it has a record of some 200 bytes of each, so 3.4 GB, whatever a forger sends. The mission has
-/// one packet for each window, channel and pair: 30 channels over 1.3 years make some four million.
+/// Maximum number of packets in a state. At some 200 bytes per record this is 3.4 GB. A mission of 30 channels over 1.3 years
+/// has some four million packets: one for each window, channel and pair.
 const PACKETS_MAX: u64 = 1 << 24;
 
-/// Packets that have been decoded, and what they say.
+/// Decoded packets and the frame in them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Delivery {
-    /// One packet, or all those of a payload in segments.
+    /// One packet, or all packets of a segmented payload.
     pub packets: Vec<DeliveredPacket>,
-    /// `None` if they say nothing new, or cannot be understood.
+    /// `None` if the content is already known or cannot be decoded.
     pub frame: Option<GroundFrame>,
 }
 
-/// The last step of a collector.
+/// Result of [`Collector::next_step`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum CollectorStep {
-    /// Packets are to be applied that have not waited.
-    Delivery(Delivery),
-    /// Packets are to be applied that were held.
-    Waited(Delivery),
-    /// A new packet of visibilities is held.
+    /// Packets to apply that were never held.
+    Direct(Delivery),
+    /// Packets to apply that were released from the hold buffer.
+    Released(Delivery),
+    /// A new packet of visibilities was put into the hold buffer.
     Held(PacketHeader),
-    /// It needs more bytes.
-    Nothing,
+    /// More bytes are needed.
+    NeedsBytes,
 }
 
-/// Takes bytes of a downlink as they arrive, and delivers what every packet says once: visibilities as soon as their
-/// positions are known, as far as the [`HoldBuffer`] reaches, everything else at once.
+/// Takes bytes of a downlink as they arrive, and delivers the content of every packet exactly once.
 ///
-/// Until the description of the instrument arrives, nothing can be decoded, and all packets are held.
+/// Visibilities are held until the ephemeris covers them or the [`HoldBuffer`] is full; other packets are delivered at
+/// once. Until the description of the instrument arrives, no packet can be decoded, and all are held.
 #[derive(Debug)]
 pub struct Collector {
     intake: Intake,
     received: [ReceivedSet; Kind::ALL.len()],
     held: HoldBuffer,
     decoder: Decoder,
-    /// Counts what is no new packet, in this session alone.
-    link: Decoder,
-    /// Held packets that may be due.
+    /// Counts duplicates, damaged bytes and bytes outside packets in this session.
+    session_counts: Decoder,
     candidates: VecDeque<PacketHeader>,
-    /// Whether positions have arrived since held visibilities were last considered.
-    has_new_positions: bool,
-    /// Whether visibilities are held, as far as there is room, although their positions are known.
-    sets_aside: bool,
-    /// Most intervals of the received set of a kind.
+    /// Whether an ephemeris has arrived since all held visibilities were last checked.
+    has_new_ephemeris: bool,
+    /// Whether visibilities are held although their positions are known, while there is room.
+    holds_for_next_session: bool,
     intervals_max: usize,
-    /// Packets received, of all kinds, and the most of them.
+    /// Packets received, of all kinds.
     packets: u64,
     packets_max: u64,
-    /// New packets for which the received set has no room, and their bytes.
-    beyond: [u64; 2],
+    refused: RefusedPackets,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct RefusedPackets {
+    packets: u64,
+    bytes: u64,
 }
 
 impl Collector {
-    /// A collector at the beginning of a stream; `wait_bytes` of visibilities may wait for their positions.
+    /// A collector at the beginning of a stream. `wait_bytes` is the capacity for held visibilities.
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
@@ -147,36 +94,36 @@ impl Collector {
             received: Default::default(),
             held: HoldBuffer::new(wait_bytes),
             decoder: Decoder::new(),
-            link: Decoder::new(),
+            session_counts: Decoder::new(),
             candidates: VecDeque::new(),
-            has_new_positions: false,
-            sets_aside: false,
+            has_new_ephemeris: false,
+            holds_for_next_session: false,
             intervals_max: INTERVALS_MAX,
             packets: 0,
-            // Nothing but the received set grows with them.
+            // Only the received set grows with the packets, and it has its own limit.
             packets_max: u64::MAX,
-            beyond: [0; 2],
+            refused: RefusedPackets::default(),
         }
     }
 
     /// Refuses new packets that would need more than `intervals_max` intervals in the received set of their kind.
     #[must_use]
-    pub fn with_intervals(self, intervals_max: usize) -> Self {
+    pub fn with_intervals_max(self, intervals_max: usize) -> Self {
         Self { intervals_max, ..self }
     }
 
     /// Refuses new packets beyond this number.
     #[must_use]
-    pub fn with_packets(self, packets_max: u64) -> Self {
+    pub fn with_packets_max(self, packets_max: u64) -> Self {
         Self { packets_max, ..self }
     }
 
-    /// Resumes at the beginning of a stream, with packets that were delivered in earlier sessions and their counters. Their
-    /// records are in memory, so the number of packets is limited.
+    /// Resumes at the beginning of a stream with the state, delivered packets and counters of earlier sessions. The records of
+    /// packets are in memory, so their number is limited.
     #[must_use]
     pub fn resume(
         state: CollectorState,
-        delivered: impl Iterator<Item = (Kind, Sent)>,
+        delivered: impl Iterator<Item = (Kind, SendingKey)>,
         counters: ReceptionCounters,
     ) -> Self {
         let CollectorState { held, decoder } = state;
@@ -190,15 +137,15 @@ impl Collector {
         collector
     }
 
-    /// What a checkpoint keeps; the bytes of an unfinished packet are not part of it.
+    /// The state for a checkpoint. It does not contain the bytes of an incomplete packet.
     #[must_use]
     pub fn view(&self) -> CollectorView<'_> {
         CollectorView { held: &self.held, decoder: self.decoder.state() }
     }
 
-    /// From now on holds visibilities for the next session, as far as there is room.
-    pub fn set_aside(&mut self) {
-        self.sets_aside = true;
+    /// From now on holds visibilities for the next session, while there is room.
+    pub fn hold_for_next_session(&mut self) {
+        self.holds_for_next_session = true;
     }
 
     /// Appends the next bytes of the stream.
@@ -211,7 +158,7 @@ impl Collector {
         self.intake.finish();
     }
 
-    /// Bytes of this session.
+    /// Bytes received in this session.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.intake.bytes()
@@ -224,14 +171,14 @@ impl Collector {
     pub fn next_delivery(&mut self, is_due: IsDue<'_>) -> Result<Option<Delivery>, DownlinkError> {
         loop {
             match self.next_step(is_due)? {
-                CollectorStep::Delivery(found) | CollectorStep::Waited(found) => return Ok(Some(found)),
+                CollectorStep::Direct(found) | CollectorStep::Released(found) => return Ok(Some(found)),
                 CollectorStep::Held(_) => {}
-                CollectorStep::Nothing => return Ok(None),
+                CollectorStep::NeedsBytes => return Ok(None),
             }
         }
     }
 
-    /// Goes on to the next delivery, or to the next packet of visibilities that has to wait.
+    /// Advances to the next delivery, or to the next packet of visibilities that has to be held.
     ///
     /// # Errors
     /// [`DownlinkError::OtherInstrument`].
@@ -239,46 +186,49 @@ impl Collector {
         loop {
             if self.knows_instrument() {
                 if let Some(found) = self.next_due(is_due) {
-                    return Ok(CollectorStep::Waited(found));
+                    return Ok(CollectorStep::Released(found));
                 }
             } else {
                 self.drop_unreadable();
             }
             match self.take_event(is_due)? {
-                // Once for all positions of a piece of the stream: much may be held.
-                EventOutcome::Nothing if self.reconsider() => {}
-                EventOutcome::Nothing => return Ok(CollectorStep::Nothing),
-                EventOutcome::Event => {}
+                EventOutcome::NeedsBytes => {
+                    // Once per chunk of the stream, not per ephemeris packet, as many packets may be held.
+                    if !self.make_candidates() {
+                        return Ok(CollectorStep::NeedsBytes);
+                    }
+                }
+                EventOutcome::Consumed => {}
                 EventOutcome::Held(header) => return Ok(CollectorStep::Held(header)),
-                EventOutcome::Delivery(found) => return Ok(CollectorStep::Delivery(found)),
+                EventOutcome::Delivery(found) => return Ok(CollectorStep::Direct(found)),
             }
         }
     }
 
-    /// The next of the held packets that are due; takes nothing from the stream.
-    pub fn next_waiting(&mut self, is_due: IsDue<'_>) -> Option<Delivery> {
+    /// Releases the next held packet that is due, without reading the stream.
+    pub fn next_released(&mut self, is_due: IsDue<'_>) -> Option<Delivery> {
         if self.knows_instrument() { self.next_due(is_due) } else { None }
     }
 
-    /// All held packets may be due.
-    pub fn consider_held(&mut self) {
-        self.has_new_positions = true;
-        self.reconsider();
+    /// Checks all held packets for release again.
+    pub fn recheck_held(&mut self) {
+        self.has_new_ephemeris = true;
+        self.make_candidates();
     }
 
-    /// Delivers the next held packet, due or not. A checkpoint must be written before.
+    /// Delivers the next held packet, due or not. Call it after the last checkpoint is written.
     pub fn flush_next(&mut self) -> Option<Delivery> {
         if let Some(packet) = self.held.pop_visibilities() {
             return Some(self.deliver(&[packet]));
         }
         let packet = self.held.pop_other()?;
-        Some(self.give_up(packet))
+        Some(self.deliver_incomplete(packet))
     }
 
-    /// Delivers all of a file to `take`, and finally the held packets.
+    /// Passes all deliveries of a file to `take`, then the held packets.
     ///
     /// # Errors
-    /// A file that cannot be read, is empty, or does not hold a packet of ours.
+    /// A file that cannot be read, is empty, or holds no packet of this format.
     pub fn read_file(&mut self, path: &Path, take: &mut dyn FnMut(Delivery)) -> Result<(), DownlinkError> {
         let mut file = ByteFeed::open(path)?;
         while file.feed(&mut self.intake)? {
@@ -292,7 +242,7 @@ impl Collector {
         require_packets(path, self.bytes(), self.received.iter().map(ReceivedSet::len).sum(), || None)
     }
 
-    /// The instrument that a file describes first, read no further than that; `None` if it describes none.
+    /// Reads a file up to its first description of an instrument; `None` if it has none.
     ///
     /// # Errors
     /// A file that cannot be read.
@@ -307,24 +257,24 @@ impl Collector {
         Ok(None)
     }
 
-    /// Packets received of each kind.
+    /// The set of packets received of each kind.
     pub fn received(&self) -> impl Iterator<Item = (Kind, &ReceivedSet)> {
         Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
     }
 
-    /// Packets of all kinds received so far, without duplicates.
+    /// Number of packets of all kinds received so far, without duplicates.
     #[must_use]
     pub fn packets(&self) -> u64 {
         self.packets
     }
 
-    /// Packets held.
+    /// The buffer of held packets.
     #[must_use]
     pub fn held(&self) -> &HoldBuffer {
         &self.held
     }
 
-    /// Removes a held packet, as if it had never been received.
+    /// Removes a held packet from the buffer and from the received set.
     pub fn remove_held(&mut self, header: &PacketHeader) -> Option<HeldPacket> {
         let removed = self.held.remove(header)?;
         self.received[header.kind.index()].remove(header.count, header.time);
@@ -332,7 +282,7 @@ impl Collector {
         Some(removed)
     }
 
-    /// The visibilities of a packet; changes nothing.
+    /// Decodes the visibilities of a packet without changing the counters.
     #[must_use]
     pub fn decoded(&self, packet: &HeldPacket) -> Option<VisibilityBlock> {
         let mut decoder = Decoder::resume(self.decoder.state(), ReceptionCounters::default());
@@ -342,25 +292,23 @@ impl Collector {
         }
     }
 
-    /// Counters: of packets delivered in any session, of gaps in the received set, and of what else was in the streams of
-    /// this session.
+    /// Counters of packets delivered in any session, of gaps in the received set, and of other bytes in this session.
     #[must_use]
     pub fn counters(&self) -> ReceptionCounters {
         let mut counters = self.decoder.counters().clone();
-        let link = self.link.counters();
+        let session = self.session_counts.counters();
         counters.frames = self.intake.frames();
-        let [packets_beyond, bytes_beyond] = self.beyond;
-        counters.bytes += link.bytes + bytes_beyond;
-        (counters.packets_beyond, counters.bytes_beyond) = (packets_beyond, bytes_beyond);
-        counters.bytes_garbage = link.bytes_garbage;
-        counters.garbage_stretches = link.garbage_stretches;
-        counters.bytes_truncated = link.bytes_truncated;
-        counters.bytes_damaged = link.bytes_damaged;
-        counters.bytes_duplicate = link.bytes_duplicate;
+        counters.bytes += session.bytes + self.refused.bytes;
+        (counters.packets_beyond, counters.bytes_beyond) = (self.refused.packets, self.refused.bytes);
+        counters.bytes_garbage = session.bytes_garbage;
+        counters.garbage_stretches = session.garbage_stretches;
+        counters.bytes_truncated = session.bytes_truncated;
+        counters.bytes_damaged = session.bytes_damaged;
+        counters.bytes_duplicate = session.bytes_duplicate;
         for kind in Kind::ALL {
             let counts = counters.kind_mut(kind);
-            counts.duplicates = link.kind(kind).duplicates;
-            counts.damaged = link.kind(kind).damaged;
+            counts.duplicates = session.kind(kind).duplicates;
+            counts.damaged = session.kind(kind).damaged;
             let eras = self.received[kind.index()].eras();
             counts.restarts = eras.len().saturating_sub(1) as u64;
             let gaps = eras.into_iter().flat_map(|era| era.missing);
@@ -380,13 +328,13 @@ impl Collector {
         self.decoder.instrument().is_some()
     }
 
-    /// The next held packets that are due; the instrument is known.
+    /// Releases the next held packets that are due. The instrument must be known.
     fn next_due(&mut self, is_due: IsDue<'_>) -> Option<Delivery> {
         loop {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
-                    // The next session considers all of them.
-                    Kind::Visibilities if self.sets_aside => None,
+                    // The next session checks all of them.
+                    Kind::Visibilities if self.holds_for_next_session => None,
                     Kind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
                     _ => self.held.take_payload(&header),
                 };
@@ -395,28 +343,36 @@ impl Collector {
                 }
             }
             if !self.held.is_full() {
-                let packet = self.held.pop_excess_segment()?;
-                return Some(self.give_up(packet));
+                return self.release_excess_segment();
             }
-            if !self.reconsider() {
-                let packet = self.held.pop_visibilities()?;
-                return Some(self.deliver(&[packet]));
+            if !self.make_candidates() {
+                return self.release_oldest_visibilities();
             }
         }
     }
 
-    /// Makes all held packets candidates if positions have arrived; returns whether.
-    fn reconsider(&mut self) -> bool {
-        let is_due = std::mem::take(&mut self.has_new_positions) && self.knows_instrument();
-        if is_due {
+    fn release_excess_segment(&mut self) -> Option<Delivery> {
+        let packet = self.held.pop_excess_segment()?;
+        Some(self.deliver_incomplete(packet))
+    }
+
+    fn release_oldest_visibilities(&mut self) -> Option<Delivery> {
+        let packet = self.held.pop_visibilities()?;
+        Some(self.deliver(&[packet]))
+    }
+
+    /// Makes all held packets candidates if an ephemeris has arrived. Returns whether it did.
+    fn make_candidates(&mut self) -> bool {
+        let is_needed = std::mem::take(&mut self.has_new_ephemeris) && self.knows_instrument();
+        if is_needed {
             self.candidates = headers(&self.held);
         }
-        is_due
+        is_needed
     }
 
-    /// Drops packets beyond the capacity while no instrument is known; they may be received again later.
+    /// Drops packets beyond the capacity while the instrument is unknown. They may be received again later.
     fn drop_unreadable(&mut self) {
-        while let Some(packet) = self.held.pop_unreadable() {
+        while let Some(packet) = self.held.pop_before_instrument() {
             let header = packet.header;
             self.received[header.kind.index()].remove(header.count, header.time);
             self.decoder.decode(packet.packet(), true);
@@ -428,32 +384,32 @@ impl Collector {
     }
 
     /// Delivers a segment without the rest of its payload.
-    fn give_up(&mut self, packet: HeldPacket) -> Delivery {
+    fn deliver_incomplete(&mut self, packet: HeldPacket) -> Delivery {
         self.decode(&[packet], true)
     }
 
-    fn decode(&mut self, packets: &[HeldPacket], is_given_up: bool) -> Delivery {
+    fn decode(&mut self, packets: &[HeldPacket], is_incomplete: bool) -> Delivery {
         let mut delivery = Delivery { packets: Vec::with_capacity(packets.len()), frame: None };
         for packet in packets {
-            let (frame, reading) = self.decoder.decode(packet.packet(), is_given_up);
-            let (header, check) = (packet.header, packet.check);
-            delivery.packets.push(DeliveredPacket { header, check, reading });
+            let (frame, counts) = self.decoder.decode(packet.packet(), is_incomplete);
+            let (header, checksum) = (packet.header, packet.checksum);
+            delivery.packets.push(DeliveredPacket { header, checksum, counts });
             delivery.frame = frame.or(delivery.frame);
         }
-        self.has_new_positions |= matches!(delivery.frame, Some(GroundFrame::Ephemeris(_)));
+        self.has_new_ephemeris |= matches!(delivery.frame, Some(GroundFrame::Ephemeris(_)));
         delivery
     }
 
-    /// Takes one event of the stream.
     fn take_event(&mut self, is_due: IsDue<'_>) -> Result<EventOutcome, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::Nothing) };
+        let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::NeedsBytes) };
         let Event::Packet(packet) = event else {
-            self.link.accept(&event);
-            return Ok(EventOutcome::Event);
+            self.session_counts.accept(&event);
+            return Ok(EventOutcome::Consumed);
         };
         let (offset, header) = (packet.offset, packet.header);
-        let describes = header.kind == Kind::Instrument;
-        if describes && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload) {
+        let is_instrument = header.kind == Kind::Instrument;
+        if is_instrument && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload)
+        {
             return Err(DownlinkError::OtherInstrument { offset });
         }
         let received = &mut self.received[header.kind.index()];
@@ -465,58 +421,53 @@ impl Collector {
         match insertion {
             PacketInsertion::New => self.packets += 1,
             PacketInsertion::Known => {
-                self.link.accept(&Event::Duplicate { offset, header });
-                return Ok(EventOutcome::Event);
+                self.session_counts.accept(&Event::Duplicate { offset, header });
+                return Ok(EventOutcome::Consumed);
             }
             PacketInsertion::Full => {
-                self.beyond = [self.beyond[0] + 1, self.beyond[1] + header.bytes as u64];
-                return Ok(EventOutcome::Event);
+                self.refused.packets += 1;
+                self.refused.bytes += header.bytes as u64;
+                return Ok(EventOutcome::Consumed);
             }
         }
-        // As nearly all are: never copied into the hold buffer.
+        // The common case: delivered without a copy into the hold buffer.
         if header.kind == Kind::Visibilities
-            && !(self.sets_aside && self.held.has_room(&header))
+            && !(self.holds_for_next_session && self.held.has_room(&header))
             && self.decoder.instrument().is_some()
             && visibilities_outline(packet.payload).as_ref().is_none_or(is_due)
         {
-            let (frame, reading) = self.decoder.decode(packet, false);
-            let packets = vec![DeliveredPacket { header, check: packet.check, reading }];
+            let (frame, counts) = self.decoder.decode(packet, false);
+            let packets = vec![DeliveredPacket { header, checksum: packet.check, counts }];
             return Ok(EventOutcome::Delivery(Delivery { packets, frame }));
         }
-        self.held.insert(HeldPacket::of(&packet));
-        if !describes && !self.knows_instrument() {
-            return Ok(EventOutcome::Event);
+        self.held.insert(HeldPacket::new(&packet));
+        if !is_instrument && !self.knows_instrument() {
+            return Ok(EventOutcome::Consumed);
         }
         if header.kind == Kind::Visibilities {
             self.candidates.push_back(header);
             return Ok(EventOutcome::Held(header));
         }
-        let Some(payload) = self.held.take_payload(&header) else { return Ok(EventOutcome::Event) };
-        if describes {
+        let Some(payload) = self.held.take_payload(&header) else { return Ok(EventOutcome::Consumed) };
+        if is_instrument {
             let whole: Vec<u8> = payload.iter().flat_map(|packet| packet.payload.iter().copied()).collect();
             if self.decoder.contradicts(&whole) {
                 return Err(DownlinkError::OtherInstrument { offset });
             }
         }
         if !self.knows_instrument() {
-            // Everything else is held until then.
+            // All other packets were held for the instrument.
             self.candidates = headers(&self.held);
         }
         Ok(EventOutcome::Delivery(self.deliver(&payload)))
     }
 }
 
-/// Outcome of one event of a stream.
 enum EventOutcome {
-    /// No event.
-    Nothing,
-    /// Nothing to deliver yet.
-    Event,
-    /// Visibilities wait.
+    /// There is no complete event.
+    NeedsBytes,
+    /// An event was taken that delivers nothing yet.
+    Consumed,
     Held(PacketHeader),
     Delivery(Delivery),
-}
-
-fn headers(held: &HoldBuffer) -> VecDeque<PacketHeader> {
-    held.packets().map(|packet| packet.header).collect()
 }

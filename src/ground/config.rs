@@ -1,9 +1,9 @@
-//! Configuration of the ground.
+//! Configuration of the ground segment.
 
 use std::path::Path;
 
 use super::GroundError;
-use super::pass_gate::{MODEL, PassGate};
+use super::pass_gate::{MODEL_FILES_KEY, PassGate};
 use crate::calibration::solver::{PassSolver, SolverConfig};
 use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
 use crate::frames::{Instrument, VisibilityReason};
@@ -12,63 +12,65 @@ use crate::imaging::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
 use crate::runtime::Ledger;
 use crate::sky::fits::check_frequencies;
 
-/// Default capacity of the hold buffer, bytes: a week of thirty channels.
+/// Default capacity of the hold buffer, bytes. It holds a week of data of 30 channels.
 #[doc(hidden)]
 pub const WAIT_BYTES: u64 = 1 << 28;
 
-/// Segments of positions that are kept: more than two years of windows.
+/// Maximum number of ephemeris segments in memory, enough for two years of windows.
 const SEGMENTS_MAX: usize = 8192;
 
-/// Configuration of the ground, from bytes to sums.
+/// Configuration of the ground segment.
 #[derive(Clone, Debug)]
 pub struct GroundConfig {
-    /// Calibration.
+    /// Which calibration is applied.
     pub calibration: CalibrationConfig,
-    /// How gains are found, for `calibration.hook = "solve"`.
+    /// How gains are solved for, if `calibration.hook = "solve"`.
     pub calibrate: SolverConfig,
-    /// Sums.
+    /// Which sums are accumulated.
     pub map: MapConfig,
-    /// Bytes of visibilities that may wait for their positions. An archive keeps the value that it was made with.
+    /// Capacity of the hold buffer for visibilities whose positions are unknown, bytes. An archive keeps its first value.
     pub wait_bytes: u64,
-    /// Most memory for the sums, bytes, as far as it is known beforehand; `None` for no limit.
+    /// Limit of the estimated memory for the sums, bytes; `None` for no limit.
     pub memory_max_bytes: Option<u64>,
-    /// The channels that are summed; `None` for all.
+    /// The channels to accumulate; `None` for all.
     pub group: Option<ChannelGroup>,
-    /// The part of the sums that is made; `None` for all of them.
+    /// The part of the sums to accumulate; `None` for the whole.
     pub part: Option<SumPart>,
 }
 
 impl GroundConfig {
-    /// Whether maps can be made of an instrument, as far as its description says.
+    /// Checks that maps can be made with the data of an instrument, from its description.
     ///
     /// # Errors
-    /// Calibration that was not made for it; settings of the map that do not fit it, or files of other frequencies; too many channels, or too
-    /// little memory for them.
+    /// A calibration for another instrument; map settings that do not fit the instrument; files at other frequencies; too many channels for
+    /// the memory.
     pub fn fits(&self, instrument: &Instrument) -> Result<(), GroundError> {
         if self.calibration.hook == CalibrationHook::Solve {
             let maps = self.calibrate.model_files.len();
-            self.calibrate.fits(instrument, maps, MODEL).map_err(CalibrationError::from)?;
+            self.calibrate
+                .check_instrument(instrument, maps, MODEL_FILES_KEY)
+                .map_err(CalibrationError::from)?;
             check_frequencies(&self.calibrate.model_files, &instrument.frequencies_hz())
                 .map_err(CalibrationError::from)?;
         }
         let described = self.described(instrument)?;
         self.map.check_priors(&described)?;
         let channels = described.channels.len();
-        if let Some(misfit) = self.map.misfits(channels).into_iter().next() {
+        if let Some(misfit) = self.map.mismatches(channels).into_iter().next() {
             return Err(AccumulationError::from(misfit).into());
         }
         Ok(self.map.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?)
     }
 
-    /// The instrument as it is after calibration.
+    /// The description of the instrument after calibration.
     ///
     /// # Errors
-    /// Calibration that was not made for it.
+    /// A calibration for another instrument.
     pub fn described(&self, instrument: &Instrument) -> Result<Instrument, GroundError> {
         Ok(self.calibration.build(Path::new(""))?.describe(instrument)?)
     }
 
-    /// The gate that holds visibilities until their gains are known, if gains are to be found.
+    /// The gate that holds visibilities until their gains are solved; `None` if gains are not solved for.
     pub(super) fn gate(&self) -> Result<Option<PassGate>, CalibrationError> {
         if self.calibration.hook != CalibrationHook::Solve {
             return Ok(None);
@@ -80,7 +82,7 @@ impl GroundConfig {
         Ok(Some(PassGate::new(PassSolver::new(&self.calibrate, van_vleck, maps))))
     }
 
-    /// A calibrator without data, posting to `ledger`, with the gains that `gate` finds.
+    /// A calibrator without data that posts to `ledger` and uses the gains of `gate`.
     pub(super) fn calibrator(
         &self,
         gate: Option<&PassGate>,
@@ -94,14 +96,14 @@ impl GroundConfig {
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
             .with_segments(SEGMENTS_MAX)
-            .of_group(self.group.clone()))
+            .with_group(self.group.clone()))
     }
 
-    /// An accumulator without data, posting to `ledger`.
+    /// An accumulator without data that posts to `ledger`.
     pub(super) fn accumulator(&self, ledger: &Ledger<VisibilityReason>) -> Accumulator {
         Accumulator::new(self.map.clone(), ledger.clone())
-            .within_memory(self.memory_max_bytes)
-            .of_group(self.group.clone())
-            .in_part(self.part.clone())
+            .with_memory_limit(self.memory_max_bytes)
+            .with_group(self.group.clone())
+            .with_part(self.part.clone())
     }
 }

@@ -1,4 +1,4 @@
-//! The ground as one stage: bytes of a downlink to sums.
+//! The ground stage, which turns the bytes of a downlink into sums.
 
 use std::sync::atomic::Ordering;
 use std::sync::{Mutex, PoisonError};
@@ -18,43 +18,38 @@ use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
 
-/// Waits before the last checkpoint of a session is tried again: what lacks may be there a moment later.
-const LAST_WAITS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
+/// Pauses between attempts to write the last checkpoint of a session, as a shortage may pass.
+const LAST_CHECKPOINT_PAUSES: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
-/// Steps after which a ground that never rests shows the counters of the reception again; counting gaps takes a while.
-const STEPS_SHOWN: u64 = 32;
+/// Steps between updates of the shown counters while data arrive without pause. Counting gaps takes a while.
+const STEPS_PER_UPDATE: u64 = 32;
 
-/// Takes the bytes of a downlink and emits sums.
+/// The ground stage: takes the bytes of a downlink and emits sums.
 ///
-/// Collects packets, each once; places and calibrates their visibilities; adds them to the sums. With an [archive](super::archive) it
-/// resumes from earlier sessions and writes checkpoints.
+/// Collects each packet once, adds positions to its visibilities, calibrates them and adds them to the sums. With an
+/// [archive](super::archive) it resumes from earlier sessions and writes checkpoints.
 pub struct Ground {
     pub(super) collector: Collector,
     pub(super) calibrator: Calibrator,
-    /// If gains are to be found.
     pub(super) gate: Option<PassGate>,
     pub(super) accumulator: Accumulator,
     pub(super) outcome: GroundOutcome,
     pub(super) archive: Option<Archive>,
-    /// Ends the work early; see [`Ground::cancelled_by`].
     pub(super) cancel: Cancel,
-    /// How long it goes on adding then, if there is no archive.
-    pub(super) linger: Duration,
-    /// Whether it begins with a snapshot of what earlier sessions have summed.
-    pub(super) begins_with_maps: bool,
-    /// Steps so far.
+    /// Time for which visibilities are still added after cancellation, without an archive.
+    pub(super) cancel_grace: Duration,
+    /// Whether the sums of earlier sessions are emitted as a snapshot at the start.
+    pub(super) has_initial_snapshot: bool,
     pub(super) steps: u64,
-    /// To senders that wait for a checkpoint.
     pub(super) promises: SenderPromises,
-    /// For those who look on.
     pub(super) live_view_writer: LiveViewWriter,
 }
 
 impl Ground {
-    /// A ground that keeps nothing for later sessions.
+    /// A ground stage without an archive.
     ///
     /// # Errors
-    /// Calibration that cannot be read.
+    /// A calibration that cannot be read.
     pub fn new(config: &GroundConfig) -> Result<Self, GroundError> {
         let gate = config.gate()?;
         let gains = gate.as_ref().map(|gate| gate.gains().clone());
@@ -64,68 +59,69 @@ impl Ground {
             calibrator: config.calibrator(gate.as_ref(), &outcome.ledger)?,
             gate,
             accumulator: config.accumulator(&outcome.ledger),
-            live_view_writer: LiveViewWriter::of(&outcome.live_view),
+            live_view_writer: LiveViewWriter::new(&outcome.live_view),
             outcome,
             archive: None,
             cancel: Cancel::new(),
-            linger: Duration::ZERO,
-            begins_with_maps: false,
+            cancel_grace: Duration::ZERO,
+            has_initial_snapshot: false,
             steps: 0,
             promises: SenderPromises::default(),
         })
     }
 
-    /// Once `cancel` is triggered, visibilities that arrive are no longer added to the sums, which takes time. With an
-    /// archive they are held for the next session, as far as the hold buffer has room. Without one they are added for
-    /// `linger` yet, and the rest counts as not received. Checkpoint and final sums follow as ever.
+    /// Stops adding visibilities to the sums once `cancel` is triggered.
+    ///
+    /// With an archive, later visibilities are held for the next session, while the hold buffer has room. Without one
+    /// they are still added for `grace`, and the rest counts as not received. The last checkpoint and the final sums follow.
     #[must_use]
     #[doc(hidden)]
-    pub fn cancelled_by(mut self, cancel: &Cancel, linger: Duration) -> Self {
+    pub fn with_cancel(mut self, cancel: &Cancel, grace: Duration) -> Self {
         self.accumulator = self.accumulator.cancelled_by(cancel);
-        Self { cancel: cancel.clone(), linger, ..self }
+        Self { cancel: cancel.clone(), cancel_grace: grace, ..self }
     }
 
-    /// As one rank's of several: it receives everything, and holds its part of the sums.
+    /// Makes the stage one of several ranks: it receives all data and holds its part of the sums.
     #[must_use]
     #[doc(hidden)]
     pub fn with_ranks(self, ranks: &Ranks) -> Self {
         Self { accumulator: self.accumulator.with_ranks(ranks), ..self }
     }
 
-    /// Sums noise of further realisations as well, one a seed: for final maps of the harmonic engine, without an archive.
+    /// Also accumulates additional noise realisations, one per seed. Only for final maps of the harmonic engine, without an archive.
     #[must_use]
     #[doc(hidden)]
-    pub fn with_noises(self, seeds: &[u64]) -> Self {
-        Self { accumulator: self.accumulator.with_noises(seeds), ..self }
+    pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
+        Self { accumulator: self.accumulator.with_noise_realisations(seeds), ..self }
     }
 
-    /// Tells senders that wait for it, through `answers`, what its checkpoints hold. To be of use, it needs an archive, and has to take
-    /// the stream of the source that shares `answers`, from its beginning.
+    /// Reports through `answers` which data the checkpoints hold, for senders that wait for it. It needs an archive and, from its
+    /// beginning, the stream of the source that shares `answers`.
     #[must_use]
     #[doc(hidden)]
-    pub fn answering(self, answers: &HeldAnswers) -> Self {
-        Self { promises: self.promises.answering(answers), ..self }
+    pub fn with_answers(self, answers: &HeldAnswers) -> Self {
+        Self { promises: self.promises.with_answers(answers), ..self }
     }
 
-    /// Begins with a snapshot of what earlier sessions have summed, if snapshots are wanted: a ground that was started again has maps at
-    /// once, and not when the next one is due.
+    /// Emits the sums of earlier sessions as a snapshot at the start, if snapshots are enabled. After a restart, maps are then
+    /// available at once.
     #[must_use]
     #[doc(hidden)]
-    pub fn beginning_with_maps(self) -> Self {
-        Self { begins_with_maps: true, ..self }
+    pub fn with_initial_snapshot(self) -> Self {
+        Self { has_initial_snapshot: true, ..self }
     }
 
-    /// Tells `observer` of each pass whose gains it has found, on its own thread.
+    /// Calls `observer` on the thread of the stage after the gains of each pass are solved.
     #[must_use]
     #[doc(hidden)]
-    pub fn observed_by(mut self, observer: PassObserver) -> Self {
+    pub fn with_observer(mut self, observer: PassObserver) -> Self {
         if let Some(gate) = &mut self.gate {
-            gate.observed_by(observer);
+            gate.set_observer(observer);
         }
         self
     }
 
-    /// The ranks that hold parts of the sums.
+    /// The ranks among which the sums are divided.
     #[must_use]
     #[doc(hidden)]
     pub fn ranks(&self) -> &Ranks {
@@ -139,7 +135,7 @@ impl Ground {
         self.collector.instrument()
     }
 
-    /// What it leaves behind besides its sums.
+    /// The results other than the sums.
     #[must_use]
     pub fn outcome(&self) -> GroundOutcome {
         self.outcome.clone()
@@ -149,18 +145,20 @@ impl Ground {
     pub(super) fn advance(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         loop {
             match self.archive {
-                Some(_) if self.cancel.is_cancelled() => self.collector.set_aside(),
-                None if self.cancel.elapsed().is_some_and(|elapsed| elapsed >= self.linger) => return Ok(()),
+                Some(_) if self.cancel.is_cancelled() => self.collector.hold_for_next_session(),
+                None if self.cancel.elapsed().is_some_and(|elapsed| elapsed >= self.cancel_grace) => {
+                    return Ok(());
+                }
                 _ => {}
             }
-            self.catch_up();
+            self.note_all_held();
             if self.collector.held().is_full() {
                 self.close_passes();
             }
             let Self { collector, calibrator, gate, .. } = self;
             let delivery = match collector.next_step(&|outline| is_due(calibrator, gate.as_ref(), outline))? {
-                CollectorStep::Waited(delivery) => delivery,
-                CollectorStep::Delivery(delivery) => {
+                CollectorStep::Released(delivery) => delivery,
+                CollectorStep::Direct(delivery) => {
                     if let (Some(gate), Some(GroundFrame::Visibilities(block))) = (gate, &delivery.frame) {
                         gate.count_late(block);
                     }
@@ -170,25 +168,25 @@ impl Ground {
                     self.note(&header, true);
                     continue;
                 }
-                CollectorStep::Nothing => return Ok(()),
+                CollectorStep::NeedsBytes => return Ok(()),
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
                 let written = self.checkpoint();
-                if self.ranks().are_many() {
-                    // Without it the parts of the others are worth nothing.
+                if self.ranks().is_distributed() {
+                    // Without it the parts of the other ranks are useless.
                     written?;
                 }
-                // Nothing is lost yet if it fails: the outcome says so, and it is tried again.
+                // A failure loses no data: the outcome reports it, and the next attempt follows.
             }
         }
     }
 
-    /// Takes note of a packet that waits for its gains; closes the pass that it ends.
+    /// Registers a packet that waits for its gains, and closes the pass that it ends.
     fn note(&mut self, header: &PacketHeader, is_new: bool) {
         let Self { collector, gate: Some(gate), archive, cancel, .. } = self else { return };
         if archive.is_some() && cancel.is_cancelled() {
-            // The next session does, in the order of sending.
+            // The next session registers them, in the order of sending.
             return;
         }
         let Some(block) = collector.held().get(header).and_then(|packet| collector.decoded(packet)) else {
@@ -206,18 +204,18 @@ impl Ground {
         }
     }
 
-    /// Takes note of what was held before the instrument was known, or in an earlier session.
-    fn catch_up(&mut self) {
+    /// Registers packets that were held before the instrument was known, or in an earlier session.
+    fn note_all_held(&mut self) {
         let Self { collector, gate: Some(gate), .. } = self else { return };
-        if !gate.is_behind || collector.instrument().is_none() {
+        if !gate.must_note_held || collector.instrument().is_none() {
             return;
         }
-        gate.is_behind = false;
+        gate.must_note_held = false;
         let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
         held.iter()
             .filter(|header| header.kind == Kind::Visibilities)
             .for_each(|header| self.note(header, false));
-        self.collector.consider_held();
+        self.collector.recheck_held();
     }
 
     fn close_passes(&mut self) {
@@ -225,27 +223,27 @@ impl Ground {
         open.into_iter().for_each(|which| self.close_pass(which));
     }
 
-    /// Finds the gains of a pass from what has arrived of it, in the order of sending.
+    /// Solves for the gains of a pass with the packets held, in the order of sending.
     fn close_pass(&mut self, which: usize) {
         let Self { collector, calibrator, gate: Some(gate), .. } = self else { return };
         let waiting = collector.held().packets().filter(|packet| packet.header.kind == Kind::Visibilities);
         let blocks = waiting.filter_map(|packet| collector.decoded(packet));
         let blocks = blocks.filter(|block| gate.holds(which, block)).collect();
         gate.close(which, blocks, calibrator.ephemeris());
-        collector.consider_held();
+        collector.recheck_held();
     }
 
-    /// Takes a delivery through calibration into the sums, and into the journal if there is an archive.
+    /// Calibrates a delivery, adds it to the sums and, if there is an archive, to the journal.
     fn apply(&mut self, delivery: Delivery, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         let Delivery { packets, frame } = delivery;
         if let (Some(GroundFrame::Instrument(instrument)), Some(gate)) = (&frame, &mut self.gate) {
             gate.describe(instrument)?;
         }
         if let Some(GroundFrame::Visibilities(block)) = &frame {
-            let bad = packets.iter().map(|packet| u64::from(packet.reading.visibilities_bad_value)).sum();
+            let bad = packets.iter().map(|packet| u64::from(packet.counts.visibilities_bad_value)).sum();
             self.calibrator.count_bad(block.start, bad);
         }
-        let autos = self.live_view_writer.expect_powers(frame.as_ref());
+        let autos = self.live_view_writer.auto_span(frame.as_ref());
         let used = self.use_frame(&packets, frame, out);
         if let Some((span, autos)) = autos.zip(self.calibrator.autos()) {
             self.live_view_writer.add_powers(span, autos);
@@ -266,7 +264,7 @@ impl Ground {
             }
             return Ok(());
         };
-        let mut draft = RecordDraft::of(frame.as_ref());
+        let mut draft = RecordDraft::new(frame.as_ref());
         if let Some(placed) = placed(&mut self.calibrator, frame)? {
             draft.offer(&placed);
             self.live_view_writer.add(&placed);
@@ -277,15 +275,15 @@ impl Ground {
         Ok(())
     }
 
-    /// Closes open passes, and applies held packets without their positions.
+    /// Closes open passes, and applies held packets although their positions are unknown.
     pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         if !(self.archive.is_some() && self.cancel.is_cancelled()) {
-            self.catch_up();
+            self.note_all_held();
             self.close_passes();
             loop {
                 let Self { collector, calibrator, gate, .. } = self;
-                let waiting = collector.next_waiting(&|outline| is_due(calibrator, gate.as_ref(), outline));
-                let Some(delivery) = waiting else { break };
+                let released = collector.next_released(&|outline| is_due(calibrator, gate.as_ref(), outline));
+                let Some(delivery) = released else { break };
                 self.apply(delivery, out)?;
             }
         }
@@ -294,7 +292,7 @@ impl Ground {
                 Some(GroundFrame::Visibilities(block))
                     if self.archive.is_some() && self.cancel.is_cancelled() =>
                 {
-                    self.calibrator.leave_for_later(block);
+                    self.calibrator.count_for_next_session(block);
                 }
                 _ => self.apply(delivery, out)?,
             }
@@ -302,26 +300,25 @@ impl Ground {
         Ok(())
     }
 
-    /// Shows the counters of the reception, and what else visitors see.
     fn show(&self, activity: Activity) {
-        // First, so that nobody sees counters that are newer.
+        // First, so that no visitor sees counters newer than the view.
         self.live_view_writer.show(activity, &self.collector, self.calibrator.ephemeris());
-        fill(&self.outcome.reception, self.collector.counters());
+        store(&self.outcome.reception, self.collector.counters());
         self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
-    /// Shows what earlier sessions have received, before anything comes.
+    /// Shows the state of earlier sessions before new data arrive.
     pub(super) fn show_state(&mut self, latest_s: Option<f64>) {
         self.live_view_writer.resume(latest_s, &self.collector, self.calibrator.ephemeris());
-        fill(&self.outcome.reception, self.collector.counters());
+        store(&self.outcome.reception, self.collector.counters());
         self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
-    /// Packets of visibilities that are known to be missing.
+    /// Counts the packets of visibilities that are known to be missing.
     fn missing_packets(&self) -> MissingPackets {
         let latest = self.calibrator.blocks().latest_report().0;
         let reported = self.instrument().zip(latest).map(|(instrument, latest)| {
-            // Beyond the range of the time code nothing is made.
+            // No packet is made beyond the range of the time code.
             CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
         });
         let mut missing = MissingPackets::default();
@@ -343,12 +340,12 @@ impl Ground {
         if written.is_ok() {
             archive.mark_packets(self.promises.bytes);
         }
-        self.promises.keep(self.collector.packets(), written.is_ok());
+        self.promises.note_checkpoint(self.collector.packets(), written.is_ok());
         self.note_unsaved();
         written
     }
 
-    /// Tells how much no checkpoint holds.
+    /// Updates the amount of data that no checkpoint holds.
     fn note_unsaved(&self) {
         if self.archive.is_some() {
             let has_new = self.promises.has_new(self.collector.packets());
@@ -356,10 +353,10 @@ impl Ground {
         }
     }
 
-    /// Whether what no checkpoint holds has become old; not of a rank, which writes where the others do.
+    /// Whether a checkpoint is due by the age of unsaved data. Ranks write at the same place of the stream, so never for them.
     fn is_old(&self) -> bool {
-        let saves = self.archive.as_ref().is_some_and(Archive::saves_on_the_way);
-        saves && !self.ranks().are_many() && self.outcome.saving.is_old()
+        let saves = self.archive.as_ref().is_some_and(Archive::saves_during_session);
+        saves && !self.ranks().is_distributed() && self.outcome.saving.is_old()
     }
 
     /// Whether the only checkpoint in the folder is the one that would be written now.
@@ -368,24 +365,25 @@ impl Ground {
         archive.is_written(&self.collector, (&self.calibrator, self.gate.as_ref()), &self.accumulator)
     }
 
-    /// Writes the last checkpoint of a session. Maps are made even if it fails for good; the outcome says so. Not so with ranks: see
-    /// [`Ground::advance`]; one that was told to end is not where the others are.
+    /// Writes the last checkpoint of a session. If all attempts fail, the outcome reports it and maps are still made.
+    ///
+    /// With ranks, a failure is an error. A cancelled rank writes none, as it stopped at another place of the stream than the others.
     fn last_checkpoint(&mut self) -> Result<(), GroundError> {
-        if self.ranks().are_many() {
+        if self.ranks().is_distributed() {
             return if self.cancel.is_cancelled() { Ok(()) } else { self.checkpoint() };
         }
-        for wait in LAST_WAITS {
+        for pause in LAST_CHECKPOINT_PAUSES {
             if self.checkpoint().is_ok() {
                 return Ok(());
             }
-            std::thread::sleep(wait);
+            std::thread::sleep(pause);
         }
         let _ = self.checkpoint();
         Ok(())
     }
 }
 
-/// Whether visibilities wait for nothing.
+/// Whether visibilities can be applied: their positions and gains are known.
 fn is_due(calibrator: &Calibrator, gate: Option<&PassGate>, outline: &VisibilitiesOutline) -> bool {
     calibrator.ephemeris().covers(outline.span) && gate.is_none_or(|gate| gate.is_due(outline))
 }
@@ -403,7 +401,7 @@ impl Stage for Ground {
     type Error = GroundError;
 
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
-        if std::mem::take(&mut self.begins_with_maps) {
+        if std::mem::take(&mut self.has_initial_snapshot) {
             self.accumulator.emit_resumed(out)?;
         }
         self.collector.push(&bytes);
@@ -411,33 +409,32 @@ impl Stage for Ground {
         self.promises.note_bytes(self.collector.bytes());
         self.note_unsaved();
         if self.promises.are_due(self.collector.packets()) || self.is_old() {
-            // If it fails, it is tried again while anyone waits.
+            // After a failure the next attempt follows while a sender waits.
             let _ = self.checkpoint();
         }
         self.steps += 1;
-        if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_SHOWN) {
+        if self.steps.is_power_of_two() || self.steps.is_multiple_of(STEPS_PER_UPDATE) {
             self.show(Activity::Working);
         }
         Ok(())
     }
 
-    /// Updates the view when the link falls silent.
-    fn rest(&mut self) {
+    fn idle(&mut self) {
         self.show(Activity::Idle);
     }
 
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.finish();
         self.advance(out)?;
-        // The checkpoint keeps held packets as they are; the final maps use them without their positions.
+        // The checkpoint keeps held packets held; the final maps use them although their positions are unknown.
         self.last_checkpoint()?;
         self.flush(out)?;
-        fill(&self.outcome.completeness, self.calibrator.close(self.missing_packets()));
+        store(&self.outcome.completeness, self.calibrator.post_losses(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }
         self.show(Activity::Idle);
-        fill(&self.outcome.autos, self.calibrator.auto_powers());
+        store(&self.outcome.autos, self.calibrator.auto_powers());
         Ok(self.accumulator.finish(out)?)
     }
 
@@ -446,6 +443,6 @@ impl Stage for Ground {
     }
 }
 
-fn fill<T>(place: &Mutex<T>, value: T) {
-    *place.lock().unwrap_or_else(PoisonError::into_inner) = value;
+fn store<T>(shared: &Mutex<T>, value: T) {
+    *shared.lock().unwrap_or_else(PoisonError::into_inner) = value;
 }

@@ -10,70 +10,71 @@ use crate::units::ChannelId;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum GroundError {
-    /// Archives whose gains were found from different data.
+    /// Archives whose gains were solved from different data.
     #[error(
-        "states with calibration.hook = \"solve\" cannot be merged: each has found its gains from its own data; replay the \
-         files into one state"
+        "states with calibration.hook = \"solve\" cannot be merged, as the gains of each were solved from its own data only; \
+        replay the files of all of them into one new state"
     )]
-    SolvedApart,
-    /// Other gains for packets that no file has.
+    SeparateSolutions,
+    /// Changed gains for packets that no file has.
     #[error(
-        "{missing} packets of visibilities in the state have other gains now and are in none of the files, packet {count} among \
-         them; expected all of them, as they were received: the state stays as it is"
+        "{missing} packets of visibilities in the state need new gains and are in none of the files, the one with count {count} \
+        among them; expected files with all of these packets: nothing was changed"
     )]
     GainsWithoutData {
-        /// How many.
+        /// Number of packets.
         missing: usize,
-        /// Count of one.
+        /// Count of one of the packets.
         count: u64,
     },
     /// Visibilities whose positions have changed since they were added.
     #[error(
-        "packet {count}: the positions that are known now are others than those that it was placed by; the state stays as it is"
+        "packet {count}: the ephemeris has changed since the packet was added to the sums; expected the same ephemeris: nothing \
+        was changed"
     )]
-    OtherPositions {
+    EphemerisChanged {
         /// Count of the packet.
         count: u64,
     },
-    /// Sums whose first data change.
+    /// Sums whose first block of data changes with the gains.
     #[error(
-        "the sums of channel {channel} begin with other data or positions under the new gains; expected all files of the channel, or a \
-         new state: this one stays as it is"
+        "with the new gains, the sums of channel {channel} would begin with other data or positions; expected all files of the \
+        channel, or a new state: nothing was changed"
     )]
-    OtherBeginning {
+    FirstDataChanged {
         /// The channel.
         channel: ChannelId,
     },
-    /// An archive that is to be merged with itself.
-    #[error("{}: named twice; expected each state once", path.display())]
-    NamedTwice {
+    /// An archive given twice for a merge.
+    #[error("{}: named twice; expected each state only once", path.display())]
+    GivenTwice {
         /// The folder.
         path: PathBuf,
     },
-    /// A state with files that nobody has named.
-    #[error("{}: the state was accumulated with {found}; expected the same again, by {expected}", path.display())]
+    /// A state that needs files which were not given.
+    #[error("{}: the state was accumulated with {found}; expected the same files, given by {expected}", path.display())]
     FilesOfState {
         /// The folder.
         path: PathBuf,
-        /// What the files are, with their checksums.
+        /// The files of the state, with their checksums.
         found: String,
-        /// How they are given.
+        /// Key or option that gives them.
         expected: &'static str,
     },
-    /// An archive that would be merged into itself.
+    /// A merge into one of its parts.
     #[error("{}: is one of the states to merge; expected a new folder for the merged state", path.display())]
-    MergedIntoPart {
+    MergeIntoPart {
         /// The folder.
         path: PathBuf,
     },
-    /// The operating system refused.
+    /// An error of the operating system.
     #[error("{}: cannot {action}: {source}", path.display())]
     Io {
         /// File or folder.
         path: PathBuf,
         /// What was attempted.
         action: &'static str,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// Another process uses the folder.
@@ -84,19 +85,19 @@ pub enum GroundError {
     },
     /// The folder of a running archive is no longer the one that was locked.
     #[error(
-        "{}: the folder of the state {what} while it was in use; expected it to stay: nothing was saved there. Its last \
-         checkpoint is where the folder went; replay what came after it",
+        "{}: the folder of the state {what} while it was in use, so nothing was saved; expected it to stay in place. The last \
+        checkpoint is in the original folder; replay the data received after it",
         path.display()
     )]
     FolderLost {
         /// The folder.
         path: PathBuf,
-        /// What has become of it.
+        /// What happened to the folder.
         what: &'static str,
     },
-    /// Ranks of a job that see different folders.
+    /// A folder that is not shared by all ranks of a job.
     #[error(
-        "{}: not the same folder on all ranks of the job; expected one on a file system that all of them share",
+    "{}: not the same folder on all ranks of the job; expected a folder on a file system that all ranks share",
         path.display()
     )]
     NotShared {
@@ -113,63 +114,63 @@ pub enum GroundError {
         /// What was expected.
         expected: &'static str,
     },
-    /// A file with a name that is like a checkpoint's and that none has.
+    /// A file with an invalid checkpoint name.
     #[error(
-        "{}: found a number that no checkpoint has; expected a name such as checkpoint-00000001.lunarray: rename the \
-         file, or move it away",
+        "{}: found an invalid checkpoint number; expected a name such as checkpoint-00000001.lunarray: rename the file, or \
+        move it out of the folder",
         path.display()
     )]
     CheckpointName {
         /// The file.
         path: PathBuf,
     },
-    /// There are checkpoints, and none can be used.
+    /// An archive without a usable checkpoint.
     #[error(
-        "{}: none of its {checkpoints} checkpoints holds, the newest because of: {newest}; move the folder away, and \
-         make a new state of its raw archive by `lunarray rebuild`, or of the files",
+        "{}: none of its {checkpoints} checkpoints can be used; the newest: {newest}. Move the folder away, and make a new \
+        state from its raw archive with `lunarray rebuild`, or from the downlink files",
         path.display()
     )]
-    NoneHolds {
+    NoUsableCheckpoint {
         /// The folder.
         path: PathBuf,
-        /// How many there are.
+        /// Number of checkpoints.
         checkpoints: usize,
         /// Why the newest cannot be used.
         newest: Box<GroundError>,
     },
-    /// The archive was made with other settings.
+    /// An archive that was made with other settings.
     #[error(
-        "{}: the state was summed with {key} = {found}; expected {expected}, as this session is to sum: give the \
-         settings that the state was made with, or another folder",
+    "{}: the state was made with {key} = {found}; expected {expected}, the value of this session: use the settings of \
+    the state, or another folder",
         path.display()
     )]
     Settings {
         /// The file.
         path: PathBuf,
-        /// Key.
+        /// Key of the setting.
         key: String,
-        /// Its value in the archive.
+        /// Value in the archive.
         found: String,
-        /// Its value now.
+        /// Value of this session.
         expected: String,
     },
     /// Sums that disagree with the journal.
     #[error(
-        "the packet of visibilities with count {count}: {found} of its visibilities could be removed from the sums; \
-         expected {expected}, as the journal says: nothing has been changed"
+        "packet of visibilities with count {count}: {found} of its visibilities could be removed from the sums; expected \
+        {expected}, as in the journal: nothing was changed"
     )]
     NotInSums {
         /// Packet count.
         count: u64,
-        /// Visibilities that could be removed.
+        /// Number of visibilities that could be removed.
         found: u64,
-        /// Visibilities that the journal has.
+        /// Number of visibilities in the journal.
         expected: u32,
     },
-    /// A state whose raw archive has more than its checkpoints.
+    /// A state whose raw archive has packets that are in no checkpoint.
     #[error(
-        "{}: the last checkpoint lacks {bytes} bytes of packets that were taken after it and are in the raw archive; they are added \
-         by the next `lunarray replay --state` of this folder",
+    "{}: {bytes} bytes of packets in the raw archive are newer than the last checkpoint; run `lunarray replay --state` \
+    on this folder first, which adds them",
         path.display()
     )]
     Unsaved {
@@ -178,34 +179,34 @@ pub enum GroundError {
         /// Bytes of packets.
         bytes: u64,
     },
-    /// A new archive where there is one.
+    /// A new archive in a folder that has one.
     #[error("{}: holds a state already; expected a new folder", path.display())]
     Occupied {
         /// The folder.
         path: PathBuf,
     },
-    /// Received bytes.
+    /// An error in the received bytes.
     #[error(transparent)]
     Downlink(#[from] crate::downlink::DownlinkError),
-    /// Calibration.
+    /// An error in the calibration.
     #[error(transparent)]
     Calibration(#[from] crate::calibration::CalibrationError),
-    /// Sums.
+    /// An error in the sums.
     #[error(transparent)]
     Accumulation(#[from] crate::imaging::AccumulationError),
 }
 
 impl GroundError {
-    /// A folder without an archive.
+    /// The error for a folder without an archive.
     pub(in crate::ground) fn without_checkpoint(path: &std::path::Path) -> Self {
         Self::Damaged {
             path: path.to_owned(),
             found: "no checkpoint".into(),
-            expected: "a folder that `lunarray replay --state` has made",
+            expected: "a folder made by `lunarray replay --state`",
         }
     }
 
-    /// Adds path and attempt to an error of the operating system.
+    /// Adds the path and the attempted action to an error of the operating system.
     pub(in crate::ground) fn io(
         path: &std::path::Path,
         action: &'static str,

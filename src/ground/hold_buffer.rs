@@ -1,4 +1,4 @@
-//! The hold buffer: visibilities wait for their positions, segments for the rest of their payload.
+//! The hold buffer, in which visibilities wait for their positions, and segments for the rest of their payload.
 
 use std::collections::BTreeMap;
 
@@ -11,56 +11,55 @@ use crate::downlink::wire::{
 };
 use crate::units::MissionTime;
 
-/// Memory of a held packet, beyond its bytes.
+/// Memory of a held packet in addition to its bytes.
 const OVERHEAD_BYTES: u64 = 128;
 
-/// Capacity for packets other than visibilities.
 const OTHERS_BYTES_MAX: u64 = 1 << 25;
 
-/// Least capacity before an instrument description arrives.
+/// Minimum capacity before an instrument description arrives, bytes.
 const BEFORE_INSTRUMENT_BYTES: u64 = 1 << 26;
 
-/// Most segments of a payload on either side of one.
+/// Maximum number of segments of a payload on either side of a segment.
 const SEGMENTS_MAX: usize = 4096;
 
-/// Whether visibilities can be delivered: their positions are known, and what else is needed.
+/// Decides whether visibilities with this outline can be delivered, for example because their positions are known.
 pub type IsDue<'a> = &'a dyn Fn(&VisibilitiesOutline) -> bool;
 
-/// Order of sending within a kind: creation time and count.
-pub(super) type Sent = (CucTime, u64);
+/// Key of a packet in the order of sending within its kind: creation time and count.
+pub(super) type SendingKey = (CucTime, u64);
 
 /// A packet in the hold buffer.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub struct HeldPacket {
-    /// Its headers.
+    /// The headers of the packet.
     pub header: PacketHeader,
-    /// Its content.
+    /// The content of the packet.
     pub payload: Vec<u8>,
-    /// Its checksum, over headers and payload.
-    pub check: u32,
+    /// The checksum over headers and payload.
+    pub checksum: u32,
 }
 
 impl HeldPacket {
     /// A copy of a packet.
     #[must_use]
-    pub fn of(packet: &Packet<'_>) -> Self {
-        Self { header: packet.header, payload: packet.payload.to_vec(), check: packet.check }
+    pub fn new(packet: &Packet<'_>) -> Self {
+        Self { header: packet.header, payload: packet.payload.to_vec(), checksum: packet.check }
     }
 
-    /// The packet as the receiver gave it.
+    /// The packet as the receiver returned it.
     #[must_use]
     pub fn packet(&self) -> Packet<'_> {
-        let Self { header, payload, check } = self;
-        Packet { offset: 0, header: *header, payload, check: *check, late: false }
+        let Self { header, payload, checksum } = self;
+        Packet { offset: 0, header: *header, payload, check: *checksum, late: false }
     }
 
-    /// First and last instant of the visibilities in it; `None` if its span is unknown.
+    /// First and last instant of the visibilities in the packet; `None` if unknown.
     #[must_use]
     pub fn span(&self) -> Option<[MissionTime; 2]> {
         self.outline().map(|outline| outline.span)
     }
 
-    /// Outline of the visibilities that it claims to hold; `None` if it has none.
+    /// Outline of the visibilities that the packet claims to hold; `None` if it has no outline.
     #[must_use]
     pub fn outline(&self) -> Option<VisibilitiesOutline> {
         visibilities_outline(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
@@ -77,20 +76,20 @@ fn cost(header: &PacketHeader) -> u64 {
 
 /// Holds visibilities until their positions are known, and segments until their payload is complete, in bounded memory.
 ///
-/// Beyond its capacity it releases the visibilities that were sent first without positions. Until then, what it holds
-/// and what it has released is a function of the set of packets received, not of their order.
+/// Beyond its capacity it releases the oldest visibilities although their positions are unknown. Until then, the held and the
+/// released packets depend on the set of packets received, not on their order.
 #[derive(Clone, Debug, Default, PartialEq, Encode, Decode)]
 pub struct HoldBuffer {
-    visibilities: BTreeMap<Sent, HeldPacket>,
-    /// Saturates, as a forged checkpoint may claim anything.
+    visibilities: BTreeMap<SendingKey, HeldPacket>,
+    /// Memory of `visibilities`. Saturates, as checkpoints are untrusted.
     bytes: u64,
-    others: BTreeMap<(Kind, Sent), HeldPacket>,
+    others: BTreeMap<(Kind, SendingKey), HeldPacket>,
     others_bytes: u64,
     bytes_max: u64,
 }
 
 impl HoldBuffer {
-    /// An empty buffer for `bytes_max` bytes of visibilities, 128 a packet beyond its own included.
+    /// An empty buffer for `bytes_max` bytes of visibilities, including 128 bytes of overhead per packet.
     #[must_use]
     pub fn new(bytes_max: u64) -> Self {
         Self { bytes_max, ..Self::default() }
@@ -102,7 +101,7 @@ impl HoldBuffer {
         self.bytes_max
     }
 
-    /// Bytes of visibilities that wait, 128 a packet beyond its own included.
+    /// Bytes of held visibilities, including 128 bytes of overhead per packet.
     #[must_use]
     pub fn waiting_bytes(&self) -> u64 {
         self.bytes
@@ -119,19 +118,19 @@ impl HoldBuffer {
         *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
     }
 
-    /// Whether the state is reachable by inserting packets; a forged checkpoint may hold anything.
+    /// Whether inserting packets could have produced this state. Checkpoints are untrusted.
     pub(super) fn is_sound(&self) -> bool {
         let is_packet =
             |packet: &HeldPacket| packet.header.count <= COUNT_MAX && packet.header.bytes <= PACKET_BYTES_MAX;
-        let sent = |packet: &HeldPacket| (packet.header.time, packet.header.count);
+        let key_of = |packet: &HeldPacket| (packet.header.time, packet.header.count);
         let cost =
             |packets: &mut dyn Iterator<Item = &HeldPacket>| -> u64 { packets.map(HeldPacket::cost).sum() };
         self.packets().all(is_packet)
             && self
                 .visibilities
                 .iter()
-                .all(|(key, packet)| (*key, Kind::Visibilities) == (sent(packet), packet.header.kind))
-            && self.others.iter().all(|(key, packet)| *key == (packet.header.kind, sent(packet)))
+                .all(|(key, packet)| (*key, Kind::Visibilities) == (key_of(packet), packet.header.kind))
+            && self.others.iter().all(|(key, packet)| *key == (packet.header.kind, key_of(packet)))
             && self.bytes == cost(&mut self.visibilities.values())
             && self.others_bytes == cost(&mut self.others.values())
     }
@@ -144,42 +143,42 @@ impl HoldBuffer {
     /// The packet with these headers.
     #[must_use]
     pub fn get(&self, header: &PacketHeader) -> Option<&HeldPacket> {
-        let sent = (header.time, header.count);
+        let key_of = (header.time, header.count);
         match header.kind {
-            Kind::Visibilities => self.visibilities.get(&sent),
-            kind => self.others.get(&(kind, sent)),
+            Kind::Visibilities => self.visibilities.get(&key_of),
+            kind => self.others.get(&(kind, key_of)),
         }
     }
 
     /// Removes a packet.
     pub fn remove(&mut self, header: &PacketHeader) -> Option<HeldPacket> {
-        let sent = (header.time, header.count);
+        let key_of = (header.time, header.count);
         let (found, bytes) = match header.kind {
-            Kind::Visibilities => (self.visibilities.remove(&sent), &mut self.bytes),
-            kind => (self.others.remove(&(kind, sent)), &mut self.others_bytes),
+            Kind::Visibilities => (self.visibilities.remove(&key_of), &mut self.bytes),
+            kind => (self.others.remove(&(kind, key_of)), &mut self.others_bytes),
         };
         *bytes = bytes.saturating_sub(found.as_ref().map_or(0, HeldPacket::cost));
         found
     }
 
-    /// Releases a packet of visibilities once `is_due` holds of what it claims to hold, or if it does not say that.
+    /// Removes a packet of visibilities if `is_due` is true for its outline, or if it has no outline.
     pub fn release(&mut self, header: &PacketHeader, is_due: IsDue<'_>) -> Option<HeldPacket> {
         if self.get(header)?.outline().as_ref().is_none_or(is_due) { self.remove(header) } else { None }
     }
 
-    /// Whether one more packet of visibilities stays within its capacity.
+    /// Whether one more packet of visibilities fits into the capacity.
     #[must_use]
     pub fn has_room(&self, header: &PacketHeader) -> bool {
         self.bytes.saturating_add(cost(header)) <= self.bytes_max
     }
 
-    /// Whether it holds more visibilities than its capacity.
+    /// Whether the held visibilities exceed the capacity.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.bytes > self.bytes_max
     }
 
-    /// Removes the visibilities that were sent first.
+    /// Removes the packet of visibilities that was sent first.
     pub fn pop_visibilities(&mut self) -> Option<HeldPacket> {
         let (_, packet) = self.visibilities.pop_first()?;
         self.bytes = self.bytes.saturating_sub(packet.cost());
@@ -195,10 +194,10 @@ impl HoldBuffer {
     /// Headers of all packets of the payload that this one belongs to, if it is complete.
     fn segments(&self, header: &PacketHeader) -> Option<Vec<PacketHeader>> {
         let PacketHeader { kind, time, count, segment, .. } = *header;
-        let at = |count: u64| self.others.get(&(kind, (time, count))).map(|packet| packet.header);
+        let header_of = |count: u64| self.others.get(&(kind, (time, count))).map(|packet| packet.header);
         let mut last = (segment, count);
         while !matches!(last.0, PacketSegment::Last | PacketSegment::Whole) {
-            let next = at(last.1 + 1)?;
+            let next = header_of(last.1 + 1)?;
             if !matches!(next.segment, PacketSegment::Continuation | PacketSegment::Last)
                 || next.count - count > SEGMENTS_MAX as u64
             {
@@ -208,7 +207,7 @@ impl HoldBuffer {
         }
         let mut first = (segment, count);
         while !matches!(first.0, PacketSegment::First | PacketSegment::Whole) {
-            let before = at(first.1.checked_sub(1)?)?;
+            let before = header_of(first.1.checked_sub(1)?)?;
             if !matches!(before.segment, PacketSegment::Continuation | PacketSegment::First)
                 || count - before.count > SEGMENTS_MAX as u64
             {
@@ -216,16 +215,16 @@ impl HoldBuffer {
             }
             first = (before.segment, before.count);
         }
-        (first.1..=last.1).map(at).collect()
+        (first.1..=last.1).map(header_of).collect()
     }
 
-    /// Removes the first packet other than visibilities if there are more than the capacity.
+    /// Removes the first packet other than visibilities if these exceed their capacity.
     pub fn pop_excess_segment(&mut self) -> Option<HeldPacket> {
         if self.others_bytes > OTHERS_BYTES_MAX { self.pop_other() } else { None }
     }
 
-    /// Removes the first packet if more than the capacity before an instrument description is held.
-    pub fn pop_unreadable(&mut self) -> Option<HeldPacket> {
+    /// Removes the first packet if the packets exceed the capacity that applies before an instrument description arrives.
+    pub fn pop_before_instrument(&mut self) -> Option<HeldPacket> {
         if self.bytes.saturating_add(self.others_bytes) <= self.bytes_max.max(BEFORE_INSTRUMENT_BYTES) {
             return None;
         }
@@ -256,10 +255,10 @@ mod tests {
             version: FORMAT_VERSION,
             bytes: BYTES as usize,
         };
-        HeldPacket { header, payload: Vec::new(), check: 0 }
+        HeldPacket { header, payload: Vec::new(), checksum: 0 }
     }
 
-    /// Found by fuzzing: a state that says that less waits than does.
+    /// A state that claims fewer bytes than its packets have, found by fuzzing.
     #[test]
     fn what_waits_may_be_more_than_a_forged_state_says() {
         let mut forged = HoldBuffer::new(0);
@@ -276,7 +275,7 @@ mod tests {
         });
         assert!(forged.remove(&packet(5).header).is_some());
         while forged.pop_visibilities().is_some() {}
-        assert!(forged.visibilities.is_empty() && forged.pop_unreadable().is_none());
+        assert!(forged.visibilities.is_empty() && forged.pop_before_instrument().is_none());
     }
 
     #[test]
@@ -302,7 +301,7 @@ mod tests {
             }
         };
         let mut placed = |count: u64, end: i64| buffer.release(&packet(count).header, &until(end)).is_some();
-        // The second goes before the first: what lies in between does not matter.
+        // The second is released before the first: only the span of each matters.
         assert!(!placed(0, 0) && !placed(1, 500) && placed(1, 1015) && !placed(1, 1015) && !placed(7, 9999));
         assert_eq!(*seen.borrow(), [(5, 15), (1005, 1015), (1005, 1015)]);
         assert!(!buffer.is_full());
@@ -310,7 +309,7 @@ mod tests {
         assert!(buffer.is_full());
         assert_eq!(buffer.pop_visibilities().map(|packet| packet.header.count), Some(0));
         assert!(!buffer.is_full());
-        // One that does not say which time it is of waits for nothing.
+        // A packet without an outline does not wait.
         assert!(buffer.release(&packet(9).header, &until(0)).is_some());
     }
 
@@ -319,7 +318,7 @@ mod tests {
         let segment = |count: u64, segment: PacketSegment| {
             let header =
                 PacketHeader { kind: Kind::Ephemeris, segment, time: CucTime(7), ..packet(count).header };
-            HeldPacket { header, payload: vec![count as u8], check: 0 }
+            HeldPacket { header, payload: vec![count as u8], checksum: 0 }
         };
         let all = [
             segment(3, PacketSegment::First),

@@ -1,4 +1,4 @@
-//! What visitors of the page see of a ground besides its counters. Nothing is gathered unless the page is served, and no
+//! The view of a ground stage for page visitors, other than its counters. It is gathered only if the page is served, and no
 //! result depends on it.
 
 use std::collections::BTreeMap;
@@ -16,15 +16,13 @@ use crate::frames::{EphemerisSegment, GroundFrame, Instrument, PlacedFrame, Plac
 use crate::units::vector::{Vec3, scale, sub};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Most channels of which baselines are counted.
 const CHANNELS_MAX: usize = 256;
 
-/// Most points of a track.
 const TRACK_MAX: usize = 64;
 
-/// Where the satellites were at the time of the latest data.
+/// Positions of the satellites at the time of the latest data.
 #[derive(Clone, Debug, PartialEq)]
-pub struct ArrayNow {
+pub struct ArrayGeometry {
     /// Mission epoch: TAI seconds since 1958-01-01.
     pub epoch_tai_s: f64,
     /// Time of the latest visibilities that have positions, s.
@@ -33,17 +31,17 @@ pub struct ArrayNow {
     pub moon_radius_m: f64,
     /// Positions of the satellites, m, Moon-centred ecliptic axes.
     pub positions_m: Vec<Vec3>,
-    /// Satellite 1 at that time, or at the nearest time with a known velocity.
+    /// State of satellite 1 at that time, or at the nearest time with a known velocity.
     pub motion: SatelliteState,
-    /// First and last time of the positions that came with the latest, s.
+    /// First and last time of the ephemeris segment, s.
     pub known_s: [f64; 2],
-    /// Where satellite 1 was between those, m.
+    /// Positions of satellite 1 between these times, m.
     pub track_m: Vec<Vec3>,
 }
 
-impl ArrayNow {
-    /// At a time; `None` without positions.
-    fn at(ephemeris: &Ephemeris, instrument: &Instrument, time_s: f64) -> Option<Self> {
+impl ArrayGeometry {
+    /// The geometry at a time; `None` if the ephemeris does not cover it.
+    fn new(ephemeris: &Ephemeris, instrument: &Instrument, time_s: f64) -> Option<Self> {
         let covers = |segment: &&EphemerisSegment| {
             segment.start.seconds() <= time_s && time_s <= segment.end().seconds()
         };
@@ -57,8 +55,8 @@ impl ArrayNow {
             [-1.0, 0.0, 1.0].map(|by_s| ephemeris.position_at(middle_s + by_s, 0));
         let motion =
             SatelliteState { position_m: there_m?, velocity_m_s: scale(0.5, sub(after_m?, before_m?)) };
-        let own = segment.positions_m.iter().step_by(satellites.max(1));
-        let track_m = own.step_by(segment.nodes().div_ceil(TRACK_MAX)).copied().collect();
+        let of_first = segment.positions_m.iter().step_by(satellites.max(1));
+        let track_m = of_first.step_by(segment.nodes().div_ceil(TRACK_MAX)).copied().collect();
         let (epoch_tai_s, moon_radius_m) = (instrument.epoch_tai_s, instrument.moon_radius_m);
         Some(Self { epoch_tai_s, time_s, moon_radius_m, positions_m, motion, known_s, track_m })
     }
@@ -67,36 +65,32 @@ impl ArrayNow {
 #[derive(Debug, Default)]
 struct Views {
     passes: Option<Arc<PassLine>>,
-    array: Option<Arc<ArrayNow>>,
+    array: Option<Arc<ArrayGeometry>>,
 }
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// Whether visitors may come.
     is_open: AtomicBool,
-    /// Whether visitors expect an update, even from a ground that never rests.
+    /// Whether an update is requested even if data arrive without pause.
     is_due: AtomicBool,
     views: Mutex<Views>,
-    /// By channel. The ground waits at most for one copy, some microseconds.
+    /// Baselines by channel. The ground stage waits at most for one copy, some microseconds.
     densities: Mutex<BTreeMap<ChannelId, UvwDensity>>,
-    /// Directions seen, by channel; copied like `densities`.
     hits: Mutex<BTreeMap<ChannelId, SkyHits>>,
-    /// Likewise.
     powers: Mutex<BTreeMap<ChannelId, PowerWaterfall>>,
 }
 
-/// Passes, positions and baselines for visitors of the page; clones share it. The ground updates it when it is idle, and from time to time
-/// while it works.
+/// The view of a ground stage for page visitors. The stage updates it when it is idle, and on request while it works. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct LiveView(Arc<Shared>);
 
 impl LiveView {
-    /// Opens it to visitors. Call it before the ground begins: earlier data are not counted.
+    /// Starts gathering. Call it before the stage begins: earlier data are not counted.
     pub fn open(&self) {
         self.0.is_open.store(true, Ordering::Relaxed);
     }
 
-    /// Asks a busy ground for an update. Call it at the intervals at which visitors expect one.
+    /// Requests an update from a busy stage. Call it at the intervals at which visitors expect updates.
     pub fn refresh(&self) {
         self.0.is_due.store(true, Ordering::Relaxed);
     }
@@ -107,25 +101,25 @@ impl LiveView {
         self.views().passes.clone()
     }
 
-    /// Where the satellites were at the time of the latest data.
+    /// The positions of the satellites at the time of the latest data.
     #[must_use]
-    pub fn array(&self) -> Option<Arc<ArrayNow>> {
+    pub fn array(&self) -> Option<Arc<ArrayGeometry>> {
         self.views().array.clone()
     }
 
-    /// The baselines of a channel of this session.
+    /// The baselines of a channel in this session.
     #[must_use]
     pub fn density(&self, channel: ChannelId) -> Option<UvwDensity> {
         self.densities().get(&channel).cloned()
     }
 
-    /// Visibilities of this session by direction, for a channel.
+    /// The number of visibilities of a channel by direction, in this session.
     #[must_use]
     pub fn hits(&self, channel: ChannelId) -> Option<SkyHits> {
         self.all_hits().get(&channel).cloned()
     }
 
-    /// The daughters' powers in a channel, of this session.
+    /// The powers of the daughters in a channel, in this session.
     #[must_use]
     pub fn powers(&self, channel: ChannelId) -> Option<PowerWaterfall> {
         self.all_powers().get(&channel).cloned()
@@ -148,16 +142,15 @@ impl LiveView {
     }
 }
 
-/// What a ground is doing when it updates the view.
+/// Activity of a ground stage when it updates the view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Activity {
-    /// Between two steps of many.
+    /// More data are waiting.
     Working,
-    /// Nothing waits to be done, or it has finished.
+    /// No data are waiting, or the stage has finished.
     Idle,
 }
 
-/// Which auto-correlations a block holds.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct AutoSpan {
     channel: ChannelId,
@@ -165,7 +158,6 @@ pub(super) struct AutoSpan {
     span: [MissionTime; 2],
 }
 
-/// The ground's side of a [`LiveView`].
 #[derive(Debug, Default)]
 pub(super) struct LiveViewWriter {
     live_view: LiveView,
@@ -173,19 +165,18 @@ pub(super) struct LiveViewWriter {
 }
 
 impl LiveViewWriter {
-    /// The writer of a live view.
-    pub(super) fn of(live_view: &LiveView) -> Self {
+    pub(super) fn new(live_view: &LiveView) -> Self {
         Self { live_view: live_view.clone(), ..Self::default() }
     }
 
-    /// Shows what earlier sessions received; `latest_s` is the time of their latest visibilities.
+    /// Shows the data of earlier sessions. `latest_s` is the time of their latest visibilities.
     pub(super) fn resume(&mut self, latest_s: Option<f64>, collector: &Collector, ephemeris: &Ephemeris) {
         self.latest_s = self.latest_s.into_iter().chain(latest_s).reduce(f64::max);
         self.put(collector, ephemeris);
     }
 
-    /// The span of a block of auto-correlations that is about to be calibrated, if the page is served.
-    pub(super) fn expect_powers(&self, frame: Option<&GroundFrame>) -> Option<AutoSpan> {
+    /// The span of a block of auto-correlations; `None` for other frames, or if the page is not served.
+    pub(super) fn auto_span(&self, frame: Option<&GroundFrame>) -> Option<AutoSpan> {
         let Some(GroundFrame::Visibilities(block)) = frame else { return None };
         let (Pair { i, j }, last) = (block.pair, block.len().checked_sub(1)?);
         let length = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
@@ -194,7 +185,6 @@ impl LiveViewWriter {
         is_wanted.then_some(AutoSpan { channel: block.channel, daughter: i, span })
     }
 
-    /// Adds the calibrated powers of a block.
     pub(super) fn add_powers(&self, AutoSpan { channel, daughter, span }: AutoSpan, autos: &AutoTable) {
         let mut powers = self.live_view.all_powers();
         if powers.len() < CHANNELS_MAX || powers.contains_key(&channel) {
@@ -205,7 +195,6 @@ impl LiveViewWriter {
         }
     }
 
-    /// Adds visibilities with positions.
     pub(super) fn add(&mut self, frame: &PlacedFrame) {
         if let PlacedFrame::Visibilities(placed) = frame
             && self.live_view.0.is_open.load(Ordering::Relaxed)
@@ -230,16 +219,16 @@ impl LiveViewWriter {
     pub(super) fn show(&self, activity: Activity, collector: &Collector, ephemeris: &Ephemeris) {
         let Shared { is_open, is_due, .. } = &*self.live_view.0;
         let is_open = is_open.load(Ordering::Relaxed);
-        let is_time = is_open && (activity == Activity::Idle || is_due.swap(false, Ordering::Relaxed));
-        if is_time {
+        let updates = is_open && (activity == Activity::Idle || is_due.swap(false, Ordering::Relaxed));
+        if updates {
             self.put(collector, ephemeris);
         }
     }
 
     fn put(&self, collector: &Collector, ephemeris: &Ephemeris) {
         let Some(instrument) = collector.instrument() else { return };
-        let passes = PassLine::of(instrument.epoch_tai_s, collector.received());
-        let array = self.latest_s.and_then(|latest_s| ArrayNow::at(ephemeris, instrument, latest_s));
+        let passes = PassLine::new(instrument.epoch_tai_s, collector.received());
+        let array = self.latest_s.and_then(|latest_s| ArrayGeometry::new(ephemeris, instrument, latest_s));
         *self.live_view.views() = Views { passes: Some(Arc::new(passes)), array: array.map(Arc::new) };
     }
 }

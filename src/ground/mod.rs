@@ -1,14 +1,15 @@
-//! The ground, from the bytes of a downlink to sums: every packet once, in any order, over any number of sessions.
+//! The ground segment: turns the bytes of a downlink into sums. It uses every packet once, in any order, over any number of sessions.
 //!
-//! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration places and corrects
-//! visibilities, the accumulator adds them up. An [`archive`] keeps all of it from one session to the next.
+//! [`Ground`] is one stage: the [`Collector`] finds packets and delivers each once, calibration adds positions and
+//! corrects visibilities, the accumulator adds them up. An [`archive`] keeps its state from one session to the next.
 //!
-//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; knows nothing of the spacecraft, of
-//! solving, or of the pipeline.
+//! Uses [`crate::downlink`], [`crate::calibration`] and [`crate::imaging`]; does not depend on the spacecraft,
+//! on solvers, or on the pipeline.
 
 #[doc(hidden)]
 pub mod archive;
 mod collector;
+mod collector_state;
 mod config;
 mod core;
 mod error;
@@ -27,7 +28,9 @@ pub use self::core::Ground;
 #[doc(hidden)]
 pub use archive::{ARCHIVE_BYTES_MAX, packets_folder};
 #[doc(hidden)]
-pub use collector::{Collector, CollectorState, CollectorStep, CollectorView, DeliveredPacket, Delivery};
+pub use collector::{Collector, CollectorStep, DeliveredPacket, Delivery};
+#[doc(hidden)]
+pub use collector_state::{CollectorState, CollectorView};
 #[doc(hidden)]
 pub use config::GroundConfig;
 pub use config::WAIT_BYTES;
@@ -35,7 +38,7 @@ pub use error::GroundError;
 #[doc(hidden)]
 pub use hold_buffer::{HeldPacket, HoldBuffer, IsDue};
 #[doc(hidden)]
-pub use live_view::{ArrayNow, LiveView};
+pub use live_view::{ArrayGeometry, LiveView};
 #[doc(hidden)]
 pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 #[doc(hidden)]

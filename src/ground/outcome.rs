@@ -1,4 +1,4 @@
-//! What the ground leaves behind besides its sums.
+//! The results of the ground stage other than its sums.
 
 use std::fmt;
 use std::sync::atomic::AtomicU64;
@@ -14,37 +14,37 @@ use crate::downlink::ReceptionCounters;
 use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
 
-/// What the ground leaves behind besides its sums; complete once its stage has finished. Clones share it.
+/// The results of the ground stage other than its sums. Clones share them; they are complete once the stage has finished.
 #[derive(Clone, Debug, Default)]
 pub struct GroundOutcome {
-    /// What became of every visibility.
+    /// Accounting of every visibility.
     pub ledger: Ledger<VisibilityReason>,
     /// Whether the ledger is known to be complete.
     pub completeness: Arc<Mutex<Completeness>>,
-    /// What was received, and what was wrong with it; while the stage works, as of a few steps ago.
+    /// Counters of received data and faults. While the stage works, they may lag by a few steps.
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
-    /// The gains that it finds, if it finds any.
+    /// The solved gains; `None` if gains are not solved for.
     pub gains: Option<SolvedGains>,
-    /// Bytes of visibilities that wait for their positions; while the stage works, as of a few steps ago.
+    /// Bytes of held visibilities. While the stage works, they may lag by a few steps.
     pub waiting_bytes: Arc<AtomicU64>,
-    /// How its checkpoints went, at any time.
+    /// The report on checkpoints, up to date at any time.
     pub saving: SharedSaving,
-    /// Where visitors see it at work.
+    /// The view for page visitors.
     pub live_view: LiveView,
 }
 
-/// A checkpoint is due once what came first after the last one is so old.
-const AGE_MAX: Duration = Duration::from_secs(60);
+/// Age of the oldest unsaved packet at which a checkpoint is due.
+const UNSAVED_AGE_MAX: Duration = Duration::from_secs(60);
 
-/// Least time between two that are due by age.
-const RETRY: Duration = Duration::from_secs(10);
+/// Minimum pause before the next checkpoint that is due by age.
+const PAUSE_MIN: Duration = Duration::from_secs(10);
 
-/// A checkpoint that is due by age takes no more than a tenth of the time.
-const REST: u32 = 9;
+/// Pause after a checkpoint in units of the time that it took, so that checkpoints due by age take at most a tenth of the time.
+const PAUSE_FACTOR: u32 = 9;
 
-/// How the checkpoints of a session went.
+/// Report on the checkpoints of a session.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct SavingReport {
     /// Checkpoints that were written.
@@ -53,9 +53,9 @@ pub struct SavingReport {
     pub failed: u64,
     /// Why the last attempt failed; `None` if it did not.
     pub unsaved: Option<String>,
-    /// Bytes that were received since the newest checkpoint, if a packet among them is new; those that came in a raw archive too.
+    /// Bytes received since the newest checkpoint, those in the raw archive included; 0 if no packet among them is new.
     pub unsaved_bytes: u64,
-    /// Age of the oldest packet that no checkpoint holds, s; 0 if all are held.
+    /// Age of the oldest packet that is in no checkpoint, s; 0 if all packets are.
     pub unsaved_s: f64,
     /// Age of the newest checkpoint of this session, s.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -75,18 +75,17 @@ fn attempts(count: u64) -> String {
     format!("{count} attempt{}", if count == 1 { "" } else { "s" })
 }
 
-/// The report on the checkpoints of a ground at work; clones share it.
+/// The report on the checkpoints of a running ground stage. Clones share it.
 #[derive(Clone, Debug, Default)]
-pub struct SharedSaving(Arc<Mutex<Option<Saving>>>);
+pub struct SharedSaving(Arc<Mutex<Option<SavingProgress>>>);
 
-/// Shared source of a [`SavingReport`].
 #[derive(Debug, Default)]
-struct Saving {
+struct SavingProgress {
     report: SavingReport,
-    /// Bytes received, and how many of them the newest checkpoint holds.
     received: u64,
-    held: u64,
-    /// When the first packet came that no checkpoint holds.
+    /// Bytes received before the newest checkpoint.
+    saved: u64,
+    /// Arrival of the oldest packet that is in no checkpoint.
     unsaved_since: Option<Instant>,
     written_at: Option<Instant>,
     /// Time before which no checkpoint is due by age.
@@ -98,9 +97,9 @@ impl SharedSaving {
     #[must_use]
     pub fn report(&self) -> Option<SavingReport> {
         let saving = self.lock();
-        let Saving { report, received, held, unsaved_since, written_at, .. } = saving.as_ref()?;
+        let SavingProgress { report, received, saved, unsaved_since, written_at, .. } = saving.as_ref()?;
         let age_s = |since: &Instant| since.elapsed().as_secs_f64();
-        let unsaved_bytes = if unsaved_since.is_some() { received.saturating_sub(*held) } else { 0 };
+        let unsaved_bytes = if unsaved_since.is_some() { received.saturating_sub(*saved) } else { 0 };
         Some(SavingReport {
             unsaved_bytes,
             unsaved_s: unsaved_since.as_ref().map_or(0.0, age_s),
@@ -109,44 +108,45 @@ impl SharedSaving {
         })
     }
 
-    /// So many bytes have been received; `has_new` if there is a packet among them that no checkpoint holds.
+    /// Notes the number of bytes received so far. `has_new` says whether a packet among them is in no checkpoint.
     pub(super) fn note_received(&self, bytes: u64, has_new: bool) {
         if let Some(saving) = &mut *self.lock() {
             saving.received = bytes;
-            match has_new {
-                true => drop(saving.unsaved_since.get_or_insert_with(Instant::now)),
-                false => (saving.unsaved_since, saving.held) = (None, bytes),
+            if has_new {
+                saving.unsaved_since.get_or_insert_with(Instant::now);
+            } else {
+                (saving.unsaved_since, saving.saved) = (None, bytes);
             }
         }
     }
 
-    /// Whether a checkpoint is due because of the age of what none holds.
+    /// Whether a checkpoint is due by the age of unsaved packets.
     pub(super) fn is_old(&self) -> bool {
         let saving = self.lock();
         let Some(saving) = &*saving else { return false };
-        saving.unsaved_since.is_some_and(|since| since.elapsed() >= AGE_MAX)
+        saving.unsaved_since.is_some_and(|since| since.elapsed() >= UNSAVED_AGE_MAX)
             && saving.not_before.is_none_or(|instant| Instant::now() >= instant)
     }
 
-    fn lock(&self) -> MutexGuard<'_, Option<Saving>> {
+    fn lock(&self) -> MutexGuard<'_, Option<SavingProgress>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// There is an archive.
+    /// Starts the report, as there is an archive.
     pub(super) fn begin(&self) {
         self.lock().get_or_insert_default();
     }
 
-    /// Counts an attempt that was begun at an instant; returns whether the one before had failed.
-    pub(super) fn update(&self, failure: Option<&GroundError>, begun: Instant) -> bool {
+    /// Counts an attempt to write a checkpoint. Returns whether the previous attempt had failed.
+    pub(super) fn count_attempt(&self, failure: Option<&GroundError>, begun: Instant) -> bool {
         let mut saving = self.lock();
         let saving = saving.get_or_insert_default();
         let now = Instant::now();
-        // After a failure not at once, either.
-        let pause = begun.elapsed().saturating_mul(REST).max(RETRY);
+        // The pause applies after a failure as well.
+        let pause = begun.elapsed().saturating_mul(PAUSE_FACTOR).max(PAUSE_MIN);
         saving.not_before = now.checked_add(pause);
         if failure.is_none() {
-            (saving.held, saving.unsaved_since, saving.written_at) = (saving.received, None, Some(now));
+            (saving.saved, saving.unsaved_since, saving.written_at) = (saving.received, None, Some(now));
         }
         let SavingReport { written, failed, unsaved, .. } = &mut saving.report;
         let failed_before = unsaved.is_some();

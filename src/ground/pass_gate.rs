@@ -1,9 +1,8 @@
 //! Holds visibilities back until the gains of their pass are known.
 //!
 //! Visibilities wait in the hold buffer, as they do for their positions. A pass ends with the first visibilities that begin more
-//! than `calibrate.pass_gap_s` after it. Two passes are open at most: the newest, and one of data that come late, which ends with
-//! late data of another pass. Data of a pass that is closed already, and those within that gap of one, get its gains; they count
-//! as late.
+//! than `calibrate.pass_gap_s` after it. At most two passes are open: the newest, and one of late data, which ends with
+//! late data of another pass. Late data of a closed pass, or within the gap of it, get the gains of that pass.
 
 use crate::array::Ephemeris;
 use crate::calibration::solver::{PassBlocks, PassSolver};
@@ -12,18 +11,17 @@ use crate::downlink::wire::VisibilitiesOutline;
 use crate::frames::{Instrument, VisibilityBlock};
 use crate::sky::fits::check_frequencies;
 
-/// What names the maps of the known sky.
-pub(super) const MODEL: &str = "calibrate.model_files";
+pub(super) const MODEL_FILES_KEY: &str = "calibrate.model_files";
 
-/// The place of the newest pass.
+/// Index of the newest open pass.
 const NEWEST: usize = 0;
-/// The place of a pass of late data.
+/// Index of the open pass of late data.
 const LATE: usize = 1;
 
-/// Hears of each pass that is closed.
+/// Called after each pass is closed.
 pub type PassObserver = Box<dyn FnMut(&SolvedGains) + Send>;
 
-/// What a checkpoint keeps of it.
+/// State of a [`PassGate`] in a checkpoint.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct PassGateState {
     pub(super) passes: Vec<ClosedPass>,
@@ -32,112 +30,121 @@ pub struct PassGateState {
 }
 
 impl PassGateState {
-    /// Whether it is one of an instrument; a forged state may hold anything.
+    /// Whether the state fits the instrument. Checkpoints are untrusted.
     pub(super) fn is_sound(&self, instrument: Option<&Instrument>) -> bool {
-        let is_open =
+        let is_span =
             |[from_s, until_s]: &[f64; 2]| from_s.is_finite() && until_s.is_finite() && from_s <= until_s;
-        let is_of = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.is_of(instrument));
-        self.passes.iter().all(is_of) && self.open.iter().flatten().all(is_open)
+        let fits = |pass: &ClosedPass| instrument.is_some_and(|instrument| pass.fits_instrument(instrument));
+        self.passes.iter().all(fits) && self.open.iter().flatten().all(is_span)
     }
 }
 
-/// Says which visibilities are due, and solves passes that have ended.
+/// Decides which visibilities are due, and solves for the gains of passes that have ended.
 pub(super) struct PassGate {
     solver: PassSolver,
     gains: SolvedGains,
     gap_s: f64,
-    /// Middle of the first and of the last integration, by [`NEWEST`] and [`LATE`].
+    /// Midpoints of the first and the last integration, by [`NEWEST`] and [`LATE`].
     open: [Option<[f64; 2]>; 2],
     observer: Option<PassObserver>,
-    /// Held visibilities may not have been noted.
-    pub(super) is_behind: bool,
+    /// Whether all held visibilities have to be passed to [`PassGate::note`] first.
+    pub(super) must_note_held: bool,
 }
 
 impl PassGate {
     pub(super) fn new(solver: PassSolver) -> Self {
         let gap_s = solver.config().pass_gap_s;
         let gains = SolvedGains::new(gap_s);
-        Self { solver, gains, gap_s, open: [None; 2], observer: None, is_behind: true }
+        Self { solver, gains, gap_s, open: [None; 2], observer: None, must_note_held: true }
     }
 
-    /// Where the gains are.
+    /// The table of solved gains, which clones share.
     pub(super) fn gains(&self) -> &SolvedGains {
         &self.gains
     }
 
-    pub(super) fn observed_by(&mut self, observer: PassObserver) {
+    pub(super) fn set_observer(&mut self, observer: PassObserver) {
         self.observer = Some(observer);
     }
 
     pub(super) fn describe(&mut self, instrument: &Instrument) -> Result<(), CalibrationError> {
-        self.is_behind = true;
+        self.must_note_held = true;
         check_frequencies(&self.solver.config().model_files, &instrument.frequencies_hz())?;
         self.gains.describe(instrument);
-        self.solver.describe(instrument, MODEL)
+        self.solver.describe(instrument, MODEL_FILES_KEY)
     }
 
     pub(super) fn state(&self) -> PassGateState {
         PassGateState { passes: self.gains.passes(), open: self.open, late: self.gains.late() }
     }
 
-    /// Goes on from a state; the instrument is described.
+    /// Resumes from a state. The instrument must have been described.
     pub(super) fn resume(&mut self, state: PassGateState) {
         let PassGateState { mut passes, open, late } = state;
-        // As they were closed, so that each is judged by what was known then.
+        // In the order in which they were closed: the validity of each depends on the gains before it.
         passes.sort_unstable_by_key(|pass| pass.number);
-        passes.into_iter().for_each(|pass| self.gains.close(pass));
+        passes.into_iter().for_each(|pass| self.gains.add_pass(pass));
         self.gains.count_late(late);
         self.gains.begin_session();
         self.open = open;
     }
 
-    /// Whether what a packet claims to hold waits for no gains.
+    /// Whether the packet with this outline can be calibrated now.
     pub(super) fn is_due(&self, outline: &VisibilitiesOutline) -> bool {
         let middle_s = outline.middle_s;
         if self.solver.instrument().is_some_and(|instrument| instrument.is_spectrum(outline.pair)) {
             return true;
         }
-        let is_open = || self.open.iter().flatten().any(|span_s| self.is_near(*span_s, [middle_s; 2]));
-        self.gains.away_s(middle_s).is_some_and(|away_s| away_s == 0.0 || !is_open())
+        let is_in_open_pass = || (0..2).any(|index| self.is_in_open_pass(index, [middle_s; 2]));
+        self.gains
+            .distance_to_pass_s(middle_s)
+            .is_some_and(|distance_s| distance_s == 0.0 || !is_in_open_pass())
     }
 
-    fn is_near(&self, [from_s, until_s]: [f64; 2], of_s: [f64; 2]) -> bool {
-        !(of_s[0] > until_s + self.gap_s || of_s[1] < from_s - self.gap_s)
+    /// Whether a block with this span belongs to an open pass, within the gap.
+    fn is_in_open_pass(&self, index: usize, [first_s, last_s]: [f64; 2]) -> bool {
+        self.open[index].is_some_and(|[from_s, until_s]| {
+            !(first_s > until_s + self.gap_s || last_s < from_s - self.gap_s)
+        })
     }
 
-    fn is_of(&self, which: usize, of_s: [f64; 2]) -> bool {
-        self.open[which].is_some_and(|span_s| self.is_near(span_s, of_s))
-    }
-
-    /// The open pass that has ended, as this block is of another.
+    /// The open pass that this block of another pass ends.
     pub(super) fn ended_by(&self, block: &VisibilityBlock) -> Option<usize> {
-        let of_s = span_s(block)?;
+        let block_span_s = span_s(block)?;
         let [_, until_s] = self.open[NEWEST]?;
-        if self.gains.away_s(of_s[0]) == Some(0.0) || self.is_of(NEWEST, of_s) {
+        if self.gains.distance_to_pass_s(block_span_s[0]) == Some(0.0)
+            || self.is_in_open_pass(NEWEST, block_span_s)
+        {
             return None;
         }
-        if of_s[0] > until_s + self.gap_s {
+        if block_span_s[0] > until_s + self.gap_s {
             return Some(NEWEST);
         }
-        (self.open[LATE].is_some() && !self.is_of(LATE, of_s) && self.gains.away_s(of_s[0]).is_none())
-            .then_some(LATE)
+        (self.open[LATE].is_some()
+            && !self.is_in_open_pass(LATE, block_span_s)
+            && self.gains.distance_to_pass_s(block_span_s[0]).is_none())
+        .then_some(LATE)
     }
 
-    /// Takes note of a block that is held; what it ends is closed. Returns whether it is of an open pass.
+    /// Registers a held block, and returns whether it is in an open pass. The pass that it ends must have been closed before.
     pub(super) fn note(&mut self, block: &VisibilityBlock) -> bool {
-        let Some(of_s) = span_s(block) else { return false };
-        let away_s = self.gains.away_s(of_s[0]);
-        let which = match () {
-            () if away_s == Some(0.0) => None,
-            () if self.is_of(NEWEST, of_s) => Some(NEWEST),
-            () if self.is_of(LATE, of_s) => Some(LATE),
-            () if away_s.is_some() => None,
-            () if self.open[NEWEST].is_none() => Some(NEWEST),
-            () => Some(LATE),
+        let Some(block_span_s) = span_s(block) else { return false };
+        let distance_s = self.gains.distance_to_pass_s(block_span_s[0]);
+        let index = if distance_s == Some(0.0) {
+            return false;
+        } else if self.is_in_open_pass(NEWEST, block_span_s) {
+            NEWEST
+        } else if self.is_in_open_pass(LATE, block_span_s) {
+            LATE
+        } else if distance_s.is_some() {
+            return false;
+        } else if self.open[NEWEST].is_none() {
+            NEWEST
+        } else {
+            LATE
         };
-        let Some(which) = which else { return false };
-        let [from_s, until_s] = self.open[which].unwrap_or(of_s);
-        self.open[which] = Some([from_s.min(of_s[0]), until_s.max(of_s[1])]);
+        let [from_s, until_s] = self.open[index].unwrap_or(block_span_s);
+        self.open[index] = Some([from_s.min(block_span_s[0]), until_s.max(block_span_s[1])]);
         true
     }
 
@@ -148,34 +155,34 @@ impl PassGate {
         }
     }
 
-    /// Passes that are open, the late one first.
     pub(super) fn open_passes(&self) -> Vec<usize> {
-        [LATE, NEWEST].into_iter().filter(|which| self.open[*which].is_some()).collect()
+        [LATE, NEWEST].into_iter().filter(|index| self.open[*index].is_some()).collect()
     }
 
-    /// Whether a block is of an open pass.
-    pub(super) fn holds(&self, which: usize, block: &VisibilityBlock) -> bool {
-        let within =
-            |([from_s, until_s], [first_s, _]): ([f64; 2], [f64; 2])| (from_s..=until_s).contains(&first_s);
-        self.open[which].zip(span_s(block)).is_some_and(within)
+    /// Whether a block begins within the span of an open pass.
+    pub(super) fn holds(&self, index: usize, block: &VisibilityBlock) -> bool {
+        let (Some([from_s, until_s]), Some([first_s, _])) = (self.open[index], span_s(block)) else {
+            return false;
+        };
+        (from_s..=until_s).contains(&first_s)
     }
 
-    /// Solves an open pass and closes it. Data for which the known signal cannot be predicted have no gains.
-    pub(super) fn close(&mut self, which: usize, blocks: Vec<VisibilityBlock>, ephemeris: &Ephemeris) {
-        let Some(span_s) = self.open[which].take() else { return };
+    /// Solves an open pass and closes it. Data for which the model signal cannot be predicted get no gains.
+    pub(super) fn close(&mut self, index: usize, blocks: Vec<VisibilityBlock>, ephemeris: &Ephemeris) {
+        let Some(span_s) = self.open[index].take() else { return };
         let number = self.gains.len() as u64;
         let all = blocks.iter().map(|block| block.len() as u64).sum();
         let solved = self.solver.solve(PassBlocks { number, span_s, blocks }, ephemeris);
         let (solutions, unused) =
             solved.map_or((Vec::new(), all), |solved| (solved.solutions, solved.unused));
-        self.gains.close(ClosedPass { number, span_s, unused, solutions });
+        self.gains.add_pass(ClosedPass { number, span_s, unused, solutions });
         if let Some(observer) = &mut self.observer {
             observer(&self.gains);
         }
     }
 }
 
-/// Middle of the first and of the last integration of two daughters, s; `None` of other blocks.
+/// Midpoints of the first and the last integration of a cross-correlation block, s; `None` for auto-correlations and empty blocks.
 fn span_s(block: &VisibilityBlock) -> Option<[f64; 2]> {
     let last = block.len().checked_sub(1).filter(|_| block.pair.i != block.pair.j)?;
     Some([block.middle_s(0), block.middle_s(last)])

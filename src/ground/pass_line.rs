@@ -1,4 +1,4 @@
-//! Passes on a time line: packets received and missing by the time at which they were made.
+//! Time line of the packets received and missing, by creation time.
 
 use std::collections::VecDeque;
 use std::ops::Range;
@@ -7,40 +7,38 @@ use serde::Serialize;
 
 use crate::downlink::{CucTime, Kind, ReceivedSet};
 
-/// Most bins of a line.
 const BINS_MAX: usize = 480;
 
-/// Least width of a bin, s; wider ones are this times a power of two. A window takes three of the narrowest.
+/// Minimum width of a bin, s. Wider bins are this times a power of two; a window spans three of the narrowest.
 const BIN_S_MIN: f64 = 900.0;
 
-/// Most ranges that are listed.
 const RANGES_MAX: usize = 1000;
 
-/// Packets of one kind, by bin.
+/// Packets of one kind by bin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindLine {
-    /// Kind.
+    /// Kind of the packets.
     pub kind: Kind,
     /// Application process identifier.
     pub apid: u16,
-    /// Packets received, those held included.
+    /// Packets received, held ones included.
     pub received: Vec<u64>,
-    /// Packets missing between those received; of some between two bins it is not known in which, and they are spread evenly.
+    /// Packets missing between received ones. A gap that spans several bins is spread evenly, as its times are unknown.
     pub missing: Vec<u64>,
 }
 
-/// Packets of consecutive counts that are missing, to be requested again.
+/// A range of missing packets with consecutive counts, to be requested again.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MissingRange {
-    /// Kind.
+    /// Kind of the packets.
     pub kind: Kind,
     /// Application process identifier.
     pub apid: u16,
-    /// Count of the first.
+    /// Count of the first packet.
     pub from: u64,
-    /// Count of the last.
+    /// Count of the last packet.
     pub to: u64,
-    /// Mission times, s, at which the packets received before and after it were made.
+    /// Creation times, mission time in s, of the packets received before and after the range.
     pub between_s: [f64; 2],
 }
 
@@ -53,18 +51,18 @@ pub struct PassLine {
     pub start_s: f64,
     /// Width of a bin, s.
     pub bin_s: f64,
-    /// The kinds that were received.
+    /// Received and missing packets of each kind received.
     pub kinds: Vec<KindLine>,
-    /// Missing packets, the latest first; at most a thousand ranges.
+    /// Ranges of missing packets, latest first, at most a thousand.
     pub ranges: Vec<MissingRange>,
-    /// Ranges that are not listed.
+    /// Number of ranges that are not listed.
     pub ranges_left_out: u64,
 }
 
 impl PassLine {
-    /// The line of what was received of each kind.
+    /// The time line of the received sets of each kind.
     #[must_use]
-    pub fn of<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) -> Self {
+    pub fn new<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) -> Self {
         let time_s = |made: CucTime| made.tai_s() - epoch_tai_s;
         let sets: Vec<(Kind, &ReceivedSet)> = received.filter(|(_, set)| !set.is_empty()).collect();
         let ends = sets.iter().filter_map(|(_, set)| set.span());
@@ -81,19 +79,19 @@ impl PassLine {
         let mut line = Self { epoch_tai_s, start_s, bin_s, ..Self::default() };
         for (kind, set) in sets {
             let apid = kind.apid();
-            let mut of_kind = KindLine { kind, apid, received: vec![0; bins], missing: vec![0; bins] };
+            let mut kind_line = KindLine { kind, apid, received: vec![0; bins], missing: vec![0; bins] };
             let mut latest = VecDeque::new();
             let mut before: Option<(f64, u64)> = None;
             for (made, Range { start, end }) in set.intervals() {
                 let time_s = time_s(made);
-                of_kind.received[bin(time_s)] += end - start;
-                // A lower count made later begins an era, at 0.
+                kind_line.received[bin(time_s)] += end - start;
+                // A lower count with a later creation time begins a new era, at 0.
                 let (since_s, due) = before.filter(|(_, due)| *due <= start).unwrap_or((time_s, 0));
                 if due < start {
-                    spread(&mut of_kind.missing[bin(since_s)..=bin(time_s)], start - due);
+                    distribute(&mut kind_line.missing[bin(since_s)..=bin(time_s)], start - due);
                     let between_s = [since_s, time_s];
                     latest.push_back(MissingRange { kind, apid, from: due, to: start - 1, between_s });
-                    // They come in the order of time.
+                    // Ranges come in the order of time.
                     if latest.len() > RANGES_MAX {
                         latest.pop_front();
                         line.ranges_left_out += 1;
@@ -101,14 +99,13 @@ impl PassLine {
                 }
                 before = Some((time_s, end));
             }
-            line.kinds.push(of_kind);
+            line.kinds.push(kind_line);
             line.ranges.extend(latest);
         }
         line.keep_latest();
         line
     }
 
-    /// Drops the earliest ranges beyond the most that are listed.
     fn keep_latest(&mut self) {
         self.ranges.sort_by(|a, b| b.between_s[1].total_cmp(&a.between_s[1]));
         self.ranges_left_out += self.ranges.len().saturating_sub(RANGES_MAX) as u64;
@@ -116,9 +113,8 @@ impl PassLine {
     }
 }
 
-/// Adds a number in equal parts, the remainder evenly.
-fn spread(bins: &mut [u64], count: u64) {
-    // As nearly always.
+fn distribute(bins: &mut [u64], count: u64) {
+    // The common case.
     if let [bin] = bins {
         *bin = bin.saturating_add(count);
         return;
@@ -141,10 +137,10 @@ mod tests {
     }
 
     fn line_of(sets: &[(Kind, ReceivedSet)]) -> PassLine {
-        PassLine::of(EPOCH_S, sets.iter().map(|(kind, set)| (*kind, set)))
+        PassLine::new(EPOCH_S, sets.iter().map(|(kind, set)| (*kind, set)))
     }
 
-    /// Ten packets a pass, made at one time, but for those left out.
+    /// Ten packets per pass with the same creation time, without lost ones.
     fn passes(count: u64, apart_s: f64, is_lost: impl Fn(u64) -> bool) -> ReceivedSet {
         let mut set = ReceivedSet::default();
         for packet in (0..10 * count).filter(|packet| !is_lost(*packet)) {
@@ -198,7 +194,7 @@ mod tests {
         let KindLine { received, missing, .. } = &line.kinds[0];
         assert!(received.len() <= BINS_MAX && received.len() > BINS_MAX / 3, "{}", received.len());
         assert_eq!(received.iter().sum::<u64>(), set.len());
-        // The last packet of all is beyond what is known.
+        // Whether the last packet was lost is unknown.
         assert_eq!(missing.iter().sum::<u64>(), set.len() - 1);
         assert_eq!(line.ranges.len() as u64 + line.ranges_left_out, set.len() - 1);
         let mut forged = ReceivedSet::default();
@@ -215,7 +211,7 @@ mod tests {
     fn equal_parts_add_up() {
         for (count, parts) in [(0, 3), (5, 1), (1, 5), (7, 3), (u64::MAX, 7)] {
             let mut bins = vec![0; parts];
-            spread(&mut bins, count);
+            distribute(&mut bins, count);
             assert_eq!(bins.iter().sum::<u64>(), count);
             let [least, most] = [bins.iter().min().unwrap(), bins.iter().max().unwrap()];
             assert!(most - least <= 1, "{bins:?}");

@@ -1,33 +1,30 @@
-//! Powers of the daughters over the mission's time, for a waterfall.
+//! Powers of the daughters over mission time, for a waterfall plot.
 
 use std::collections::BTreeMap;
 
 use serde::Serialize;
 use serde::ser::{SerializeStruct, Serializer};
 
-/// Most times at which there are powers.
-const TIMES_MAX: usize = 256;
+const BINS_MAX: usize = 256;
 
-/// Most daughters.
 const DAUGHTERS_MAX: usize = 64;
 
-/// Least width of a time, s.
-const TIME_S_MIN: f64 = 15.0;
+const BIN_S_MIN: f64 = 15.0;
 
-/// Sum of powers, K sr, and their number.
+/// Sum of powers, K sr, and the number of powers.
 type PowerSum = (f64, u64);
 
-/// Mean powers of one channel by time and daughter. Bounded, however long the mission: times grow wider by a factor of two.
+/// Mean powers of one channel by time and daughter. Memory is bounded, as the time bins grow by factors of two.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PowerWaterfall {
-    time_s: f64,
-    /// By the number of the time, from the mission's epoch.
+    bin_s: f64,
+    /// Sums by the number of the time bin, counted from the mission epoch.
     sums: BTreeMap<i64, Vec<PowerSum>>,
 }
 
 impl Default for PowerWaterfall {
     fn default() -> Self {
-        Self { time_s: TIME_S_MIN, sums: BTreeMap::new() }
+        Self { bin_s: BIN_S_MIN, sums: BTreeMap::new() }
     }
 }
 
@@ -38,20 +35,19 @@ impl PowerWaterfall {
         if daughter >= DAUGHTERS_MAX || !time_s.is_finite() || !power_k_sr.is_finite() {
             return;
         }
-        let sums = self.sums.entry((time_s / self.time_s).floor() as i64).or_default();
+        let sums = self.sums.entry((time_s / self.bin_s).floor() as i64).or_default();
         if sums.len() <= daughter {
             sums.resize(daughter + 1, (0.0, 0));
         }
         sums[daughter].0 += power_k_sr;
         sums[daughter].1 += 1;
-        while self.sums.len() > TIMES_MAX {
+        while self.sums.len() > BINS_MAX {
             self.widen();
         }
     }
 
-    /// Doubles the width of the times.
     fn widen(&mut self) {
-        self.time_s *= 2.0;
+        self.bin_s *= 2.0;
         for (number, sums) in std::mem::take(&mut self.sums) {
             let wide = self.sums.entry(number >> 1).or_default();
             wide.resize(wide.len().max(sums.len()), (0.0, 0));
@@ -62,16 +58,16 @@ impl PowerWaterfall {
     }
 }
 
-/// As it is told: `time_s`, the width of a time; `times_s`, where each begins; `powers_k_sr`, by time and daughter, `null`
-/// where there is none.
+/// Serialises `time_s`, the width of a bin; `times_s`, the start of each; and `powers_k_sr` by bin and daughter, `null` where
+/// there is none.
 impl Serialize for PowerWaterfall {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mean = |&(sum, count): &PowerSum| (count > 0).then(|| sum / count as f64);
-        let times_s: Vec<f64> = self.sums.keys().map(|&number| number as f64 * self.time_s).collect();
+        let times_s: Vec<f64> = self.sums.keys().map(|&number| number as f64 * self.bin_s).collect();
         let powers: Vec<Vec<Option<f64>>> =
             self.sums.values().map(|sums| sums.iter().map(mean).collect()).collect();
         let mut out = serializer.serialize_struct("PowerWaterfall", 3)?;
-        out.serialize_field("time_s", &self.time_s)?;
+        out.serialize_field("time_s", &self.bin_s)?;
         out.serialize_field("times_s", &times_s)?;
         out.serialize_field("powers_k_sr", &powers)?;
         out.end()
@@ -95,12 +91,12 @@ mod tests {
         waterfall.add(200, 0.0, 1.0);
         waterfall.add(0, f64::NAN, 1.0);
         // 1000 times of 15 s are 250 of 60 s.
-        let told = serde_json::to_value(&waterfall).unwrap();
-        assert_eq!(told["time_s"], 60.0);
-        let times = told["times_s"].as_array().unwrap();
+        let serialised = serde_json::to_value(&waterfall).unwrap();
+        assert_eq!(serialised["time_s"], 60.0);
+        let times = serialised["times_s"].as_array().unwrap();
         assert_eq!((times.len(), &times[0], &times[249]), (250, &(-7500.0).into(), &7440.0.into()));
         // The mean of 5 to 14.
-        for row in told["powers_k_sr"].as_array().unwrap() {
+        for row in serialised["powers_k_sr"].as_array().unwrap() {
             assert_eq!(*row, serde_json::json!([9.5, null, 11.5]));
         }
     }

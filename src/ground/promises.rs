@@ -1,61 +1,59 @@
-//! Answers to senders about checkpoints.
+//! Acknowledges to senders which of their data are in a checkpoint.
 
 use crate::downlink::transport::socket::HeldAnswers;
 
-/// Tells senders what is in a checkpoint.
+/// Acknowledges to senders which of their data are in a checkpoint.
 #[derive(Debug, Default)]
 pub(super) struct SenderPromises {
-    /// Senders that wait; `None` if none may.
+    /// Senders that wait; `None` if there is no answer channel.
     answers: Option<HeldAnswers>,
-    /// Bytes of the stream whose packets have all been applied, or are held.
+    /// Bytes of the stream whose packets have all been applied or are held.
     pub(super) bytes: u64,
-    /// Bytes that were applied before the stream began: from the raw archive.
-    before: u64,
-    /// Packets that the newest checkpoint has.
+    /// Bytes that were applied from the raw archive, before the stream began.
+    archived_bytes: u64,
     packets: u64,
 }
 
 impl SenderPromises {
-    /// The promises of a ground whose newest checkpoint has this number of packets.
+    /// The initial state, for a newest checkpoint with this number of packets.
     pub(super) fn since(packets: u64) -> Self {
         Self { packets, ..Self::default() }
     }
 
-    /// The stream begins after so many bytes.
+    /// Notes that the stream begins after this number of bytes.
     pub(super) fn begin(&mut self, bytes: u64) {
-        (self.before, self.bytes) = (bytes, 0);
+        (self.archived_bytes, self.bytes) = (bytes, 0);
     }
 
-    /// So many bytes have been applied, or are held.
+    /// Notes the number of bytes that have been applied or are held.
     pub(super) fn note_bytes(&mut self, bytes: u64) {
-        self.bytes = bytes.saturating_sub(self.before);
+        self.bytes = bytes.saturating_sub(self.archived_bytes);
     }
 
-    /// Whether there are more than `packets` of the newest checkpoint.
     pub(super) fn has_new(&self, packets: u64) -> bool {
         packets > self.packets
     }
 
-    /// From now on tells these.
-    pub(super) fn answering(self, answers: &HeldAnswers) -> Self {
+    /// Answers these senders from now on.
+    pub(super) fn with_answers(self, answers: &HeldAnswers) -> Self {
         Self { answers: Some(answers.clone()), ..self }
     }
 
-    /// Whether a checkpoint has to be written because senders wait for it. If the newest one has all `packets` already, they are
-    /// told.
+    /// Whether a checkpoint has to be written because senders wait for it. If the newest one already has all `packets`, the senders get
+    /// their answer.
     pub(super) fn are_due(&self, packets: u64) -> bool {
         let Some(answers) = self.answers.as_ref().filter(|answers| answers.begin(self.bytes)) else {
             return false;
         };
-        let is_new = packets > self.packets;
-        if !is_new {
+        let has_new = self.has_new(packets);
+        if !has_new {
             answers.hold(self.bytes);
         }
-        is_new
+        has_new
     }
 
-    /// Notes whether a checkpoint of this many packets was written.
-    pub(super) fn keep(&mut self, packets: u64, is_written: bool) {
+    /// Notes whether a checkpoint with this number of packets was written, and answers the senders.
+    pub(super) fn note_checkpoint(&mut self, packets: u64, is_written: bool) {
         if is_written {
             self.packets = packets;
         }

@@ -1,4 +1,4 @@
-//! Bytes to frames, without sums.
+//! A stage that turns bytes into frames, without sums.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,21 +9,21 @@ use crate::downlink::receive::ReceptionCounters;
 use crate::frames::GroundFrame;
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Finds packets in what arrives, from one sender or several, and emits their frames: each once, after the
-/// instrument's description, visibilities after their positions as far as the hold buffer reaches.
+/// Finds packets in the bytes of one or more senders, and emits each frame once, after the description of the instrument.
+/// Visibilities follow their ephemeris unless the hold buffer is full.
 ///
-/// [`super::Ground`] does the same on the way to its sums.
+/// [`super::Ground`] does the same before it accumulates sums.
 #[derive(Debug)]
 pub struct Reception {
     collector: Collector,
-    /// Positions that were emitted.
+    /// Ephemeris segments that were emitted.
     ephemeris: Ephemeris,
     counters: Arc<Mutex<ReceptionCounters>>,
 }
 
 impl Reception {
-    /// At most `wait_bytes` of visibilities wait for their positions; positions of `segments_max` segments are known.
-    /// Leaves its counters in `counters` at the end.
+    /// A stage with a hold buffer of `wait_bytes` and an ephemeris of at most `segments_max` segments. It writes `counters`
+    /// at the end.
     #[must_use]
     pub fn new(wait_bytes: u64, segments_max: usize, counters: Arc<Mutex<ReceptionCounters>>) -> Self {
         Self { collector: Collector::new(wait_bytes), ephemeris: Ephemeris::new(segments_max), counters }

@@ -1,4 +1,4 @@
-//! How many visibilities saw each direction of the sky.
+//! Number of visibilities for which each direction of the sky was above the lunar limb.
 
 use serde::Serialize;
 
@@ -7,76 +7,76 @@ use crate::frames::PlacedVisibilities;
 use crate::sky::healpix::{pixel_count, pixel_directions, pixel_of};
 use crate::units::vector::{Vec3, norm, scale};
 
-/// nside of the sky's directions and of the pairs' directions: pixels of 3.7 degrees.
+/// nside of the map and of the histogram of pair midpoints. Its pixels are 3.7 degrees wide.
 const NSIDE: usize = 16;
 
-/// Every n-th visibility is counted.
+/// Stride of counted visibilities.
 const EVERY: u64 = 8;
 
-/// Where the middles of pairs stood, seen from the Moon, at the visibilities of one channel. That costs little per visibility; what
-/// the Moon hid from them is worked out when somebody asks.
+/// Histogram of the selenocentric directions of pair midpoints for the visibilities of one channel. It is cheap to update; the
+/// occultation by the Moon is computed on request.
 #[derive(Clone, Debug)]
 pub struct SkyHits {
     frequency_hz: f64,
     visibilities: u64,
-    /// Counted ones by the direction of the middle, RING order.
-    places: Vec<u64>,
+    /// Counted visibilities by the direction of the pair midpoint, RING order.
+    midpoints: Vec<u64>,
     counted: u64,
-    /// Sum of the distances of the middles from the Moon's, m.
+    /// Sum of the distances of the midpoints from the centre of the Moon, m.
     radius_sum_m: f64,
 }
 
-/// Visibilities by direction.
+/// Map of the number of visibilities by direction.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct HitsMap {
     /// Centre frequency of the channel, Hz.
     pub frequency_hz: f64,
     /// Visibilities so far.
     pub visibilities: u64,
-    /// Every n-th is counted, beginning with the first.
+    /// Stride of counted visibilities, beginning with the first.
     pub every: u64,
     /// nside of the map.
     pub nside: usize,
-    /// Visibilities for which the Moon did not hide the direction, RING order, ecliptic axes. Pairs stand in the middles of pixels
-    /// of this nside: a limb is off by up to two degrees.
+    /// Visibilities for which the Moon did not occult the direction, RING order, ecliptic axes. Midpoints are rounded to pixel
+    /// centres of this nside, so that the limb is accurate to two degrees.
     pub hits: Vec<u64>,
 }
 
 impl SkyHits {
-    /// Nothing at a frequency, Hz.
+    /// An empty histogram for a channel at a frequency, Hz.
     #[must_use]
     pub fn new(frequency_hz: f64) -> Self {
-        let places = vec![0; pixel_count(NSIDE)];
-        Self { frequency_hz, visibilities: 0, places, counted: 0, radius_sum_m: 0.0 }
+        let midpoints = vec![0; pixel_count(NSIDE)];
+        Self { frequency_hz, visibilities: 0, midpoints, counted: 0, radius_sum_m: 0.0 }
     }
 
-    /// Counts visibilities. Those without a direction, which are forged, are in no place.
+    /// Counts visibilities. Forged positions without a direction are not in the histogram.
     pub fn add(&mut self, placed: &PlacedVisibilities) {
         let first = (EVERY - self.visibilities % EVERY) % EVERY;
         self.visibilities += placed.len() as u64;
         for (r_i_m, r_j_m) in
             placed.r_i_m.iter().zip(&placed.r_j_m).skip(first as usize).step_by(EVERY as usize)
         {
-            let middle_m: Vec3 = std::array::from_fn(|k| 0.5 * (r_i_m[k] + r_j_m[k]));
-            let radius_m = norm(middle_m);
+            let midpoint_m: Vec3 = std::array::from_fn(|k| 0.5 * (r_i_m[k] + r_j_m[k]));
+            let radius_m = norm(midpoint_m);
             if radius_m.is_normal() && radius_m < 1e12 {
-                self.places[pixel_of(NSIDE, scale(radius_m.recip(), middle_m))] += 1;
+                self.midpoints[pixel_of(NSIDE, scale(radius_m.recip(), midpoint_m))] += 1;
                 self.counted += 1;
                 self.radius_sum_m += radius_m;
             }
         }
     }
 
-    /// The map, for a Moon of this radius, m. Some ten million comparisons.
+    /// Computes the map for a Moon of this radius, m, with some ten million comparisons.
     #[must_use]
     pub fn map(&self, moon_radius_m: f64) -> HitsMap {
         let directions = pixel_directions(NSIDE);
         let radius_m = self.radius_sum_m / self.counted.max(1) as f64;
         let mut hits = vec![0; directions.len()];
-        for (count, place) in self.places.iter().zip(&directions).filter(|(count, _)| **count > 0) {
-            let stands_m = scale(radius_m, *place);
+        for (count, midpoint) in self.midpoints.iter().zip(&directions).filter(|(count, _)| **count > 0) {
+            let midpoint_m = scale(radius_m, *midpoint);
             for (hits, n_hat) in hits.iter_mut().zip(&directions) {
-                if !hidden_by_moon(stands_m, *n_hat, moon_radius_m) {
+                if !hidden_by_moon(midpoint_m, *n_hat, moon_radius_m) {
                     *hits += EVERY * count;
                 }
             }
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
     use crate::units::vector::dot;
 
-    /// Visibilities of a pair 2 km apart whose middle stands there.
+    /// Visibilities of a 2 km pair with these midpoints.
     fn placed(middles_m: &[Vec3]) -> PlacedVisibilities {
         let count = middles_m.len();
         let side = |by_m: f64| middles_m.iter().map(|r| [r[0], r[1], r[2] + by_m]).collect();
@@ -121,7 +121,7 @@ mod tests {
         let map = whole.map(moon_m);
         assert_eq!(map, parts.map(moon_m));
         assert_eq!((map.visibilities, map.hits.len()), (400, 3072));
-        // By the angle from the Moon's middle and the limb's, counted one by one; those within the blur may go either way.
+        // Counted by the angles from the centre of the Moon and of the limb; directions within the rounding may be either.
         let limb = (moon_m / radius_m).asin();
         let blur = 2.6_f64.to_radians();
         for (n_hat, hits) in pixel_directions(16).iter().zip(&map.hits) {

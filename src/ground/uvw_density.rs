@@ -1,4 +1,4 @@
-//! How the baselines fill the space of u, v, w.
+//! Density of the baselines in the uvw space.
 
 use serde::Serialize;
 
@@ -9,40 +9,39 @@ use crate::units::vector::{Vec3, scale, sub};
 /// Cells along a side of a plane; a multiple of four.
 const CELLS: usize = 64;
 
-/// Every n-th visibility is counted. A baseline moves by an eighth of a wavelength from one to the next, so that a cell is
-/// passed in many times as many.
+/// Stride of counted visibilities. A baseline moves by an eighth of a wavelength between visibilities, so that a cell is
+/// crossed in many more visibilities than this.
 const EVERY: u64 = 8;
 
-/// Greatest half side of a plane, wavelengths: 2^22 are further apart than satellites of the Moon, at any frequency observed.
+/// Maximum half side of a plane, wavelengths. 2^22 is longer than any baseline in lunar orbit at the observed frequencies.
 const EXTENT_WAVELENGTHS_MAX: f64 = 4_194_304.0;
 
-/// The planes: horizontal and vertical axis.
+/// Horizontal and vertical axis of each plane.
 const PLANES: [[usize; 2]; 3] = [[0, 1], [0, 2], [1, 2]];
 
-/// Baselines `r_i - r_j` of one channel, counted in cells of three planes: u-v, u-w and v-w, on the Moon-centred ecliptic axes.
+/// Histogram of the baselines `r_i - r_j` of one channel in the planes u-v, u-w and v-w, on Moon-centred ecliptic axes.
 ///
-/// A visibility is known at both signs of its baseline; the other one is not counted. The planes grow as longer baselines come,
-/// by a factor of two each time, so their counts are kept.
+/// Only one sign of each baseline is counted. The planes grow by factors of two with the longest baseline, so that counts are kept.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct UvwDensity {
     /// Centre frequency of the channel, Hz.
     pub frequency_hz: f64,
     /// Visibilities so far.
     pub visibilities: u64,
-    /// Every n-th is in the planes, beginning with the first.
+    /// Stride of counted visibilities, beginning with the first.
     pub every: u64,
-    /// Visibilities outside all planes: their baseline is too long.
+    /// Counted visibilities whose baseline is too long for the planes.
     pub beyond: u64,
-    /// Half side of a plane, wavelengths: cells go from minus this to this.
+    /// Half side of a plane, wavelengths: cells extend from minus this to this.
     pub extent_wavelengths: f64,
     /// Cells along a side.
     pub cells: usize,
-    /// Counts of the planes u-v, u-w and v-w: row after row of the second axis, both rising.
+    /// Counts in the planes u-v, u-w and v-w, in rows of rising second axis.
     pub planes: [Vec<u64>; 3],
 }
 
 impl UvwDensity {
-    /// Nothing at a frequency, Hz.
+    /// An empty histogram for a channel at a frequency, Hz.
     #[must_use]
     pub fn new(frequency_hz: f64) -> Self {
         Self {
@@ -68,10 +67,9 @@ impl UvwDensity {
         }
     }
 
-    /// Counts a baseline, wavelengths.
     fn count(&mut self, uvw: Vec3) {
         let longest = uvw.iter().fold(0.0, |longest: f64, x| longest.max(x.abs()));
-        // Not a number is beyond, too.
+        // NaN counts as too long.
         if !uvw.iter().all(|x| x.abs() < EXTENT_WAVELENGTHS_MAX) {
             self.beyond += 1;
             return;
@@ -85,7 +83,7 @@ impl UvwDensity {
         }
     }
 
-    /// Doubles the planes: each cell goes into one twice as wide.
+    /// Doubles the side of the planes by merging cells.
     fn widen(&mut self) {
         self.extent_wavelengths *= 2.0;
         for plane in &mut self.planes {

@@ -1,4 +1,4 @@
-//! Configuration of the daughters' antennas as maps take them to be.
+//! Configuration of the daughters' antennas that a refined map assumes.
 
 use crate::imaging::anywhere::AssumedAntenna;
 use crate::response::PatternsByFrequency;
@@ -31,7 +31,7 @@ impl AntennasConfig {
         self.keys_set().is_empty()
     }
 
-    /// Keys by which an antenna is not ideal.
+    /// Names of the keys that make an antenna differ from an ideal one.
     #[must_use]
     pub fn keys_set(&self) -> Vec<&'static str> {
         let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
@@ -40,7 +40,7 @@ impl AntennasConfig {
         lists.chain(by_frequency).collect()
     }
 
-    /// Degree of pairs' responses as polynomials in the direction, at most: of two dipoles, and of a pattern of each.
+    /// Maximum degree of a pair's response as a polynomial in the direction, from two dipoles and two patterns.
     #[must_use]
     pub fn degree(&self) -> usize {
         let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
@@ -48,16 +48,16 @@ impl AntennasConfig {
         2 * usize::from(!self.is_ideal()) + 4 * usize::from(has_patterns)
     }
 
-    /// What is believed of each antenna, without patterns by frequency; empty if all are ideal.
+    /// The assumed antennas, without patterns by frequency; empty if all are ideal.
     pub(super) fn assumed(&self) -> Vec<AssumedAntenna> {
         if self.is_ideal() {
             return Vec::new();
         }
         let count = self.lists().map(|(_, values)| values.len()).into_iter().max().unwrap_or(0);
-        let of = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
+        let value = |values: &[f64], k: usize| values.get(k).copied().unwrap_or(0.0);
         let antenna = |k: usize| AssumedAntenna {
-            tilt_deg: [of(&self.tilt_along_deg, k), of(&self.tilt_radial_deg, k)],
-            distortion: of(&self.pattern, k),
+            tilt_deg: [value(&self.tilt_along_deg, k), value(&self.tilt_radial_deg, k)],
+            distortion: value(&self.pattern, k),
         };
         (0..count).map(antenna).collect()
     }
@@ -65,18 +65,18 @@ impl AntennasConfig {
     pub(super) fn check(&self, checks: &mut Checks) {
         self.pattern_by_frequency.check("antennas.pattern_by_frequency", None, checks);
         for (key, values) in self.lists() {
-            let expected = format!("at most {}, one a daughter", u8::MAX);
+            let expected = format!("at most {}, one per daughter", u8::MAX);
             checks.require(
                 format!("antennas.{key}"),
                 format!("({} values)", values.len()),
                 values.len() <= usize::from(u8::MAX),
                 expected,
             );
-            let (most, expected) = match key {
+            let (limit, expected) = match key {
                 "pattern" => (2.0, "-2 to 2"),
                 _ => (80.0, "-80 to 80 degrees"),
             };
-            checks.numbers(format!("antennas.{key}"), values, |value| value.abs() <= most, expected);
+            checks.numbers(format!("antennas.{key}"), values, |value| value.abs() <= limit, expected);
         }
     }
 }

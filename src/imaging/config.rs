@@ -19,25 +19,25 @@ use crate::sky::{Frame, TEMPERATURE_K_MAX};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, Checks, InvalidValue, PerChannel, keys};
 
-/// Greatest nside of the pixel engine: 49152 pixels, 9.7 GB of sums a channel (half of a symmetric matrix, f64).
+/// Maximum nside of the pixel engine: 49152 pixels, 9.7 GB of sums per channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
 
-/// Greatest nside of the pixel engine without its matrix: a pass over the rows of a million visibilities takes hours.
+/// Maximum nside of the matrix-free pixel engine: one product with the rows of a million visibilities takes hours.
 pub const MATRIX_FREE_NSIDE_MAX: usize = 256;
 
-/// Greatest nside of maps from the harmonic engine: pixels ten times finer than its greatest degree.
+/// Maximum nside of maps from the harmonic engine: pixels ten times finer than its maximum degree.
 pub const HARMONIC_ENGINE_NSIDE_MAX: usize = 1024;
 
-/// epsilon of an R that has one, if it is not set.
+/// Default epsilon.
 const EPSILON: f64 = 1e-4;
 
-/// Default number of degrees of a harmonic map per nside: as many as pixels represent to 1e-6.
+/// Default number of degrees of a harmonic map per nside: those that pixels represent to 1e-6.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
-/// Most directions in which beams are solved for, a solution each.
+/// Maximum number of beam directions, each of which takes a solution.
 const BEAMS_MAX: usize = 100;
 
-/// Channels whose sums are in memory at one time.
+/// Channels whose sums are in memory at the same time.
 pub type ChannelGroup = BTreeSet<ChannelId>;
 
 /// The basis of the normal equations.
@@ -45,16 +45,16 @@ pub type ChannelGroup = BTreeSet<ChannelId>;
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum EngineKind {
-    /// Pixels: exact, for any orbit; N_pix^2 operations a visibility.
+    /// Pixels: exact, for any orbit; N_pix^2 operations per visibility.
     #[default]
     Pixel,
-    /// Spherical harmonics: thousands of operations a visibility; needs satellites on one circle.
+    /// Spherical harmonics: thousands of operations per visibility; needs satellites on one circular orbit.
     Harmonic,
     /// The cheaper one that the array's orbits allow: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
     Auto,
 }
 
-/// What the pixel engine does with its matrix.
+/// Storage of the pixel engine's matrix.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -62,22 +62,22 @@ pub enum MatrixKind {
     /// Forms the normal matrix in memory and factorises it (Cholesky).
     #[default]
     Stored,
-    /// Keeps the visibilities instead, and computes rows of B again for each iteration.
+    /// Stores the visibilities instead, and computes rows of B again in each iteration.
     Free,
 }
 
-/// What R is.
+/// The choice of R.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum RegulariserChoice {
-    /// `R_l = 1 / C_l` with the sky's angular power C_l as the data have it.
+    /// `R_l = 1 / C_l` with the sky's angular power C_l estimated from the data.
     Data,
-    /// `R = epsilon W_max I`, the paper's.
+    /// `R = epsilon W_max I`, as in the paper.
     Identity,
     /// `R_l = epsilon W_max (l + 1)^exponent`.
     Degree(f64),
-    /// `R_l = epsilon / C_l` of tables of l and C_l (K^2), one a channel.
+    /// `R_l = epsilon / C_l` from tables of l and C_l (K^2), one per channel.
     File(Vec<PathBuf>),
 }
 
@@ -161,7 +161,7 @@ keys! {
     }
 }
 
-/// Value of `map.refine.passes_max` among the settings of sums that hold visibilities one by one.
+/// Value recorded for `map.refine.passes_max` in the settings of sums that store visibilities for refinement.
 pub const REFINED: &str = "above 0";
 
 keys! {
@@ -194,37 +194,37 @@ impl RefineConfig {
     }
 }
 
-/// So that what is not set changes no hash of a configuration.
+/// Whether a value is the default, which is not serialised so that it does not change configuration hashes.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_off(value: &bool) -> bool {
     !*value
 }
 
-/// Likewise.
+/// Whether a value is the default, as [`is_off`].
 fn is_usual(matrix: &MatrixKind) -> bool {
     *matrix == MatrixKind::Stored
 }
 
 impl MapConfig {
-    /// What R is: from the data, unless something else is set. An epsilon alone asks for the identity, and so do visibilities that are held
-    /// one by one and pixels too many for an R from the data.
+    /// The choice of R: from the data unless set otherwise. The default is the identity if epsilon is set, if visibilities are stored, or if
+    /// there are too many pixels for an R from the data.
     #[must_use]
     #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
         let is_large = self.engine != EngineKind::Harmonic && self.nside > POWER_NSIDE_MAX;
         let is_identity = self.holds_visibilities() || self.epsilon.is_some() || is_large;
-        let usual = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
-        self.regulariser.clone().unwrap_or(usual)
+        let default = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
+        self.regulariser.clone().unwrap_or(default)
     }
 
-    /// epsilon of an R that has one.
+    /// The value of epsilon, or its default.
     #[must_use]
     #[doc(hidden)]
     pub fn epsilon(&self) -> PerChannel<f64> {
         self.epsilon.clone().unwrap_or(PerChannel::All(EPSILON))
     }
 
-    /// Tables of the sky's angular power that are to be read, one a channel.
+    /// Paths of the tables of the sky's angular power, one per channel.
     #[must_use]
     #[doc(hidden)]
     pub fn power_files(&self) -> &[PathBuf] {
@@ -234,33 +234,33 @@ impl MapConfig {
         }
     }
 
-    /// Whether rows of B are made again for each product over pixels.
+    /// Whether the pixel engine computes rows of B again for each product.
     #[must_use]
     #[doc(hidden)]
     pub fn is_matrix_free(&self) -> bool {
         self.engine != EngineKind::Harmonic && self.matrix == MatrixKind::Free
     }
 
-    /// Whether visibilities are held one by one instead of sums.
+    /// Whether individual visibilities are stored instead of sums.
     #[must_use]
     #[doc(hidden)]
     pub fn holds_visibilities(&self) -> bool {
         self.refine.is_on() || self.is_matrix_free()
     }
 
-    /// All invalid settings; empty if there are none.
+    /// All invalid settings.
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("map");
+        let mut checks = Checks::new("map");
         let is_harmonic = self.engine == EngineKind::Harmonic;
-        let most = match self.engine {
+        let nside_max = match self.engine {
             EngineKind::Harmonic => HARMONIC_ENGINE_NSIDE_MAX,
             _ if self.is_matrix_free() => MATRIX_FREE_NSIDE_MAX,
             EngineKind::Pixel | EngineKind::Auto => PIXEL_ENGINE_NSIDE_MAX,
         };
-        let good = is_valid_nside(self.nside) && self.nside <= most;
-        let expected = format!("a power of two from 1 to {most} for this engine");
+        let good = is_valid_nside(self.nside) && self.nside <= nside_max;
+        let expected = format!("a power of two from 1 to {nside_max} for this engine");
         checks.require("nside", self.nside, good, expected);
         let channels = self.channels_max;
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
@@ -298,13 +298,18 @@ impl MapConfig {
         );
         let every = self.snapshot_every_s;
         checks.number("snapshot_every_s", every, every >= 0.0, "seconds, or 0 for a final map only");
-        let one = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
+        let is_single = self.prior_files.is_empty() || self.prior_k.values().iter().all(|&k| k == 0.0);
         let files = self.prior_files.len();
-        checks.require("prior_files", format!("({files} files)"), one, "none where map.prior_k is given");
+        checks.require(
+            "prior_files",
+            format!("({files} files)"),
+            is_single,
+            "none where map.prior_k is given",
+        );
         checks.finish()
     }
 
-    /// Checks the refinement, and that nothing is asked for that it cannot do.
+    /// Checks the refinement, and that no setting is incompatible with it.
     fn check_refinement(&self, checks: &mut Checks) {
         let RefineConfig { residual_max, visibilities_max, .. } = self.refine;
         checks.number(
@@ -331,7 +336,7 @@ impl MapConfig {
         }
     }
 
-    /// Checks R, and that nothing is asked for that holds for multiples of the identity alone.
+    /// Checks R, and that traces are requested only for multiples of the identity.
     fn check_regularisation(&self, checks: &mut Checks) {
         let regulariser = self.regulariser();
         if let RegulariserChoice::Degree(exponent) = regulariser {
@@ -341,7 +346,7 @@ impl MapConfig {
             checks.require("regulariser.file", "[]", !files.is_empty(), "at least one table");
         }
         let is_identity = regulariser == RegulariserChoice::Identity;
-        let by_degree = !is_identity && regulariser != RegulariserChoice::Data;
+        let is_by_degree = !is_identity && regulariser != RegulariserChoice::Data;
         let found = match &regulariser {
             RegulariserChoice::Data => "data",
             RegulariserChoice::Identity => "identity",
@@ -351,13 +356,13 @@ impl MapConfig {
         checks.require(
             "regulariser",
             found,
-            is_identity || !self.holds_visibilities() || (by_degree && self.refine.is_on()),
+            is_identity || !self.holds_visibilities() || (is_by_degree && self.refine.is_on()),
             "\"identity\", or no such key, with map.matrix = \"free\"; not \"data\" with map.refine",
         );
         checks.require(
             "regulariser",
             found,
-            !by_degree || self.engine == EngineKind::Harmonic,
+            !is_by_degree || self.engine == EngineKind::Harmonic,
             "\"data\" or \"identity\" without map.engine = \"harmonic\"",
         );
         let has_effect = self.epsilon.is_none() || regulariser != RegulariserChoice::Data;
@@ -370,11 +375,11 @@ impl MapConfig {
             "\"identity\" with the pixel engine beyond nside 32; or map.engine = \"harmonic\"",
         );
         let beams = self.beams_deg.len();
-        let few = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
+        let is_valid = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
         checks.require(
             "beams_deg",
             format!("({beams} directions)"),
-            few,
+            is_valid,
             "at most 100, and none with map.refine or map.matrix = \"free\"",
         );
         for &[longitude_deg, latitude_deg] in &self.beams_deg {
@@ -388,18 +393,18 @@ impl MapConfig {
         }
     }
 
-    /// Greatest degree of a map from the harmonic engine.
+    /// Maximum degree of a map from the harmonic engine.
     #[must_use]
     #[doc(hidden)]
     pub fn degree(&self) -> usize {
         if self.l_max > 0 { self.l_max } else { (DEGREES_PER_NSIDE * self.nside as f64) as usize }
     }
 
-    /// The settings that determine the sums, by key; the others determine only what is solved from them.
+    /// The settings that determine the sums, by key; all others affect only solutions.
     #[must_use]
     #[doc(hidden)]
-    pub fn of_sums(&self) -> Vec<(&'static str, String)> {
-        // Every field is named: whoever adds a key decides here whether a state depends on it.
+    pub fn sum_settings(&self) -> Vec<(&'static str, String)> {
+        // Every field is named, so that whoever adds a key must decide whether a state depends on it.
         let Self {
             nside,
             engine,
@@ -409,7 +414,7 @@ impl MapConfig {
             companion_seed,
             limits,
             weight_max,
-            channels: mapped,
+            channels,
             channels_max: _,
             epsilon: _,
             regulariser: _,
@@ -423,7 +428,7 @@ impl MapConfig {
             residual_max: _,
             iterations_max: _,
             trace_probes: _,
-            l_max: _, // As `degree`.
+            l_max: _, // See `degree`.
             antennas: _,
             refine,
         } = self;
@@ -434,8 +439,8 @@ impl MapConfig {
             ("map.companion_seed", companion_seed.to_string()),
             ("map.weight_max", format!("{weight_max:?}")),
         ];
-        if !mapped.is_empty() {
-            settings.push(("map.channels", format!("{mapped:?}")));
+        if !channels.is_empty() {
+            settings.push(("map.channels", format!("{channels:?}")));
         }
         match engine {
             EngineKind::Pixel | EngineKind::Auto => {
@@ -448,7 +453,7 @@ impl MapConfig {
                 settings.push(("map.l_max", self.degree().to_string()));
                 settings.push(("map.limits", format!("{limits:?}")));
                 if refine.is_on() {
-                    // How often and how well a map is refined is no matter of the visibilities that are held for it.
+                    // The stored visibilities do not depend on how a map is refined.
                     settings.push(("map.refine.passes_max", REFINED.to_owned()));
                 }
             }
@@ -456,7 +461,7 @@ impl MapConfig {
         settings
     }
 
-    /// What the rows of a refined map are made with.
+    /// The instrument that the rows of a refined map assume.
     #[must_use]
     #[doc(hidden)]
     pub fn assumed(&self) -> AssumedInstrument {
@@ -468,7 +473,7 @@ impl MapConfig {
         }
     }
 
-    /// Longest baseline used at a frequency, m.
+    /// The longest baseline used at a frequency, m.
     ///
     /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4).
     #[must_use]
@@ -481,12 +486,12 @@ impl MapConfig {
     /// Whether a channel is mapped.
     #[must_use]
     #[doc(hidden)]
-    pub fn maps(&self, channel: ChannelId) -> bool {
+    pub fn is_mapped(&self, channel: ChannelId) -> bool {
         self.channels.is_empty() || self.channels.contains(&channel.0)
     }
 
-    /// Requires that the sums of the channels of a group, of `channels` in all, take at most `limit_bytes`. Those of the
-    /// harmonic engine grow with the data, so they are not known beforehand.
+    /// Requires that the sums of the mapped channels of a group take at most `limit_bytes`; the instrument has `channels` channels. Harmonic sums
+    /// grow with the data and are not counted.
     ///
     /// # Errors
     /// [`AccumulationError::Memory`].
@@ -502,8 +507,9 @@ impl MapConfig {
             _ if self.is_matrix_free() => 0,
             EngineKind::Pixel | EngineKind::Auto => PixelEngine::memory_bytes(self.nside),
         };
-        let is_summed =
-            |channel: &ChannelId| self.maps(*channel) && group.is_none_or(|group| group.contains(channel));
+        let is_summed = |channel: &ChannelId| {
+            self.is_mapped(*channel) && group.is_none_or(|group| group.contains(channel))
+        };
         let channels = (0..channels as u16).map(ChannelId).filter(is_summed).count();
         let needed_bytes = each.saturating_mul(channels as u64);
         match limit_bytes {
@@ -514,7 +520,7 @@ impl MapConfig {
         }
     }
 
-    /// Requires that prior maps are of the frequencies of the instrument's channels, as far as they say it.
+    /// Requires that prior maps which state a frequency have that of their channel.
     ///
     /// # Errors
     /// [`AccumulationError::Prior`].
@@ -523,19 +529,19 @@ impl MapConfig {
         Ok(check_frequencies(&self.prior_files, &instrument.frequencies_hz())?)
     }
 
-    /// Settings by channel that do not match an instrument of `channels` channels.
+    /// Per-channel settings that do not match an instrument of `channels` channels.
     #[must_use]
     #[doc(hidden)]
-    pub fn misfits(&self, channels: usize) -> Vec<InvalidValue> {
+    pub fn mismatches(&self, channels: usize) -> Vec<InvalidValue> {
         let epsilon = self.epsilon();
         let (files, tables) = (self.prior_files.len(), self.power_files().len());
-        let mut checks = Checks::of("map");
+        let mut checks = Checks::new("map");
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
         checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
-        for (place, &channel) in self.channels.iter().enumerate() {
+        for (index, &channel) in self.channels.iter().enumerate() {
             let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
-            checks.require(format!("channels[{place}]"), channel, usize::from(channel) < channels, expected);
+            checks.require(format!("channels[{index}]"), channel, usize::from(channel) < channels, expected);
         }
         for (key, fits, found) in [
             ("epsilon", epsilon.fits(channels), epsilon.values().len()),

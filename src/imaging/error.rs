@@ -1,4 +1,4 @@
-//! Why visibilities could not be summed.
+//! Errors of accumulation.
 
 use std::path::PathBuf;
 
@@ -8,47 +8,47 @@ use crate::response::general::RowsRefusal;
 use crate::response::pixel::ResponseError;
 use crate::units::{ChannelId, Dimension, InvalidValue};
 
-/// Why visibilities could not be summed.
+/// Why visibilities could not be accumulated.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum AccumulationError {
     /// Rows of B cannot be computed.
     #[error(transparent)]
     Response(#[from] ResponseError),
-    /// A block whose arrays are not of one length.
+    /// The arrays of a block have unequal lengths.
     #[error(transparent)]
     Lengths(#[from] crate::frames::UnequalLengths),
-    /// A prior map that cannot be used.
+    /// A prior map cannot be used.
     #[error("map.prior_files: {0}")]
     Prior(#[from] crate::sky::fits::FitsError),
-    /// A setup out of range.
+    /// A quantity of an engine's setup is out of range.
     #[error("invalid setup of an engine: {name} = {value}: expected {expected}")]
     Setup {
         /// Quantity.
         name: &'static str,
-        /// Value found.
+        /// The value that was found.
         value: f64,
-        /// Range that is accepted.
+        /// The accepted range.
         expected: &'static str,
     },
     /// Data of a channel that is not in the instrument description.
     #[error("visibilities of channel {0}, which is not in the instrument description")]
     UnknownChannel(ChannelId),
-    /// Data to be removed that the sums do not hold.
+    /// Data to be removed are not in the sums.
     #[error("visibilities of channel {0} are to be removed, but its sums do not hold them")]
     NothingHeld(ChannelId),
-    /// Data of another frequency.
+    /// A block has another frequency than its engine.
     #[error("a block at {} for an engine at {}", Dimension::Frequency.show(*found_hz), Dimension::Frequency.show(*expected_hz))]
     Frequency {
-        /// The engine's, Hz.
+        /// Frequency of the engine, Hz.
         expected_hz: f64,
-        /// The block's, Hz.
+        /// Frequency of the block, Hz.
         found_hz: f64,
     },
-    /// Settings by channel do not match the instrument.
+    /// Per-channel settings do not match the instrument.
     #[error("the downlink's channels: {0}")]
-    Misfit(#[from] InvalidValue),
-    /// The sums of an instrument take more memory than there is.
+    ChannelSettings(#[from] InvalidValue),
+    /// The sums of an instrument would exceed the memory limit.
     #[error(
         "the sums of the downlink's {channels} channels take at least {:.1} GB: expected at most {:.1} GB; lower \
          map.nside, map some channels at a time (--groups auto), or state another limit, as in --memory-max {}GB",
@@ -57,12 +57,12 @@ pub enum AccumulationError {
     Memory {
         /// Channels of the instrument.
         channels: usize,
-        /// Estimated need, bytes.
+        /// Estimated memory, bytes.
         needed_bytes: u64,
         /// The limit, bytes.
         limit_bytes: u64,
     },
-    /// Sums that wait on disk cannot be written.
+    /// Sums cannot be written to disk.
     #[error("cannot keep sums in {}: {source}; expected room for all of them", folder.display())]
     Store {
         /// Folder.
@@ -70,40 +70,45 @@ pub enum AccumulationError {
         /// The system's error.
         source: std::io::Error,
     },
-    /// Engines of different setups.
+    /// Engines of different setups cannot be merged.
     #[error("engines of different {what} cannot be merged")]
     Mismatch {
         /// What differs.
         what: &'static str,
     },
-    /// Engines whose combined sums would exceed the range, or fall below nothing.
+    /// Parts of the sums come from an engine that does not divide its sums among ranks.
+    #[error(
+        "the sums of this engine are not divided among ranks; expected parts of harmonic sums (map.engine = \"harmonic\")"
+    )]
+    Undivided,
+    /// Combined sums would exceed the range of an engine, or become negative.
     #[error(
         "combined sums would leave the range of an engine: expected room for both at this map.weight_max, and no more \
          removed than held"
     )]
     Range,
-    /// Positions without a row of B.
+    /// The positions of a visibility have no row of B.
     #[error("a visibility has no row of the beam matrix: {0}")]
     Rows(RowsRefusal),
-    /// More visibilities than may be held for refinement.
+    /// Merged states hold more visibilities than the limit.
     #[error(
         "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \
-         map.refine.visibilities_max = {most}: raise it"
+         map.refine.visibilities_max = {limit}: raise it"
     )]
     TooManyVisibilities {
         /// Channel.
         channel: ChannelId,
-        /// Visibilities of all.
+        /// Number of visibilities of all states.
         found: u64,
         /// The limit.
-        most: u64,
+        limit: u64,
     },
-    /// Ranks that hold visibilities one by one.
+    /// Stored visibilities cannot be divided among ranks.
     #[error(
         "map.refine with a saved state of several ranks; expected one process, or map.refine.passes_max = 0"
     )]
     HeldByRank,
-    /// A segment of visibilities that is missing or damaged.
+    /// A segment of visibilities is missing or damaged.
     #[error("{}: found {found}; expected the visibilities that the checkpoint names", path.display())]
     Segment {
         /// The file.

@@ -1,14 +1,14 @@
-//! Maps from visibilities: normal equations, summed as data arrive, and their regularised solution
-//! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p` with `R_l = 1 / C_l`, C_l the sky's angular power as the data have it ([`SkyPower`]);
-//! or `R = epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4), or another [`Regulariser`].
+//! Maps from visibilities: normal equations, accumulated as data arrive, and their regularised solution
+//! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p`. R is `1 / C_l` with the sky's angular power C_l estimated from the data ([`SkyPower`]);
+//! or `epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4); or another [`Regulariser`].
 //!
-//! Each map method is a folder, with its sums and their solution. `pixel` forms the matrix itself, or makes its rows again for each
-//! product; [`circle`] makes the matrix act on spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines its
-//! maps with rows at the true positions; `joint` solves for several channels of its sums together.
+//! Each map method has a folder with its sums and their solution. `pixel` forms the matrix over pixels, or computes its rows again for each
+//! product. [`circle`] applies the matrix to spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines its maps with
+//! rows of B at the true positions; `joint` solves for several channels together.
 //!
-//! Methods share `exact` (sums as integers, whose bits depend only on which visibilities are in them, and checkpoints), `solver`
-//! (conjugate gradients, eigenvalues, traces) and `power` (the sky's angular power). `stage` holds the two stages of the pipeline,
-//! [`Accumulator`] and [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
+//! The methods share `exact` (integer sums, whose bits depend only on which visibilities they hold, and the checkpoint format), `solver`
+//! (conjugate gradients, eigenvalues, traces) and `power` (C_l from the data). `stage` holds the two pipeline stages, [`Accumulator`] and
+//! [`Solver`]. Uses [`crate::frames`], [`mod@crate::array`], [`crate::response`], [`crate::sky`].
 
 mod antennas;
 #[doc(hidden)]
@@ -53,12 +53,12 @@ pub use regulariser::Regulariser;
 pub use solver::SolveError;
 #[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, HELD_MAX, LargestEigenvalue, NamedWatch, SolveWatch, Solving, SolvingPart,
+    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, STORED_MAX, SolveWatch, Solving, SolvingPart,
     Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
     noise_variance, probed_traces, regularisation, spectrum, traces,
 };
 #[doc(hidden)]
-pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotSums, Solution, Solver, SolverSetup};
+pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotData, Solution, Solver, SolverSetup};
 
 use std::collections::BTreeMap;
 
@@ -67,14 +67,14 @@ use serde::Serialize;
 use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::response::harmonic::GeometryRefusal;
 
-/// Number, weight and power of the visibilities in an engine or its sums.
+/// Number, total weight and power of the visibilities in an engine or its sums.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SumCounts {
     /// Visibilities in the sums.
     pub visibilities: u64,
     /// Sum of their weights, (K sr)^-2.
     pub weight: f64,
-    /// `V'N^-1V`: the sum of their squares times weights.
+    /// `V'N^-1V`, the sum of their squared moduli times weights.
     pub power: f64,
 }
 
@@ -82,7 +82,7 @@ pub struct SumCounts {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// The engine's basis does not cover the positions of its satellites.
+    /// The engine does not cover the positions of its satellites.
     Geometry(GeometryRefusal),
     /// Its baseline is longer than the engine's limit.
     TooLong,
@@ -100,7 +100,7 @@ impl From<GeometryRefusal> for Refusal {
     }
 }
 
-/// The reason in the ledger.
+/// Converts a refusal to its reason in the ledger.
 impl From<Refusal> for VisibilityReason {
     fn from(refusal: Refusal) -> Self {
         match refusal {
@@ -117,13 +117,13 @@ impl From<Refusal> for VisibilityReason {
     }
 }
 
-/// Result of one call: each visibility was either accepted or refused.
+/// The result of adding or removing visibilities, each of which is either accepted or refused.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 #[must_use]
 pub struct Added {
-    /// Accepted: now in the sums, or removed from them.
+    /// Number of visibilities that were added to the sums, or removed from them.
     pub visibilities: u64,
-    /// Refused, by reason.
+    /// Number of refused visibilities by reason.
     pub refused: BTreeMap<Refusal, u64>,
 }
 
@@ -133,12 +133,12 @@ impl Added {
     }
 }
 
-/// Sums the visibilities of one channel, block by block.
+/// Accumulates the visibilities of one channel, block by block.
 ///
-/// Sums are exact: each term is rounded once, by a rule that looks at its own visibility alone, to a multiple of a
-/// quantum that the setup fixes, and the multiples are added as integers. So the sums, and the bytes of a checkpoint,
-/// depend on which visibilities are in them and on nothing else: not on their order, blocks or threads, not on how
-/// engines were merged, nor on what was added and removed again.
+/// Sums are exact: each term is rounded once, by a rule that depends only on its own visibility, to a multiple of a
+/// quantum that the setup fixes, and the multiples are added as integers. Therefore the sums, and the bytes of a
+/// checkpoint, depend only on which visibilities are in them: not on their order, blocks or threads, nor on how engines
+/// were merged, nor on what was added and removed again.
 pub trait NormalEngine: Send {
     /// The form of the sums.
     type Equations: NormalSums;
@@ -146,28 +146,28 @@ pub trait NormalEngine: Send {
     /// Adds visibilities.
     ///
     /// # Errors
-    /// A block of another frequency, or with arrays of unequal lengths. A visibility that the engine does not cover, or has no room for, is counted as
-    /// refused instead.
+    /// The block has another frequency, or arrays of unequal lengths. A visibility that the engine does not cover, or has no room for, is no
+    /// error but counted as refused.
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
     /// Removes visibilities that were added: the exact inverse of [`NormalEngine::add`].
     ///
-    /// A visibility that the engine would not add is refused here too, and counted. The caller has to know that the
-    /// others were added.
+    /// A visibility that the engine would not add is counted as refused here too. The caller must ensure that the others
+    /// were added.
     ///
     /// # Errors
-    /// A block of another frequency, or with arrays of unequal lengths; or [`AccumulationError::NothingHeld`] if the engine holds less than is to be
-    /// removed. Nothing changes then.
+    /// The block has another frequency, or arrays of unequal lengths; or [`AccumulationError::NothingHeld`] if the engine holds less than is
+    /// to be removed. The engine is then unchanged.
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError>;
 
-    /// Sums the pending visibilities now instead of with the next batch; the sums get the same bits either way.
+    /// Adds pending visibilities to the sums now instead of with the next batch, with the same bits.
     #[doc(hidden)]
     fn flush(&mut self);
 
     /// Adds the sums of another engine of the same setup.
     ///
     /// # Errors
-    /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if there is no room for both.
+    /// [`AccumulationError::Mismatch`] if the setups differ; [`AccumulationError::Range`] if the sums have no room for both.
     fn merge(&mut self, other: Self) -> Result<(), AccumulationError>
     where
         Self: Sized;
@@ -181,7 +181,7 @@ pub trait NormalEngine: Send {
     where
         Self: Sized;
 
-    /// Number and weight of the visibilities in the engine.
+    /// Number, weight and power of the visibilities in the engine.
     fn counts(&self) -> SumCounts;
 
     /// The sums of all visibilities so far, as a copy.
@@ -200,10 +200,10 @@ pub trait NormalEngine: Send {
     #[doc(hidden)]
     fn checkpoint(&mut self, out: &mut dyn std::io::Write) -> Result<(), AccumulationError>;
 
-    /// Reads an engine that [`NormalEngine::checkpoint`] wrote; it resumes to the same bits.
+    /// Reads an engine that [`NormalEngine::checkpoint`] wrote, with the same bits.
     ///
     /// # Errors
-    /// Data that is damaged, truncated, or of another format.
+    /// The data is damaged, truncated, or of another format.
     #[doc(hidden)]
     fn restore(from: &mut dyn std::io::Read) -> Result<Self, AccumulationError>
     where
@@ -215,10 +215,10 @@ pub trait NormalSums: Send {
     /// Number of unknowns: pixels or harmonic coefficients.
     fn unknowns(&self) -> usize;
 
-    /// `y = BtN^-1B x`; both of length [`NormalSums::unknowns`].
+    /// Computes `y = BtN^-1B x`; both have length [`NormalSums::unknowns`].
     fn apply(&self, x: &[f64], y: &mut [f64]);
 
-    /// `BtN^-1B x` of each x, with the bits of [`NormalSums::apply`]; cheaper than one by one where reading the sums takes time.
+    /// Computes `BtN^-1B x` for each x with the bits of [`NormalSums::apply`], in one reading of the sums where that saves time.
     #[doc(hidden)]
     fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
         let product = |x: &&[f64]| {
@@ -229,34 +229,34 @@ pub trait NormalSums: Send {
         x.iter().map(product).collect()
     }
 
-    /// `BtN^-1V`.
+    /// The right-hand side `BtN^-1V`.
     fn right_hand_side(&self) -> &[f64];
 
-    /// `BtN^-1n` for noise n of the data's own weights: the right-hand side of a noise-only map.
+    /// The right-hand side `BtN^-1n` of the noise-only map, n being simulated noise with the data's weights.
     #[doc(hidden)]
     fn noise_right_hand_side(&self) -> &[f64];
 
-    /// Number and weight of the visibilities in the sums.
+    /// Number, weight and power of the visibilities in the sums.
     fn counts(&self) -> SumCounts;
 
-    /// How well the eigenvalues of `BtN^-1B` are known.
+    /// The accuracy of the eigenvalues of `BtN^-1B`.
     #[doc(hidden)]
     fn accuracy(&self) -> Accuracy;
 
-    /// Why sums on disk could not be read: products are not numbers from then on.
+    /// Why sums on disk could not be read, if so; products are NaN from then on.
     #[doc(hidden)]
     fn failure(&self) -> Option<&str> {
         None
     }
 }
 
-/// What rounding and the approximations of an engine leave open of an eigenvalue W of `BtN^-1B`: `relative` W + `absolute`
-/// W_max. Those of the harmonic engine have been compared with rows one by one in f64; those of the other are estimates.
+/// The error of an eigenvalue W of `BtN^-1B` from rounding and approximations of an engine: `relative` W + `absolute` W_max. The values of
+/// the harmonic engine were measured against rows in f64; those of the pixel engine are estimates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[doc(hidden)]
 pub struct Accuracy {
-    /// Of the eigenvalue itself.
+    /// Error relative to the eigenvalue itself.
     pub relative: f64,
-    /// Of the largest one. Much smaller eigenvalues have no meaning.
+    /// Error relative to the largest eigenvalue; much smaller eigenvalues are not significant.
     pub absolute: f64,
 }

@@ -1,5 +1,4 @@
-//! R, diagonal over degrees: one over the sky's angular power as the data have it, `epsilon W_max` times the identity, or growing with l; or
-//! what a known angular power asks for.
+//! The regulariser R: a multiple of the identity, or a diagonal matrix that depends on the degree.
 
 use std::path::Path;
 
@@ -7,18 +6,17 @@ use crate::files::read_text;
 use crate::imaging::circle::degrees;
 use crate::imaging::solver::SolveError;
 
-/// Longest table, bytes: more than one of the greatest degree needs.
+/// Maximum size of a table, bytes; a table up to the maximum degree is smaller.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// How R depends on the degree.
+/// The dependence of R on the degree.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Regulariser {
-    /// `R_l = 1 / C_l` with the C_l that the data make most likely ([`crate::imaging::SkyPower`]).
+    /// `R_l = 1 / C_l` with the maximum-likelihood C_l of the data ([`crate::imaging::SkyPower`]).
     Data,
     /// `R_l = epsilon W_max (l + 1)^exponent`; the identity with an exponent of 0.
     Power(f64),
-    /// `R_l = epsilon / C_l` for a sky (without the prior) of the angular power C_l, K^2, from l = 0: with epsilon = 1 the map that is
-    /// most likely if both sky and noise are Gaussian (Wiener's).
+    /// `R_l = epsilon / C_l` for a sky (without the prior) of angular power C_l, K^2, from l = 0; with epsilon = 1 the Wiener filter.
     Wiener(Vec<f64>),
 }
 
@@ -28,61 +26,58 @@ impl Default for Regulariser {
     }
 }
 
-/// R over unknowns.
+/// The diagonal of R over the unknowns.
 #[derive(Clone, Debug, PartialEq)]
 pub(in crate::imaging) enum Diagonal {
-    /// The same for all.
+    /// One value for all unknowns.
     Uniform(f64),
-    /// Of harmonics, by degree from l = 0.
+    /// Values for harmonics by degree, from l = 0.
     ByDegree(Vec<f64>),
 }
 
 impl Diagonal {
-    /// `y += R x`.
+    /// Computes `y += R x`.
     pub(in crate::imaging) fn add_product(&self, x: &[f64], y: &mut [f64]) {
         match self {
             Self::Uniform(level) => y.iter_mut().zip(x).for_each(|(y, x)| *y += level * x),
-            Self::ByDegree(of_degree) => {
-                let levels = degrees(of_degree.len().saturating_sub(1)).map(|l| of_degree[l]);
+            Self::ByDegree(by_degree) => {
+                let levels = degrees(by_degree.len().saturating_sub(1)).map(|l| by_degree[l]);
                 y.iter_mut().zip(x).zip(levels).for_each(|((y, x), level)| *y += level * x);
             }
         }
     }
 
-    /// `factor R`.
+    /// The matrix `factor R`.
     pub(in crate::imaging) fn times(&self, factor: f64) -> Self {
         match self {
             Self::Uniform(level) => Self::Uniform(factor * level),
-            Self::ByDegree(of_degree) => {
-                Self::ByDegree(of_degree.iter().map(|level| factor * level).collect())
+            Self::ByDegree(by_degree) => {
+                Self::ByDegree(by_degree.iter().map(|level| factor * level).collect())
             }
         }
     }
 
-    /// Of degree `l`.
+    /// The element of degree `l`.
     pub(in crate::imaging) fn at(&self, l: usize) -> f64 {
         match self {
             Self::Uniform(level) => *level,
-            Self::ByDegree(of_degree) => of_degree[l],
+            Self::ByDegree(by_degree) => by_degree[l],
         }
     }
 }
 
 impl Regulariser {
-    /// Reads the angular power of a sky: a table of l and C_l, K^2, separated by a comma or blanks, from l = 0 on without a gap.
+    /// Reads the angular power of a sky from a table of l and C_l, K^2, separated by a comma or blanks, from l = 0 without gaps.
     ///
     /// # Errors
-    /// A file that cannot be read or is no such table; power that is not positive.
+    /// The file cannot be read or is no such table, or a power is not positive.
     pub fn read(path: &Path) -> Result<Self, SolveError> {
         let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
         let text = read_text(path, FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
-        power_of(&text).map(Self::Wiener).map_err(failed)
+        parse_table(&text).map(Self::Wiener).map_err(failed)
     }
 
-    /// R of a solution up to `l_max`.
-    ///
-    /// # Errors
-    /// A table that ends before `l_max`.
+    /// The diagonal of R for a solution up to `l_max`.
     pub(in crate::imaging) fn diagonal(
         &self,
         epsilon: f64,
@@ -91,7 +86,7 @@ impl Regulariser {
     ) -> Result<Diagonal, SolveError> {
         let level = epsilon * w_max;
         Ok(match self {
-            // Found while the map is solved for.
+            // The solution itself finds this one.
             Self::Data => return Err(SolveError::NoPower),
             Self::Power(0.0) => Diagonal::Uniform(level),
             Self::Power(exponent) => {
@@ -107,14 +102,14 @@ impl Regulariser {
     }
 }
 
-/// C_l of a table, or what is wrong in it.
-fn power_of(text: &str) -> Result<Vec<f64>, String> {
+/// Parses a table to C_l, or says which line is wrong.
+fn parse_table(text: &str) -> Result<Vec<f64>, String> {
     let mut power_k2 = Vec::new();
     for (number, line) in text.lines().enumerate() {
         let fields: Vec<&str> =
             line.split([',', ' ', '\t']).map(str::trim).filter(|field| !field.is_empty()).collect();
-        let is_head = number == 0 && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
-        if fields.is_empty() || is_head || line.starts_with('#') {
+        let is_header = number == 0 && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
+        if fields.is_empty() || is_header || line.starts_with('#') {
             continue;
         }
         let values = (fields.first().and_then(|l| l.parse::<usize>().ok()), fields.get(1));
@@ -134,20 +129,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn r_grows_as_its_exponent_says_or_as_power_falls() {
-        let of = |regulariser: Regulariser| regulariser.diagonal(0.5, 4.0, 2);
-        assert_eq!(of(Regulariser::default()), Ok(Diagonal::Uniform(2.0)));
-        assert_eq!(of(Regulariser::Power(2.0)), Ok(Diagonal::ByDegree(vec![2.0, 8.0, 18.0])));
+    fn r_follows_its_exponent_or_the_power() {
+        let diagonal = |regulariser: Regulariser| regulariser.diagonal(0.5, 4.0, 2);
+        assert_eq!(diagonal(Regulariser::default()), Ok(Diagonal::Uniform(2.0)));
+        assert_eq!(diagonal(Regulariser::Power(2.0)), Ok(Diagonal::ByDegree(vec![2.0, 8.0, 18.0])));
         let power_k2 = vec![1.0, 0.25, 0.125, 9.0];
-        assert_eq!(of(Regulariser::Wiener(power_k2)), Ok(Diagonal::ByDegree(vec![0.5, 2.0, 4.0])));
+        assert_eq!(diagonal(Regulariser::Wiener(power_k2)), Ok(Diagonal::ByDegree(vec![0.5, 2.0, 4.0])));
         let short = SolveError::PowerLength { found: 2, expected: 3 };
-        assert_eq!(of(Regulariser::Wiener(vec![1.0; 2])), Err(short));
+        assert_eq!(diagonal(Regulariser::Wiener(vec![1.0; 2])), Err(short));
     }
 
     #[test]
-    fn tables_hold_every_degree_or_say_where_they_do_not() {
-        assert_eq!(power_of("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok(vec![3e9, 2.5, 1.0]));
-        assert_eq!(power_of("# from elsewhere\n0 1\n"), Ok(vec![1.0]));
+    fn tables_are_parsed_or_the_bad_line_is_named() {
+        assert_eq!(parse_table("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok(vec![3e9, 2.5, 1.0]));
+        assert_eq!(parse_table("# from elsewhere\n0 1\n"), Ok(vec![1.0]));
         for (text, found) in [
             ("", "no degrees"),
             ("0,1\n2,1", "line 2: 2,1"),
@@ -157,7 +152,7 @@ mod tests {
             ("0,1\n1", "line 2: 1"),
             ("0,1\none,1", "line 2: one,1"),
         ] {
-            assert_eq!(power_of(text), Err(found.to_owned()), "{text}");
+            assert_eq!(parse_table(text), Err(found.to_owned()), "{text}");
         }
         let gone = Regulariser::read(Path::new("no such table")).unwrap_err().to_string();
         assert!(gone.contains("no such table"), "{gone}");

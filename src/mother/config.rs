@@ -14,17 +14,17 @@ use crate::response::model::ModelChoice;
 use crate::units::constants::YEAR_S;
 use crate::units::{Checks, Dimension, InvalidValue, PerChannel, keys};
 
-/// Most channels: the mission's own number.
+/// Maximum number of channels: that of the mission.
 pub const CHANNELS_MAX: usize = 30;
 
 /// Lowest and highest channel frequency, Hz: the mission's band.
 pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 
-/// Narrowest channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute, in which the
-/// array moves by some degrees; the cost of narrower channels grows with the third power of that time.
+/// Minimum width of a channel of samples, Hz. The 2^14 samples that are synthesised together then span half a minute,
+/// in which the array moves by some degrees; the cost grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
-/// So that missions without it keep their hash.
+/// Missions with the default keep their hash.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_one(number: &u64) -> bool {
     *number == 1
@@ -135,12 +135,12 @@ pub enum StoreDrop {
     Newest,
     /// The oldest data, of all channels and pairs alike.
     Oldest,
-    /// The data that adds least to the map for each byte: blocks with the least weight of a visibility, relative to the
-    /// weight of a second of their channel. These are the long baselines, whose integrations are short.
+    /// The data that add least to the map for each byte: blocks with the lowest weight of a visibility, relative to
+    /// the weight of a second of their channel. These are the long baselines, whose integrations are short.
     LowestValue,
 }
 
-/// The form of the Moon that reflects the sky.
+/// Shape of the Moon as a mirror of the sky.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum MoonMirror {
@@ -167,7 +167,7 @@ pub enum Antenna {
     Isotropic,
     /// A short dipole along the orbit normal.
     DipoleNormal,
-    /// Three short dipoles across each other.
+    /// Three short dipoles perpendicular to each other.
     ThreeDipoles,
 }
 
@@ -181,7 +181,7 @@ impl From<Antenna> for AntennaResponse {
     }
 }
 
-/// Integrations that are shorter than the shortest sum of the correlator.
+/// Integrations are shorter than the shortest dump of the correlator.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error(
     "spacecraft.motion_wavelengths_max and spacecraft.integration_s_max give integrations of {shortest_s:.3e} s, shorter \
@@ -189,14 +189,14 @@ impl From<Antenna> for AntennaResponse {
      (spacecraft.baseline_wavelengths_max)"
 )]
 pub struct IntegrationTooShort {
-    /// The shortest integration, s.
+    /// Shortest integration, s.
     pub shortest_s: f64,
-    /// The shortest sum, s.
+    /// Shortest dump, s.
     pub dump_s: f64,
 }
 
 impl SpacecraftConfig {
-    /// The channels, as the instrument description has them.
+    /// Channels as in the instrument description.
     #[must_use]
     pub fn channels(&self) -> Vec<Channel> {
         let width_hz = self.channel_width_hz;
@@ -209,16 +209,16 @@ impl SpacecraftConfig {
         if self.auto_powers || self.fidelity == Fidelity::Samples { self.auto_integration_s } else { 0.0 }
     }
 
-    /// Which windows are observed.
+    /// Selection of the observed windows.
     #[must_use]
     pub fn window_thinning(&self) -> WindowThinning {
         match self.thin {
             0 | 1 => WindowThinning::EveryNth(self.every_nth_window),
-            thin => WindowThinning::Spread(thinning::shares(thin).0),
+            thin => WindowThinning::Spread(thinning::strides(thin).0),
         }
     }
 
-    /// One schedule a channel.
+    /// One schedule for each channel.
     #[must_use]
     pub fn schedules(&self) -> Vec<Schedule> {
         let schedule = |(channel, &frequency_hz): (usize, &f64)| Schedule {
@@ -227,14 +227,14 @@ impl SpacecraftConfig {
             baseline_wavelengths_max: self.baseline_wavelengths_max.get(channel).unwrap_or(0.0),
             every_nth: match self.thin {
                 0 | 1 => self.every_nth_integration.get(channel).unwrap_or(1),
-                thin => thinning::shares(thin).1,
+                thin => thinning::strides(thin).1,
             },
             windows: self.window_thinning(),
         };
         self.channels_hz.iter().enumerate().map(schedule).collect()
     }
 
-    /// Integrations of samples in an array that are shorter than one sum of the correlator.
+    /// Problem of integrations of samples that are shorter than one dump of the correlator.
     #[must_use]
     pub fn dump_problem(&self, array: &Array) -> Option<IntegrationTooShort> {
         let schedules = self.schedules();
@@ -245,7 +245,7 @@ impl SpacecraftConfig {
         short.then_some(IntegrationTooShort { shortest_s, dump_s })
     }
 
-    /// Delays and sub-bands of samples.
+    /// Delay centre and sub-bands of samples.
     #[must_use]
     pub fn division(&self) -> Division {
         let delay_centre = match self.delay_centre_deg[..] {
@@ -259,7 +259,7 @@ impl SpacecraftConfig {
         Division { sub_bands: self.sub_bands.max(1), delay_centre }
     }
 
-    /// Checks channels, and lists by channel.
+    /// Checks the channels, and lists by channel.
     fn check_channels(&self, checks: &mut Checks) {
         let channels = self.channels_hz.len();
         let count = format!("({channels} channels)");
@@ -268,14 +268,15 @@ impl SpacecraftConfig {
         checks.require("channels_hz", count, is_listed, expected);
         let [low_hz, high_hz] = BAND_HZ;
         let [low, high] = BAND_HZ.map(|hz| Dimension::Frequency.show(hz));
-        // Each value and pair of values can be a problem: of a list that is too long only its length is.
+        // Each value and pair of values can be a problem; for a list that is too long only its length is reported.
         let listed = if is_listed { self.channels_hz.as_slice() } else { &[] };
         for (index, &value) in listed.iter().enumerate() {
             let key = format!("channels_hz[{index}]");
             let inside = (low_hz..=high_hz).contains(&value);
             checks.number(&key, value, inside, format!("{low} to {high}"));
             let half_hz = 0.5 * self.channel_width_hz;
-            // Sub-bands are channels of the downlink, which lie within the band; others must only stay above zero.
+            // Sub-bands are channels of the downlink and must lie within the band; other channels must only stay
+            // above zero.
             let inside = value - half_hz >= low_hz && value + half_hz <= high_hz;
             let fits = half_hz < value && (self.sub_bands == 1 || inside);
             let expected = format!(
@@ -287,10 +288,10 @@ impl SpacecraftConfig {
         for (second, &high) in listed.iter().enumerate() {
             for (first, &low) in listed[..second].iter().enumerate() {
                 let distance_hz = (high - low).abs();
-                let apart = distance_hz >= self.channel_width_hz.max(1e3);
+                let is_separated = distance_hz >= self.channel_width_hz.max(1e3);
                 let expected =
                     format!("at least channel_width_hz, and 1 kHz, from channels_hz[{first}] = {low}");
-                checks.number(format!("channels_hz[{second}]"), high, apart, expected);
+                checks.number(format!("channels_hz[{second}]"), high, is_separated, expected);
             }
         }
         for (key, values, fits) in [
@@ -310,7 +311,7 @@ impl SpacecraftConfig {
         }
     }
 
-    /// Checks what is simulated and how, with delays and sub-bands.
+    /// Checks the fidelity, with delays and sub-bands.
     fn check_fidelity(&self, checks: &mut Checks) {
         let samples = self.fidelity == Fidelity::Samples;
         let direct = matches!(self.model, ModelChoice::Auto | ModelChoice::Direct)
@@ -321,7 +322,7 @@ impl SpacecraftConfig {
             "\"samples\"",
             !samples || direct,
             "spacecraft.model = \"auto\" or \"direct\", and spacecraft.smear_integrations = false, as samples are direct \
-             sums of instants; smear_bandwidth = false too, as they are of the whole channel",
+             sums at single instants; smear_bandwidth = false too, as samples cover the whole channel",
         );
         let good = match self.delay_centre_deg[..] {
             [] => true,
@@ -337,17 +338,21 @@ impl SpacecraftConfig {
         let expected = "ecliptic longitude and latitude, -90 to 90 degrees, or []";
         checks.require("delay_centre_deg", &centre, good, expected);
         let bands = self.sub_bands;
-        let expected =
-            "with fidelity = \"visibilities\", which are of one frequency or averages over the whole channel";
+        let expected = "with fidelity = \"visibilities\", which are for one frequency or averages over the whole channel";
         checks.require("sub_bands", bands, samples || bands == 1, format!("1 {expected}"));
         let whole = samples || self.delay_centre_deg.is_empty();
         checks.require("delay_centre_deg", centre, whole, format!("[] {expected}"));
-        let noisy = self.thermal_noise || !samples;
-        checks.require("thermal_noise", false, noisy, "true with fidelity = \"samples\": samples are noise");
+        let has_noise = self.thermal_noise || !samples;
+        checks.require(
+            "thermal_noise",
+            false,
+            has_noise,
+            "true with fidelity = \"samples\": samples are noise",
+        );
     }
 
-    /// What a daughter's receiver adds to the power of the sky in each channel, K sr: `T_rec / zeta (1 + knee / nu)`, and the
-    /// floor of interference. 0 for what a configuration with [`Self::problems`] lacks.
+    /// Power that a daughter's receiver adds to the sky in each channel, K sr: `T_rec / zeta (1 + knee / nu)`, and
+    /// the floor of interference. 0 for values missing in a configuration with [`Self::problems`].
     #[must_use]
     pub fn receiver_k_sr(&self) -> Vec<f64> {
         let of_channel = |(channel, &frequency_hz): (usize, &f64)| {
@@ -366,7 +371,7 @@ impl SpacecraftConfig {
         check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
     }
 
-    /// The rule of the adaptive integration.
+    /// Rule of the integration time.
     #[must_use]
     pub fn rule(&self) -> IntegrationRule {
         IntegrationRule {
@@ -375,10 +380,10 @@ impl SpacecraftConfig {
         }
     }
 
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All invalid values; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         self.check_channels(&mut checks);
         self.check_fidelity(&mut checks);
         self.check_numbers(&mut checks);
@@ -399,8 +404,13 @@ impl SpacecraftConfig {
         checks.number("window_s_max", window, window >= 0.0, "seconds, or 0 for all of a window");
         let width = self.channel_width_hz;
         checks.number("channel_width_hz", width, width > 0.0 && width <= 1e6, "above 0 Hz and at most 1 MHz");
-        let moving = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
-        checks.number("channel_width_hz", width, moving, "at least 500 Hz with fidelity = \"samples\"");
+        let is_wide_enough = self.fidelity == Fidelity::Visibilities || width >= SAMPLES_WIDTH_HZ_MIN;
+        checks.number(
+            "channel_width_hz",
+            width,
+            is_wide_enough,
+            "at least 500 Hz with fidelity = \"samples\"",
+        );
         let longest = self.integration_s_max;
         checks.number("integration_s_max", longest, (1e-3..=1000.0).contains(&longest), "0.001 s to 1000 s");
         let motion = self.motion_wavelengths_max;
@@ -419,7 +429,7 @@ impl SpacecraftConfig {
         let share = self.moon_reflection;
         checks.number("moon_reflection", share, (0.0..=1.0).contains(&share), "0 to 1");
         let direct = self.moon_mirror == MoonMirror::Flat || self.model == ModelChoice::Direct;
-        let expected = "spacecraft.model = \"direct\" with it, as harmonics are of a flat mirror";
+        let expected = "\"flat\", or spacecraft.model = \"direct\": harmonics assume a flat mirror";
         checks.require("moon_mirror", "\"sphere\"", direct, expected);
         let moon_k = self.moon_temperature_k;
         checks.number("moon_temperature_k", moon_k, (0.0..=1e4).contains(&moon_k), "0 K to 1e4 K");
@@ -434,13 +444,13 @@ impl SpacecraftConfig {
             self.every_nth_window == 1 && self.every_nth_integration.values().iter().all(|&nth| nth == 1);
         let expected = "1, or every_nth_window = 1 and every_nth_integration = 1, which it replaces";
         checks.number("thin", self.thin as f64, self.thin <= 1 || is_alone, expected);
-        let some = self.every_nth_integration.values().iter().all(|&nth| nth >= 1);
-        checks.require("every_nth_integration", 0, some, "at least 1");
+        let is_positive = self.every_nth_integration.values().iter().all(|&nth| nth >= 1);
+        checks.require("every_nth_integration", 0, is_positive, "at least 1");
         let limits = self.baseline_wavelengths_max.values();
         let expected = "wavelengths, or 0 for no limit";
         checks.numbers("baseline_wavelengths_max", limits, |limit| limit >= 0.0, expected);
         let epoch = self.epoch_tai_s;
-        // Four octets of whole seconds are what the time code holds.
+        // The time code holds whole seconds in four octets.
         checks.number("epoch_tai_s", epoch, (0.0..=3.0e9).contains(&epoch), "0 to 3e9 s");
     }
 }

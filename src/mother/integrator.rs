@@ -1,4 +1,4 @@
-//! The stage that simulates the integrated visibilities of observing windows.
+//! Stage that simulates the integrated visibilities of observing windows.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -8,10 +8,10 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Gamma, StandardNormal};
 use rayon::prelude::*;
 
+use super::pair_errors::PairErrors;
 use super::powers::SkyPowers;
 use super::schedule::{Integration, Schedule};
-use super::troubles::PairTroubles;
-use crate::array::{Array, EarthShadow, segments_for};
+use crate::array::{Array, EarthOccultation, segments_for};
 use crate::daughters::{InstrumentErrors, PassErrors};
 use crate::frames::{
     AntennaResponse, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow,
@@ -21,19 +21,21 @@ use crate::response::model::{ModelError, PairPosition, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{ChannelId, MissionTime, Pair, StreamKind, TICKS_PER_SECOND, all_pairs, random_stream};
 
-/// Largest spacing of tabulated positions, s; interpolation is then accurate to micrometres.
+/// Maximum spacing of tabulated positions, s: interpolation is then accurate to micrometres.
 const EPHEMERIS_STEP_S: f64 = 60.0;
 
-/// Queued visibilities of all channels at which they are predicted in any case; bounds memory to some 200 MB.
+/// Number of queued visibilities of all channels at which they are predicted, even if batches are not full; bounds
+/// memory to some 200 MB.
 const QUEUED_VISIBILITIES_MAX: usize = 1_000_000;
-/// Queued windows at which they are predicted in any case.
+/// Number of queued windows at which they are predicted, even if batches are not full.
 const QUEUED_WINDOWS_MAX: usize = 64;
 
-/// Integrates all pairs and channels over each window.
+/// Simulates the integrated visibilities of all pairs and channels in each window.
 ///
 /// Emits for each window: the instrument description, the ephemeris, the visibilities by channel and pair, the
-/// auto-correlations if configured, and a housekeeping frame that closes the window. Windows are queued until the models
-/// have enough visibilities for an efficient batch; this depends on the windows alone.
+/// auto-correlations if configured, and a housekeeping frame that closes the window. Windows are queued until the
+/// models have enough visibilities for an efficient batch. Batches depend on the windows alone, so that results are
+/// reproducible.
 pub struct Integrator {
     array: Arc<Array>,
     models: Vec<ChannelModel>,
@@ -45,16 +47,16 @@ pub struct Integrator {
     errors: Option<Arc<InstrumentErrors>>,
 }
 
-/// The model of a channel.
+/// Model of a channel.
 pub struct ChannelModel {
-    /// Its preferred number of visibilities a call.
+    /// Preferred number of visibilities per call.
     pub batch: usize,
-    /// The model; `None` for a channel that is simulated elsewhere. Batches are those of all channels, so that visibilities have
-    /// the same bits whichever others are simulated with them.
+    /// The model; `None` for a channel that another process or group simulates. Batches count all channels, so that a
+    /// channel has the same bits whichever others are simulated with it.
     pub model: Option<Box<dyn VisibilityModel>>,
 }
 
-/// How a prediction becomes a measurement.
+/// Options of the conversion from predictions to measurements.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeasurementOptions {
     /// Thermal noise.
@@ -67,7 +69,7 @@ pub struct MeasurementOptions {
     pub flag_earth: bool,
 }
 
-/// A window whose visibilities have not been predicted yet.
+/// A window whose visibilities are not predicted yet.
 struct QueuedWindow {
     window: ObservingWindow,
     channels: Vec<QueuedChannel>,
@@ -76,7 +78,7 @@ struct QueuedWindow {
 /// A channel of a queued window.
 struct QueuedChannel {
     visibilities: usize,
-    /// The pairs that have integrations; none of a channel that is simulated elsewhere.
+    /// Pairs with integrations; empty for a channel that is simulated elsewhere.
     pairs: Vec<PairSchedule>,
 }
 
@@ -86,15 +88,15 @@ struct PairSchedule {
     integrations: Vec<Integration>,
 }
 
-/// One channel of a window, with what all pairs share.
+/// One channel of a window, with data that all pairs share.
 #[derive(Clone, Copy)]
 struct WindowChannel<'a> {
     window: ObservingWindow,
     channel: ChannelId,
     powers: &'a SkyPowers,
-    /// Present if the Earth in sight is flagged.
-    shadow: Option<&'a EarthShadow>,
-    /// Present if the instrument has errors.
+    /// Occultation of the Earth, if visibilities with the Earth in sight are flagged.
+    earth_occultation: Option<&'a EarthOccultation>,
+    /// Instrument errors of the pass, if there are any.
     pass: Option<&'a PassErrors>,
 }
 
@@ -102,8 +104,8 @@ impl WindowChannel<'_> {
     /// Flags of an integration.
     fn flags(&self, pair: Pair, from: MissionTime, duration_ticks: u32) -> Flags {
         let until = from.plus_ticks(duration_ticks.into());
-        match self.shadow {
-            Some(shadow) if !shadow.covers(pair, from, until) => Flags::EARTH,
+        match self.earth_occultation {
+            Some(earth_occultation) if !earth_occultation.covers(pair, from, until) => Flags::EARTH,
             _ => Flags::GOOD,
         }
     }
@@ -112,11 +114,11 @@ impl WindowChannel<'_> {
 /// Thermal noise of integrated visibilities.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NoiseModel {
-    /// Seed of the noise; `None` adds none (weights are those of the noise anyway).
+    /// Seed of the noise; `None` for no noise. Weights are the same in both cases.
     pub seed: Option<u64>,
-    /// Receiver noise of each channel, T_rec / zeta with all that is added to it, K sr.
+    /// Receiver noise of each channel, K sr: T_rec / zeta plus 1/f noise and the interference floor.
     pub receiver_noise_k_sr: Vec<f64>,
-    /// The antennas, which may have several receivers.
+    /// Antenna response, which determines the number of receivers.
     pub response: AntennaResponse,
 }
 
@@ -125,9 +127,9 @@ impl NoiseModel {
     /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with each daughter's own
     /// system temperature).
     ///
-    /// Three dipoles have three receivers. Their mean times 3/2 is half of a sum: of the sky's powers P, and of 3/2 of a receiver's
-    /// noise. Where each has a third of that, the variance is a third of that of one receiver with the same power; dipoles whose powers
-    /// differ by 10 % add 1 % to it, which is left out.
+    /// With three dipoles the visibility is half the sum over the dipoles. The sky's power in it is P, the receivers'
+    /// 3/2 of one receiver's noise. If the three contribute equally, the variance is a third of that of one receiver
+    /// with the same total power. Dipoles whose powers differ by 10 % would add 1 %, which is neglected.
     #[must_use]
     pub fn sigma_k_sr(&self, channel: ChannelId, powers_k_sr: [f64; 2], width_hz: f64, dt_s: f64) -> f64 {
         let receiver = self.receiver_k_sr(channel);
@@ -135,16 +137,16 @@ impl NoiseModel {
         (p_i * p_j / (2.0 * self.samples(width_hz, dt_s))).sqrt()
     }
 
-    /// Independent samples of an integration in all receivers of a daughter.
+    /// Number of independent samples of an integration in all receivers of a daughter.
     fn samples(&self, width_hz: f64, dt_s: f64) -> f64 {
         f64::from(self.response.receivers()) * width_hz * dt_s
     }
 
     fn receiver_k_sr(&self, channel: ChannelId) -> f64 {
-        let one_k_sr = self.receiver_noise_k_sr.get(usize::from(channel.0)).copied().unwrap_or(0.0);
+        let per_receiver_k_sr = self.receiver_noise_k_sr.get(usize::from(channel.0)).copied().unwrap_or(0.0);
         match self.response.receivers() {
-            1 => one_k_sr,
-            receivers => 0.5 * f64::from(receivers) * one_k_sr,
+            1 => per_receiver_k_sr,
+            receivers => 0.5 * f64::from(receivers) * per_receiver_k_sr,
         }
     }
 
@@ -158,7 +160,7 @@ impl NoiseModel {
 }
 
 impl Integrator {
-    /// An integrator with one schedule and one model per channel of `instrument`.
+    /// Creates an integrator with one schedule and one model per channel of `instrument`.
     #[must_use]
     pub fn new(
         array: Arc<Array>,
@@ -176,7 +178,7 @@ impl Integrator {
         Self { errors, ..self }
     }
 
-    /// The integrations of every channel and pair in a window.
+    /// Schedules the integrations of every channel and pair in a window.
     fn schedule(&self, window: ObservingWindow) -> QueuedWindow {
         let pairs = all_pairs(self.array.satellites());
         let channel = |(schedule, model): (&Schedule, &ChannelModel)| {
@@ -196,7 +198,7 @@ impl Integrator {
         QueuedWindow { window, channels: self.schedules.iter().zip(&self.models).map(channel).collect() }
     }
 
-    /// Whether the queue is large enough to be predicted.
+    /// Whether the queue is large enough for a prediction.
     fn batch_is_full(&self) -> bool {
         let counts: Vec<usize> = (0..self.schedules.len())
             .map(|channel| self.queued.iter().map(|queued| queued.channels[channel].visibilities).sum())
@@ -208,11 +210,11 @@ impl Integrator {
             || counts.iter().all(|&count| count == 0)
     }
 
-    /// Predicts, measures and emits all queued windows.
-    fn measure_queue(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
+    /// Simulates and emits all queued windows.
+    fn simulate_queue(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let queued = std::mem::take(&mut self.queued);
         let windows: Vec<ObservingWindow> = queued.iter().map(|queued| queued.window).collect();
-        let shadows = self.shadows(&windows);
+        let earth_occultations = self.earth_occultations(&windows);
         let passes: Vec<PassErrors> = match &self.errors {
             Some(errors) => windows.par_iter().map(|window| errors.pass(*window)).collect(),
             None => Vec::new(),
@@ -223,18 +225,26 @@ impl Integrator {
         for channel in 0..self.schedules.len() {
             let Some(model) = &mut self.models[channel].model else { continue };
             let sky = SkyPowers::predict(model.as_mut(), &self.array, &windows)?;
-            blocks.push(self.channel_blocks(&queued, channel, &sky, (&shadows, &passes))?.into_iter());
+            blocks.push(
+                self.channel_blocks(&queued, channel, &sky, (&earth_occultations, &passes))?.into_iter(),
+            );
             powers.push((ChannelId(channel as u16), sky));
             if out.is_closed() {
                 return Ok(());
             }
         }
         for (k, window) in windows.into_iter().enumerate() {
-            describe(&self.array, &self.instrument, window, passes.get(k), out);
+            send_window_header(&self.array, &self.instrument, window, passes.get(k), out);
             let visibilities = blocks.iter_mut().flat_map(|windows| windows.next().unwrap_or_default());
             let autos = powers.iter().flat_map(|(channel, powers)| {
-                let (shadow, pass) = (shadows.get(k), passes.get(k));
-                self.autos(WindowChannel { window, channel: *channel, powers: &powers[k], shadow, pass })
+                let (earth_occultation, pass) = (earth_occultations.get(k), passes.get(k));
+                self.autos(WindowChannel {
+                    window,
+                    channel: *channel,
+                    powers: &powers[k],
+                    earth_occultation,
+                    pass,
+                })
             });
             let blocks = visibilities.chain(autos).map(|mut block| {
                 if let Some(pass) = passes.get(k) {
@@ -250,30 +260,31 @@ impl Integrator {
         Ok(())
     }
 
-    /// The Earth's shadow in each window; none if it does not matter.
-    fn shadows(&self, windows: &[ObservingWindow]) -> Vec<EarthShadow> {
+    /// Occultations of the Earth in each window; empty if they are not needed.
+    fn earth_occultations(&self, windows: &[ObservingWindow]) -> Vec<EarthOccultation> {
         if !self.options.flag_earth {
             return Vec::new();
         }
-        windows.iter().map(|window| EarthShadow::new(&self.array, *window)).collect()
+        windows.iter().map(|window| EarthOccultation::new(&self.array, *window)).collect()
     }
 
-    /// The measurements of one channel, window by window and pair by pair.
+    /// Simulates one channel, window by window and pair by pair.
     fn channel_blocks(
         &mut self,
         queued: &[QueuedWindow],
         channel: usize,
         powers: &[SkyPowers],
-        (shadows, passes): (&[EarthShadow], &[PassErrors]),
+        (earth_occultations, passes): (&[EarthOccultation], &[PassErrors]),
     ) -> Result<Vec<Vec<VisibilityBlock>>, ModelError> {
         let scheduled: Vec<(WindowChannel, &PairSchedule)> = queued
             .iter()
             .zip(powers)
             .enumerate()
             .flat_map(|(k, (queued, powers))| {
-                let (window, shadow, pass) = (queued.window, shadows.get(k), passes.get(k));
+                let (window, earth_occultation, pass) =
+                    (queued.window, earth_occultations.get(k), passes.get(k));
                 let channel_id = ChannelId(channel as u16);
-                let context = WindowChannel { window, channel: channel_id, powers, shadow, pass };
+                let context = WindowChannel { window, channel: channel_id, powers, earth_occultation, pass };
                 queued.channels[channel].pairs.iter().map(move |pair| (context, pair))
             })
             .collect();
@@ -291,10 +302,12 @@ impl Integrator {
             parts.push(part);
             rest = after;
         }
-        let measure = |((context, pair), part): (&(WindowChannel, &PairSchedule), &&[Complex64])| {
-            self.measure(*context, pair, part)
-        };
-        let blocks: Vec<VisibilityBlock> = scheduled.par_iter().zip(&parts).map(measure).collect();
+        let add_noise_and_errors =
+            |((context, pair), part): (&(WindowChannel, &PairSchedule), &&[Complex64])| {
+                self.add_noise_and_errors(*context, pair, part)
+            };
+        let blocks: Vec<VisibilityBlock> =
+            scheduled.par_iter().zip(&parts).map(add_noise_and_errors).collect();
         let mut blocks = blocks.into_iter();
         let of_window =
             |queued: &QueuedWindow| blocks.by_ref().take(queued.channels[channel].pairs.len()).collect();
@@ -310,7 +323,7 @@ impl Integrator {
             let time_s = from.seconds() + 0.5 * dt_s;
             let smeared = self.options.smear_integrations;
             PairPosition {
-                at: Some((scheduled.pair, time_s)),
+                pair_time: Some((scheduled.pair, time_s)),
                 r_i_m: self.array.position_m(i.into(), time_s),
                 r_j_m: self.array.position_m(j.into(), time_s),
                 span_rad: if smeared { TAU * dt_s / self.array.orbital_period_s() } else { 0.0 },
@@ -319,8 +332,8 @@ impl Integrator {
         scheduled.integrations.iter().map(position).collect()
     }
 
-    /// Adds noise, weights and time tags to the model's predictions.
-    fn measure(
+    /// Adds errors, noise and weights to the model's predictions for a pair.
+    fn add_noise_and_errors(
         &self,
         context: WindowChannel,
         scheduled: &PairSchedule,
@@ -330,33 +343,36 @@ impl Integrator {
         let (pair, noise_model) = (scheduled.pair, &self.options.noise);
         let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
         let mut noise = noise_model.stream(window, channel, pair);
-        let mut troubles = self.troubles(context, pair);
+        let mut pair_errors = self.pair_errors(context, pair);
         let mut block = VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
         for (integration, prediction) in scheduled.integrations.iter().zip(predictions) {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
             let from = window.start.plus_ticks(i64::from(integration.offset_ticks));
             let middle_s = from.seconds() + 0.5 * dt_s;
-            let mut own = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
+            let mut sky_powers_k_sr = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
             let mut value = *prediction;
             let mut gain = Complex64::ONE;
-            if let Some(troubles) = &troubles {
-                let signals = troubles.signals(middle_s);
-                value += signals.visibility_k_sr;
-                own.iter_mut().zip(signals.powers_k_sr).for_each(|(own, power)| *own += power);
-                gain = troubles.gain(middle_s);
+            if let Some(pair_errors) = &pair_errors {
+                let interference = pair_errors.artificial_signals(middle_s);
+                value += interference.visibility_k_sr;
+                sky_powers_k_sr
+                    .iter_mut()
+                    .zip(interference.powers_k_sr)
+                    .for_each(|(total, power)| *total += power);
+                gain = pair_errors.gain(middle_s);
                 // A dead receiver delivers noise of the same power.
-                value = if troubles.is_dead() { Complex64::ZERO } else { value * gain };
+                value = if pair_errors.is_dead() { Complex64::ZERO } else { value * gain };
             }
-            let sigma = noise_model.sigma_k_sr(channel, own, width_hz, dt_s) * gain.norm();
+            let sigma = noise_model.sigma_k_sr(channel, sky_powers_k_sr, width_hz, dt_s) * gain.norm();
             if let Some(stream) = &mut noise {
                 let draw: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(stream));
                 value.re += sigma * draw[0];
                 value.im += sigma * draw[1];
             }
             let mut flags = context.flags(pair, from, integration.duration_ticks);
-            if let Some(troubles) = &mut troubles {
-                value += sigma * troubles.outlier();
-                if troubles.beacon_is_on(middle_s) {
+            if let Some(pair_errors) = &mut pair_errors {
+                value += sigma * pair_errors.outlier();
+                if pair_errors.beacon_is_on(middle_s) {
                     flags.0 |= Flags::BEACON.0;
                 }
             }
@@ -369,11 +385,11 @@ impl Integrator {
         block
     }
 
-    /// What is wrong with a pair, if anything is.
-    fn troubles<'a>(&'a self, context: WindowChannel<'a>, pair: Pair) -> Option<PairTroubles<'a>> {
+    /// Instrument errors of a pair in a window; `None` for an ideal instrument.
+    fn pair_errors<'a>(&'a self, context: WindowChannel<'a>, pair: Pair) -> Option<PairErrors<'a>> {
         let (errors, pass) = (self.errors.as_deref()?, context.pass?);
         let channel = usize::from(context.channel.0);
-        Some(PairTroubles {
+        Some(PairErrors {
             errors,
             pass,
             array: &self.array,
@@ -398,7 +414,7 @@ impl Integrator {
         let block = |n: u8| {
             let pair = Pair { i: n, j: n };
             let mut noise = noise_model.stream(window, channel, pair);
-            let troubles = self.troubles(context, pair);
+            let pair_errors = self.pair_errors(context, pair);
             let mut block =
                 VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
             for offset in (0..length).step_by(step as usize) {
@@ -409,10 +425,10 @@ impl Integrator {
                 let mut expected_k_sr =
                     noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
                 let mut flags = context.flags(pair, from, duration);
-                if let Some(troubles) = &troubles {
-                    expected_k_sr += troubles.signals(middle_s).powers_k_sr[0];
-                    expected_k_sr *= troubles.gain(middle_s).norm();
-                    if troubles.beacon_is_on(middle_s) {
+                if let Some(pair_errors) = &pair_errors {
+                    expected_k_sr += pair_errors.artificial_signals(middle_s).powers_k_sr[0];
+                    expected_k_sr *= pair_errors.gain(middle_s).norm();
+                    if pair_errors.beacon_is_on(middle_s) {
                         flags.0 |= Flags::BEACON.0;
                     }
                 }
@@ -436,14 +452,14 @@ impl Integrator {
     }
 }
 
-/// A random mean of |x|^2 over `samples` samples of a complex Gaussian of unit power.
+/// Draws a mean of |x|^2 over `samples` samples of a complex Gaussian of unit power.
 fn mean_square(samples: f64, stream: &mut impl rand::Rng) -> f64 {
     // The distribution exists for any positive shape and scale.
     Gamma::new(samples, samples.recip()).map_or(1.0, |gamma| gamma.sample(stream))
 }
 
-/// Begins a window: what the spacecraft says of the instrument, and where its daughters are.
-pub(super) fn describe(
+/// Sends the instrument description and the ephemeris of a window.
+pub(super) fn send_window_header(
     array: &Array,
     instrument: &Instrument,
     window: ObservingWindow,
@@ -451,21 +467,22 @@ pub(super) fn describe(
     out: &mut Outlet<GroundFrame>,
 ) {
     out.push(GroundFrame::Instrument(instrument.clone()));
-    for segment in positions_said(array, window, pass) {
+    for segment in reported_ephemeris(array, window, pass) {
         out.push(GroundFrame::Ephemeris(segment));
     }
 }
 
-/// The ephemeris of a window as packets say it; beyond the window where time tags may lie outside it.
-pub(super) fn positions_said(
+/// Ephemeris of a window as reported in packets, with navigation errors. It extends beyond the window if time tags
+/// may lie outside.
+pub(super) fn reported_ephemeris(
     array: &Array,
     window: ObservingWindow,
     pass: Option<&PassErrors>,
 ) -> Vec<EphemerisSegment> {
-    let reach_s = pass.map_or(0.0, PassErrors::reach_s);
-    let reach = MissionTime::from_seconds(reach_s).0;
-    let (mut from, mut until) = (window.start.plus_ticks(-reach), window.end.plus_ticks(reach));
-    if let Some([from_s, until_s]) = array.known_s().filter(|_| reach > 0) {
+    let tag_error_max_s = pass.map_or(0.0, PassErrors::tag_error_max_s);
+    let margin_ticks = MissionTime::from_seconds(tag_error_max_s).0;
+    let (mut from, mut until) = (window.start.plus_ticks(-margin_ticks), window.end.plus_ticks(margin_ticks));
+    if let Some([from_s, until_s]) = array.known_s().filter(|_| margin_ticks > 0) {
         from = from.max(MissionTime::from_seconds(from_s).plus_ticks(1)).min(window.start);
         until = until.min(MissionTime::from_seconds(until_s).plus_ticks(-1)).max(window.end);
     }
@@ -476,7 +493,8 @@ pub(super) fn positions_said(
     segments
 }
 
-/// Sends the visibilities of a window and closes it; returns their number. `sampled` is that of all windows before.
+/// Sends the visibilities of a window and closes it; returns their number. `sampled` is the total of all earlier
+/// windows.
 pub(super) fn send_window(
     blocks: impl Iterator<Item = VisibilityBlock>,
     window: ObservingWindow,
@@ -501,11 +519,11 @@ impl Stage for Integrator {
     fn step(&mut self, window: ObservingWindow, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         let scheduled = self.schedule(window);
         self.queued.push(scheduled);
-        if self.batch_is_full() { self.measure_queue(out) } else { Ok(()) }
+        if self.batch_is_full() { self.simulate_queue(out) } else { Ok(()) }
     }
 
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
-        self.measure_queue(out)
+        self.simulate_queue(out)
     }
 
     fn units(&self) -> Units {

@@ -1,14 +1,14 @@
 //! The mother: integration of visibilities while the Moon hides the Earth, and the onboard store that holds them until
 //! the Earth is in sight.
 //!
-//! The space segment has two fidelities with the same output frames. [`Integrator`] simulates integrated visibilities:
-//! the prediction of a model plus thermal noise. [`correlator`] computes them from the samples of [`crate::daughters`].
-//! Where memory has no room for the models of all channels, integrators of groups of them leave their visibilities on disk
-//! ([`SpoolWriter`]), and a [`Merger`] makes the frames. [`Ninth`] adds the spectra of a ninth daughter, [`Store`] buffers the frames until a pass.
+//! The space segment has two fidelities with the same output frames. [`Integrator`] simulates integrated
+//! visibilities: the prediction of a model plus thermal noise and errors. [`correlator`] computes them from the
+//! samples of [`crate::daughters`]. If the models of all channels do not fit into memory, they are simulated in
+//! groups: [`SpoolWriter`] writes the visibilities of a group to disk, and a [`Merger`] combines the groups.
+//! [`Ninth`] adds the spectra of a ninth daughter. [`Store`] buffers the frames until a pass.
 //!
-//! May use [`crate::frames`], [`crate::array`], [`crate::response`], [`crate::daughters`] and [`crate::runtime`].
-//! Only the frames in [`crate::frames`] leave this folder, and only bytes in [`crate::downlink`] reach the ground. The
-//! store drops nothing silently: what it drops is counted in the housekeeping frame.
+//! Only the frames in [`crate::frames`] leave this folder, and only bytes in [`crate::downlink`] reach the ground.
+//! The housekeeping frame counts what the store drops.
 
 mod config;
 pub mod correlator;
@@ -16,6 +16,7 @@ mod integrator;
 mod merger;
 mod ninth;
 mod observer;
+mod pair_errors;
 mod powers;
 mod receiver;
 mod schedule;
@@ -23,7 +24,6 @@ mod sizes;
 mod spool;
 mod store;
 mod thinning;
-mod troubles;
 
 pub use config::{
     Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, MoonMirror, SpacecraftConfig, StoreDrop,

@@ -1,4 +1,4 @@
-//! The ninth daughter: a spectrometer for the whole sky from 30 to 120 MHz, which measures the monopole there.
+//! Ninth daughter: a spectrometer for the whole sky from 30 to 120 MHz, which measures the monopole.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::sizes::VISIBILITY_BYTES;
 use crate::array::Array;
 use crate::frames::{Flags, GroundFrame, Housekeeping, ObservingWindow, Spectrometer, VisibilityBlock};
-use crate::numerics::lagrange;
+use crate::numerics::lagrange_weights;
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::{
@@ -18,7 +18,8 @@ use crate::units::{
 /// Lowest and highest frequency that a ninth daughter may observe, Hz.
 pub const NINTH_BAND_HZ: [f64; 2] = [30e6, 120e6];
 
-/// Smallest number of samples of an integration (width x time): noise is treated as Gaussian, and its skewness is 2 % then.
+/// Minimum number of samples of an integration (width x time): the noise is modelled as Gaussian, and its true
+/// skewness is then 2 %.
 const SAMPLES_MIN: f64 = 1e4;
 
 keys! {
@@ -48,7 +49,7 @@ keys! {
 }
 
 impl NinthConfig {
-    /// The spectrometer for the instrument description, if there is a ninth daughter.
+    /// The spectrometer in the instrument description; `None` without a ninth daughter.
     #[must_use]
     pub fn spectrometer(&self) -> Option<Spectrometer> {
         let [low_hz, high_hz] = self.band_hz;
@@ -61,10 +62,10 @@ impl NinthConfig {
     /// All problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         let [low_hz, high_hz] = self.band_hz;
-        let inside = NINTH_BAND_HZ[0] <= low_hz && low_hz < high_hz && high_hz <= NINTH_BAND_HZ[1];
-        checks.number("ninth.band_hz", high_hz, inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
+        let is_inside = NINTH_BAND_HZ[0] <= low_hz && low_hz < high_hz && high_hz <= NINTH_BAND_HZ[1];
+        checks.number("ninth.band_hz", high_hz, is_inside, "two frequencies, rising, from 30e6 to 120e6 Hz");
         let channels = self.channels;
         checks.number("ninth.channels", channels as f64, (1..=1024).contains(&channels), "1 to 1024");
         let length_s = self.integration_s;
@@ -75,12 +76,12 @@ impl NinthConfig {
             "0.001 s to 1000 s",
         );
         let samples = (high_hz - low_hz) / channels.max(1) as f64 * length_s;
-        let many = samples >= SAMPLES_MIN || !inside;
+        let is_sufficient = samples >= SAMPLES_MIN || !is_inside;
         checks.number(
             "ninth.integration_s",
             length_s,
-            many,
-            "1e4 samples or more: so much over a channel's width, Hz",
+            is_sufficient,
+            "at least 1e4 samples: 1e4 / (width of a channel in Hz) seconds or more",
         );
         let noise = self.receiver_noise_k_sr;
         checks.number("ninth.receiver_noise_k_sr", noise, noise >= 0.0, "K sr, not negative");
@@ -100,7 +101,7 @@ impl NinthConfig {
     }
 }
 
-/// The sky over a band of frequencies, as one daughter receives it.
+/// Sky over a band of frequencies, as one daughter receives it.
 pub enum NinthSky {
     /// One map whose temperatures follow a power law in frequency.
     PowerLaw {
@@ -111,7 +112,7 @@ pub enum NinthSky {
         /// Spectral index.
         index: f64,
     },
-    /// Maps at ascending frequencies, Hz; between them log power is a polynomial in log frequency.
+    /// Maps at increasing frequencies, Hz, between which log power is a polynomial in log frequency.
     Maps(Vec<(f64, DirectSum)>),
 }
 
@@ -131,33 +132,40 @@ impl NinthSky {
     /// Powers (K sr) by position, then by frequency.
     ///
     /// # Errors
-    /// [`ModelError`], for positions that a model does not cover.
+    /// A model does not cover the positions.
     pub fn powers(
         &mut self,
-        places: &[DaughterPosition],
+        positions: &[DaughterPosition],
         frequencies_hz: &[f64],
     ) -> Result<Vec<Vec<f64>>, ModelError> {
         match self {
             Self::PowerLaw { model, frequency_hz, index } => {
-                let mut powers = vec![0.0; places.len()];
-                model.predict_powers(places, &mut powers)?;
+                let mut powers = vec![0.0; positions.len()];
+                model.predict_powers(positions, &mut powers)?;
                 let factors: Vec<f64> =
                     frequencies_hz.iter().map(|at_hz| (at_hz / *frequency_hz).powf(*index)).collect();
                 let scaled = |power: f64| factors.iter().map(|factor| power * factor).collect();
                 Ok(powers.into_iter().map(scaled).collect())
             }
             Self::Maps(maps) => {
-                let mut found = vec![vec![0.0; places.len()]; maps.len()];
-                for ((_, model), powers) in maps.iter_mut().zip(&mut found) {
-                    model.predict_powers(places, powers)?;
+                let mut map_powers = vec![vec![0.0; positions.len()]; maps.len()];
+                for ((_, model), powers) in maps.iter_mut().zip(&mut map_powers) {
+                    model.predict_powers(positions, powers)?;
                 }
                 let nodes: Vec<f64> = maps.iter().map(|(frequency_hz, _)| frequency_hz.ln()).collect();
                 let weights: Vec<Vec<f64>> =
-                    frequencies_hz.iter().map(|at_hz| lagrange(&nodes, at_hz.ln())).collect();
-                let at = |place: usize, weights: &Vec<f64>| {
-                    weights.iter().zip(&found).map(|(w, powers)| w * powers[place].ln()).sum::<f64>().exp()
+                    frequencies_hz.iter().map(|at_hz| lagrange_weights(&nodes, at_hz.ln())).collect();
+                let at = |position: usize, weights: &Vec<f64>| {
+                    weights
+                        .iter()
+                        .zip(&map_powers)
+                        .map(|(w, powers)| w * powers[position].ln())
+                        .sum::<f64>()
+                        .exp()
                 };
-                Ok((0..places.len()).map(|place| weights.iter().map(|w| at(place, w)).collect()).collect())
+                Ok((0..positions.len())
+                    .map(|position| weights.iter().map(|w| at(position, w)).collect())
+                    .collect())
             }
         }
     }
@@ -165,43 +173,45 @@ impl NinthSky {
 
 /// Setup of [`Ninth`].
 pub struct NinthSetup {
-    /// The array whose orbit it shares.
+    /// The array, whose orbit the daughter shares.
     pub array: Arc<Array>,
-    /// Its settings.
+    /// Settings of the daughter.
     pub config: NinthConfig,
-    /// The sky that it receives.
+    /// The sky that the daughter receives.
     pub sky: NinthSky,
-    /// Windows in which it observes, in the order of time.
+    /// Windows of observation, in the order of time.
     pub windows: Vec<ObservingWindow>,
-    /// Seed of its noise; `None` adds none.
+    /// Seed of the noise; `None` for no noise.
     pub seed: Option<u64>,
 }
 
-/// Passes frames through, and inserts the ninth daughter's spectra of each window before the frame that closes it.
+/// Forwards frames, and inserts the ninth daughter's spectra of each window before the frame that closes it.
 ///
-/// A power is that of sky and receiver at the middle of an integration, with noise of P / sqrt(dnu dt) (the radiometer
-/// equation of one receiver); its weight is dnu dt / P^2 with the measured power. Integrations are contiguous from the
-/// start of a window, the last one cut at the end; a remainder of less than 1e4 samples is added to the integration
-/// before it, or omitted if there is none.
+/// Each power is that of sky plus receiver at the middle of an integration, with noise of P / sqrt(dnu dt) (the
+/// radiometer equation of one receiver). Its weight is dnu dt / P^2 with the measured power. Integrations are
+/// contiguous from the start of a window, the last one cut at its end. A remainder of fewer than 1e4 samples is added
+/// to the preceding integration, or omitted if there is none.
 pub struct Ninth {
     setup: NinthSetup,
     spectrometer: Spectrometer,
     windows: std::iter::Peekable<std::vec::IntoIter<ObservingWindow>>,
-    /// Numbers of channels and of satellites in the instrument; those of the ninth daughter follow them.
-    offset: (usize, u8),
+    /// Number of channels of the array: index of the first channel of the spectrum.
+    first_channel: usize,
+    /// Number of daughters of the array: index of the ninth daughter.
+    satellite: u8,
     sampled: u64,
 }
 
 impl Ninth {
-    /// The ninth daughter of a setup; `None` if the configuration has none.
+    /// Creates the ninth daughter of a setup; `None` if the configuration has none.
     #[must_use]
     pub fn new(mut setup: NinthSetup) -> Option<Self> {
         let windows = std::mem::take(&mut setup.windows).into_iter().peekable();
         let spectrometer = setup.config.spectrometer()?;
-        Some(Self { setup, spectrometer, windows, offset: (0, 0), sampled: 0 })
+        Some(Self { setup, spectrometer, windows, first_channel: 0, satellite: 0, sampled: 0 })
     }
 
-    /// The spectra of a window, channel by channel.
+    /// Spectra of a window, by channel.
     fn spectra(&mut self, window: ObservingWindow) -> Result<Vec<VisibilityBlock>, ModelError> {
         let config = &self.setup.config;
         let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
@@ -211,9 +221,11 @@ impl Ninth {
         let samples = |duration: u32| self.spectrometer.width_hz * f64::from(duration) * 1e-6;
         if let Some(rest) = durations.pop_if(|duration| samples(*duration) < SAMPLES_MIN) {
             offsets.pop();
-            durations.last_mut().into_iter().for_each(|last| *last += rest);
+            if let Some(last) = durations.last_mut() {
+                *last += rest;
+            }
         }
-        let place = |(offset, duration): (&u32, &u32)| {
+        let position = |(offset, duration): (&u32, &u32)| {
             let middle = f64::from(*offset) + 0.5 * f64::from(*duration);
             let t_s = window.start.seconds() + middle / TICKS_PER_SECOND as f64;
             let r_m = self.setup.array.trailing_m(config.arc_m, t_s);
@@ -223,11 +235,11 @@ impl Ninth {
                 ..DaughterPosition::default()
             }
         };
-        let places: Vec<DaughterPosition> = offsets.iter().zip(&durations).map(place).collect();
+        let positions: Vec<DaughterPosition> = offsets.iter().zip(&durations).map(position).collect();
         let channels: Vec<_> = self.spectrometer.channels().collect();
         let frequencies_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
-        let powers = self.setup.sky.powers(&places, &frequencies_hz)?;
-        let (first, satellite) = self.offset;
+        let powers = self.setup.sky.powers(&positions, &frequencies_hz)?;
+        let (first, satellite) = (self.first_channel, self.satellite);
         let blocks = channels.iter().enumerate().map(|(k, channel)| {
             let mut noise = self
                 .setup
@@ -263,7 +275,7 @@ impl Stage for Ninth {
     fn step(&mut self, frame: GroundFrame, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
         match frame {
             GroundFrame::Instrument(instrument) => {
-                self.offset = (instrument.channels.len(), instrument.satellites);
+                (self.first_channel, self.satellite) = (instrument.channels.len(), instrument.satellites);
                 out.push(GroundFrame::Instrument(instrument));
             }
             GroundFrame::Housekeeping(report) => {

@@ -1,4 +1,4 @@
-//! The source of the space segment in visibility fidelity: the observing windows.
+//! Source of observing windows, for the space segment in visibility fidelity.
 
 use super::thinning::WindowThinning;
 use crate::array::{Array, ObservingWindows};
@@ -12,13 +12,13 @@ pub struct Observer {
 }
 
 impl Observer {
-    /// A source of `windows`.
+    /// Creates a source of `windows`.
     #[must_use]
     pub fn new(windows: Vec<ObservingWindow>) -> Self {
         Self { windows: windows.into_iter() }
     }
 
-    /// The windows of `array` from the epoch to `duration_s` that `thinning` keeps, in the order of time.
+    /// Windows of `array` from the epoch to `duration_s` that `thinning` keeps, in the order of time.
     #[must_use]
     pub fn windows(array: &Array, duration_s: f64, thinning: WindowThinning) -> Vec<ObservingWindow> {
         ObservingWindows::new(array, 0.0, duration_s).filter(|window| thinning.keeps(window.index)).collect()

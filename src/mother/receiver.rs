@@ -1,10 +1,10 @@
-//! The noise of the receivers, channel by channel.
+//! Noise of the receivers, by channel.
 
 use serde::{Deserialize, Serialize};
 
 use crate::units::{Checks, PerChannel};
 
-/// Most points of a table of receiver noise.
+/// Maximum number of points of a table of receiver noise.
 const POINTS_MAX: usize = 1000;
 
 /// Receiver noise T_rec / zeta, referred to the sky, K sr.
@@ -16,7 +16,7 @@ const POINTS_MAX: usize = 1000;
 pub enum ReceiverNoise {
     /// One value, or one for each channel.
     Channels(PerChannel<f64>),
-    /// Points `[frequency_hz, k_sr]` at rising frequencies; linear between them in the logarithms of both.
+    /// Points `[frequency_hz, k_sr]` at increasing frequencies, interpolated linearly in the logarithms of both.
     Table(Vec<[f64; 2]>),
 }
 
@@ -27,7 +27,7 @@ impl Default for ReceiverNoise {
 }
 
 impl ReceiverNoise {
-    /// The value for `channel` at its frequency, K sr; `None` where there is none.
+    /// Noise of `channel` at its frequency, K sr; `None` if it is not specified.
     #[must_use]
     pub fn at(&self, channel: usize, frequency_hz: f64) -> Option<f64> {
         match self {
@@ -39,8 +39,8 @@ impl ReceiverNoise {
                     return Some(high_k_sr);
                 }
                 let [low_hz, low_k_sr] = points[upper.checked_sub(1)?];
-                let part = (frequency_hz / low_hz).ln() / (high_hz / low_hz).ln();
-                Some(low_k_sr * (high_k_sr / low_k_sr).powf(part))
+                let fraction = (frequency_hz / low_hz).ln() / (high_hz / low_hz).ln();
+                Some(low_k_sr * (high_k_sr / low_k_sr).powf(fraction))
             }
         }
     }
@@ -55,17 +55,18 @@ impl ReceiverNoise {
             Self::Table(points) => points,
         };
         let count = points.len();
-        let some = (2..=POINTS_MAX).contains(&count);
-        checks.require(key, format!("({count} points)"), some, format!("2 to {POINTS_MAX} points"));
-        let good = |[hz, k_sr]: &[f64; 2]| hz.is_finite() && k_sr.is_finite() && *hz > 0.0 && *k_sr > 0.0;
-        if let Some(bad) = points.iter().position(|point| !good(point)) {
+        let is_accepted = (2..=POINTS_MAX).contains(&count);
+        checks.require(key, format!("({count} points)"), is_accepted, format!("2 to {POINTS_MAX} points"));
+        let is_positive =
+            |[hz, k_sr]: &[f64; 2]| hz.is_finite() && k_sr.is_finite() && *hz > 0.0 && *k_sr > 0.0;
+        if let Some(bad) = points.iter().position(|point| !is_positive(point)) {
             let expected = "[frequency, K sr], both above 0 as their logarithms are interpolated";
             checks.require(format!("{key}[{bad}]"), format!("{:?}", points[bad]), false, expected);
             return;
         }
-        if let Some(before) = points.windows(2).position(|pair| pair[0][0] >= pair[1][0]) {
-            let (bad, low_hz) = (before + 1, points[before][0]);
-            let expected = format!("a frequency above that of the point before, {low_hz} Hz");
+        if let Some(preceding) = points.windows(2).position(|pair| pair[0][0] >= pair[1][0]) {
+            let (bad, low_hz) = (preceding + 1, points[preceding][0]);
+            let expected = format!("a frequency above that of the preceding point, {low_hz} Hz");
             checks.require(format!("{key}[{bad}]"), format!("{:?}", points[bad]), false, expected);
             return;
         }
@@ -77,20 +78,20 @@ impl ReceiverNoise {
     }
 }
 
-/// Requires one value, or one for each channel, none negative, K sr.
+/// Checks that there is one value, or one for each channel, and that none is negative.
 pub(super) fn check_channels(key: &str, values: &PerChannel<f64>, channels: usize, checks: &mut Checks) {
     let expected = format!("a single value, or a list of one for each of the {channels} channels");
     checks.require(key, format!("({} values)", values.values().len()), values.fits(channels), expected);
     checks.numbers(key, values.values(), |k_sr| k_sr >= 0.0, "K sr, not negative");
 }
 
-/// Whether a number is 0: keys that came later are left out of hashes while they change nothing.
+/// Whether a number is 0. Keys that were added later are left out of hashes while they have no effect.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 pub(super) fn is_zero(value: &f64) -> bool {
     *value == 0.0
 }
 
-/// Whether all channels have 0, as [`is_zero`].
+/// Whether all channels have 0, see [`is_zero`].
 pub(super) fn is_none(values: &PerChannel<f64>) -> bool {
     *values == PerChannel::All(0.0)
 }
@@ -99,13 +100,13 @@ pub(super) fn is_none(values: &PerChannel<f64>) -> bool {
 mod tests {
     use crate::mother::SpacecraftConfig;
 
-    fn told(lines: &str) -> Vec<String> {
+    fn problems_of(lines: &str) -> Vec<String> {
         let config: SpacecraftConfig = toml::from_str(lines).unwrap();
         config.problems().iter().map(ToString::to_string).collect()
     }
 
     #[test]
-    fn tables_are_lines_in_the_logarithms() {
+    fn tables_are_interpolated_in_the_logarithms() {
         let table: SpacecraftConfig = toml::from_str(
             "channels_hz = [1e6, 2e6, 10e6, 17320508.0, 30e6]\nreceiver_noise_k_sr = [[1e6, 2e4], [10e6, 300], [30e6, 100.0]]",
         )
@@ -129,7 +130,7 @@ mod tests {
         assert_eq!(config.receiver_k_sr(), [307.0, 57.0]);
         let usual = SpacecraftConfig { channels_hz: vec![1e6, 10e6], ..SpacecraftConfig::default() };
         assert_eq!(usual.receiver_k_sr(), [0.0, 0.0]);
-        // Provenance of what was made before these keys does not change.
+        // The provenance of data made before these keys existed does not change.
         let text = toml::to_string(&usual).unwrap();
         assert!(text.contains("receiver_noise_k_sr = 0.0\n"), "{text}");
         assert!(
@@ -142,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_noise_is_refused_by_name() {
+    fn invalid_noise_is_refused_with_its_key() {
         for (line, expected) in [
             ("receiver_noise_k_sr = -1.0", "receiver_noise_k_sr = -1: expected K sr, not negative"),
             (
@@ -173,11 +174,11 @@ mod tests {
             ("interference_floor_k_sr = [1.0]", "interference_floor_k_sr = (1 values): expected one value"),
             ("interference_floor_k_sr = inf", "interference_floor_k_sr = inf: expected K sr, not negative"),
         ] {
-            let found = told(&format!("channels_hz = [5e6, 10e6]\n{line}"));
+            let found = problems_of(&format!("channels_hz = [5e6, 10e6]\n{line}"));
             let expected = format!("spacecraft.{expected}");
             assert!(found.iter().any(|text| text.starts_with(&expected)), "{line}: {found:?}");
         }
         let table = "channels_hz = [10e6, 1e6]\nreceiver_noise_k_sr = [[9e6, 2e4], [30e6, 1.0]]";
-        assert!(told(table)[0].contains("covers channels_hz[1] = 1000000"));
+        assert!(problems_of(table)[0].contains("covers channels_hz[1] = 1000000"));
     }
 }

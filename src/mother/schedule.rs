@@ -1,4 +1,4 @@
-//! The integrations of a window.
+//! Division of windows into integrations.
 
 use super::thinning::WindowThinning;
 use crate::array::{Array, IntegrationRule, integration_time_s};
@@ -8,7 +8,7 @@ use crate::units::{Pair, TICKS_PER_SECOND};
 
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// One integration: start relative to the window's start, and duration, us.
+/// An integration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Integration {
     /// Start, us after the window's start.
@@ -17,18 +17,18 @@ pub struct Integration {
     pub duration_ticks: u32,
 }
 
-/// The rule that divides windows into integrations, for one channel.
+/// Rule that divides windows into integrations, for one channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Schedule {
-    /// Rule of the adaptive integration.
+    /// Rule of the integration time.
     pub rule: IntegrationRule,
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Longest baseline, wavelengths; 0 for no limit.
+    /// Maximum baseline, wavelengths; 0 for no limit.
     pub baseline_wavelengths_max: f64,
-    /// Keep only every n-th integration.
+    /// Stride of kept integrations.
     pub every_nth: u64,
-    /// Which windows are observed; keeps the two kinds of thinning from running in step.
+    /// Selection of windows, by which the choice of integrations varies from window to window.
     pub windows: WindowThinning,
 }
 
@@ -49,26 +49,26 @@ impl Schedule {
         }
         let mut found = Vec::new();
         let mut offset_ticks = 0;
-        let mut number = self.windows.first_integration(window.index, self.every_nth);
+        let mut index = self.windows.first_integration(window.index, self.every_nth);
         while offset_ticks < length_ticks {
             let t_s = window.start.plus_ticks(i64::from(offset_ticks)).seconds();
             let (i, j) = (array.state(pair.i.into(), t_s), array.state(pair.j.into(), t_s));
             let dt_s = integration_time_s(self.rule, self.frequency_hz, i.velocity_m_s, j.velocity_m_s);
-            // At least one tick, so that the loop ends whatever the rule says.
+            // At least one tick, so that the loop ends with any rule.
             let dt_ticks = ((dt_s * TICKS_PER_SECOND as f64) as u32).max(1);
             let duration_ticks = dt_ticks.min(length_ticks - offset_ticks);
-            let near_enough = norm(sub(i.position_m, j.position_m)) < longest_m;
-            if near_enough && number.is_multiple_of(self.every_nth) {
+            let is_in_range = norm(sub(i.position_m, j.position_m)) < longest_m;
+            if is_in_range && index.is_multiple_of(self.every_nth) {
                 found.push(Integration { offset_ticks, duration_ticks });
             }
             offset_ticks += duration_ticks;
-            number += 1;
+            index += 1;
         }
         found
     }
 
-    /// Estimated number of integrations that [`Self::integrations`] gives, and the baseline's length, m; both
-    /// evaluated at the window's middle.
+    /// Estimated number of integrations in a window, and the baseline's length, m; both evaluated at the window's
+    /// middle.
     #[must_use]
     pub fn estimate(&self, array: &Array, window: ObservingWindow, pair: Pair) -> (f64, f64) {
         let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
@@ -84,10 +84,10 @@ impl Schedule {
     }
 }
 
-/// Shortest length of a pair's baseline in a window, m. A chord depends only on the daughters' arcs, which are linear in
-/// time between turnarounds, so it is shortest at an end of the window or at a turnaround.
+/// Shortest baseline of a pair in a window, m. A chord depends only on the daughters' arcs, which are linear in time
+/// between turnarounds, so it is shortest at an end of the window or at a turnaround.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
-    // Ellipses give no bound.
+    // Elliptic orbits give no bound.
     let Some(formation) = array.formation() else { return 0.0 };
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
     let length_m =
@@ -95,7 +95,7 @@ fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     let next = |t_s: &f64| Some(formation.next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
     let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
     let shortest = instants.chain([end_s]).map(length_m).fold(f64::INFINITY, f64::min);
-    // No bound for a formation with more turnarounds than that.
+    // There is no bound for a formation with more turnarounds.
     if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * formation.period_s() {
         return 0.0;
     }
@@ -138,7 +138,7 @@ mod tests {
                 };
                 let until = from + f64::from(*duration_ticks) * 1e-6;
                 let moved_m = norm(sub(baseline(until), baseline(from)));
-                // A chord of the motion is at most its path; lambda / 8 at 10 MHz.
+                // The motion's chord is at most its path, lambda / 8 at 10 MHz.
                 assert!(moved_m <= 0.125 * SPEED_OF_LIGHT_M_S / 10e6 * (1.0 + 1e-6), "{pair}: {moved_m} m");
             }
             assert_eq!(i64::from(expected), window.end.0 - window.start.0);
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn long_baselines_are_left_out_exactly() {
+    fn baselines_beyond_the_limit_are_left_out() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         for window in ObservingWindows::new(&array, 0.0, 15.0 * 86_400.0).step_by(7) {
             for pair in all_pairs(8) {
@@ -169,7 +169,8 @@ mod tests {
         for pair in all_pairs(5) {
             let count = schedule(0.0, 1).integrations(&array, window, pair).len() as f64;
             let (estimate, _) = schedule(0.0, 1).estimate(&array, window, pair);
-            // Rounding to whole integrations, and a baseline that changes by less than 1 % in a window.
+            // The estimate neglects rounding to whole integrations, and the change of the baseline in a window, below
+            // 1 %.
             assert!((count - estimate).abs() <= 1.0 + 0.01 * count, "{pair}: {count} {estimate}");
         }
     }

@@ -1,15 +1,16 @@
-//! Visibilities of some channels on disk, window by window: a simulation of more channels than memory has room for leaves them
-//! group by group, and [`Merger`](super::Merger) makes of them the frames of all.
+//! Spool files: visibilities of a group of channels on disk, window by window. A simulation of more channels than fit
+//! into memory writes one for each group, and [`Merger`](super::Merger) combines them.
 //!
 //! | field | bytes |
 //! |---|---|
 //! | magic, `LNRSPOOL` | 8 |
 //! | version, u16 | 2 |
-//! | key of what it was made from, u64 | 8 |
-//! | windows: length u32, blocks, CRC-32C u32 | as many as there are |
+//! | key of the inputs, u64 | 8 |
+//! | for each window: length u32, blocks, CRC-32C u32 | variable |
 //!
-//! A block: channel u16, pair 2 u8, start i64, number u32, and as many of each: offset u32, duration u32, real and imaginary part
-//! f32, weight f32, flags u8. All numbers are little-endian. A file that has its name is whole.
+//! A block: channel u16, pair 2 u8, start i64, number of visibilities u32, and for each of them: offset u32, duration
+//! u32, real and imaginary part f32, weight f32, flags u8. All numbers are little-endian. A file gets its final name
+//! once it is complete.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -26,54 +27,54 @@ use crate::units::{ChannelId, MissionTime, Pair};
 
 const MAGIC: &[u8; 8] = b"LNRSPOOL";
 const VERSION: u16 = 1;
-/// Bytes before the number of a block's visibilities.
+/// Size of a block's header before the number of its visibilities, bytes.
 const BLOCK_HEAD: usize = 12;
-/// Bytes of a visibility.
+/// Size of a visibility, bytes.
 const VISIBILITY: usize = 21;
 
-/// Why visibilities could not be put aside, or read back.
+/// Error of a spool file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SpoolError {
-    /// The system's reason.
+    /// The file cannot be accessed.
     #[error("{}: {source}", path.display())]
     File {
-        /// Path.
+        /// The file.
         path: PathBuf,
-        /// Reason.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// Bytes that are not what was written.
+    /// The bytes are not those that were written.
     #[error("{}: damaged at byte {at}: {found}; expected {expected}. Remove the file and repeat the command", path.display())]
     Damaged {
-        /// Path.
+        /// The file.
         path: PathBuf,
-        /// Place.
+        /// Position, bytes.
         at: u64,
-        /// What is there.
+        /// What was found.
         found: String,
         /// What was expected.
         expected: &'static str,
     },
 }
 
-/// Writes the visibilities of frames, and no others; a housekeeping frame ends a window.
+/// Writes the visibilities of frames; a housekeeping frame ends a window.
 #[derive(Debug)]
 pub struct SpoolWriter {
     path: PathBuf,
     /// `None` once finished.
     file: Option<AtomicFile>,
-    /// Windows that are still to come.
+    /// Number of windows still to be written.
     left: usize,
     window: Vec<u8>,
     written: u64,
 }
 
 impl SpoolWriter {
-    /// A file of the visibilities of `windows` windows, with this key. It takes its name once it is complete.
+    /// Creates a file for the visibilities of `windows` windows, with this key. It gets its name once it is complete.
     ///
     /// # Errors
-    /// A file that cannot be created.
+    /// The file cannot be created.
     pub fn create(path: &Path, key: u64, windows: usize) -> Result<Self, SpoolError> {
         let failed = |source| SpoolError::File { path: path.to_owned(), source };
         let mut file = AtomicFile::create(path, IfUnfinished::Remove).map_err(failed)?;
@@ -87,7 +88,7 @@ impl SpoolWriter {
         out.extend(block.channel.0.to_le_bytes());
         out.extend([block.pair.i, block.pair.j]);
         out.extend(block.start.0.to_le_bytes());
-        // Far fewer fit into a window.
+        // A window has far fewer visibilities.
         out.extend((block.len() as u32).to_le_bytes());
         out.extend(block.offset_ticks.iter().flat_map(|x| x.to_le_bytes()));
         out.extend(block.duration_ticks.iter().flat_map(|x| x.to_le_bytes()));
@@ -121,14 +122,14 @@ impl Sink for SpoolWriter {
         match frame {
             GroundFrame::Visibilities(block) => self.put(&block),
             GroundFrame::Housekeeping(_) => self.end_window()?,
-            // The merger makes its own.
+            // The merger makes these frames itself.
             GroundFrame::Instrument(_) | GroundFrame::Ephemeris(_) => {}
         }
         Ok(())
     }
 
     fn finish(&mut self) -> Result<(), SpoolError> {
-        // Of a run that was cancelled nothing stays.
+        // An incomplete file of a cancelled run is removed.
         let Some(file) = self.file.take().filter(|_| self.left == 0) else { return Ok(()) };
         let finished = file.finish();
         finished.map(drop).map_err(|source| SpoolError::File { path: self.path.clone(), source })
@@ -209,7 +210,7 @@ impl SpoolReader {
     }
 }
 
-/// The blocks of a window's bytes; `None` if they end within one.
+/// Parses the blocks of a window; `None` if the last one is incomplete.
 fn blocks(mut rest: &[u8]) -> Option<Vec<VisibilityBlock>> {
     let mut found = Vec::new();
     while !rest.is_empty() {

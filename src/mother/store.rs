@@ -1,4 +1,4 @@
-//! The onboard store: holds data until the Earth is in sight, and releases them as fast as the link allows.
+//! Onboard store: holds data until the Earth is in sight, and releases them at the rate of the link.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -14,13 +14,13 @@ use crate::runtime::{Outlet, Stage, Units};
 /// A downlink of limited rate that works while the Earth is in sight.
 #[derive(Clone, Debug)]
 pub struct PacedLink {
-    /// The array, whose orbit determines when that is.
+    /// The array, whose orbit determines when the Earth is in sight.
     pub array: Arc<Array>,
     /// Payload rate, bytes/s.
     pub bytes_per_s: f64,
 }
 
-/// A block that waits in the store.
+/// A block in the store.
 #[derive(Debug)]
 struct HeldBlock {
     window: u64,
@@ -32,8 +32,8 @@ struct HeldBlock {
 /// Value of a byte, in seconds of typical data: the bits of a non-negative f64, which sort like the number itself.
 type Value = u64;
 
-/// A block is dropped in steps of one such fraction, so that it is not copied for every visibility. All blocks of a window
-/// are then cut at the same time, to within one step.
+/// Visibilities of a block are dropped in fractions of 1 / `PARTS`, so that the block is not copied for every one.
+/// All blocks of a window are thus cut at the same time, to within one fraction.
 const PARTS: usize = 32;
 
 /// Order in which a full store drops blocks, lowest first: the value, or the time as (window, ticks), inverted if the
@@ -47,16 +47,17 @@ enum StoreEnd {
     Back,
 }
 
-/// Holds frames while the Earth is hidden, and releases them in the passes that follow, oldest first.
+/// Stage that holds frames while the Earth is hidden, and releases them in the following passes, oldest first.
 ///
-/// A housekeeping frame closes a window: the Earth is in sight from then until the next window begins. What does not fit
-/// in a pass stays for the next one, and is sent after the positions that it needs. At the end of the mission a last
+/// A housekeeping frame closes a window: the Earth is in sight from then until the next window begins. Data that do
+/// not fit into a pass stay for the next one, and are sent after their positions. At the end of the mission a last
 /// pass empties the store.
 ///
-/// A pass begins, after the instrument's description, and ends with a report of the counts, which are the same: if the
-/// end of the pass is lost, the ground still learns how much it held. The reports of the last pass hold for all time.
+/// A pass begins, after the instrument's description, and ends with the same report of the counts: if the end of the
+/// pass is lost, the ground still learns how much it contained. The reports of the last pass apply to all time.
 ///
-/// When the store is full, visibilities are dropped as [`StoreDrop`] says and counted in the reports of the pass. Nothing else is ever dropped.
+/// When the store is full, visibilities are dropped according to [`StoreDrop`] and counted in the reports of the
+/// pass. Nothing else is ever dropped.
 #[derive(Debug)]
 pub struct Store {
     capacity_bytes: u64,
@@ -64,24 +65,24 @@ pub struct Store {
     link: Option<PacedLink>,
     /// Index of the window that is being observed.
     window: u64,
-    /// By window: the instrument and ephemeris frames that precede its visibilities.
+    /// Instrument and ephemeris frames that precede the visibilities of a window, by window.
     descriptions: BTreeMap<u64, Vec<GroundFrame>>,
     /// Blocks by arrival number.
     held: BTreeMap<u64, HeldBlock>,
-    /// Blocks by rank; within a rank the latest arrival comes first.
+    /// Blocks by rank; within a rank the latest arrival is first.
     by_rank: BTreeSet<(Rank, Reverse<u64>)>,
     held_bytes: u64,
     blocks: u64,
-    /// By channel: sums of the weights and of the durations, s, of all good visibilities so far.
+    /// Sums of the weights and of the durations, s, of all good visibilities so far, by channel.
     typical: BTreeMap<u16, [f64; 2]>,
-    /// The frame that closes the current pass.
+    /// Frame that closes the current pass.
     closing: Option<Housekeeping>,
     kept: u64,
     dropped: u64,
 }
 
 impl Store {
-    /// An empty store in front of a link; without a link everything is sent at once.
+    /// Creates an empty store before a link; without a link everything is sent at once.
     #[must_use]
     pub fn new(config: &SpacecraftConfig, link: Option<PacedLink>) -> Self {
         Self {
@@ -112,14 +113,14 @@ impl Store {
         self.held.insert(number, HeldBlock { window: self.window, value, rank, block });
         while self.held_bytes > self.capacity_bytes {
             let too_many = (self.held_bytes - self.capacity_bytes).div_ceil(VISIBILITY_BYTES);
-            let Some(gone) = self.drop_first(too_many) else { break };
-            self.kept -= gone;
-            self.dropped += gone;
+            let Some(dropped_block) = self.drop_first(too_many) else { break };
+            self.kept -= dropped_block;
+            self.dropped += dropped_block;
         }
     }
 
-    /// Rank of a block in the order of dropping: by value, or by the time of its first or last visibility, whatever the
-    /// order of arrival.
+    /// Rank of a block in the order of dropping: by value, or by the time of its first or last visibility,
+    /// independent of the order of arrival.
     fn rank(&self, window: u64, value: Value, block: &VisibilityBlock) -> Rank {
         let ticks = |offset: Option<&u32>| offset.copied().unwrap_or(0);
         match self.drop {
@@ -148,12 +149,12 @@ impl Store {
             (StoreDrop::Oldest, _) => (offsets.len(), StoreEnd::Front),
             (StoreDrop::Newest | StoreDrop::LowestValue, _) => (offsets.len(), StoreEnd::Back),
         };
-        let gone = self.remove(number, count.min(below_next.max(least) as u64), end)?;
-        Some(gone.len() as u64)
+        let dropped_block = self.remove(number, count.min(below_next.max(least) as u64), end)?;
+        Some(dropped_block.len() as u64)
     }
 
-    /// Value of a byte of a block: its weight, relative to the mean weight of a second of good data of its channel so far.
-    /// Flagged data have no value.
+    /// Value of a byte of a block: its weight relative to the mean weight of a second of good data of its channel so
+    /// far. Flagged data have no value.
     fn value(&mut self, block: &VisibilityBlock) -> Value {
         let [weights, seconds] = self.typical.entry(block.channel.0).or_default();
         let mut weight = 0.0;
@@ -191,8 +192,8 @@ impl Store {
         Some(taken)
     }
 
-    /// Sends the windows before window `until`, up to `bytes` bytes. The report goes before the first frame that is no
-    /// description of the instrument, without which no packet can be read.
+    /// Sends the windows before window `until`, up to `bytes` bytes. The report precedes the first frame other than
+    /// an instrument description, without which no packet can be read.
     fn send(
         &mut self,
         until: u64,
@@ -214,7 +215,7 @@ impl Store {
                 self.held.first_key_value().filter(|(_, held)| held.window == window)
             {
                 if left < VISIBILITY_BYTES {
-                    // The rest of the window needs them again.
+                    // The rest of the window needs these frames again.
                     self.descriptions.insert(window, descriptions);
                     return;
                 }
@@ -277,7 +278,7 @@ impl Stage for Store {
                 }
             }
             GroundFrame::Housekeeping(report) => {
-                // After a window without data: the time during which the Earth was hidden does not count.
+                // After a window without data the time with the Earth hidden does not count.
                 self.end_pass(Some(report.time.seconds()), out);
                 self.closing = Some(report);
                 self.window += 1;
@@ -287,7 +288,7 @@ impl Stage for Store {
         Ok(())
     }
 
-    /// An interrupted window is sent as far as it was observed.
+    /// Sends everything; an interrupted window as far as it was observed.
     fn finish(&mut self, out: &mut Outlet<GroundFrame>) -> Result<(), Infallible> {
         self.end_pass(None, out);
         self.send(u64::MAX, None, None, out);
@@ -323,7 +324,7 @@ mod tests {
         }
     }
 
-    /// Feeds windows of two blocks each; returns the frames sent, pass by pass.
+    /// Processes windows of two blocks each; returns the frames sent, pass by pass.
     fn passes(store: &mut Store, windows: &[ObservingWindow]) -> Vec<Vec<GroundFrame>> {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let (mut out, mut sampled) = (Outlet::collect(), 0);
@@ -343,7 +344,7 @@ mod tests {
         let passes: Vec<Vec<GroundFrame>> = frames.split_inclusive(ends_pass()).map(<[_]>::to_vec).collect();
         for (k, pass) in passes.iter().enumerate() {
             let reports: Vec<&GroundFrame> = pass.iter().filter(|frame| is_report(frame)).collect();
-            // One before everything but descriptions of the instrument, one at the end, and both say the same.
+            // One report before everything except instrument descriptions, and an equal one at the end.
             assert!(is_report(&pass[0]) && reports.len() == 2 && reports[0] == reports[1], "{reports:?}");
             let GroundFrame::Housekeeping(report) = reports[0] else { panic!("no report") };
             assert_eq!(report.is_last(), k + 1 == windows.len());
@@ -400,7 +401,7 @@ mod tests {
                     .map(description_bytes)
                     .sum();
                 let time_for = (1.5 * sight_s - described as f64) / VISIBILITY_BYTES as f64;
-                // Whole visibilities; the limb crossing is found to 1e-7 s.
+                // Only whole visibilities are sent; the limb crossing is found to 1e-7 s.
                 assert!((sent as f64 - time_for).abs() <= 1.0, "{sent} {time_for}");
             }
             // No visibility is sent before its positions.
@@ -426,7 +427,7 @@ mod tests {
         for (drop, first, second) in [
             // The first pair's integrations last twice as long as the second's.
             (StoreDrop::Newest, 500, 1_000),
-            // The same time span of both: 167 of the first and 333 of the second.
+            // Equal time spans: 167 of the first pair and 333 of the second.
             (StoreDrop::Oldest, 833, 667),
             // The second pair's integrations are half as long and weigh half as much.
             (StoreDrop::LowestValue, 1_000, 500),
@@ -444,7 +445,7 @@ mod tests {
                 assert_eq!(report.dropped, 500 * (k as u64 + 1));
             }
         }
-        // Flagged data are dropped first, however long.
+        // Flagged data are dropped first, whatever their duration.
         let mut store = Store::new(&config(room, StoreDrop::LowestValue), None);
         let mut flagged = block(&windows[0], 1, 200_000);
         flagged.flags.fill(Flags::INTERFERENCE);

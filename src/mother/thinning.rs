@@ -1,11 +1,12 @@
-//! Which windows and integrations of a mission are observed when not all are.
+//! Subsampling of observing windows and integrations, to simulate a fraction of a mission's visibilities.
 
-/// Which windows are observed.
+/// Selection of the windows that are observed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WindowThinning {
-    /// Every n-th. Where n windows are nearly a multiple of a period, parts of that period are never observed.
+    /// Every n-th window. Aliases with any period of which n windows are nearly a multiple.
     EveryNth(u64),
-    /// One of each n, at a place of its own among them, which the number of the n decides as a die would: no period can run in step.
+    /// One window of each block of n, at a pseudo-random position derived from the block's number, so that it aliases
+    /// with no period.
     Spread(u64),
 }
 
@@ -15,38 +16,39 @@ impl WindowThinning {
     pub fn keeps(self, window: u64) -> bool {
         match self {
             Self::EveryNth(n) => window.is_multiple_of(n.max(1)),
-            Self::Spread(n) => window % n.max(1) == place(window / n.max(1), n),
+            Self::Spread(n) => window % n.max(1) == hash_below(window / n.max(1), n),
         }
     }
 
-    /// Number that the first integration of a window has when every `every_nth`-th integration is kept: it moves from window to window, so
-    /// that no part of a window is always left out.
+    /// Index of the first integration kept in a window, when every `every_nth`-th is kept. It changes from window to
+    /// window, so that no part of a window is always left out.
     #[must_use]
     pub fn first_integration(self, window: u64, every_nth: u64) -> u64 {
         match self {
             Self::EveryNth(n) => window / n.max(1),
-            Self::Spread(n) => place(!(window / n.max(1)), every_nth),
+            // The complement makes this choice independent of that of the window.
+            Self::Spread(n) => hash_below(!(window / n.max(1)), every_nth),
         }
     }
 }
 
-/// Place, 0 to `of` - 1, that a number has by chance, the same at any time: the mixing of bits of SplitMix64 (Steele et al. 2014). Of 0
-/// it is 0, so that a mission has its first window.
-fn place(number: u64, of: u64) -> u64 {
+/// Pseudo-random number below `bound`, by the mixing function of SplitMix64 (Steele et al. 2014). Maps 0 to 0, so
+/// that a mission always has its first window.
+fn hash_below(number: u64, bound: u64) -> u64 {
     let mixed = (number ^ (number >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    ((u128::from(mixed ^ (mixed >> 31)) * u128::from(of)) >> 64) as u64
+    ((u128::from(mixed ^ (mixed >> 31)) * u128::from(bound)) >> 64) as u64
 }
 
-/// How to keep one visibility in `thin`: the distance of windows and that of integrations. Many windows that give few
-/// integrations cover the periods better than few whole ones.
+/// Strides of windows and of integrations that together keep one visibility in `thin`. Many windows with few
+/// integrations each cover the periods better than few complete windows.
 #[must_use]
-pub fn shares(thin: u64) -> (u64, u64) {
+pub fn strides(thin: u64) -> (u64, u64) {
     let windows = thin.max(1).isqrt();
     (windows, (thin.max(1) + windows / 2) / windows)
 }
 
-/// The largest part of a period in which none of these times lies, 0 to 1.
+/// Largest fraction of a period that contains none of these times, 0 to 1.
 #[must_use]
 pub fn largest_gap(times_s: impl Iterator<Item = f64>, period_s: f64) -> f64 {
     let mut phases: Vec<f64> = times_s.map(|t_s| (t_s / period_s).rem_euclid(1.0)).collect();
@@ -62,7 +64,7 @@ mod tests {
     use crate::units::constants::SIDEREAL_MONTH_S;
 
     #[test]
-    fn spread_windows_are_one_of_each_n() {
+    fn one_window_of_each_block_of_n_is_kept() {
         for n in [1, 2, 7, 17, 24, 300] {
             for block in 0..500 {
                 let kept =
@@ -70,21 +72,22 @@ mod tests {
                 assert_eq!(kept, 1, "{n}, from window {}", block * n);
             }
         }
-        // A mission shorter than n windows has its first one, as with every n-th.
+        // A mission shorter than n windows has its first window, as with every n-th.
         assert!(WindowThinning::Spread(300).keeps(0));
     }
 
     #[test]
     fn one_visibility_in_n_is_kept() {
-        assert_eq!([1, 2, 3, 4, 300, 600].map(shares), [(1, 1), (1, 2), (1, 3), (2, 2), (17, 18), (24, 25)]);
+        assert_eq!([1, 2, 3, 4, 300, 600].map(strides), [(1, 1), (1, 2), (1, 3), (2, 2), (17, 18), (24, 25)]);
         for thin in 1..2000_u64 {
-            let (windows, integrations) = shares(thin);
-            // Half of the distance of windows is what rounding to whole integrations can cost.
+            let (windows, integrations) = strides(thin);
+            // Rounding to whole integrations can cost half a stride of windows.
             assert!((windows * integrations).abs_diff(thin) <= windows.div_ceil(2), "{thin}");
         }
     }
 
-    /// Kept windows of 1.3 years of the paper's array by cells of equal size over two periods: fewest, mean and most.
+    /// Number of kept windows of 1.3 years of the paper's array in cells of equal size over two periods: minimum,
+    /// mean and maximum.
     fn coverage(windows: WindowThinning, periods_s: [f64; 2]) -> [f64; 3] {
         const SIDE: usize = 5;
         let config = ArrayConfig::default();
@@ -108,12 +111,12 @@ mod tests {
     fn spread_windows_cover_month_breathing_and_precession_together() {
         let config = ArrayConfig::default();
         let (breathing_s, precession_s) = (config.breathing.period_s, config.precession_period_s);
-        // The third is a period nobody thought of.
+        // The third period is arbitrary.
         for other_s in [SIDEREAL_MONTH_S, breathing_s, 9.3 * 86_400.0] {
             for thin in [150, 300, 600] {
-                let spread = WindowThinning::Spread(shares(thin).0);
+                let spread = WindowThinning::Spread(strides(thin).0);
                 let [least, mean, most] = coverage(spread, [precession_s, other_s]);
-                // 2.5 times the scatter of counts by chance, without the order that one of each n brings.
+                // 2.5 times the Poisson scatter; stratification only reduces it.
                 let bar = 2.5 * mean.sqrt();
                 assert!(
                     least > mean - bar && most < mean + bar,
@@ -127,12 +130,12 @@ mod tests {
     }
 
     #[test]
-    fn integrations_begin_at_all_places() {
+    fn integrations_begin_at_all_positions() {
         let mut counts = [0_u32; 8];
         for window in 0..8_000 {
             counts[WindowThinning::Spread(10).first_integration(10 * window, 8) as usize] += 1;
         }
-        // Five standard deviations of 1000 by chance.
+        // Five Poisson standard deviations of a count of 1000.
         assert!(counts.iter().all(|count| count.abs_diff(1000) < 160), "{counts:?}");
     }
 

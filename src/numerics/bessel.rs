@@ -1,7 +1,7 @@
 //! Bessel functions of many orders, for several arguments at a time.
 //!
-//! `J_n(x)` and `j_n(x)` obey `f_{n+1} = (2 n + s) / x f_n - f_{n-1}` with s = 0 and 1. It is followed upwards from the first two while
-//! n <= x; beyond, where f_n falls and upwards errors grow, ratios `f_n / f_{n-1}` come from far above.
+//! `J_n(x)` and `j_n(x)` obey `f_{n+1} = (2 n + s) / x f_n - f_{n-1}` with s = 0 and 1. Forward recurrence from the first two orders is
+//! stable while n <= x. Beyond, f_n falls and errors would grow, so the ratios `f_n / f_{n-1}` come from backward recurrence.
 
 use std::f64::consts::PI;
 
@@ -13,14 +13,14 @@ pub(crate) const LANES: usize = 8;
 /// One number for each argument.
 pub(crate) type Lanes = [f64; LANES];
 
-/// From here on Hankel's series gives Bessel functions to rounding.
+/// Smallest argument for which Hankel's asymptotic series is exact to rounding.
 const HANKEL_X_MIN: f64 = 30.0;
 
-/// Points of a quarter of the circle over which smaller arguments are averaged: the rule errs by `J_64(30)`, 1e-14.
-const QUARTER: usize = 16;
+/// Intervals of the trapezoidal rule over a quarter of the circle, for smaller arguments: its error is `J_64(30)`, 1e-14.
+const QUARTER_INTERVALS: usize = 16;
 
-/// Orders beyond the last that is asked for, or beyond the turn at n = x, over which the error of the far end decays.
-const FAR_MARGIN: usize = 40;
+/// Orders above the last requested one, or above the turning point n = x, over which the error of the backward recurrence's start decays.
+const START_MARGIN: usize = 40;
 
 /// Evaluates orders 0, 1, .. for [`LANES`] arguments.
 #[derive(Clone, Debug, Default)]
@@ -36,7 +36,7 @@ impl BesselOrders {
         } else {
             let mut start = [[0.0; LANES]; 2];
             for k in 0..LANES {
-                let [zero, one] = if x[k] >= HANKEL_X_MIN { hankel_one(x[k]) } else { averages(x[k]) };
+                let [zero, one] = if x[k] >= HANKEL_X_MIN { hankel_one(x[k]) } else { by_quadrature(x[k]) };
                 (start[0][k], start[1][k]) = (zero, one);
             }
             start
@@ -50,7 +50,7 @@ impl BesselOrders {
         for k in 0..LANES {
             let (sin, cos) = x[k].sin_cos();
             start[0][k] = sin / x[k];
-            // Where the two terms cancel, the series: the next term is below 1e-13 of the first.
+            // The series where the two terms would cancel: its next term is below 1e-13 of the first.
             let square = x[k] * x[k];
             start[1][k] = if x[k] < 0.03 {
                 x[k] / 3.0 * (1.0 - square / 10.0 * (1.0 - square / 28.0))
@@ -62,14 +62,14 @@ impl BesselOrders {
     }
 
     fn fill(&mut self, x: &Lanes, shift: f64, start: [Lanes; 2], order_max: usize) -> &[Lanes] {
-        // Where the orders that are asked for stay below x, what is beyond does not matter.
-        let beyond = x.iter().filter(|x| **x < (order_max + 1) as f64);
-        let far = beyond.map(|x| order_max.max((x + 10.0 * x.cbrt()) as usize) + FAR_MARGIN).max();
-        let far = far.unwrap_or(order_max).max(1);
-        if self.values.len() <= far {
-            self.values.resize(far + 1, [0.0; LANES]);
+        // Backward recurrence is needed only for arguments below the largest requested order.
+        let small = x.iter().filter(|x| **x < (order_max + 1) as f64);
+        let start_order = small.map(|x| order_max.max((x + 10.0 * x.cbrt()) as usize) + START_MARGIN).max();
+        let start_order = start_order.unwrap_or(order_max).max(1);
+        if self.values.len() <= start_order {
+            self.values.resize(start_order + 1, [0.0; LANES]);
         }
-        recurrence(x, shift, &start, &mut self.values[..=far], order_max);
+        recurrence(x, shift, &start, &mut self.values[..=start_order], order_max);
         &self.values[..=order_max]
     }
 }
@@ -108,24 +108,24 @@ fn hankel_one(x: f64) -> [f64; 2] {
 }
 
 /// `J_0` and `J_1` as means of `cos(x sin psi)` and `sin(x sin psi) sin psi` over the circle.
-fn averages(x: f64) -> [f64; 2] {
+fn by_quadrature(x: f64) -> [f64; 2] {
     let mut sums = [0.0; 2];
-    for k in 0..=QUARTER {
-        let end = if k == 0 || k == QUARTER { 0.5 } else { 1.0 };
-        let (slope, _) = sin_cos(0.5 * PI * k as f64 / QUARTER as f64);
+    for k in 0..=QUARTER_INTERVALS {
+        let end = if k == 0 || k == QUARTER_INTERVALS { 0.5 } else { 1.0 };
+        let (slope, _) = sin_cos(0.5 * PI * k as f64 / QUARTER_INTERVALS as f64);
         let (sin, cos) = sin_cos(x * slope);
         sums[0] += end * cos;
         sums[1] += end * sin * slope;
     }
-    sums.map(|sum| sum / QUARTER as f64)
+    sums.map(|sum| sum / QUARTER_INTERVALS as f64)
 }
 
-/// Fills `values[n]`: ratios from the far end down to where n <= x for all, then values upwards.
+/// Fills `values[n]`: first ratios by backward recurrence down to n <= x for all lanes, then values by forward recurrence.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn recurrence(x: &Lanes, shift: f64, start: &[Lanes; 2], values: &mut [Lanes], order_max: usize) {
-    let least = x.iter().fold(f64::INFINITY, |least, x| least.min(*x)) as usize;
+    let x_min = x.iter().fold(f64::INFINITY, |x_min, x| x_min.min(*x)) as usize;
     let mut ratio = [0.0; LANES];
-    for n in (least.max(1) + 1..values.len()).rev() {
+    for n in (x_min.max(1) + 1..values.len()).rev() {
         for k in 0..LANES {
             ratio[k] = x[k] / ((2 * n) as f64 + shift - x[k] * ratio[k]);
         }
@@ -142,10 +142,10 @@ fn recurrence(x: &Lanes, shift: f64, start: &[Lanes; 2], values: &mut [Lanes], o
         let factor = (2 * (n - 1)) as f64 + shift;
         let order = n as f64;
         for k in 0..LANES {
-            let upwards = factor * inverse[k] * now[k] - before[k];
-            let downwards = value[k] * now[k];
+            let forward = factor * inverse[k] * now[k] - before[k];
+            let from_ratio = value[k] * now[k];
             before[k] = now[k];
-            now[k] = if order <= x[k] { upwards } else { downwards };
+            now[k] = if order <= x[k] { forward } else { from_ratio };
         }
         *value = now;
     }
@@ -190,7 +190,7 @@ mod tests {
                         let value = |t: f64| (n as f64 * PI * t - x * (PI * t).sin()).cos();
                         let sum: f64 =
                             rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * value(*t)).sum();
-                        // Rounding of phases of up to 800 rad, at each of as many steps.
+                        // Rounding of phases of up to 800 rad, in about 800 recurrence steps.
                         assert!((found - sum).abs() < 1e-12, "J_{n}({x}): {found} {sum}");
                     }
                 }

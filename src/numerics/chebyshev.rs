@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 
-/// Greatest number of terms.
+/// Maximum number of terms.
 pub(crate) const TERMS_MAX: usize = 16;
 
 /// Terms needed for `exp(i h tau)`, |tau| <= 1, to `tolerance`: the error is about `2 (h/2)^K / K!`.
@@ -17,8 +17,8 @@ pub(crate) fn terms_for(h: f64, tolerance: f64) -> Option<usize> {
     None
 }
 
-/// The greatest h that `terms` terms cover to `tolerance`.
-pub(crate) fn reach(terms: usize, tolerance: f64) -> f64 {
+/// The largest h for which [`terms_for`] needs at most `terms` terms.
+pub(crate) fn h_max(terms: usize, tolerance: f64) -> f64 {
     let factorial: f64 = (1..=terms).map(|k| k as f64).product();
     2.0 * (0.5 * tolerance * factorial).powf(1.0 / terms as f64)
 }
@@ -28,7 +28,7 @@ pub(crate) fn points(terms: usize) -> Vec<f64> {
     (0..terms).map(|k| (PI * (k as f64 + 0.5) / terms as f64).cos()).collect()
 }
 
-/// `[n][k]`: contribution of the value at point k to the coefficient of T_n.
+/// The matrix `[n][k]` that turns the values at the points k into the coefficients of T_n.
 pub(crate) fn analysis(terms: usize) -> Vec<Vec<f64>> {
     (0..terms)
         .map(|n| {
@@ -45,7 +45,7 @@ pub(crate) fn weights_at(terms: usize, tau: f64) -> Vec<f64> {
     (0..terms).map(|k| (0..terms).map(|n| analysis[n][k] * polynomials[n]).sum()).collect()
 }
 
-/// `T_0(tau) .. T_{terms-1}(tau)`.
+/// The Chebyshev polynomials `T_0(tau) .. T_{terms-1}(tau)`.
 pub(crate) fn polynomials(terms: usize, tau: f64) -> [f64; TERMS_MAX] {
     let mut values = [0.0; TERMS_MAX];
     values[0] = 1.0;
@@ -67,7 +67,7 @@ mod tests {
         for h in [0.05, 0.5, 1.5, 3.0] {
             for tolerance in [1e-3, 1e-5, 1e-7] {
                 let terms = terms_for(h, tolerance).expect("few terms");
-                assert!(reach(terms, tolerance) >= h);
+                assert!(h_max(terms, tolerance) >= h);
                 let nodes = points(terms);
                 for k in 0..=20 {
                     let tau = 0.1 * f64::from(k) - 1.0;

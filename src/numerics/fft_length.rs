@@ -1,6 +1,6 @@
-//! Lengths of Fourier transforms.
+//! Lengths for which fast Fourier transforms are fast.
 
-/// The least even length >= `n` with prime factors 2, 3 and at most one 5, which the FFT transforms fastest.
+/// The smallest even length >= `n` with prime factors 2, 3 (at most four times) and 5 (at most once), which the FFT transforms fastest.
 pub(crate) fn fft_length(n: usize) -> usize {
     let n = n.max(2);
     let mut best = n.next_power_of_two();

@@ -1,7 +1,7 @@
-//! Interpolation through any nodes.
+//! Lagrange interpolation.
 
-/// Lagrange weights of the values at `nodes` for interpolation at `x`. Nodes must differ.
-pub(crate) fn lagrange(nodes: &[f64], x: f64) -> Vec<f64> {
+/// The weights with which values at distinct `nodes` are interpolated at `x`.
+pub(crate) fn lagrange_weights(nodes: &[f64], x: f64) -> Vec<f64> {
     let weight = |k: usize| {
         let others = nodes.iter().enumerate().filter(|(m, _)| *m != k);
         others.map(|(_, node)| (x - node) / (nodes[k] - node)).product()
@@ -16,7 +16,7 @@ mod tests {
     #[test]
     fn a_parabola_is_interpolated_exactly() {
         let nodes = [1.0, 2.0, 4.0];
-        let value: f64 = lagrange(&nodes, 3.0).iter().zip(nodes).map(|(w, x)| w * (x * x - x)).sum();
+        let value: f64 = lagrange_weights(&nodes, 3.0).iter().zip(nodes).map(|(w, x)| w * (x * x - x)).sum();
         // 9 - 3; rounding of three products.
         assert!((value - 6.0).abs() < 1e-14, "{value}");
     }

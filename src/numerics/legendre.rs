@@ -1,9 +1,9 @@
-//! Associated Legendre functions at many colatitudes at once.
+//! Normalised associated Legendre functions at many colatitudes at once.
 
 use super::Real;
 use super::scaled::{LaneSlices, ScaledLanes, advance};
 
-/// Orthonormal `lambda_{l mu}(theta) = Y_{l mu}(theta, 0)`, Condon-Shortley phase.
+/// Computes `lambda_{l mu}(theta) = Y_{l mu}(theta, 0)`, orthonormal, with the Condon-Shortley phase.
 #[derive(Clone, Debug)]
 pub(crate) struct Legendre {
     z: Vec<f64>,
@@ -29,25 +29,25 @@ impl Legendre {
         Self { z, ln_sin, ln_first, l_max }
     }
 
-    /// `weight(theta) lambda_{l mu}(theta)` for l = mu, mu + 2, .. <= l_max: one row a degree, over the first
-    /// `weights.len()` colatitudes.
+    /// Rows `weight(theta) lambda_{l mu}(theta)`, one for each degree l = mu, mu + 2, .. <= l_max, at the first `weights.len()` colatitudes.
     pub(crate) fn even_rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
-        self.every(2, mu, weights)
+        self.rows_of_every(2, mu, weights)
     }
 
-    /// As [`Self::even_rows`], for l = mu, mu + 1, ..
+    /// The rows of [`Self::even_rows`] for all degrees l = mu, mu + 1, ..
     pub(crate) fn rows<T: Real>(&self, mu: usize, weights: &[f64]) -> Vec<T> {
-        self.every(1, mu, weights)
+        self.rows_of_every(1, mu, weights)
     }
 
-    /// For l = mu, mu + `step`, ..
-    fn every<T: Real>(&self, step: usize, mu: usize, weights: &[f64]) -> Vec<T> {
+    /// The rows for l = mu, mu + `step`, ..
+    fn rows_of_every<T: Real>(&self, step: usize, mu: usize, weights: &[f64]) -> Vec<T> {
         let points = weights.len().min(self.z.len());
         let mut rows = Vec::with_capacity(points * ((self.l_max - mu) / step + 1));
         let sign = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
         let mut lanes = ScaledLanes::zeros(points);
         let ln_512 = 512.0 * std::f64::consts::LN_2;
         for k in 0..points {
+            // The first degree lies below the range of f64 near the poles.
             let ln = self.ln_first[mu] + if mu > 0 { mu as f64 * self.ln_sin[k] } else { 0.0 };
             let power = (ln / ln_512).round().min(0.0);
             lanes.power[k] = power;
@@ -57,17 +57,17 @@ impl Legendre {
         for l in mu..=self.l_max {
             if l > mu {
                 let square = |l: usize| (l * l) as f64 - (mu * mu) as f64;
-                let (twice, above) = (2.0 * l as f64, 1.0 / square(l));
-                let forward = ((twice * twice - 1.0) * above).sqrt();
+                let (twice, inverse) = (2.0 * l as f64, 1.0 / square(l));
+                let forward = ((twice * twice - 1.0) * inverse).sqrt();
                 let behind = if l == mu + 1 {
                     0.0
                 } else {
-                    ((twice + 1.0) / (twice - 3.0) * square(l - 1) * above).sqrt()
+                    ((twice + 1.0) / (twice - 3.0) * square(l - 1) * inverse).sqrt()
                 };
                 advance_all(forward, behind, &self.z[..points], &mut lanes);
             }
             if (l - mu).is_multiple_of(step) {
-                rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::entry(v * w)));
+                rows.extend(lanes.value.iter().zip(weights).map(|(v, w)| T::table_entry(v * w)));
             }
         }
         rows

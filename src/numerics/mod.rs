@@ -1,5 +1,4 @@
-//! General mathematics that several folders use: quadrature, interpolation, special functions, statistics. Knows no physics and
-//! uses nothing of the crate.
+//! General mathematics: quadrature, interpolation, special functions, statistics. Contains no physics and uses no other module of the crate.
 
 pub(crate) mod bessel;
 pub(crate) mod chebyshev;
@@ -14,6 +13,6 @@ pub(crate) mod trigonometry;
 pub(crate) mod wigner;
 
 pub(crate) use fft_length::fft_length;
-pub(crate) use lagrange::lagrange;
+pub(crate) use lagrange::lagrange_weights;
 pub use real::Real;
 pub(crate) use statistics::{median, percentiles};

@@ -1,22 +1,22 @@
-//! Gauss-Legendre rules.
+//! Gauss-Legendre quadrature.
 
 use std::f64::consts::PI;
 
-/// Abscissae and weights on [0, 1], abscissae rising.
+/// A Gauss-Legendre rule on [0, 1], with increasing abscissae.
 #[derive(Clone, Debug)]
 pub(crate) struct GaussLegendre {
     pub(crate) abscissae: Vec<f64>,
     pub(crate) weights: Vec<f64>,
 }
 
-/// Most points of a rule found by Newton's iteration on the recurrence of P_n, n operations a step.
+/// Largest rule whose zeros are found by Newton's iteration on the recurrence of P_n, which takes n operations per step.
 const NEWTON_MAX: usize = 96;
 
-/// Terms of P_n around a zero: the next zero lies within them to rounding (Glaser, Liu and Rokhlin 2007).
-const TERMS: usize = 30;
+/// Terms of the Taylor series of P_n about a zero that give the next zero to rounding (Glaser, Liu and Rokhlin 2007).
+const TAYLOR_TERMS: usize = 30;
 
 impl GaussLegendre {
-    /// The rule of `n` points, exact for polynomials of degree 2n - 1. A point takes some 0.3 us, whatever `n`.
+    /// The rule of `n` points, exact for polynomials of degree 2n - 1. Each point takes some 0.3 us for any `n`.
     pub(crate) fn new(n: usize) -> Self {
         let n = n.max(1);
         let mut rule = Self { abscissae: vec![0.5; n], weights: vec![1.0; n] };
@@ -32,32 +32,32 @@ impl GaussLegendre {
         }
         // From the middle outwards, each zero from the one before.
         let (value, slope) = legendre(n, 0.0);
-        let mut at = LegendreExpansion { n: n as f64, x: 0.0, value, slope };
+        let mut zero = LegendreExpansion { n: n as f64, x: 0.0, value, slope };
         for k in (0..half).rev() {
             let is_middle = 2 * k + 1 == n;
             if !is_middle {
-                at = at.zero_near(asymptotic_zero(n, k));
+                zero = zero.zero_near(asymptotic_zero(n, k));
             }
-            set(k, [at.x, at.slope]);
+            set(k, [zero.x, zero.slope]);
         }
         rule
     }
 
-    /// Points needed for `exp(i omega t)` over t in [-1, 1] to about f64 precision: half a point a
+    /// Points needed for `exp(i omega t)` over t in [-1, 1] to about f64 precision: half a point per
     /// radian, and the width of the turning region.
     pub(crate) fn points_for(omega: f64) -> usize {
         (0.5 * omega + 4.0 * omega.cbrt() + 16.0).ceil() as usize
     }
 }
 
-/// The `k`th zero of P_n, from above, to some thousandths of the distance to its neighbour (Tricomi).
+/// The `k`th largest zero of P_n, to some thousandths of the distance to its neighbour (Tricomi's formula).
 fn asymptotic_zero(n: usize, k: usize) -> f64 {
     let cos = (PI * (k as f64 + 0.75) / (n as f64 + 0.5)).cos();
     let n = n as f64;
     (1.0 - (n - 1.0) / (8.0 * n * n * n)) * cos
 }
 
-/// The `k`th zero of P_n and the slope there, by Newton's iteration.
+/// The `k`th largest zero of P_n and the slope there, by Newton's iteration.
 fn zero_by_recurrence(n: usize, k: usize) -> [f64; 2] {
     let (mut x, mut slope) = (asymptotic_zero(n, k), 1.0);
     for _ in 0..8 {
@@ -72,7 +72,7 @@ fn zero_by_recurrence(n: usize, k: usize) -> [f64; 2] {
     [x, slope]
 }
 
-/// P_n around a point.
+/// Value and slope of P_n at a point, from which its Taylor series follows.
 struct LegendreExpansion {
     n: f64,
     x: f64,
@@ -81,14 +81,14 @@ struct LegendreExpansion {
 }
 
 impl LegendreExpansion {
-    /// A neighbouring zero, by Newton's iteration on the Taylor series, whose terms follow from Legendre's equation:
+    /// The zero near `guess`, by Newton's iteration on the Taylor series, whose terms follow from Legendre's equation:
     /// `(1 - x^2) (k + 1) (k + 2) a_{k+2} = 2 x (k + 1)^2 a_{k+1} + (k (k + 1) - n (n + 1)) a_k`.
     fn zero_near(&self, guess: f64) -> Self {
         let Self { n, x, value, slope } = *self;
         let step = guess - x;
-        let mut terms = [0.0; TERMS];
+        let mut terms = [0.0; TAYLOR_TERMS];
         (terms[0], terms[1]) = (value, slope * step);
-        for k in 0..TERMS - 2 {
+        for k in 0..TAYLOR_TERMS - 2 {
             let order = k as f64;
             let sum = 2.0 * x * step * (order + 1.0) * (order + 1.0) * terms[k + 1]
                 + step * step * (order * (order + 1.0) - n * (n + 1.0)) * terms[k];
@@ -111,7 +111,7 @@ impl LegendreExpansion {
         }
         let slope = slope / step;
         let next = x + step * t;
-        // What rounding takes from a zero is put back by the value there, or such errors would add up.
+        // The value at the rounded zero is kept, or rounding errors would add up from zero to zero.
         let missed = step * t - (next - x);
         Self { n, x: next, value: -missed * slope, slope }
     }
@@ -127,27 +127,27 @@ fn legendre(n: usize, x: f64) -> (f64, f64) {
     (value, n as f64 * (before - x * value) / (1.0 - x * x))
 }
 
-/// Rules of rising size, each at most a sixteenth or 16 points larger than the one before; sizes are multiples of 16.
+/// QuadratureRules of increasing size, each at most a sixteenth or 16 points larger than the one before.
 #[derive(Clone, Debug)]
-pub(crate) struct Rules(Vec<GaussLegendre>);
+pub(crate) struct QuadratureRules(Vec<GaussLegendre>);
 
-impl Rules {
-    /// Sizes are multiples of this.
-    const STEP: usize = 16;
+impl QuadratureRules {
+    /// All sizes are multiples of this.
+    const SIZE_UNIT: usize = 16;
 
-    /// Rules of up to `points` points.
+    /// QuadratureRules that cover all sizes up to `points` points.
     pub(crate) fn up_to(points: usize) -> Self {
-        let mut sizes = vec![Self::STEP];
+        let mut sizes = vec![Self::SIZE_UNIT];
         while let Some(&last) = sizes.last().filter(|&&last| last < points) {
-            sizes.push((last + (last / 16).max(1)).next_multiple_of(Self::STEP));
+            sizes.push((last + (last / 16).max(1)).next_multiple_of(Self::SIZE_UNIT));
         }
         Self(sizes.into_iter().map(GaussLegendre::new).collect())
     }
 
-    /// The smallest rule of at least so many points, or the greatest.
-    pub(crate) fn of(&self, points: usize) -> &GaussLegendre {
-        let place = self.0.partition_point(|rule| rule.weights.len() < points);
-        &self.0[place.min(self.0.len() - 1)]
+    /// The smallest rule of at least `points` points, or the largest rule.
+    pub(crate) fn at_least(&self, points: usize) -> &GaussLegendre {
+        let index = self.0.partition_point(|rule| rule.weights.len() < points);
+        &self.0[index.min(self.0.len() - 1)]
     }
 }
 
@@ -162,12 +162,12 @@ mod tests {
             let sum: f64 =
                 rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * (2.0 * omega * t).cos()).sum();
             let exact = if omega == 0.0 { 1.0 } else { (2.0 * omega).sin() / (2.0 * omega) };
-            // Phases carry a rounding of 2e-16 each radian, by chance to either side.
+            // Phases are rounded to 2e-16 per radian, with random signs.
             assert!((sum - exact).abs() < 1e-14 + 2e-16 * omega, "{omega}: {sum} {exact}");
         }
     }
 
-    /// On both sides of the change from one way of finding zeros to the other, and far beyond.
+    /// Sizes on both sides of the change of method, and far beyond.
     #[test]
     fn polynomials_are_integrated_whatever_the_number_of_points() {
         for n in (1..=4).chain(NEWTON_MAX - 2..NEWTON_MAX + 4).chain([1000, 1001, 30_000]) {
@@ -176,8 +176,8 @@ mod tests {
             for power in (0..2 * n.min(20)).map(|k| k as i32) {
                 let sum: f64 = rule.abscissae.iter().zip(&rule.weights).map(|(t, w)| w * t.powi(power)).sum();
                 let exact = 1.0 / f64::from(power + 1);
-                // Slopes of neighbours follow from each other by sums of some thirty terms: roundings add up as the root of
-                // the number of points.
+                // Each slope follows from its neighbour's by a sum of some thirty terms: rounding errors grow as the square
+                // root of the number of points.
                 let error = 30.0 * f64::EPSILON * (n as f64).sqrt();
                 assert!((sum / exact - 1.0).abs() < 4e-15 + error, "{n} {power}: {sum} {exact}");
             }
@@ -186,14 +186,17 @@ mod tests {
 
     #[test]
     fn rules_reach_every_number_of_points() {
-        for most in [1, 16, 17, 100, 5000] {
-            let rules = Rules::up_to(most);
-            for points in 1..=most {
-                let found = rules.of(points).weights.len();
-                assert!(found >= points && found.is_multiple_of(16), "{most} {points}");
-                assert!(found < points + points / 16 + 32, "{most} {points}: {found}");
+        for points_max in [1, 16, 17, 100, 5000] {
+            let rules = QuadratureRules::up_to(points_max);
+            for points in 1..=points_max {
+                let found = rules.at_least(points).weights.len();
+                assert!(found >= points && found.is_multiple_of(16), "{points_max} {points}");
+                assert!(found < points + points / 16 + 32, "{points_max} {points}: {found}");
             }
-            assert_eq!(rules.of(10 * most).weights.len(), rules.of(most).weights.len());
+            assert_eq!(
+                rules.at_least(10 * points_max).weights.len(),
+                rules.at_least(points_max).weights.len()
+            );
         }
     }
 }

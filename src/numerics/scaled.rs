@@ -1,4 +1,4 @@
-//! Numbers far below the range of f64: a mantissa and a power of 2^512.
+//! Numbers far below the range of f64, as a mantissa and a power of 2^512.
 //!
 //! Recurrences in the degree start from such numbers and grow into the range of f64.
 
@@ -22,7 +22,7 @@ pub(crate) struct Scaled {
 impl Scaled {
     pub(crate) const ONE: Self = Self { mantissa: 1.0, power: 0.0 };
 
-    /// `x^0 ..= x^count` for |x| <= 1.
+    /// The powers `x^0 ..= x^count` for |x| <= 1.
     pub(crate) fn powers(x: f64, count: usize) -> Vec<Self> {
         let mut powers = Vec::with_capacity(count + 1);
         let mut power = Self::ONE;
@@ -33,16 +33,16 @@ impl Scaled {
         powers
     }
 
-    /// Product with a factor of ordinary size.
+    /// The product with a factor whose size is near one.
     pub(crate) fn times(self, factor: f64) -> Self {
-        Self { mantissa: self.mantissa * factor, power: self.power }.normal()
+        Self { mantissa: self.mantissa * factor, power: self.power }.normalised()
     }
 
     pub(crate) fn product(self, other: Self) -> Self {
-        Self { mantissa: self.mantissa * other.mantissa, power: self.power + other.power }.normal()
+        Self { mantissa: self.mantissa * other.mantissa, power: self.power + other.power }.normalised()
     }
 
-    fn normal(self) -> Self {
+    fn normalised(self) -> Self {
         let Self { mantissa, power } = self;
         if mantissa == 0.0 {
             Self { mantissa: 0.0, power: 0.0 }
@@ -61,7 +61,7 @@ impl Scaled {
     }
 }
 
-/// State of a three-term recurrence in many lanes; the values of a lane are those stored times 2^(512 power).
+/// State of a three-term recurrence in many lanes, each with a power of 2^512 that scales its stored values.
 #[derive(Clone, Debug)]
 pub(crate) struct ScaledLanes {
     /// Latest value.
@@ -109,15 +109,14 @@ pub(crate) struct LaneSlices<'a> {
     pub(crate) value: &'a mut [f64],
 }
 
-/// Makes `next` the latest value of a lane, given by its current and previous value, its power and its value as f64;
-/// scales all of them down once they have grown out of range.
+/// Makes `next` the current value of a lane, and scales the lane down once it has grown out of range.
 #[inline(always)]
 pub(crate) fn advance(next: f64, [current, previous, power, value]: [&mut f64; 4]) {
     let grown = next.abs() > RESCALE_ABOVE;
     let scale = if grown { RESCALE_DOWN } else { 1.0 };
-    let now = *power + if grown { 1.0 } else { 0.0 };
+    let new_power = *power + if grown { 1.0 } else { 0.0 };
     *previous = *current * scale;
     *current = next * scale;
-    *power = now;
-    *value = if now == 0.0 { next * scale } else { 0.0 };
+    *power = new_power;
+    *value = if new_power == 0.0 { next * scale } else { 0.0 };
 }

@@ -1,6 +1,6 @@
 //! Order statistics.
 
-/// The median; of an even number of values the greater of the two in the middle. `None` without values.
+/// The median (the upper one of an even number of values); `None` without values.
 pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
@@ -13,10 +13,10 @@ pub(crate) fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> Option<(
     }
     values.sort_unstable_by(f64::total_cmp);
     let at = |percent: f64| {
-        let place = percent / 100.0 * (values.len() - 1) as f64;
-        let before = place.floor() as usize;
+        let position = percent / 100.0 * (values.len() - 1) as f64;
+        let before = position.floor() as usize;
         let after = (before + 1).min(values.len() - 1);
-        values[before] + (place - before as f64) * (values[after] - values[before])
+        values[before] + (position - before as f64) * (values[after] - values[before])
     };
     Some((at(low), at(high)))
 }

@@ -11,14 +11,13 @@
 //! ```
 //!
 //! starts at `l = max(|m|, |mu|)` from the closed form
-//! `d^l_{l mu} = sqrt(C(2l, l-mu)) cos^{l+mu}(beta/2) (-sin(beta/2))^{l-mu}` and its mirror images. Upwards it
-//! first grows out of the classically forbidden region and then oscillates, so it is stable; its starting
-//! values lie below the range of f64 (0.5^1000 at l = 1000 and 30 deg), so every lane carries a power of
-//! 2^512 until it is back in range.
+//! `d^l_{l mu} = sqrt(C(2l, l-mu)) cos^{l+mu}(beta/2) (-sin(beta/2))^{l-mu}` and its mirror images. The forward
+//! recurrence grows out of the classically forbidden region and then oscillates, so it is stable; its starting
+//! values lie below the range of f64 (0.5^1000 at l = 1000 and 30 deg), so every lane carries a power of 2^512.
 
 use super::scaled::{LaneSlices, Scaled, ScaledLanes, advance};
 
-/// Tables shared by the recurrences at all mu: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
+/// Tables that the recurrences at all mu share: `sqrt(l^2 - m^2)`, its inverse, powers of the half angle.
 #[derive(Clone, Debug)]
 pub struct WignerTable {
     l_max: usize,
@@ -55,7 +54,7 @@ impl WignerTable {
         }
     }
 
-    /// Greatest degree.
+    /// Maximum degree.
     #[must_use]
     pub fn l_max(&self) -> usize {
         self.l_max
@@ -68,7 +67,7 @@ impl WignerTable {
     }
 }
 
-/// Rows of d at one `mu >= 0`, degree after degree.
+/// An iteration over the rows of d at one `mu >= 0`, by increasing degree.
 ///
 /// Negative mu follow from `d^l_{m,-mu} = (-1)^(m-mu) d^l_{-m,mu}`.
 #[derive(Clone, Debug)]
@@ -100,7 +99,7 @@ impl<'a> WignerRows<'a> {
             self.start();
         } else {
             self.step(l);
-            self.enter(l);
+            self.start_outer_orders(l);
         }
         self.next_l += 1;
         let centre = self.table.l_max;
@@ -121,8 +120,8 @@ impl<'a> WignerRows<'a> {
         }
     }
 
-    /// The two orders that begin at degree l > mu.
-    fn enter(&mut self, l: usize) {
+    /// Starts the two orders m = -l and m = l, whose recurrences begin at degree l > mu.
+    fn start_outer_orders(&mut self, l: usize) {
         let (mu, centre) = (self.mu, self.table.l_max);
         let ratio = (2 * l * (2 * l - 1)) as f64 / ((l - mu) * (l + mu)) as f64;
         self.binomial = self.binomial.times(ratio.sqrt());
@@ -137,14 +136,14 @@ impl<'a> WignerRows<'a> {
     fn step(&mut self, l: usize) {
         let (table, mu, centre) = (self.table, self.mu, self.table.l_max);
         let from = l - 1;
-        let at = |l: usize, m: usize| l * l + l + m;
-        let by_mu = table.inverse_root[at(l, mu)];
+        let index = |l: usize, m: usize| l * l + l + m;
+        let by_mu = table.inverse_root[index(l, mu)];
         let first = (2 * from + 1) as f64 * l as f64 * by_mu;
         let (slope, behind) = if from == 0 {
             (0.0, 0.0)
         } else {
             let inverse = 1.0 / from as f64;
-            (mu as f64 * inverse / l as f64, l as f64 * inverse * table.root[at(from, mu)] * by_mu)
+            (mu as f64 * inverse / l as f64, l as f64 * inverse * table.root[index(from, mu)] * by_mu)
         };
         step_lanes(
             [first * table.cos_beta, first * slope, behind, -(from as f64)],
@@ -154,8 +153,8 @@ impl<'a> WignerRows<'a> {
     }
 }
 
-/// One step of the recurrence on all lanes. `factors`: first cos beta, first slope, behind, first order; `roots`:
-/// `1 / e_l(m)` and `e_{l-1}(m)`.
+/// One step of the recurrence on all lanes. `factors` are those of `d^{l-1}` at m = 0 and per order, that of `d^{l-2}`, and the first order;
+/// `roots` are `1 / e_l(m)` and `e_{l-1}(m)`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn step_lanes(factors: [f64; 4], roots: [&[f64]; 2], lanes: LaneSlices<'_>) {
     let [at_zero, by_order, behind, first_order] = factors;
@@ -170,7 +169,7 @@ fn step_lanes(factors: [f64; 4], roots: [&[f64]; 2], lanes: LaneSlices<'_>) {
     }
 }
 
-/// `d^l_{m mu}(beta)` for l = 0 ..= `l_max` at any signs of the orders; zero below `max(|m|, |mu|)`.
+/// The values `d^l_{m mu}(beta)` for l = 0 ..= `l_max` and orders of any sign; zero for l below `max(|m|, |mu|)`.
 #[must_use]
 pub fn wigner_d(l_max: usize, m: i64, mu: i64, beta_rad: f64) -> Vec<f64> {
     let mut values = vec![0.0; l_max + 1];

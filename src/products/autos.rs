@@ -1,4 +1,4 @@
-//! The products of auto-correlations: a table, statistics and a picture.
+//! Products of auto-correlations: a table, statistics and a picture.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -32,7 +32,7 @@ pub struct AutoSummary {
     pub mean_k_sr: f64,
     /// Standard deviation of the mean from the noise of the integrations, K sr.
     pub sigma_k_sr: f64,
-    /// Mean square deviation from the mean, in units of the noise: 1 if only noise varies.
+    /// Reduced chi-square of the powers about their mean, 1 if they vary only by noise.
     pub chi_square: f64,
 }
 
@@ -53,8 +53,8 @@ pub fn summarise(powers: &[AutoPower]) -> Vec<AutoSummary> {
 
 fn statistics(powers: &[&AutoPower]) -> Option<AutoSummary> {
     let first = powers.first()?;
-    // Weight by the number of samples: sigma is proportional to the measured power, so weights 1 / sigma^2 would favour
-    // powers that came out too small.
+    // Weights are numbers of samples. As sigma is proportional to the measured power, weights 1 / sigma^2 would favour low
+    // powers.
     let samples = |power: &AutoPower| (power.power_k_sr / power.sigma_k_sr).powi(2);
     let total: f64 = powers.iter().map(|power| samples(power)).sum();
     if total <= 0.0 {
@@ -85,7 +85,7 @@ pub fn write_autos(
     if powers.is_empty() {
         return Ok(Vec::new());
     }
-    // By frequency, daughter, time, whatever the order of arrival.
+    // The order of arrival must not matter.
     powers.sort_unstable_by(|a, b| key(a).cmp(&key(b)).then(a.time_s.total_cmp(&b.time_s)));
     let path = folder.join("autos.csv");
     let write = |path: &Path, bytes: &[u8]| {
@@ -109,7 +109,6 @@ fn table(powers: &[AutoPower]) -> String {
     for power in powers {
         let AutoPower { daughter, frequency_hz, width_hz, time_s, power_k_sr, sigma_k_sr } = power;
         let daughter = u32::from(*daughter) + 1;
-        // Writing to a String cannot fail.
         let _ = writeln!(
             text,
             "{frequency_hz},{width_hz},{daughter},{time_s:.6},{power_k_sr:.7e},{sigma_k_sr:.3e}"

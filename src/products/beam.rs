@@ -1,4 +1,4 @@
-//! The effective beam of a map, from what it keeps of each degree, and noise in janskys a beam.
+//! The effective beam of a map, from the response at each degree, and the noise in Jy per beam.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -7,38 +7,38 @@ use serde::Serialize;
 use crate::sky::Comparison;
 use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 
-/// One jansky, W m^-2 Hz^-1.
 const JANSKY: f64 = 1e-26;
-/// Step in angle times the number of degrees, rad: a tenth of the narrowest beam's half width.
+/// Step in angle times the number of degrees, rad, a tenth of the half width of the narrowest beam.
 const STEP: f64 = 0.2;
-/// Halvings of a step: rounding is reached.
+/// Number of bisections of a step, which reaches rounding.
 const BISECTIONS: usize = 50;
-/// What a map keeps of each degree of the sky, and the beam that keeps as much.
+
+/// The effective beam of a map, from its response to each degree of the sky.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct EffectiveBeam {
-    /// `w_l = C_l^X / C_l^in` of the map and the input, from l = 0; with the Gaussian beam of post-processing, which the
-    /// comparison's input has too. NaN (null) where the input has no power.
+    /// Response `w_l = C_l^X / C_l^in` of the map, from l = 0, including the Gaussian beam of post-processing. NaN (null) where
+    /// the input has no power.
     pub w: Vec<f64>,
-    /// FWHM of the effective beam `sum_l (2 l + 1) w_l P_l(cos theta) / 4 pi`, degrees; absent without a peak. A map that keeps all
-    /// degrees up to l_max has 4.430 / (l_max + 1) rad.
+    /// FWHM of the effective beam `sum_l (2 l + 1) w_l P_l(cos theta) / 4 pi`, degrees; absent without a peak. For `w_l = 1` up to
+    /// l_max it is 4.430 / (l_max + 1) rad.
     pub fwhm_deg: Option<f64>,
-    /// Solid angle of that beam, `4 pi / sum (2 l + 1) w_l` with w_l relative to that of the monopole, sr: what a source's peak in K is
-    /// multiplied by for its flux density.
+    /// Solid angle of the beam, `4 pi w_0 / sum (2 l + 1) w_l`, sr. It converts the peak of a source in K to its flux density.
     pub area_sr: Option<f64>,
-    /// RMS of the noise-only map, K, as compared.
+    /// RMS of the noise-only map as compared, K.
     pub noise_rms_k: f64,
-    /// The same in that beam: `S = 2 k T nu^2 / c^2` times the solid angle, Jy.
+    /// RMS of the noise per beam, `2 k T nu^2 / c^2` times the solid angle, Jy.
     pub noise_rms_jy: Option<f64>,
 }
 
 impl EffectiveBeam {
-    /// Of a comparison at `frequency_hz`, whose map and input `smoothing` (by degree) has smoothed; `noise` is the noise-only
-    /// map, K.
+    /// The beam from a comparison at `frequency_hz`. `smoothing`, by degree, was applied to map and input; `noise` is the
+    /// noise-only map, K.
     #[must_use]
     pub(super) fn new(comparison: &Comparison, smoothing: &[f64], noise: &[f64], frequency_hz: f64) -> Self {
-        let share = comparison.cl_cross.iter().zip(&comparison.cl_truth).map(|(cross, input)| cross / input);
+        let response =
+            comparison.cl_cross.iter().zip(&comparison.cl_truth).map(|(cross, input)| cross / input);
         let w: Vec<f64> =
-            share.enumerate().map(|(l, w)| w * smoothing.get(l).copied().unwrap_or(1.0)).collect();
+            response.enumerate().map(|(l, w)| w * smoothing.get(l).copied().unwrap_or(1.0)).collect();
         let fwhm_rad = fwhm_rad(&w);
         let area_sr = area_sr(&w);
         let noise_rms_k = (noise.iter().map(|x| x * x).sum::<f64>() / noise.len().max(1) as f64).sqrt();
@@ -52,23 +52,22 @@ impl EffectiveBeam {
     }
 }
 
-/// Flux density of a temperature over a solid angle, Jy: `S = 2 k T nu^2 / c^2` times it.
 fn flux_jy(temperature_k: f64, frequency_hz: f64, area_sr: f64) -> f64 {
     let per_m = frequency_hz / SPEED_OF_LIGHT_M_S;
     2.0 * BOLTZMANN_J_K * temperature_k * per_m * per_m * area_sr / JANSKY
 }
 
-/// Solid angle of the beam `sum_l (2 l + 1) w_l P_l / 4 pi` over its value at 0, sr; degrees without a value count nothing. `None`
-/// without a peak, or without a monopole.
+/// Solid angle of the beam `sum_l (2 l + 1) w_l P_l / 4 pi` over its value at 0, sr. Unknown w_l count as 0. `None` without a
+/// peak or monopole.
 fn area_sr(w: &[f64]) -> Option<f64> {
-    let known = |w: &f64| if w.is_finite() { *w } else { 0.0 };
-    let peak: f64 = (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * known(w)).sum();
-    let area_sr = 2.0 * TAU * known(w.first()?) / peak;
+    let finite = |w: &f64| if w.is_finite() { *w } else { 0.0 };
+    let peak: f64 = (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * finite(w)).sum();
+    let area_sr = 2.0 * TAU * finite(w.first()?) / peak;
     (peak > 0.0 && area_sr > 0.0).then_some(area_sr)
 }
 
-/// Full width at half maximum of `sum_l (2 l + 1) w_l P_l(cos theta)`, rad; degrees without a value count nothing. `None` if it has no
-/// peak at 0, or does not fall to half of it within 90 degrees.
+/// Full width at half maximum of `sum_l (2 l + 1) w_l P_l(cos theta)`, rad. Unknown w_l count as 0. `None` without a peak at
+/// 0, or if the beam does not fall to half of it within 90 degrees.
 fn fwhm_rad(w: &[f64]) -> Option<f64> {
     let weights: Vec<f64> =
         (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * if w.is_finite() { *w } else { 0.0 }).collect();
@@ -76,25 +75,25 @@ fn fwhm_rad(w: &[f64]) -> Option<f64> {
     if peak <= 0.0 {
         return None;
     }
-    let above = |theta: f64| legendre_series(&weights, theta.cos()) - 0.5 * peak;
+    let excess = |theta: f64| legendre_series(&weights, theta.cos()) - 0.5 * peak;
     let step = STEP / weights.len() as f64;
     let steps = (FRAC_PI_2 / step) as u32;
-    let first = (1..=steps).map(|k| f64::from(k) * step).find(|&theta| above(theta) <= 0.0)?;
+    let first = (1..=steps).map(|k| f64::from(k) * step).find(|&theta| excess(theta) <= 0.0)?;
     let (mut inside, mut outside) = (first - step, first);
     for _ in 0..BISECTIONS {
         let middle = 0.5 * (inside + outside);
-        if above(middle) > 0.0 { inside = middle } else { outside = middle }
+        if excess(middle) > 0.0 { inside = middle } else { outside = middle }
     }
     Some(2.0 * inside)
 }
 
 /// `sum_l weights[l] P_l(x)` by the recurrence of P_l.
 fn legendre_series(weights: &[f64], x: f64) -> f64 {
-    let (mut before, mut now, mut sum) = (0.0, 1.0, 0.0);
+    let (mut previous, mut current, mut sum) = (0.0, 1.0, 0.0);
     for (l, weight) in (0..).zip(weights) {
-        sum += weight * now;
+        sum += weight * current;
         let l = f64::from(l);
-        (before, now) = (now, ((2.0 * l + 1.0) * x * now - l * before) / (l + 1.0));
+        (previous, current) = (current, ((2.0 * l + 1.0) * x * current - l * previous) / (l + 1.0));
     }
     sum
 }
@@ -106,17 +105,17 @@ mod tests {
 
     #[test]
     fn janskys_are_those_of_the_rayleigh_jeans_law() {
-        // By hand: 1e4 K at 10 MHz are 3.0724e4 Jy/sr, and a beam of 1 degree FWHM 1.1331 (pi/180)^2 sr.
+        // By hand: 1e4 K at 10 MHz are 3.0724e4 Jy/sr, and a beam of 1 degree FWHM has 1.1331 (pi/180)^2 sr.
         let area_sr = 1.1331 * 1_f64.to_radians().powi(2);
         assert!((flux_jy(1e4, 1e7, area_sr) / 10.605 - 1.0).abs() < 1e-4);
     }
 
     #[test]
     fn the_area_is_that_of_the_beam_itself() {
-        // All degrees up to l_max alike: sum (2 l + 1) = (l_max + 1)^2, so 4 pi / 161^2 = 4.848e-4 sr; a Gaussian of its width has 8.58e-4.
+        // Equal w_l up to l_max: sum (2 l + 1) = (l_max + 1)^2, so 4 pi / 161^2 = 4.848e-4 sr. A Gaussian of that width has 8.58e-4.
         let sharp = area_sr(&[0.7; 161]).unwrap();
         assert!((sharp / 4.848e-4 - 1.0).abs() < 1e-4, "{sharp}");
-        // A Gaussian that ends far beyond its width: 2 pi sigma^2, up to sigma^2.
+        // A well-sampled Gaussian has 2 pi sigma^2, up to relative terms of sigma^2.
         let fwhm_rad = 2.0_f64.to_radians();
         let smooth = area_sr(&gaussian_beam(fwhm_rad, 600)).unwrap();
         let expected = TAU * fwhm_rad.powi(2) / (8.0 * std::f64::consts::LN_2);
@@ -128,18 +127,18 @@ mod tests {
 
     #[test]
     fn the_width_is_that_of_the_profile() {
-        // A Gaussian on the sphere differs from its plane one by the square of its width.
+        // A Gaussian on the sphere differs from one on the plane by the square of its width.
         for fwhm_deg in [0.7_f64, 1.3, 5.0] {
             let fwhm = fwhm_rad(&gaussian_beam(fwhm_deg.to_radians(), 1500)).unwrap().to_degrees();
             assert!((fwhm / fwhm_deg - 1.0).abs() < fwhm_deg.to_radians().powi(2), "{fwhm} {fwhm_deg}");
         }
-        // All degrees up to l_max alike: 2 J_1(x) / x with x = (l_max + 1) theta, half at x = 2.21509 (tables), for small angles.
+        // Equal w_l up to l_max: 2 J_1(x) / x with x = (l_max + 1) theta at small angles, which is half at x = 2.21509 (tables).
         for l_max in [48_usize, 160] {
             let fwhm = fwhm_rad(&vec![1.0; l_max + 1]).unwrap();
             let expected = 2.0 * 2.21509 / (l_max + 1) as f64;
             assert!((fwhm / expected - 1.0).abs() < expected * expected, "{fwhm} {expected}");
         }
-        // Large scales that are missing or unknown hardly count.
+        // Unknown large scales have little effect.
         let mut w = gaussian_beam(0.02, 400);
         let whole = fwhm_rad(&w).unwrap();
         w[..18].fill(f64::NAN);

@@ -1,17 +1,18 @@
-//! The products of one channel.
+//! Writes the products of one channel.
 
 use std::path::{Path, PathBuf};
 
 use super::beam::EffectiveBeam;
+use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
 use super::latitudes::latitude_errors;
 use super::pictures::{
-    Axis, Bars, ColourScale, Curve, MapPanel, Palette, Picture, PictureError, Plot, Sampling, Scaling, Sheet,
-    View, draw_map, draw_plots, draw_sheet,
+    Bars, ColourScale, MapPanel, Palette, Picture, Sampling, Scaling, Sheet, View, draw_map, draw_sheet,
 };
 use super::point_beams::{PointBeamSummary, beams_csv};
 use super::provenance::Provenance;
+use super::sheet_maps::SheetMaps;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
@@ -19,36 +20,29 @@ use crate::files::{disk_room, write_atomically};
 use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
-use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with, is_unseen};
+use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::units::constants::DAY_S;
 
-/// Part of its disk that a listening ground leaves free.
-const KEPT_FREE: u64 = 20;
+/// Reciprocal of the fraction of the disk that products leave free, while a ground stage listens.
+const FREE_DIVISOR: u64 = 20;
 
-/// Maximum number of maps on the sheet of snapshots: the first, the last and some between.
-const SHEET_MAPS_MAX: usize = 6;
-
-/// Fixed names of the last map and its picture. They are files of their own, as links break where a folder is copied or packed.
+/// Fixed names of copies of the last map and its picture. They are not links, which break if a folder is copied or packed.
 const LATEST_MAP: &str = "latest.fits";
 const LATEST_PICTURE: &str = "latest.png";
 
-/// A channel's output folder, and the summary of its maps so far.
+/// The output folder of a channel, and the summary of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
-    /// Output folder of the run.
     root: PathBuf,
-    /// Name of the channel's folder within `root`.
     name: String,
     frequency_hz: f64,
     truth: Option<ChannelTruth>,
-    /// Snapshots for the sheet.
-    shown: SheetMaps,
+    sheet_maps: SheetMaps,
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
     beams: Vec<PointBeamSummary>,
-    /// Whether it leaves a part of the disk free.
-    leaves_room: bool,
+    needs_free_disk: bool,
 }
 
 impl ChannelFolder {
@@ -71,26 +65,26 @@ impl ChannelFolder {
             name,
             frequency_hz,
             truth: truth.cloned(),
-            shown: SheetMaps::default(),
+            sheet_maps: SheetMaps::default(),
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
             beams: Vec::new(),
-            leaves_room: false,
+            needs_free_disk: false,
         })
     }
 
-    /// Leaves a part of the disk free for the state and the raw archive of a ground, which may be on the same one.
-    pub(super) fn leaving_room(self) -> Self {
-        Self { leaves_room: true, ..self }
+    /// Leaves a part of the disk free for the state and the raw archive, which may be on the same disk.
+    pub(super) fn with_free_disk(self) -> Self {
+        Self { needs_free_disk: true, ..self }
     }
 
-    /// Lets final maps take the rest of the disk: nothing comes after them.
-    fn require_room(&self, solution: &Solution) -> Result<(), ProductsError> {
-        let leaves = self.leaves_room && !solution.is_final;
-        match disk_room(&self.root).filter(|_| leaves) {
-            Some([free, size]) if free < size / KEPT_FREE => {
-                let reason = "less than a twentieth of the disk is free, which is left to state and archive";
+    /// Returns an error if less than 1 / [`FREE_DIVISOR`] of the disk is free. Final maps are exempt, as no data follow them.
+    fn require_free_disk(&self, solution: &Solution) -> Result<(), ProductsError> {
+        let is_limited = self.needs_free_disk && !solution.is_final;
+        match disk_room(&self.root).filter(|_| is_limited) {
+            Some([free, size]) if free < size / FREE_DIVISOR => {
+                let reason = "less than a twentieth of the disk is free, which is reserved for the state and the raw archive";
                 let source = std::io::Error::new(std::io::ErrorKind::StorageFull, reason);
                 Err(ProductsError::Write { path: self.root.clone(), source })
             }
@@ -98,7 +92,9 @@ impl ChannelFolder {
         }
     }
 
-    /// Writes the products of one solution; the complete set if it is final. If they cannot be written, only viewers see the map.
+    /// Writes the products of one solution, and all products if it is final.
+    ///
+    /// If the files cannot be written, viewers still get the map, but the summary has no entry for it.
     pub(super) fn publish(
         &mut self,
         solution: &Solution,
@@ -106,8 +102,9 @@ impl ChannelFolder {
         viewers: &MapWatch,
     ) -> Result<(), ProductsError> {
         let (snapshots, beams) = (self.snapshots.len(), self.beams.len());
-        let published = self.publish_whole(solution, provenance, viewers);
+        let published = self.write_products(solution, provenance, viewers);
         if published.is_err() {
+            // There is a new summary entry if the map itself is valid and only its files could not be written.
             if self.snapshots.len() > snapshots {
                 self.show(None, Origin { provenance, solution }, viewers);
             }
@@ -117,7 +114,7 @@ impl ChannelFolder {
         published
     }
 
-    fn publish_whole(
+    fn write_products(
         &mut self,
         solution: &Solution,
         provenance: &Provenance,
@@ -133,14 +130,14 @@ impl ChannelFolder {
             self.config.processing().map(|processing| solved.processed(processing)).transpose()?;
         let shown = processed.as_ref().unwrap_or(&solved);
         let comparison = self.compare(solution, shown)?;
-        self.note(solution, shown, comparison.as_ref());
-        self.require_room(solution)?;
+        self.record_snapshot(solution, shown, comparison.as_ref());
+        self.require_free_disk(solution)?;
         if self.config.snapshot_maps && !solution.is_final {
             let name = format!("{}.fits", map_name(solution));
             self.write_map(&name, &solved.map, None, origin)?;
         }
         if self.config.pictures {
-            self.shown.offer(shown.map.values(), &caption(solution));
+            self.sheet_maps.offer(shown.map.values(), &caption(solution));
             self.draw_snapshot(solution, shown)?;
         }
         self.write_named(LATEST_MAP, &map_name(solution), &solved.map, None, origin)?;
@@ -160,7 +157,6 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Shows the map to viewers, as its file has it.
     fn show(&self, comparison: Option<&Comparison>, origin: Origin<'_>, viewers: &MapWatch) {
         let Origin { provenance, solution } = origin;
         let Some(figures) = self.snapshots.last() else { return };
@@ -171,7 +167,7 @@ impl ChannelFolder {
         });
     }
 
-    /// The truth beside maps that are shown.
+    /// The input sky, processed like the maps with which it is compared.
     fn input(&self, processing: Option<PostProcessing>) -> Option<&InputSky> {
         let truth = self.truth.as_ref()?;
         if processing.is_some() { truth.processed.as_ref() } else { Some(&truth.plain) }
@@ -179,19 +175,19 @@ impl ChannelFolder {
 
     fn compare(&self, solution: &Solution, shown: &ShownMaps) -> Result<Option<Comparison>, ProductsError> {
         let Some(input) = self.input(shown.processing) else { return Ok(None) };
-        // A harmonic map has no power beyond its own degrees; split pixels have no more than before.
+        // A harmonic map has no power above its l_max, and splitting pixels adds no degrees.
         let l_max = solution.diagnostics.l_max.unwrap_or(3 * solution.nside - 1);
         let comparison = compare_with(&shown.map, input, Some(&shown.noise), Some(l_max))?;
         let is_noisy = !solution.instrument.noiseless;
         Ok(Some(if is_noisy { comparison.with_noise_subtracted() } else { comparison }))
     }
 
-    /// The summary, if there was a final map.
+    /// The summary; `None` if there was no final map.
     pub(super) fn into_summary(self) -> Option<ChannelSummary> {
         self.summary.map(|summary| ChannelSummary { files: self.files, ..summary })
     }
 
-    fn note(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
+    fn record_snapshot(&mut self, solution: &Solution, shown: &ShownMaps, comparison: Option<&Comparison>) {
         let input = self.input(shown.processing);
         let rms_error_over_rms_truth =
             input.map(|input| rms_error_over_rms_truth(shown.map.values(), input.map.values()));
@@ -253,7 +249,7 @@ impl ChannelFolder {
         }
     }
 
-    /// A path in the channel's folder, recorded in the list of files.
+    /// The path of a file in the channel's folder. Adds the file to the list in the summary.
     fn file(&mut self, name: &str) -> PathBuf {
         let relative = format!("{}/{name}", self.name);
         let path = self.root.join(&relative);
@@ -273,7 +269,7 @@ impl ChannelFolder {
         self.write_named(name, name.trim_end_matches(".fits"), map, processing, origin)
     }
 
-    /// Writes a map; `what` describes it in the header.
+    /// Writes a map; `what` is its description in the header.
     fn write_named(
         &mut self,
         name: &str,
@@ -288,7 +284,7 @@ impl ChannelFolder {
         Ok(write_map(&path, map, &options)?)
     }
 
-    /// Map, noise and input, as solved or post-processed.
+    /// Writes the maps of sky, noise and input, as solved or post-processed.
     fn write_final(&mut self, maps: &ShownMaps, origin: Origin<'_>) -> Result<(), ProductsError> {
         let &ShownMaps { ref map, ref noise, processing } = maps;
         let ending = if processing.is_some() { "-smooth" } else { "" };
@@ -312,7 +308,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// Beams as maps, solved and post-processed, and a table of their widths.
+    /// Writes maps of the effective beams, as solved and post-processed, and a table of their widths.
     fn write_beams(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         let Origin { solution, .. } = origin;
         for (number, beam) in solution.beams.iter().enumerate() {
@@ -334,7 +330,7 @@ impl ChannelFolder {
         Ok(())
     }
 
-    /// The colour scale that map and input share: the range of the input, or of the map if there is no input.
+    /// The colour scale shared by map and input, with the range of the input, or of the map if there is no input.
     fn scale(&self, shown: &ShownMaps) -> ColourScale {
         let input = self.input(shown.processing).map(|input| &input.map);
         let reference = input.unwrap_or(&shown.map).values();
@@ -373,14 +369,14 @@ impl ChannelFolder {
         let map = shown.map.values();
         let scale = self.scale(shown);
         let how = provenance.caption(solution);
-        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution());
+        let subtitle = format!("{} visibilities, {}; {how}", solution.visibilities, shown.resolution_text());
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
         self.write_picture("map", &picture)?;
         picture.write(&self.file(LATEST_PICTURE))?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
-            let picture = draw_map(&panel, &shown.resolution(), &view(self.config.frame))?;
+            let picture = draw_map(&panel, &shown.resolution_text(), &view(self.config.frame))?;
             self.write_picture("input", &picture)?;
         }
         if let Some(comparison) = comparison {
@@ -388,23 +384,22 @@ impl ChannelFolder {
             let picture = draw_relative_error(&title, &subtitle, comparison, self.config.frame)?;
             self.write_picture("error", &picture)?;
             let noise = if solution.instrument.noiseless { "without" } else { "with" };
-            let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution());
+            let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution_text());
             self.write_picture("spectra", &draw_comparison(&title, comparison)?)?;
         }
         self.draw_sheet(shown, &caption(solution), scale)
     }
 
-    /// Draws the sheet of snapshots.
     fn draw_sheet(
         &mut self,
         last: &ShownMaps,
         caption: &str,
         scale: ColourScale,
     ) -> Result<(), ProductsError> {
-        let shown = self.shown.spread((last.map.values(), caption));
+        let shown = self.sheet_maps.evenly_spaced((last.map.values(), caption));
         let panels: Vec<MapPanel<'_>> = shown.map(|(map, caption)| self.panel(map, caption, scale)).collect();
         let sheet = Sheet {
-            title: format!("The map at {} MHz sharpens", self.frequency_hz / 1e6),
+            title: format!("Map at {} MHz by time observed", self.frequency_hz / 1e6),
             columns: 3,
             width_px: 1800,
             bars: Bars::Shared,
@@ -415,7 +410,7 @@ impl ChannelFolder {
         self.write_picture("sharpening", &picture)
     }
 
-    /// Writes a final picture, and the same as SVG if configured.
+    /// Writes a final picture as PNG, and as SVG if configured.
     fn write_picture(&mut self, name: &str, picture: &Picture) -> Result<(), ProductsError> {
         let path = self.file(&format!("{name}.png"));
         picture.write(&path)?;
@@ -427,18 +422,17 @@ impl ChannelFolder {
     }
 }
 
-/// Where a map comes from.
 #[derive(Clone, Copy)]
 struct Origin<'a> {
     provenance: &'a Provenance,
     solution: &'a Solution,
 }
 
-/// A map and its noise-only companion, as solved or post-processed.
+/// A map and its noise-only map, as solved or post-processed.
 struct ShownMaps {
     map: SkyMap,
     noise: SkyMap,
-    /// How they were processed.
+    /// The processing; `None` for maps as solved.
     processing: Option<PostProcessing>,
 }
 
@@ -448,8 +442,7 @@ impl ShownMaps {
         Ok(Self { map: apply(&self.map)?, noise: apply(&self.noise)?, processing: Some(processing) })
     }
 
-    /// The processing in words.
-    fn resolution(&self) -> String {
+    fn resolution_text(&self) -> String {
         let nside = self.map.nside();
         match self.processing {
             None => format!("nside {nside}"),
@@ -460,49 +453,6 @@ impl ShownMaps {
     }
 }
 
-/// A bounded selection of snapshots: the first, and every 2^n-th after it.
-#[derive(Default)]
-struct SheetMaps {
-    /// Maps with their captions.
-    maps: Vec<(Vec<f64>, String)>,
-    /// Number of maps offered so far.
-    offered: usize,
-    /// log2 of the number of maps offered per map kept.
-    halvings: u32,
-}
-
-impl SheetMaps {
-    /// Offers a map, which is kept if its number is due.
-    fn offer(&mut self, map: &[f64], caption: &str) {
-        let is_kept = |offered: usize, halvings: u32| offered.is_multiple_of(1 << halvings);
-        if is_kept(self.offered, self.halvings) && self.maps.len() == 2 * SHEET_MAPS_MAX {
-            let mut is_odd = true;
-            self.maps.retain(|_| {
-                is_odd = !is_odd;
-                !is_odd
-            });
-            self.halvings += 1;
-        }
-        if is_kept(self.offered, self.halvings) {
-            self.maps.push((map.to_vec(), caption.to_owned()));
-        }
-        self.offered += 1;
-    }
-
-    /// The maps for the sheet, in equal steps from the first to `last`, which was offered last.
-    fn spread<'a>(&'a self, last: (&'a [f64], &'a str)) -> impl Iterator<Item = (&'a [f64], &'a str)> {
-        let is_last = |k: usize| (k << self.halvings) + 1 == self.offered;
-        let others = (0..self.maps.len()).filter(|&k| !is_last(k)).count();
-        let places = SHEET_MAPS_MAX.min(others + 1);
-        (0..places).map(move |place| {
-            let k = if places > 1 { place * others / (places - 1) } else { 0 };
-            let kept = self.maps[..others].get(k);
-            kept.map_or(last, |(map, caption)| (map.as_slice(), caption.as_str()))
-        })
-    }
-}
-
-/// Name of a map's file without its extension.
 fn map_name(solution: &Solution) -> String {
     if solution.is_final { "map".to_owned() } else { format!("snapshot-{:03}", solution.number) }
 }
@@ -511,126 +461,18 @@ fn caption(solution: &Solution) -> String {
     format!("after {:.0} days", (solution.span_s[1] - solution.span_s[0]) / DAY_S)
 }
 
-/// Maps of the chain are on ecliptic axes.
+/// The view of a map, which is on ecliptic axes, in a celestial frame.
 fn view(frame: Frame) -> View {
     View { sampling: Sampling::Interpolated, ..View::of(frame, Frame::Ecliptic) }
 }
 
-/// RMS of (map - truth) divided by RMS of truth.
 fn rms_error_over_rms_truth(map: &[f64], truth: &[f64]) -> f64 {
     let difference: f64 = map.iter().zip(truth).map(|(m, t)| (m - t) * (m - t)).sum();
     let scale: f64 = truth.iter().map(|t| t * t).sum();
     (difference / scale).sqrt()
 }
 
-/// Mean of rho_l over 1 <= l <= `l_max`.
 fn mean_rho(rho: &[f64], l_max: usize) -> f64 {
     let range = &rho[1.min(rho.len())..rho.len().min(l_max + 1)];
     range.iter().sum::<f64>() / range.len().max(1) as f64
-}
-
-/// Draws (map - truth) / truth over the sky, percent, in a celestial frame.
-///
-/// # Errors
-/// A page that is too large, which one map is not.
-pub fn draw_relative_error(
-    title: &str,
-    subtitle: &str,
-    comparison: &Comparison,
-    frame: Frame,
-) -> Result<Picture, PictureError> {
-    let map = &comparison.relative_error_map;
-    let percent = |&value: &f64| if is_unseen(value) { value } else { 100.0 * value };
-    let values: Vec<f64> = map.values().iter().map(percent).collect();
-    let panel = MapPanel {
-        values: &values,
-        caption: title.to_owned(),
-        scale: ColourScale::symmetric(&values),
-        unit: "% of the truth".to_owned(),
-    };
-    let view = View { sampling: Sampling::Interpolated, ..View::of(frame, map.frame()) };
-    draw_map(&panel, subtitle, &view)
-}
-
-/// Draws rho_l, the angular power spectra and SNR_l as curves.
-///
-/// # Errors
-/// A page that is too large, which three plots are not.
-pub fn draw_comparison(title: &str, comparison: &Comparison) -> Result<Picture, PictureError> {
-    let curve = |label: &str, values: &[f64], dashed: bool| Curve {
-        label: label.to_owned(),
-        points: comparison.l.iter().map(|&l| l as f64).zip(values.iter().copied()).collect(),
-        dashed,
-    };
-    let correlations = match &comparison.rho_noise_subtracted {
-        None => vec![curve("", &comparison.rho, false)],
-        Some(quiet) => vec![
-            curve("with the map's noise", &comparison.rho, false),
-            curve("its power subtracted", quiet, true),
-        ],
-    };
-    let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
-    let mut plots = vec![
-        Plot {
-            title: "Correlation with the input".to_owned(),
-            x: l.clone(),
-            y: Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false },
-            curves: correlations,
-            levels: vec![1.0],
-        },
-        Plot {
-            title: "Angular power".to_owned(),
-            x: l.clone(),
-            y: Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None },
-            curves: vec![
-                curve("map", &comparison.cl_map, false),
-                curve("input", &comparison.cl_truth, true),
-                curve("cross", &comparison.cl_cross, false),
-            ],
-            levels: Vec::new(),
-        },
-    ];
-    if let Some(snr) = &comparison.snr {
-        plots.push(Plot {
-            title: "Signal to noise".to_owned(),
-            x: l,
-            y: Axis { label: "SNR_{l}".to_owned(), log: true, limits: None },
-            curves: vec![curve("", snr, false)],
-            levels: vec![1.0],
-        });
-    }
-    draw_plots(title, &plots, plots.len())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_sheet_goes_from_the_first_map_to_the_last_in_bounded_memory() {
-        for count in [1, 2, 5, 6, 7, 12, 13, 24, 25, 100, 471] {
-            let mut shown = SheetMaps::default();
-            for k in 0..count {
-                shown.offer(&[k as f64], &k.to_string());
-                assert!(shown.maps.len() <= 2 * SHEET_MAPS_MAX);
-            }
-            let last = count - 1;
-            let sheet: Vec<(f64, String)> = shown
-                .spread((&[last as f64], &last.to_string()))
-                .map(|(map, caption)| (map[0], caption.to_owned()))
-                .collect();
-            assert_eq!(sheet.len(), SHEET_MAPS_MAX.min(count));
-            assert_eq!((sheet[0].0, sheet[sheet.len() - 1].0), (0.0, last as f64));
-            for (map, caption) in &sheet {
-                assert_eq!(&map.to_string(), caption);
-            }
-            // Steps are whole multiples of the kept maps, a twelfth to a sixth of all: half to twice the equal step.
-            let equal = last as f64 / (sheet.len().max(2) - 1) as f64;
-            let steps = sheet.windows(2).map(|two| two[1].0 - two[0].0);
-            assert!(
-                steps.clone().all(|step| step >= 0.4 * equal && step <= 2.0 * equal),
-                "{count}: {sheet:?}"
-            );
-        }
-    }
 }

@@ -24,38 +24,38 @@ keys! {
     }
 }
 
-/// What is done with maps before they are compared and drawn: pixels are split, and smoothed to a Gaussian beam (the paper,
+/// Processing of maps before they are compared and drawn. Pixels are split, and smoothed with a Gaussian beam (the paper,
 /// Sect. 4: nside 64 to 256, FWHM 1 deg).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PostProcessing {
-    /// Pixels along a side into which one is split.
+    /// Number of parts into which the side of a pixel is split.
     pub split: usize,
-    /// FWHM, degrees.
+    /// FWHM of the beam, degrees.
     pub fwhm_deg: f64,
 }
 
 impl PostProcessing {
-    /// nside of a map of `nside` afterwards.
+    /// nside of a processed map whose nside was `nside`.
     #[must_use]
     pub fn nside(self, nside: usize) -> usize {
         self.split * nside
     }
 
-    /// FWHM, rad.
+    /// FWHM of the beam, rad.
     #[must_use]
     pub fn fwhm_rad(self) -> f64 {
         self.fwhm_deg.to_radians()
     }
 
-    /// The map after it.
+    /// Processes a map.
     ///
     /// # Errors
-    /// As [`SkyMap::refined`].
+    /// Errors of [`SkyMap::refined`].
     pub fn apply(self, map: &SkyMap) -> Result<SkyMap, MapError> {
         map.refined(self.split, self.fwhm_rad())
     }
 
-    /// Smooths coefficients.
+    /// Smooths harmonic coefficients with the beam.
     pub fn smooth(self, alm: &mut Alm) {
         let beam = gaussian_beam(self.fwhm_rad(), alm.l_max());
         multiply_degrees(alm, &beam);
@@ -63,17 +63,17 @@ impl PostProcessing {
 }
 
 impl ProductsConfig {
-    /// What is done with maps, if anything.
+    /// The processing of maps; `None` without smoothing.
     #[must_use]
     pub fn processing(&self) -> Option<PostProcessing> {
         let fwhm_deg = self.smooth_fwhm_deg;
         (fwhm_deg > 0.0).then_some(PostProcessing { split: 4, fwhm_deg })
     }
 
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All problems of the configuration; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("products");
+        let mut checks = Checks::new("products");
         let fwhm_deg = self.smooth_fwhm_deg;
         checks.require("smooth_fwhm_deg", fwhm_deg, (0.0..=90.0).contains(&fwhm_deg), "0 to 90 degrees");
         checks.finish()

@@ -7,20 +7,20 @@ use thiserror::Error;
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 
-/// Why a product could not be made.
+/// Errors of products.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProductsError {
     /// A file or folder that cannot be written.
-    #[error("cannot write {}: {source}; expected a writable place (choose one with --out)", path.display())]
+    #[error("cannot write {}: {source}; expected a writable folder (choose one with --out)", path.display())]
     Write {
-        /// Path.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// A folder that holds files already.
-    #[error("{}: there are files in it; expected a new or empty folder", path.display())]
+    /// A folder that is not empty.
+    #[error("{}: the folder contains files; expected a new or empty folder", path.display())]
     NotEmpty {
         /// The folder.
         path: PathBuf,
@@ -28,41 +28,41 @@ pub enum ProductsError {
     /// The summary of a run that cannot be read.
     #[error("cannot read {}: {source}; expected the folder of a finished run", path.display())]
     Read {
-        /// Path.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// A file that is not the summary of a run of this version.
     #[error("{}: {reason}; expected a summary.json that `lunarray run`, `replay` or `study` wrote", path.display())]
     NotASummary {
-        /// Path.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the problem.
         reason: String,
     },
     /// Data that cannot be encoded.
     #[error("cannot encode {}: {reason}", path.display())]
     Encode {
-        /// Path.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// The encoder's reason.
+        /// Error of the encoder.
         reason: String,
     },
     /// A downlink file that cannot be read.
     #[error(transparent)]
     Downlink {
-        /// Why.
+        /// Error of the downlink.
         source: Box<crate::downlink::DownlinkError>,
     },
     /// A downlink file without a description of the instrument.
-    #[error("{}: no description of the instrument; expected a file from the start of a pass", path.display())]
+    #[error("{}: no description of the instrument; expected a file from the start of a downlink", path.display())]
     NoInstrument {
         /// The file.
         path: PathBuf,
     },
-    /// Reading was interrupted.
-    #[error("{}: interrupted before its end", path.display())]
+    /// An interrupted read.
+    #[error("{}: reading was interrupted before the end of the file", path.display())]
     Interrupted {
         /// The file.
         path: PathBuf,

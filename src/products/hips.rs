@@ -1,4 +1,4 @@
-//! Maps as HiPS (Hierarchical Progressive Surveys, IVOA Recommendation 1.0), which Aladin reads.
+//! Writes maps as HiPS (Hierarchical Progressive Surveys, IVOA Recommendation 1.0), for example for Aladin.
 //!
 //! The sky is divided into the HEALPix pixels of an order, each a tile of `width` by `width` HEALPix pixels of a higher order, in
 //! `NorderK/DirD/NpixN.fits` and `.png`. A tile's first row from the top begins at the southern corner: rows go to the north-east
@@ -22,37 +22,36 @@ use crate::sky::healpix::{face_direction, nested_to_face, pixel_of};
 use crate::sky::{Frame, Rotation, SkyMap, is_unseen, rotate};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// The order that every HiPS has, whose tiles are the first to be shown.
+/// The lowest order that every HiPS must have. Clients show its tiles first.
 const ORDER_MIN: u8 = 3;
-/// Widths of tiles: 512 is usual, and 64 is that of published maps of nside 512 (WMAP). Clients keep hundreds of tiles, and
-/// smaller ones save little: coarser maps have several pixels of a tile in one of theirs.
+/// Minimum and maximum width of tiles. 512 is the standard, and 64 is used for published maps of nside 512 (WMAP). Clients cache
+/// hundreds of tiles, so that smaller ones save little.
 const WIDTHS: [usize; 2] = [64, 512];
-/// Width of a tile in the picture of the whole sky.
 const PREVIEW_WIDTH: usize = 64;
-/// Tiles of order 3, and how many of them stand in a row of the picture of the whole sky.
 const PREVIEW_TILES: usize = 768;
 const PREVIEW_COLUMNS: usize = 27;
-/// Name of the lock of a folder that is being written; one that an interrupted export left marks tiles that may be replaced.
+/// Name of the lock file of a folder that is being written. An interrupted export leaves it as a mark that its tiles may be
+/// replaced.
 const UNFINISHED: &str = ".lunarray-hips";
 
-/// How a map is written as HiPS.
+/// Options for writing a map as HiPS.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Hips {
     /// Frame of the tiles.
     pub frame: Frame,
     /// Scale of the colours.
     pub scaling: Scaling,
-    /// Title, one line.
+    /// Title in one line.
     pub title: String,
     /// Identifier in the Virtual Observatory, such as `ivo://AUTHORITY/P/NAME`.
     pub id: String,
-    /// When the map was made, as `YYYY-mm-ddTHH:MMZ`.
+    /// Date of the map, as `YYYY-mm-ddTHH:MMZ`.
     pub date: String,
     /// Frequency of the map, Hz.
     pub frequency_hz: Option<f64>,
 }
 
-/// What was written.
+/// Report on a HiPS that was written.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct HipsReport {
     /// Highest order of tiles.
@@ -65,13 +64,12 @@ pub struct HipsReport {
     pub tiles: usize,
 }
 
-/// Values of a tile, K, row by row from the top; NaN where there is none.
+/// Values of a tile, K, row by row from the top; NaN for pixels without a value.
 type Tile = Vec<f32>;
 
-/// A HiPS that is being written.
-struct Tiles<'a> {
+struct TileWriter<'a> {
     map: &'a SkyMap,
-    /// From the tiles' frame to the map's.
+    /// Rotation from the frame of the tiles to that of the map.
     rotation: Rotation,
     same_frame: bool,
     scale: ColourScale,
@@ -80,17 +78,19 @@ struct Tiles<'a> {
     folder: &'a Path,
 }
 
-/// What a tile and those in it leave to the orders above.
+/// A written tile, with the results of all tiles within it.
 struct TileSummary {
     tile: Tile,
-    /// Tiles of order 3 with their numbers, reduced.
+    /// Reduced tiles of order 3 with their numbers.
     previews: Vec<(usize, Tile)>,
     count: usize,
 }
 
 impl Hips {
-    /// Writes a map in K into a new or empty folder. The file `properties`, without which nobody reads a HiPS, comes last; tiles without it
-    /// are those of an export that was broken off, and are replaced.
+    /// Writes a map in K into a new or empty folder.
+    ///
+    /// The file `properties`, which every reader needs, is written last. Tiles without it are left from an interrupted export, and
+    /// are replaced.
     ///
     /// # Errors
     /// A folder that is not empty, or in which files cannot be written; values beyond single precision.
@@ -101,17 +101,17 @@ impl Hips {
         };
         fs::create_dir_all(folder).map_err(failed(folder))?;
         let properties = folder.join("properties");
-        let mut left = Vec::new();
+        let mut existing = Vec::new();
         for entry in fs::read_dir(folder).map_err(failed(folder))? {
-            left.push(entry.map_err(failed(folder))?.path());
+            existing.push(entry.map_err(failed(folder))?.path());
         }
-        // Of an export that was broken off, by a full disk or a signal, the lock stays: without it the tiles are somebody else's.
+        // An interrupted export leaves its lock file. Tiles without it were not written by this program.
         let begins = |path: &Path, start: &str| {
             path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(start))
         };
-        let is_ours = left.iter().any(|path| begins(path, UNFINISHED));
+        let is_ours = existing.iter().any(|path| begins(path, UNFINISHED));
         let (tiles, others): (Vec<&PathBuf>, Vec<&PathBuf>) =
-            left.iter().filter(|path| !begins(path, UNFINISHED)).partition(|path| begins(path, "Norder"));
+            existing.iter().filter(|path| !begins(path, UNFINISHED)).partition(|path| begins(path, "Norder"));
         if !others.is_empty() || (!tiles.is_empty() && !is_ours) {
             return Err(ProductsError::NotEmpty { path: folder.to_owned() });
         }
@@ -122,7 +122,7 @@ impl Hips {
         let depth = map.nside().trailing_zeros() as u8;
         let width = (map.nside() >> ORDER_MIN).clamp(WIDTHS[0], WIDTHS[1]);
         let order = depth.saturating_sub(width.trailing_zeros() as u8).max(ORDER_MIN);
-        let tiles = Tiles {
+        let tiles = TileWriter {
             map,
             rotation: self.frame.to_frame(map.frame()),
             same_frame: self.frame == map.frame(),
@@ -144,8 +144,8 @@ impl Hips {
         Ok(HipsReport { order, tile_width: width, frame: self.frame, tiles: count })
     }
 
-    /// The file `properties`: a key and its value a line.
-    fn properties(&self, tiles: &Tiles<'_>) -> String {
+    /// The contents of the file `properties`, with one key and value per line.
+    fn properties(&self, tiles: &TileWriter<'_>) -> String {
         let seen = || tiles.map.values().iter().copied().filter(|value| !is_unseen(*value));
         let (low, high) = (seen().fold(f64::INFINITY, f64::min), seen().fold(f64::NEG_INFINITY, f64::max));
         let pixel_deg = (4.0 * std::f64::consts::PI / 12.0).sqrt().to_degrees()
@@ -189,15 +189,13 @@ impl Hips {
             lines.push(("em_max", format!("{wavelength_m:e}")));
         }
         lines.iter().fold(String::new(), |mut text, (key, value)| {
-            // A string takes everything that is written to it.
             let _ = writeln!(text, "{key:<20} = {value}");
             text
         })
     }
 }
 
-impl Tiles<'_> {
-    /// Writes a tile and all that are in it.
+impl TileWriter<'_> {
     fn write(&self, order: u8, number: usize) -> Result<TileSummary, ProductsError> {
         let (mut previews, mut count) = (Vec::new(), 1);
         let tile = if order == self.order {
@@ -231,16 +229,16 @@ impl Tiles<'_> {
         Ok(TileSummary { tile, previews, count })
     }
 
-    /// The map's values at the centres of a tile's pixels.
+    /// The values of the map at the pixel centres of a tile.
     fn sampled(&self, number: usize) -> Tile {
         let tiles = 1_usize << self.order;
         let (face, x0, y0) = nested_to_face(tiles, number);
         let side = (tiles * self.width) as f64;
-        let place = |first: usize, k: usize| ((first * self.width + k) as f64 + 0.5) / side;
+        let coordinate = |first: usize, k: usize| ((first * self.width + k) as f64 + 0.5) / side;
         let mut tile = Vec::with_capacity(self.width * self.width);
         for row in 0..self.width {
             for column in 0..self.width {
-                let direction = face_direction(face, place(x0, row), place(y0, column));
+                let direction = face_direction(face, coordinate(x0, row), coordinate(y0, column));
                 let direction = if self.same_frame { direction } else { rotate(&self.rotation, direction) };
                 let value = self.map.values()[pixel_of(self.map.nside(), direction)];
                 tile.push(if is_unseen(value) { f32::NAN } else { value as f32 });
@@ -249,12 +247,11 @@ impl Tiles<'_> {
         tile
     }
 
-    /// The tile that holds four.
     fn merged(&self, inside: &[Tile]) -> Tile {
         let half = self.width / 2;
         let mut tile = vec![f32::NAN; self.width * self.width];
         for (child, values) in inside.iter().enumerate() {
-            // The lower bit is of x, the upper one of y.
+            // The lower bit of the number is of x, the upper one of y.
             let (down, right) = (child % 2 * half, child / 2 * half);
             for (row, values) in halved(values, self.width).chunks_exact(half).enumerate() {
                 let start = (down + row) * self.width + right;
@@ -264,7 +261,7 @@ impl Tiles<'_> {
         tile
     }
 
-    /// All tiles of order 3 in one picture.
+    /// Writes all tiles of order 3 as one picture.
     fn write_preview(&self, previews: &[(usize, Tile)]) -> Result<(), ProductsError> {
         let width = self.width.min(PREVIEW_WIDTH);
         let columns = PREVIEW_COLUMNS * width;
@@ -280,7 +277,8 @@ impl Tiles<'_> {
         self.write_both(&self.folder.join(format!("Norder{ORDER_MIN}")), "Allsky", columns, &all, &cards)
     }
 
-    /// An image as FITS and as PNG. Thousands of them are not synchronised one by one: `properties` tells that all are there.
+    /// Writes an image as FITS and PNG. The thousands of files are not synced one by one, as `properties` marks the export as
+    /// complete.
     fn write_both(
         &self,
         folder: &Path,
@@ -303,16 +301,16 @@ impl Tiles<'_> {
     }
 }
 
-/// Means of four pixels each, of those that have a value.
+/// Halves the width of a tile by the means of four pixels, without pixels that have no value.
 fn halved(values: &[f32], width: usize) -> Tile {
     let half = width / 2;
     let mean = |row: usize, column: usize| {
-        let four = [0, 1, width, width + 1].map(|step| values[2 * row * width + 2 * column + step]);
-        let (sum, count) = four
+        let pixels = [0, 1, width, width + 1].map(|step| values[2 * row * width + 2 * column + step]);
+        let (sum, count) = pixels
             .iter()
             .filter(|value| !value.is_nan())
             .fold((0.0_f64, 0.0), |(sum, count), &value| (sum + f64::from(value), count + 1.0));
-        // NaN of none.
+        // NaN if no pixel has a value.
         (sum / count) as f32
     };
     (0..half * half).map(|k| mean(k / half, k % half)).collect()
@@ -324,7 +322,7 @@ mod tests {
     use crate::units::constants::HEALPIX_UNSEEN;
 
     #[test]
-    fn means_leave_out_what_has_no_value() {
+    fn means_leave_out_pixels_without_value() {
         let nan = f32::NAN;
         let values = [1.0, 2.0, nan, nan, 3.0, 6.0, nan, nan, nan, 5.0, 0.0, 0.0, 7.0, nan, 1.0, 1.0];
         let found = halved(&values, 4);
@@ -352,12 +350,12 @@ mod tests {
         assert_eq!(report.tiles, 12 * (1 + 4 + 16 + 64));
         let properties = fs::read_to_string(out.join("properties")).unwrap();
         assert!(properties.contains("obs_title            = two lines\n"), "{properties}");
-        // Of 3 MHz, m.
+        // The wavelength at 3 MHz, m.
         assert!(properties.contains("em_min               = 9.993"), "{properties}");
         let again = hips.write(&map, &out).unwrap_err().to_string();
         assert!(again.contains("expected a new or empty folder"), "{again}");
-        // One that was broken off has no `properties`, a tile that is not whole, and its lock. What is not ours stays, and so do tiles without
-        // the lock.
+        // An interrupted export has no `properties`, an incomplete tile, and its lock. Other files stay, and so do tiles without the
+        // lock.
         let tile = out.join("Norder3/Dir0/Npix5.fits");
         let whole = fs::read(&tile).unwrap();
         fs::remove_file(out.join("properties")).unwrap();
@@ -371,7 +369,7 @@ mod tests {
         hips.write(&map, &out).unwrap();
         assert!(!out.join(UNFINISHED).exists());
         assert_eq!(fs::read(&tile).unwrap(), whole);
-        // With one pixel for four at each order, the mean of what is seen is that of all.
+        // The tile of order 0 has the standard size.
         let preview = fs::read(out.join("Norder0/Dir0/Npix0.fits")).unwrap();
         assert_eq!(preview.len(), 2880 * (1 + (4 * 64 * 64_usize).div_ceil(2880)));
     }

@@ -1,26 +1,25 @@
-//! The relative error of a map by distance from the ecliptic: baselines of an inclined orbit see the poles least.
+//! The relative error of a map by distance from the ecliptic, as the baselines of an inclined orbit constrain the poles least.
 
 use serde::{Deserialize, Serialize};
 
 use crate::sky::{Comparison, is_unseen};
 
-/// Edges of the bands, degrees.
 const EDGES_DEG: [f64; 7] = [0.0, 15.0, 30.0, 45.0, 60.0, 75.0, 90.0];
 
-/// Relative error of a map, (map - truth) / truth, in both bands at a distance from the ecliptic.
+/// Relative error of a map, (map - truth) / truth, in the northern and southern band at a distance from the ecliptic.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, bincode::Encode, bincode::Decode)]
 pub struct LatitudeError {
-    /// Least distance from the ecliptic, degrees.
+    /// Minimum distance from the ecliptic, degrees.
     pub from_deg: f64,
-    /// Greatest.
+    /// Maximum distance from the ecliptic, degrees.
     pub to_deg: f64,
-    /// Mean.
+    /// Mean of the relative error.
     pub mean: f64,
-    /// Root mean square.
+    /// Root mean square of the relative error.
     pub rms: f64,
 }
 
-/// Errors of a comparison by latitude; bands without a pixel are left out.
+/// Relative errors by latitude, without bands that contain no pixel.
 #[must_use]
 pub(super) fn latitude_errors(comparison: &Comparison) -> Vec<LatitudeError> {
     let map = &comparison.relative_error_map;
@@ -52,7 +51,7 @@ mod tests {
     use crate::sky::{Frame, SkyMap, compare};
 
     #[test]
-    fn a_dark_pole_is_told() {
+    fn a_dark_pole_is_reported() {
         let truth = SkyMap::constant(16, Frame::Ecliptic, 10.0).unwrap();
         // Half the truth beyond 75 degrees, a tenth too bright elsewhere.
         let limit = 75_f64.to_radians().sin();

@@ -1,14 +1,15 @@
 //! The products of a run: maps, pictures, tables and summaries in an output folder.
 //!
 //! [`Publisher`] is the sink that writes every [`crate::imaging::Solution`]; [`write_autos`] writes the
-//! auto-correlations. [`pictures`] draws. A [`MapViewer`] sees maps as they are published.
+//! auto-correlations; [`pictures`] draws. A [`MapViewer`] gets every map when it is published.
 //!
-//! May use [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
+//! Uses [`crate::imaging`], [`crate::ground`], [`crate::downlink`], [`crate::sky`], [`crate::frames`] and [`crate::runtime`]. Equal data give
 //! equal bytes, and every map carries its provenance: configuration hashes, seed, program version and data span.
 
 mod autos;
 mod beam;
 mod channel;
+mod comparison_pictures;
 mod config;
 mod epsilons;
 mod error;
@@ -18,7 +19,9 @@ pub mod pictures;
 mod point_beams;
 mod provenance;
 mod publisher;
+mod run_pictures;
 mod runs;
+mod sheet_maps;
 mod summary;
 mod time_coverage;
 mod truth;
@@ -30,7 +33,7 @@ pub use autos::{AutoSummary, summarise, write_autos};
 #[doc(hidden)]
 pub use beam::EffectiveBeam;
 #[doc(hidden)]
-pub use channel::{draw_comparison, draw_relative_error};
+pub use comparison_pictures::{draw_comparison, draw_relative_error};
 #[doc(hidden)]
 pub use config::{PostProcessing, ProductsConfig};
 #[doc(hidden)]
@@ -50,9 +53,11 @@ pub use provenance::Provenance;
 #[doc(hidden)]
 pub use publisher::{ProductsReport, ProductsWatch, Publisher};
 #[doc(hidden)]
+pub use run_pictures::draw_runs;
+#[doc(hidden)]
 pub use runs::{
     BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,
-    RunFigures, TraceFigures, crossings, draw_runs, runs_csv, spectra_csv,
+    RunFigures, TraceFigures, crossings, runs_csv, spectra_csv,
 };
 pub use summary::ChannelSummary;
 #[doc(hidden)]

@@ -1,4 +1,4 @@
-//! Effective beams in given directions, from the maps of points, with their widths.
+//! Point-spread functions of a map: effective beams in some directions, with their widths.
 
 use std::fmt::Write;
 
@@ -7,53 +7,54 @@ use serde::Serialize;
 use crate::sky::healpix::pixel_directions;
 use crate::sky::{Cutout, Frame, MapError, PlaneProjection, SkyMap};
 
-/// Side of the plane on which a beam is measured: in pixels of the map as solved, and in places.
+/// Side of the cutout on which a beam is measured, in pixels of the map as solved.
 const SIDE_PIXELS: f64 = 16.0;
-const SIDE_PLACES: usize = 241;
-/// Parts along a side of a pixel into which a map is split before its width is measured.
+/// Side of the cutout in pixels of its own.
+const SIDE_SAMPLES: usize = 241;
+/// Number of parts into which the side of a pixel is split before beams are measured.
 const SPLIT: usize = 8;
 
-/// Widths of a beam: of the part above half its greatest value, which is an ellipse for a Gaussian one.
+/// Widths of a beam, from the second moments of the region above half its maximum, which is an ellipse for a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct BeamWidths {
-    /// Greatest value near the point, K: of a source that is 1 K in one pixel.
+    /// Maximum near the point, K, for a source of 1 K in one pixel.
     pub peak_k: f64,
-    /// Distance of the middle from the point, degrees.
+    /// Distance of the centroid from the point, degrees.
     pub offset_deg: f64,
     /// Full width at half maximum along the longer axis, degrees.
     pub fwhm_major_deg: f64,
-    /// Along the shorter one.
+    /// Full width at half maximum along the shorter axis, degrees.
     pub fwhm_minor_deg: f64,
-    /// Direction of the longer axis, from the ecliptic's north towards east, degrees from -90 to 90.
+    /// Position angle of the longer axis, from ecliptic north towards east, -90 to 90 degrees.
     pub angle_deg: f64,
 }
 
 impl BeamWidths {
-    /// FWHM of the circle of the same area, degrees.
+    /// FWHM of a circular beam of the same area, degrees.
     #[must_use]
     pub fn fwhm_deg(&self) -> f64 {
         (self.fwhm_major_deg * self.fwhm_minor_deg).sqrt()
     }
 
-    /// Around a pixel of a map of `nside`, of a map that is as fine or finer; `None` if nothing is above zero there.
+    /// Measures the beam around a pixel of a map of `nside`, on the same or a finer map; `None` if no value there is positive.
     pub(super) fn around(fine: &SkyMap, nside: usize, centre_deg: [f64; 2]) -> Option<Self> {
         let pixel_deg = (std::f64::consts::PI / 3.0).sqrt().to_degrees() / nside as f64;
         let cutout = Cutout {
             projection: PlaneProjection::Gnomonic,
             frame: Frame::Ecliptic,
             centre_deg,
-            // A small map's pixels are large, and the plane ends at 120 degrees.
+            // Pixels of a coarse map are large, and the projection ends at 120 degrees.
             size_deg: (SIDE_PIXELS * pixel_deg).min(100.0),
-            pixels: SIDE_PLACES,
+            pixels: SIDE_SAMPLES,
         };
         let values = cutout.values(fine);
-        let step_deg = cutout.size_deg / SIDE_PLACES as f64;
-        let place = |k: usize| {
-            let at = |k: usize| (k as f64 - 0.5 * (SIDE_PLACES as f64 - 1.0)) * step_deg;
-            [at(k % SIDE_PLACES), at(k / SIDE_PLACES)]
+        let step_deg = cutout.size_deg / SIDE_SAMPLES as f64;
+        let position_deg = |k: usize| {
+            let offset_deg = |k: usize| (k as f64 - 0.5 * (SIDE_SAMPLES as f64 - 1.0)) * step_deg;
+            [offset_deg(k % SIDE_SAMPLES), offset_deg(k / SIDE_SAMPLES)]
         };
-        // The greatest within a quarter of the plane's side: others are not this beam.
-        let is_near = |k: usize| place(k)[0].hypot(place(k)[1]) < 0.25 * cutout.size_deg;
+        // Maxima farther away than a quarter of the side are not of this beam.
+        let is_near = |k: usize| position_deg(k)[0].hypot(position_deg(k)[1]) < 0.25 * cutout.size_deg;
         let top =
             (0..values.len()).filter(|&k| is_near(k)).max_by(|&a, &b| values[a].total_cmp(&values[b]))?;
         let peak_k = values[top];
@@ -62,15 +63,19 @@ impl BeamWidths {
         }
         let inside = connected(&values, top, 0.5 * peak_k);
         let count = inside.len() as f64;
-        let mean = [0, 1].map(|axis| inside.iter().map(|&k| place(k)[axis]).sum::<f64>() / count);
+        let mean = [0, 1].map(|axis| inside.iter().map(|&k| position_deg(k)[axis]).sum::<f64>() / count);
         let moment = |a: usize, b: usize| {
-            inside.iter().map(|&k| (place(k)[a] - mean[a]) * (place(k)[b] - mean[b])).sum::<f64>() / count
+            inside
+                .iter()
+                .map(|&k| (position_deg(k)[a] - mean[a]) * (position_deg(k)[b] - mean[b]))
+                .sum::<f64>()
+                / count
         };
         let (xx, yy, xy) = (moment(0, 0), moment(1, 1), moment(0, 1));
         let (middle, spread) = (0.5 * (xx + yy), (0.5 * (xx - yy)).hypot(xy));
-        // The second moment of an ellipse's area along an axis is a quarter of its half axis squared.
+        // The second moment of an ellipse along an axis is a quarter of the square of the semi-axis.
         let width = |variance: f64| 4.0 * variance.max(0.0).sqrt();
-        // From up towards the left, where east is.
+        // From up (north) towards left (east).
         let angle = 0.5 * (-2.0 * xy).atan2(yy - xx);
         Some(Self {
             peak_k,
@@ -82,22 +87,22 @@ impl BeamWidths {
     }
 }
 
-/// Places around `top` that hold at least `least`, without a gap.
-fn connected(values: &[f64], top: usize, least: f64) -> Vec<usize> {
+/// The connected region around `top` with values of at least `threshold`.
+fn connected(values: &[f64], top: usize, threshold: f64) -> Vec<usize> {
     let mut seen = vec![false; values.len()];
     let (mut open, mut inside) = (vec![top], Vec::new());
     seen[top] = true;
     while let Some(k) = open.pop() {
         inside.push(k);
-        let (column, row) = (k % SIDE_PLACES, k / SIDE_PLACES);
-        let beside = [
+        let (column, row) = (k % SIDE_SAMPLES, k / SIDE_SAMPLES);
+        let neighbours = [
             (column > 0).then(|| k - 1),
-            (column + 1 < SIDE_PLACES).then(|| k + 1),
-            (row > 0).then(|| k - SIDE_PLACES),
-            (row + 1 < SIDE_PLACES).then(|| k + SIDE_PLACES),
+            (column + 1 < SIDE_SAMPLES).then(|| k + 1),
+            (row > 0).then(|| k - SIDE_SAMPLES),
+            (row + 1 < SIDE_SAMPLES).then(|| k + SIDE_SAMPLES),
         ];
-        for next in beside.into_iter().flatten() {
-            if !seen[next] && values[next] >= least {
+        for next in neighbours.into_iter().flatten() {
+            if !seen[next] && values[next] >= threshold {
                 seen[next] = true;
                 open.push(next);
             }
@@ -109,20 +114,20 @@ fn connected(values: &[f64], top: usize, least: f64) -> Vec<usize> {
 /// The effective beam in one direction.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PointBeamSummary {
-    /// Ecliptic longitude of the pixel's centre, degrees.
+    /// Ecliptic longitude of the pixel centre, degrees.
     pub longitude_deg: f64,
-    /// Ecliptic latitude of it.
+    /// Ecliptic latitude of the pixel centre, degrees.
     pub latitude_deg: f64,
-    /// Of the map as solved; absent if nothing of the point is left.
+    /// Widths in the map as solved; absent if the point is not visible.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub solved: Option<BeamWidths>,
-    /// After post-processing, if there is any.
+    /// Widths after post-processing; absent without it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub processed: Option<BeamWidths>,
 }
 
 impl PointBeamSummary {
-    /// Of the map of a point at a pixel, as solved (harmonics up to `l_max`, or pixels) and as processed.
+    /// Measures the beam in the map of a point source in a pixel, as solved (harmonic up to `l_max`, or pixels) and as processed.
     pub(super) fn new(
         pixel: usize,
         solved: &SkyMap,
@@ -134,7 +139,7 @@ impl PointBeamSummary {
         let (longitude_deg, latitude_deg) =
             (y.atan2(x).to_degrees().rem_euclid(360.0), z.clamp(-1.0, 1.0).asin().to_degrees());
         let measure = |map: &SkyMap| BeamWidths::around(map, nside, [longitude_deg, latitude_deg]);
-        // Harmonics have values between pixels; pixels are what they are.
+        // Harmonic maps can be evaluated between pixels.
         let fine = match l_max {
             Some(l_max) => solved.band_limited(SPLIT * nside, l_max)?,
             None => solved.clone(),
@@ -147,7 +152,6 @@ impl PointBeamSummary {
     }
 }
 
-/// Beams as a table (CSV).
 #[must_use]
 pub(super) fn beams_csv(beams: &[PointBeamSummary]) -> String {
     let mut text = "longitude_deg,latitude_deg,processed,peak_k,offset_deg,fwhm_deg,fwhm_major_deg,fwhm_minor_deg,angle_deg\n".to_owned();
@@ -155,7 +159,6 @@ pub(super) fn beams_csv(beams: &[PointBeamSummary]) -> String {
         for (is_processed, widths) in [(false, beam.solved), (true, beam.processed)] {
             let Some(widths) = widths else { continue };
             let BeamWidths { peak_k, offset_deg, fwhm_major_deg, fwhm_minor_deg, angle_deg } = widths;
-            // Writing to a string does not fail.
             let _ = writeln!(
                 text,
                 "{},{},{is_processed},{peak_k:e},{offset_deg},{},{fwhm_major_deg},{fwhm_minor_deg},{angle_deg}",
@@ -172,7 +175,7 @@ pub(super) fn beams_csv(beams: &[PointBeamSummary]) -> String {
 mod tests {
     use super::*;
 
-    /// An elliptical Gaussian of known axes, at several places and angles.
+    /// An elliptical Gaussian of known axes, at several positions and angles.
     #[test]
     fn widths_of_a_gaussian_are_found_again() {
         for (centre_deg, angle_deg) in [([40.0, 10.0], 30.0), ([250.0, -62.0], -70.0)] {
@@ -197,12 +200,12 @@ mod tests {
             let map =
                 SkyMap::new(Frame::Ecliptic, pixel_directions(512).iter().map(value).collect()).unwrap();
             let found = BeamWidths::around(&map, nside, centre_deg).unwrap();
-            // Pixels of 0.11 degrees: the edge is uncertain by a small part of one (those of 0.23 degrees lose 1.3 %). On the tangent plane lengths are larger by
-            // 1 / cos^2 of 2.6 degrees, 2e-3.
+            // The edge is uncertain by a small fraction of a pixel of 0.11 degrees (pixels of 0.23 degrees lose 1.3 %). On the
+            // tangent plane lengths are larger by 1 / cos^2 of 2.6 degrees, 2e-3.
             assert!((found.fwhm_major_deg / major - 1.0).abs() < 0.01, "{found:?}");
             assert!((found.fwhm_minor_deg / minor - 1.0).abs() < 0.01, "{found:?}");
             assert!((found.angle_deg - angle_deg).abs() < 2.0 && found.offset_deg < 0.05, "{found:?}");
-            // The nearest pixel's centre is up to 0.08 degrees off the middle: 4 ln 2 (0.08 / 3.9)^2 = 1.2e-3.
+            // The nearest pixel centre is up to 0.08 degrees from the centre: 4 ln 2 (0.08 / 3.9)^2 = 1.2e-3.
             assert!((found.peak_k / 0.7 - 1.0).abs() < 1.5e-3, "{found:?}");
         }
         let nothing = SkyMap::constant(16, Frame::Ecliptic, 0.0).unwrap();

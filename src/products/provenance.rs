@@ -1,4 +1,4 @@
-//! Provenance of the maps.
+//! Provenance of the maps: header cards and captions.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use crate::imaging::{EngineKind, MapConfig, RegulariserChoice};
 use crate::sky::fits::Card;
 use crate::units::calendar::tai_text;
 
-/// The ground segment's share of the provenance; the rest comes with each solution.
+/// The part of the provenance that is common to all maps. The rest comes with each solution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Provenance {
     /// Hash of the ground segment's configuration.
@@ -20,7 +20,7 @@ pub struct Provenance {
 }
 
 impl Provenance {
-    /// FITS header cards of a map. Runs on the same data give the same cards.
+    /// FITS header cards of a map. Equal data give equal cards.
     #[must_use]
     pub fn cards(&self, solution: &Solution, what: &str, processing: Option<PostProcessing>) -> Vec<Card> {
         let Instrument { name, channels, seed, configuration_hash, epoch_tai_s, .. } =
@@ -58,13 +58,12 @@ impl Provenance {
         cards
     }
 
-    /// What the map was made from, and how.
     fn method_cards(&self, solution: &Solution, frequency_hz: f64) -> Vec<Card> {
         let map = &self.map;
         let mut cards = vec![
-            Card::text("NOISE", noise(&solution.instrument), "thermal noise in the visibilities"),
-            Card::text("ANTENNA", antenna(solution.instrument.response), "response of every daughter"),
-            Card::text("ENGINE", engine(map.engine), "unknowns of the solution"),
+            Card::text("NOISE", noise_state(&solution.instrument), "thermal noise in the visibilities"),
+            Card::text("ANTENNA", antenna_name(solution.instrument.response), "response of every daughter"),
+            Card::text("ENGINE", engine_name(map.engine), "unknowns of the solution"),
         ];
         match map.engine {
             EngineKind::Pixel | EngineKind::Auto => {
@@ -92,7 +91,6 @@ impl Provenance {
         cards
     }
 
-    /// What R is.
     fn regulariser_cards(&self, solution: &Solution) -> Vec<Card> {
         let mut cards = Vec::new();
         if let Some(epsilon) = solution.diagnostics.epsilon {
@@ -119,15 +117,14 @@ impl Provenance {
         cards
     }
 
-    /// How a map was refined, and with which rows.
     fn refinement_cards(&self, refinement: &Refinement) -> Vec<Card> {
-        let passes = i64::try_from(refinement.convergence.iterations).unwrap_or(i64::MAX);
+        let iterations = i64::try_from(refinement.convergence.iterations).unwrap_or(i64::MAX);
         let antennas = match self.map.antennas.keys_set() {
             keys if keys.is_empty() => "ideal".to_owned(),
             keys => keys.join(", "),
         };
         vec![
-            Card::integer("PASSES", passes, "over visibilities, rows of true positions"),
+            Card::integer("PASSES", iterations, "over visibilities, rows of true positions"),
             Card::real("RESIDUAL", refinement.convergence.residual, "of the equations, relative"),
             Card::logical("CONVERGD", refinement.convergence.converged, "no more passes are needed"),
             Card::logical("SMEARED", self.map.refine.smear_integrations, "rows averaged over integrations"),
@@ -135,7 +132,6 @@ impl Provenance {
         ]
     }
 
-    /// The prior of a channel in words.
     fn prior(&self, channel: usize) -> String {
         let map = &self.map;
         match map.prior_files.get(channel) {
@@ -147,7 +143,7 @@ impl Provenance {
         }
     }
 
-    /// How a map was made, in a line below its picture.
+    /// Line on the method below the picture of a map.
     pub(super) fn caption(&self, solution: &Solution) -> String {
         let map = &self.map;
         let prior = self.prior(usize::from(solution.channel.0));
@@ -158,27 +154,27 @@ impl Provenance {
             RegulariserChoice::File(_) => format!("epsilon {epsilon:e} / C_{{l}}"),
             _ => format!("epsilon {epsilon:e}"),
         };
-        let ended = if solution.has_converged() { "" } else { "NOT CONVERGED, " };
+        let warning = if solution.has_converged() { "" } else { "NOT CONVERGED, " };
         format!(
-            "{ended}{regulariser}, b < {} b_p, prior: {prior}, thermal noise {}",
+            "{warning}{regulariser}, b < {} b_p, prior: {prior}, thermal noise {}",
             map.baseline_bp_max,
-            noise(&solution.instrument)
+            noise_state(&solution.instrument)
         )
     }
 }
 
-/// The end of a file's name: a header card holds 68 characters.
+/// The last 30 characters of a file name, as a header card holds 68.
 fn file_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy();
     let name: String = name.chars().filter(char::is_ascii_graphic).collect();
     name[name.len().saturating_sub(30)..].to_owned()
 }
 
-fn noise(instrument: &Instrument) -> &'static str {
+fn noise_state(instrument: &Instrument) -> &'static str {
     if instrument.noiseless { "off" } else { "on" }
 }
 
-fn antenna(response: AntennaResponse) -> &'static str {
+fn antenna_name(response: AntennaResponse) -> &'static str {
     match response {
         AntennaResponse::Isotropic => "isotropic",
         AntennaResponse::DipoleNormal => "dipole-normal",
@@ -186,14 +182,14 @@ fn antenna(response: AntennaResponse) -> &'static str {
     }
 }
 
-fn engine(engine: EngineKind) -> &'static str {
+fn engine_name(engine: EngineKind) -> &'static str {
     match engine {
         EngineKind::Pixel | EngineKind::Auto => "pixel",
         EngineKind::Harmonic => "harmonic",
     }
 }
 
-/// A text as a header can hold it: what is not printable ASCII is percent-encoded, byte by byte in UTF-8 (RFC 3986).
+/// Encodes a text for a header: UTF-8 bytes that are not printable ASCII are percent-encoded (RFC 3986).
 fn in_ascii(text: &str) -> String {
     text.bytes()
         .map(|byte| match byte {

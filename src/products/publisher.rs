@@ -1,4 +1,4 @@
-//! The sink of the ground segment: writes maps, pictures and summaries into a folder.
+//! The sink of the ground segment, which writes maps, pictures and summaries into a folder.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ use crate::imaging::Solution;
 use crate::runtime::{Sink, Units};
 use crate::units::ChannelId;
 
-/// Writes the solver's solutions, channel by channel.
+/// Writes the products of solutions into one folder per channel.
 pub struct Publisher {
     config: ProductsConfig,
     folder: PathBuf,
@@ -28,28 +28,27 @@ pub struct Publisher {
     summaries: Arc<Mutex<Vec<ChannelSummary>>>,
     published: u64,
     viewers: MapWatch,
-    /// Where failures are told, if they end nothing.
-    trouble: Option<ProductsWatch>,
-    /// The last map of a channel whose files could not be written.
+    /// Report on failures, if these do not end the run.
+    watch: Option<ProductsWatch>,
+    /// The last map of each channel whose files could not be written.
     unwritten: BTreeMap<ChannelId, Solution>,
 }
 
-/// Time after which files that could not be written are tried again.
-const AGAIN: Duration = Duration::from_secs(5);
+const RETRY_AFTER: Duration = Duration::from_secs(5);
 
-/// Waits before files that could not be written are tried a last time.
-const LAST_WAITS: [Duration; 3] = [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1)];
+/// Pauses between attempts to write the remaining files at the end.
+const FINAL_PAUSES: [Duration; 3] = [Duration::ZERO, Duration::from_millis(200), Duration::from_secs(1)];
 
-/// How the files of products went.
+/// Report on the writing of product files.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct ProductsReport {
-    /// Attempts that failed.
+    /// Number of failed attempts.
     pub failed: u64,
     /// Why the last attempt failed; `None` if it did not.
     pub unwritten: Option<String>,
 }
 
-/// The report on the products of a ground at work; clones share it.
+/// The report on the product files of a running ground segment. Clones share it.
 #[derive(Clone, Debug, Default)]
 pub struct ProductsWatch(Arc<Mutex<ProductsReport>>);
 
@@ -68,8 +67,8 @@ impl ProductsWatch {
 }
 
 impl Publisher {
-    /// A publisher to `folder`, which is created if necessary. At the end it stores the summaries of all channels in
-    /// `summaries`.
+    /// A publisher that writes into `folder`, which it creates if needed. At the end it stores the summaries of all
+    /// channels in `summaries`.
     ///
     /// # Errors
     /// A folder that cannot be created.
@@ -92,21 +91,21 @@ impl Publisher {
             summaries,
             published: 0,
             viewers,
-            trouble: None,
+            watch: None,
             unwritten: BTreeMap::new(),
         })
     }
 
-    /// Shows every map to `viewers`, once its files are written.
+    /// Shows every map to `viewers` after its files are written.
     #[must_use]
-    pub fn shown_to(self, viewers: MapWatch) -> Self {
+    pub fn with_viewers(self, viewers: MapWatch) -> Self {
         Self { viewers, ..self }
     }
 
-    /// Goes on if files cannot be written, says so to `watch`, and tries again after a while, with the next map, and at the end.
+    /// Continues if files cannot be written, reports failures to `watch`, and tries again after a pause, with the next map, and at the end.
     #[must_use]
-    pub fn persisting(self, watch: &ProductsWatch) -> Self {
-        Self { trouble: Some(watch.clone()), ..self }
+    pub fn with_retries(self, watch: &ProductsWatch) -> Self {
+        Self { watch: Some(watch.clone()), ..self }
     }
 
     fn publish(&mut self, solution: &Solution, viewers: &MapWatch) -> Result<(), ProductsError> {
@@ -114,7 +113,7 @@ impl Publisher {
         if !self.channels.contains_key(&channel) {
             let truth = self.truth.channel(channel);
             let opened = ChannelFolder::open(&self.folder, &self.config, truth, solution)?;
-            let opened = if self.trouble.is_some() { opened.leaving_room() } else { opened };
+            let opened = if self.watch.is_some() { opened.with_free_disk() } else { opened };
             self.channels.insert(channel, opened);
         }
         if let Some(folder) = self.channels.get_mut(&channel) {
@@ -124,8 +123,7 @@ impl Publisher {
         Ok(())
     }
 
-    /// Tries to write what could not be written.
-    fn write_again(&mut self) -> Result<(), ProductsError> {
+    fn retry_unwritten(&mut self) -> Result<(), ProductsError> {
         while let Some((channel, solution)) = self.unwritten.pop_first() {
             if let Err(error) = self.publish(&solution, &MapWatch::default()) {
                 self.unwritten.insert(channel, solution);
@@ -142,8 +140,8 @@ impl Sink for Publisher {
 
     fn take(&mut self, solution: Solution) -> Result<(), ProductsError> {
         let viewers = self.viewers.clone();
-        let Some(trouble) = self.trouble.clone() else { return self.publish(&solution, &viewers) };
-        // A newer map takes the place of one that could not be written.
+        let Some(watch) = self.watch.clone() else { return self.publish(&solution, &viewers) };
+        // A newer map replaces one that could not be written.
         self.unwritten.remove(&solution.channel);
         let written = self.publish(&solution, &viewers);
         let failure = match written {
@@ -151,17 +149,17 @@ impl Sink for Publisher {
                 self.unwritten.insert(solution.channel, solution);
                 Some(error)
             }
-            Ok(()) => self.write_again().err(),
+            Ok(()) => self.retry_unwritten().err(),
         };
-        trouble.update(failure.as_ref());
+        watch.update(failure.as_ref());
         Ok(())
     }
 
     fn finish(&mut self) -> Result<(), ProductsError> {
         let mut last = Ok(());
-        for wait in LAST_WAITS {
-            std::thread::sleep(wait);
-            last = self.write_again();
+        for pause in FINAL_PAUSES {
+            std::thread::sleep(pause);
+            last = self.retry_unwritten();
             if last.is_ok() {
                 break;
             }
@@ -173,14 +171,14 @@ impl Sink for Publisher {
         Ok(())
     }
 
-    fn tries_again_after(&self) -> Option<Duration> {
-        (!self.unwritten.is_empty()).then_some(AGAIN)
+    fn retry_after(&self) -> Option<Duration> {
+        (!self.unwritten.is_empty()).then_some(RETRY_AFTER)
     }
 
-    fn try_again(&mut self) {
-        let failure = self.write_again().err();
-        if let Some(trouble) = &self.trouble {
-            trouble.update(failure.as_ref());
+    fn retry(&mut self) {
+        let failure = self.retry_unwritten().err();
+        if let Some(watch) = &self.watch {
+            watch.update(failure.as_ref());
         }
     }
 

@@ -1,4 +1,4 @@
-//! Several runs side by side: what their summaries say, as tables and overlaid curves.
+//! Figures of runs from their summaries, and tables that compare several runs.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -7,47 +7,43 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ProductsError;
 use super::latitudes::LatitudeError;
-use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 
-/// Most runs that are drawn over one another: more cannot be told apart.
-const DRAWN_MAX: usize = 14;
-
-/// The maps of a run, from its `summary.json`.
+/// Figures of the maps of a run, from its `summary.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunFigures {
-    /// Label: its name, or that of a study's case.
+    /// Name of the run, or of a case of a study.
     #[serde(rename = "name")]
     pub label: String,
-    /// Whether it was ended early.
+    /// Whether the run was cancelled.
     pub cancelled: bool,
-    /// Its channels.
+    /// Figures of each channel.
     pub channels: Vec<ChannelFigures>,
 }
 
-/// Figures of one channel's final map. Spectra run from l = 0; unknown values are `None`.
+/// Figures of the final map of one channel. Spectra start at l = 0; unknown values are `None`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ChannelFigures {
     /// Frequency, Hz.
     pub frequency_hz: f64,
     /// nside of the map.
     pub nside: usize,
-    /// Visibilities in it.
+    /// Number of visibilities in the map.
     pub visibilities: u64,
-    /// Its mean, K.
+    /// Mean of the map, K.
     pub mean_k: f64,
     /// RMS of the noise-only map, K.
     pub noise_rms_k: f64,
-    /// Whether the visibilities hold thermal noise.
+    /// Whether the visibilities contain thermal noise.
     pub thermal_noise: bool,
     /// Regularisation and traces.
     pub diagnostics: DiagnosticFigures,
-    /// rho_l.
+    /// Correlation with the input, rho_l.
     pub rho: Option<Vec<Option<f64>>>,
-    /// rho_l with the noise's power subtracted.
+    /// rho_l with the noise power subtracted.
     pub rho_noise_subtracted: Option<Vec<Option<f64>>>,
-    /// SNR_l.
+    /// Signal-to-noise ratio, SNR_l.
     pub snr: Option<Vec<Option<f64>>>,
-    /// Angular power.
+    /// Angular power spectra.
     pub power: Option<PowerFigures>,
     /// The effective beam.
     pub beam: Option<BeamFigures>,
@@ -58,23 +54,24 @@ pub struct ChannelFigures {
     pub power_kept: Option<PowerKept>,
 }
 
-/// Power of a map relative to that of the same map from an instrument without errors, by degree from l = 0.
+/// Power of a map relative to the map of an ideal instrument, by degree from l = 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PowerKept {
-    /// C_l over C_l of the ideal map. Power that errors spread over the map counts.
+    /// C_l over C_l of the ideal map, including power added by errors.
     pub cl_ratio: Vec<Option<f64>>,
-    /// Square of the cross power with the input over that of the ideal map: what is still the sky.
+    /// Square of the cross power with the input over that of the ideal map, the fraction that is coherent with the sky.
     pub coherent: Vec<Option<f64>>,
 }
 
 impl PowerKept {
-    /// The power of `map` relative to `ideal`; `None` if either has none.
-    fn of(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
+    /// The power of `map` relative to `ideal`; `None` if either has no spectra.
+    fn new(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
         let (map, ideal) = (map.power.as_ref()?, ideal.power.as_ref()?);
-        let ratios = |of: &[Option<f64>], to: &[Option<f64>], power: i32| {
-            let ratio =
-                |(of, to): (&Option<f64>, &Option<f64>)| Some((*of)? / (*to)?).filter(|r| r.is_finite());
-            of.iter().zip(to).map(|pair| ratio(pair).map(|ratio| ratio.powi(power))).collect()
+        let ratios = |found: &[Option<f64>], ideal: &[Option<f64>], power: i32| {
+            let ratio = |(found, ideal): (&Option<f64>, &Option<f64>)| {
+                Some((*found)? / (*ideal)?).filter(|r| r.is_finite())
+            };
+            found.iter().zip(ideal).map(|pair| ratio(pair).map(|ratio| ratio.powi(power))).collect()
         };
         Some(Self {
             cl_ratio: ratios(&map.map_k2, &ideal.map_k2, 1),
@@ -83,30 +80,30 @@ impl PowerKept {
     }
 }
 
-/// Regularisation of a solution, and its traces.
+/// Regularisation and traces of a solution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DiagnosticFigures {
     /// epsilon of R = epsilon W_max I.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub epsilon: Option<f64>,
-    /// W_max, K^-2; both absent where R is from the data.
+    /// W_max, K^-2; both absent if R is from the data.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub w_max: Option<f64>,
-    /// Traces, if they were asked for.
+    /// Traces, if requested.
     pub traces: Option<TraceFigures>,
-    /// Residuals of the data, if they were asked for.
+    /// Residuals of the data, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<FitFigures>,
 }
 
-/// A map against its data.
+/// Residuals of the data of a map.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FitFigures {
-    /// Real numbers in the data.
+    /// Number of real data.
     pub numbers: u64,
-    /// `V'N^-1V`.
+    /// Power of the data, `V'N^-1V`.
     pub data_power: f64,
-    /// `|V - B T|^2` in units of their noise.
+    /// `|V - B T|^2` in units of the noise.
     pub residual: EstimateFigures,
     /// `|T - T_p|^2` over the pixels, K^2.
     pub solution_k2: f64,
@@ -115,38 +112,38 @@ pub struct FitFigures {
 /// Traces of the covariances (the paper, Sect. 4).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TraceFigures {
-    /// Tr Sigma_n, K^2.
+    /// Trace of the noise covariance, Tr Sigma_n, K^2.
     pub sigma_n_k2: EstimateFigures,
-    /// Tr Sigma_s.
+    /// Trace for the regularisation bias, Tr Sigma_s.
     pub sigma_s: EstimateFigures,
-    /// Tr A (A + R)^-1.
+    /// Effective number of parameters, Tr A (A + R)^-1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub measured: Option<EstimateFigures>,
 }
 
-/// A value with its error; `None` if it has no bound.
+/// An estimate and its error.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EstimateFigures {
-    /// Value.
+    /// Estimated value.
     pub value: f64,
-    /// Error.
+    /// Bound on the error; `None` if unbounded.
     pub error: Option<f64>,
 }
 
-/// The effective beam of a map, and its noise.
+/// The effective beam of a map and its noise.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct BeamFigures {
-    /// FWHM, degrees.
+    /// FWHM of the beam, degrees.
     pub fwhm_deg: Option<f64>,
-    /// Solid angle, sr.
+    /// Solid angle of the beam, sr.
     pub area_sr: Option<f64>,
     /// RMS of the noise-only map as compared, K.
     pub noise_rms_k: f64,
-    /// The same in the beam, Jy.
+    /// RMS of the noise per beam, Jy.
     pub noise_rms_jy: Option<f64>,
 }
 
-/// Angular power, K^2.
+/// Angular power spectra, K^2.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PowerFigures {
     /// C_l of the map.
@@ -163,7 +160,7 @@ impl RunFigures {
     /// Reads the `summary.json` in the folder of a run.
     ///
     /// # Errors
-    /// A file that cannot be read, or is no summary of a run.
+    /// A file that cannot be read, or is not the summary of a run.
     pub fn read(folder: &Path) -> Result<Self, ProductsError> {
         let path = folder.join("summary.json");
         let bytes =
@@ -187,14 +184,14 @@ impl ChannelFigures {
         self.mean(self.rho.as_ref()?)
     }
 
-    /// Means of C_l over that of the ideal instrument, and of its coherent part, over the same degrees.
+    /// Means over 20 <= l <= 120, or to 2 nside if that is less, of the power and the coherent power relative to the ideal instrument.
     #[must_use]
     pub fn power_kept_means(&self) -> [Option<f64>; 2] {
         let kept = self.power_kept.as_ref();
         [kept.and_then(|kept| self.mean(&kept.cl_ratio)), kept.and_then(|kept| self.mean(&kept.coherent))]
     }
 
-    /// Mean over 20 <= l <= 120, or to 2 nside if that is less, if all of these are known.
+    /// Mean over 20 <= l <= 120, or to 2 nside if that is less; `None` if any of these is unknown.
     fn mean(&self, of_degrees: &[Option<f64>]) -> Option<f64> {
         let values: Option<Vec<f64>> =
             of_degrees.get(20..=120.min(2 * self.nside))?.iter().copied().collect();
@@ -205,29 +202,30 @@ impl ChannelFigures {
 }
 
 impl RunFigures {
-    /// Notes the power of each channel's map relative to that of an instrument without errors.
-    pub fn against_ideal(&mut self, ideal: &Self) {
+    /// Sets the power of each channel's map relative to the run of an ideal instrument.
+    pub fn set_power_kept(&mut self, ideal: &Self) {
         for channel in &mut self.channels {
             let same = ideal.channels.iter().find(|ideal| ideal.frequency_hz == channel.frequency_hz);
-            channel.power_kept = same.and_then(|ideal| PowerKept::of(channel, ideal));
+            channel.power_kept = same.and_then(|ideal| PowerKept::new(channel, ideal));
         }
     }
 }
 
-/// Where thermal noise equals what the regulariser leaves out, as only epsilon changes (the paper, Fig. 15).
+/// The epsilon at which thermal-noise variance equals regularisation bias, for runs that differ only in epsilon (the paper, Fig. 15).
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Crossing {
-    /// Label of the first of the runs.
-    pub of: String,
-    /// Frequency, Hz.
+    /// Label of the first run.
+    #[serde(rename = "of")]
+    pub run_label: String,
+    /// Frequency of the channel, Hz.
     pub frequency_hz: f64,
-    /// epsilon at which Tr Sigma_n = T^2 Tr Sigma_s with T the mean of the input, both K^2.
+    /// epsilon at which Tr Sigma_n = T^2 Tr Sigma_s, with T the mean of the input.
     pub epsilon: Option<f64>,
-    /// epsilon at which the number of K^2 in Tr Sigma_n is the number of K in T Tr Sigma_s.
+    /// epsilon at which Tr Sigma_n in K^2 and T Tr Sigma_s in K are numerically equal.
     pub epsilon_first_power: Option<f64>,
 }
 
-/// Crossings of the traces in groups of runs that differ in epsilon alone.
+/// Crossings of the traces in groups of runs that differ only in epsilon.
 #[must_use]
 pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
     let mut found = Vec::new();
@@ -247,7 +245,7 @@ pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
                 continue;
             }
             found.push(Crossing {
-                of: group[0].label.clone(),
+                run_label: group[0].label.clone(),
                 frequency_hz: first.frequency_hz,
                 epsilon: crossing(&points, 2),
                 epsilon_first_power: crossing(&points, 1),
@@ -257,7 +255,7 @@ pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
     found
 }
 
-/// Where `n = mean^power s`, on straight lines between logarithms.
+/// The epsilon at which `n = mean^power s`, by linear interpolation of logarithms.
 fn crossing(points: &[[f64; 4]], power: i32) -> Option<f64> {
     let excess = |[epsilon, n, s, mean]: &[f64; 4]| (epsilon.ln(), (n / (s * mean.powi(power))).ln());
     points.windows(2).find_map(|two| {
@@ -266,7 +264,7 @@ fn crossing(points: &[[f64; 4]], power: i32) -> Option<f64> {
     })
 }
 
-/// Text of one field of a table with commas.
+/// Quotes a text as a field of a CSV table.
 fn field(text: &str) -> String {
     if text.contains([',', '"', '\n']) {
         format!("\"{}\"", text.replace('"', "\"\""))
@@ -279,7 +277,7 @@ fn number(value: Option<f64>) -> String {
     value.map_or_else(String::new, |value| format!("{value:e}"))
 }
 
-/// Runs as a table (CSV), a line a channel.
+/// Formats runs as a CSV table with one line per channel.
 #[must_use]
 pub fn runs_csv(runs: &[&RunFigures]) -> String {
     let mut text =
@@ -289,8 +287,8 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             .to_owned();
     for (run, channel) in runs.iter().flat_map(|run| run.channels.iter().map(move |channel| (run, channel))) {
         let DiagnosticFigures { epsilon, w_max, traces, .. } = &channel.diagnostics;
-        let [n, s] =
-            [|t: &TraceFigures| t.sigma_n_k2, |t: &TraceFigures| t.sigma_s].map(|of| traces.as_ref().map(of));
+        let [n, s] = [|t: &TraceFigures| t.sigma_n_k2, |t: &TraceFigures| t.sigma_s]
+            .map(|trace| traces.as_ref().map(trace));
         let [cl_ratio, coherent] = channel.power_kept_means();
         let start = [
             field(&run.label),
@@ -321,7 +319,7 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
     text
 }
 
-/// Spectra of runs as a table (CSV), a line a degree.
+/// Formats spectra of runs as a CSV table with one line per degree.
 #[must_use]
 pub fn spectra_csv(runs: &[&RunFigures]) -> String {
     let mut text =
@@ -343,121 +341,10 @@ pub fn spectra_csv(runs: &[&RunFigures]) -> String {
         for l in 0..degrees {
             let values =
                 columns.map(|column| number(column.and_then(|column| column.get(l).copied().flatten())));
-            // Writing to a string does not fail.
             let _ = writeln!(text, "{},{},{l},{}", field(&run.label), channel.frequency_hz, values.join(","));
         }
     }
     text
-}
-
-/// Curves of runs over one another: rho_l, SNR_l, C_l of the maps, and the traces against epsilon where there are some.
-///
-/// # Errors
-/// A page that is too large, which six plots are not.
-pub fn draw_runs(title: &str, runs: &[&RunFigures]) -> Result<Picture, PictureError> {
-    let channels: Vec<(String, &ChannelFigures)> = runs
-        .iter()
-        .flat_map(|run| {
-            run.channels.iter().map(|channel| {
-                let several = run.channels.len() > 1;
-                let frequency = format!("{:.3} MHz", channel.frequency_hz / 1e6);
-                let label = if several { format!("{}, {frequency}", run.label) } else { run.label.clone() };
-                (label, channel)
-            })
-        })
-        .collect();
-    let of_degrees = |get: &dyn Fn(&ChannelFigures) -> Option<&Vec<Option<f64>>>| -> Vec<Curve> {
-        channels
-            .iter()
-            .take(DRAWN_MAX)
-            .enumerate()
-            .filter_map(|(number, (label, channel))| {
-                // What is not known interrupts the curve.
-                let points = get(channel)?
-                    .iter()
-                    .enumerate()
-                    .map(|(l, y)| (l as f64, y.unwrap_or(f64::NAN)))
-                    .collect();
-                Some(Curve { label: label.clone(), points, dashed: number >= 7 })
-            })
-            .collect()
-    };
-    let l = Axis { label: "degree l".to_owned(), ..Axis::default() };
-    let mut plots = Vec::new();
-    let mut plot = |title: &str, y: Axis, curves: Vec<Curve>, levels: Vec<f64>| {
-        if !curves.is_empty() {
-            plots.push(Plot { title: title.to_owned(), x: l.clone(), y, curves, levels });
-        }
-    };
-    let rho = Axis { label: "rho_{l}".to_owned(), limits: Some((0.0, 1.05)), log: false };
-    plot("Correlation with the input", rho, of_degrees(&|c| c.rho.as_ref()), vec![1.0]);
-    let snr = Axis { label: "SNR_{l}".to_owned(), log: true, limits: None };
-    plot("Signal to noise", snr, of_degrees(&|c| c.snr.as_ref()), vec![1.0]);
-    let mut powers = of_degrees(&|c| c.power.as_ref().map(|power| &power.map_k2));
-    if let Some((_, first)) = channels.first()
-        && let Some(power) = &first.power
-        && powers.len() < DRAWN_MAX
-    {
-        let points =
-            power.input_k2.iter().enumerate().map(|(l, y)| (l as f64, y.unwrap_or(f64::NAN))).collect();
-        powers.push(Curve { label: "input".to_owned(), points, dashed: true });
-    }
-    let power = Axis { label: "C_{l} (K²)".to_owned(), log: true, limits: None };
-    plot("Angular power of the maps", power, powers, Vec::new());
-    // Errors add power as well: the ratio may be far above one.
-    let ratio = Axis { label: "C_{l} / C_{l} ideal".to_owned(), log: true, limits: None };
-    let kept = of_degrees(&|c| c.power_kept.as_ref().map(|kept| &kept.cl_ratio));
-    plot("Power against the ideal instrument's", ratio, kept, vec![0.95, 1.0]);
-    let ratio = Axis { label: "coherent power".to_owned(), limits: Some((0.0, 1.2)), log: false };
-    let coherent = of_degrees(&|c| c.power_kept.as_ref().map(|kept| &kept.coherent));
-    plot("Part of it that is still the sky", ratio, coherent, vec![0.95, 1.0]);
-    plots.extend(trace_plot(&channels));
-    if plots.is_empty() {
-        plots.push(Plot { title: "No input to compare with, and no traces".to_owned(), ..Plot::default() });
-    }
-    let columns = plots.len().min(2);
-    let more = channels.len() > DRAWN_MAX;
-    let title = if more {
-        format!("{title} (the first {DRAWN_MAX} of {})", channels.len())
-    } else {
-        title.to_owned()
-    };
-    draw_plots(title.trim_start(), &plots, columns)
-}
-
-/// The traces against epsilon, if there are at least two.
-fn trace_plot(channels: &[(String, &ChannelFigures)]) -> Option<Plot> {
-    let mut curves: Vec<Curve> = Vec::new();
-    let mut frequencies: Vec<f64> = channels.iter().map(|(_, channel)| channel.frequency_hz).collect();
-    frequencies.dedup();
-    for &frequency_hz in frequencies.iter().take(3) {
-        let mut points: Vec<(f64, f64, f64)> = channels
-            .iter()
-            .filter(|(_, channel)| channel.frequency_hz == frequency_hz)
-            .filter_map(|(_, channel)| {
-                let traces = channel.diagnostics.traces.as_ref()?;
-                let square = channel.input_mean_k()?.powi(2);
-                Some((channel.diagnostics.epsilon?, traces.sigma_n_k2.value, square * traces.sigma_s.value))
-            })
-            .collect();
-        points.sort_by(|a, b| a.0.total_cmp(&b.0));
-        if points.len() < 2 {
-            continue;
-        }
-        let at = format!("{:.3} MHz", frequency_hz / 1e6);
-        let noise = points.iter().map(|point| (point.0, point.1)).collect();
-        let imperfection = points.iter().map(|point| (point.0, point.2)).collect();
-        curves.push(Curve { label: format!("Tr Sigma_{{n}}, {at}"), points: noise, dashed: false });
-        let label = format!("mean(T)² Tr Sigma_{{s}}, {at}");
-        curves.push(Curve { label, points: imperfection, dashed: true });
-    }
-    (!curves.is_empty()).then(|| Plot {
-        title: "Thermal noise and imperfection".to_owned(),
-        x: Axis { label: "epsilon".to_owned(), log: true, limits: None },
-        y: Axis { label: "trace (K²)".to_owned(), log: true, limits: None },
-        curves,
-        levels: Vec::new(),
-    })
 }
 
 #[cfg(test)]
@@ -500,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn traces_cross_between_the_epsilons_where_they_change_places() {
+    fn traces_cross_where_their_order_changes() {
         // n = 1 / epsilon and s = epsilon: with 100 K^2 at epsilon = 0.1, with 10 K at epsilon = 1 / sqrt 10.
         let runs: Vec<RunFigures> =
             [1e-3, 1e-2, 1e-1, 1.0].map(|epsilon| run("a", epsilon, 1.0 / epsilon, epsilon)).into();
@@ -511,7 +398,7 @@ mod tests {
         let first_power = crossing.epsilon_first_power.unwrap();
         assert!((first_power / 0.1_f64.sqrt() - 1.0).abs() < 1e-9, "{crossing:?}");
         assert_eq!(crossings(&[vec![&runs[0]]]), []);
-        // Without a change of places there is none.
+        // Traces that do not cross give no epsilon.
         let none = crossings(&[runs[..2].iter().collect()]);
         assert_eq!((none[0].epsilon, none[0].epsilon_first_power), (None, None));
     }
@@ -528,12 +415,11 @@ mod tests {
         );
         let spectra = spectra_csv(&all);
         assert_eq!(spectra.lines().nth(2).unwrap(), "\"b < b_p, \"\"all\"\"\",10000000,1,,,,,2e0,1e0,,,");
-        // The header has as many fields as the lines.
         for text in [&table, &spectra] {
             let fields = |line: usize| text.lines().nth(line).unwrap().replace(", ", " ").split(',').count();
             assert_eq!(fields(0), fields(1), "{text}");
         }
-        assert!(draw_runs("runs", &all).is_ok());
+        assert!(crate::products::draw_runs("runs", &all).is_ok());
     }
     #[test]
     fn power_kept_is_relative_to_the_ideal_map() {
@@ -542,16 +428,16 @@ mod tests {
         let power = spoilt.channels[0].power.as_mut().unwrap();
         power.map_k2 = vec![power.map_k2[0].map(|c| 3.0 * c), Some(1.0)];
         power.cross_k2 = vec![power.cross_k2[0].map(|c| 0.5 * c), Some(0.25)];
-        spoilt.against_ideal(&ideal);
+        spoilt.set_power_kept(&ideal);
         let kept = spoilt.channels[0].power_kept.as_ref().unwrap();
-        // Where the ideal map's power is not known, neither is the ratio.
+        // The ratio is unknown if the power of the ideal map is.
         assert!((kept.cl_ratio[0].unwrap() - 3.0).abs() < 1e-12 && kept.cl_ratio[1].is_none());
         assert!((kept.coherent[0].unwrap() - 0.25).abs() < 1e-12 && kept.coherent[1] == Some(0.0625));
         // Two degrees are no mean over 20 <= l <= 120, and other frequencies are not compared.
         assert_eq!(spoilt.channels[0].power_kept_means(), [None, None]);
         let mut other = ideal.clone();
         other.channels[0].frequency_hz = 2e7;
-        spoilt.against_ideal(&other);
+        spoilt.set_power_kept(&other);
         assert!(spoilt.channels[0].power_kept.is_none());
     }
 }

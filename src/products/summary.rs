@@ -1,4 +1,4 @@
-//! Summary of a channel's maps.
+//! Summary of the maps of a channel.
 
 use std::fmt;
 
@@ -11,14 +11,14 @@ use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
 use crate::imaging::{Convergence, Diagnostics, SkyPower};
 
-/// One snapshot.
+/// Summary of one snapshot.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SnapshotSummary {
     /// Number, from 1.
     pub number: u32,
-    /// Mission time of the last data in it, s.
+    /// Mission time of the last data in the map, s.
     pub until_s: f64,
-    /// Visibilities in it.
+    /// Number of visibilities in the map.
     pub visibilities: u64,
     /// RMS of (map - truth) / RMS of truth; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -28,7 +28,7 @@ pub struct SnapshotSummary {
     pub rho_mean: Option<f64>,
 }
 
-/// Angular power spectra of what is compared, from l = 0.
+/// Angular power spectra of map, input and noise, from l = 0.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PowerSpectra {
     /// C_l of the map, K^2.
@@ -41,7 +41,7 @@ pub struct PowerSpectra {
     pub noise_k2: Option<Vec<f64>>,
 }
 
-/// One channel: its maps and their quality.
+/// Summary of the maps of one channel and their quality.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChannelSummary {
     /// Frequency, Hz.
@@ -54,36 +54,36 @@ pub struct ChannelSummary {
     pub nside: usize,
     /// Mission times of the first and the last data, s.
     pub span_s: [f64; 2],
-    /// Visibilities in the final map.
+    /// Number of visibilities in the final map.
     pub visibilities: u64,
     /// Mean of the final map, K.
     pub mean_k: f64,
-    /// Standard deviation of the mean, K, by the posterior; absent unless R is from the data.
+    /// Posterior standard deviation of the mean, K; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mean_sigma_k: Option<f64>,
-    /// Angular power of the sky that R is the inverse of, with its uncertainty; absent unless R is from the data.
+    /// Angular power of the sky, whose inverse is R, with its uncertainty; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sky_power: Option<SkyPower>,
-    /// RMS of the noise-only companion map, K.
+    /// RMS of the noise-only map, K.
     pub noise_rms_k: f64,
     /// Regularisation and solver diagnostics of the final solution.
     pub diagnostics: Diagnostics,
-    /// How it was refined with the positions as they are; absent without `map.refine`.
+    /// Report on the iterative refinement with exact positions; absent without `map.refine`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refinement: Option<Refinement>,
     /// The snapshots, including the final map.
     pub snapshots: Vec<SnapshotSummary>,
-    /// Whether the visibilities, and so the map, hold thermal noise; with real data they do.
+    /// Whether the visibilities, and so the map, contain thermal noise; always true for real data.
     pub thermal_noise: bool,
-    /// What was done with map, noise and input before they were compared; absent if nothing was.
+    /// Processing of map, noise and input before they were compared; absent if there was none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub post_processing: Option<PostProcessing>,
-    /// rho_l of the final map as it is, with its thermal noise if it holds any, and the input at its own resolution,
-    /// l = 0, 1, ..; absent without a truth.
+    /// rho_l of the final map, including any thermal noise, and the input at its own resolution, from l = 0; absent without a
+    /// truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rho: Option<Vec<f64>>,
-    /// The same with the power of the noise-only companion subtracted from that of the map, which leaves noise out of it up to
-    /// chance; absent without noise or truth. Null where noise is all.
+    /// rho_l with the power of the noise-only map subtracted from that of the map; absent without noise or truth. Null where
+    /// the noise exceeds the map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rho_noise_subtracted: Option<Vec<f64>>,
     /// SNR_l of the final map; absent without a truth.
@@ -92,7 +92,7 @@ pub struct ChannelSummary {
     /// Angular power of the final map, its input and its noise; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub power: Option<PowerSpectra>,
-    /// The effective beam, and noise in it; absent without a truth.
+    /// The effective beam, and the noise per beam; absent without a truth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub beam: Option<EffectiveBeam>,
     /// Effective beams in the directions of `map.beams_deg`; absent without any.
@@ -106,15 +106,15 @@ pub struct ChannelSummary {
 }
 
 impl ChannelSummary {
-    /// Whether the noise of a pixel exceeds the mean of the map, so that single pixels show little but noise. Without thermal
-    /// noise in the visibilities there is none in the map.
+    /// Whether the noise of a pixel exceeds the mean of the map, so that single pixels are mostly noise. Never without thermal
+    /// noise in the visibilities.
     #[must_use]
     pub fn is_noise(&self) -> bool {
         self.thermal_noise && self.noise_rms_k > self.mean_k.abs()
     }
 }
 
-/// A temperature with its standard deviation, if that is known.
+/// Formats a temperature with its standard deviation, if known.
 fn with_error(value_k: f64, sigma_k: Option<f64>) -> String {
     match sigma_k {
         Some(sigma_k) => format!("({value_k:.4e} +- {sigma_k:.1e}) K"),
@@ -123,12 +123,11 @@ fn with_error(value_k: f64, sigma_k: Option<f64>) -> String {
 }
 
 impl ChannelSummary {
-    /// What R the map was made with, in words.
-    fn told_regulariser(&self) -> String {
+    fn regulariser_text(&self) -> String {
         let Some(power) = &self.sky_power else {
             return match self.diagnostics.epsilon {
                 Some(epsilon) => {
-                    format!("regularised with epsilon {epsilon:e}: errors of pixels are not known")
+                    format!("regularised with epsilon {epsilon:e}: uncertainty of pixels unknown")
                 }
                 None => String::new(),
             };
@@ -136,8 +135,8 @@ impl ChannelSummary {
         let decided: f64 = power.decided.iter().sum();
         let all = power.decided.len().pow(2);
         format!(
-            "as smooth as the data say (map.regulariser = \"data\"): they decide {decided:.0} of {all} harmonics, and \
-             scatter {:.2} times their noise; errors of pixels are in sigma.fits",
+            "regularised by the power spectrum of the data (map.regulariser = \"data\"): {decided:.0} of {all} harmonics \
+            measured, residuals {:.2} times the noise; uncertainty of pixels in sigma.fits",
             power.noise_factor
         )
     }
@@ -154,7 +153,7 @@ impl fmt::Display for ChannelSummary {
             with_error(self.mean_k, self.mean_sigma_k),
             self.noise_rms_k
         )?;
-        write!(f, "\n             {}", self.told_regulariser())?;
+        write!(f, "\n             {}", self.regulariser_text())?;
         if self.is_noise() {
             write!(
                 f,
@@ -165,16 +164,12 @@ impl fmt::Display for ChannelSummary {
         if let Some(refinement) = &self.refinement {
             write!(f, "\n             {refinement}")?;
         } else if let Diagnostics { convergence: Some(convergence), l_max: None, .. } = self.diagnostics {
-            // Pixels without their matrix; one that is held leaves no residual.
+            // Matrix-free pixel maps; a direct solution has no residual.
             let Convergence { iterations, residual, converged } = convergence;
-            let ended = if converged {
-                ""
-            } else {
-                ": not converged, more products (map.iterations_max) change the map"
-            };
+            let warning = if converged { "" } else { ": not converged, increase map.iterations_max" };
             write!(
                 f,
-                "\n             {iterations} products with rows made again, residual {residual:.1e}{ended}"
+                "\n             {iterations} matrix-free iterations, residual {residual:.1e}{warning}"
             )?;
         }
         if let Some((fwhm_deg, noise_jy)) =
@@ -182,7 +177,7 @@ impl fmt::Display for ChannelSummary {
         {
             write!(
                 f,
-                "\n             effective beam: FWHM {fwhm_deg:.2} deg, noise {noise_jy:.3e} Jy rms in it"
+                "\n             effective beam: FWHM {fwhm_deg:.2} deg, noise {noise_jy:.3e} Jy rms per beam"
             )?;
         }
         for beam in &self.point_beams {

@@ -1,16 +1,13 @@
-//! A picture of what was received, and of what is missing.
+//! Draws the integration time received and missing over mission time.
 
 use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
 use crate::downlink::Kind;
 use crate::ground::archive::{ChannelCoverage, CoverageSurvey, Gaps, JournalEntry};
 use crate::units::constants::DAY_S;
 
-/// Time steps of a plot.
 const BINS: usize = 240;
-/// Most channels in a picture.
 const PLOTS_MAX: usize = 64;
 
-/// The time axis: bins of equal length.
 struct TimeBins {
     first_s: f64,
     last_s: f64,
@@ -18,7 +15,7 @@ struct TimeBins {
 }
 
 impl TimeBins {
-    fn of<'a>(entries: impl Iterator<Item = &'a JournalEntry> + Clone) -> Self {
+    fn new<'a>(entries: impl Iterator<Item = &'a JournalEntry> + Clone) -> Self {
         let first_s = entries.clone().map(|entry| entry.start.seconds()).fold(f64::INFINITY, f64::min);
         let last_s = entries.map(|entry| entry.end.seconds()).fold(f64::NEG_INFINITY, f64::max);
         Self { first_s, last_s, bin_s: ((last_s - first_s) / BINS as f64).max(1.0) }
@@ -32,7 +29,7 @@ impl TimeBins {
         self.first_s + self.bin_s * bin as f64
     }
 
-    /// A curve of steps: hours over days.
+    /// Points of a step curve, hours over days.
     fn steps(&self, sums_s: &[f64]) -> Vec<(f64, f64)> {
         let day = |bin: usize| self.edge_s(bin) / DAY_S;
         let corners = |(k, &sum): (usize, &f64)| [(day(k), sum / 3600.0), (day(k + 1), sum / 3600.0)];
@@ -40,22 +37,23 @@ impl TimeBins {
     }
 }
 
-/// Draws integration time over mission time, channel by channel: received, and with what is missing.
+/// Draws integration time over mission time for each channel: received, and received plus missing.
 ///
 /// # Errors
-/// [`PictureError::Size`] if nothing has been received. Of more than 64 channels the first are shown.
+/// [`PictureError::Size`] if nothing has been received. Only the first 64 channels are shown.
 pub fn draw_coverage(survey: &CoverageSurvey, gaps: &Gaps) -> Result<Picture, PictureError> {
-    let readings = &survey.received().readings;
-    let bins = TimeBins::of(readings.iter().map(|reading| &reading.entry));
-    let most = if readings.is_empty() { 0 } else { PLOTS_MAX };
+    let packets = &survey.received().packets;
+    let bins = TimeBins::new(packets.iter().map(|packet| &packet.entry));
+    // Without packets there is no time axis; `draw_plots` refuses zero plots.
+    let plots_max = if packets.is_empty() { 0 } else { PLOTS_MAX };
     let plots: Vec<Plot> =
-        gaps.channels.iter().take(most).map(|channel| plot(survey, gaps, channel, &bins)).collect();
+        gaps.channels.iter().take(plots_max).map(|channel| plot(survey, gaps, channel, &bins)).collect();
     draw_plots("Integration time received", &plots, 1 + usize::from(plots.len() > 3))
 }
 
 fn plot(survey: &CoverageSurvey, gaps: &Gaps, coverage: &ChannelCoverage, bins: &TimeBins) -> Plot {
     let mut received_s = vec![0.0; BINS];
-    for entry in survey.received().readings.iter().map(|reading| &reading.entry) {
+    for entry in survey.received().packets.iter().map(|packet| &packet.entry) {
         if entry.channel.0 == coverage.channel && entry.pair.i != entry.pair.j {
             let middle_s = 0.5 * (entry.start.seconds() + entry.end.seconds());
             received_s[bins.bin(middle_s)] += entry.integration_s;
@@ -69,16 +67,16 @@ fn plot(survey: &CoverageSurvey, gaps: &Gaps, coverage: &ChannelCoverage, bins: 
             None => format!("channel {}", coverage.channel),
         },
         x: Axis { label: "mission time, days".into(), ..Axis::default() },
-        y: Axis { label: format!("pair hours in {:.2} d", bins.bin_s / DAY_S), ..Axis::default() },
+        y: Axis { label: format!("baseline hours per {:.2} d", bins.bin_s / DAY_S), ..Axis::default() },
         curves: vec![
-            Curve { label: "with what is missing".into(), points: bins.steps(&all_s), dashed: true },
+            Curve { label: "received and missing".into(), points: bins.steps(&all_s), dashed: true },
             Curve { label: "received".into(), points: bins.steps(&received_s), dashed: false },
         ],
         levels: Vec::new(),
     }
 }
 
-/// Spreads the missing integration time of a channel over the observed parts of its gaps.
+/// Adds the missing integration time of a channel, distributed over the observed parts of its gaps.
 fn add_missing(survey: &CoverageSurvey, gaps: &Gaps, channel: u16, bins: &TimeBins, sums_s: &mut [f64]) {
     for gap in gaps.gaps.iter().filter(|gap| gap.kind == Kind::Visibilities) {
         let of_channel = gap.lost.iter().filter(|lost| lost.channel == channel);

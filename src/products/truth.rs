@@ -1,4 +1,4 @@
-//! The true sky of a simulation, which the ground segment does not know.
+//! The true sky of a simulation, with which maps are compared. The ground segment does not use it.
 
 use std::collections::BTreeMap;
 
@@ -6,44 +6,43 @@ use super::config::PostProcessing;
 use crate::sky::{Frame, InputSky, MapError, SkyMap};
 use crate::units::ChannelId;
 
-/// The true sky of every channel, to compare maps with.
+/// The true sky of every channel, with which maps are compared.
 ///
-/// Spectra are of the sky at its own resolution, pictures and relative errors of the sky in pixels of the maps.
+/// Spectra use the sky at its own resolution; pictures and relative errors use the sky in pixels of the maps.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Truth(BTreeMap<ChannelId, ChannelTruth>);
 
-/// The true sky of a channel.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ChannelTruth {
-    /// In the pixels of the maps.
+    /// The sky in the pixels of the maps.
     pub(super) plain: InputSky,
-    /// In those of post-processed maps, and smoothed like them, if there are any.
+    /// The sky in the pixels of post-processed maps, smoothed like them; `None` without post-processing.
     pub(super) processed: Option<InputSky>,
 }
 
-/// Maps with which a truth is compared.
+/// Shape of the maps that are compared with the true sky.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapShape {
-    /// nside.
+    /// nside of the maps.
     pub nside: usize,
-    /// Greatest degree of maps of harmonics; `None` for maps of pixels.
+    /// Maximum degree of harmonic maps; `None` for pixel maps.
     pub l_max: Option<usize>,
-    /// What is done with them.
+    /// Post-processing of the maps.
     pub processing: Option<PostProcessing>,
 }
 
 impl Truth {
-    /// No truth, as with real data.
+    /// An unknown truth, as with real data.
     #[must_use]
     pub fn unknown() -> Self {
         Self::default()
     }
 
-    /// The truth for maps of this shape: `skies`, one per channel, turned to ecliptic axes. For maps of pixels they are
-    /// averaged over them; for maps of harmonics they are limited to the same degrees.
+    /// The truth for maps of this shape from `skies`, one per channel, rotated to ecliptic axes. For pixel maps they are averaged
+    /// over pixels; for harmonic maps they are limited to the same degrees.
     ///
     /// # Errors
-    /// A sky that cannot be turned, resampled or smoothed.
+    /// A sky that cannot be rotated, resampled or smoothed.
     pub fn new(skies: &[SkyMap], shape: MapShape) -> Result<Self, MapError> {
         let channels = (0..).map(ChannelId).zip(skies);
         channels
@@ -52,16 +51,15 @@ impl Truth {
             .map(Self)
     }
 
-    /// With that of one more channel.
+    /// Adds the true sky of a channel.
     ///
     /// # Errors
-    /// As [`Truth::new`].
+    /// Errors of [`Truth::new`].
     pub fn with(mut self, channel: ChannelId, sky: &SkyMap, shape: MapShape) -> Result<Self, MapError> {
         self.0.insert(channel, ChannelTruth::new(sky, shape)?);
         Ok(self)
     }
 
-    /// The true sky of one channel, if known.
     #[must_use]
     pub(super) fn channel(&self, channel: ChannelId) -> Option<&ChannelTruth> {
         self.0.get(&channel)

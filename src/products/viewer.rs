@@ -1,4 +1,4 @@
-//! A hook that sees every map as it is published.
+//! Shows every map to viewers when it is published.
 
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -11,25 +11,25 @@ use crate::sky::{Comparison, SkyMap};
 /// A map that has just been published.
 #[derive(Clone, Copy)]
 pub struct PublishedMap<'a> {
-    /// The map and its noise-only companion.
+    /// The solution with the map and its noise-only map.
     pub solution: &'a Solution,
-    /// Its figures.
+    /// Figures of the map.
     pub figures: &'a SnapshotSummary,
-    /// Header cards of its file.
+    /// Header cards of the map.
     pub cards: &'a [Card],
-    /// Spectra of the map, and of the truth if it is known.
+    /// Comparison with the true sky, if known.
     pub comparison: Option<&'a Comparison>,
-    /// The true sky in the pixels of the map, if it is known.
+    /// The true sky in the pixels of the map, if known.
     pub input: Option<&'a SkyMap>,
 }
 
-/// Sees maps on the publisher's thread, which waits: it takes a copy and returns.
+/// Gets maps on the thread of the publisher, which waits. It should only take a copy and return.
 pub trait MapViewer: Send + Sync {
-    /// A map was published.
+    /// Takes a map that has just been published.
     fn view(&self, map: PublishedMap<'_>);
 }
 
-/// Where viewers may join; clones share them. Without one nothing is done.
+/// The list of viewers. Clones share it.
 #[derive(Clone, Default)]
 pub struct MapWatch(Arc<Mutex<Vec<Box<dyn MapViewer>>>>);
 
@@ -38,12 +38,11 @@ impl MapWatch {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Shows every map from now on to `viewer`, too.
-    pub fn join(&self, viewer: Box<dyn MapViewer>) {
+    /// Adds a viewer, which gets every map from now on.
+    pub fn add_viewer(&self, viewer: Box<dyn MapViewer>) {
         self.viewers().push(viewer);
     }
 
-    /// Shows what `map` makes, to each who looks on.
     pub(super) fn offer(&self, show: impl Fn(&dyn MapViewer)) {
         self.viewers().iter().for_each(|viewer| show(viewer.as_ref()));
     }

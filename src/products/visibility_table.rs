@@ -1,4 +1,4 @@
-//! The visibilities of a downlink file as a table for other programs.
+//! The visibilities of a downlink file as a table, for analysis with other programs.
 
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -16,41 +16,39 @@ use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 use crate::units::vector::{Vec3, sub};
 use crate::units::{ChannelId, Pair};
 
-/// Segments of positions that are kept: more than two years of windows.
+/// Maximum number of ephemeris segments, enough for two years of windows.
 const SEGMENTS_MAX: usize = 8192;
 
-/// Columns of the table that [`VisibilityTable::write_csv`] writes.
 const CSV_HEADER: &str = "time_s,tai_s,dt_s,i,j,u_m,v_m,w_m,x_i_m,y_i_m,z_i_m,x_j_m,y_j_m,z_j_m,re_k_sr,im_k_sr,re_jy,im_jy,weight,flag";
 
-/// W m^-2 Hz^-1 in a jansky.
 const JANSKY: f64 = 1e-26;
 
-/// What a visibility of 1 K sr is in Jy: 2 k nu^2 / c^2, of both polarisations.
+/// Converts visibilities from K sr to Jy: `2 k nu^2 / c^2`, for both polarisations.
 #[must_use]
 pub fn jansky_per_k_sr(frequency_hz: f64) -> f64 {
     2.0 * BOLTZMANN_J_K * (frequency_hz / SPEED_OF_LIGHT_M_S).powi(2) / JANSKY
 }
 
-/// One visibility as it came down, with the positions of its satellites. Nothing is calibrated.
+/// One visibility as received, not calibrated, with the positions of its satellites.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisibilityRow {
-    /// Middle of the integration, half microseconds since the mission epoch: exact.
+    /// Midpoint of the integration, half microseconds since the mission epoch, which is exact.
     pub middle_half_us: i64,
     /// Length of the integration, us.
     pub duration_us: u32,
-    /// Pair; a satellite with itself for an auto-correlation.
+    /// Pair of satellites, twice the same for an auto-correlation.
     pub pair: Pair,
-    /// Positions of both satellites at that time, m, Moon-centred ecliptic axes; `None` where the downlink has none.
+    /// Positions of both satellites at the midpoint, m, Moon-centred ecliptic axes; `None` if the downlink has none.
     pub positions_m: Option<[Vec3; 2]>,
-    /// Visibility, K sr.
+    /// Value of the visibility, K sr.
     pub value_k_sr: Complex32,
     /// Inverse variance of the real part, (K sr)^-2.
     pub weight: f32,
-    /// Flags.
+    /// Flags of the visibility.
     pub flags: Flags,
 }
 
-/// What a downlink file holds, in memory: 21 bytes a visibility.
+/// The contents of a downlink file in memory, with 21 bytes per visibility.
 #[derive(Clone, Debug)]
 pub struct VisibilityTable {
     instrument: Instrument,
@@ -59,10 +57,10 @@ pub struct VisibilityTable {
 }
 
 impl VisibilityTable {
-    /// Reads a file of either format. Damage is passed over; `lunarray inspect` counts it.
+    /// Reads a downlink file of any format. Damaged parts are skipped; `lunarray inspect` counts them.
     ///
     /// # Errors
-    /// A file that cannot be read or describes no instrument; the end of `cancel`.
+    /// A file that cannot be read or has no description of the instrument; cancellation.
     pub fn read(path: &Path, cancel: &Cancel) -> Result<Self, ProductsError> {
         let failed = |error: DownlinkError| ProductsError::Downlink { source: Box::new(error) };
         let mut reader = DownlinkReader::open(path).map_err(failed)?;
@@ -84,19 +82,19 @@ impl VisibilityTable {
         Ok(Self { instrument, ephemeris, blocks })
     }
 
-    /// The instrument.
+    /// The description of the instrument.
     #[must_use]
     pub fn instrument(&self) -> &Instrument {
         &self.instrument
     }
 
-    /// Positions of the satellites.
+    /// The ephemeris of the satellites.
     #[must_use]
     pub fn ephemeris(&self) -> &Ephemeris {
         &self.ephemeris
     }
 
-    /// Visibilities of one channel (correlations of two satellites), in the order of the file.
+    /// Cross-correlations of one channel, in the order of the file.
     #[must_use]
     pub fn visibilities(&self, channel: ChannelId) -> Vec<VisibilityRow> {
         self.rows(|block| block.channel == channel && block.pair.i != block.pair.j)
@@ -105,16 +103,16 @@ impl VisibilityTable {
             .collect()
     }
 
-    /// Auto-correlations of all channels, with their channel.
+    /// Auto-correlations of all channels, each with its channel.
     #[must_use]
     pub fn autos(&self) -> Vec<(ChannelId, VisibilityRow)> {
         self.rows(|block| block.pair.i == block.pair.j)
     }
 
-    /// Writes the visibilities of one channel as a table with commas, a line each; returns their number.
+    /// Writes the visibilities of one channel as a CSV table with one line each, and returns their number.
     ///
-    /// Times are s since the mission epoch and TAI s since 1958, satellites are counted from 1, u, v, w is the baseline
-    /// r_i - r_j and x, y, z are positions, m, Moon-centred ecliptic axes, empty where the downlink has none.
+    /// Times are in s since the mission epoch and in TAI s since 1958. Satellites are counted from 1. u, v, w is the baseline
+    /// r_i - r_j, and x, y, z are positions, m, on Moon-centred ecliptic axes; they are empty if the downlink has none.
     ///
     /// # Errors
     /// A file that cannot be written.
@@ -128,10 +126,10 @@ impl VisibilityTable {
         Ok(rows)
     }
 
-    /// As [`Self::write_csv`], to what writes bytes.
+    /// Like [`Self::write_csv`], to any writer.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// Errors of `out`.
     pub fn write_csv_to(&self, channel: ChannelId, out: &mut impl Write) -> io::Result<usize> {
         let frequency_hz =
             self.instrument.channels.get(usize::from(channel.0)).map_or(f64::NAN, |c| c.frequency_hz);
@@ -170,22 +168,22 @@ impl VisibilityTable {
         wanted.par_iter().flat_map_iter(rows).collect()
     }
 
-    /// The rows of a block. Visibilities with flags are placed too.
+    /// The rows of a block. Flagged visibilities get positions as well.
     fn rows_of(&self, block: &VisibilityBlock) -> Vec<VisibilityRow> {
         let all = VisibilityBlock { flags: vec![Flags::GOOD; block.len()], ..block.clone() };
         let (placed, _) = self.ephemeris.place(&all, 0.0);
-        // Those that could be placed, in the order of the block.
-        let mut places = placed.time_s.iter().zip(placed.r_i_m.iter().zip(&placed.r_j_m)).peekable();
+        // Positions of the visibilities that have some, in the order of the block.
+        let mut positions = placed.time_s.iter().zip(placed.r_i_m.iter().zip(&placed.r_j_m)).peekable();
         let row = |k: usize| {
             let (offset, duration_us) = (i64::from(block.offset_ticks[k]), block.duration_ticks[k]);
             let middle_half_us = 2 * block.start.plus_ticks(offset).0 + i64::from(duration_us);
             let time_s = middle_half_us as f64 / 2e6;
-            let place = places.next_if(|(placed_s, _)| **placed_s == time_s);
+            let position = positions.next_if(|(placed_s, _)| **placed_s == time_s);
             VisibilityRow {
                 middle_half_us,
                 duration_us,
                 pair: block.pair,
-                positions_m: place.map(|(_, (r_i_m, r_j_m))| [*r_i_m, *r_j_m]),
+                positions_m: position.map(|(_, (r_i_m, r_j_m))| [*r_i_m, *r_j_m]),
                 value_k_sr: block.value_k_sr[k],
                 weight: block.weight[k],
                 flags: block.flags[k],

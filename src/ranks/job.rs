@@ -1,27 +1,27 @@
-//! The MPI job that a process is a rank of.
+//! The MPI job that this process belongs to.
 
 use super::{Ranks, RanksError};
 
-/// The MPI job that this process is a rank of. It ends in order when this is dropped, once all ranks have come so far.
+/// The MPI job that this process is a rank of. Dropping it waits for all ranks and finalises MPI.
 pub struct RankJob {
-    /// Ranks on this machine.
-    here: usize,
+    /// Number of ranks on this machine.
+    ranks_here: usize,
     #[cfg(feature = "mpi")]
     _universe: mpi::environment::Universe,
 }
 
 impl RankJob {
-    /// Joins the job that the process was started in: by `mpirun` or `srun`, or alone.
+    /// Joins the job that `mpirun` or `srun` started this process in; a process started alone is a job of one rank.
     ///
     /// # Errors
-    /// MPI that was started before, or that does not work with threads.
+    /// MPI was started before, or does not support threads.
     #[cfg(feature = "mpi")]
     pub fn start() -> Result<(Self, Ranks), RanksError> {
-        let super::world::MpiJob { universe, ranks, here } = super::world::join()?;
-        Ok((Self { here, _universe: universe }, ranks))
+        let super::world::MpiJob { universe, ranks, ranks_here } = super::world::join()?;
+        Ok((Self { ranks_here, _universe: universe }, ranks))
     }
 
-    /// Refuses: this program was built without MPI.
+    /// Always fails, because this program was built without MPI.
     ///
     /// # Errors
     /// [`RanksError::NotBuilt`].
@@ -30,13 +30,13 @@ impl RankJob {
         Err(RanksError::NotBuilt)
     }
 
-    /// Ranks on this machine.
+    /// Number of ranks on this machine.
     #[must_use]
     pub fn ranks_here(&self) -> usize {
-        self.here
+        self.ranks_here
     }
 
-    /// Ends all ranks at once, this one with the exit code.
+    /// Aborts all ranks of the job; this process ends with the exit code.
     pub fn abort(&self, code: u8) -> ! {
         #[cfg(feature = "mpi")]
         super::world::abort(code);
@@ -47,7 +47,7 @@ impl RankJob {
 
 impl Drop for RankJob {
     fn drop(&mut self) {
-        // To end in order would be to wait for the others, which wait for this rank.
+        // Finalising MPI would wait for the other ranks, which wait for this one.
         if std::thread::panicking() {
             self.abort(101);
         }

@@ -1,8 +1,8 @@
-//! The ranks of an MPI job (`--mpi`, feature `mpi`): processes that share the sums of a map, and what they exchange.
+//! The ranks of an MPI job (`--mpi`, feature `mpi`): processes that share the sums of a map.
 //!
-//! Each rank runs the whole chain and holds a part of the sums. Ranks exchange integers alone, never floats, whose sums would
-//! depend on the number of ranks. All make the same collective calls in the same order, from one thread at a time. The others
-//! would wait for ever for a rank that leaves early: it ends the job ([`RankJob::abort`]).
+//! Each rank runs the whole chain and holds a part of the sums. Ranks exchange integers only, because sums of floats would depend on the
+//! number of ranks. All ranks make the same exchanges in the same order, from one thread at a time, and each exchange waits for all
+//! ranks. A rank that fails therefore aborts the job ([`RankJob::abort`]), or the others would wait forever.
 
 mod error;
 mod job;
@@ -19,24 +19,24 @@ pub use job::RankJob;
 #[cfg(test)]
 pub(crate) use threads::on_threads;
 
-/// How ranks exchange numbers. Every rank calls the same functions in the same order, with as many values.
+/// Exchanges numbers between ranks. All ranks call the same functions in the same order, with the same number of values.
 pub trait RankExchange: fmt::Debug + Send + Sync {
-    /// Replaces each value by the sum over all ranks; it must not leave 64 bits.
+    /// Replaces each value by its sum over all ranks, which must fit 64 bits.
     fn sum(&self, values: &mut [i64]);
 
-    /// Replaces each value by the greatest of all ranks.
-    fn greatest(&self, values: &mut [i64]);
+    /// Replaces each value by its maximum over all ranks.
+    fn max(&self, values: &mut [i64]);
 }
 
-/// A process's place among those that share the sums of a map.
+/// The rank of this process among those that share the sums of a map.
 #[derive(Clone, Debug)]
 pub struct Ranks {
     share: RankShare,
-    /// `None` for a process alone.
+    /// `None` for a single process.
     exchange: Option<Arc<dyn RankExchange>>,
 }
 
-/// Which blocks of something a rank holds: every `count`-th from `rank` on, so that data of any span in time are shared evenly.
+/// The blocks that a rank holds: every `count`-th from number `rank` on, so that data of any time span are shared evenly.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RankShare {
     /// Number of this rank, from 0.
@@ -46,33 +46,33 @@ pub struct RankShare {
 }
 
 impl RankShare {
-    /// Everything.
+    /// The share of a single process: all blocks.
     pub const WHOLE: Self = Self { rank: 0, count: 1 };
 
-    /// Whether this rank holds a block.
+    /// Whether the rank holds a block.
     #[inline(always)]
     #[must_use]
     pub fn holds(self, block: usize) -> bool {
         block % self.count == self.rank
     }
 
-    /// Blocks that this rank holds of `blocks`.
+    /// The number of blocks that the rank holds out of `blocks`.
     #[must_use]
-    pub fn of(self, blocks: usize) -> usize {
+    pub fn block_count(self, blocks: usize) -> usize {
         (blocks + self.count - 1 - self.rank) / self.count
     }
 }
 
 impl Ranks {
-    /// A process alone.
+    /// A single process that holds everything.
     #[must_use]
-    pub fn one() -> Self {
+    pub fn single() -> Self {
         Self { share: RankShare::WHOLE, exchange: None }
     }
 
-    /// A process alone that holds a part at a time, and never asks the others.
+    /// A single process that holds one share at a time and exchanges nothing.
     #[must_use]
-    pub fn part(share: RankShare) -> Self {
+    pub fn single_with_share(share: RankShare) -> Self {
         Self { share, exchange: None }
     }
 
@@ -82,53 +82,53 @@ impl Ranks {
         Self { share, exchange: Some(exchange) }
     }
 
-    /// What this rank holds.
+    /// The share of the blocks that this rank holds.
     #[must_use]
     pub fn share(&self) -> RankShare {
         self.share
     }
 
-    /// Whether this rank writes products and talks to people.
+    /// Whether this rank writes products and messages.
     #[must_use]
     pub fn is_first(&self) -> bool {
         self.share.rank == 0
     }
 
-    /// Whether there are others.
+    /// Whether there are several ranks.
     #[must_use]
-    pub fn are_many(&self) -> bool {
+    pub fn is_distributed(&self) -> bool {
         self.share.count > 1
     }
 
-    /// Replaces each value by the sum over all ranks; it must not leave 64 bits.
+    /// Replaces each value by its sum over all ranks, which must fit 64 bits.
     pub fn sum(&self, values: &mut [i64]) {
         if let Some(exchange) = &self.exchange {
             exchange.sum(values);
         }
     }
 
-    /// Replaces each value by the greatest of all ranks.
-    pub fn greatest(&self, values: &mut [i64]) {
+    /// Replaces each value by its maximum over all ranks.
+    pub fn max(&self, values: &mut [i64]) {
         if let Some(exchange) = &self.exchange {
-            exchange.greatest(values);
+            exchange.max(values);
         }
     }
 
-    /// Whether all ranks say yes.
+    /// Whether `holds` is true on all ranks.
     #[must_use]
-    pub fn all(&self, yes: bool) -> bool {
-        let mut no = [i64::from(!yes)];
-        self.greatest(&mut no);
-        no == [0]
+    pub fn all(&self, holds: bool) -> bool {
+        let mut fails = [i64::from(!holds)];
+        self.max(&mut fails);
+        fails == [0]
     }
 
-    /// Whether all ranks have the same values.
+    /// Whether all ranks have equal values.
     #[must_use]
-    pub fn agree(&self, values: &[i64]) -> bool {
-        // The complement turns the order round without overflow.
+    pub fn have_equal(&self, values: &[i64]) -> bool {
+        // The bitwise complement reverses the order without overflow, so its maximum is the minimum.
         let mut both: Vec<i64> = values.iter().flat_map(|value| [*value, !value]).collect();
-        self.greatest(&mut both);
-        both.as_chunks::<2>().0.iter().all(|[greatest, least]| *greatest == !least)
+        self.max(&mut both);
+        both.as_chunks::<2>().0.iter().all(|[max, not_min]| *max == !not_min)
     }
 }
 
@@ -137,31 +137,34 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shares_are_all_blocks_once() {
+    fn each_block_is_held_once() {
         for count in 1..6 {
             for blocks in 0..12 {
                 let shares = (0..count).map(|rank| RankShare { rank, count });
-                let held: usize = shares.clone().map(|share| share.of(blocks)).sum();
+                let held: usize = shares.clone().map(|share| share.block_count(blocks)).sum();
                 assert_eq!(held, blocks, "{count} ranks");
                 for share in shares {
-                    assert_eq!((0..blocks).filter(|block| share.holds(*block)).count(), share.of(blocks));
+                    assert_eq!(
+                        (0..blocks).filter(|block| share.holds(*block)).count(),
+                        share.block_count(blocks)
+                    );
                 }
             }
         }
     }
 
     #[test]
-    fn ranks_tell_one_another_numbers() {
+    fn ranks_exchange_numbers() {
         let found = threads::on_threads(3, |ranks| {
             let rank = ranks.share().rank as i64;
-            let (mut sum, mut greatest) = ([rank, 10 * rank], [-rank, rank]);
+            let (mut sum, mut max) = ([rank, 10 * rank], [-rank, rank]);
             ranks.sum(&mut sum);
-            ranks.greatest(&mut greatest);
+            ranks.max(&mut max);
             let votes = [ranks.all(true), ranks.all(rank != 1)];
-            let agreements = [ranks.agree(&[i64::MIN, 5]), ranks.agree(&[5, rank])];
-            (sum, greatest, votes, agreements)
+            let agreements = [ranks.have_equal(&[i64::MIN, 5]), ranks.have_equal(&[5, rank])];
+            (sum, max, votes, agreements)
         });
         assert_eq!(found, [([3, 30], [0, 2], [true, false], [true, false]); 3]);
-        assert!(Ranks::one().all(true) && !Ranks::one().all(false) && Ranks::one().agree(&[1]));
+        assert!(Ranks::single().all(true) && !Ranks::single().all(false) && Ranks::single().have_equal(&[1]));
     }
 }

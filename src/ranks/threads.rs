@@ -1,4 +1,4 @@
-//! Ranks that are threads of one process, for tests without MPI.
+//! Ranks as threads of one process, for tests without MPI.
 
 use std::sync::{Arc, Barrier, Mutex, PoisonError};
 use std::thread;
@@ -8,23 +8,23 @@ use super::{RankExchange, RankShare, Ranks};
 #[derive(Debug)]
 struct ThreadExchange {
     barrier: Barrier,
-    /// What the threads that have come so far say together.
-    said: Mutex<Option<Vec<i64>>>,
+    /// The reduction of the values of all threads so far.
+    reduced: Mutex<Option<Vec<i64>>>,
 }
 
 impl ThreadExchange {
-    fn reduce(&self, values: &mut [i64], join: impl Fn(i64, i64) -> i64) {
-        let said = || self.said.lock().unwrap_or_else(PoisonError::into_inner);
+    fn reduce(&self, values: &mut [i64], combine: impl Fn(i64, i64) -> i64) {
+        let lock = || self.reduced.lock().unwrap_or_else(PoisonError::into_inner);
         {
-            let mut said = said();
-            let together = said.get_or_insert_with(|| vec![0; values.len()]);
-            assert_eq!(together.len(), values.len(), "ranks ask different questions");
-            together.iter_mut().zip(values.iter()).for_each(|(a, b)| *a = join(*a, *b));
+            let mut reduced = lock();
+            let reduced = reduced.get_or_insert_with(|| vec![0; values.len()]);
+            assert_eq!(reduced.len(), values.len(), "ranks exchange different numbers of values");
+            reduced.iter_mut().zip(values.iter()).for_each(|(a, b)| *a = combine(*a, *b));
         }
         self.barrier.wait();
-        values.copy_from_slice(said().as_deref().unwrap_or_default());
+        values.copy_from_slice(lock().as_deref().unwrap_or_default());
         if self.barrier.wait().is_leader() {
-            *said() = None;
+            *lock() = None;
         }
         self.barrier.wait();
     }
@@ -35,8 +35,8 @@ impl RankExchange for ThreadExchange {
         self.reduce(values, |a, b| a + b);
     }
 
-    fn greatest(&self, values: &mut [i64]) {
-        // From zero up: from the least number instead.
+    fn max(&self, values: &mut [i64]) {
+        // The reduction starts from zero, so values are shifted to start at i64::MIN.
         values.iter_mut().for_each(|value| *value = value.wrapping_sub(i64::MIN));
         let order = |value: i64| value as u64;
         self.reduce(values, |a, b| if order(a) >= order(b) { a } else { b });
@@ -44,14 +44,14 @@ impl RankExchange for ThreadExchange {
     }
 }
 
-/// Ranks for so many threads.
+/// Creates one rank for each of `count` threads.
 fn ranks_of_threads(count: usize) -> Vec<Ranks> {
-    let exchange = Arc::new(ThreadExchange { barrier: Barrier::new(count), said: Mutex::new(None) });
+    let exchange = Arc::new(ThreadExchange { barrier: Barrier::new(count), reduced: Mutex::new(None) });
     let ranks = |rank| Ranks::new(RankShare { rank, count }, exchange.clone());
     (0..count).map(ranks).collect()
 }
 
-/// Results of `work` on each of `count` threads, in order.
+/// Runs `work` as each of `count` ranks and returns the results by rank.
 pub(crate) fn on_threads<T: Send>(count: usize, work: impl Fn(&Ranks) -> T + Sync) -> Vec<T> {
     let work = &work;
     thread::scope(|scope| {

@@ -1,4 +1,4 @@
-//! All ranks of an MPI job, by way of the MPI library.
+//! Exchange between the ranks of an MPI job through the MPI library.
 
 use std::sync::Arc;
 use std::thread;
@@ -12,19 +12,19 @@ use mpi::traits::{Communicator, CommunicatorCollectives};
 
 use super::{RankExchange, RankShare, Ranks, RanksError};
 
-/// Time that MPI has to end a job, before this process ends without it.
-const ABORT: Duration = Duration::from_secs(3);
+/// Time after which this process aborts by itself if MPI has not ended the job.
+const ABORT_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// What joining a job yields.
+/// An MPI job that was joined.
 pub(super) struct MpiJob {
     /// Finalises MPI when it is dropped.
     pub(super) universe: Universe,
     pub(super) ranks: Ranks,
-    /// Ranks on this machine.
-    pub(super) here: usize,
+    /// Number of ranks on this machine.
+    pub(super) ranks_here: usize,
 }
 
-/// Joins the job that the process was started in, which may be the process alone.
+/// Joins the job that this process was started in.
 pub(super) fn join() -> Result<MpiJob, RanksError> {
     let (universe, threading) =
         mpi::initialize_with_threading(Threading::Serialized).ok_or(RanksError::AlreadyStarted)?;
@@ -32,17 +32,17 @@ pub(super) fn join() -> Result<MpiJob, RanksError> {
         return Err(RanksError::Threads { found: format!("{threading:?}") });
     }
     let world = universe.world();
-    let number = |of_c: i32| usize::try_from(of_c).unwrap_or(0);
-    let share = RankShare { rank: number(world.rank()), count: number(world.size()).max(1) };
-    let here = number(world.split_shared(world.rank()).size()).max(1);
-    Ok(MpiJob { universe, ranks: Ranks::new(share, Arc::new(World)), here })
+    let to_usize = |of_c: i32| usize::try_from(of_c).unwrap_or(0);
+    let share = RankShare { rank: to_usize(world.rank()), count: to_usize(world.size()).max(1) };
+    let ranks_here = to_usize(world.split_shared(world.rank()).size()).max(1);
+    Ok(MpiJob { universe, ranks: Ranks::new(share, Arc::new(World)), ranks_here })
 }
 
-/// Ends all ranks at once.
+/// Aborts all ranks of the job.
 pub(super) fn abort(code: u8) -> ! {
-    // MPI may be waiting for the others on another thread. A process that dies takes the job with it, too.
+    // MPI may be waiting for the other ranks on another thread. The job also ends when a process dies.
     thread::spawn(|| {
-        thread::sleep(ABORT);
+        thread::sleep(ABORT_TIMEOUT);
         std::process::abort();
     });
     SimpleCommunicator::world().abort(i32::from(code))
@@ -53,12 +53,12 @@ struct World;
 
 impl RankExchange for World {
     fn sum(&self, values: &mut [i64]) {
-        let own = values.to_vec();
-        SimpleCommunicator::world().all_reduce_into(&own[..], values, SystemOperation::sum());
+        let sent = values.to_vec();
+        SimpleCommunicator::world().all_reduce_into(&sent[..], values, SystemOperation::sum());
     }
 
-    fn greatest(&self, values: &mut [i64]) {
-        let own = values.to_vec();
-        SimpleCommunicator::world().all_reduce_into(&own[..], values, SystemOperation::max());
+    fn max(&self, values: &mut [i64]) {
+        let sent = values.to_vec();
+        SimpleCommunicator::world().all_reduce_into(&sent[..], values, SystemOperation::max());
     }
 }

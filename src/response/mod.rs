@@ -1,19 +1,19 @@
 //! The beam matrix B: the response of each pair of daughters to the sky.
 //!
-//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Eq. 7); a row of B is
-//! the integrand without T, by pixels or by spherical harmonics.
+//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Eq. 7). A row of B is
+//! the integrand without T, over pixels or over spherical harmonics.
 //!
 //! | module | holds |
 //! |---|---|
 //! | [`pixel`] | rows of B over HEALPix pixels, and direct sums over a sky |
-//! | [`harmonic`] | rows of B over spherical harmonics, for satellites on one circle |
-//! | [`general`] | the same for satellites at any positions |
-//! | [`beacon`] | an artificial signal |
-//! | [`model`] | visibilities of a given sky, by either of the two |
-//! | [`PatternsByFrequency`] | how antennas' patterns change with frequency |
+//! | [`harmonic`] | rows of B over spherical harmonics, for satellites on one circle, by non-uniform FFTs (NUFFT) |
+//! | [`general`] | rows of B over spherical harmonics, for satellites at any positions |
+//! | [`beacon`] | an artificial plane wave |
+//! | [`model`] | visibilities of a given sky, by any of these |
+//! | [`PatternsByFrequency`] | the change of antenna patterns with frequency |
 //!
-//! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share it,
-//! so a bug here would cancel out unseen: tests compare it with reference values made by other code.
+//! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share this
+//! code, so that a bug would cancel out unseen: tests compare it with reference values made by other code.
 
 #[doc(hidden)]
 pub mod beacon;

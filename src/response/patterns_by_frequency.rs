@@ -1,17 +1,19 @@
-//! How the patterns of antennas change with frequency.
+//! Change of antenna patterns with frequency.
 
 use serde::{Deserialize, Serialize};
 
 use crate::units::Checks;
 
-/// Most rows of a table.
+/// Maximum number of rows of a table.
 const ROWS_MAX: usize = 1000;
 
-/// Greatest |q| of a pattern.
+/// Maximum |q| of a pattern.
 const Q_MAX: f64 = 2.0;
 
-/// q of a factor `1 + q (3 cos^2 - 1) / 2` of voltage patterns, by frequency: rows `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2,
-/// ...]` with one q a daughter, at rising frequencies. Linear between rows; beyond its ends that of the end.
+/// Table over frequency of q in the factor `1 + q (3 cos^2 - 1) / 2` of the voltage pattern.
+///
+/// Rows are `[frequency_hz, q]`, or `[frequency_hz, q_1, q_2, ...]` with one q per daughter, at rising frequencies. q is linear between
+/// rows, and constant beyond the first and the last.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct PatternsByFrequency(Vec<Vec<f64>>);
@@ -23,53 +25,54 @@ impl PatternsByFrequency {
         self.0.iter().all(|row| row.iter().skip(1).all(|q| *q == 0.0))
     }
 
-    /// q of a daughter, from 0, at a frequency; 0 for daughters beyond the rows.
+    /// q of a daughter (counted from 0) at a frequency; 0 for a daughter without a column.
     #[must_use]
     pub fn q(&self, daughter: usize, frequency_hz: f64) -> f64 {
-        let of = |row: &[f64]| match row {
-            [_, alike] => *alike,
+        let q = |row: &[f64]| match row {
+            [_, common] => *common,
             _ => row.get(1 + daughter).copied().unwrap_or(0.0),
         };
-        let at = |row: &[f64]| row.first().copied().unwrap_or(f64::NAN);
-        let above = self.0.iter().position(|row| at(row) > frequency_hz).unwrap_or(self.0.len());
+        let row_hz = |row: &[f64]| row.first().copied().unwrap_or(f64::NAN);
+        let above = self.0.iter().position(|row| row_hz(row) > frequency_hz).unwrap_or(self.0.len());
         match (above.checked_sub(1).map(|below| &self.0[below]), self.0.get(above)) {
             (Some(low), Some(high)) => {
-                let part = (frequency_hz - at(low)) / (at(high) - at(low));
-                of(low) + part * (of(high) - of(low))
+                let fraction = (frequency_hz - row_hz(low)) / (row_hz(high) - row_hz(low));
+                q(low) + fraction * (q(high) - q(low))
             }
-            (Some(end), None) | (None, Some(end)) => of(end),
+            (Some(end), None) | (None, Some(end)) => q(end),
             (None, None) => 0.0,
         }
     }
 
-    /// Requires rising frequencies, and patterns that are none other than small; for so many satellites, if that is known.
+    /// Requires rising frequencies, |q| of at most 2, and a column for each of `satellites`, if their number is known.
     pub fn check(&self, key: &str, satellites: Option<usize>, checks: &mut Checks) {
         let count = self.0.len();
         checks.require(key, format!("({count} rows)"), count <= ROWS_MAX, format!("at most {ROWS_MAX} rows"));
         let width = self.0.first().map_or(2, Vec::len);
-        let mut below_hz = 0.0;
+        let mut previous_hz = 0.0;
         for (k, row) in self.0.iter().enumerate() {
             let (key, found) = (format!("{key}[{k}]"), format!("({} numbers)", row.len()));
-            let alike = row.len() == width && row.len() >= 2;
-            let known = row.len() == 2 || satellites.is_none_or(|satellites| row.len() == satellites + 1);
-            if !alike || !known {
+            let is_rectangular = row.len() == width && row.len() >= 2;
+            let fits_array =
+                row.len() == 2 || satellites.is_none_or(|satellites| row.len() == satellites + 1);
+            if !is_rectangular || !fits_array {
                 let expected = match satellites {
                     Some(satellites) => format!(
-                        "[frequency_hz, q], or a frequency and {satellites} values, one a daughter, in every row"
+                        "[frequency_hz, q], or a frequency and {satellites} values, one per daughter, in every row"
                     ),
-                    None => {
-                        "[frequency_hz, q], or a frequency and one value a daughter, in every row".to_owned()
-                    }
+                    None => "[frequency_hz, q], or a frequency and one value per daughter, in every row"
+                        .to_owned(),
                 };
                 checks.require(key, found, false, expected);
                 return;
             }
-            if row[0] <= below_hz || !row[0].is_finite() {
-                let expected = format!("a frequency above {below_hz} Hz, that of the row before");
+            if row[0] <= previous_hz || !row[0].is_finite() {
+                let expected =
+                    format!("a frequency above {previous_hz} Hz, the frequency of the previous row");
                 checks.require(key, row[0], false, expected);
                 return;
             }
-            below_hz = row[0];
+            previous_hz = row[0];
             checks.numbers(key, &row[1..], |q| q.abs() <= Q_MAX, "patterns of -2 to 2 after the frequency");
         }
     }
@@ -119,12 +122,12 @@ mod tests {
             ("[[1e6, 2.5]]", "patterns of -2 to 2"),
             ("[[1e6, nan]]", "patterns of -2 to 2"),
         ] {
-            let mut checks = Checks::of("instrument");
+            let mut checks = Checks::new("instrument");
             table(text).check("pattern", Some(3), &mut checks);
             let said: Vec<String> = checks.finish().iter().map(ToString::to_string).collect();
             assert!(said.len() == 1 && said[0].contains(expected), "{text}: {said:?}");
         }
-        let mut checks = Checks::of("map");
+        let mut checks = Checks::new("map");
         table("[[1e6, 0.1, 0.2], [2e6, 0.0, 0.1]]").check("antennas.pattern", None, &mut checks);
         assert!(checks.finish().is_empty());
     }

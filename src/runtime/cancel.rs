@@ -1,4 +1,4 @@
-//! Ending a run early: in order from outside, at once after a failure.
+//! Ends a run early: by draining after cancellation, at once after a failure.
 
 use std::convert::Infallible;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
 
-/// Asks a run to end early: sources stop, all stages drain their queues, every `finish` runs.
+/// Token that ends a run early: sources stop, all stages drain their queues, and every `finish` runs.
 ///
-/// Clones share one state; safe to trigger from a signal handler.
+/// Clones share one state. It is safe to trigger from a signal handler.
 #[derive(Clone, Debug, Default)]
 pub struct Cancel {
     flag: Arc<AtomicBool>,
-    /// When somebody first saw the flag: a signal handler must not read a clock.
+    /// Time at which the flag was first seen set, as a signal handler must not read a clock.
     seen: Arc<OnceLock<Instant>>,
 }
 
@@ -24,25 +24,25 @@ impl Cancel {
         Self::default()
     }
 
-    /// Triggers it; it cannot be reset.
+    /// Triggers cancellation, which cannot be reset.
     pub fn cancel(&self) {
         self.flag.store(true, Ordering::Release);
     }
 
-    /// The flag itself; setting it cancels. For signal handlers.
+    /// The flag itself, for signal handlers. Setting it triggers cancellation.
     #[must_use]
     #[doc(hidden)]
     pub fn flag(&self) -> Arc<AtomicBool> {
         Arc::clone(&self.flag)
     }
 
-    /// Whether it was triggered.
+    /// Whether cancellation was triggered.
     #[must_use]
     pub fn is_cancelled(&self) -> bool {
         self.flag.load(Ordering::Acquire)
     }
 
-    /// Time since it was first seen to be triggered; `None` if it was not. A running graph looks often.
+    /// Time since cancellation was first noticed; `None` without cancellation. A running graph checks often.
     #[must_use]
     #[doc(hidden)]
     pub fn elapsed(&self) -> Option<Duration> {
@@ -50,7 +50,7 @@ impl Cancel {
     }
 }
 
-/// A flag that wakes every thread that waits on a channel.
+/// A flag that wakes every thread that selects on its channel.
 #[derive(Debug)]
 pub(super) struct Wake {
     set: AtomicBool,
@@ -74,20 +74,19 @@ impl Wake {
         self.set.load(Ordering::SeqCst)
     }
 
-    /// Never yields; disconnects when it is set. For `select!`.
+    /// For `select!`: a channel without items that disconnects when the flag is set.
     pub(super) fn stop(&self) -> &Receiver<Infallible> {
         &self.stop
     }
 }
 
-/// Set by the first failure, or when a cancelled run is cut short.
+/// State that halts a run, after the first failure or when a cancelled run is cut short.
 ///
-/// The flag is set before the failing thread drops its channels. So a thread that finds a channel closed reads from the
-/// flag whether the other end finished or failed.
+/// It is set before the failing thread drops its channels. So a thread that finds a channel closed can tell whether the
+/// other end finished or failed.
 #[derive(Debug)]
 pub(super) struct Halt {
     failed: AtomicBool,
-    /// For either reason.
     wake: Wake,
 }
 
@@ -96,13 +95,13 @@ impl Halt {
         Self { failed: AtomicBool::new(false), wake: Wake::new() }
     }
 
-    /// Ends a run that failed: stages stop without `finish`.
+    /// Halts a run that failed. Stages stop without `finish`.
     pub(super) fn fail(&self) {
         self.failed.store(true, Ordering::SeqCst);
         self.wake.set();
     }
 
-    /// Ends a cancelled run whose time is up: stages take what is in their queue and run `finish`; outputs are discarded.
+    /// Halts a cancelled run whose grace period is over. Stages take the items in their queue and run `finish`; outputs are discarded.
     pub(super) fn cut(&self) {
         self.wake.set();
     }
@@ -116,7 +115,7 @@ impl Halt {
         self.wake.is_set()
     }
 
-    /// Never yields; disconnects when the run halts. For `select!`.
+    /// For `select!`: a channel without items that disconnects when the run halts.
     pub(super) fn stop(&self) -> &Receiver<Infallible> {
         self.wake.stop()
     }

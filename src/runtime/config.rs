@@ -17,10 +17,10 @@ keys! {
 }
 
 impl RuntimeConfig {
-    /// Everything that is wrong with the configuration; empty if it is good.
+    /// All problems of the configuration; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("runtime");
+        let mut checks = Checks::new("runtime");
         let capacity = self.queue_capacity;
         checks.number(
             "queue_capacity",
@@ -32,7 +32,7 @@ impl RuntimeConfig {
             "threads",
             self.threads as f64,
             self.threads <= 1024,
-            "at most 1024, or 0 for one a core",
+            "at most 1024, or 0 for one per core",
         );
         let grace = self.grace_s;
         checks.number("grace_s", grace, (0.0..=1e6).contains(&grace), "0 s to 1e6 s");

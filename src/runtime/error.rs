@@ -8,13 +8,13 @@ use thiserror::Error;
 /// Any error of a stage.
 pub type BoxError = Box<dyn std::error::Error + Send + Sync>;
 
-/// Position of a stage when something happened.
+/// Position of a stage in its input at a failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Moment {
-    /// While it processed this input, counted from 0; a source: while it made this item.
+    /// In the step on this input, counted from 0. For a source, on this output.
     Item(u64),
-    /// In `finish`, after this number of inputs; a source: of items.
+    /// In `finish`, after this number of inputs. For a source, of outputs.
     Finish(u64),
 }
 
@@ -27,10 +27,10 @@ impl fmt::Display for Moment {
     }
 }
 
-/// Stages that had not ended by the deadline; displayed as an empty string if there are none.
+/// Stages that had not ended by the deadline. Displayed as an empty string if there are none.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct UnfinishedStages {
-    /// Their names, in the order in which they were added.
+    /// Names of the stages, in the order in which they were added.
     pub stages: Vec<String>,
     /// How long the supervisor waited for them.
     pub waited: Duration,
@@ -46,54 +46,56 @@ impl fmt::Display for UnfinishedStages {
     }
 }
 
-/// Why a graph cannot run, or did not finish.
+/// Errors of building or running a graph.
 ///
-/// A stage's own error is the `source()`, not part of the message: print the chain.
+/// The error of a stage is the `source()` and not part of the message, so that the whole chain should be printed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RuntimeError {
-    /// A stage returned an error; the first one of the run.
-    #[error("stage `{stage}` failed {at}{laggards}")]
+    /// The first failure was an error of a stage.
+    #[error("stage `{stage}` failed {at}{unfinished}")]
     Failed {
         /// Name of the stage.
         stage: String,
-        /// Its position.
+        /// Position of the stage.
         at: Moment,
-        /// Stages that did not stop in time.
-        laggards: UnfinishedStages,
-        /// The stage's error.
+        /// Stages that had not ended by the deadline.
+        unfinished: UnfinishedStages,
+        /// Error of the stage.
         source: BoxError,
     },
-    /// A stage panicked; the first failure of the run.
-    #[error("stage `{stage}` panicked {at}: {message}{laggards}")]
+    /// The first failure was a panic of a stage.
+    #[error("stage `{stage}` panicked {at}: {message}{unfinished}")]
     Panicked {
         /// Name of the stage.
         stage: String,
-        /// Its position.
+        /// Position of the stage.
         at: Moment,
-        /// The panic's message.
+        /// Message of the panic.
         message: String,
-        /// Stages that did not stop in time.
-        laggards: UnfinishedStages,
+        /// Stages that had not ended by the deadline.
+        unfinished: UnfinishedStages,
     },
-    /// No stage made progress any more.
-    #[error("no stage made progress for {:.1} s; in a step: `{}`{laggards}", waited.as_secs_f64(), stages.join("`, `"))]
+    /// No stage made progress within the time limit.
+    #[error("no stage made progress for {:.1} s; in a step: `{}`{unfinished}", waited.as_secs_f64(), stages.join("`, `"))]
     Stalled {
-        /// Names of the stages that waited neither for input nor for room.
+        /// Names of the stages that waited neither for input nor for space in their queue.
         stages: Vec<String>,
-        /// How long there was no progress.
+        /// Time without progress.
         waited: Duration,
-        /// Stages that did not stop in time.
-        laggards: UnfinishedStages,
+        /// Stages that had not ended by the deadline.
+        unfinished: UnfinishedStages,
     },
     /// A thread could not be started.
-    #[error("no thread for stage `{stage}`{laggards}; the system's limit on threads may be too low")]
+    #[error(
+        "cannot start a thread for stage `{stage}`{unfinished}; the limit of the system on threads may be too low"
+    )]
     Thread {
         /// Name of the stage.
         stage: String,
-        /// Stages that did not stop in time.
-        laggards: UnfinishedStages,
-        /// The system's error.
+        /// Stages that had not ended by the deadline.
+        unfinished: UnfinishedStages,
+        /// Error of the system.
         source: std::io::Error,
     },
     /// A queue without capacity.
@@ -102,10 +104,10 @@ pub enum RuntimeError {
         /// Name of the stage that fills the queue.
         stage: String,
     },
-    /// A name that is invalid for a thread, or in use.
-    #[error("stage name `{stage}`: expected a unique name, not empty and without NUL")]
+    /// A stage name that is in use, or invalid as a thread name.
+    #[error("stage name `{stage}` is in use or invalid; expected a unique name, not empty and without NUL")]
     Name {
-        /// The name.
+        /// Name of the stage.
         stage: String,
     },
     /// A link without a receiver.

@@ -1,4 +1,4 @@
-//! Graphs of stages with typed links.
+//! Builds and runs graphs of stages with typed links.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,11 +21,11 @@ pub struct Link<T> {
     receiver: Receiver<StampedItem<T>>,
     capacity: usize,
     from: usize,
-    /// Which graph it belongs to.
+    /// Identifies the graph to which the link belongs.
     halt: Arc<Halt>,
 }
 
-/// Sources, stages and sinks, each to run on a thread of its own.
+/// A graph of sources, stages and sinks, each of which runs on its own thread.
 ///
 /// ```
 /// use std::convert::Infallible;
@@ -77,12 +77,11 @@ pub struct Graph {
     nodes: Vec<StageNode>,
     metrics: Arc<Metrics>,
     halt: Arc<Halt>,
-    /// Longest time without progress before the run fails; `None` for no limit.
+    /// Maximum time without progress before the run fails; `None` for no limit.
     stall: Option<Duration>,
-    /// How long a cancelled run waits for stages that are not kept; `None` for no limit.
+    /// Time that a cancelled run waits for stages that are not kept; `None` for no limit.
     grace: Option<Duration>,
-    /// First mistake in the calls that built the graph.
-    mistake: Option<RuntimeError>,
+    build_error: Option<RuntimeError>,
 }
 
 impl Default for Graph {
@@ -101,13 +100,13 @@ impl Graph {
             halt: Arc::new(Halt::new()),
             stall: None,
             grace: None,
-            mistake: None,
+            build_error: None,
         }
     }
 
     /// Adds a source whose output queue holds `capacity` items.
     ///
-    /// A mistake (a name in use, capacity 0) is reported by [`Graph::run`].
+    /// An error (a name in use, capacity 0) is reported by [`Graph::run`].
     pub fn source<S>(&mut self, name: &str, capacity: usize, source: S) -> Link<S::Out>
     where
         S: Source<Out: 'static> + 'static,
@@ -120,7 +119,7 @@ impl Graph {
 
     /// Adds a stage that reads `input`; its output queue holds `capacity` items.
     ///
-    /// A mistake (a name in use, capacity 0, a link of another graph) is reported by [`Graph::run`].
+    /// An error (a name in use, capacity 0, a link of another graph) is reported by [`Graph::run`].
     pub fn stage<S>(&mut self, name: &str, capacity: usize, input: Link<S::In>, stage: S) -> Link<S::Out>
     where
         S: Stage<In: 'static, Out: 'static> + 'static,
@@ -134,7 +133,7 @@ impl Graph {
 
     /// Adds a sink that reads `input`.
     ///
-    /// A mistake (a name in use, a link of another graph) is reported by [`Graph::run`].
+    /// An error (a name in use, a link of another graph) is reported by [`Graph::run`].
     pub fn sink<S>(&mut self, name: &str, input: Link<S::In>, sink: S)
     where
         S: Sink<In: 'static> + 'static,
@@ -144,29 +143,28 @@ impl Graph {
         self.add(counters, Box::new(SinkWorker { sink, inlet }), true);
     }
 
-    /// Makes the run fail after this time without progress: no step of any stage has ended, no item was received or
-    /// sent. Must exceed the longest step.
+    /// Makes the run fail after this time without progress, in which no step ended and no item was received or sent. It must
+    /// exceed the longest step.
     #[doc(hidden)]
     pub fn fail_after_stall(&mut self, stall: Duration) {
         self.stall = Some(stall);
     }
 
-    /// Limits how long a cancelled run waits for its stages, except those named in `kept`.
+    /// Limits the time that a cancelled run waits for its stages, except those named in `kept`.
     ///
-    /// Kept stages are those that save data. After three tenths of `grace` a stage before the first of them that is in a
-    /// long step is left behind: what follows it takes what is in the queues, and runs `finish`. When all of `grace` is
-    /// over, everything else ends, and its outputs are discarded; stages in a long step are left behind, too. They keep
-    /// running, as after a failure, so the process should end. Sources that hand over what they have, and kept stages, may
-    /// take longer.
+    /// Kept stages are those that save data. After three tenths of `grace`, a stage before the first of them that is in a
+    /// long step is abandoned: the stages after it take the items in their queues and run `finish`. After all of `grace`,
+    /// the other stages end and their outputs are discarded; those in a long step are abandoned as well. Abandoned stages
+    /// keep running, so the process should end. Kept stages, and sources that are flushing, may take longer.
     #[doc(hidden)]
     pub fn cut_after(&mut self, grace: Duration, kept: &[&str]) {
         self.grace = Some(grace);
         for node in &mut self.nodes {
-            node.kept = kept.contains(&node.counters.name.as_str());
+            node.must_finish = kept.contains(&node.counters.name.as_str());
         }
     }
 
-    /// Counters that may be read while the graph runs.
+    /// Counters that can be read while the graph runs.
     #[must_use]
     pub fn metrics(&self) -> Arc<Metrics> {
         Arc::clone(&self.metrics)
@@ -174,18 +172,17 @@ impl Graph {
 
     /// Runs every stage on its own thread until all have ended.
     ///
-    /// After `cancel` the sources stop and the other stages drain, without a deadline unless [`Graph::cut_after`] has set
-    /// one. After a failure the stages have
-    /// `deadline` to end; the error names those that do not, which keep running. A thread cannot be ended from outside, so
-    /// the process should be.
+    /// After `cancel` the sources stop and the other stages drain, without a time limit unless [`Graph::cut_after`] has set
+    /// one. After a failure the stages have `deadline` to end. The error names those that have not ended; they keep running,
+    /// as a thread cannot be stopped from outside, so the process should end.
     ///
     /// # Errors
-    /// [`RuntimeError`]: a mistake in the graph, or the first failure of a stage.
+    /// [`RuntimeError`]: an error in the graph, or the first failure of a stage.
     pub fn run(mut self, cancel: &Cancel, deadline: Duration) -> Result<Report, RuntimeError> {
-        if let Some(mistake) = self.mistake.take() {
-            return Err(mistake);
+        if let Some(build_error) = self.build_error.take() {
+            return Err(build_error);
         }
-        if let Some(open) = self.nodes.iter().find(|node| !node.taken) {
+        if let Some(open) = self.nodes.iter().find(|node| !node.is_connected) {
             return Err(RuntimeError::OpenEnd { stage: open.counters.name.clone() });
         }
         let limits = Limits { grace: self.grace, deadline, stall: self.stall };
@@ -194,7 +191,7 @@ impl Graph {
 
     fn counters(&mut self, name: &str, queue: Option<usize>, unit: &'static str) -> Arc<Counters> {
         if name.is_empty() || name.contains('\0') || self.metrics.knows(name) {
-            self.note(RuntimeError::Name { stage: name.to_owned() });
+            self.note_build_error(RuntimeError::Name { stage: name.to_owned() });
         }
         let counters = Arc::new(Counters::new(name, queue, unit));
         self.metrics.add(Arc::clone(&counters));
@@ -203,7 +200,7 @@ impl Graph {
 
     fn link<T>(&mut self, capacity: usize, counters: &Arc<Counters>) -> (Outlet<T>, Link<T>) {
         if capacity == 0 {
-            self.note(RuntimeError::Capacity { stage: counters.name.clone() });
+            self.note_build_error(RuntimeError::Capacity { stage: counters.name.clone() });
         }
         let (sender, receiver) = bounded(capacity);
         let queue = Queue::new(sender, Arc::clone(&self.halt), Arc::clone(counters));
@@ -213,18 +210,18 @@ impl Graph {
 
     fn inlet<T>(&mut self, name: &str, link: Link<T>) -> Inlet<T> {
         if !Arc::ptr_eq(&link.halt, &self.halt) {
-            self.note(RuntimeError::ForeignLink { stage: name.to_owned() });
+            self.note_build_error(RuntimeError::ForeignLink { stage: name.to_owned() });
         } else if let Some(from) = self.nodes.get_mut(link.from) {
-            from.taken = true;
+            from.is_connected = true;
         }
         Inlet::new(link.receiver)
     }
 
-    fn add(&mut self, counters: Arc<Counters>, worker: Box<dyn Worker>, taken: bool) {
-        self.nodes.push(StageNode { counters, worker, taken, kept: false });
+    fn add(&mut self, counters: Arc<Counters>, worker: Box<dyn Worker>, is_connected: bool) {
+        self.nodes.push(StageNode { counters, worker, is_connected, must_finish: false });
     }
 
-    fn note(&mut self, mistake: RuntimeError) {
-        self.mistake.get_or_insert(mistake);
+    fn note_build_error(&mut self, build_error: RuntimeError) {
+        self.build_error.get_or_insert(build_error);
     }
 }

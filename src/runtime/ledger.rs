@@ -1,4 +1,4 @@
-//! The ledger that closes every run: sampled = accumulated + flagged + lost.
+//! Accounting of samples, which must balance at the end of a run: sampled = accumulated + flagged + lost.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,9 +10,9 @@ use thiserror::Error;
 
 use crate::units::Reason;
 
-/// Counts samples, and whether each was accumulated, flagged or lost. Clones share one set of counts.
+/// Counts samples that were taken, and how many of them were accumulated, flagged or lost. Clones share one set of counts.
 ///
-/// Counts saturate at `u64::MAX`. Posting takes a lock: post by block, not by sample.
+/// Counts saturate at `u64::MAX`. Adding takes a lock, so add by block, not by sample.
 #[derive(Clone, Debug)]
 pub struct Ledger<R: Reason>(Arc<Mutex<LedgerReport<R>>>);
 
@@ -33,22 +33,22 @@ impl<R: Reason> Ledger<R> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Posts `count` new samples.
-    pub fn sampled(&self, count: u64) {
+    /// Adds `count` new samples.
+    pub fn add_sampled(&self, count: u64) {
         add(&mut self.counts().sampled, count);
     }
 
-    /// Posts `count` samples that reached the result.
-    pub fn accumulated(&self, count: u64) {
+    /// Adds `count` samples that reached the result.
+    pub fn add_accumulated(&self, count: u64) {
         add(&mut self.counts().accumulated, count);
     }
 
-    /// Posts `count` samples that were flagged or lost for `reason`.
-    pub fn left_out(&self, reason: R, count: u64) {
+    /// Adds `count` samples that were flagged or lost for `reason`.
+    pub fn add_left_out(&self, reason: R, count: u64) {
         self.counts().leave_out(reason, count);
     }
 
-    /// Posts all counts of a report.
+    /// Adds all counts of a report.
     #[doc(hidden)]
     pub fn post_report(&self, report: &LedgerReport<R>) {
         let mut counts = self.counts();
@@ -66,18 +66,18 @@ impl<R: Reason> Ledger<R> {
         std::mem::take(&mut *self.counts())
     }
 
-    /// All counts, balanced or not.
+    /// All counts, whether or not they balance.
     #[must_use]
     pub fn report(&self) -> LedgerReport<R> {
         self.counts().clone()
     }
 
-    /// All counts, which must balance.
+    /// All counts, after checking that they balance.
     ///
     /// # Errors
     /// [`LedgerImbalance`] unless sampled = accumulated + flagged + lost.
     #[doc(hidden)]
-    pub fn close(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
+    pub fn balanced_report(&self) -> Result<LedgerReport<R>, LedgerImbalance<R>> {
         let report = self.report();
         if report.unaccounted() == 0 { Ok(report) } else { Err(LedgerImbalance { report }) }
     }
@@ -87,14 +87,14 @@ fn add(entry: &mut u64, count: u64) {
     *entry = entry.saturating_add(count);
 }
 
-/// The counts of a ledger; shown as a table.
+/// The counts of a ledger, displayed as a table.
 #[derive(Clone, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct LedgerReport<R: Reason> {
-    /// New samples.
+    /// Number of new samples.
     pub sampled: u64,
-    /// Samples that reached the result.
+    /// Number of samples that reached the result.
     pub accumulated: u64,
-    /// Samples that were flagged or lost, by reason.
+    /// Number of samples that were flagged or lost, by reason.
     pub left_out: BTreeMap<R, u64>,
 }
 
@@ -104,7 +104,6 @@ impl<R: Reason> Default for LedgerReport<R> {
     }
 }
 
-/// An entry for samples that were lost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 struct Loss {
     stage: &'static str,
@@ -114,21 +113,23 @@ struct Loss {
 
 impl<R: Reason> LedgerReport<R> {
     fn leave_out(&mut self, reason: R, count: u64) {
-        // No entry of zero.
+        // Without entries of zero.
         if count > 0 {
             add(self.left_out.entry(reason).or_default(), count);
         }
     }
 
-    /// The ledger of two passes over the same samples, each of which took some of them to its result. Reasons of which
-    /// `is_of_pass` are those of one pass alone, the others of both; what neither pass took counts under `elsewhere`.
+    /// Merges the ledgers of two readings of the same samples, each of which accumulated some of them.
+    ///
+    /// Counts of reasons for which `is_of_reading` holds are of one reading only and added. Other counts are common and taken
+    /// once. Samples that neither reading accumulated count under `elsewhere`.
     #[must_use]
     #[doc(hidden)]
-    pub fn of_two_passes(&self, other: &Self, is_of_pass: impl Fn(R) -> bool, elsewhere: R) -> Self {
+    pub fn merge_readings(&self, other: &Self, is_of_reading: impl Fn(R) -> bool, elsewhere: R) -> Self {
         let mut both = self.clone();
         add(&mut both.accumulated, other.accumulated);
         for (&reason, &count) in &other.left_out {
-            if is_of_pass(reason) {
+            if is_of_reading(reason) {
                 both.leave_out(reason, count);
             } else {
                 both.left_out.entry(reason).or_insert(count);
@@ -140,7 +141,7 @@ impl<R: Reason> LedgerReport<R> {
         both
     }
 
-    /// Samples left out for one reason.
+    /// Number of samples left out for one reason.
     #[must_use]
     pub fn count(&self, reason: R) -> u64 {
         self.left_out.get(&reason).copied().unwrap_or(0)
@@ -151,34 +152,34 @@ impl<R: Reason> LedgerReport<R> {
         entries.map(|(_, &count)| u128::from(count)).sum()
     }
 
-    /// Samples flagged for any reason.
+    /// Number of samples flagged for any reason.
     #[must_use]
     pub fn flagged_total(&self) -> u128 {
         self.total(false)
     }
 
-    /// Samples lost in any stage.
+    /// Number of samples lost in any stage.
     #[must_use]
     pub fn lost_total(&self) -> u128 {
         self.total(true)
     }
 
-    /// Samples without an entry; negative if the entries are more than the samples.
+    /// Number of samples without an entry; negative if the entries exceed the samples.
     #[must_use]
     #[doc(hidden)]
     pub fn unaccounted(&self) -> i128 {
         let known = u128::from(self.accumulated) + self.flagged_total() + self.lost_total();
-        // A u64 an entry: 2^63 entries would have to be full to leave the range.
+        // Each entry is at most u64::MAX, so that it takes 2^63 entries to leave the range.
         i128::from(self.sampled) - i128::try_from(known).unwrap_or(i128::MAX)
     }
 
-    /// Counts of flagged samples by text, in the order of the texts.
+    /// Counts of flagged samples, sorted by the text of the reason.
     fn flagged(&self) -> BTreeMap<&'static str, u64> {
         let flags = self.left_out.iter().filter(|(reason, _)| reason.lost_in().is_none());
         flags.map(|(reason, &count)| (reason.text(), count)).collect()
     }
 
-    /// Entries for lost samples, in the order of stages and texts.
+    /// Entries for lost samples, sorted by stage and text of the reason.
     fn losses(&self) -> Vec<Loss> {
         let loss = |(reason, &count): (&R, &u64)| {
             reason.lost_in().map(|stage| Loss { stage, reason: reason.text(), count })
@@ -199,7 +200,7 @@ impl<R: Reason> LedgerReport<R> {
 }
 
 impl<R: Reason> Serialize for LedgerReport<R> {
-    /// Counts by text: `sampled`, `accumulated`, `flagged` by reason, `lost` by stage and reason.
+    /// Serialises `sampled`, `accumulated`, `flagged` by reason, and `lost` by stage and reason.
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut report = serializer.serialize_struct("LedgerReport", 4)?;
         report.serialize_field("sampled", &self.sampled)?;
@@ -221,11 +222,11 @@ impl<R: Reason> fmt::Display for LedgerReport<R> {
     }
 }
 
-/// The counts of a run do not balance: a bug of the program.
+/// Counts of a run that do not balance, which is a bug of the program.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error(
-    "the ledger does not close: {} samples unaccounted for ({}); expected sampled = accumulated + flagged + \
-     lost",
+    "the ledger does not balance, which is a bug of the program: {} samples unaccounted for ({}); expected sampled = \
+    accumulated + flagged + lost",
     report.unaccounted(),
     entries(report)
 )]
@@ -284,8 +285,8 @@ mod tests {
 
     fn post(ledger: &Ledger<Why>, fate: Option<Why>, count: u64) {
         match fate {
-            None => ledger.accumulated(count),
-            Some(reason) => ledger.left_out(reason, count),
+            None => ledger.add_accumulated(count),
+            Some(reason) => ledger.add_left_out(reason, count),
         }
     }
 
@@ -295,11 +296,11 @@ mod tests {
             let ledger = Ledger::new();
             let total: u64 = fates.iter().map(|&(_, count)| count).sum();
             prop_assume!(total >= 3);
-            ledger.sampled(total.checked_add_signed(missing).unwrap());
+            ledger.add_sampled(total.checked_add_signed(missing).unwrap());
             for &(fate, count) in &fates {
                 post(&ledger, fate, count);
             }
-            match ledger.close() {
+            match ledger.balanced_report() {
                 Ok(report) => {
                     prop_assert_eq!(missing, 0);
                     let known = u128::from(report.accumulated) + report.flagged_total() + report.lost_total();
@@ -337,22 +338,22 @@ mod tests {
     #[test]
     fn forged_counts_saturate() {
         let ledger = Ledger::new();
-        ledger.left_out(Why::Gap, u64::MAX);
-        ledger.left_out(Why::Gap, u64::MAX);
-        ledger.left_out(Why::Checksum, u64::MAX);
+        ledger.add_left_out(Why::Gap, u64::MAX);
+        ledger.add_left_out(Why::Gap, u64::MAX);
+        ledger.add_left_out(Why::Checksum, u64::MAX);
         assert_eq!(ledger.report().unaccounted(), -2 * i128::from(u64::MAX));
-        assert!(ledger.close().is_err());
+        assert!(ledger.balanced_report().is_err());
     }
 
     #[test]
     fn the_report_is_shown_and_serialised() {
         let ledger = Ledger::new();
-        ledger.sampled(20);
-        ledger.accumulated(6);
+        ledger.add_sampled(20);
+        ledger.add_accumulated(6);
         for (reason, count) in REASONS.into_iter().zip([3, 2, 4, 0, 5]) {
-            ledger.left_out(reason, count);
+            ledger.add_left_out(reason, count);
         }
-        let report = ledger.close().unwrap();
+        let report = ledger.balanced_report().unwrap();
         let rows: Vec<(String, u64)> = report.rows();
         let rows: Vec<(&str, u64)> = rows.iter().map(|(name, count)| (name.as_str(), *count)).collect();
         let expected = [

@@ -1,17 +1,17 @@
-//! Durations that others may read while a stage counts them.
+//! Statistics of durations that can be read while a stage records them.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use super::timing::TimingSummary;
 
-/// log2 of the upper limit of the shortest class, ns: about 1 us.
+/// log2 of the upper limit of the first class, ns, which is about 1 us.
 const FIRST_LIMIT_LOG2: u32 = 10;
 
-/// Number of classes: the last one ends at about 18 minutes and takes all that is longer.
+/// Number of classes. The last one ends at about 18 minutes and also takes longer durations.
 const CLASSES: usize = 31;
 
-/// Counters of durations in classes, each twice as wide as the one before; one thread writes, so stores suffice.
+/// Histogram of durations in classes that double in width. Only one thread writes, so stores suffice.
 #[derive(Debug, Default)]
 pub(super) struct LiveTiming {
     classes: [AtomicU64; CLASSES],
@@ -47,18 +47,18 @@ fn class(nanoseconds: u64) -> usize {
     (log2.saturating_sub(FIRST_LIMIT_LOG2) as usize).min(CLASSES - 1)
 }
 
-/// Numbers of durations by class.
+/// Number of durations by class.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DurationCounts {
     classes: [u64; CLASSES],
-    /// Sum, s.
+    /// Sum of the durations, s.
     pub total_s: f64,
-    /// Longest, s.
+    /// Longest duration, s.
     pub max_s: f64,
 }
 
 impl DurationCounts {
-    /// Upper limit of each class, s, and the number of durations in it. The last class also has all that is longer.
+    /// Upper limit of each class, s, and the number of durations in it. The last class also contains longer ones.
     pub fn classes(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
         (FIRST_LIMIT_LOG2..)
             .zip(&self.classes)
@@ -71,11 +71,11 @@ impl DurationCounts {
         self.classes.iter().sum()
     }
 
-    /// Statistics; percentiles are upper limits of classes, so up to twice the true ones, and never above the maximum.
+    /// Statistics of the durations. Percentiles are upper limits of classes, so up to twice the true values, but at most the maximum.
     #[must_use]
     pub fn summary(&self) -> TimingSummary {
         let count = self.count();
-        let at = |quantile: f64| {
+        let percentile_s = |quantile: f64| {
             let rank = (quantile * count as f64).ceil().max(1.0) as u64;
             let mut below = 0;
             let reaches = |&(_, more): &(f64, u64)| {
@@ -87,9 +87,9 @@ impl DurationCounts {
         TimingSummary {
             count,
             total_s: self.total_s,
-            p50_s: at(0.5),
-            p99_s: at(0.99),
-            p999_s: at(0.999),
+            p50_s: percentile_s(0.5),
+            p99_s: percentile_s(0.99),
+            p999_s: percentile_s(0.999),
             max_s: self.max_s,
         }
     }
@@ -108,7 +108,7 @@ mod tests {
         }
         let summary = timing.read().summary();
         assert_eq!(summary.count, 1_000);
-        // 1 + .. + 1000 us; a rounding error for each.
+        // 1 + .. + 1000 us, with a rounding error each.
         assert!((summary.total_s - 0.500_5).abs() < 1e-9);
         for (found, expected) in [(summary.p50_s, 500e-6), (summary.p99_s, 990e-6), (summary.p999_s, 999e-6)]
         {

@@ -1,16 +1,16 @@
-//! Counters that may be read during a run.
+//! Counters that can be read during a run.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::live_timing::{DurationCounts, LiveTiming};
 
-/// Amount that a stage has processed, in a unit of its choice (visibilities, bytes), for its throughput.
+/// Amount of data that a stage has processed, in its own unit such as visibilities or bytes, for its throughput.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Units {
     /// Number since the start.
     pub count: u64,
-    /// Name of the unit in the plural; empty if the stage counts none.
+    /// Name of the unit in the plural; empty if the stage does not count.
     pub name: &'static str,
 }
 
@@ -22,7 +22,7 @@ impl Units {
     }
 }
 
-/// Counters of one stage; written by its thread alone, so stores suffice.
+/// Counters of one stage. Only its thread writes them, so stores suffice.
 #[derive(Debug)]
 pub(super) struct Counters {
     pub(super) name: String,
@@ -33,15 +33,12 @@ pub(super) struct Counters {
     items_out: AtomicU64,
     units: AtomicU64,
     queue_depth_max: AtomicUsize,
-    /// Steps that have ended.
     steps: AtomicU64,
-    /// Work of each step.
     pub(super) working_time: LiveTiming,
-    /// From the source's push to the end of the step.
+    /// Time from the push of the source to the end of the step.
     pub(super) since_source: LiveTiming,
-    /// Whether the stage is in a step, and not waiting for room.
+    /// Whether the stage is in a step and not waiting for space in its queue.
     working: AtomicBool,
-    /// Whether the stage is in its `finish`.
     finishing: AtomicBool,
     ended: AtomicBool,
 }
@@ -103,8 +100,8 @@ impl Counters {
         self.finishing.load(Ordering::Relaxed)
     }
 
-    /// Changes whenever the stage has done something.
-    pub(super) fn moves(&self) -> [u64; 4] {
+    /// Values of which at least one changes with any progress of the stage.
+    pub(super) fn progress_marks(&self) -> [u64; 4] {
         let ended = u64::from(self.ended.load(Ordering::Relaxed));
         [self.items_in(), self.items_out(), self.steps.load(Ordering::Relaxed), ended]
     }
@@ -145,38 +142,37 @@ impl Counters {
     }
 }
 
-/// Counters of one stage.
+/// Snapshot of the counters of one stage.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StageProgress {
     /// Name of the stage.
     pub name: String,
-    /// Items received, including the one in work.
+    /// Items received, including the one being processed.
     pub items_in: u64,
     /// Items sent.
     pub items_out: u64,
     /// Units processed up to the last completed step.
     pub units: Units,
-    /// Greatest number of items found in the queue before the stage.
+    /// Maximum number of items found in the queue before the stage.
     pub queue_depth_max: usize,
-    /// Capacity of that queue; `None` for a source.
+    /// Capacity of the queue before the stage; `None` for a source.
     pub queue_capacity: Option<usize>,
-    /// Working: one entry for each step.
+    /// Time of work in each step.
     pub working: DurationCounts,
-    /// From the source's push of an item, or since when the source says that it was there, to the end of the step on what was made
-    /// from it.
+    /// Time from the push of an item by the source, or from its arrival there, to the end of the step on the items made from it.
     pub since_source: DurationCounts,
-    /// Whether the stage is in a step, and not waiting for room.
+    /// Whether the stage is in a step and not waiting for space in its queue.
     pub is_working: bool,
     /// Whether the stage has ended.
     pub ended: bool,
 }
 
-/// Live counters of a graph's stages; reading them costs the stages nothing.
+/// Live counters of the stages of a graph. Reading them does not delay the stages.
 #[derive(Debug, Default)]
 pub struct Metrics(Mutex<Vec<Arc<Counters>>>);
 
 impl Metrics {
-    /// Every stage's progress, in the order in which they were added.
+    /// Snapshots of the counters of all stages, in the order in which they were added.
     #[must_use]
     pub fn snapshot(&self) -> Vec<StageProgress> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().map(|c| c.progress()).collect()

@@ -1,15 +1,15 @@
-//! Stages on named threads, connected by bounded channels, under one supervisor. Knows no physics; uses [`crate::units`].
+//! Runs stages on named threads, connected by bounded channels, under one supervisor. Uses [`crate::units`].
 //!
 //! A [`Graph`] consists of chains source -> stages -> sink. Every link is a bounded channel that keeps the order of its
 //! items. So a fast source waits for a slow sink, and the items in flight are at most the sum of the capacities plus a few
-//! for each stage. The runner owns receiving, timing, thread names and panics. A [`Stage`] does only its own work and is
-//! tested alone with [`Outlet::collect`].
+//! for each stage. The runtime does receiving, timing and thread names, and catches panics. A [`Stage`] can be tested
+//! alone with [`Outlet::collect`].
 //!
 //! A run ends in one of two ways:
 //! - The source is done, or [`Cancel`] stops it. Every stage drains its queue, every `finish` runs, and the run returns a
 //!   [`Report`]. A cancelled run may have a time limit, [`Graph::cut_after`].
 //! - A stage fails or panics. The supervisor keeps the first error with the name and position of the stage, and wakes all
-//!   other stages, which stop without `finish`. The error names the stages that do not end by the deadline.
+//!   other stages, which stop without `finish`. The error names the stages that have not ended by the deadline.
 //!
 //! A [`Ledger`] counts samples that were accumulated, flagged or lost; it must balance at the end of a run.
 

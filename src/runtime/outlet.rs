@@ -1,4 +1,4 @@
-//! The output of a stage.
+//! The output of a source or stage.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,19 +8,19 @@ use crossbeam_channel::{Sender, TrySendError, select};
 use super::cancel::{Cancel, Halt};
 use super::metrics::Counters;
 
-/// How often a sender that may give up looks for room.
-const ROOM_POLL: Duration = Duration::from_millis(10);
+/// Interval between checks for space in the queue, in [`Outlet::push_unless`].
+const SPACE_POLL: Duration = Duration::from_millis(10);
 
-/// An item, and the instant at which the source emitted the item that it was made from.
+/// An item, and the instant at which the source pushed the item from which it was made.
 pub(super) struct StampedItem<T> {
     pub(super) item: T,
-    pub(super) born: Instant,
+    pub(super) source_time: Instant,
 }
 
-/// Takes the outputs of a stage, in order: a queue to the next stage, or a list for tests.
+/// Takes the outputs of a stage, in order, into a queue to the next stage, or into a list for tests.
 ///
-/// [`Outlet::push`] waits while the queue is full. After a failure of another stage, pushing does nothing and the runner
-/// ends the stage after its step. A stage with many outputs in one step may check [`Outlet::is_closed`] and return early.
+/// [`Outlet::push`] waits while the queue is full. After a failure of another stage, it does nothing, and the stage ends
+/// after its step. A stage with many outputs in one step may check [`Outlet::is_closed`] and return early.
 pub struct Outlet<T>(Target<T>);
 
 enum Target<T> {
@@ -29,7 +29,7 @@ enum Target<T> {
 }
 
 impl<T> Outlet<T> {
-    /// An outlet that keeps everything, to test a stage alone.
+    /// An outlet that keeps all items, to test a stage alone.
     #[must_use]
     pub fn collect() -> Self {
         Self(Target::List(Vec::new()))
@@ -47,17 +47,17 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// As [`Outlet::push`] of a source, for an item that was there `since` an instant: from then on its latencies count.
+    /// Like [`Outlet::push`], for an item that arrived at a source at `since`, from which its latency is counted.
     #[doc(hidden)]
     pub fn push_since(&mut self, item: T, since: Instant) {
-        self.descend_from(since);
+        self.set_source_time(since);
         self.push(item);
         if let Target::Queue(queue) = &mut self.0 {
-            queue.born = None;
+            queue.source_time = None;
         }
     }
 
-    /// As [`Outlet::push`], but gives up waiting for room when `cancel` is triggered; for items that no one needs then.
+    /// Like [`Outlet::push`], but drops the item once `cancel` is triggered, for items that are not needed then.
     #[doc(hidden)]
     pub fn push_unless(&mut self, item: T, cancel: &Cancel) {
         match &mut self.0 {
@@ -66,18 +66,18 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Lets a source wait for input from outside. The time counts as waiting for input, and not as work.
+    /// Calls `wait`, in which a source waits for input. The time counts as waiting for input, not as work.
     #[doc(hidden)]
     pub fn await_input<R>(&mut self, wait: impl FnOnce() -> R) -> R {
         let since = Instant::now();
         let found = wait();
         if let Target::Queue(queue) = &mut self.0 {
-            queue.starved += since.elapsed();
+            queue.waiting.input += since.elapsed();
         }
         found
     }
 
-    /// Whether pushed items are discarded, as the run has failed or was cut short.
+    /// Whether pushed items are discarded because the run has failed or was cut short.
     #[must_use]
     #[doc(hidden)]
     pub fn is_closed(&self) -> bool {
@@ -87,7 +87,7 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Items of a collecting outlet; empty for a queue.
+    /// The items of a collecting outlet; empty for a queue.
     #[must_use]
     #[doc(hidden)]
     pub fn items(&self) -> &[T] {
@@ -105,55 +105,58 @@ impl<T> Outlet<T> {
         }
     }
 
-    /// Items of a collecting outlet; empty for a queue.
+    /// The items of a collecting outlet; empty for a queue.
     #[must_use]
     pub fn into_vec(mut self) -> Vec<T> {
         self.take()
     }
 
-    /// Stamps all items that are pushed from now on with `born`.
-    pub(super) fn descend_from(&mut self, born: Instant) {
+    pub(super) fn set_source_time(&mut self, source_time: Instant) {
         if let Target::Queue(queue) = &mut self.0 {
-            queue.born = Some(born);
+            queue.source_time = Some(source_time);
         }
     }
 
-    /// Time spent waiting for room, and for input from outside, since the last call.
-    pub(super) fn lap(&mut self) -> [Duration; 2] {
+    pub(super) fn take_waiting_times(&mut self) -> WaitingTimes {
         match &mut self.0 {
-            Target::Queue(queue) => [&mut queue.waited, &mut queue.starved].map(std::mem::take),
-            Target::List(_) => [Duration::ZERO; 2],
+            Target::Queue(queue) => std::mem::take(&mut queue.waiting),
+            Target::List(_) => WaitingTimes::default(),
         }
     }
 }
 
-/// The sending end of a link.
+#[derive(Default)]
+pub(super) struct WaitingTimes {
+    /// For space in the output queue.
+    pub(super) space: Duration,
+    /// For input of a source.
+    pub(super) input: Duration,
+}
+
 pub(super) struct Queue<T> {
     sender: Sender<StampedItem<T>>,
     halt: Arc<Halt>,
     counters: Arc<Counters>,
-    /// Source timestamp of pushed items; `None` in a source, which stamps them as it pushes.
-    born: Option<Instant>,
-    waited: Duration,
-    starved: Duration,
+    /// Source time of pushed items; `None` in a source, which stamps each at its push.
+    source_time: Option<Instant>,
+    waiting: WaitingTimes,
     closed: bool,
 }
 
 impl<T> Queue<T> {
     pub(super) fn new(sender: Sender<StampedItem<T>>, halt: Arc<Halt>, counters: Arc<Counters>) -> Self {
-        let (waited, starved) = (Duration::ZERO, Duration::ZERO);
-        Self { sender, halt, counters, born: None, waited, starved, closed: false }
+        Self { sender, halt, counters, source_time: None, waiting: WaitingTimes::default(), closed: false }
     }
 
     fn push_unless(&mut self, item: T, cancel: &Cancel) {
         let since = Instant::now();
         self.counters.set_working(false);
         while self.sender.is_full() && !cancel.is_cancelled() && !self.halt.is_set() {
-            std::thread::sleep(ROOM_POLL);
+            std::thread::sleep(SPACE_POLL);
         }
         self.counters.set_working(true);
-        self.waited += since.elapsed();
-        // This is the only sender, so there is room still.
+        self.waiting.space += since.elapsed();
+        // This is the only sender, so there is still space.
         if !cancel.is_cancelled() {
             self.push(item);
         }
@@ -163,8 +166,8 @@ impl<T> Queue<T> {
         if self.closed || self.halt.is_set() {
             return;
         }
-        let born = self.born.unwrap_or_else(Instant::now);
-        match self.sender.try_send(StampedItem { item, born }) {
+        let source_time = self.source_time.unwrap_or_else(Instant::now);
+        match self.sender.try_send(StampedItem { item, source_time }) {
             Ok(()) => {}
             Err(TrySendError::Full(stamped)) => self.wait_and_push(stamped),
             Err(TrySendError::Disconnected(_)) => self.closed = true,
@@ -182,12 +185,12 @@ impl<T> Queue<T> {
             recv(self.halt.stop()) -> _ => self.closed = true,
         }
         self.counters.set_working(true);
-        self.waited += since.elapsed();
+        self.waiting.space += since.elapsed();
     }
 }
 
 impl<T> Drop for Queue<T> {
-    /// A panic while unwinding must not look like a clean end to the next stage.
+    /// Reports a panic, as a closed link must not look like a normal end to the next stage.
     fn drop(&mut self) {
         if std::thread::panicking() {
             self.halt.fail();

@@ -8,36 +8,36 @@ use super::metrics::Counters;
 use super::timing::TimingSummary;
 use super::worker::Timings;
 
-/// Use of the queue before a stage.
+/// Statistics of the queue before a stage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct QueueReport {
-    /// Items that it can hold.
+    /// Capacity of the queue, items.
     pub capacity: usize,
-    /// Greatest number of items found in it.
+    /// Maximum number of items found in the queue.
     pub depth_max: usize,
 }
 
-/// Statistics of one stage. The three kinds of time add up to the lifetime of its thread.
+/// Statistics of one stage. Working and the two waiting times add up to the lifetime of its thread.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
     /// Name of the stage.
     pub name: String,
-    /// Items received.
+    /// Number of items received.
     pub items_in: u64,
-    /// Items sent.
+    /// Number of items sent.
     pub items_out: u64,
-    /// Units processed.
+    /// Number of units processed.
     pub units: u64,
-    /// Name of the unit; empty if none is counted.
+    /// Name of the unit; empty if the stage does not count.
     pub unit: &'static str,
-    /// Waiting for input: one entry for each input, and one for the end.
+    /// Time waiting for input, with one entry per input and one for the end.
     pub waiting_in: TimingSummary,
-    /// Working: one entry for each step, and one for `finish`.
+    /// Time working, with one entry per step and one for `finish`.
     pub working: TimingSummary,
-    /// Waiting for room in the output queue: one entry for each step, and one for `finish`.
+    /// Time waiting for space in the output queue, with one entry per step and one for `finish`.
     pub waiting_out: TimingSummary,
-    /// From the source's push of an item, or since when the source says that it was there, to the end of the step on what was made
-    /// from it; one entry for each input.
+    /// Time from the push of an item by the source, or from its arrival there, to the end of the step on the items made from it,
+    /// with one entry per input.
     pub since_source: TimingSummary,
     /// The queue before the stage; `None` for a source.
     pub queue: Option<QueueReport>,
@@ -63,22 +63,22 @@ impl StageReport {
     }
 }
 
-/// Statistics of a run, stage by stage; shown as a table.
+/// Statistics of a run by stage, displayed as a table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Report {
-    /// The stages in the order in which they were added.
+    /// Statistics of the stages, in the order in which they were added.
     pub stages: Vec<StageReport>,
-    /// Elapsed time, s.
+    /// Duration of the run, s.
     pub elapsed_s: f64,
     /// Whether a source was cancelled before its end.
     pub cancelled: bool,
-    /// Stages that had not ended when the time after cancellation was over; what they still had to do is missing.
+    /// Stages that had not ended when the grace period after cancellation was over. Their remaining outputs are missing.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub cut: Vec<String>,
 }
 
 impl Report {
-    /// The stage called `name`.
+    /// The statistics of the stage called `name`.
     #[must_use]
     pub fn stage(&self, name: &str) -> Option<&StageReport> {
         self.stages.iter().find(|stage| stage.name == name)
@@ -99,7 +99,7 @@ const HEADINGS: [&str; 10] = [
 ];
 
 impl fmt::Display for Report {
-    /// A table in plain text: shares of each thread's time, greatest queue length and capacity, time of a step, latency.
+    /// A plain-text table with fractions of the time of each thread, maximum queue length and capacity, time per step, and latency.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut rows = vec![HEADINGS.map(str::to_owned)];
         rows.extend(self.stages.iter().map(|stage| self.row(stage)));
@@ -114,7 +114,7 @@ impl fmt::Display for Report {
             }
             writeln!(f, "{}", line.trim_end())?;
         }
-        write!(f, "elapsed {}", duration(self.elapsed_s))?;
+        write!(f, "elapsed {}", format_duration(self.elapsed_s))?;
         if self.cancelled {
             f.write_str(", cancelled")?;
         }
@@ -127,24 +127,24 @@ impl fmt::Display for Report {
 
 impl Report {
     fn row(&self, stage: &StageReport) -> [String; HEADINGS.len()] {
-        let life_s = stage.waiting_in.total_s + stage.working.total_s + stage.waiting_out.total_s;
-        let share = |summary: &TimingSummary| match life_s {
+        let lifetime_s = stage.waiting_in.total_s + stage.working.total_s + stage.waiting_out.total_s;
+        let percentage = |summary: &TimingSummary| match lifetime_s {
             0.0 => "-".to_owned(),
-            _ => format!("{:.0} %", 100.0 * summary.total_s / life_s),
+            _ => format!("{:.0} %", 100.0 * summary.total_s / lifetime_s),
         };
         let has_queue = stage.queue.is_some();
         let rate = match stage.unit {
             "" => "-".to_owned(),
-            unit => format!("{} {unit}", rate(stage.units as f64 / self.elapsed_s)),
+            unit => format!("{} {unit}", format_rate(stage.units as f64 / self.elapsed_s)),
         };
         [
             stage.name.clone(),
             if has_queue { stage.items_in.to_string() } else { "-".to_owned() },
             stage.items_out.to_string(),
             rate,
-            share(&stage.working),
-            if stage.waiting_in.count > 0 { share(&stage.waiting_in) } else { "-".to_owned() },
-            if stage.waiting_out.count > 0 { share(&stage.waiting_out) } else { "-".to_owned() },
+            percentage(&stage.working),
+            if stage.waiting_in.count > 0 { percentage(&stage.waiting_in) } else { "-".to_owned() },
+            if stage.waiting_out.count > 0 { percentage(&stage.waiting_out) } else { "-".to_owned() },
             stage.queue.map_or("-".to_owned(), |queue| format!("{}/{}", queue.depth_max, queue.capacity)),
             percentiles(&stage.working),
             percentiles(&stage.since_source),
@@ -156,12 +156,11 @@ fn percentiles(summary: &TimingSummary) -> String {
     if summary.count == 0 {
         return "-".to_owned();
     }
-    let [p50, p99, p999] = [summary.p50_s, summary.p99_s, summary.p999_s].map(duration);
+    let [p50, p99, p999] = [summary.p50_s, summary.p99_s, summary.p999_s].map(format_duration);
     format!("{p50} / {p99} / {p999}")
 }
 
-/// `seconds` to three digits with a fitting unit.
-fn duration(seconds: f64) -> String {
+fn format_duration(seconds: f64) -> String {
     let (value, unit) = match seconds {
         s if s >= 1.0 => (s, "s"),
         s if s >= 1e-3 => (s * 1e3, "ms"),
@@ -171,8 +170,7 @@ fn duration(seconds: f64) -> String {
     format!("{} {unit}", three_digits(value))
 }
 
-/// `per_second` to three digits with a fitting prefix.
-fn rate(per_second: f64) -> String {
+fn format_rate(per_second: f64) -> String {
     let (value, prefix) = match per_second {
         r if r >= 1e9 => (r * 1e-9, " G"),
         r if r >= 1e6 => (r * 1e-6, " M"),

@@ -1,4 +1,4 @@
-//! The three parts of a chain: sources, stages and sinks.
+//! The traits of the three parts of a chain: sources, stages and sinks.
 
 use std::error::Error;
 use std::time::Duration;
@@ -6,10 +6,10 @@ use std::time::Duration;
 use super::metrics::Units;
 use super::outlet::Outlet;
 
-/// Whether a source has more to give.
+/// Whether a source has more items.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Flow {
-    /// Call `next` again.
+    /// There may be more; call `next` again.
     Continue,
     /// The input has ended; call `finish`.
     Done,
@@ -17,7 +17,7 @@ pub enum Flow {
 
 /// Turns each input into any number of outputs, in order.
 ///
-/// A stage never spawns threads, logs in its loop or reads clocks: the runner does that.
+/// A stage never spawns threads, logs in its loop or reads clocks; the runtime does that.
 ///
 /// ```
 /// use lunarray::prelude::*;
@@ -47,34 +47,33 @@ pub enum Flow {
 /// # Ok::<(), std::convert::Infallible>(())
 /// ```
 pub trait Stage: Send {
-    /// Type of its inputs.
+    /// Type of the inputs.
     type In: Send;
-    /// Type of its outputs.
+    /// Type of the outputs.
     type Out: Send;
-    /// Its error.
+    /// Type of the errors.
     type Error: Error + Send + Sync + 'static;
 
     /// Processes one input and pushes the outputs.
     ///
     /// # Errors
-    /// An error ends the whole run. Bad data is not an error: it is counted and dropped.
+    /// An error ends the whole run. Bad data are not an error; they are counted and dropped.
     fn step(&mut self, input: Self::In, out: &mut Outlet<Self::Out>) -> Result<(), Self::Error>;
 
-    /// Flushes; called once after the last input of a run that did not fail, cancelled or not.
+    /// Flushes the stage. Called once after the last input, unless the run has failed.
     ///
     /// # Errors
-    /// As [`Stage::step`].
+    /// Errors of [`Stage::step`].
     fn finish(&mut self, out: &mut Outlet<Self::Out>) -> Result<(), Self::Error> {
         let _ = out;
         Ok(())
     }
 
-    /// Called after a step when no further input waits, so that what it shows of itself need not be shown in every step to be the
-    /// newest while nothing comes.
+    /// Called after a step if no further input waits, so that a stage can update its displayed state then and not in every step.
     #[doc(hidden)]
-    fn rest(&mut self) {}
+    fn idle(&mut self) {}
 
-    /// Units processed so far; the name of the unit must not change.
+    /// Units processed so far. The name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }
@@ -82,19 +81,19 @@ pub trait Stage: Send {
 
 /// The start of a chain.
 pub trait Source: Send {
-    /// Type of its outputs.
+    /// Type of the outputs.
     type Out: Send;
-    /// Its error.
+    /// Type of the errors.
     type Error: Error + Send + Sync + 'static;
 
-    /// Pushes the next items, any number of them. Should return often: the runner looks for cancellation and failures
-    /// of other stages between calls.
+    /// Pushes any number of items. It should return often, as cancellation and failures of other stages are checked
+    /// between calls.
     ///
     /// # Errors
     /// An error ends the whole run.
     fn next(&mut self, out: &mut Outlet<Self::Out>) -> Result<Flow, Self::Error>;
 
-    /// Called once after [`Flow::Done`] or cancellation.
+    /// Flushes the source. Called once after [`Flow::Done`] or cancellation.
     ///
     /// # Errors
     /// An error ends the whole run.
@@ -103,7 +102,7 @@ pub trait Source: Send {
         Ok(())
     }
 
-    /// Units produced so far; the name of the unit must not change.
+    /// Units produced so far. The name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }
@@ -111,9 +110,9 @@ pub trait Source: Send {
 
 /// The end of a chain.
 pub trait Sink: Send {
-    /// Type of its inputs.
+    /// Type of the inputs.
     type In: Send;
-    /// Its error.
+    /// Type of the errors.
     type Error: Error + Send + Sync + 'static;
 
     /// Takes one input.
@@ -122,7 +121,7 @@ pub trait Sink: Send {
     /// An error ends the whole run.
     fn take(&mut self, input: Self::In) -> Result<(), Self::Error>;
 
-    /// Called once after the last input of a run that did not fail, cancelled or not.
+    /// Flushes the sink. Called once after the last input, unless the run has failed.
     ///
     /// # Errors
     /// An error ends the whole run.
@@ -130,17 +129,17 @@ pub trait Sink: Send {
         Ok(())
     }
 
-    /// After which time without input [`Sink::try_again`] is due, if it has something left to do.
+    /// Time without input after which [`Sink::retry`] is called; `None` if nothing has to be retried.
     #[doc(hidden)]
-    fn tries_again_after(&self) -> Option<Duration> {
+    fn retry_after(&self) -> Option<Duration> {
         None
     }
 
-    /// Tries again what it could not do with an input.
+    /// Retries work on earlier inputs that failed.
     #[doc(hidden)]
-    fn try_again(&mut self) {}
+    fn retry(&mut self) {}
 
-    /// Units consumed so far; the name of the unit must not change.
+    /// Units consumed so far. The name of the unit must not change.
     fn units(&self) -> Units {
         Units::default()
     }

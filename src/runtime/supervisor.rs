@@ -1,4 +1,4 @@
-//! Starts the threads, keeps the first failure, wakes all stages and joins them with a deadline.
+//! Starts the threads, keeps the first failure, wakes all stages, and joins them with a deadline.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -12,16 +12,16 @@ use super::cancel::{Cancel, Halt, Wake};
 use super::error::{RuntimeError, UnfinishedStages};
 use super::metrics::Counters;
 use super::report::{Report, StageReport};
-use super::worker::{Ending, StageNode, Timings, Watch, Worker};
+use super::worker::{Ending, StageNode, Timings, Worker, WorkerMonitor};
 
-/// Keeps the first failure of a run.
-struct Verdict {
+struct FirstFailure {
     halt: Arc<Halt>,
     first: Mutex<Option<RuntimeError>>,
 }
 
-impl Verdict {
-    fn fail(&self, error: RuntimeError) {
+impl FirstFailure {
+    /// Records an error, unless it is not the first, and halts the run.
+    fn record(&self, error: RuntimeError) {
         self.first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         self.halt.fail();
     }
@@ -31,74 +31,69 @@ impl Verdict {
     }
 }
 
-/// The result of a thread.
 struct WorkerEnd {
     index: usize,
     ending: Ending,
     timings: Timings,
 }
 
-/// How often a run looks whether it was cancelled.
-const LOOK: Duration = Duration::from_millis(50);
+const CANCEL_POLL: Duration = Duration::from_millis(50);
 
-/// How long stages may take to end when a cancelled run is cut short, before it leaves them behind.
-const LEAVE: Duration = Duration::from_millis(300);
+/// Time that stages have to end after a cancelled run is cut short, before they are abandoned.
+const ABANDON_AFTER: Duration = Duration::from_millis(300);
 
-/// Share of the grace that stages before the kept ones have to end: the rest is for what follows.
-const INPUT_SHARE: f64 = 0.3;
+/// Fraction of the grace period after which the input of the kept stages is cut off. The rest is for these and later stages.
+const INPUT_FRACTION: f64 = 0.3;
 
-/// A thread that was started, and its timings when it has ended.
-struct Member {
+/// A thread that was started, and its timings after its end.
+struct StageThread {
     counters: Arc<Counters>,
-    /// Whether a cancelled run waits for it however long it takes.
-    kept: bool,
-    /// Ends its input.
-    last_input: Arc<Wake>,
-    /// Whether the run does not wait for it any more.
-    left: bool,
+    /// Whether a cancelled run waits for the stage without a time limit.
+    must_finish: bool,
+    end_of_input: Arc<Wake>,
+    /// Whether the run no longer waits for the stage.
+    is_abandoned: bool,
     handle: Option<JoinHandle<()>>,
     timings: Option<Timings>,
 }
 
-impl Member {
+impl StageThread {
     fn is_running(&self) -> bool {
         self.handle.is_some()
     }
 
-    /// Whether, being a source, it is handing over what it has.
-    fn hands_over(&self) -> bool {
+    /// Whether a source is in `finish` or waits for space in its queue.
+    fn is_flushing(&self) -> bool {
         self.is_running() && (self.counters.is_finishing() || !self.counters.is_working())
     }
 }
 
-/// How long a run waits for its stages.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Limits {
-    /// For stages that are not kept to end after cancellation; `None` for no limit.
+    /// Time for stages that are not kept to end after cancellation; `None` for no limit.
     pub(super) grace: Option<Duration>,
-    /// For all stages to end after a failure.
+    /// Time for all stages to end after a failure.
     pub(super) deadline: Duration,
-    /// For any progress; `None` for no limit.
+    /// Maximum time without progress; `None` for no limit.
     pub(super) stall: Option<Duration>,
 }
 
-/// Detects that no stage makes progress.
 struct StallWatch {
-    patience: Duration,
+    limit: Duration,
     seen: Vec<[u64; 4]>,
     since: Instant,
 }
 
 impl StallWatch {
-    /// Stages in a step, if there was no progress for the whole patience.
-    fn look(&mut self, members: &[Member]) -> Option<Vec<String>> {
-        let now: Vec<[u64; 4]> = members.iter().map(|member| member.counters.moves()).collect();
+    /// The stages that are in a step, if there was no progress within the limit.
+    fn stalled_stages(&mut self, threads: &[StageThread]) -> Option<Vec<String>> {
+        let now: Vec<[u64; 4]> = threads.iter().map(|thread| thread.counters.progress_marks()).collect();
         if now != self.seen {
             (self.seen, self.since) = (now, Instant::now());
             return None;
         }
-        let stalled = self.since.elapsed() >= self.patience;
-        stalled.then(|| names(members.iter().filter(|member| member.counters.is_working())))
+        let stalled = self.since.elapsed() >= self.limit;
+        stalled.then(|| names(threads.iter().filter(|thread| thread.counters.is_working())))
     }
 }
 
@@ -110,91 +105,110 @@ pub(super) fn run(
 ) -> Result<Report, RuntimeError> {
     let deadline = limits.deadline;
     let since = Instant::now();
-    let verdict = Arc::new(Verdict { halt: Arc::clone(halt), first: Mutex::new(None) });
-    let (say, heard) = bounded(nodes.len().max(1));
-    let mut members = start(nodes, &verdict, cancel, &say);
-    drop(say);
-    let (cancelled, cut) = join(&mut members, &heard, &verdict, cancel, limits);
-    let laggards =
-        UnfinishedStages { stages: names(members.iter().filter(|m| m.is_running())), waited: deadline };
-    if let Some(error) = verdict.take() {
-        return Err(with_laggards(error, laggards));
+    let failure = Arc::new(FirstFailure { halt: Arc::clone(halt), first: Mutex::new(None) });
+    let (end_sender, ends) = bounded(nodes.len().max(1));
+    let mut threads = start(nodes, &failure, cancel, &end_sender);
+    drop(end_sender);
+    let (cancelled, cut) = join(&mut threads, &ends, &failure, cancel, limits);
+    let unfinished =
+        UnfinishedStages { stages: names(threads.iter().filter(|m| m.is_running())), waited: deadline };
+    if let Some(error) = failure.take() {
+        return Err(with_unfinished(error, unfinished));
     }
-    let stages = members
+    let stages = threads
         .iter()
-        .filter_map(|member| Some(StageReport::new(&member.counters, member.timings.as_ref()?)))
+        .filter_map(|thread| Some(StageReport::new(&thread.counters, thread.timings.as_ref()?)))
         .collect();
     Ok(Report { stages, elapsed_s: since.elapsed().as_secs_f64(), cancelled, cut })
 }
 
-fn names<'a>(members: impl Iterator<Item = &'a Member>) -> Vec<String> {
-    members.map(|member| member.counters.name.clone()).collect()
+fn names<'a>(threads: impl Iterator<Item = &'a StageThread>) -> Vec<String> {
+    threads.map(|thread| thread.counters.name.clone()).collect()
 }
 
-/// Starts a thread for every node, or as many as the system allows.
 fn start(
     nodes: Vec<StageNode>,
-    verdict: &Arc<Verdict>,
+    failure: &Arc<FirstFailure>,
     cancel: &Cancel,
-    say: &Sender<WorkerEnd>,
-) -> Vec<Member> {
-    let mut members = Vec::with_capacity(nodes.len());
-    for (index, StageNode { counters, worker, kept, .. }) in nodes.into_iter().enumerate() {
-        let last_input = Arc::new(Wake::new());
-        let watch = Watch::new(
+    end_sender: &Sender<WorkerEnd>,
+) -> Vec<StageThread> {
+    let mut threads = Vec::with_capacity(nodes.len());
+    for (index, StageNode { counters, worker, must_finish, .. }) in nodes.into_iter().enumerate() {
+        let end_of_input = Arc::new(Wake::new());
+        let monitor = WorkerMonitor::new(
             Arc::clone(&counters),
             cancel.clone(),
-            Arc::clone(&verdict.halt),
-            Arc::clone(&last_input),
+            Arc::clone(&failure.halt),
+            Arc::clone(&end_of_input),
         );
-        let (verdict_there, say) = (Arc::clone(verdict), say.clone());
+        let (failure_of_thread, end_sender) = (Arc::clone(failure), end_sender.clone());
         let body = move || {
-            let (ending, timings) = live(worker, watch, &verdict_there);
-            // Fails only if the supervisor has stopped waiting.
-            let _ = say.send(WorkerEnd { index, ending, timings });
+            let (ending, timings) = run_worker(worker, monitor, &failure_of_thread);
+            // Fails only if the supervisor no longer waits.
+            let _ = end_sender.send(WorkerEnd { index, ending, timings });
         };
         match thread::Builder::new().name(counters.name.clone()).spawn(body) {
             Ok(handle) => {
                 let handle = Some(handle);
-                members.push(Member { counters, kept, last_input, left: false, handle, timings: None });
+                threads.push(StageThread {
+                    counters,
+                    must_finish,
+                    end_of_input,
+                    is_abandoned: false,
+                    handle,
+                    timings: None,
+                });
             }
             Err(source) => {
                 let stage = counters.name.clone();
-                verdict.fail(RuntimeError::Thread { stage, laggards: UnfinishedStages::default(), source });
+                failure.record(RuntimeError::Thread {
+                    stage,
+                    unfinished: UnfinishedStages::default(),
+                    source,
+                });
                 break;
             }
         }
     }
-    members
+    threads
 }
 
-/// The life of a thread: works, reports a failure before it drops its links, cleans up.
-fn live(mut worker: Box<dyn Worker>, mut watch: Watch, verdict: &Verdict) -> (Ending, Timings) {
-    let worked = catch_unwind(AssertUnwindSafe(|| worker.work(&mut watch)));
-    let (stage, at) = (watch.counters.name.clone(), watch.moment());
+/// Runs a worker to its end. A failure is recorded before the worker drops its links.
+fn run_worker(
+    mut worker: Box<dyn Worker>,
+    mut monitor: WorkerMonitor,
+    failure: &FirstFailure,
+) -> (Ending, Timings) {
+    let worked = catch_unwind(AssertUnwindSafe(|| worker.work(&mut monitor)));
+    let (stage, at) = (monitor.counters.name.clone(), monitor.moment());
     let panicked = |payload: Box<dyn Any + Send>| RuntimeError::Panicked {
         stage: stage.clone(),
         at,
         message: panic_message(payload.as_ref()),
-        laggards: UnfinishedStages::default(),
+        unfinished: UnfinishedStages::default(),
     };
     let ending = match worked {
         Ok(Ok(ending)) => ending,
         Ok(Err(source)) => {
             let stage = stage.clone();
-            verdict.fail(RuntimeError::Failed { stage, at, laggards: UnfinishedStages::default(), source });
+            failure.record(RuntimeError::Failed {
+                stage,
+                at,
+                unfinished: UnfinishedStages::default(),
+                source,
+            });
             Ending::Halted
         }
         Err(payload) => {
-            verdict.fail(panicked(payload));
+            failure.record(panicked(payload));
             Ending::Halted
         }
     };
     if let Err(payload) = catch_unwind(AssertUnwindSafe(|| drop(worker))) {
-        verdict.fail(panicked(payload));
+        failure.record(panicked(payload));
     }
-    watch.counters.end();
-    (ending, watch.timings)
+    monitor.counters.end();
+    (ending, monitor.timings)
 }
 
 fn panic_message(payload: &(dyn Any + Send)) -> String {
@@ -203,124 +217,125 @@ fn panic_message(payload: &(dyn Any + Send)) -> String {
     text.unwrap_or("a payload that is not text").to_owned()
 }
 
-/// Ends a cancelled run in time.
-struct Cutter {
+/// Enforces the grace period of a cancelled run.
+struct GraceEnforcer {
     grace: Duration,
-    /// When what has not ended is left behind.
-    leave: Option<Instant>,
+    /// Time after which abandoned stages are no longer waited for.
+    abandon_at: Option<Instant>,
     has_cut_input: bool,
-    /// Whether everything was cut.
     is_over: bool,
-    /// Stages that lose something.
     cut: Vec<String>,
 }
 
-impl Cutter {
+impl GraceEnforcer {
     fn new(grace: Duration) -> Self {
-        Self { grace, leave: None, has_cut_input: false, is_over: false, cut: Vec::new() }
+        Self { grace, abandon_at: None, has_cut_input: false, is_over: false, cut: Vec::new() }
     }
 
-    /// Cuts what is due. Called every [`LOOK`].
-    fn look(&mut self, members: &mut [Member], cancel: &Cancel, halt: &Halt) {
+    /// Cuts stages whose time is over. Called every [`CANCEL_POLL`].
+    fn enforce(&mut self, threads: &mut [StageThread], cancel: &Cancel, halt: &Halt) {
         let Some(elapsed) = cancel.elapsed().filter(|_| !halt.has_failed()) else { return };
-        // What a source hands over to a stage that saves it is waited for.
-        let may_cut = match &*members {
-            [source, saves, ..] if saves.kept => !source.hands_over(),
+        // A source that flushes into a kept stage, which saves its items, is not cut.
+        let may_cut = match &*threads {
+            [source, second, ..] if second.must_finish => !source.is_flushing(),
             _ => true,
         };
-        if !self.has_cut_input && may_cut && elapsed >= self.grace.mul_f64(INPUT_SHARE) {
-            self.cut_input(members);
+        if !self.has_cut_input && may_cut && elapsed >= self.grace.mul_f64(INPUT_FRACTION) {
+            self.cut_input(threads);
         }
         if !self.is_over && may_cut && elapsed >= self.grace {
-            for member in members.iter_mut().filter(|member| member.is_running() && !member.kept) {
-                member.left = true;
-                if !self.cut.contains(&member.counters.name) {
-                    self.cut.push(member.counters.name.clone());
+            for thread in threads.iter_mut().filter(|thread| thread.is_running() && !thread.must_finish) {
+                thread.is_abandoned = true;
+                if !self.cut.contains(&thread.counters.name) {
+                    self.cut.push(thread.counters.name.clone());
                 }
             }
             halt.cut();
-            (self.is_over, self.leave) = (true, Some(Instant::now() + LEAVE));
+            (self.is_over, self.abandon_at) = (true, Some(Instant::now() + ABANDON_AFTER));
         }
     }
 
-    /// Ends the input of the stage behind the last one before the kept ones that is in a step; all that follows drains.
-    fn cut_input(&mut self, members: &mut [Member]) {
-        let Some(kept) = members.iter().position(|member| member.kept) else { return };
-        if members[..=kept].iter().all(|member| !member.is_running()) {
+    /// Cuts off the input of the kept stages.
+    ///
+    /// Of the stages before the first kept one, finds the last that is in a step. Abandons it and all before it, and ends the
+    /// input of the next stage, so that all later stages drain.
+    fn cut_input(&mut self, threads: &mut [StageThread]) {
+        let Some(kept) = threads.iter().position(|thread| thread.must_finish) else { return };
+        if threads[..=kept].iter().all(|thread| !thread.is_running()) {
             return;
         }
-        let is_busy = |member: &Member| member.is_running() && member.counters.is_working();
-        let Some(busy) = members[..kept].iter().rposition(is_busy) else { return };
-        self.cut.push(members[busy].counters.name.clone());
-        members[..=busy].iter_mut().for_each(|member| member.left = true);
-        members[busy + 1].last_input.set();
-        (self.has_cut_input, self.leave) = (true, Some(Instant::now() + LEAVE));
+        let is_busy = |thread: &StageThread| thread.is_running() && thread.counters.is_working();
+        let Some(busy) = threads[..kept].iter().rposition(is_busy) else { return };
+        self.cut.push(threads[busy].counters.name.clone());
+        threads[..=busy].iter_mut().for_each(|thread| thread.is_abandoned = true);
+        threads[busy + 1].end_of_input.set();
+        (self.has_cut_input, self.abandon_at) = (true, Some(Instant::now() + ABANDON_AFTER));
     }
 
-    /// Whether nobody is left to wait for.
-    fn is_done(&self, members: &[Member]) -> bool {
-        let is_left = self.leave.is_some_and(|leave| Instant::now() >= leave);
-        members.iter().all(|member| !member.is_running() || (is_left && member.left))
+    fn is_done(&self, threads: &[StageThread]) -> bool {
+        let may_abandon = self.abandon_at.is_some_and(|abandon_at| Instant::now() >= abandon_at);
+        threads.iter().all(|thread| !thread.is_running() || (may_abandon && thread.is_abandoned))
     }
 }
 
-/// Waits for all members: after a failure no longer than `deadline`, after cancellation and its grace for kept ones only.
-/// Removes the handles of members that ended. Returns whether cancellation stopped a source early, and the names of the
-/// stages that it cut short.
+/// Waits for all threads, and takes the handles of those that ended.
+///
+/// After a failure it waits no longer than the deadline; after cancellation and the grace period only for kept stages. Returns
+/// whether cancellation stopped a source early, and the names of the stages that it cut short.
 fn join(
-    members: &mut [Member],
-    heard: &Receiver<WorkerEnd>,
-    verdict: &Verdict,
+    threads: &mut [StageThread],
+    ends: &Receiver<WorkerEnd>,
+    failure: &FirstFailure,
     cancel: &Cancel,
     limits: Limits,
 ) -> (bool, Vec<String>) {
     let mut cancelled = false;
-    let mut cutter = Cutter::new(limits.grace.unwrap_or_default());
-    let clock = limits.grace.map_or_else(never, |_| tick(LOOK));
-    let mut stop = verdict.halt.stop().clone();
-    let mut give_up = never();
-    let patience = limits.stall.unwrap_or_default();
-    let mut watch = StallWatch { patience, seen: Vec::new(), since: Instant::now() };
-    let mut look = limits.stall.map_or_else(never, |stall| tick(stall / 8));
-    while !cutter.is_done(members) {
+    let mut enforcer = GraceEnforcer::new(limits.grace.unwrap_or_default());
+    let cancel_tick = limits.grace.map_or_else(never, |_| tick(CANCEL_POLL));
+    let mut stop = failure.halt.stop().clone();
+    let mut deadline = never();
+    let stall_limit = limits.stall.unwrap_or_default();
+    let mut stall_watch = StallWatch { limit: stall_limit, seen: Vec::new(), since: Instant::now() };
+    let mut stall_tick = limits.stall.map_or_else(never, |stall| tick(stall / 8));
+    while !enforcer.is_done(threads) {
         select! {
-            recv(heard) -> ended => {
+            recv(ends) -> ended => {
                 let Ok(WorkerEnd { index, ending, timings }) = ended else { break };
                 cancelled |= ending == Ending::Cancelled;
-                let Some(member) = members.get_mut(index) else { continue };
-                member.timings = Some(timings);
-                if let Some(handle) = member.handle.take() {
-                    // The thread only has to return, and it catches its panics.
+                let Some(thread) = threads.get_mut(index) else { continue };
+                thread.timings = Some(timings);
+                if let Some(handle) = thread.handle.take() {
+                    // The thread is about to return, and it catches its panics.
                     let _ = handle.join();
                 }
             }
             recv(stop) -> _ => {
                 stop = never();
-                look = never();
-                // Not if the run was cut short.
-                if verdict.halt.has_failed() {
-                    give_up = after(limits.deadline);
+                stall_tick = never();
+                // The deadline does not apply to a run that was cut short.
+                if failure.halt.has_failed() {
+                    deadline = after(limits.deadline);
                 }
             }
-            recv(look) -> _ => {
-                if let Some(stages) = watch.look(members) {
-                    verdict.fail(RuntimeError::Stalled { stages, waited: patience, laggards: UnfinishedStages::default() });
+            recv(stall_tick) -> _ => {
+                if let Some(stages) = stall_watch.stalled_stages(threads) {
+                    failure.record(RuntimeError::Stalled { stages, waited: stall_limit, unfinished: UnfinishedStages::default() });
                 }
             }
-            recv(clock) -> _ => cutter.look(members, cancel, &verdict.halt),
-            recv(give_up) -> _ => break,
+            recv(cancel_tick) -> _ => enforcer.enforce(threads, cancel, &failure.halt),
+            recv(deadline) -> _ => break,
         }
     }
-    (cancelled || cutter.has_cut_input || cutter.is_over, cutter.cut)
+    (cancelled || enforcer.has_cut_input || enforcer.is_over, enforcer.cut)
 }
 
-fn with_laggards(mut error: RuntimeError, found: UnfinishedStages) -> RuntimeError {
-    if let RuntimeError::Failed { laggards, .. }
-    | RuntimeError::Panicked { laggards, .. }
-    | RuntimeError::Stalled { laggards, .. }
-    | RuntimeError::Thread { laggards, .. } = &mut error
+fn with_unfinished(mut error: RuntimeError, found: UnfinishedStages) -> RuntimeError {
+    if let RuntimeError::Failed { unfinished, .. }
+    | RuntimeError::Panicked { unfinished, .. }
+    | RuntimeError::Stalled { unfinished, .. }
+    | RuntimeError::Thread { unfinished, .. } = &mut error
     {
-        *laggards = found;
+        *unfinished = found;
     }
     error
 }

@@ -5,13 +5,13 @@ use std::time::Duration;
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-/// Longest duration in the histogram, ns: one day. Longer ones count as this one in the percentiles.
+/// Longest duration in the histogram, ns, which is one day. In percentiles longer ones count as this.
 const LONGEST_NS: u64 = 86_400_000_000_000;
 
-/// Decimal digits kept: 1 % of a duration. About 40 kB a histogram, whatever the number of entries.
+/// Decimal digits of a duration, for a precision of 1 %. A histogram takes about 40 kB.
 const DIGITS: u8 = 2;
 
-/// Durations of one kind in one stage.
+/// Histogram of durations of one kind in one stage.
 pub(super) struct Timing {
     histogram: Histogram<u64>,
     total: Duration,
@@ -33,32 +33,32 @@ impl Timing {
     }
 
     pub(super) fn summary(&self) -> TimingSummary {
-        let at = |quantile| self.histogram.value_at_quantile(quantile) as f64 * 1e-9;
+        let percentile_s = |quantile| self.histogram.value_at_quantile(quantile) as f64 * 1e-9;
         TimingSummary {
             count: self.histogram.len(),
             total_s: self.total.as_secs_f64(),
-            p50_s: at(0.5),
-            p99_s: at(0.99),
-            p999_s: at(0.999),
+            p50_s: percentile_s(0.5),
+            p99_s: percentile_s(0.99),
+            p999_s: percentile_s(0.999),
             max_s: self.longest.as_secs_f64(),
         }
     }
 }
 
-/// Statistics of durations of one kind in one stage, s; percentiles to 1 %, total and maximum exact.
+/// Statistics of durations of one kind in one stage, s. Percentiles are precise to 1 %, total and maximum are exact.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct TimingSummary {
     /// Number of entries.
     pub count: u64,
-    /// Sum.
+    /// Sum of the durations.
     pub total_s: f64,
-    /// Median.
+    /// Median duration.
     pub p50_s: f64,
     /// 99th percentile.
     pub p99_s: f64,
     /// 99.9th percentile.
     pub p999_s: f64,
-    /// Longest.
+    /// Longest duration.
     pub max_s: f64,
 }
 

@@ -1,4 +1,4 @@
-//! The loops of the threads: around a source, a stage and a sink.
+//! The loops that run a source, a stage or a sink on a thread.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,38 +8,35 @@ use crossbeam_channel::{Receiver, Select, TryRecvError, select};
 use super::cancel::{Cancel, Halt, Wake};
 use super::error::{BoxError, Moment};
 use super::metrics::{Counters, Units};
-use super::outlet::{Outlet, StampedItem};
+use super::outlet::{Outlet, StampedItem, WaitingTimes};
 use super::stage::{Flow, Sink, Source, Stage};
 use super::timing::Timing;
 
-/// How a worker ended without an error of its own.
+/// End of a worker that did not fail itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Ending {
     /// The input was drained and `finish` ran.
     Finished,
-    /// As `Finished`, but [`Cancel`] stopped a source.
+    /// Like `Finished`, after [`Cancel`] stopped a source.
     Cancelled,
-    /// Another stage failed.
     Halted,
 }
 
 /// A source, stage or sink with its ends of the links.
 pub(super) trait Worker: Send {
-    /// Works until the input ends, the run halts, or an error.
-    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError>;
+    /// Works until the input ends, the run halts, or an error occurs.
+    fn work(&mut self, monitor: &mut WorkerMonitor) -> Result<Ending, BoxError>;
 }
 
-/// A stage of the graph that has no thread yet.
+/// A stage of a graph before its thread is started.
 pub(super) struct StageNode {
     pub(super) counters: Arc<Counters>,
     pub(super) worker: Box<dyn Worker>,
-    /// Whether its output is connected; true for a sink.
-    pub(super) taken: bool,
-    /// Whether a cancelled run waits for it however long it takes.
-    pub(super) kept: bool,
+    pub(super) is_connected: bool,
+    /// Whether a cancelled run waits for the stage without a time limit.
+    pub(super) must_finish: bool,
 }
 
-/// The four timings of a stage.
 pub(super) struct Timings {
     pub(super) waiting_in: Timing,
     pub(super) working: Timing,
@@ -47,25 +44,23 @@ pub(super) struct Timings {
     pub(super) since_source: Timing,
 }
 
-/// Counts and times one worker.
-pub(super) struct Watch {
+pub(super) struct WorkerMonitor {
     pub(super) counters: Arc<Counters>,
     pub(super) timings: Timings,
     cancel: Cancel,
     halt: Arc<Halt>,
-    /// Set when the stage before this one is not waited for any more.
-    last_input: Arc<Wake>,
+    /// Set to end the input, as the stage before is no longer waited for.
+    end_of_input: Arc<Wake>,
     finishing: bool,
-    /// End of the last timed interval.
     mark: Instant,
 }
 
-impl Watch {
+impl WorkerMonitor {
     pub(super) fn new(
         counters: Arc<Counters>,
         cancel: Cancel,
         halt: Arc<Halt>,
-        last_input: Arc<Wake>,
+        end_of_input: Arc<Wake>,
     ) -> Self {
         let timings = Timings {
             waiting_in: Timing::new(),
@@ -73,7 +68,7 @@ impl Watch {
             waiting_out: Timing::new(),
             since_source: Timing::new(),
         };
-        Self { counters, timings, cancel, halt, last_input, finishing: false, mark: Instant::now() }
+        Self { counters, timings, cancel, halt, end_of_input, finishing: false, mark: Instant::now() }
     }
 
     fn begin_finish(&mut self) {
@@ -81,7 +76,6 @@ impl Watch {
         self.counters.set_finishing();
     }
 
-    /// Position of the worker, for an error.
     pub(super) fn moment(&self) -> Moment {
         let is_source = self.counters.queue_capacity.is_none();
         match (self.finishing, is_source) {
@@ -92,21 +86,20 @@ impl Watch {
         }
     }
 
-    /// The wait for input is over.
-    fn received(&mut self) {
+    fn end_wait(&mut self) {
         let now = Instant::now();
         self.timings.waiting_in.record(now - self.mark);
         self.mark = now;
     }
 
-    /// A step is over, of which `waited` was spent waiting.
-    fn worked(&mut self, waited: Duration, born: Option<Instant>, units: Units) {
+    /// Records the end of a step, of which `waited` was spent waiting.
+    fn end_step(&mut self, waited: Duration, source_time: Option<Instant>, units: Units) {
         let now = Instant::now();
         let working = (now - self.mark).saturating_sub(waited);
         self.timings.working.record(working);
         self.counters.working_time.record(working);
-        if let Some(born) = born {
-            let since_source = now.saturating_duration_since(born);
+        if let Some(source_time) = source_time {
+            let since_source = now.saturating_duration_since(source_time);
             self.timings.since_source.record(since_source);
             self.counters.since_source.record(since_source);
         }
@@ -115,18 +108,17 @@ impl Watch {
         self.mark = now;
     }
 
-    /// As [`Watch::worked`], for a worker with an outlet.
-    fn worked_into<T>(&mut self, out: &mut Outlet<T>, born: Option<Instant>, units: Units) {
-        let [waited, starved] = out.lap();
-        self.worked(waited + starved, born, units);
-        self.timings.waiting_out.record(waited);
-        if starved > Duration::ZERO {
-            self.timings.waiting_in.record(starved);
+    /// Like [`WorkerMonitor::end_step`], for a worker with an outlet.
+    fn end_step_with_outlet<T>(&mut self, out: &mut Outlet<T>, source_time: Option<Instant>, units: Units) {
+        let WaitingTimes { space, input } = out.take_waiting_times();
+        self.end_step(space + input, source_time, units);
+        self.timings.waiting_out.record(space);
+        if input > Duration::ZERO {
+            self.timings.waiting_in.record(input);
         }
     }
 }
 
-/// The receiving end of a link.
 pub(super) struct Inlet<T> {
     receiver: Receiver<StampedItem<T>>,
 }
@@ -142,80 +134,80 @@ impl<T> Inlet<T> {
         Self { receiver }
     }
 
-    /// Waits for the next item; timed and counted.
-    fn receive(&mut self, watch: &mut Watch) -> Input<T> {
+    /// Waits for the next item, and times and counts it.
+    fn receive(&mut self, monitor: &mut WorkerMonitor) -> Input<T> {
         let depth = self.receiver.len();
-        watch.counters.set_working(false);
+        monitor.counters.set_working(false);
         let received = match self.receiver.try_recv() {
             Ok(stamped) => Some(stamped),
-            // The wait may end although an item has just arrived.
-            Err(TryRecvError::Empty) => self.wait(watch).or_else(|| self.receiver.try_recv().ok()),
+            // An item may have arrived at the moment at which the wait was ended.
+            Err(TryRecvError::Empty) => self.wait(monitor).or_else(|| self.receiver.try_recv().ok()),
             Err(TryRecvError::Disconnected) => None,
         };
-        watch.received();
-        watch.counters.set_working(true);
-        // After the wait: a closed channel means an end only if nothing failed.
-        if watch.halt.has_failed() {
+        monitor.end_wait();
+        monitor.counters.set_working(true);
+        // After the wait, as a closed channel means the end of the input only without a failure.
+        if monitor.halt.has_failed() {
             return Input::Halt;
         }
         let Some(stamped) = received else {
             return Input::End;
         };
-        watch.counters.note_depth(depth.max(1));
-        watch.counters.count_in();
+        monitor.counters.note_depth(depth.max(1));
+        monitor.counters.count_in();
         Input::Item(stamped)
     }
 
-    /// Whether something comes within a time: an item, the end, or a halt.
-    fn comes_within(&self, time: Duration, watch: &Watch) -> bool {
-        watch.counters.set_working(false);
+    /// Whether an item, the end of the input, or a halt comes within a time.
+    fn is_ready_within(&self, time: Duration, monitor: &WorkerMonitor) -> bool {
+        monitor.counters.set_working(false);
         let mut select = Select::new();
         select.recv(&self.receiver);
-        select.recv(watch.halt.stop());
-        select.recv(watch.last_input.stop());
+        select.recv(monitor.halt.stop());
+        select.recv(monitor.end_of_input.stop());
         select.ready_timeout(time).is_ok()
     }
 
-    fn wait(&self, watch: &Watch) -> Option<StampedItem<T>> {
+    fn wait(&self, monitor: &WorkerMonitor) -> Option<StampedItem<T>> {
         select! {
             recv(self.receiver) -> stamped => stamped.ok(),
-            recv(watch.halt.stop()) -> _ => None,
-            recv(watch.last_input.stop()) -> _ => None,
+            recv(monitor.halt.stop()) -> _ => None,
+            recv(monitor.end_of_input.stop()) -> _ => None,
         }
     }
 }
 
-/// A source and its outlet. Fields drop in this order: the source first, then the link.
+/// A source and its outlet. The order of the fields matters: the source drops first, then the link.
 pub(super) struct SourceWorker<S: Source> {
     pub(super) source: S,
     pub(super) out: Outlet<S::Out>,
 }
 
 impl<S: Source> Worker for SourceWorker<S> {
-    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+    fn work(&mut self, monitor: &mut WorkerMonitor) -> Result<Ending, BoxError> {
         let Self { source, out } = self;
-        watch.counters.set_working(true);
+        monitor.counters.set_working(true);
         let ending = loop {
-            if watch.halt.has_failed() {
+            if monitor.halt.has_failed() {
                 return Ok(Ending::Halted);
             }
-            if watch.cancel.is_cancelled() {
+            if monitor.cancel.is_cancelled() {
                 break Ending::Cancelled;
             }
             let flow = source.next(out)?;
-            watch.worked_into(out, None, source.units());
+            monitor.end_step_with_outlet(out, None, source.units());
             if flow == Flow::Done {
                 break Ending::Finished;
             }
         };
-        watch.begin_finish();
+        monitor.begin_finish();
         source.finish(out)?;
-        watch.worked_into(out, None, source.units());
+        monitor.end_step_with_outlet(out, None, source.units());
         Ok(if out.is_closed() { Ending::Halted } else { ending })
     }
 }
 
-/// A stage and its links. Fields drop in this order: the stage first, then the links.
+/// A stage and its links. The order of the fields matters: the stage drops first, then the links.
 pub(super) struct StageWorker<S: Stage> {
     pub(super) stage: S,
     pub(super) inlet: Inlet<S::In>,
@@ -223,56 +215,55 @@ pub(super) struct StageWorker<S: Stage> {
 }
 
 impl<S: Stage> Worker for StageWorker<S> {
-    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+    fn work(&mut self, monitor: &mut WorkerMonitor) -> Result<Ending, BoxError> {
         let Self { stage, inlet, out } = self;
         loop {
-            match inlet.receive(watch) {
-                Input::Item(StampedItem { item, born }) => {
-                    out.descend_from(born);
+            match inlet.receive(monitor) {
+                Input::Item(StampedItem { item, source_time }) => {
+                    out.set_source_time(source_time);
                     stage.step(item, out)?;
-                    watch.worked_into(out, Some(born), stage.units());
+                    monitor.end_step_with_outlet(out, Some(source_time), stage.units());
                     if inlet.receiver.is_empty() {
-                        stage.rest();
+                        stage.idle();
                     }
                 }
                 Input::End => break,
                 Input::Halt => return Ok(Ending::Halted),
             }
         }
-        watch.begin_finish();
+        monitor.begin_finish();
         stage.finish(out)?;
-        watch.worked_into(out, None, stage.units());
+        monitor.end_step_with_outlet(out, None, stage.units());
         Ok(if out.is_closed() { Ending::Halted } else { Ending::Finished })
     }
 }
 
-/// A sink and its link.
 pub(super) struct SinkWorker<S: Sink> {
     pub(super) sink: S,
     pub(super) inlet: Inlet<S::In>,
 }
 
 impl<S: Sink> Worker for SinkWorker<S> {
-    fn work(&mut self, watch: &mut Watch) -> Result<Ending, BoxError> {
+    fn work(&mut self, monitor: &mut WorkerMonitor) -> Result<Ending, BoxError> {
         let Self { sink, inlet } = self;
         loop {
-            while let Some(after) = sink.tries_again_after()
-                && !inlet.comes_within(after, watch)
+            while let Some(after) = sink.retry_after()
+                && !inlet.is_ready_within(after, monitor)
             {
-                sink.try_again();
+                sink.retry();
             }
-            match inlet.receive(watch) {
-                Input::Item(StampedItem { item, born }) => {
+            match inlet.receive(monitor) {
+                Input::Item(StampedItem { item, source_time }) => {
                     sink.take(item)?;
-                    watch.worked(Duration::ZERO, Some(born), sink.units());
+                    monitor.end_step(Duration::ZERO, Some(source_time), sink.units());
                 }
                 Input::End => break,
                 Input::Halt => return Ok(Ending::Halted),
             }
         }
-        watch.begin_finish();
+        monitor.begin_finish();
         sink.finish()?;
-        watch.worked(Duration::ZERO, None, sink.units());
+        monitor.end_step(Duration::ZERO, None, sink.units());
         Ok(Ending::Finished)
     }
 }

@@ -126,7 +126,7 @@ impl Console {
     pub(super) fn begin(&self, watched: &Watched) {
         let viewer =
             PageViewer { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
-        watched.maps.join(Box::new(viewer));
+        watched.maps.add_viewer(Box::new(viewer));
         if let Some(ground) = &watched.ground {
             ground.live_view.open();
         }
@@ -232,7 +232,7 @@ impl Console {
                 report,
             }
         });
-        let solving = watched.and_then(|watched| watched.solving.now());
+        let solving = watched.and_then(|watched| watched.solving.progress());
         let saving = ground.and_then(|ground| ground.saving.report());
         let read = |ground: &GroundOutcome| {
             let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();

@@ -5,7 +5,7 @@ use std::f64::consts::TAU;
 use serde::Serialize;
 
 use crate::array::{EarthModel, SatelliteState, hidden_by_moon};
-use crate::ground::ArrayNow;
+use crate::ground::ArrayGeometry;
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
 
@@ -44,8 +44,8 @@ pub(super) struct Geometry {
 
 impl Geometry {
     /// The geometry of an array, with the Earth of a model.
-    pub(super) fn of(now: &ArrayNow, earth: EarthModel) -> Self {
-        let ArrayNow { epoch_tai_s, time_s, moon_radius_m, positions_m, motion, known_s, track_m } = now;
+    pub(super) fn of(now: &ArrayGeometry, earth: EarthModel) -> Self {
+        let ArrayGeometry { epoch_tai_s, time_s, moon_radius_m, positions_m, motion, known_s, track_m } = now;
         let is_hidden =
             |position_m: Vec3, earth_hat: Vec3| hidden_by_moon(position_m, earth_hat, *moon_radius_m);
         let earth_hat = earth.hat(*epoch_tai_s, *time_s);

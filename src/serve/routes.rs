@@ -289,7 +289,7 @@ async fn gaps(State(desk): State<PageState>) -> Response {
     let Some(folder) = desk.console.state.clone() else {
         return refusal(StatusCode::NOT_FOUND, "gaps are known to a ground with a state: replay --state DIR");
     };
-    match slowly(&desk, move || CoverageSurvey::of(&folder).map(|survey| survey.gaps())).await {
+    match slowly(&desk, move || CoverageSurvey::read(&folder).map(|survey| survey.gaps())).await {
         Ok(Ok(gaps)) => json(&gaps),
         // No checkpoint yet.
         Ok(Err(error)) => refusal(StatusCode::SERVICE_UNAVAILABLE, &error.to_string()),

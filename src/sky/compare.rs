@@ -1,4 +1,4 @@
-//! Comparison of a map with the truth: spectra, correlation, signal to noise, relative error.
+//! Comparison of a map with the input sky: spectra, correlation, signal-to-noise ratio, relative error.
 
 use serde::Serialize;
 
@@ -12,9 +12,9 @@ use crate::units::constants::HEALPIX_UNSEEN;
 /// Result of a comparison. Arrays run over `l` = 0 .. l_max, including monopole and dipole.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// The nside of the comparison: the coarsest of the maps'.
+    /// nside of the comparison: the coarsest of all maps.
     pub nside: usize,
-    /// Frame: that of all maps if they agree, else ecliptic.
+    /// Common frame of all maps, or ecliptic if they differ.
     pub frame: Frame,
     /// Degrees.
     pub l: Vec<usize>,
@@ -24,20 +24,20 @@ pub struct Comparison {
     pub cl_truth: Vec<f64>,
     /// Cross C_l, K^2.
     pub cl_cross: Vec<f64>,
-    /// rho_l = C_l^X / sqrt(C_l^in C_l^re), of the map as it is, with its noise; NaN where a spectrum is zero (null in JSON).
+    /// Correlation rho_l = C_l^X / sqrt(C_l^in C_l^re) of the map including its noise; NaN where a spectrum is zero (null in JSON).
     pub rho: Vec<f64>,
-    /// rho_l of the map without its noise, whose power the noise-only map has; absent unless the map is known to hold noise.
+    /// rho_l after the power of the noise-only map is subtracted from C_l^re; absent unless the map is known to contain noise.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rho_noise_subtracted: Option<Vec<f64>>,
     /// C_l of the noise-only map, K^2, if there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cl_noise: Option<Vec<f64>>,
-    /// SNR_l = C_l^X / sqrt(C_l^in C_l^ns), if there is a noise map.
+    /// Signal-to-noise ratio SNR_l = C_l^X / sqrt(C_l^in C_l^ns), if there is a noise map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub snr: Option<Vec<f64>>,
-    /// Mean, root mean square and percentiles of the relative error.
+    /// Statistics of the relative error.
     pub relative_error: ErrorSummary,
-    /// (map - truth) / truth; UNSEEN where the truth is zero.
+    /// Relative error (map - truth) / truth of each pixel; UNSEEN where the truth is zero.
     #[serde(skip)]
     pub relative_error_map: SkyMap,
 }
@@ -49,26 +49,26 @@ pub struct ErrorSummary {
     pub mean: f64,
     /// Root mean square.
     pub rms: f64,
-    /// 5 % of pixels are below this.
+    /// 5th percentile.
     pub percentile_5: f64,
-    /// Half of the pixels are below this.
+    /// Median.
     pub median: f64,
-    /// 95 % of pixels are below this.
+    /// 95th percentile.
     pub percentile_95: f64,
 }
 
-/// A sky to compare maps with: its pixels for the relative error, and its coefficients for the spectra.
+/// Input sky to compare maps with: its pixels for the relative error, and its coefficients for the spectra.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InputSky {
     /// The sky at the resolution of the maps.
     pub map: SkyMap,
-    /// Coefficients of the sky itself at its own resolution, in the frame of `map`.
+    /// Coefficients of the sky at its own resolution, in the frame of `map`.
     pub alm: Alm,
 }
 
 impl InputSky {
-    /// `sky` in its own frame or on ecliptic axes, averaged over the pixels of `nside` or split into them, with coefficients
-    /// up to `l_max` at most.
+    /// Prepares `sky` in its own frame or on ecliptic axes, averaged over the pixels of `nside` or split into them, with
+    /// coefficients up to at most `l_max`.
     ///
     /// # Errors
     /// [`MapError::BadPixels`] for a sky with invalid pixels; [`MapError::Nside`].
@@ -78,18 +78,18 @@ impl InputSky {
     }
 }
 
-/// Coefficients of a map in its own frame or on ecliptic axes, to which they turn exactly.
+/// Computes the coefficients of a map in its own frame or on ecliptic axes; the rotation of coefficients is exact.
 fn harmonics(map: &SkyMap, frame: Frame, l_max: usize) -> Result<Alm, MapError> {
     let alm = map.harmonics(l_max, &AnalysisOptions::default())?;
     Ok(if map.frame() == frame { alm } else { alm.rotated(&map.frame().to_ecliptic()) })
 }
 
-/// Compares a map with the truth, and with a map of pure noise for SNR_l.
+/// Compares a map with the truth, and with a noise-only map for SNR_l.
 ///
-/// Spectra are those of each map's own pixels, so that rho_l is of the truth at its full resolution, as in the paper: a
-/// truth averaged over the map's pixels first has lost what the map can not have, and correlates better. Coefficients are
-/// those of healpy's `anafast`; `l_max` is 3 nside - 1 of the coarsest map unless given. For the relative error all are
-/// brought to the coarsest nside by averaging. Maps of different frames are compared in ecliptic coordinates.
+/// Spectra are computed from each map's own pixels, so that rho_l refers to the truth at full resolution, as in the paper. A
+/// truth averaged over the map's pixels would lack the scales that the map lacks, and correlate better. Coefficients are
+/// those of healpy's `anafast`; the default `l_max` is 3 nside - 1 of the coarsest map. For the relative error all maps are
+/// averaged to the coarsest nside. Maps of different frames are compared in ecliptic coordinates.
 ///
 /// # Errors
 /// [`MapError::BadPixels`] for a map with invalid pixels; [`MapError::Harmonics`] for `l_max` above
@@ -105,12 +105,12 @@ pub fn compare(
     let one_frame = all.iter().all(|other| other.frame() == map.frame());
     let frame = if one_frame { map.frame() } else { Frame::Ecliptic };
     let l_max = l_max.unwrap_or(3 * coarsest - 1);
-    // A degree that one of them does not determine is an error, not a shorter spectrum.
+    // A degree that one of the maps does not determine is an error, and does not shorten the spectrum.
     Transform::new(coarsest, l_max)?;
     compare_with(map, &InputSky::new(truth, frame, coarsest, l_max)?, noise, Some(l_max))
 }
 
-/// As [`compare`], with a truth whose coefficients are known, in the truth's frame: that of the other maps, or ecliptic.
+/// Compares maps as [`compare`] with a truth whose coefficients are known, in its frame, which must be that of the maps or ecliptic.
 ///
 /// # Errors
 /// As [`compare`].
@@ -120,7 +120,7 @@ pub fn compare_with(
     noise: Option<&SkyMap>,
     l_max: Option<usize>,
 ) -> Result<Comparison, MapError> {
-    let InputSky { map: truth, alm: of_truth } = input;
+    let InputSky { map: truth, alm: truth_alm } = input;
     let frame = truth.frame();
     let others: Vec<&SkyMap> = [Some(map), noise].into_iter().flatten().collect();
     for map in &others {
@@ -128,12 +128,12 @@ pub fn compare_with(
     }
     let nside = others.iter().map(|map| map.nside()).fold(truth.nside(), usize::min);
     let l_max = l_max.unwrap_or(3 * nside - 1);
-    let of_map = harmonics(map, frame, l_max)?;
+    let map_alm = harmonics(map, frame, l_max)?;
     // The truth may have degrees beyond `l_max`, or fewer.
-    let cl_cross = cross_cl(&of_map, of_truth);
+    let cl_cross = cross_cl(&map_alm, truth_alm);
     let l_max = cl_cross.len() - 1;
     let cl = |alm: &Alm| auto_cl(alm).into_iter().take(l_max + 1).collect::<Vec<f64>>();
-    let (cl_map, cl_truth) = (cl(&of_map), cl(of_truth));
+    let (cl_map, cl_truth) = (cl(&map_alm), cl(truth_alm));
     let cl_noise = noise.map(|noise| Ok::<_, MapError>(cl(&harmonics(noise, frame, l_max)?))).transpose()?;
     let snr = cl_noise.as_ref().map(|cl_noise| normalised(&cl_cross, &cl_truth, cl_noise));
     let (map, truth) = (map.rotate_pixels(frame).degrade(nside)?, truth.degrade(nside)?);
@@ -155,13 +155,14 @@ pub fn compare_with(
 }
 
 impl Comparison {
-    /// With the correlation of the noise-free part of the map, if the map holds noise of its own: its power is that of the
-    /// map less that of the noise-only map, degree by degree. NaN where noise is all.
+    /// Adds the correlation of the noise-free part of the map, whose power is that of the map minus that of the noise-only map at
+    /// each degree. NaN where noise exceeds the map's power.
     #[must_use]
     pub fn with_noise_subtracted(mut self) -> Self {
         if let Some(cl_noise) = &self.cl_noise {
-            let quiet: Vec<f64> = self.cl_map.iter().zip(cl_noise).map(|(all, noise)| all - noise).collect();
-            self.rho_noise_subtracted = Some(normalised(&self.cl_cross, &self.cl_truth, &quiet));
+            let noise_free: Vec<f64> =
+                self.cl_map.iter().zip(cl_noise).map(|(map, noise)| map - noise).collect();
+            self.rho_noise_subtracted = Some(normalised(&self.cl_cross, &self.cl_truth, &noise_free));
         }
         self
     }
@@ -175,10 +176,11 @@ fn summary(errors: &[f64], truth: &[f64]) -> ErrorSummary {
     let known = errors.iter().zip(truth).filter(|(_, truth)| **truth != 0.0);
     let mut sorted: Vec<f64> = known.map(|(error, _)| *error).collect();
     sorted.sort_unstable_by(f64::total_cmp);
-    let mean_of = |of: fn(f64) -> f64| sorted.iter().copied().map(of).sum::<f64>() / sorted.len() as f64;
+    let mean_of =
+        |function: fn(f64) -> f64| sorted.iter().copied().map(function).sum::<f64>() / sorted.len() as f64;
     let percentile = |percent: usize| {
-        let place = percent * sorted.len().saturating_sub(1) / 100;
-        sorted.get(place).copied().unwrap_or(f64::NAN)
+        let index = percent * sorted.len().saturating_sub(1) / 100;
+        sorted.get(index).copied().unwrap_or(f64::NAN)
     };
     ErrorSummary {
         mean: mean_of(|error| error),
@@ -211,7 +213,7 @@ mod tests {
         let noise = scaled(&truth, 0.1);
         let found = compare(&scaled(&truth, 1.25), &truth, Some(&noise), Some(20)).unwrap();
         assert_eq!((found.nside, found.l.len(), found.l[20]), (16, 21, 20));
-        // Coefficients as small as 1e-6 beside a monopole of 10, each good to some 1e-16 of the latter.
+        // Coefficients are as small as 1e-6 beside a monopole of 10, with errors of some 1e-16 of the monopole.
         for l in 0..=20 {
             assert!((found.rho[l] - 1.0).abs() < 1e-7, "l {l}: {}", found.rho[l]);
             assert!((found.cl_map[l] / found.cl_truth[l] - 1.5625).abs() < 1e-7);
@@ -230,9 +232,9 @@ mod tests {
         let map = truth.to_ecliptic().degrade(16).unwrap();
         let found = compare(&map, &truth, None, None).unwrap();
         assert_eq!((found.nside, found.frame, found.l.len()), (16, Frame::Ecliptic, 48));
-        // The truth keeps its small scales: averages over pixels of nside 16 alias them by their window, 1 - l^2 / 24 nside^2
-        // at most 2 % at l = 12, into what little there is.
-        // At even l above 2 the field is zero: what is there is rounding.
+        // The truth keeps its small scales; averages over pixels of nside 16 change them by the pixel window, 1 - l^2 / 24 nside^2,
+        // at most 2 % at l = 12.
+        // At even l above 2 the field is zero up to rounding.
         let mut powers = (0..12).filter(|l| l % 2 == 1 || *l <= 2).map(|l| found.rho[l]);
         assert!(powers.all(|rho| (rho - 1.0).abs() < 1e-3), "{:?}", &found.rho[..12]);
         assert!(found.snr.is_none());

@@ -9,14 +9,14 @@ use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, PerChannel, keys};
 
-/// What is done with a map file of another frequency than the channel's.
+/// Treatment of a map file whose frequency differs from the channel's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub enum MapFrequency {
-    /// It is refused.
+    /// The file is refused.
     #[default]
     #[serde(rename = "must-match")]
     MustMatch,
-    /// It is scaled as a power of frequency: T(nu) = T(FREQ) (nu / FREQ)^index.
+    /// The map is scaled by a power of frequency: T(nu) = T(FREQ) (nu / FREQ)^index.
     #[serde(rename = "spectral_index")]
     SpectralIndex(f64),
 }
@@ -49,69 +49,69 @@ keys! {
     }
 }
 
-/// `sky.added`: what is added to a map file, with the numbers of `[sky.generated]` and at `sky.nside` or the map's own
+/// Components added to a map file (`sky.added`), with the parameters of `[sky.generated]`, at `sky.nside` or at the nside of the map
 /// if that is finer.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AddedSky {
     /// Fluctuations on small scales.
     pub small_scales: bool,
-    /// Point sources by their counts.
+    /// Point sources drawn from the published counts.
     pub sources: bool,
-    /// Point sources of a table (CSV).
+    /// Point sources from a table (CSV).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub catalogue: Option<PathBuf>,
 }
 
-/// Greatest nside of a generated sky.
+/// Maximum nside of a generated sky.
 pub const GENERATED_NSIDE_MAX: usize = 1024;
 
-/// Highest degree of the harmonic model.
+/// Maximum degree of the harmonic model.
 const L_MAX: usize = 1536;
 
 impl SkyConfig {
-    /// Highest degree that a map of `nside` determines.
+    /// Maximum degree that the configuration may set for a map of `nside`.
     #[must_use]
-    pub fn l_max_most(nside: usize) -> usize {
+    pub fn l_max_limit(nside: usize) -> usize {
         L_MAX.min(5 * nside / 2)
     }
 
-    fn l_max_expected(most: usize) -> String {
-        format!("0, or at most {most}: 2.5 nside of the sky, and {L_MAX}")
+    fn l_max_expected(limit: usize) -> String {
+        format!("0, or at most {limit}: 2.5 nside of the sky, and {L_MAX}")
     }
 
-    /// Highest degree that the analysis of a map of `nside` determines exactly: 9/4 nside.
+    /// Maximum degree that the analysis of a map of `nside` determines exactly: 9/4 nside.
     #[must_use]
     #[doc(hidden)]
-    pub fn l_max_held(nside: usize) -> usize {
+    pub fn l_max_determined(nside: usize) -> usize {
         9 * nside / 4
     }
 
     /// Requires that a map of `nside` determines coefficients up to `l_max`.
     ///
     /// # Errors
-    /// [`InvalidValue`] of `sky.l_max`.
+    /// [`InvalidValue`] for `sky.l_max`.
     pub fn check_l_max(l_max: usize, nside: usize) -> Result<(), InvalidValue> {
-        let most = Self::l_max_most(nside);
-        let mut checks = Checks::of("sky");
-        checks.require("l_max", l_max, l_max <= most, Self::l_max_expected(most));
+        let limit = Self::l_max_limit(nside);
+        let mut checks = Checks::new("sky");
+        checks.require("l_max", l_max, l_max <= limit, Self::l_max_expected(limit));
         checks.finish().pop().map_or(Ok(()), Err)
     }
 
-    /// Everything that is wrong with the configuration for `channels` channels; empty if it is good.
+    /// Lists the problems of the configuration for `channels` channels; empty if it is valid.
     #[must_use]
     pub fn problems(&self, channels: usize) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("sky");
+        let mut checks = Checks::new("sky");
         let nside = self.nside;
         let good = is_valid_nside(nside) && nside <= GENERATED_NSIDE_MAX;
         checks.require("nside", nside, good, format!("a power of two from 1 to {GENERATED_NSIDE_MAX}"));
-        let most = Self::l_max_most(nside);
-        let good = self.file.is_some() || self.l_max <= most;
-        checks.require("l_max", self.l_max, good, Self::l_max_expected(most));
+        let limit = Self::l_max_limit(nside);
+        let good = self.file.is_some() || self.l_max <= limit;
+        checks.require("l_max", self.l_max, good, Self::l_max_expected(limit));
         if let Some(files) = &self.file {
             let files = files.values().len();
-            // Whether one file can stand for all channels is seen by its frequency.
-            let expected = format!("one, or one a channel, of which there are {channels}");
+            // Whether one file can serve all channels is decided later, by its frequency.
+            let expected = format!("one, or one per channel, of which there are {channels}");
             checks.require("file", format!("({files} files)"), files == 1 || files == channels, expected);
         }
         if let MapFrequency::SpectralIndex(index) = self.frequency {

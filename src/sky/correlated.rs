@@ -1,4 +1,4 @@
-//! A sky that resembles another as much as is asked for: a wrong prior (the paper, Fig. 12).
+//! Skies with a given correlation to another sky, as imperfect priors (the paper, Fig. 12).
 
 use num_complex::Complex64;
 use rand::RngExt;
@@ -10,13 +10,13 @@ use super::map::SkyMap;
 use super::spectra::{auto_cl, cross_cl};
 use crate::units::{StreamKind, random_stream};
 
-/// First word of the identity of the random stream: other skies draw from streams of their own.
+/// First word of the random stream's identity, which keeps it apart from the streams of other skies.
 const STREAM: u64 = 0xC0;
 
 impl SkyMap {
-    /// A map with the mean and the power of this one at every degree up to 2 nside, and the correlation
-    /// `rho_l = correlation` with it from l = 1: `a_lm -> rho a_lm + sqrt(1 - rho^2) r_lm`, with random r_lm of the same power
-    /// that are orthogonal to a_lm at each degree. Equal seeds give equal maps.
+    /// Returns a map with the mean and the power spectrum of this one up to l = 2 nside, and with the correlation
+    /// `rho_l = correlation` from l = 1: `a_lm -> rho a_lm + sqrt(1 - rho^2) r_lm`, where random r_lm of the same power
+    /// are orthogonal to a_lm at each degree. Equal seeds give equal maps.
     ///
     /// # Errors
     /// [`MapError::BadPixels`] for a map with invalid pixels.
@@ -24,7 +24,7 @@ impl SkyMap {
     pub fn correlated(&self, correlation: f64, seed: u64) -> Result<Self, MapError> {
         let l_max = 2 * self.nside();
         let own = self.harmonics(l_max, &AnalysisOptions::default())?;
-        let mut alm = random(l_max, seed);
+        let mut alm = white_noise(l_max, seed);
         let (own_cl, cross) = (auto_cl(&own), cross_cl(&own, &alm));
         add_degrees(&mut alm, &own, |l| -cross[l] / own_cl[l]);
         let random_cl = auto_cl(&alm);
@@ -32,7 +32,7 @@ impl SkyMap {
         let scale = |l: usize| rest * (own_cl[l] / random_cl[l]).sqrt();
         for m in 0..=l_max {
             for (value, l) in alm.order_mut(m).iter_mut().zip(m..) {
-                // The mean stays, and a degree without power has none.
+                // The mean does not change, and a degree without power stays zero.
                 *value *= if l == 0 || !scale(l).is_finite() { 0.0 } else { scale(l) };
             }
         }
@@ -41,7 +41,7 @@ impl SkyMap {
     }
 }
 
-/// Adds `other`, times a factor of its degree.
+/// Adds the coefficients of `other`, each times the factor of its degree.
 fn add_degrees(alm: &mut Alm, other: &Alm, factor: impl Fn(usize) -> f64) {
     for m in 0..=alm.l_max() {
         for ((value, other), l) in alm.order_mut(m).iter_mut().zip(other.order(m)).zip(m..) {
@@ -53,8 +53,8 @@ fn add_degrees(alm: &mut Alm, other: &Alm, factor: impl Fn(usize) -> f64) {
     }
 }
 
-/// White noise: the parts of m > 0 have half the variance of m = 0, whose imaginary part is zero.
-fn random(l_max: usize, seed: u64) -> Alm {
+/// Draws white noise: real and imaginary parts of m > 0 have half the variance of m = 0, which is real.
+fn white_noise(l_max: usize, seed: u64) -> Alm {
     let mut stream = random_stream(seed, StreamKind::SkyFluctuations, [STREAM, l_max as u64]);
     let mut alm = Alm::zeros(l_max);
     for m in 0..=l_max {
@@ -76,7 +76,7 @@ mod tests {
 
     #[test]
     fn every_degree_has_the_correlation_and_the_power_asked_for() {
-        // Peaks of l-th coefficients that fall as 0.82^l: every degree has power.
+        // Coefficients that fall as 0.82^l, so that every degree has power.
         let peak = |x: f64| 1.0 / (1.02 - x);
         let value = |n: &[f64; 3]| peak(0.6 * n[0] + 0.8 * n[2]) + peak(0.28 * n[0] - 0.96 * n[1]);
         let map = SkyMap::new(Frame::Galactic, pixel_directions(16).iter().map(value).collect()).unwrap();
@@ -87,7 +87,7 @@ mod tests {
             let found = coefficients(&other);
             let (power, expected) = (auto_cl(&found), auto_cl(&own));
             for l in 1..=24 {
-                // Quadrature over pixels of nside 16 is good to 1e-3 of a degree's power below 1.5 nside.
+                // Quadrature over pixels of nside 16 is accurate to 1e-3 of a degree's power below 1.5 nside.
                 let rho = rho(&own, &found)[l];
                 assert!((rho - correlation).abs() < 5e-3, "l = {l}: {rho} of {correlation}");
                 assert!((power[l] / expected[l] - 1.0).abs() < 1e-2, "l = {l}");

@@ -1,4 +1,4 @@
-//! Square pieces of a map on a plane: gnomonic or cartesian, as healpy's `gnomview` and `cartview` have them.
+//! Square cutouts of a map on a plane, in gnomonic or cartesian projection as in healpy's `gnomview` and `cartview`.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,18 +7,18 @@ use super::healpix::pixel_of;
 use super::map::SkyMap;
 use crate::units::vector::{Vec3, direction};
 
-/// How the sphere is laid on a plane around the centre of a piece.
+/// Projection of the sphere onto a plane around the centre of a cutout.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PlaneProjection {
-    /// From the centre of the sphere onto the tangent plane: great circles are straight.
+    /// Gnomonic projection from the centre of the sphere onto the tangent plane: great circles are straight.
     #[default]
     Gnomonic,
-    /// Longitude and latitude, counted from the centre along its own great circle, as they are.
+    /// Longitude and latitude in a system whose equator passes through the centre (plate carree).
     Cartesian,
 }
 
-/// A square piece of the sky with its pixels; east is to the left.
+/// Square cutout of the sky; east is to the left.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cutout {
     /// Projection.
@@ -27,27 +27,27 @@ pub struct Cutout {
     pub frame: Frame,
     /// Longitude and latitude of the centre in that frame, degrees.
     pub centre_deg: [f64; 2],
-    /// Length of a side, degrees at the centre: below 120.
+    /// Length of a side, degrees at the centre; below 120.
     pub size_deg: f64,
-    /// Pixels along a side.
+    /// Number of pixels along a side.
     pub pixels: usize,
 }
 
 impl Cutout {
-    /// The values of the map's pixels at the centres of the piece's, row by row from the lowest, from east to west.
+    /// Samples the map at the centres of the cutout's pixels, row by row from the lowest, each from east to west.
     #[must_use]
     pub fn values(&self, map: &SkyMap) -> Vec<f64> {
-        let turn = product(&self.frame.to_frame(map.frame()), &self.plane_axes());
+        let rotation = product(&self.frame.to_frame(map.frame()), &self.plane_axes());
         let step_deg = self.size_deg / self.pixels as f64;
         let at = |k: usize| (k as f64 - 0.5 * (self.pixels as f64 - 1.0)) * step_deg;
         let value = |k: usize| {
-            let direction = self.on_sphere(at(k % self.pixels), at(k / self.pixels));
-            map.values()[pixel_of(map.nside(), rotate(&turn, direction))]
+            let direction = self.direction_of(at(k % self.pixels), at(k / self.pixels));
+            map.values()[pixel_of(map.nside(), rotate(&rotation, direction))]
         };
         (0..self.pixels * self.pixels).map(value).collect()
     }
 
-    /// Where a direction lies on the plane, degrees to the right of the centre and above it; `None` if it is not there.
+    /// Position of a direction on the plane, degrees to the right of the centre and above it; `None` if it does not project.
     #[must_use]
     pub fn place_deg(&self, longitude_deg: f64, latitude_deg: f64) -> Option<[f64; 2]> {
         let [x, y, z] = rotate(&transpose(&self.plane_axes()), direction(longitude_deg, latitude_deg));
@@ -59,15 +59,15 @@ impl Cutout {
         }
     }
 
-    /// Turns the plane's axes (x towards the centre, z up) to those of the frame.
+    /// Rotation from the plane's axes (x towards the centre, z up) to those of the frame.
     fn plane_axes(&self) -> Rotation {
         let ((sin_l, cos_l), (sin_b, cos_b)) =
             (self.centre_deg[0].to_radians().sin_cos(), self.centre_deg[1].to_radians().sin_cos());
         [[cos_l * cos_b, -sin_l, -cos_l * sin_b], [sin_l * cos_b, cos_l, -sin_l * sin_b], [sin_b, 0.0, cos_b]]
     }
 
-    /// A place on the plane, degrees, as a direction on the plane's axes.
-    fn on_sphere(&self, right_deg: f64, up_deg: f64) -> Vec3 {
+    /// Direction, on the plane's axes, of a position on the plane, degrees.
+    fn direction_of(&self, right_deg: f64, up_deg: f64) -> Vec3 {
         let (right, up) = (right_deg.to_radians(), up_deg.to_radians());
         match self.projection {
             PlaneProjection::Gnomonic => {
@@ -101,7 +101,7 @@ mod tests {
             assert!(right.abs() < 1e-12 && up.abs() < 1e-12);
             assert!(cutout.place_deg(76.0, 40.0).unwrap()[0] < 0.0);
             assert!(cutout.place_deg(75.0, 41.0).unwrap()[1] > 0.0);
-            // Values of a map that rises to the north, and to the east.
+            // A map whose values rise to the north, or to the east.
             for (axis, rises) in [(2, "up"), (1, "left")] {
                 let values = pixel_directions(64).iter().map(|n| n[axis]).collect();
                 let map = SkyMap::new(Frame::Galactic, values).unwrap();
@@ -122,12 +122,12 @@ mod tests {
             size_deg: 20.0,
             pixels: 40,
         };
-        // On the meridian of the centre the tangent plane is at tan of the distance.
+        // On the meridian of the centre the position is the tangent of the distance.
         let [right, up] = cutout.place_deg(310.0, -30.0).unwrap();
         assert!(right.abs() < 1e-9 && (up - 5_f64.to_radians().tan().to_degrees()).abs() < 1e-9);
-        // There and back.
+        // The projections are inverses.
         for (right, up) in [(3.0, -7.0), (-9.0, 9.0), (0.5, 0.5)] {
-            let n = rotate(&cutout.plane_axes(), cutout.on_sphere(right, up));
+            let n = rotate(&cutout.plane_axes(), cutout.direction_of(right, up));
             let found = cutout.place_deg(n[1].atan2(n[0]).to_degrees(), n[2].asin().to_degrees()).unwrap();
             assert!((found[0] - right).abs() < 1e-9 && (found[1] - up).abs() < 1e-9, "{found:?}");
         }

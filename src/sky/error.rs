@@ -8,7 +8,7 @@ use super::healpix::NSIDE_MAX;
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MapError {
-    /// The number of values is not that of a HEALPix map.
+    /// The number of values does not fit a HEALPix map.
     #[error(
         "{pixels} values do not make a HEALPix map; expected 12 nside^2, nside a power of two up to {NSIDE_MAX}"
     )]
@@ -27,7 +27,7 @@ pub enum MapError {
     Direction {
         /// The operation, "degraded" or "upgraded".
         verb: &'static str,
-        /// Own nside.
+        /// nside of the map.
         from: usize,
         /// Requested nside.
         to: usize,
@@ -46,7 +46,7 @@ pub enum MapError {
         total: usize,
         /// RING number of the first such pixel.
         first: usize,
-        /// Its value.
+        /// Value of the first such pixel.
         value: f64,
     },
     /// Pixels that are no temperature of a sky.
@@ -61,12 +61,12 @@ pub enum MapError {
         total: usize,
         /// RING number of the first such pixel.
         first: usize,
-        /// Its value, K.
+        /// Value of the first such pixel, K.
         value: f64,
-        /// Greatest temperature, K.
+        /// Maximum temperature, K.
         most: f64,
     },
-    /// A sky without power, and receivers without noise.
+    /// A sky without power, with receivers without noise.
     #[error(
         "the mean of the pixels is {value:e} K: without power visibilities have no weight; expected a mean above 0 K, or \
          spacecraft.receiver_noise_k_sr above 0"
@@ -75,7 +75,7 @@ pub enum MapError {
         /// Mean of the pixels, K.
         value: f64,
     },
-    /// A known sky without power.
+    /// A sky without power, with which nothing can be calibrated.
     #[error(
         "the mean of the pixels is {value:e} K, a sky of which nothing can be known; expected a mean above 0 K, to calibrate with"
     )]

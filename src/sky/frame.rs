@@ -6,14 +6,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::units::vector::{Vec3, dot};
 
-/// A rotation: row `k` is the target's axis `k` in the source's coordinates.
+/// Rotation matrix: row `k` is axis `k` of the target frame in coordinates of the source frame.
 pub type Rotation = [Vec3; 3];
 
 /// Celestial frame of a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Frame {
-    /// Mean ecliptic and equinox of J2000, the frame of all computation.
+    /// Mean ecliptic and equinox of J2000, in which all computation is done.
     #[default]
     Ecliptic,
     /// Galactic (IAU 1958).
@@ -22,17 +22,17 @@ pub enum Frame {
     Equatorial,
 }
 
-/// Galactic to ecliptic.
+/// Rotation from Galactic to ecliptic axes.
 ///
-/// As astropy 8.0 transforms `galactic` into `barycentricmeanecliptic` (IAU 2006 obliquity and frame bias,
-/// Capitaine & Wallace 2006; Galactic pole of Reid & Brunthaler 2004), which is what healpy's `Rotator` uses.
+/// It is astropy 8.0's transformation of `galactic` into `barycentricmeanecliptic` (IAU 2006 obliquity and frame bias,
+/// Capitaine & Wallace 2006; Galactic pole of Reid & Brunthaler 2004), which healpy's `Rotator` uses.
 const GALACTIC_TO_ECLIPTIC: Rotation = [
     [-5.487_563_486_628_312e-2, 4.941_095_288_578_971_6e-1, -8.676_660_868_040_493e-1],
     [-9.938_213_523_891_737e-1, -1.109_909_720_383_277_8e-1, -3.516_551_470_140_832e-4],
     [-9.647_685_853_808_478e-2, 8.622_857_865_103_742e-1, 4.971_473_002_529_609_5e-1],
 ];
 
-/// Equatorial to ecliptic: astropy's `fk5` (J2000) to `barycentricmeanecliptic`, as healpy's `Rotator`.
+/// Rotation from equatorial to ecliptic axes: astropy's `fk5` (J2000) to `barycentricmeanecliptic`, as in healpy's `Rotator`.
 const EQUATORIAL_TO_ECLIPTIC: Rotation = [
     [9.999_999_999_999_924e-1, 4.023_865_539_325_272e-8, 1.246_801_808_749_580_6e-7],
     [-8.651_314_600_163_742e-8, 9.174_821_682_916_512e-1, 3.977_769_109_272_729e-1],
@@ -69,7 +69,7 @@ impl Frame {
         }
     }
 
-    /// The frame of a COORDSYS value: a letter (C or Q for equatorial) or the name, upper or lower case.
+    /// Parses a COORDSYS value: a letter (C or Q for equatorial) or the name, in upper or lower case.
     #[must_use]
     #[doc(hidden)]
     pub fn from_coordsys(text: &str) -> Option<Self> {
@@ -142,8 +142,8 @@ mod tests {
 
     #[test]
     fn known_directions_agree() {
-        // The frames' textbook definitions neglect the bias between dynamical mean, FK5 and ICRS axes,
-        // 0.023 arcsec = 1.1e-7, and give the pole to 1e-8: 3e-7.
+        // Textbook definitions of the frames neglect the bias between dynamical mean, FK5 and ICRS axes,
+        // 0.023 arcsec = 1.1e-7 rad, and give the pole to 1e-8: 3e-7 in total.
         let textbook = 3e-7;
         let (sin, cos) = (84_381.406_f64 / 3600.0).to_radians().sin_cos();
         let ecliptic_pole = rotate(&Frame::Ecliptic.to_frame(Frame::Equatorial), [0.0, 0.0, 1.0]);

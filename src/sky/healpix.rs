@@ -1,14 +1,14 @@
-//! HEALPix pixels (Gorski et al. 2005): numbers, centres, continuous positions inside a face.
+//! HEALPix pixels (Gorski et al. 2005): numbers, centres, and positions inside a base face.
 //!
-//! Conversions between RING and NESTED are exact: whole numbers only. The search is written for speed, and directions
-//! because rows of B need them to the last bits and at points other than pixel centres.
+//! Conversions between RING and NESTED use integers only, and are exact. Rows of B need directions to the last bits, and at points
+//! other than pixel centres.
 
 use std::cmp::Ordering;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 
 use crate::units::vector::Vec3;
 
-/// Greatest nside of maps.
+/// Maximum nside of maps.
 #[doc(hidden)]
 pub const NSIDE_MAX: usize = 8192;
 
@@ -30,7 +30,7 @@ pub const fn pixel_count(nside: usize) -> usize {
     12 * nside * nside
 }
 
-/// The nside of a map of `pixels` pixels, if it is valid.
+/// Returns the nside of a map of `pixels` pixels, if it is valid.
 #[must_use]
 pub fn nside_of(pixels: usize) -> Option<usize> {
     let nside = ((pixels / 12) as f64).sqrt().round() as usize;
@@ -47,19 +47,19 @@ pub fn pixel_area_sr(nside: usize) -> f64 {
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[doc(hidden)]
 pub struct Ring {
-    /// RING number of its first pixel.
+    /// RING number of the first pixel.
     pub first: usize,
     /// Number of pixels.
     pub len: usize,
-    /// cos(colatitude).
+    /// Cosine of the colatitude.
     pub z: f64,
-    /// sin(colatitude), accurate near the poles.
+    /// Sine of the colatitude, accurate near the poles.
     pub sin_theta: f64,
     /// Longitude of the first pixel, rad.
     pub phi0_rad: f64,
 }
 
-/// Ring `k` = 1 .. 4 nside - 1, counted from the north.
+/// Returns ring `k` = 1 .. 4 nside - 1, counted from the north.
 #[must_use]
 #[doc(hidden)]
 pub fn ring(nside: usize, k: usize) -> Ring {
@@ -78,11 +78,11 @@ pub fn ring(nside: usize, k: usize) -> Ring {
     Ring { first, len, z: if southern { -z } else { z }, sin_theta, phi0_rad }
 }
 
-/// The integers of a ring.
+/// Pixel numbers of a ring.
 struct RingPixels {
     first: usize,
     len: usize,
-    /// Whether the first pixel is centred half a pixel east of longitude 0, and not on it.
+    /// Whether the first pixel is centred half a pixel east of longitude 0 instead of on it.
     is_shifted: bool,
 }
 
@@ -152,7 +152,7 @@ pub fn ring_to_nested(nside: usize, pixel: usize) -> usize {
     } else if k > 3 * nside {
         8 + column / quarter
     } else {
-        // Edges of base faces west of the centre, as in `pixel_of`. No centre lies on one.
+        // Counts the edges of base faces west of the centre, as in `pixel_of`; no centre lies on an edge.
         let ascending = (longitude + k - nside) / (2 * nside);
         let descending = (longitude + 3 * nside - k) / (2 * nside);
         match ascending.cmp(&descending) {
@@ -170,10 +170,10 @@ pub fn ring_to_nested(nside: usize, pixel: usize) -> usize {
     let difference = longitude - centre as isize;
     let x = (sum as isize + difference) / 2;
     let (x, y) = (x as usize, sum - x as usize);
-    face * nside * nside + (at_even_bits(x) | at_even_bits(y) << 1)
+    face * nside * nside + (spread_bits(x) | spread_bits(y) << 1)
 }
 
-/// Ring, counted from the north and from 1, and place in it, from 0, of a RING pixel.
+/// Returns the ring of a RING pixel, counted from 1 at the north, and its index in the ring, from 0.
 fn ring_and_column(nside: usize, pixel: usize) -> (usize, usize) {
     let cap = 2 * nside * (nside - 1);
     // Rings 1 to k of a cap have 2 k (k + 1) pixels.
@@ -196,14 +196,14 @@ pub fn nested_to_ring(nside: usize, pixel: usize) -> usize {
     let (face, x, y) = nested_to_face(nside, pixel);
     let RingPixels { first, len, is_shifted } =
         ring_pixels(nside, usize::from(FACE_RING[face]) * nside - 1 - x - y);
-    // Longitude as in `ring_to_nested`, with a turn added, so that it is never below zero.
+    // Longitude as in `ring_to_nested`, plus a turn so that it is never negative.
     let longitude = usize::from(FACE_LONGITUDE[face]) * (len / 4) + 2 * len + x - y;
     first + (longitude - usize::from(is_shifted)) / 2 % len
 }
 
-/// RING number of the pixel that contains a direction, given as a vector of any length with a normal square.
+/// RING number of the pixel that contains a direction, given as a vector of any length whose square does not overflow.
 ///
-/// Gorski et al. 2005, Sect. 4: a direction lies between two ascending and two descending edges.
+/// A direction lies between two ascending and two descending edges (Gorski et al. 2005, Sect. 4).
 #[must_use]
 pub fn pixel_of(nside: usize, direction: Vec3) -> usize {
     let [x, y, height] = direction;
@@ -225,10 +225,10 @@ pub fn pixel_of(nside: usize, direction: Vec3) -> usize {
         2 * nside * (nside - 1) + (ring - 1) * 4 * nside + column
     } else {
         let inside = turn.fract();
-        // sqrt(3 (1 - |z|)), exact near the pole.
-        let reach = n * (3.0 / (1.0 + z.abs())).sqrt() * (across / length);
-        let east = ((inside * reach) as usize).min(nside - 1);
-        let west = (((1.0 - inside) * reach) as usize).min(nside - 1);
+        // n sqrt(3 (1 - |z|)), without cancellation near the pole.
+        let from_pole = n * (3.0 / (1.0 + z.abs())).sqrt() * (across / length);
+        let east = ((inside * from_pole) as usize).min(nside - 1);
+        let west = (((1.0 - inside) * from_pole) as usize).min(nside - 1);
         let ring = (east + west + 1).min(nside);
         let column = ((turn * ring as f64) as usize) % (4 * ring);
         if z > 0.0 {
@@ -247,7 +247,7 @@ pub fn nested_to_face(nside: usize, pixel: usize) -> (usize, usize, usize) {
     (pixel / (nside * nside), even_bits(in_face), even_bits(in_face >> 1))
 }
 
-/// Bits 0, 2, 4 .. of a number of at most 32 bits, side by side.
+/// Compresses bits 0, 2, 4, .. of a number of at most 32 bits.
 fn even_bits(number: usize) -> usize {
     let pairs = number & 0x5555_5555;
     let fours = (pairs | pairs >> 1) & 0x3333_3333;
@@ -256,8 +256,8 @@ fn even_bits(number: usize) -> usize {
     (halves | halves >> 8) & 0x0000_ffff
 }
 
-/// The number of at most 32 bits whose [`even_bits`] are these 16.
-fn at_even_bits(number: usize) -> usize {
+/// Spreads a number of at most 16 bits to bits 0, 2, 4, ..: the inverse of [`even_bits`].
+fn spread_bits(number: usize) -> usize {
     let halves = (number | number << 8) & 0x00ff_00ff;
     let bytes = (halves | halves << 4) & 0x0f0f_0f0f;
     let fours = (bytes | bytes << 2) & 0x3333_3333;
@@ -278,7 +278,7 @@ mod tests {
                 let (face, x, y) = nested_to_face(nside, ring_to_nested(nside, pixel));
                 let centre = |k: usize| (k as f64 + 0.5) / nside as f64;
                 let inside = face_direction(face, centre(x), centre(y));
-                // Two routes of a few roundings each to numbers of order one.
+                // Both computations have a few roundings of numbers of order one.
                 assert!(norm(sub(direction, inside)) < 1e-14, "{nside} {pixel}");
                 assert_eq!(pixel_of(nside, direction), pixel);
                 assert_eq!(nested_to_ring(nside, ring_to_nested(nside, pixel)), pixel);
@@ -286,7 +286,7 @@ mod tests {
         }
     }
 
-    /// `healpy.ring2nest` of pixels about the borders of caps, belt and base faces, and of some between (healpy 1.20.1:
+    /// `healpy.ring2nest` of pixels near the boundaries of caps, belt and base faces, and of some between (healpy 1.20.1:
     /// `[(p, hp.ring2nest(n, p)) for p in ...]`). `tests/sky` compares all pixels with healpy itself.
     const HEALPY: &[(usize, &[(usize, usize)])] = &[
         (
@@ -530,7 +530,7 @@ mod tests {
         let mut uniform = move || 2.0 * rand::RngExt::random::<f64>(&mut stream) - 1.0;
         for nside in [1, 2, 32, 1024, NSIDE_MAX] {
             for k in 0..20_000_u32 {
-                // Every fourth direction close to a pole.
+                // Every fourth direction is close to a pole.
                 let squeeze = if k % 4 == 0 { 1e-4 } else { 1.0 };
                 let [x, y, z] = [squeeze * uniform(), squeeze * uniform(), uniform()];
                 let length = norm([x, y, z]);
@@ -542,7 +542,7 @@ mod tests {
                     corner(at_x) + 0.5 / nside as f64,
                     corner(at_y) + 0.5 / nside as f64,
                 );
-                // No corner of a pixel is farther: `healpy.max_pixrad(nside)` is at most 1.0690 / nside, at 8192.
+                // The corners are the farthest points: `healpy.max_pixrad(nside)` is at most 1.0690 / nside, at 8192.
                 let distance = norm(sub(centre, [x / length, y / length, z / length]));
                 assert!(distance < 1.0690 / nside as f64, "{nside} {x} {y} {z}: {distance}");
             }

@@ -1,4 +1,4 @@
-//! Maps in memory.
+//! HEALPix maps in memory.
 
 use rayon::prelude::*;
 
@@ -10,14 +10,13 @@ use super::healpix::{
 use crate::units::constants::HEALPIX_UNSEEN;
 use crate::units::vector::Vec3;
 
-/// Pixels of one task; fixed, so that results do not depend on the number of threads.
 const PIXELS_PER_TASK: usize = 4096;
 
-/// Greatest temperature of a sky, K: far above that of any source below 100 MHz, solar bursts (1e15 K) included. The
-/// square of a visibility and its inverse stay within single precision.
+/// Maximum temperature of a sky, K: above any source below 100 MHz, even solar bursts (1e15 K), and low enough that the square of a
+/// visibility and its inverse stay within single precision.
 pub const TEMPERATURE_K_MAX: f64 = 1e16;
 
-/// Powers of ten by which UNSEEN may have been scaled: values remain beyond any temperature.
+/// Maximum power of ten by which UNSEEN may have been scaled: the result is still beyond any temperature.
 const UNSEEN_DECADES: f64 = 13.0;
 
 /// A HEALPix map in RING order, in K unless stated otherwise.
@@ -28,14 +27,14 @@ pub struct SkyMap {
     values: Vec<f64>,
 }
 
-/// Whether a value is UNSEEN: within 1e-5 of -1.6375e30, as in healpy, which includes its single-precision form.
+/// Whether a value is UNSEEN: within 1e-5 of -1.6375e30, as in healpy, so that its single-precision form counts.
 #[inline]
 #[must_use]
 pub fn is_unseen(value: f64) -> bool {
     (value - HEALPIX_UNSEEN).abs() <= 1e-5 * HEALPIX_UNSEEN.abs()
 }
 
-/// Whether a value is UNSEEN, or that times a power of ten, which conversions of units leave behind.
+/// Whether a value is UNSEEN times a power of ten, as it is after a conversion of units.
 fn is_scaled_unseen(value: f64) -> bool {
     let decades = (value / HEALPIX_UNSEEN).log10();
     // Single precision keeps seven digits.
@@ -43,7 +42,7 @@ fn is_scaled_unseen(value: f64) -> bool {
 }
 
 impl SkyMap {
-    /// From values in RING order.
+    /// Creates a map from values in RING order.
     ///
     /// # Errors
     /// [`MapError::PixelCount`] if their number is not 12 nside^2.
@@ -52,7 +51,7 @@ impl SkyMap {
         Ok(Self { nside, frame, values })
     }
 
-    /// A constant map.
+    /// Creates a constant map.
     ///
     /// # Errors
     /// [`MapError::Nside`].
@@ -91,13 +90,13 @@ impl SkyMap {
         self.values
     }
 
-    /// A map of other values with the nside of this one.
+    /// Creates a map of other values with the nside of this one.
     pub(super) fn with_values(&self, frame: Frame, values: Vec<f64>) -> Self {
         debug_assert_eq!(values.len(), self.values.len());
         Self { nside: self.nside, frame, values }
     }
 
-    /// Directions of the map's pixel centres on ecliptic axes, in the order of its values: with these, maps in any
+    /// Directions of the map's pixel centres on ecliptic axes, in the order of its values, so that maps in any
     /// frame need no interpolation.
     #[must_use]
     pub fn directions_ecliptic(&self) -> Vec<Vec3> {
@@ -111,7 +110,7 @@ impl SkyMap {
         directions
     }
 
-    /// The map averaged down to `nside`. UNSEEN children are ignored; a pixel of only such children is UNSEEN.
+    /// Averages the map down to `nside`. UNSEEN children are ignored; a pixel that has only such children is UNSEEN.
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is above the map's own.
@@ -137,7 +136,7 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// The map at another nside: averaged, split, or unchanged.
+    /// Averages or splits the pixels of the map to `nside`.
     ///
     /// # Errors
     /// [`MapError::Nside`] unless `nside` is a valid power of two.
@@ -145,7 +144,7 @@ impl SkyMap {
         if nside <= self.nside { self.degrade(nside) } else { self.upgrade(nside) }
     }
 
-    /// The map with every pixel split into its children, up to `nside`.
+    /// Splits every pixel into its children at `nside`.
     ///
     /// # Errors
     /// [`MapError::Nside`]; [`MapError::Direction`] if `nside` is below the map's own.
@@ -170,11 +169,11 @@ impl SkyMap {
         Ok(Self { nside, frame: self.frame, values })
     }
 
-    /// Checks that every pixel is a temperature of a sky: at most 1e16 K in size. A sky may have pixels below
-    /// 0, as filtered maps do; the power that a satellite receives counts.
+    /// Checks that every pixel is a temperature of a sky, of at most 1e16 K in magnitude. Pixels may be negative, as in filtered
+    /// maps, because only the power that a satellite receives matters.
     ///
     /// # Errors
-    /// [`MapError::NoTemperature`] with the number and the first of the others.
+    /// [`MapError::NoTemperature`] with the number of bad pixels and the first of them.
     #[doc(hidden)]
     pub fn check_temperatures(&self) -> Result<(), MapError> {
         let bad = |&(_, value): &(usize, &f64)| !(-TEMPERATURE_K_MAX..=TEMPERATURE_K_MAX).contains(value);
@@ -191,7 +190,7 @@ impl SkyMap {
     /// Checks that every pixel has a usable value.
     ///
     /// # Errors
-    /// [`MapError::BadPixels`] with the number and the first of the pixels that are NaN, infinite or UNSEEN, in another unit too.
+    /// [`MapError::BadPixels`] with the number of pixels that are NaN, infinite or UNSEEN (in any unit), and the first of them.
     #[doc(hidden)]
     pub fn check_whole(&self) -> Result<(), MapError> {
         let bad = |&(_, &value): &(usize, &f64)| !value.is_finite() || is_scaled_unseen(value);

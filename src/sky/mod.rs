@@ -6,10 +6,9 @@
 //! | [`fits`] | reading and writing map files |
 //! | [`harmonics`] | coefficients, transforms, rotations |
 //! | [`spectra`] | power spectra and Gaussian smoothing |
-//! | [`generated`] | a sky from a formula |
+//! | [`generated`] | a model of the Galactic and extragalactic sky |
 //!
-//! Maps ([`SkyMap`]) are in RING order and K; all computation is on ecliptic axes ([`Frame::Ecliptic`]). Uses
-//! [`crate::units`] and [`crate::files`] only.
+//! Maps ([`SkyMap`]) are in RING order and K; all computation is on ecliptic axes ([`Frame::Ecliptic`]).
 
 mod compare;
 mod config;

@@ -17,9 +17,10 @@ const PIXELS_PER_TASK: usize = 4096;
 /// A ring and its colatitude, rad.
 type PlacedRing = (Ring, f64);
 
-/// Bilinear interpolation on a HEALPix map, along the two rings that enclose a direction and between them, as in
-/// healpy's `get_interp_val`: weights are linear in longitude, then in colatitude; beyond the last ring the value at
-/// the pole is the mean of that ring's four pixels.
+/// Bilinear interpolation on a HEALPix map, as in healpy's `get_interp_val`.
+///
+/// Weights are linear in longitude along the two rings that enclose a direction, and linear in colatitude between them. Beyond the
+/// last ring, the value at the pole is the mean of that ring's four pixels.
 #[derive(Clone, Debug)]
 pub struct Bilinear {
     nside: usize,
@@ -41,7 +42,7 @@ impl Bilinear {
         Ok(Self { nside, rings: (1..4 * nside).map(with_colatitude).collect() })
     }
 
-    /// Four RING pixels and their weights, which add up to 1, for a vector of any length.
+    /// Returns four RING pixels and their weights, which add up to 1, for a vector of any length.
     #[must_use]
     pub fn weights(&self, [x, y, z]: Vec3) -> [(usize, f64); 4] {
         let colatitude = x.hypot(y).atan2(z);
@@ -63,7 +64,7 @@ impl Bilinear {
         }
     }
 
-    /// Value of `map` (RING order) in a direction; UNSEEN if a pixel with weight is.
+    /// Value of `map` (RING order) in a direction; UNSEEN if a pixel with non-zero weight is UNSEEN.
     #[must_use]
     pub fn value(&self, map: &[f64], direction: Vec3) -> f64 {
         let mut sum = 0.0;
@@ -80,7 +81,7 @@ impl Bilinear {
     fn rings_around(&self, colatitude: f64) -> [Option<&PlacedRing>; 2] {
         let n = self.nside as f64;
         let (sin, cos) = colatitude.sin_cos();
-        // The ring from the formula for its colatitude, then corrected for rounding.
+        // The formula for the colatitude of a ring is inverted, and the result corrected for rounding.
         let guess = if cos.abs() <= 2.0 / 3.0 {
             n * (2.0 - 1.5 * cos)
         } else {
@@ -102,19 +103,19 @@ impl Bilinear {
 /// The two pixels of a ring around a longitude, with weights that add up to 1.
 fn along(ring: &Ring, longitude: f64) -> [(usize, f64); 2] {
     let len = ring.len as f64;
-    let place = (longitude - ring.phi0_rad) / TAU * len;
-    let first = place.floor();
-    let east = place - first;
+    let position = (longitude - ring.phi0_rad) / TAU * len;
+    let first = position.floor();
+    let east = position - first;
     let first = first.rem_euclid(len) as usize % ring.len;
     let second = (first + 1) % ring.len;
     [(ring.first + first, 1.0 - east), (ring.first + second, east)]
 }
 
-/// Between the first or last ring and the pole, `towards` of the way to the pole.
-fn cap(ring: &Ring, longitude: f64, towards: f64) -> [(usize, f64); 4] {
+/// Pixels and weights between the first or last ring and the pole, at a fraction of the way to the pole.
+fn cap(ring: &Ring, longitude: f64, fraction: f64) -> [(usize, f64); 4] {
     let [(a, weight_a), (b, weight_b)] = along(ring, longitude);
     let opposite = |pixel: usize| ring.first + (pixel - ring.first + 2) % 4;
-    let (ring_part, pole_part) = (1.0 - towards, 0.25 * towards);
+    let (ring_part, pole_part) = (1.0 - fraction, 0.25 * fraction);
     [
         (a, weight_a * ring_part + pole_part),
         (b, weight_b * ring_part + pole_part),
@@ -124,8 +125,8 @@ fn cap(ring: &Ring, longitude: f64, towards: f64) -> [(usize, f64); 4] {
 }
 
 impl SkyMap {
-    /// The map in another frame, by [`Bilinear`] interpolation at the new pixel centres (healpy: `rotate_map_pixel`).
-    /// Loses some power near the pixel scale; [`SkyMap::directions_ecliptic`] avoids that loss.
+    /// Rotates the map to another frame, by [`Bilinear`] interpolation at the new pixel centres (healpy: `rotate_map_pixel`).
+    /// Some power near the pixel scale is lost; [`SkyMap::directions_ecliptic`] avoids the loss.
     #[must_use]
     #[doc(hidden)]
     pub fn rotate_pixels(&self, frame: Frame) -> Self {
@@ -144,7 +145,7 @@ impl SkyMap {
         self.with_values(frame, values)
     }
 
-    /// The map in the ecliptic frame, see [`SkyMap::rotate_pixels`].
+    /// Rotates the map to the ecliptic frame, see [`SkyMap::rotate_pixels`].
     #[must_use]
     pub fn to_ecliptic(&self) -> Self {
         self.rotate_pixels(Frame::Ecliptic)
@@ -162,7 +163,7 @@ mod tests {
             for (pixel, &direction) in pixel_directions(nside).iter().enumerate() {
                 let weight: f64 =
                     bilinear.weights(direction).iter().filter(|(p, _)| *p == pixel).map(|(_, w)| w).sum();
-                // Colatitude and longitude err by 1e-16 rad, of a pixel of 1 / nside.
+                // Colatitude and longitude have errors of 1e-16 rad, relative to a pixel of 1 / nside.
                 assert!((weight - 1.0).abs() < 1e-13, "{nside} {pixel} {weight}");
             }
         }
@@ -174,7 +175,7 @@ mod tests {
         let bilinear = Bilinear::new(nside).unwrap();
         let field = |[x, y, z]: Vec3| 1.0 + x + 2.0 * y * z;
         let map: Vec<f64> = pixel_directions(nside).into_iter().map(field).collect();
-        // Points that are no centres, poles and the meridian of longitude 0 among them.
+        // Points off the pixel centres, including poles and the meridian of longitude 0.
         let mut points = pixel_directions(16);
         points.extend([
             [0.0, 0.0, 1.0],

@@ -7,7 +7,7 @@ use super::frame::Frame;
 use super::harmonics::{Alm, AnalysisOptions, Transform};
 use super::map::SkyMap;
 
-/// Cross power C_l = sum over m of Re(a_lm conj(b_lm)) / (2 l + 1), from l = 0 to the smaller l_max.
+/// Cross-power spectrum C_l = sum over m of Re(a_lm conj(b_lm)) / (2 l + 1), from l = 0 to the smaller l_max.
 #[must_use]
 pub fn cross_cl(a: &Alm, b: &Alm) -> Vec<f64> {
     let l_max = a.l_max().min(b.l_max());
@@ -19,14 +19,15 @@ pub fn cross_cl(a: &Alm, b: &Alm) -> Vec<f64> {
     (0..=l_max).map(of_degree).collect()
 }
 
-/// Auto power C_l of one set of coefficients.
+/// Power spectrum C_l of one set of coefficients.
 #[must_use]
 pub fn auto_cl(alm: &Alm) -> Vec<f64> {
     cross_cl(alm, alm)
 }
 
-/// Ratio of a cross spectrum to the geometric mean of two spectra, by degree: rho_l with the spectra of both maps,
-/// SNR_l with those of the input and of a noise map (the paper, Sect. 4). NaN where a spectrum is zero.
+/// Ratio of a cross-power spectrum to the geometric mean of two power spectra at each degree; NaN where a spectrum is zero.
+///
+/// With the spectra of both maps it is rho_l, with those of the input and of a noise map SNR_l (the paper, Sect. 4).
 #[must_use]
 #[doc(hidden)]
 pub fn normalised(cross: &[f64], one: &[f64], other: &[f64]) -> Vec<f64> {
@@ -37,13 +38,13 @@ pub fn normalised(cross: &[f64], one: &[f64], other: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// rho_l = C_l^X / sqrt(C_l^a C_l^b) of two sets of coefficients.
+/// Correlation rho_l = C_l^X / sqrt(C_l^a C_l^b) of two sets of coefficients.
 #[must_use]
 pub fn rho(a: &Alm, b: &Alm) -> Vec<f64> {
     normalised(&cross_cl(a, b), &auto_cl(a), &auto_cl(b))
 }
 
-/// Factors of a_lm for a Gaussian beam of a FWHM (rad), l = 0 .. `l_max`:
+/// Window function of a Gaussian beam with this FWHM (rad), l = 0 .. `l_max`:
 /// exp(-l (l + 1) sigma^2 / 2), sigma = FWHM / sqrt(8 ln 2).
 #[must_use]
 #[doc(hidden)]
@@ -63,7 +64,7 @@ pub fn multiply_degrees(alm: &mut Alm, factors: &[f64]) {
 }
 
 impl SkyMap {
-    /// Coefficients up to `l_max` (healpy's `map2alm` with the default options).
+    /// Computes coefficients up to `l_max` (healpy's `map2alm` with the default options).
     ///
     /// # Errors
     /// [`MapError::BadPixels`]; [`MapError::Harmonics`] for `l_max` above 3 nside - 1.
@@ -73,9 +74,9 @@ impl SkyMap {
         Ok(Transform::new(self.nside(), l_max)?.analysis(self.values(), options)?.alm)
     }
 
-    /// The map without degrees beyond `l_max`, at the pixel centres of `nside`, in ecliptic coordinates.
+    /// Removes the degrees beyond `l_max`, and samples the map at the pixel centres of `nside`, in ecliptic coordinates.
     ///
-    /// Averages over pixels, as in [`SkyMap::resized`], also attenuate lower degrees and alias higher ones: with point
+    /// Averages over pixels, as in [`SkyMap::resized`], would attenuate lower degrees and alias higher ones: with point
     /// sources a tenth of the power at l = 2 nside.
     ///
     /// # Errors
@@ -91,7 +92,7 @@ impl SkyMap {
         Self::new(Frame::Ecliptic, Transform::new(nside, l_max)?.synthesis(&alm)?)
     }
 
-    /// The map convolved with a Gaussian beam of a FWHM (rad), through harmonics up to l = 3 nside - 1, as
+    /// Convolves the map with a Gaussian beam of this FWHM (rad), by harmonics up to l = 3 nside - 1, as
     /// in healpy's `smoothing`.
     ///
     /// # Errors
@@ -108,7 +109,7 @@ impl SkyMap {
         Ok(self.with_values(self.frame(), transform.synthesis(&alm)?))
     }
 
-    /// Post-processing as in the paper: splits every pixel into `factor`^2 and smooths to a FWHM (rad).
+    /// Refines the map as in the paper: splits every pixel into `factor`^2 and smooths to this FWHM (rad).
     ///
     /// # Errors
     /// [`MapError::Nside`] unless `factor` is a power of two that leads to a valid nside; as
@@ -144,7 +145,7 @@ mod tests {
         let mean_square = map.iter().map(|v| v * v).sum::<f64>() / map.len() as f64;
         let cl = auto_cl(&alm);
         let sum: f64 = (0..).zip(&cl).map(|(l, cl)| f64::from(2 * l + 1) * cl).sum();
-        // Parseval, as the quadrature of degree 2 l_max has it: measured in healpy's papers as 1e-3 or so.
+        // Parseval's theorem, up to the error of HEALPix quadrature at degree 2 l_max, about 1e-3.
         assert!((sum / (4.0 * std::f64::consts::PI) / mean_square - 1.0).abs() < 3e-3);
     }
 
@@ -170,14 +171,14 @@ mod tests {
         let fwhm = 0.2;
         let smooth = map.smoothed(fwhm).unwrap();
         let total: f64 = smooth.values().iter().sum();
-        // The mean is one coefficient, found by quadrature improved three times.
+        // The mean is one coefficient, found by quadrature with three corrections.
         assert!((total - 1.0).abs() < 1e-3, "{total}");
         let centre = map.directions_ecliptic()[pixel];
         let peak = smooth.values()[pixel];
         for (value, direction) in smooth.values().iter().zip(map.directions_ecliptic()) {
             let angle = crate::units::vector::dot(centre, direction).clamp(-1.0, 1.0).acos();
             if angle < fwhm {
-                // A plane Gaussian; sphere and pixel change it by the order of sigma^2 / 12.
+                // A plane Gaussian; the sphere and the pixel change it by about sigma^2 / 12.
                 let expected = (-4.0 * LN_2 * (angle / fwhm).powi(2)).exp();
                 assert!((value / peak - expected).abs() < 5e-3, "{angle}");
             }
@@ -195,7 +196,7 @@ mod tests {
         let refined = map.refined(4, 8_f64.to_radians()).unwrap();
         assert_eq!((refined.nside(), refined.frame()), (32, Frame::Galactic));
         let found = refined.harmonics(l_max, &AnalysisOptions { method: Method::ACCURATE }).unwrap();
-        // 8 deg of smoothing and pixels of 7 deg cost 8 % of the amplitude at l = 6; the phases stay.
+        // 8 deg of smoothing and pixels of 7 deg reduce the amplitude at l = 6 by 8 %, but do not change phases.
         for (l, rho) in rho(&found, &alm).into_iter().enumerate() {
             assert!(rho > 0.999, "l {l}: {rho}");
         }

@@ -1,31 +1,30 @@
-//! Arithmetic for the inner loops of several folders: branch-free, so that loops over it become vector code.
+//! Branch-free arithmetic for inner loops that the compiler vectorises.
 //!
 //! A kernel that `multiversion` compiles for several targets sets `FMA` where the hardware has fused multiply-adds;
-//! elsewhere they would be calls into the C library.
+//! elsewhere each would be a call into the C library.
 
-/// `a b + c`, fused if `FMA`.
+/// Computes `a b + c` in f32, fused if `FMA`.
 #[inline(always)]
 pub(crate) fn fused<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// `a b + c`, fused if `FMA`.
+/// Computes `a b + c` in f64, fused if `FMA`.
 #[inline(always)]
 pub(crate) fn fused64<const FMA: bool>(a: f64, b: f64, c: f64) -> f64 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// `turns` minus the nearest whole number.
+/// The difference between `turns` and the nearest whole number, exact for |turns| < 2^51.
 ///
-/// Rounds by adding 1.5 2^52, which leaves no bits for a fraction: exact for |turns| < 2^51, without a library call on
-/// any target.
+/// Rounds by adding 1.5 2^52, which leaves no bits for a fraction, so that no target needs a library call.
 #[inline(always)]
 pub(crate) fn fraction_of_turn(turns: f64) -> f32 {
     const MAGIC: f64 = 6_755_399_441_055_744.0;
     (turns - ((turns + MAGIC) - MAGIC)) as f32
 }
 
-/// A polynomial by Horner's rule, constant term first.
+/// Evaluates a polynomial by Horner's rule; the constant term is the first coefficient.
 #[inline(always)]
 pub(crate) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N], x: f32) -> f32 {
     let mut sum = coefficients[N - 1];
@@ -35,10 +34,9 @@ pub(crate) fn polynomial<const FMA: bool, const N: usize>(coefficients: &[f32; N
     sum
 }
 
-/// cos and sin of 2 pi `turns`, |turns| <= 1/2, to 1e-6.
+/// The cosine and sine of 2 pi `turns`, |turns| <= 1/2, to 1e-6.
 ///
-/// From the half angle: sin(pi t)/t and cos(pi t) as polynomials in t^2, interpolated at Chebyshev
-/// points of 0 <= t^2 <= 1/4; then the formulas for the double angle.
+/// Polynomials in t^2 give sin(pi t)/t and cos(pi t) (interpolated at the Chebyshev points of 0 <= t^2 <= 1/4); double-angle formulas follow.
 #[inline(always)]
 pub(crate) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
     const SIN: [f32; 5] = [std::f32::consts::PI, -5.167_710_3, 2.550_077_4, -0.598_291_3, 0.077_657_66];
@@ -50,7 +48,7 @@ pub(crate) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
     (fused::<FMA>(-twice, sin, 1.0), twice * cos)
 }
 
-/// sin(x) / x.
+/// The function sin(x) / x, 1 at x = 0.
 #[inline]
 pub(crate) fn sinc(x: f64) -> f64 {
     if x.abs() < 1e-8 { 1.0 } else { x.sin() / x }
@@ -62,7 +60,7 @@ mod tests {
     use std::f64::consts::TAU;
 
     #[test]
-    fn sines_of_turns_are_right() {
+    fn sines_of_turns_agree_with_the_library() {
         for k in -5000..=5000 {
             let turns = k as f32 / 1e4;
             let (cos, sin) = cos_sin_turns::<false>(turns);

@@ -1,34 +1,34 @@
-//! Dates of the calendar, by `chrono`; which scale they are of is for [`super::time_scales`].
+//! Calendar dates without a time scale, by `chrono`; [`super::time_scales`] adds the scale.
 
 use chrono::{DateTime, NaiveDate};
 
-/// Days from 1958-01-01, with which TAI begins, to 1970-01-01.
+/// Days from 1958-01-01, the epoch of TAI, to 1970-01-01.
 const DAYS_BEFORE_1970: i64 = 4_383;
 const DAY_S: i64 = 86_400;
-/// From the beginning of TAI to 1970-01-01T00:00:00, s.
+/// Time from the epoch of TAI to 1970-01-01T00:00:00, s.
 pub const TAI_1970_S: f64 = (DAYS_BEFORE_1970 * DAY_S) as f64;
 
-/// The ISO 8601 date and time of day, to the millisecond, of TAI seconds since 1958-01-01T00:00:00.
+/// Formats seconds since 1958-01-01T00:00:00 as an ISO 8601 date and time, to the millisecond, on the same scale.
 #[must_use]
 pub fn tai_text(tai_s: f64) -> String {
     let ms = ((tai_s * 1e3).round() as i64).saturating_sub(1_000 * DAYS_BEFORE_1970 * DAY_S);
-    written(DateTime::from_timestamp_millis(ms), "%Y-%m-%dT%H:%M:%S%.3f")
+    formatted(DateTime::from_timestamp_millis(ms), "%Y-%m-%dT%H:%M:%S%.3f")
 }
 
-/// A date and time of day of the calendar, whatever its scale.
+/// A calendar date and time of day on any scale.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct CalendarTime {
     /// Days from 1970-01-01.
     pub(super) day: i64,
-    /// Whole seconds of the day, 0 to 86,400: the last one is a leap second's.
+    /// Whole seconds of the day, 0 to 86,400; the last is a leap second.
     pub(super) second: i64,
-    /// The rest of the second, 0 to less than 1.
+    /// Fraction of the second, 0 to less than 1.
     pub(super) part_s: f64,
 }
 
 impl CalendarTime {
-    /// Reads `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`, with or without a Z; only 23:59 has a second 60.
-    pub(super) fn read(text: &str) -> Option<Self> {
+    /// Parses `YYYY-MM-DDThh:mm:ss[.d]` or `YYYY-DDDThh:mm:ss[.d]`, with or without a Z; second 60 exists at 23:59 only.
+    pub(super) fn parse(text: &str) -> Option<Self> {
         fn digits(text: &str, count: usize) -> Option<u32> {
             (text.len() == count && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
         }
@@ -49,18 +49,18 @@ impl CalendarTime {
             true => format!("0.{decimals}").parse().ok()?,
             false => return None,
         };
-        // Twenty nines and more round to 1.
+        // A fraction of twenty nines would be rounded to 1.
         let part_s = part_s.min(1.0 - f64::EPSILON / 2.0);
-        let leaps = (hour, minute, whole) == (23, 59, 60);
-        let good = hour < 24 && minute < 60 && (whole < 60 || leaps);
-        good.then(|| Self {
+        let is_leap = (hour, minute, whole) == (23, 59, 60);
+        let is_valid = hour < 24 && minute < 60 && (whole < 60 || is_leap);
+        is_valid.then(|| Self {
             day: date.signed_duration_since(NaiveDate::default()).num_days(),
             second: i64::from(hour * 3600 + minute * 60 + whole),
             part_s,
         })
     }
 
-    /// The date and time of day with so many decimals of a second; the rest is cut off.
+    /// Formats the date and time of day with this many decimals of a second.
     pub(super) fn text(self, decimals: usize) -> String {
         let Self { day, second, part_s } = self;
         let date = DateTime::from_timestamp(day.saturating_mul(DAY_S), 0);
@@ -73,7 +73,7 @@ impl CalendarTime {
     }
 }
 
-fn written(time: Option<DateTime<chrono::Utc>>, pattern: &str) -> String {
+fn formatted(time: Option<DateTime<chrono::Utc>>, pattern: &str) -> String {
     time.map_or_else(|| "beyond the calendar".to_owned(), |time| time.format(pattern).to_string())
 }
 
@@ -82,7 +82,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dates_are_those_of_the_calendar() {
+    fn dates_agree_with_python() {
         // Made with Python: datetime(1958, 1, 1) + timedelta(seconds=s).
         for (s, text) in [
             (0.0, "1958-01-01T00:00:00.000"),
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn dates_are_days_and_seconds_of_the_calendar() {
+    fn dates_are_parsed_to_days_and_seconds() {
         // `date -u -d ... +%s`.
         for (date, expected) in [
             ("1970-01-01T00:00:00", 0.0),
@@ -108,16 +108,16 @@ mod tests {
             ("2024-060T23:59:59.5", 1_709_251_199.5),
             ("2030-12-31T00:00:00Z", 1_924_905_600.0),
             ("2030-365T00:00:00", 1_924_905_600.0),
-            // A second 60 has a number of its own: that of the next midnight.
+            // A second 60 has the same number as the next midnight.
             ("2016-12-31T23:59:60.5", 1_483_228_800.5),
         ] {
-            let CalendarTime { day, second, part_s } = CalendarTime::read(date).unwrap();
+            let CalendarTime { day, second, part_s } = CalendarTime::parse(date).unwrap();
             assert_eq!((day * DAY_S + second) as f64 + part_s, expected, "{date}");
         }
         for date in ["1960-12-31T12:00:00.000", "2024-02-29T23:59:59.500", "2016-12-31T23:59:60.250"] {
-            assert_eq!(CalendarTime::read(date).unwrap().text(3), date);
+            assert_eq!(CalendarTime::parse(date).unwrap().text(3), date);
         }
-        assert_eq!(CalendarTime::read("2024-03-01T00:00:09.999").unwrap().text(0), "2024-03-01T00:00:09");
+        assert_eq!(CalendarTime::parse("2024-03-01T00:00:09.999").unwrap().text(0), "2024-03-01T00:00:09");
         for bad in [
             "",
             "2030-02-29T00:00:00",
@@ -132,7 +132,7 @@ mod tests {
             "2030-01-01T0:00:00",
             "2030-1-1T00:00:00",
         ] {
-            assert_eq!(CalendarTime::read(bad), None, "{bad}");
+            assert_eq!(CalendarTime::parse(bad), None, "{bad}");
         }
     }
 }

@@ -1,11 +1,11 @@
-//! Names of channels and satellite pairs.
+//! Identifiers of channels and satellite pairs.
 
 use std::fmt;
 use std::str::FromStr;
 
 use thiserror::Error;
 
-/// Most daughters an array may have; bounds every table that is indexed by satellite.
+/// Maximum number of daughters of an array; it bounds every table that is indexed by satellite.
 pub const MAX_SATELLITES: usize = 64;
 
 /// Index of a frequency channel in the instrument description.
@@ -31,7 +31,7 @@ impl fmt::Display for ChannelId {
     }
 }
 
-/// Two daughters `i < j`, counted from 0; shown and parsed counted from 1, as in "1-2".
+/// Two daughters `i < j`, numbered from 0; displayed and parsed with numbers from 1, as in "1-2".
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
 )]
@@ -46,10 +46,10 @@ pub struct Pair {
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum PairError {
-    /// Not of the form `i-j`.
+    /// The text is not of the form `i-j`.
     #[error("`{0}` is not a pair; expected two satellite numbers such as 1-2")]
     Form(String),
-    /// Numbers out of range or not increasing.
+    /// The numbers are out of range or not increasing.
     #[error("pair {i}-{j}: expected 1 <= i < j <= {MAX_SATELLITES}")]
     Range {
         /// First number, counted from 1.
@@ -60,7 +60,7 @@ pub enum PairError {
 }
 
 impl Pair {
-    /// The pair of daughters `i < j`, counted from 1 as people count them.
+    /// The pair of daughters `i < j`, numbered from 1.
     ///
     /// # Errors
     /// [`PairError::Range`] unless `1 <= i < j <= MAX_SATELLITES`.
@@ -83,10 +83,10 @@ impl FromStr for Pair {
     type Err = PairError;
 
     fn from_str(s: &str) -> Result<Self, PairError> {
-        let form = || PairError::Form(s.to_owned());
-        let (i, j) = s.split_once('-').ok_or_else(form)?;
-        let i = i.trim().parse().map_err(|_| form())?;
-        let j = j.trim().parse().map_err(|_| form())?;
+        let malformed = || PairError::Form(s.to_owned());
+        let (i, j) = s.split_once('-').ok_or_else(malformed)?;
+        let i = i.trim().parse().map_err(|_| malformed())?;
+        let j = j.trim().parse().map_err(|_| malformed())?;
         Self::from_one_based(i, j)
     }
 }
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pairs_are_shown_as_they_are_parsed() {
+    fn pairs_are_displayed_as_they_are_parsed() {
         let pairs = all_pairs(8);
         assert_eq!(pairs.len(), 28);
         for pair in pairs {

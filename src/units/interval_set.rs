@@ -5,9 +5,8 @@ use std::ops::Range;
 
 /// A set of values, held as disjoint half-open intervals `start..end`. Intervals that overlap or touch are merged.
 ///
-/// Lookup, insertion and removal cost the logarithm of the number of intervals, plus the intervals that they merge
-/// or remove. Memory grows with that number alone; [`IntervalSet::insert_bridging`] and [`IntervalSet::drop_lowest`]
-/// bound it.
+/// Lookup, insertion and removal take a time that grows as the logarithm of the number of intervals, plus that of the intervals they merge
+/// or remove. Memory depends on that number only; [`IntervalSet::insert_bridging`] and [`IntervalSet::drop_lowest`] bound it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct IntervalSet<T> {
     /// End of each interval by its start.
@@ -29,8 +28,8 @@ impl<T: Copy + Ord> IntervalSet<T> {
         }
     }
 
-    /// Adds an interval to at most `intervals_max`. If one more would be needed, the interval below is extended over
-    /// the hole instead; without one below, nothing is added.
+    /// Adds an interval unless the set would then have more than `intervals_max`; in that case the next lower interval is extended over the
+    /// gap instead. If there is no lower one, nothing is added.
     pub fn insert_bridging(&mut self, interval: Range<T>, intervals_max: usize) {
         let Range { start, end } = self.take_merged(interval);
         if start >= end {
@@ -43,7 +42,7 @@ impl<T: Copy + Ord> IntervalSet<T> {
         }
     }
 
-    /// Removes an interval, or what the set holds of it.
+    /// Removes all values of an interval from the set.
     pub fn remove(&mut self, interval: Range<T>) {
         if interval.is_empty() {
             return;
@@ -109,7 +108,7 @@ impl<T: Copy + Ord> IntervalSet<T> {
         self.ends.last_key_value().map(|(start, end)| *start..*end)
     }
 
-    /// Removes all intervals that overlap or touch `interval`; returns their union with it.
+    /// Removes all intervals that overlap or touch the given one, and returns their union with it.
     fn take_merged(&mut self, Range { mut start, mut end }: Range<T>) -> Range<T> {
         if start >= end {
             return start..end;
@@ -146,13 +145,13 @@ mod tests {
     }
 
     #[test]
-    fn a_full_set_bridges_the_hole_below_a_new_interval() {
+    fn a_full_set_bridges_the_gap_below_a_new_interval() {
         let mut set = set_of(&[(10, 20), (30, 40)]);
         set.insert_bridging(15..25, 2);
         assert_eq!(set.iter().collect::<Vec<_>>(), [10..25, 30..40]);
         set.insert_bridging(50..60, 2);
         assert_eq!(set.iter().collect::<Vec<_>>(), [10..25, 30..60]);
-        // Nothing below to extend.
+        // There is no lower interval to extend.
         set.insert_bridging(0..5, 2);
         assert_eq!(set.iter().collect::<Vec<_>>(), [10..25, 30..60]);
     }
@@ -173,7 +172,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_is_a_set_of_values(
+        fn it_agrees_with_a_set_of_single_values(
             steps in proptest::collection::vec((any::<bool>(), 0..50_i64, 0..12_i64), 1..60),
         ) {
             let (mut set, mut expected) = (IntervalSet::default(), BTreeSet::new());

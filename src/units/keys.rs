@@ -1,41 +1,41 @@
-//! One declaration of each key of a pipeline file, beside the struct that holds its value.
+//! Declares each key of a pipeline file once, beside the struct that holds its value.
 //!
-//! [`keys!`](crate::units::keys) makes the struct, its defaults, how it is read, and the table from which reference, help and checks
-//! of effect are made.
+//! [`keys!`](crate::units::keys) generates the struct, its defaults, its parser, and the table from which reference, help and checks of
+//! effect are made.
 
-/// Who needs a key.
+/// The readers that a key is shown to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
-    /// Whoever makes maps: shown by help and by `lunarray config`.
+    /// Everyone who makes maps: help and `lunarray config` show the key.
     Everyday,
-    /// Who studies one part: shown on request.
+    /// Those who study one part: the key is shown on request.
     Expert,
-    /// It is a section, and its keys have levels of their own.
+    /// The key is a section, whose keys have levels of their own.
     Section,
 }
 
-/// A key of a section, or a section in it.
+/// A key of a section, or a subsection.
 #[derive(Debug)]
 pub struct Key {
     /// Name in its section, with the unit.
     pub name: &'static str,
     /// Who needs it.
     pub level: Level,
-    /// What it means, line by line.
+    /// Its description, line by line.
     pub about: &'static [&'static str],
-    /// When it has an effect: comparisons of keys, joined by ` or `; always if empty. A strength of zero is a value like others, which a
-    /// study may go through: what belongs to it has its effect.
+    /// The condition under which it has an effect: comparisons of keys, joined by ` or `; empty if it always has one. A strength of zero
+    /// does not count as off, because a study may step through it.
     pub only_with: &'static str,
     /// The default; `None` for a key that is absent by default.
     pub default: fn() -> Option<toml::Value>,
-    /// Keys of a section.
+    /// The keys of a section.
     pub keys: &'static [Key],
 }
 
 /// Declares a section: the struct, its defaults, and its table `KEYS`.
 ///
-/// Each field has its documentation (which `lunarray explain` shows), `#[only_with("...")]` if it has an effect only then, what serde needs,
-/// its level (`everyday`, `expert` or `section`) and its default.
+/// Each field has its documentation (which `lunarray explain` shows), `#[only_with("...")]` with its condition if it has one, its serde
+/// attributes, its level (`everyday`, `expert` or `section`) and its default.
 macro_rules! keys {
     (
         $(#[$outer:meta])*
@@ -66,7 +66,7 @@ macro_rules! keys {
         }
 
         impl $name {
-            /// Its keys.
+            /// The keys of this section.
             #[doc(hidden)]
             pub const KEYS: &'static [$crate::units::Key] = &[$(
                 $crate::units::Key {
@@ -75,8 +75,8 @@ macro_rules! keys {
                     about: &[$($doc),+],
                     only_with: concat!($($only)?),
                     default: || {
-                        let usual: $type = $default;
-                        toml::Value::try_from(usual).ok()
+                        let default: $type = $default;
+                        toml::Value::try_from(default).ok()
                     },
                     keys: $crate::units::keys!(@keys $level $type),
                 },

@@ -1,7 +1,7 @@
 //! Identifiers, mission time, constants, three-vectors, keyed random streams, ledger reasons, checks of configuration
 //! values, and arithmetic for vectorised loops.
 //!
-//! Uses nothing else of the crate.
+//! Uses no other module of the crate.
 
 pub(crate) mod arithmetic;
 #[doc(hidden)]

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, expecting = "expected one value, or a list with one for each channel")]
 pub enum PerChannel<T> {
-    /// The same for all channels.
+    /// One value for all channels.
     All(T),
-    /// One for each channel, in their order.
+    /// One value for each channel, in order.
     Each(Vec<T>),
 }
 
@@ -31,7 +31,7 @@ impl<T: Clone> PerChannel<T> {
         }
     }
 
-    /// Whether the list, if it is one, has `channels` values.
+    /// Whether there is a value for each of `channels` channels, and no more.
     #[must_use]
     pub fn fits(&self, channels: usize) -> bool {
         match self {
@@ -40,7 +40,7 @@ impl<T: Clone> PerChannel<T> {
         }
     }
 
-    /// All values, one or one for each channel.
+    /// All values that were given.
     pub fn values(&self) -> &[T] {
         match self {
             Self::All(value) => std::slice::from_ref(value),

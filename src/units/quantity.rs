@@ -1,15 +1,15 @@
-//! Numbers with units, as people write them: `3MHz`, `30d`, `10km`. One parser for arguments and pipeline files.
+//! Numbers with units, such as `3MHz`, `30d` or `10km`: one parser for arguments and pipeline files.
 
 use super::constants::DAY_S;
 
-/// The dimension of a number, and its unit.
+/// The dimension of a number, with the unit in which its values are held.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Dimension {
     /// Hz.
     Frequency,
     /// s.
     Time,
-    /// Times as short as those of clocks: ns.
+    /// ns, for clock errors and the like.
     ShortTime,
     /// m.
     Length,
@@ -17,10 +17,10 @@ pub enum Dimension {
     Angle,
 }
 
-/// Sizes of numbers that are written without a power of ten.
-const PLAIN: std::ops::Range<f64> = 1e-3..1e9;
+/// Magnitudes of numbers that are written without a power of ten.
+const PLAIN_RANGE: std::ops::Range<f64> = 1e-3..1e9;
 
-/// Units of frequency and what they are in Hz; longer names before those that they end with.
+/// Units of frequency, each with its size in Hz. A name stands before the names it ends with, here and below.
 const FREQUENCIES: [(&str, f64); 4] = [("GHz", 1e9), ("MHz", 1e6), ("kHz", 1e3), ("Hz", 1.0)];
 const TIMES: [(&str, f64); 7] = [
     ("min", 60.0),
@@ -36,10 +36,10 @@ const LENGTHS: [(&str, f64); 2] = [("km", 1e3), ("m", 1.0)];
 const ANGLES: [(&str, f64); 3] = [("arcmin", 1.0 / 60.0), ("arcsec", 1.0 / 3600.0), ("deg", 1.0)];
 
 impl Dimension {
-    /// The dimension of a key, by the unit at the end of its name: `channels_hz`, `duration_s`, `clock_sigma_ns`, `altitude_m`,
-    /// `inclination_deg`, also before `_max` and `_min`. `None` for other units, and rates such as `_m_s`.
+    /// The dimension of a key, by the unit that ends its name (before `_max` or `_min`), as in `channels_hz` or `window_s_max`. `None` for
+    /// other units and for quotients such as `_m_s`.
     #[must_use]
-    pub fn of_key(key: &str) -> Option<Self> {
+    pub fn from_key(key: &str) -> Option<Self> {
         let name = key.rsplit('.').next().unwrap_or(key);
         let name = name.strip_suffix("_max").or_else(|| name.strip_suffix("_min")).unwrap_or(name);
         let (stem, unit) = name.rsplit_once('_')?;
@@ -51,10 +51,10 @@ impl Dimension {
             "deg" => Self::Angle,
             _ => return None,
         };
-        // A quotient of units (bits_per_s, km_s) is none of them.
-        let of_quotient =
+        // As in bits_per_s or km_s.
+        let is_quotient =
             ["per", "m", "km", "deg", "k", "s"].contains(&stem.rsplit('_').next().unwrap_or(stem));
-        (!of_quotient).then_some(dimension)
+        (!is_quotient).then_some(dimension)
     }
 
     fn units(self) -> &'static [(&'static str, f64)] {
@@ -67,7 +67,7 @@ impl Dimension {
         }
     }
 
-    /// What is accepted, for messages.
+    /// Describes what [`Dimension::parse`] accepts, for messages.
     #[must_use]
     pub fn expected(self) -> &'static str {
         match self {
@@ -79,36 +79,36 @@ impl Dimension {
         }
     }
 
-    /// A value as people write it: in the largest unit of which it is one or more, with no digit lost.
+    /// Formats a value in the largest unit that does not exceed it and loses no digit.
     #[must_use]
     pub fn show(self, value: f64) -> String {
-        let plain = |number: f64, unit: &str| match PLAIN.contains(&number.abs()) || number == 0.0 {
+        let plain = |number: f64, unit: &str| match PLAIN_RANGE.contains(&number.abs()) || number == 0.0 {
             true => format!("{number} {unit}"),
             false => format!("{number:e} {unit}"),
         };
-        // Units of time are for arguments; a mission is counted in days.
+        // These units are accepted only; a mission is counted in days.
         let shown = self.units().iter().filter(|(unit, _)| !["yr", "h", "min"].contains(unit));
         let fitting = shown.filter(|(_, size)| value.abs() >= *size && (value / size) * size == value);
         let (unit, size) = fitting.max_by(|a, b| a.1.total_cmp(&b.1)).copied().unwrap_or(self.base());
         plain(value / size, unit)
     }
 
-    /// The unit in which values are kept.
+    /// The unit in which values are held.
     fn base(self) -> (&'static str, f64) {
         let unit = self.units().iter().find(|(_, size)| *size == 1.0);
         unit.copied().unwrap_or_default()
     }
 
-    /// The value of a text, in the unit that this dimension is kept in; a number alone is in that unit.
+    /// Parses a text to a value in the unit of this dimension; a number without a unit is in that unit.
     ///
     /// # Errors
-    /// What was expected, if the text is not a finite number with one of the units.
+    /// A message that says what was expected, if the text is not a finite number with one of the units.
     pub fn parse(self, text: &str) -> Result<f64, String> {
         let text = text.trim();
         let found = self.units().iter().find_map(|(unit, size)| Some((text.strip_suffix(unit)?, *size)));
         let (number, size) = found.unwrap_or((text, 1.0));
         let plain = number.trim();
-        // Words such as `inf` and `nan` are numbers to Rust, and none here.
+        // Rust would parse words such as `inf` and `nan` as numbers.
         let is_number = plain.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c));
         match plain.replace('_', "").parse::<f64>() {
             Ok(value) if is_number && (value * size).is_finite() => Ok(value * size),
@@ -196,7 +196,7 @@ mod tests {
             ("map.nside", None),
             ("map.prior_k", None),
         ] {
-            assert_eq!(Dimension::of_key(key), expected, "{key}");
+            assert_eq!(Dimension::from_key(key), expected, "{key}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Random streams keyed by their purpose, so that nothing depends on scheduling.
+//! Random streams keyed by their purpose, so that no result depends on scheduling.
 
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
@@ -9,7 +9,7 @@ use rand_chacha::rand_core::SeedableRng;
 pub enum StreamKind {
     /// Thermal noise of integrated visibilities.
     VisibilityNoise = 1,
-    /// Noise of the noise-only companion map, drawn on the ground.
+    /// Noise of the noise-only companion map, generated on the ground.
     CompanionNoise = 2,
     /// Small-scale structure of a generated sky.
     SkyFluctuations = 3,
@@ -23,7 +23,7 @@ pub enum StreamKind {
     Interference = 7,
     /// Noise of the ninth daughter's spectra.
     Spectrometer = 8,
-    /// Errors of the instrument.
+    /// Errors of the simulated instrument.
     Instrument = 9,
     /// Faults of a simulated link.
     Link = 20,
@@ -32,8 +32,7 @@ pub enum StreamKind {
 /// The random stream of `seed`, `kind` and two words of identity (for a block of visibilities:
 /// channel and pair, and start tick).
 ///
-/// ChaCha8 with the identity as key: equal arguments give equal streams, wherever and whenever they
-/// are drawn.
+/// It is ChaCha8 with the arguments as key, so equal arguments give equal streams on any thread.
 #[must_use]
 pub fn random_stream(seed: u64, kind: StreamKind, identity: [u64; 2]) -> ChaCha8Rng {
     let words = [seed, kind as u64, identity[0], identity[1]];

@@ -1,14 +1,14 @@
-//! Reasons for which data does not reach a result.
+//! Reasons why data does not reach a result.
 
 use std::fmt::Debug;
 
-/// Why a sample or a visibility does not reach the result: a closed set of values, each with one text.
+/// A closed set of reasons why a sample or a visibility does not reach the result.
 ///
-/// The ledger of a run counts by these values. Users see the texts.
+/// The ledger of a run counts data by reason; users see the texts.
 pub trait Reason: Copy + Debug + Ord + Send + 'static {
-    /// The text, the same wherever the reason is shown.
+    /// The text that users see wherever the reason is shown.
     fn text(self) -> &'static str;
 
-    /// The stage that lost the data; `None` if the data was left out on purpose, that is flagged.
+    /// The stage that lost the data; `None` for data that was left out on purpose (flagged).
     fn lost_in(self) -> Option<&'static str>;
 }

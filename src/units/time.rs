@@ -7,8 +7,8 @@ pub const TICKS_PER_SECOND: i64 = 1_000_000;
 
 /// Time since the mission epoch in whole microseconds.
 ///
-/// Time tags travel in this unit, so that a tag means the same on both sides of the downlink. One
-/// tick moves a 100 km baseline by 76 micrometres: 3e-5 rad of phase at 30 MHz.
+/// Time tags are sent in this unit, so that both ends of the downlink have the same value. In one
+/// tick a 100 km baseline moves by 76 micrometres, 3e-5 rad of phase at 30 MHz.
 #[derive(
     Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, bincode::Encode, bincode::Decode,
 )]

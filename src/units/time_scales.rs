@@ -1,6 +1,6 @@
-//! Time scales: TAI inside, and UTC, TT, TDB and GPS where dates are read or written.
+//! Time scales. Times are held in TAI, which has no leap seconds; dates are read and written in UTC, TAI, TT, TDB and GPS.
 //!
-//! Mission time counts seconds of TAI. It has no leap seconds, and the packets' time code is TAI too.
+//! Mission time counts seconds of TAI, and so does the packets' time code.
 
 use std::fmt;
 
@@ -8,21 +8,21 @@ use super::calendar::{CalendarTime, TAI_1970_S};
 
 const DAY_S: i64 = 86_400;
 
-/// TT less TAI, s (IAU 1991, exact).
-const TT_LESS_TAI_S: f64 = 32.184;
+/// TT minus TAI, s (IAU 1991, exact).
+const TT_MINUS_TAI_S: f64 = 32.184;
 
-/// TAI less the time of the Global Positioning System, s.
-const TAI_LESS_GPS_S: f64 = 19.0;
+/// TAI minus GPS time, s.
+const TAI_MINUS_GPS_S: f64 = 19.0;
 
-/// From 1970-01-01 to J2000 (2000-01-01T12:00:00), s of the calendar.
+/// Calendar time from 1970-01-01 to J2000 (2000-01-01T12:00:00), s.
 const J2000_1970_S: f64 = 946_728_000.0;
 
 /// One Julian century, s.
 const CENTURY_S: f64 = 36_525.0 * 86_400.0;
 
-/// Days since 1970-01-01 from the beginning of which TAI - UTC is so many seconds (IERS Bulletin C; the list is that of
-/// `leap-seconds.list`, in which no later leap second is announced in November 2026).
-const LEAPS: [(i64, i64); 28] = [
+/// Each change of TAI - UTC: the day since 1970-01-01 at whose start it takes effect, and the new difference, s (IERS Bulletin C;
+/// `leap-seconds.list` as of November 2026 announces no later one).
+const LEAP_SECONDS: [(i64, i64); 28] = [
     (730, 10),    // 1972-01-01
     (912, 11),    // 1972-07-01
     (1_096, 12),  // 1973-01-01
@@ -53,7 +53,7 @@ const LEAPS: [(i64, i64); 28] = [
     (17_167, 37), // 2017-01-01
 ];
 
-/// A scale on which dates are written.
+/// A time scale of dates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TimeScale {
     /// Coordinated universal time, with leap seconds, from 1972 on.
@@ -64,14 +64,14 @@ pub enum TimeScale {
     Tt,
     /// Barycentric dynamical time.
     Tdb,
-    /// Time of the Global Positioning System.
+    /// GPS time.
     Gps,
 }
 
 impl TimeScale {
-    /// The scale of a name such as `UTC`.
+    /// The scale with a name such as `UTC`.
     #[must_use]
-    pub fn of_name(name: &str) -> Option<Self> {
+    pub fn from_name(name: &str) -> Option<Self> {
         Some(match name {
             "UTC" => Self::Utc,
             "TAI" => Self::Tai,
@@ -98,98 +98,100 @@ impl fmt::Display for TimeScale {
 /// A time on TAI, to a nanosecond or better.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub struct Tai {
-    /// Whole seconds from 1970-01-01T00:00:00 TAI, so that their number keeps its digits.
+    /// Whole seconds since 1970-01-01T00:00:00 TAI, as an integer that loses no digit.
     whole_s: i64,
-    /// The rest, 0 to less than 1 s.
+    /// Fraction of the second, 0 to less than 1.
     part_s: f64,
 }
 
 impl Tai {
-    /// The time that is `tai_s` from 1958-01-01T00:00:00 TAI, s.
+    /// The time `tai_s` seconds after 1958-01-01T00:00:00 TAI.
     #[must_use]
-    pub fn from_1958_s(tai_s: f64) -> Self {
-        Self::of(-(TAI_1970_S as i64), tai_s)
+    pub fn from_seconds_since_1958(tai_s: f64) -> Self {
+        Self::normalised(-(TAI_1970_S as i64), tai_s)
     }
 
-    fn of(whole_s: i64, part_s: f64) -> Self {
-        let more = part_s.floor();
-        Self { whole_s: whole_s.saturating_add(more as i64), part_s: part_s - more }
+    fn normalised(whole_s: i64, part_s: f64) -> Self {
+        let carry_s = part_s.floor();
+        Self { whole_s: whole_s.saturating_add(carry_s as i64), part_s: part_s - carry_s }
     }
 
-    /// Reads a date such as 2030-01-31T12:00:00.5 or 2030-031T12:00:00 of a scale. `None` of other text, of a second 60 in which
-    /// there was no leap second, and of UTC before 1972.
+    /// Parses a date on a scale, such as 2030-01-31T12:00:00.5 or 2030-031T12:00:00. `None` for other text, for a second 60 where there is no
+    /// leap second, and for UTC before 1972.
     #[must_use]
-    pub fn read(date: &str, scale: TimeScale) -> Option<Self> {
-        let CalendarTime { day, second, part_s } = CalendarTime::read(date)?;
-        let leaps = second == DAY_S;
-        if leaps && !(scale == TimeScale::Utc && LEAPS.iter().skip(1).any(|(first, _)| *first == day + 1)) {
+    pub fn parse(date: &str, scale: TimeScale) -> Option<Self> {
+        let CalendarTime { day, second, part_s } = CalendarTime::parse(date)?;
+        let is_leap = second == DAY_S;
+        if is_leap
+            && !(scale == TimeScale::Utc && LEAP_SECONDS.iter().skip(1).any(|(first, _)| *first == day + 1))
+        {
             return None;
         }
         let label_s = day * DAY_S + second;
-        let scaled = Self::of(label_s, part_s);
+        let scaled = Self::normalised(label_s, part_s);
         Some(match scale {
             TimeScale::Utc => {
-                let (_, offset_s) = LEAPS.iter().rev().find(|(first, _)| *first <= day)?;
-                Self::of(label_s + offset_s, part_s)
+                let (_, offset_s) = LEAP_SECONDS.iter().rev().find(|(first, _)| *first <= day)?;
+                Self::normalised(label_s + offset_s, part_s)
             }
             TimeScale::Tai => scaled,
-            TimeScale::Gps => scaled.plus_s(TAI_LESS_GPS_S),
-            TimeScale::Tt => scaled.plus_s(-TT_LESS_TAI_S),
-            // The difference changes by 3e-10 of the time: taken at TDB it is that at TT to a picosecond.
-            TimeScale::Tdb => scaled.plus_s(-tdb_less_tt_s(scaled.centuries()) - TT_LESS_TAI_S),
+            TimeScale::Gps => scaled.plus_s(TAI_MINUS_GPS_S),
+            TimeScale::Tt => scaled.plus_s(-TT_MINUS_TAI_S),
+            // TDB - TT changes so slowly that its value at TDB is that at TT to a picosecond.
+            TimeScale::Tdb => scaled.plus_s(-tdb_minus_tt_s(scaled.centuries()) - TT_MINUS_TAI_S),
         })
     }
 
-    /// Seconds from 1958-01-01T00:00:00 TAI, rounded to half a microsecond in this century.
+    /// Seconds since 1958-01-01T00:00:00 TAI, to half a microsecond in this century.
     #[must_use]
-    pub fn from_1958(self) -> f64 {
+    pub fn seconds_since_1958(self) -> f64 {
         (self.whole_s + TAI_1970_S as i64) as f64 + self.part_s
     }
 
-    /// The whole second in which this time is.
+    /// This time rounded down to a whole second.
     #[must_use]
-    pub fn whole(self) -> Self {
+    pub fn floor_second(self) -> Self {
         Self { part_s: 0.0, ..self }
     }
 
-    /// Seconds from another time to this one.
+    /// Seconds elapsed from `other` to this time.
     #[must_use]
     pub fn since_s(self, other: Self) -> f64 {
         (self.whole_s - other.whole_s) as f64 + (self.part_s - other.part_s)
     }
 
-    /// The time some seconds later.
+    /// The time `s` seconds later.
     #[must_use]
     pub fn plus_s(self, s: f64) -> Self {
         let whole = s.floor();
-        Self::of(self.whole_s.saturating_add(whole as i64), self.part_s + (s - whole))
+        Self::normalised(self.whole_s.saturating_add(whole as i64), self.part_s + (s - whole))
     }
 
-    /// Julian centuries of TT from J2000.
+    /// Julian centuries of TT since J2000.
     #[must_use]
     pub fn tt_centuries(self) -> f64 {
-        self.plus_s(TT_LESS_TAI_S).centuries()
+        self.plus_s(TT_MINUS_TAI_S).centuries()
     }
 
     fn centuries(self) -> f64 {
         ((self.whole_s as f64 - J2000_1970_S) + self.part_s) / CENTURY_S
     }
 
-    /// The date and time of day on a scale, with so many decimals of a second. UTC has a second 60 where there was a leap second;
-    /// before 1972 it goes on as it began then.
+    /// Formats the date and time of day on a scale, with this many decimals of a second. A leap second of UTC is second 60; before 1972 the
+    /// difference between TAI and UTC is taken to be that of 1972.
     #[must_use]
     pub fn text(self, scale: TimeScale, decimals: usize) -> String {
         let unit = 10f64.powi(decimals as i32);
         let scaled = match scale {
             TimeScale::Utc | TimeScale::Tai => self,
-            TimeScale::Gps => self.plus_s(-TAI_LESS_GPS_S),
-            TimeScale::Tt => self.plus_s(TT_LESS_TAI_S),
+            TimeScale::Gps => self.plus_s(-TAI_MINUS_GPS_S),
+            TimeScale::Tt => self.plus_s(TT_MINUS_TAI_S),
             TimeScale::Tdb => {
-                let tt = self.plus_s(TT_LESS_TAI_S);
-                tt.plus_s(tdb_less_tt_s(tt.centuries()))
+                let tt = self.plus_s(TT_MINUS_TAI_S);
+                tt.plus_s(tdb_minus_tt_s(tt.centuries()))
             }
         };
-        // Rounded first: a second that is full counts for the minute, and for the leap second.
+        // Rounding may complete a second, so it comes before the division into minutes and leap seconds.
         let rounded = (scaled.part_s * unit).round();
         let (whole_s, fraction) =
             if rounded >= unit { (scaled.whole_s + 1, 0.0) } else { (scaled.whole_s, rounded) };
@@ -201,35 +203,35 @@ impl Tai {
     }
 }
 
-/// From when on, s of TAI since 1970-01-01, TAI - UTC is how many seconds.
+/// Each change of TAI - UTC: its time, s of TAI since 1970-01-01, and the new difference, s.
 pub fn leap_seconds() -> impl Iterator<Item = [i64; 2]> {
-    LEAPS.iter().map(|(day, offset_s)| [day * DAY_S + offset_s, *offset_s])
+    LEAP_SECONDS.iter().map(|(day, offset_s)| [day * DAY_S + offset_s, *offset_s])
 }
 
-/// TAI less UTC, s, at whole seconds of TAI since 1970-01-01; before 1972 as then.
+/// TAI minus UTC, s, at whole seconds of TAI since 1970-01-01; before 1972 the value of 1972.
 #[must_use]
-pub fn tai_less_utc_s(tai_1970_s: i64) -> i64 {
+pub fn tai_minus_utc_s(tai_1970_s: i64) -> i64 {
     let (day, second) = utc_label(tai_1970_s);
     tai_1970_s - day * DAY_S - second
 }
 
-/// Day since 1970 and second of the day, up to 86,400 in a leap second, of whole seconds of TAI since 1970.
+/// The UTC day since 1970 and second of the day (86,400 for a leap second) at whole seconds of TAI since 1970.
 fn utc_label(whole_s: i64) -> (i64, i64) {
-    let begins = |(day, offset_s): &(i64, i64)| day * DAY_S + offset_s;
-    let next = LEAPS.partition_point(|leap| begins(leap) <= whole_s);
-    let (_, offset_s) = LEAPS[next.saturating_sub(1)];
+    let start_s = |(day, offset_s): &(i64, i64)| day * DAY_S + offset_s;
+    let next = LEAP_SECONDS.partition_point(|leap| start_s(leap) <= whole_s);
+    let (_, offset_s) = LEAP_SECONDS[next.saturating_sub(1)];
     // The second before the offset changes is the leap second.
-    if let Some(leap) = LEAPS.get(next).filter(|leap| next > 0 && whole_s == begins(leap) - 1) {
+    if let Some(leap) = LEAP_SECONDS.get(next).filter(|leap| next > 0 && whole_s == start_s(leap) - 1) {
         return (leap.0 - 1, DAY_S);
     }
     let label_s = whole_s - offset_s;
     (label_s.div_euclid(DAY_S), label_s.rem_euclid(DAY_S))
 }
 
-/// TDB less TT, s, to 10 us over 1600 to 2200 (USNO Circular 179, Eq. 2.6).
-fn tdb_less_tt_s(centuries: f64) -> f64 {
+/// TDB minus TT, s, to 10 us over 1600 to 2200 (USNO Circular 179, Eq. 2.6).
+fn tdb_minus_tt_s(centuries: f64) -> f64 {
     let t = centuries;
-    let term = |size: f64, rate: f64, phase: f64| size * (rate * t + phase).sin();
+    let term = |amplitude: f64, rate: f64, phase: f64| amplitude * (rate * t + phase).sin();
     term(0.001_657, 628.307_6, 6.240_1)
         + term(0.000_022, 575.338_5, 4.297_0)
         + term(0.000_014, 1_256.615_2, 6.196_9)
@@ -239,17 +241,17 @@ fn tdb_less_tt_s(centuries: f64) -> f64 {
         + t * term(0.000_010, 628.307_6, 4.249_0)
 }
 
-/// The date and time of day, UTC to the millisecond, of TAI seconds since 1958-01-01T00:00:00.
+/// Formats TAI seconds since 1958-01-01T00:00:00 as a UTC date and time, to the millisecond.
 #[must_use]
 pub fn utc_text(tai_s: f64) -> String {
-    Tai::from_1958_s(tai_s).text(TimeScale::Utc, 3)
+    Tai::from_seconds_since_1958(tai_s).text(TimeScale::Utc, 3)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Made with astropy 8.0.2 (`Time(date, scale=scale).tai`, whose TDB is ERFA's dtdb without a place on the Earth).
+    /// From astropy 8.0.2 (`Time(date, scale=scale).tai`, with ERFA's dtdb at the geocentre for TDB).
     const DATES: [(&str, TimeScale, &str); 9] = [
         ("1972-01-01T00:00:00.000000000", TimeScale::Utc, "1972-01-01T00:00:10.000000000"),
         ("2016-12-31T23:59:59.500000000", TimeScale::Utc, "2017-01-01T00:00:35.500000000"),
@@ -265,9 +267,9 @@ mod tests {
     #[test]
     fn dates_of_all_scales_are_those_of_astropy() {
         for (date, scale, tai) in DATES {
-            let found = Tai::read(date, scale).unwrap();
-            let expected = Tai::read(tai, TimeScale::Tai).unwrap();
-            // What the series of TDB leaves out; other scales are exact.
+            let found = Tai::parse(date, scale).unwrap();
+            let expected = Tai::parse(tai, TimeScale::Tai).unwrap();
+            // The truncation of the TDB series; other scales are exact.
             let tolerance_s = if scale == TimeScale::Tdb { 1e-5 } else { 1e-9 };
             assert!(
                 found.since_s(expected).abs() < tolerance_s,
@@ -279,8 +281,8 @@ mod tests {
     }
 
     #[test]
-    fn a_table_of_leap_seconds_is_that_of_dates() {
-        // TAI - UTC as `erfa.leap_seconds.get()` has it, a year a row from 1972: the value on 1 January, and on 1 July.
+    fn leap_seconds_agree_with_erfa() {
+        // TAI - UTC from `erfa.leap_seconds.get()`: one row per year from 1972, with the values on 1 January and on 1 July.
         let by_year: [[i64; 2]; 46] = [
             [10, 11],
             [12, 12],
@@ -333,9 +335,9 @@ mod tests {
         for (year, offsets) in (1972..).zip(by_year) {
             for (month, offset) in ["01", "07"].into_iter().zip(offsets) {
                 let date = format!("{year}-{month}-01T00:00:00");
-                let utc = Tai::read(&date, TimeScale::Utc).unwrap();
-                assert_eq!(utc.since_s(Tai::read(&date, TimeScale::Tai).unwrap()), offset as f64, "{date}");
-                assert_eq!(tai_less_utc_s(utc.whole_s), offset);
+                let utc = Tai::parse(&date, TimeScale::Utc).unwrap();
+                assert_eq!(utc.since_s(Tai::parse(&date, TimeScale::Tai).unwrap()), offset as f64, "{date}");
+                assert_eq!(tai_minus_utc_s(utc.whole_s), offset);
                 // The second before has a name of its own only where one was put in.
                 let second = utc.plus_s(-0.5).text(TimeScale::Utc, 1);
                 assert_eq!(second.ends_with("23:59:60.5"), offset == before + 1, "{second}");
@@ -354,13 +356,16 @@ mod tests {
             ("2016-12-31T12:00:60", TimeScale::Utc),
             ("1971-12-31T23:59:59", TimeScale::Utc),
         ] {
-            assert_eq!(Tai::read(date, scale), None, "{date} {scale}");
+            assert_eq!(Tai::parse(date, scale), None, "{date} {scale}");
         }
-        assert_eq!(Tai::read("2027-01-01T00:00:00", TimeScale::Tai).unwrap().from_1958(), 2_177_452_800.0);
+        assert_eq!(
+            Tai::parse("2027-01-01T00:00:00", TimeScale::Tai).unwrap().seconds_since_1958(),
+            2_177_452_800.0
+        );
         assert_eq!(utc_text(2_177_452_800.0), "2026-12-31T23:59:23.000");
         // Rounding to the full second is the leap second's, too.
         assert_eq!(
-            Tai::read("2017-01-01T00:00:35.9999", TimeScale::Tai).unwrap().text(TimeScale::Utc, 3),
+            Tai::parse("2017-01-01T00:00:35.9999", TimeScale::Tai).unwrap().text(TimeScale::Utc, 3),
             "2016-12-31T23:59:60.000"
         );
     }

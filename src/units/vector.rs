@@ -10,21 +10,21 @@ pub fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// `a - b`.
+/// The difference `a - b`.
 #[inline]
 #[must_use]
 pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
-/// `a + b`.
+/// The sum `a + b`.
 #[inline]
 #[must_use]
 pub fn add(a: Vec3, b: Vec3) -> Vec3 {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
 }
 
-/// `s a`.
+/// The vector `a` times `s`.
 #[inline]
 #[must_use]
 pub fn scale(s: f64, a: Vec3) -> Vec3 {

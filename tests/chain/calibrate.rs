@@ -284,7 +284,7 @@ fn a_study_has_each_case_as_sent_and_calibrated() {
     let model = format!("model = [\"{ideal}/{}/input.fits\"]\n{STUDY}", MHZ[0]);
     let study = place.file("modelled.toml", model.as_bytes());
     args[1] = &study;
-    assert!(fail(&args).contains("one a channel of the downlink"));
+    assert!(fail(&args).contains("one for each channel of the downlink"));
     assert_eq!(made("as-sent-large"), before[0]);
 }
 
@@ -303,7 +303,7 @@ fn what_does_not_fit_is_refused() {
     // Nothing is left of what came to nothing.
     let sky = place.path("one.fits");
     succeed(&["sky", &place.pipeline, "--no-picture", "--freq-hz", "3MHz", "--nside", "4", "--out", &sky]);
-    assert!(said(&["--model", &sky]).contains("one a channel of the downlink"));
+    assert!(said(&["--model", &sky]).contains("one for each channel of the downlink"));
     assert!(!Path::new(&out).exists());
 }
 

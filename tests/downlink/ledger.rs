@@ -170,7 +170,7 @@ fn receive(arrived: &[u8]) -> Received {
     for frame in frames.into_vec() {
         calibrator.step(frame, &mut placed).unwrap();
     }
-    let completeness = calibrator.close(MissingPackets::default());
+    let completeness = calibrator.post_losses(MissingPackets::default());
     // All baselines and weights: what is placed is summed.
     let map = MapConfig { nside: 1, baseline_bp_max: 1e6, weight_max: 1e3, ..MapConfig::default() };
     let mut accumulator = Accumulator::new(map, ledger.clone());
@@ -182,7 +182,7 @@ fn receive(arrived: &[u8]) -> Received {
         accumulator.step(frame, &mut maps).unwrap();
     }
     accumulator.finish(&mut maps).unwrap();
-    let ledger = ledger.close().unwrap();
+    let ledger = ledger.balanced_report().unwrap();
     let reception = account.lock().unwrap_or_else(PoisonError::into_inner).clone();
     Received { ledger, reception, completeness, summed }
 }
@@ -396,7 +396,7 @@ fn ground_of(arrived: &[u8]) -> (LedgerReport<VisibilityReason>, Completeness) {
     }
     ground.finish(&mut maps).unwrap();
     let completeness = outcome.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    (outcome.ledger.close().unwrap(), completeness)
+    (outcome.ledger.balanced_report().unwrap(), completeness)
 }
 
 /// Passes and frames that do not arrive, of each of which a ground may notice nothing.
@@ -489,7 +489,7 @@ fn forged(count: u64, s: u64) -> Vec<u8> {
 #[test]
 fn forged_packets_of_one_time_are_refused_beyond_a_number() {
     const ROOM: u64 = 100;
-    let mut collector = Collector::new(1 << 20).with_packets(ROOM);
+    let mut collector = Collector::new(1 << 20).with_packets_max(ROOM);
     let all: Vec<u8> = (0..3 * ROOM).flat_map(|k| forged(k, 5)).collect();
     for [beyond, duplicates] in [[2 * ROOM, 0], [4 * ROOM, ROOM]] {
         collector.push(&all);
@@ -503,7 +503,7 @@ fn forged_packets_of_one_time_are_refused_beyond_a_number() {
 #[test]
 fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
     const ROOM: usize = 100;
-    let mut collector = Collector::new(1 << 20).with_intervals(ROOM);
+    let mut collector = Collector::new(1 << 20).with_intervals_max(ROOM);
     let mut push = |packets: Vec<u8>| {
         collector.push(&packets);
         while collector.next_delivery(&|_| true).unwrap().is_some() {}

@@ -48,7 +48,7 @@ fn a_damaged_checkpoint_is_told_and_the_one_before_used() {
         }
         let output = place.output("state", &[&file], &every);
         let said = String::from_utf8(output.stderr).unwrap();
-        assert!(!output.status.success() && said.contains("none of its 2 checkpoints holds"), "{said}");
+        assert!(!output.status.success() && said.contains("none of its 2 checkpoints can be used"), "{said}");
         assert_eq!(checkpoints(Path::new(&folder)).len(), 2);
     }
 }

@@ -16,7 +16,7 @@ fn core(place: &Ground, state: &str, wait_bytes: u64, cancel: &Cancel) -> Core {
     let source = ConfigSource { file: Some(place.pipeline.clone().into()), ..ConfigSource::default() };
     let settings = source.load_ground().unwrap().ground(wait_bytes);
     let ground = Core::open(Path::new(&place.path(state)), &settings, u64::MAX).unwrap();
-    ground.cancelled_by(cancel, Duration::ZERO)
+    ground.with_cancel(cancel, Duration::ZERO)
 }
 
 #[test]
@@ -35,7 +35,7 @@ fn what_arrives_after_an_interrupt_is_held_and_added_by_the_next_session() {
                 cancel.cancel();
                 ground.step(parts[1].to_vec(), &mut out).unwrap();
                 ground.finish(&mut out).unwrap();
-                outcome.ledger.close().unwrap()
+                outcome.ledger.balanced_report().unwrap()
             };
             let name = |name: &str| format!("{name}.{wait_bytes}");
             let whole = session(&name("whole"), [&bytes, &[]]);

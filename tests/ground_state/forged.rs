@@ -52,5 +52,5 @@ fn memory_follows_what_a_state_holds_not_what_it_announces() {
     let announced = (u64::from(u32::MAX) - (16 << 20)) / size_of::<(String, String)>() as u64;
     forge(&place.path("state"), |_| 16, &[&[0xFD][..], &announced.to_le_bytes()].concat());
     let (code, said) = within_the_limit(&["gaps".to_owned(), place.path("state")]);
-    assert!(code == Some(1) && said.contains("checkpoints holds"), "{code:?} {said}");
+    assert!(code == Some(1) && said.contains("checkpoints can be used"), "{code:?} {said}");
 }

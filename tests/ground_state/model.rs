@@ -144,7 +144,7 @@ impl Mission {
 
     /// The packets that a checkpoint says it has received.
     fn received(&self, checkpoint: &Path) -> Packets {
-        let survey = CoverageSurvey::of(checkpoint).unwrap();
+        let survey = CoverageSurvey::read(checkpoint).unwrap();
         let sets = &survey.received().sets;
         self.having(|k| {
             let PacketHeader { kind, count, time, .. } = self.headers[k];
@@ -525,7 +525,7 @@ impl Sequence<'_> {
         let opened = Ground::open(&self.states[at].folder, &config, u64::MAX);
         let received = &self.states[at].received;
         let Some(&before) = received.len().checked_sub(2).and_then(|k| received.get(k)) else {
-            assert!(matches!(opened, Err(GroundError::NoneHolds { .. })));
+            assert!(matches!(opened, Err(GroundError::NoUsableCheckpoint { .. })));
             std::fs::write(newest, good).unwrap();
             return;
         };

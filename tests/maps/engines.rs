@@ -4,7 +4,7 @@
 use faer::{Mat, Side};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
-use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, orbit_of};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, nominal_orbit};
 use lunarray::imaging::{
     HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
     solve_harmonics, solve_pixels, spectrum, traces,
@@ -87,7 +87,7 @@ pub fn harmonic_sums(blocks: &[PlacedVisibilities], l_max: usize, baseline_m_max
         baseline_m_max,
         moon_radius_m: ArrayConfig::default().moon_radius_m,
         response: AntennaResponse::Isotropic,
-        orbit: orbit_of(&blocks[0], GeometryLimits::default()).unwrap(),
+        orbit: nominal_orbit(&blocks[0], GeometryLimits::default()).unwrap(),
         companion_seed: 1,
         weight_max: 1e-5,
     };
@@ -295,7 +295,7 @@ fn solutions_start_warm_and_end_early() {
     let convergence = ended.diagnostics.convergence.unwrap();
     assert!(!convergence.converged && convergence.iterations <= 12);
     assert!(distance(&ended.map_k, &cold.map_k) < 0.1, "{}", distance(&ended.map_k, &cold.map_k));
-    assert!(hurried.now().is_none());
+    assert!(hurried.progress().is_none());
 }
 
 /// With a prior the map goes to it where nothing was measured.

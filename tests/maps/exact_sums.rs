@@ -3,7 +3,7 @@
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
-use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, orbit_of};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, nominal_orbit};
 use lunarray::imaging::{
     AccumulationError, NormalEngine, NormalSums, PixelEngine, PixelSetup, Refusal, automatic_weight_max,
 };
@@ -163,7 +163,7 @@ fn harmonic(weight_max: f64) -> HarmonicEngine {
         baseline_m_max: 3_000.0,
         moon_radius_m: ArrayConfig::default().moon_radius_m,
         response: AntennaResponse::Isotropic,
-        orbit: orbit_of(block, GeometryLimits::default()).unwrap(),
+        orbit: nominal_orbit(block, GeometryLimits::default()).unwrap(),
         companion_seed: 3,
         weight_max,
     })

@@ -10,7 +10,7 @@ use lunarray::imaging::anywhere::AssumedInstrument;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::{
     Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
-    SnapshotSums, SumCounts,
+    SnapshotData, SumCounts,
 };
 use lunarray::imaging::{SolveError, SolveWatch, Solver, SolverSetup, StoppingRule};
 use lunarray::response::pixel::PixelMethod;
@@ -87,7 +87,7 @@ fn positions_just_above_the_surface_or_far_away_end_no_refined_ground() {
         let mut out = Outlet::collect();
         accumulator.step(PlacedFrame::Instrument(instrument()), &mut out).unwrap();
         for _ in 0..2 {
-            ledger.sampled(bad.len() as u64);
+            ledger.add_sampled(bad.len() as u64);
             accumulator.step(PlacedFrame::Visibilities(bad.clone()), &mut out).unwrap();
             bad.time_s.iter_mut().for_each(|time_s| *time_s += 1e4);
         }
@@ -108,11 +108,11 @@ fn positions_within_the_moon_make_no_engine_and_end_nothing() {
         let count = good.len() as u64;
         accumulator.step(PlacedFrame::Instrument(instrument()), &mut out).unwrap();
         for placed in [&bad, &good] {
-            ledger.sampled(count);
+            ledger.add_sampled(count);
             accumulator.step(PlacedFrame::Visibilities(placed.clone()), &mut out).unwrap();
         }
         accumulator.finish(&mut out).unwrap();
-        let report = ledger.close().unwrap();
+        let report = ledger.balanced_report().unwrap();
         assert_eq!((report.count(VisibilityReason::OffAltitude), report.accumulated), (count, count));
         assert_eq!(out.into_vec().len(), 1);
     }
@@ -140,7 +140,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             is_final,
             span_s: [0.0, 1.0],
             nside: 2,
-            sums: SnapshotSums::Pixel(sums),
+            data: SnapshotData::Pixel(sums),
         };
         let setup = SolverSetup {
             epsilon: PerChannel::All(1e-4),
@@ -152,7 +152,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
             refine: RefineRule { passes_max: 0, residual_max: 1e-4 },
             assumed: AssumedInstrument::default(),
-            passes: None,
+            iteration_folder: None,
             trace_probes: 0,
             samples: 0,
             watch: SolveWatch::default(),

@@ -248,7 +248,7 @@ fn an_iteration_says_how_it_ended() {
     assert_eq!(short, SolveError::PriorLength { found: 12, expected: sums.unknowns() });
     let cancel = Cancel::new();
     cancel.cancel();
-    let watch = SolveWatch::new(cancel).within(std::time::Duration::ZERO);
+    let watch = SolveWatch::new(cancel).with_grace(std::time::Duration::ZERO);
     assert_eq!(solve(None, few, &watch).unwrap_err(), SolveError::Interrupted);
     let empty = matrix_free(archive(&[]), PixelMethod::Centre);
     let nothing = solve_matrix_free(&empty, 1e-4, None, None, few, SolveWatch::default().named("test"));

@@ -20,7 +20,7 @@ use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, 
 use lunarray::imaging::{
     HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule, solve_harmonics,
 };
-use lunarray::response::general::{GeneralRows, PairAt, RowsSetup};
+use lunarray::response::general::{GeneralRows, RowsSetup, TimedPair};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
 use lunarray::runtime::Cancel;
 use lunarray::sky::harmonics::Alm;
@@ -41,7 +41,7 @@ const EPSILON: f64 = 1e-4;
 const BASELINES_M: [f64; 5] = [30.0, 55.0, 95.0, 160.0, 290.0];
 
 /// Thirds of orbits, all nodes of the plane: one satellite of a pair trails the other and swings out of its plane.
-fn geometry(altitude_m: f64, cross: f64, step_s: f64, orbits: usize, baselines_m: &[f64]) -> Vec<PairAt> {
+fn geometry(altitude_m: f64, cross: f64, step_s: f64, orbits: usize, baselines_m: &[f64]) -> Vec<TimedPair> {
     geometry_over(altitude_m, cross, step_s, orbits, baselines_m, TAU)
 }
 
@@ -53,7 +53,7 @@ fn geometry_over(
     orbits: usize,
     baselines_m: &[f64],
     turn_rad: f64,
-) -> Vec<PairAt> {
+) -> Vec<TimedPair> {
     let eccentricity = altitude_m / RADIUS_M;
     let mut all = Vec::new();
     for (k, baseline_m) in baselines_m.iter().enumerate() {
@@ -72,7 +72,7 @@ fn geometry_over(
             };
             let start_s = PERIOD_S * (orbit as f64 * 13.0 + 0.29 * ((orbit * 7 + k * 3) % 11) as f64);
             let count = (PERIOD_S / 3.0 / step_s) as usize;
-            all.extend((0..count).map(|n| start_s + step_s * n as f64).map(|time_s| PairAt {
+            all.extend((0..count).map(|n| start_s + step_s * n as f64).map(|time_s| TimedPair {
                 pair,
                 time_s,
                 r_i_m: at(time_s, cross * baseline_m / RADIUS_M),
@@ -83,16 +83,21 @@ fn geometry_over(
     all
 }
 
-fn weight(at: &PairAt) -> f64 {
+fn weight(at: &TimedPair) -> f64 {
     1e-8 * (1.0 + f64::from(at.pair.j % 3))
 }
 
 /// Blocks of up to `size` visibilities of one pair.
-fn blocks(at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
+fn blocks(at: &[TimedPair], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
     blocks_at(WAVELENGTH_M, at, values, size)
 }
 
-fn blocks_at(wavelength_m: f64, at: &[PairAt], values: &[Complex64], size: usize) -> Vec<PlacedVisibilities> {
+fn blocks_at(
+    wavelength_m: f64,
+    at: &[TimedPair],
+    values: &[Complex64],
+    size: usize,
+) -> Vec<PlacedVisibilities> {
     let frequency_hz = SPEED_OF_LIGHT_M_S / wavelength_m;
     let mut blocks: Vec<PlacedVisibilities> = Vec::new();
     for (at, value) in at.iter().zip(values) {
@@ -154,7 +159,7 @@ fn solve(
     rule: RefineRule,
     watch: &SolveWatch,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
-    let steps = RefineSteps { start: None, passed: &mut |_| {} };
+    let steps = RefineSteps { start: None, save: &mut |_| {} };
     solve_refined(sums, request, (rule, &Regulariser::default()), None, steps, watch.named("test"))
 }
 
@@ -192,7 +197,7 @@ fn rows(wavelength_m: f64, l_max: usize) -> GeneralRows {
 const MONTH_RAD: f64 = 0.4;
 
 /// Data of a sky with degrees beyond the map's, which no map fits.
-fn seen_sky(wavelength_m: f64, at: &[PairAt], l_max: usize) -> Vec<Complex64> {
+fn seen_sky(wavelength_m: f64, at: &[TimedPair], l_max: usize) -> Vec<Complex64> {
     let l_max = l_max + 8;
     let mut sky = Alm::zeros(l_max);
     for l in 0..=l_max {
@@ -275,7 +280,7 @@ fn a_refined_map_takes_an_r_of_the_degree() {
     let sums = sums(10, &blocks(&at, &seen_sky(WAVELENGTH_M, &at, 10), 1000));
     let rule = RefineRule { passes_max: 20, residual_max: 1e-6 };
     let solved = |regulariser: &Regulariser| {
-        let steps = RefineSteps { start: None, passed: &mut |_| {} };
+        let steps = RefineSteps { start: None, save: &mut |_| {} };
         let (rule, watch) = ((rule, regulariser), SolveWatch::default());
         solve_refined(&sums, request(4), rule, None, steps, watch.named("test")).unwrap().0
     };
@@ -499,7 +504,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     let watch = SolveWatch::default();
     let mut passes = Vec::new();
     let mut keep = |x: [&[f64]; 2]| passes.push(x.map(<[f64]>::to_vec));
-    let steps = RefineSteps { start: None, passed: &mut keep };
+    let steps = RefineSteps { start: None, save: &mut keep };
     let (whole, refinement) =
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap();
@@ -508,7 +513,7 @@ fn an_earlier_solution_saves_the_passes_that_led_to_it() {
     assert_eq!(passes.last(), Some(&whole.unknowns));
     // The matrix tells errors in x from residuals by its condition, as far as that is measured: a prior of 1e-4 of W_max.
     let go_on = |start: [Vec<f64>; 2]| {
-        let steps = RefineSteps { start: Some(start), passed: &mut |_| {} };
+        let steps = RefineSteps { start: Some(start), save: &mut |_| {} };
         solve_refined(&sums, request(4), (rule, &Regulariser::default()), None, steps, watch.named("test"))
             .unwrap()
     };
@@ -538,7 +543,7 @@ fn interrupted_before_its_first_pass_there_is_no_map() {
     let at = geometry(20e3, 0.02, 300.0, 2, &BASELINES_M[..1]);
     let sums = sums(4, &blocks(&at, &vec![Complex64::ONE; at.len()], 1000));
     let cancel = Cancel::new();
-    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    let watch = SolveWatch::new(cancel.clone()).with_grace(Duration::ZERO);
     let rule = RefineRule { passes_max: 2, residual_max: 1e-9 };
     assert!(solve(&sums, request(2), rule, &watch).is_ok());
     cancel.cancel();

@@ -74,7 +74,7 @@ fn interrupted_traces_are_none() {
     let sums = harmonic_sums(&observe(&sky, 3e6, 250.0, 100), 20, 250.0);
     let w_max = w_max(&sums);
     let cancel = Cancel::new();
-    let watch = SolveWatch::new(cancel.clone()).within(Duration::ZERO);
+    let watch = SolveWatch::new(cancel.clone()).with_grace(Duration::ZERO);
     assert!(traces(&sums, 0.1, w_max, 2, watch.named("test")).unwrap().is_some());
     cancel.cancel();
     assert_eq!(traces(&sums, 0.1, w_max, 2, watch.named("test")), Ok(None));

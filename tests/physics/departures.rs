@@ -76,7 +76,7 @@ fn error(real: &mut HarmonicModel, nominal: &mut HarmonicModel, u: f64) -> f64 {
         .iter()
         .map(|state| {
             let [r_i, r_j] = pair(state, inclination, radius);
-            orbit.pair(&PairOrientation::of(r_i, r_j).unwrap(), WAVELENGTH_M).unwrap().state
+            orbit.pair(&PairOrientation::of_pair(r_i, r_j).unwrap(), WAVELENGTH_M).unwrap().state
         })
         .collect();
     let mut values = [vec![Complex64::ZERO; states.len()], vec![Complex64::ZERO; states.len()]];

@@ -4,7 +4,9 @@
 use std::f64::consts::TAU;
 
 use lunarray::frames::AntennaResponse;
-use lunarray::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsRefusal, RowsSetup};
+use lunarray::response::general::{
+    GeneralRows, ObservationDetails, PairResponse, RowsRefusal, RowsSetup, TimedPair,
+};
 use lunarray::response::harmonic::{HarmonicModel, ModelSettings, PairState, PatternGeometry};
 use lunarray::response::pixel::{Directions, PairGeometry, SatelliteAntenna, antenna_sums, sky_sums};
 use lunarray::sky::harmonics::{Alm, AnalysisOptions, Method, analysis, synthesis};
@@ -62,7 +64,7 @@ struct Shape {
 }
 
 /// A third of each of several orbits of a pair: one trails the other by `baseline_m` and swings out of its plane.
-fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize) -> Vec<PairAt> {
+fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize) -> Vec<TimedPair> {
     let of_orbit = |orbit: usize| {
         let node = TAU * (orbit as f64 + 0.3) / orbits as f64;
         let start_s = PERIOD_S * (13 * orbit) as f64 + 1000.0 * orbit as f64;
@@ -78,12 +80,12 @@ fn passes(shape: Shape, pair: Pair, baseline_m: f64, step_s: f64, orbits: usize)
 }
 
 /// Positions at some times of the first of one orbit of [`passes`].
-fn passes_at(shape: Shape, pair: Pair, baseline_m: f64, times_s: &[f64]) -> Vec<PairAt> {
+fn passes_at(shape: Shape, pair: Pair, baseline_m: f64, times_s: &[f64]) -> Vec<TimedPair> {
     places(shape, pair, baseline_m, TAU * 0.3, times_s)
 }
 
 /// Positions at some times of an orbit with this node.
-fn places(shape: Shape, pair: Pair, baseline_m: f64, node: f64, times_s: &[f64]) -> Vec<PairAt> {
+fn places(shape: Shape, pair: Pair, baseline_m: f64, node: f64, times_s: &[f64]) -> Vec<TimedPair> {
     let axis_m = RADIUS_M;
     let eccentricity = shape.altitude_m / axis_m;
     let lag_s = baseline_m / (TAU * axis_m / PERIOD_S);
@@ -102,7 +104,7 @@ fn places(shape: Shape, pair: Pair, baseline_m: f64, node: f64, times_s: &[f64])
         [x * co - y * so * ci, x * so + y * co * ci, y * si]
     };
     let tilt = shape.cross * baseline_m / axis_m;
-    let place = |&time_s: &f64| PairAt {
+    let place = |&time_s: &f64| TimedPair {
         pair,
         time_s,
         r_i_m: at(time_s, node, tilt),
@@ -145,7 +147,7 @@ fn on_a_circle_rows_are_those_of_the_harmonic_model() {
             })
             .collect();
         states.sort_by(|a, b| a.phase_rad.total_cmp(&b.phase_rad));
-        let pairs: Vec<PairAt> = states
+        let pairs: Vec<TimedPair> = states
             .iter()
             .enumerate()
             .map(|(k, state)| {
@@ -156,7 +158,7 @@ fn on_a_circle_rows_are_those_of_the_harmonic_model() {
                     let (s, c) = (state.phase_rad + off).sin_cos();
                     [c * co - s * so * ci, c * so + s * co * ci, s * si].map(|v| RADIUS_M * v)
                 });
-                PairAt { pair: Pair { i: 0, j: 1 }, time_s: k as f64, r_i_m, r_j_m }
+                TimedPair { pair: Pair { i: 0, j: 1 }, time_s: k as f64, r_i_m, r_j_m }
             })
             .collect();
         let mut expected = vec![Complex64::ZERO; states.len()];
@@ -184,9 +186,9 @@ fn off_a_circle_rows_are_direct_sums() {
     ] {
         let mut pairs = passes(shape, pair, 400.0, 600.0, 3);
         // The other way round: the conjugate.
-        let turned: Vec<PairAt> =
-            pairs.iter().map(|at| PairAt { r_i_m: at.r_j_m, r_j_m: at.r_i_m, ..*at }).collect();
-        pairs.extend(turned.into_iter().map(|at| PairAt { pair: Pair { i: 6, j: 7 }, ..at }));
+        let turned: Vec<TimedPair> =
+            pairs.iter().map(|at| TimedPair { r_i_m: at.r_j_m, r_j_m: at.r_i_m, ..*at }).collect();
+        pairs.extend(turned.into_iter().map(|at| TimedPair { pair: Pair { i: 6, j: 7 }, ..at }));
         let rows = GeneralRows::new(setup(L_MAX, AntennaResponse::Isotropic));
         let found = rows.forward(&rows.plan_direct(&pairs).unwrap(), std::slice::from_ref(&sky)).remove(0);
         let geometries: Vec<PairGeometry> = pairs
@@ -268,7 +270,7 @@ fn rows_hold_over_many_orbits_and_where_a_satellite_changes_its_velocity() {
     }
     // In the middle of the sixth pass.
     let from_s = PERIOD_S * (13.0 * 5.0) + 5000.0 + PERIOD_S / 6.0 + 1.3;
-    let is_pass = |at: &PairAt| (at.time_s - from_s).abs() < PERIOD_S / 3.0;
+    let is_pass = |at: &TimedPair| (at.time_s - from_s).abs() < PERIOD_S / 3.0;
     for at in pairs.iter_mut().filter(|at| is_pass(at) && at.time_s > from_s) {
         let away: Vec3 = std::array::from_fn(|k| at.r_j_m[k] - at.r_i_m[k]);
         let length_m = away.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -357,7 +359,7 @@ fn antenna(elements: AntennaResponse, satellite: u8, time_s: f64) -> SatelliteAn
     }
 }
 
-fn antennas_of(elements: AntennaResponse, at: &PairAt) -> [SatelliteAntenna; 2] {
+fn antennas_of(elements: AntennaResponse, at: &TimedPair) -> [SatelliteAntenna; 2] {
     [at.pair.i, at.pair.j].map(|satellite| antenna(elements, satellite, at.time_s))
 }
 
@@ -386,7 +388,9 @@ fn antennas_that_differ(elements: AntennaResponse) {
         let [a, b] = antennas_of(elements, &pairs[k]);
         PairResponse::of_antennas([&a, &b])
     };
-    let plan = rows.plan_of(&pairs, &Observed { response: Some(&response), ..Observed::default() }).unwrap();
+    let plan = rows
+        .plan_with(&pairs, &ObservationDetails { response: Some(&response), ..ObservationDetails::default() })
+        .unwrap();
     assert!(plan.computed() < pairs.len());
     let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
     let geometries: Vec<_> = pairs
@@ -415,17 +419,20 @@ fn antennas_that_differ(elements: AntennaResponse) {
     let [a, b] = [antenna(elements, 1, 0.0), antenna(elements, 4, 5e3)];
     let constant = PairResponse::of_antennas([&a, &b]);
     let product: Vec<f64> =
-        pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.at(*n) * t).collect();
+        pixel_directions(NSIDE).iter().zip(&map).map(|(n, t)| constant.value(*n) * t).collect();
     let product = analysis(&product, L_MAX + 6, &AnalysisOptions { method: Method::ACCURATE }).unwrap().alm;
     let same = |_: usize| constant.clone();
     // Rows of lower degrees do not hold it.
     let most = constant.degree() - 2;
     let lower =
         GeneralRows::new(RowsSetup { polynomial_degree: most, ..setup(L_MAX, AntennaResponse::Isotropic) });
-    let refused = lower.plan_of(&pairs, &Observed { response: Some(&same), ..Observed::default() });
+    let refused = lower
+        .plan_with(&pairs, &ObservationDetails { response: Some(&same), ..ObservationDetails::default() });
     let error = refused.map(|plan| plan.rows()).unwrap_err();
-    assert_eq!(error.refusal, RowsRefusal::Degree { degree: most + 2, most });
-    let plan = rows.plan_of(&pairs, &Observed { response: Some(&same), ..Observed::default() }).unwrap();
+    assert_eq!(error.refusal, RowsRefusal::Degree { degree: most + 2, degree_max: most });
+    let plan = rows
+        .plan_with(&pairs, &ObservationDetails { response: Some(&same), ..ObservationDetails::default() })
+        .unwrap();
     let found = rows.forward(&plan, std::slice::from_ref(&sky)).remove(0);
     let plain = GeneralRows::new(setup(L_MAX + 6, AntennaResponse::Isotropic));
     let expected = plain.forward(&plain.plan_direct(&pairs).unwrap(), &[product]).remove(0);
@@ -451,7 +458,7 @@ fn averages_over_integrations_are_those_of_many_instants() {
         // Midpoints of as many parts of each integration, at their own positions.
         let fine = passes_at(shape, pair, baseline_m, &{
             let part_s = step_s / INSTANTS as f64;
-            let of = |at: &PairAt| {
+            let of = |at: &TimedPair| {
                 let start_s = at.time_s - 0.5 * step_s;
                 (0..INSTANTS).map(move |k| start_s + (k as f64 + 0.5) * part_s)
             };
@@ -463,8 +470,8 @@ fn averages_over_integrations_are_those_of_many_instants() {
             .map(|instants| instants.iter().sum::<Complex64>() / INSTANTS as f64)
             .collect();
         let duration_s = vec![step_s as f32; pairs.len()];
-        let observed = Observed { duration_s: &duration_s, ..Observed::default() };
-        let plan = rows.plan_of(&pairs, &observed).unwrap();
+        let observed = ObservationDetails { duration_s: &duration_s, ..ObservationDetails::default() };
+        let plan = rows.plan_with(&pairs, &observed).unwrap();
         assert_eq!(plan.instants(), 0);
         let found = rows.forward(&plan, &skies).remove(0);
         let middle = rows.forward(&rows.plan(&pairs).unwrap(), &skies).remove(0);
@@ -473,9 +480,10 @@ fn averages_over_integrations_are_those_of_many_instants() {
         assert!(left_out > 10.0 * error, "{baseline_m}: {error:e}, {left_out:e}");
 
         // Without others about it nobody knows how a pair moves.
-        let alone: Vec<PairAt> = pairs.iter().step_by(pairs.len() / 3).copied().collect();
-        let observed = Observed { duration_s: &duration_s[..alone.len()], ..Observed::default() };
-        assert_eq!(rows.plan_of(&alone, &observed).unwrap().instants(), alone.len());
+        let alone: Vec<TimedPair> = pairs.iter().step_by(pairs.len() / 3).copied().collect();
+        let observed =
+            ObservationDetails { duration_s: &duration_s[..alone.len()], ..ObservationDetails::default() };
+        assert_eq!(rows.plan_with(&alone, &observed).unwrap().instants(), alone.len());
     }
 }
 
@@ -491,8 +499,9 @@ fn adjoint_and_normal_products_of_averages_with_antennas_are_the_transposes() {
         PairResponse::of_dipoles(a.axes_hat[0], b.axes_hat[0])
     };
     let duration_s = vec![14.0; pairs.len()];
-    let plan =
-        rows.plan_of(&pairs, &Observed { duration_s: &duration_s, response: Some(&response) }).unwrap();
+    let plan = rows
+        .plan_with(&pairs, &ObservationDetails { duration_s: &duration_s, response: Some(&response) })
+        .unwrap();
     let skies = [sky(L_MAX), {
         let mut other = sky(L_MAX);
         *other.get_mut(3, 2) = Complex64::new(3e5, -1e5);

@@ -3,7 +3,7 @@
 use crate::common;
 
 use lunarray::array::{
-    Array, ArrayConfig, EarthShadow, Formation, IntegrationRule, ObservingWindows, integration_time_s,
+    Array, ArrayConfig, EarthOccultation, Formation, IntegrationRule, ObservingWindows, integration_time_s,
 };
 use lunarray::units::vector::{norm, sub};
 use lunarray::units::{MissionTime, Pair, all_pairs};
@@ -122,7 +122,7 @@ const EARTH_SETS_S: [f64; 8] = [
 fn a_pair_observes_where_both_daughters_are_in_the_shadow() {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let window = ObservingWindows::new(&array, 0.0, 1e5).next().unwrap();
-    let shadow = EarthShadow::new(&array, window);
+    let shadow = EarthOccultation::new(&array, window);
     for pair in all_pairs(8) {
         let sets_s = EARTH_SETS_S[usize::from(pair.i)].max(EARTH_SETS_S[usize::from(pair.j)]);
         let until = window.end;
@@ -135,12 +135,12 @@ fn a_pair_observes_where_both_daughters_are_in_the_shadow() {
     }
     // A window that is cut short before the last daughters lose the Earth.
     let end = MissionTime::from_seconds(EARTH_SETS_S[6] + 1.0);
-    let cut = EarthShadow::new(&array, lunarray::frames::ObservingWindow { end, ..window });
+    let cut = EarthOccultation::new(&array, lunarray::frames::ObservingWindow { end, ..window });
     let late = MissionTime::from_seconds(EARTH_SETS_S[6] + 1e-3);
     assert!(cut.covers(Pair { i: 0, j: 6 }, late, end));
     assert!(!cut.covers(Pair { i: 6, j: 7 }, late, end));
     // One that begins after the last of them did.
     let start = MissionTime::from_seconds(EARTH_SETS_S[7] + 1e-3);
-    let whole = EarthShadow::new(&array, lunarray::frames::ObservingWindow { start, ..window });
+    let whole = EarthOccultation::new(&array, lunarray::frames::ObservingWindow { start, ..window });
     assert!(whole.covers(Pair { i: 6, j: 7 }, start, window.end));
 }

@@ -76,7 +76,7 @@ fn expectations(
                     r_i_m: array.position_m(block.pair.i.into(), t_s),
                     r_j_m: array.position_m(block.pair.j.into(), t_s),
                     span_rad: 0.0,
-                    at: None,
+                    pair_time: None,
                 }
             }));
         }

@@ -287,9 +287,9 @@ fn read_for(
     path: &Path,
     frequency_hz: f64,
     frequency: MapFrequency,
-    may_be_dark: bool,
+    is_dark_accepted: bool,
 ) -> Result<SkyMap, FitsError> {
-    let channel = SkyChannel { frequency_hz, may_be_dark, shares_file: false };
+    let channel = SkyChannel { frequency_hz, is_dark_accepted, is_file_shared: false };
     read_sky(path, &channel, &SkyConfig { frequency, ..SkyConfig::default() })
 }
 
@@ -297,13 +297,13 @@ fn read_for(
 fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("sky.fits");
-    let read = |value: f64, may_be_dark: bool| {
+    let read = |value: f64, is_dark_accepted: bool| {
         let mut values = vec![0.0; 48];
         (values[7], values[9]) = (value, 0.5 * value);
         let map = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let options = WriteOptions { precision: Precision::Double, ..WriteOptions::default() };
         write_map(&path, &map, &options).unwrap();
-        read_for(&path, 3e6, MapFrequency::MustMatch, may_be_dark).map_err(|error| error.to_string())
+        read_for(&path, 3e6, MapFrequency::MustMatch, is_dark_accepted).map_err(|error| error.to_string())
     };
     assert!(read(1e7, false).is_ok() && read(0.0, true).is_ok());
     // -1.5 K in 48 pixels.
@@ -345,9 +345,9 @@ fn a_sky_of_another_frequency_is_refused_or_scaled() {
         assert!((found / value / factor - 1.0).abs() < 1e-11, "{found} {value}");
     }
     // A map that does not say its frequency may be of any, but of one channel, and cannot be scaled.
-    let shared = SkyChannel { frequency_hz: 10e6, may_be_dark: true, shares_file: true };
+    let shared = SkyChannel { frequency_hz: 10e6, is_dark_accepted: true, is_file_shared: true };
     let said = read_sky(&unknown, &shared, &SkyConfig::default()).unwrap_err().to_string();
-    assert!(said.contains("FREQ is missing") && said.contains("one map a channel"), "{said}");
+    assert!(said.contains("FREQ is missing") && said.contains("one map per channel"), "{said}");
     let at_own = SkyChannel { frequency_hz: 3e6, ..shared };
     assert!(read_sky(&at_3, &at_own, &SkyConfig::default()).is_ok());
     assert_eq!(read_for(&unknown, 10e6, MapFrequency::MustMatch, true).unwrap(), map(4));
@@ -427,7 +427,7 @@ fn the_first_header_says_what_the_table_s_leaves_out() {
     let map = read_for(&path, 408e6, MapFrequency::MustMatch, false).unwrap();
     // At nside 1 both orders are the same.
     assert_eq!((map.frame(), map.values()[3]), (Frame::Galactic, 23.0));
-    let understood = MapOutline::of(&path, &ReadOptions::default()).unwrap().to_string();
+    let understood = MapOutline::read(&path, &ReadOptions::default()).unwrap().to_string();
     for part in ["408 MHz", "Galactic frame", "mK", "column `TEMPERATURE` of 2", "nside 1", "mean 2.55"] {
         assert!(understood.contains(part), "{part}: {understood}");
     }
@@ -472,7 +472,7 @@ fn a_column_is_of_the_channel_that_it_names() {
         |names: [&'static str; 3]| [1.0_f32, 2.0, 3.0].map(|k| (names[k as usize - 1], "K", [k * 1e5; 12]));
     let write = |names| foreign_map(&path, &["COORDSYS= 'G'"], &["NSIDE   = 1"], &columns(names));
     write(["T_1MHz", "T_3MHz", "T_10.0MHz"]);
-    let shared = |frequency_hz| SkyChannel { frequency_hz, may_be_dark: false, shares_file: true };
+    let shared = |frequency_hz| SkyChannel { frequency_hz, is_dark_accepted: false, is_file_shared: true };
     for (hz, value) in [(1e6, 1e5), (3e6, 2e5), (10e6, 3e5)] {
         assert_eq!(read_sky(&path, &shared(hz), &SkyConfig::default()).unwrap().values()[0], value);
     }

@@ -1,6 +1,7 @@
-//! Where the Earth and the Sun are, seen from the Moon's centre.
+//! Directions of the Earth and the Sun from the Moon's centre.
 //!
-//! Orbits with dates have both as they are; a mission without has an idealised Earth on a circle in the ecliptic.
+//! Missions with dates use ephemerides of both. A mission without dates has an idealised Earth on a circle in the
+//! ecliptic.
 
 mod moon;
 mod sun;
@@ -15,26 +16,26 @@ use crate::units::constants::SIDEREAL_MONTH_S;
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, dot, norm, sub, unit};
 
-/// Steps of the table of directions, s: cubic interpolation of a motion of 13 degrees a day errs by 2e-10 rad.
+/// Step of the table of directions, s: cubic interpolation of a motion of 13 degrees per day errs by 2e-10 rad.
 const STEP_S: f64 = 3600.0;
 
-/// Longest table, steps: 23 years. Beyond it directions come from the series, which takes 3 us.
+/// Maximum length of the table, steps: 23 years. Beyond it directions come from the series, which takes 3 us.
 const STEPS_MAX: f64 = 2e5;
 
-/// Angle by which the Earth may be above the limb and count as hidden by it, degrees: its radius seen from the Moon.
+/// Angle above the limb up to which the Earth counts as hidden, degrees: its radius seen from the Moon.
 const LIMB_DEG: f64 = 1.0;
 
-/// Which Earth a mission has.
+/// Model of the Earth's motion in a mission.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum EarthModel {
-    /// An idealised one, on a circle in the ecliptic: its longitude at the epoch, degrees.
+    /// Idealised Earth on a circle in the ecliptic: its longitude at the epoch, degrees.
     Circle(f64),
-    /// The Earth of the dates.
+    /// Ephemeris of the Earth by date.
     Dated,
 }
 
 impl EarthModel {
-    /// The Earth of an array: orbits of files have dates.
+    /// Model of the Earth for an array: orbits from files have dates.
     #[must_use]
     pub fn of(config: &ArrayConfig) -> Self {
         if config.oem.is_empty() { Self::Circle(config.earth_longitude_deg) } else { Self::Dated }
@@ -45,7 +46,7 @@ impl EarthModel {
     pub fn hat(self, epoch_tai_s: f64, t_s: f64) -> Vec3 {
         match self {
             Self::Circle(earth_deg) => Earth::Circle(earth_deg.to_radians()).hat(t_s),
-            Self::Dated => earth_hat(Tai::from_1958_s(epoch_tai_s).plus_s(t_s)),
+            Self::Dated => earth_hat(Tai::from_seconds_since_1958(epoch_tai_s).plus_s(t_s)),
         }
     }
 }
@@ -59,8 +60,9 @@ impl fmt::Display for EarthModel {
     }
 }
 
-/// Whether the Moon hides the Earth, as it is by the dates, from satellite 1 at both ends of an ephemeris segment: to a degree, the
-/// Earth's own radius. That of observing windows is, unless the mission's Earth is an idealised one.
+/// Whether the Moon hides the Earth, by its ephemeris, from satellite 1 at both ends of an ephemeris segment: to a
+/// degree, the Earth's own radius. Segments of observing windows satisfy this, unless the mission's Earth is
+/// idealised.
 #[must_use]
 #[doc(hidden)]
 pub fn earth_is_hidden_by_date(segment: &EphemerisSegment, epoch_tai_s: f64, moon_radius_m: f64) -> bool {
@@ -76,12 +78,12 @@ pub fn earth_is_hidden_by_date(segment: &EphemerisSegment, epoch_tai_s: f64, moo
     })
 }
 
-/// Where the Earth is.
+/// Position of the Earth.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Earth {
-    /// On a circle in the ecliptic: its longitude at the epoch, rad.
+    /// Idealised, on a circle in the ecliptic: its longitude at the epoch, rad.
     Circle(f64),
-    /// By the date.
+    /// Ephemeris by date.
     Dated(Arc<DatedEarth>),
 }
 
@@ -98,7 +100,7 @@ impl Earth {
     }
 }
 
-/// The Earth by the date; its directions are tabulated over the time that matters.
+/// Ephemeris of the Earth by date, tabulated over the time of the mission.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct DatedEarth {
     epoch: Tai,
@@ -108,7 +110,7 @@ pub(super) struct DatedEarth {
 }
 
 impl DatedEarth {
-    /// The Earth of a mission that begins at `epoch` and is known from one to another time after it, s.
+    /// Creates the ephemeris for a mission that starts at `epoch`, from one to another time after it, s.
     pub(super) fn new(epoch: Tai, [from_s, until_s]: [f64; 2]) -> Self {
         let steps = ((until_s - from_s) / STEP_S).ceil() + 3.0;
         let first_s = from_s - STEP_S;
@@ -122,7 +124,7 @@ impl DatedEarth {
         let below = steps.floor();
         let places = if below >= 1.0 { self.earth_hat.get(below as usize - 1..) } else { None };
         let Some([a, b, c, d, ..]) = places else { return earth_hat(self.epoch.plus_s(t_s)) };
-        // Lagrange's polynomial through four.
+        // Lagrange polynomial through four nodes.
         let s = steps - below;
         let weights = [
             -s * (s - 1.0) * (s - 2.0) / 6.0,
@@ -143,7 +145,7 @@ impl DatedEarth {
 
 /// Direction of the Earth from the Moon, on ecliptic axes of J2000; to 0.004 degrees from 2020 to 2040.
 ///
-/// Geometric: the Earth goes 40 km, 2e-3 degrees seen from the Moon, while its light comes.
+/// Geometric direction: the Earth moves 40 km, 2e-3 degrees seen from the Moon, during the light travel time.
 fn earth_hat(time: Tai) -> Vec3 {
     unit(sub([0.0; 3], moon::position_m(time.tt_centuries())))
 }
@@ -190,11 +192,11 @@ mod tests {
     }
 
     #[test]
-    fn earth_and_sun_are_where_other_ephemerides_have_them() {
+    fn directions_agree_with_another_ephemeris() {
         for (date, earth, sun) in PLACES {
-            let time = Tai::read(date, TimeScale::Utc).unwrap();
+            let time = Tai::parse(date, TimeScale::Utc).unwrap();
             let off_deg = |found: Vec3, place| norm(sub(found, towards(place))).to_degrees();
-            // As far as the series say they go, and 1e-4 of rounding above.
+            // The tolerance is the stated accuracy of the series, plus 1e-4 of rounding in the table above.
             let [earth_deg, sun_deg] = [off_deg(earth_hat(time), earth), off_deg(sun_hat(time), sun)];
             assert!(earth_deg < 0.004, "{date}: Earth off by {earth_deg} degrees");
             assert!(sun_deg < 0.002, "{date}: Sun off by {sun_deg} degrees");
@@ -203,10 +205,10 @@ mod tests {
 
     #[test]
     fn a_table_of_directions_is_the_series() {
-        let epoch = Tai::read("2027-03-05T06:30:00", TimeScale::Utc).unwrap();
+        let epoch = Tai::parse("2027-03-05T06:30:00", TimeScale::Utc).unwrap();
         let earth = DatedEarth::new(epoch, [-7200.0, 2.6e6]);
         for k in 0..3000 {
-            // From before the table to beyond it.
+            // Times extend from before the table to beyond it.
             let t_s = -20e3 + 887.3 * f64::from(k);
             let [read, made] = [earth.hat(t_s), earth_hat(epoch.plus_s(t_s))];
             assert!(norm(sub(read, made)) < 1e-9, "{t_s}: {}", norm(sub(read, made)));

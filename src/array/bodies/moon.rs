@@ -1,4 +1,4 @@
-//! The Moon as seen from the Earth.
+//! Position of the Moon as seen from the Earth.
 
 use crate::units::vector::Vec3;
 
@@ -71,7 +71,7 @@ struct Arguments {
     longitude: f64,
     /// Mean elongation D, anomalies of the Sun M and of the Moon M', distance from the node F.
     four: [f64; 4],
-    /// Factor of terms with the Sun's anomaly: the Earth's eccentricity changes.
+    /// Factor of terms with the Sun's anomaly, as the Earth's eccentricity changes.
     eccentricity: f64,
 }
 
@@ -111,7 +111,7 @@ pub(super) fn position_m(t: f64) -> Vec3 {
     for (multiples, sine) in LATITUDE {
         latitude_deg += scale(multiples) * sine * angle(multiples).sin();
     }
-    // What Venus, Jupiter and the Earth's flattening add.
+    // Contributions of Venus, Jupiter and the Earth's flattening.
     let [_, _, anomaly, node] = four;
     let [venus, jupiter, turn] = [119.75 + 131.849 * t, 53.09 + 479_264.290 * t, 313.45 + 481_266.484 * t];
     let sine = |deg: f64| deg.to_radians().sin();
@@ -126,7 +126,7 @@ pub(super) fn position_m(t: f64) -> Vec3 {
     to_j2000([distance_m * cos_b * cos_l, distance_m * cos_b * sin_l, distance_m * sin_b], t)
 }
 
-/// From the mean ecliptic and equinox of date to those of J2000 (Lieske et al. 1977; Meeus, Eq. 21.5).
+/// Converts from the mean ecliptic and equinox of date to those of J2000 (Lieske et al. 1977; Meeus, Eq. 21.5).
 fn to_j2000(v: Vec3, t: f64) -> Vec3 {
     const SECONDS: f64 = 3600.0;
     let tilt = (t * (47.002_9 - 0.033_02 * t) / SECONDS).to_radians();

@@ -1,4 +1,4 @@
-//! The Sun as seen from the Earth.
+//! Position of the Sun as seen from the Earth.
 
 use crate::units::vector::Vec3;
 
@@ -41,7 +41,7 @@ const CONSTANT: [&[[f64; 3]]; 3] = [
     &[],
 ];
 
-/// The same of what grows with time, au a Julian year.
+/// The same for terms that grow with time, au per Julian year.
 #[rustfmt::skip]
 const GROWING: [&[[f64; 3]]; 3] = [
     &[

@@ -140,7 +140,7 @@ impl Collector {
         let frame = metadata.frame(line)?;
         let expected = "TIME_SYSTEM = UTC, TAI, TT, TDB or GPS";
         let (system, at) = metadata.value("TIME_SYSTEM", line);
-        let Some(scale) = TimeScale::of_name(system) else { return Err(Fault::new(at, system, expected)) };
+        let Some(scale) = TimeScale::from_name(system) else { return Err(Fault::new(at, system, expected)) };
         let (method, degree) = metadata.interpolation(line)?;
         let useable = [
             metadata.date("USEABLE_START_TIME", scale, line)?,
@@ -167,7 +167,7 @@ impl Collector {
         else {
             return Err(Fault::new(line, short(epoch), "metadata before states"));
         };
-        let Some(time) = Tai::read(epoch, form.scale) else {
+        let Some(time) = Tai::parse(epoch, form.scale) else {
             let expected = format!(
                 "an epoch on {} such as 2030-01-31T12:00:00.000 or 2030-031T12:00:00; UTC from 1972 on, with a second 60 only \
                  where there was a leap second",
@@ -181,7 +181,7 @@ impl Collector {
             let expected = "an epoch and six finite numbers: position in km, velocity in km/s";
             return Err(Fault::new(line, format!("{} numbers after {epoch}", numbers.len()), expected));
         };
-        let zero = *self.zero.get_or_insert_with(|| time.whole());
+        let zero = *self.zero.get_or_insert_with(|| time.floor_second());
         let time_s = time.since_s(zero);
         if segment.time_s.last().is_some_and(|before| *before >= time_s) {
             let expected = "epochs in rising order: each later than the one before";
@@ -315,7 +315,7 @@ impl Metadata {
             return Ok(None);
         }
         let (text, line) = self.value(key, end);
-        match Tai::read(text, scale) {
+        match Tai::parse(text, scale) {
             Some(time) => Ok(Some((time, line))),
             None => Err(Fault::new(
                 line,

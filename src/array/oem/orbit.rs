@@ -135,7 +135,9 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
         reading.message.zero.plus_s(first.map_or(0.0, |segment| segment.useable_s[0]))
     };
     let latest = readings.iter().map(begins).reduce(|a, b| if b > a { b } else { a });
-    let (Some(latest), Some(first)) = (latest, readings.first()) else { return Ok(Tai::from_1958_s(0.0)) };
+    let (Some(latest), Some(first)) = (latest, readings.first()) else {
+        return Ok(Tai::from_seconds_since_1958(0.0));
+    };
     let given = if epoch.is_empty() {
         latest
     } else {
@@ -150,14 +152,14 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
                 ),
             ));
         }
-        Tai::read(epoch, first.scale).ok_or_else(|| {
+        Tai::parse(epoch, first.scale).ok_or_else(|| {
             error(
                 &paths[0],
                 format!("array.oem_epoch = {epoch:?}; expected a date on {}, as in the file", first.scale),
             )
         })?
     };
-    Ok(Tai::from_1958_s(given.from_1958()))
+    Ok(Tai::from_seconds_since_1958(given.seconds_since_1958()))
 }
 
 fn read_file(path: &Path, moon_radius_m: f64) -> Result<Reading, ArrayError> {
@@ -232,7 +234,7 @@ impl TableOrbit {
             velocity_m_s,
         };
         let segments: Vec<OemSegment> = stretches.into_iter().map(segment).collect();
-        let message = OemMessage { zero: Tai::from_1958_s(0.0), segments };
+        let message = OemMessage { zero: Tai::from_seconds_since_1958(0.0), segments };
         let span_s = message.span_s(0.0).unwrap_or_default();
         Self { message: Arc::new(message), epoch_s: 0.0, span_s }
     }

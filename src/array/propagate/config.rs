@@ -1,21 +1,21 @@
-//! Configuration of orbits that are propagated.
+//! Configuration of orbit propagation.
 
 use serde::{Deserialize, Serialize};
 
 use super::grgm900c::DEGREE_MAX;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Days of all satellites, at most: 1.6 GB of states.
+/// Maximum number of satellite-days: 1.6 GB of states.
 const DAYS_MAX: f64 = 40_000.0;
 
-/// What station keeping restores.
+/// Target of station keeping.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum StationKeeping {
-    /// The followers' places behind satellite 1, whose orbit goes on as it is.
+    /// The followers' positions behind satellite 1, whose orbit is not corrected.
     #[default]
     Formation,
-    /// Satellite 1's semi-major axis, eccentricity, inclination and argument of the periapsis, too; its node stays.
+    /// Also satellite 1's semi-major axis, eccentricity, inclination and argument of the periapsis; its node stays.
     Orbit,
 }
 
@@ -48,14 +48,14 @@ impl PropagateConfig {
         self.days != 0.0
     }
 
-    /// Whether the section is as it is without being mentioned.
+    /// Whether the section has its default values.
     pub(in crate::array) fn is_default(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Everything that is wrong with the section; empty if it is good.
+    /// All invalid values; empty if there are none.
     pub(in crate::array) fn problems(&self, satellites: usize, from_elements: bool) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("array.propagate");
+        let mut checks = Checks::new("array.propagate");
         let days_max = DAYS_MAX / satellites.max(1) as f64;
         let expected =
             format!("0 to {days_max:.0} for {satellites} satellites, whose states take 40 kB a day each");

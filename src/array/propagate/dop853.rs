@@ -1,6 +1,6 @@
-//! Runge and Kutta's method of eighth order by Dormand and Prince, for several satellites at once.
+//! Eighth-order Runge-Kutta method of Dormand and Prince, for several satellites at once.
 
-/// Satellites that are computed together: they are the lanes of vectors.
+/// Number of satellites computed together in the lanes of vectors.
 pub(super) const LANES: usize = 8;
 
 /// One number for each satellite.
@@ -9,7 +9,7 @@ pub(super) type Lanes = [f64; LANES];
 /// Positions, m, and velocities, m/s, by axis.
 pub(super) type States = [Lanes; 6];
 
-/// Stages of a step.
+/// Number of stages of a step.
 const STAGES: usize = 12;
 
 // DOP853: Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, 2nd ed. (1993), Sect. II.10. Each stage is the
@@ -95,7 +95,7 @@ const STAGE_WEIGHTS: [&[(usize, f64)]; STAGES] = [
     ],
 ];
 
-/// States after a step, s, of its own for each satellite; `slopes` gives rates of states at times.
+/// States after one step, s, which may differ between satellites; `slopes` gives the time derivatives of states.
 pub(super) fn step(
     time_s: &Lanes,
     step_s: &Lanes,
@@ -105,14 +105,14 @@ pub(super) fn step(
     let mut known = [[[0.0; LANES]; 6]; STAGES];
     for stage in 0..STAGES {
         let at_s = std::array::from_fn(|lane| time_s[lane] + NODES[stage] * step_s[lane]);
-        let there = moved(states, step_s, STAGE_WEIGHTS[stage], &known);
+        let there = advanced(states, step_s, STAGE_WEIGHTS[stage], &known);
         known[stage] = slopes(&at_s, &there);
     }
-    moved(states, step_s, WEIGHTS, &known)
+    advanced(states, step_s, WEIGHTS, &known)
 }
 
-/// States moved by weighted slopes.
-fn moved(states: &States, step_s: &Lanes, weights: &[(usize, f64)], slopes: &[States; STAGES]) -> States {
+/// States advanced by weighted slopes.
+fn advanced(states: &States, step_s: &Lanes, weights: &[(usize, f64)], slopes: &[States; STAGES]) -> States {
     let mut out = *states;
     for (part, out) in out.iter_mut().enumerate() {
         let mut sum = [0.0; LANES];
@@ -132,9 +132,9 @@ fn moved(states: &States, step_s: &Lanes, weights: &[(usize, f64)], slopes: &[St
 mod tests {
     use super::*;
 
-    /// Ellipses about a point mass of 1, with a semi-major axis of 1, from their periapsis, after one turn in `steps` steps: the
-    /// greatest distance from where they began.
-    fn error_after_a_turn(steps: u32) -> f64 {
+    /// Distance from the start after one revolution in `steps` steps from the periapsis, for ellipses about a point
+    /// mass of 1 with a semi-major axis of 1: the maximum.
+    fn error_after_a_revolution(steps: u32) -> f64 {
         let slopes = |_: &Lanes, states: &States| -> States {
             let mut out = [[0.0; LANES]; 6];
             for lane in 0..LANES {
@@ -153,7 +153,7 @@ mod tests {
         let h = std::f64::consts::TAU / f64::from(steps);
         let mut states = start;
         for _ in 0..steps {
-            // Nothing depends on time.
+            // The force does not depend on time.
             states = step(&[0.0; LANES], &[h; LANES], &states, &slopes);
         }
         let apart = (0..3).flat_map(|axis| (0..LANES).map(move |lane| (axis, lane)));
@@ -161,19 +161,20 @@ mod tests {
     }
 
     #[test]
-    fn ellipses_close_to_the_eighth_order() {
-        let (coarse, fine) = (error_after_a_turn(24), error_after_a_turn(48));
-        // Halved steps leave 2^-8 of the error where they are short against the periapsis: more than a method of seventh order does.
+    fn ellipses_close_with_an_error_of_eighth_order() {
+        let (coarse, fine) = (error_after_a_revolution(24), error_after_a_revolution(48));
+        // Halved steps leave 2^-8 of the error if they are short compared with the periapsis: a seventh-order method
+        // leaves more.
         assert!(coarse > 1e-8 && fine < coarse / 128.0, "{coarse} {fine}");
         // The 68 steps of 120 s of an orbit 300 km above the Moon close to less than 1e-4 m.
-        let close = error_after_a_turn(68);
+        let close = error_after_a_revolution(68);
         assert!(close < 5e-11, "{close}");
     }
 
     #[test]
-    fn stages_hold_together() {
+    fn stages_are_consistent() {
         for (stage, weights) in STAGE_WEIGHTS.iter().enumerate() {
-            // A slope of 1 leads to the stage's own time.
+            // A slope of 1 gives the stage's own time.
             let sum: f64 = weights.iter().map(|(_, weight)| weight).sum();
             assert!((sum - NODES[stage]).abs() < 1e-14, "{stage}");
         }

@@ -11,32 +11,32 @@ use crate::units::constants::SIDEREAL_MONTH_S;
 /// GM of the Earth, m^3/s^2 (DE440).
 const EARTH_GM_M3_S2: f64 = 3.986_004_355e14;
 
-/// Distance of the Earth, m: the mean of its semi-major axis.
+/// Distance of the Earth, m: its mean semi-major axis.
 const EARTH_DISTANCE_M: f64 = 384.4e6;
 
 /// Acceleration by one spherical harmonic, for its cosine and sine coefficients.
 #[derive(Clone, Copy, Debug, Default)]
 struct Term {
-    /// From those of one and two degrees below.
+    /// Recursion factors for the terms of one and two degrees below.
     from_below: [f64; 2],
     x: [f64; 2],
     y: [f64; 2],
     z: [f64; 2],
 }
 
-/// The forces.
+/// Forces on a satellite.
 #[derive(Clone, Debug)]
 pub(super) struct Forces {
-    /// By order, then by degree from the order on; of degrees 0 to one more than the field's.
+    /// Terms by order, then by degree from the order on; for degrees 0 to one more than the field's.
     terms: Vec<Vec<Term>>,
     earth: bool,
-    /// Longitude of the Earth at the epoch, rad. The Moon shows it the same side: it is the longitude of the Moon's prime
-    /// meridian, too.
+    /// Longitude of the Earth at the epoch, rad. As the Moon keeps one side to the Earth, it is also the longitude of
+    /// the Moon's prime meridian.
     earth_rad: f64,
 }
 
 impl Forces {
-    /// The Moon's field to `degree`, and the Earth's pull if it is asked for.
+    /// Creates the Moon's field up to `degree`, with the attraction of the Earth if `earth`.
     pub(super) fn new(degree: usize, earth: bool, earth_rad: f64) -> Self {
         let top = degree + 1;
         let mut terms: Vec<Vec<Term>> =
@@ -82,30 +82,31 @@ impl Forces {
         }
         let mut out = [[0.0; LANES]; 6];
         out[..3].copy_from_slice(&states[3..]);
-        let pulls = moon_pull(&self.terms, &turn, states);
+        let pulls = moon_acceleration(&self.terms, &turn, states);
         out[3..].copy_from_slice(&pulls);
         if self.earth {
-            add_earth_pull(&turn, states, &mut out);
+            add_earth_acceleration(&turn, states, &mut out);
         }
         out
     }
 }
 
-/// C and S of a degree and order for Legendre functions without norm.
+/// C and S of a degree and order, for unnormalised Legendre functions.
 fn unnormalised(n: usize, m: usize) -> [f64; 2] {
     let product: f64 = (n - m + 1..=n + m).map(|k| k as f64).product();
     let twice = if m == 0 { 1.0 } else { 2.0 };
     let norm = (twice * (2 * n + 1) as f64 / product).sqrt();
-    // Degrees from 2 on, each with its orders from 0.
+    // The table lists degrees from 2 on, each with its orders from 0.
     COEFFICIENTS[n * (n + 1) / 2 + m - 3].map(|value| norm * value)
 }
 
-/// Accelerations in the Moon's field, m/s^2, by axis; `turn` is the cosine and sine of the longitude of its prime meridian.
+/// Accelerations in the Moon's field, m/s^2, by axis; `turn` is the cosine and sine of the longitude of its prime
+/// meridian.
 ///
-/// Harmonic functions by Cunningham's recursions (Montenbruck and Gill, Eq. 3.29 to 3.31) on axes that turn with the Moon. No
-/// multiplication is fused with an addition, so that every target gives the same bits.
+/// Harmonic functions follow from Cunningham's recursions (Montenbruck and Gill, Eq. 3.29 to 3.31) on axes that
+/// rotate with the Moon. No multiplication is fused with an addition, so that every target gives the same bits.
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2"))]
-fn moon_pull(terms: &[Vec<Term>], turn: &[Lanes; 2], states: &States) -> [Lanes; 3] {
+fn moon_acceleration(terms: &[Vec<Term>], turn: &[Lanes; 2], states: &States) -> [Lanes; 3] {
     let mut x = [0.0; LANES];
     let mut y = [0.0; LANES];
     let mut z = [0.0; LANES];
@@ -164,8 +165,8 @@ fn moon_pull(terms: &[Vec<Term>], turn: &[Lanes; 2], states: &States) -> [Lanes;
     out
 }
 
-/// Adds the Earth's pull on the satellite less that on the Moon; `turn` is its direction.
-fn add_earth_pull(turn: &[Lanes; 2], states: &States, out: &mut States) {
+/// Adds the Earth's attraction of the satellite minus that of the Moon; `turn` is its direction.
+fn add_earth_acceleration(turn: &[Lanes; 2], states: &States, out: &mut States) {
     for k in 0..LANES {
         let earth_m = [EARTH_DISTANCE_M * turn[0][k], EARTH_DISTANCE_M * turn[1][k], 0.0];
         let away_m: [f64; 3] = std::array::from_fn(|axis| earth_m[axis] - states[axis][k]);

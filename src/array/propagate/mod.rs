@@ -1,13 +1,15 @@
 //! Orbits by numerical integration of the forces on each satellite.
 //!
-//! Forces: the Moon's field (GRGM900C, to degree and order 16), and the Earth as a point mass in a circle in the plane of the
-//! ecliptic. The Moon turns about the pole of the ecliptic and shows the Earth the same side. So its pole is 1.54 deg from its
-//! place, the Earth's distance is a mean, and the Sun (1 % of the Earth's pull) and the pressure of its light are left out.
+//! The forces are the Moon's field (GRGM900C, to degree and order 16), and the Earth as a point mass on a circle in
+//! the plane of the ecliptic. The Moon rotates about the pole of the ecliptic and keeps one side to the Earth. So its
+//! pole is off by 1.54 deg, the Earth's distance is a mean, and the Sun (1 % of the Earth's attraction) and radiation
+//! pressure are neglected.
 //!
-//! Followers begin where the leader, satellite 1, was when it had their arc still to go, with the velocity that it had there, each
-//! in a plane that is tilted as `cross_track_ratio` says. So they follow each other along one track, and drift apart as
-//! little as free satellites can. Station keeping puts them there again at once, at the arcs of that time, when the Earth is high
-//! above satellite 1: no observing window has a jump.
+//! A follower starts where the leader, satellite 1, was when it had the follower's arc still to go, with the velocity
+//! that it had there, in a plane tilted according to `cross_track_ratio`. So the satellites follow each other along
+//! one track, and drift apart as little as free satellites can. Station keeping restores these positions
+//! instantaneously, for the arcs of that time, when the Earth is high above satellite 1: no observing window has a
+//! jump.
 
 mod config;
 mod dop853;
@@ -32,35 +34,35 @@ use dop853::{LANES, Lanes, States, step};
 use field::Forces;
 use grgm900c::GM_M3_S2;
 
-/// Step of the integration, s: 68 an orbit 300 km above the Moon. Each leaves a state; twice as long ones would do for the method, but
-/// interpolation between them would err by a centimetre.
+/// Step of the integration, s: 68 per orbit 300 km above the Moon. Each step leaves a state; the method would allow
+/// twice as long ones, but interpolation between them would err by a centimetre.
 const STEP_S: f64 = 120.0;
 
-/// States that a stretch has at least: as many as its interpolation takes.
+/// Minimum number of states of a stretch: as many as interpolation needs.
 const NODES_MIN: usize = 4;
 
-/// Greatest distance from the Moon's centre, m: its sphere of influence.
+/// Maximum distance from the Moon's centre, m: its sphere of influence.
 const RADIUS_M_MAX: f64 = 6.6e7;
 
-/// Intervals of progress, in states.
+/// Interval of progress reports, in states.
 const TELL_EVERY: usize = 4_000;
 
-/// Takes the days that are done, and those that there are.
+/// Callback for progress, with the number of days done and their total.
 pub type PropagationProgress = fn(f64, f64);
 
-static TELLER: OnceLock<PropagationProgress> = OnceLock::new();
+static PROGRESS: OnceLock<PropagationProgress> = OnceLock::new();
 
-/// Has the progress of long propagations told; the first call of a process counts.
-pub fn report_propagation_to(teller: PropagationProgress) {
-    let _ = TELLER.set(teller);
+/// Sets the callback for the progress of long propagations; only the first call in a process counts.
+pub fn report_propagation_to(progress: PropagationProgress) {
+    let _ = PROGRESS.set(progress);
 }
 
-/// The orbits of the array for which they were asked last: a pipeline asks several times.
+/// Cache of the last propagated orbits: a pipeline requests them several times.
 static LATEST: Mutex<Option<(ArrayConfig, Vec<TableOrbit>)>> = Mutex::new(None);
 
-/// The orbits of all satellites of a configuration without other problems.
+/// Orbits of all satellites of a configuration without other problems.
 pub(super) fn orbits(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
-    // Not held while orbits are propagated, which may wait for other work of this thread.
+    // The lock is not held while orbits are propagated, which may wait for other work of this thread.
     let latest = || LATEST.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     if let Some((known, orbits)) = &*latest()
         && known == config
@@ -73,9 +75,9 @@ pub(super) fn orbits(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError
 }
 
 fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
-    let flight = Flight::new(config)?;
-    // The leader flies with each group of followers.
-    let groups: Vec<Vec<usize>> = match flight.formation {
+    let propagation = Propagation::new(config)?;
+    // The leader is propagated with each group of followers.
+    let groups: Vec<Vec<usize>> = match propagation.formation {
         Some(_) => {
             let followers: Vec<usize> = (1..config.satellites).collect();
             followers.chunks(LANES - 1).map(|some| [&[0], some].concat()).collect()
@@ -85,8 +87,11 @@ fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
             all.chunks(LANES).map(<[usize]>::to_vec).collect()
         }
     };
-    let found: Result<Vec<Vec<Vec<OrbitArc>>>, ArrayError> =
-        groups.par_iter().enumerate().map(|(index, group)| flight.fly(group, index == 0)).collect();
+    let found: Result<Vec<Vec<Vec<OrbitArc>>>, ArrayError> = groups
+        .par_iter()
+        .enumerate()
+        .map(|(index, group)| propagation.propagate_group(group, index == 0))
+        .collect();
     let mut orbits: Vec<TableOrbit> = Vec::with_capacity(config.satellites);
     for (stretches, group) in found?.into_iter().zip(&groups) {
         for (stretches, satellite) in stretches.into_iter().zip(group) {
@@ -98,17 +103,17 @@ fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
     Ok(orbits)
 }
 
-/// What is to be propagated.
-struct Flight<'a> {
+/// A propagation: forces, initial states and length.
+struct Propagation<'a> {
     config: &'a ArrayConfig,
     forces: Forces,
-    /// Without one, each satellite has elements of its own.
+    /// The formation; `None` if each satellite has its own elements.
     formation: Option<Formation>,
-    /// States to be kept after the first.
+    /// Number of states to be kept after the first.
     nodes: usize,
 }
 
-impl<'a> Flight<'a> {
+impl<'a> Propagation<'a> {
     fn new(config: &'a ArrayConfig) -> Result<Self, ArrayError> {
         let PropagateConfig { days, degree, earth, .. } = config.propagate;
         Ok(Self {
@@ -119,13 +124,18 @@ impl<'a> Flight<'a> {
         })
     }
 
-    /// The stretches of satellites that are computed together; satellite 1 is the first of them if there is a formation.
-    fn fly(&self, group: &[usize], tells: bool) -> Result<Vec<Vec<OrbitArc>>, ArrayError> {
+    /// Propagates satellites that are computed together, and returns their stretches; satellite 1 is the first of
+    /// them if there is a formation.
+    fn propagate_group(
+        &self,
+        group: &[usize],
+        reports_progress: bool,
+    ) -> Result<Vec<Vec<OrbitArc>>, ArrayError> {
         let mut states = self.at_epoch(group);
         let mut out: Vec<Vec<OrbitArc>> = vec![vec![OrbitArc::default()]; group.len()];
         let every_s = self.config.propagate.keep_every_days * DAY_S;
         let mut due_s = if every_s > 0.0 { every_s } else { f64::INFINITY };
-        // How high the Earth stood above satellite 1 at the last two states.
+        // Height of the Earth above satellite 1 at the last two states.
         let mut heights = [f64::NEG_INFINITY; 2];
         for node in 0..=self.nodes {
             let time_s = node as f64 * STEP_S;
@@ -135,16 +145,16 @@ impl<'a> Flight<'a> {
             let culminates = heights[0] < heights[1] && height <= heights[1];
             heights = [heights[1], height];
             if time_s >= due_s && culminates && node + NODES_MIN <= self.nodes {
-                states = self.kept(time_s, &states, group);
+                states = self.after_station_keeping(time_s, &states, group);
                 out.iter_mut().for_each(|stretches| stretches.push(OrbitArc::default()));
                 append(&mut out, time_s, &states);
                 due_s = every_s * ((time_s / every_s).floor() + 1.0);
             }
             let slopes = |time_s: &Lanes, states: &States| self.forces.slopes(time_s, states);
             states = step(&[time_s; LANES], &[STEP_S; LANES], &states, &slopes);
-            if tells
+            if reports_progress
                 && node % TELL_EVERY == 0
-                && let Some(tell) = TELLER.get()
+                && let Some(tell) = PROGRESS.get()
             {
                 tell(time_s / DAY_S, self.nodes as f64 * STEP_S / DAY_S);
             }
@@ -161,9 +171,9 @@ impl<'a> Flight<'a> {
                 &self.leader(node_longitude_deg, orbital_phase_deg - periapsis_deg),
                 GM_M3_S2,
             );
-            return self.released(0.0, leader.state(0.0), group);
+            return self.with_followers(0.0, leader.state(0.0), group);
         }
-        // The field turns planes and apsides: rates that are given for them are not used.
+        // The field rotates planes and apsides: configured rates are not used.
         let state = |satellite: usize| {
             let still = KeplerElements {
                 node_rate_deg_per_day: 0.0,
@@ -172,12 +182,12 @@ impl<'a> Flight<'a> {
             };
             KeplerOrbit::about(&still, GM_M3_S2).state(0.0)
         };
-        let mut states = filled(state(group[0]));
+        let mut states = all_lanes(state(group[0]));
         group.iter().enumerate().for_each(|(lane, satellite)| put(&mut states, lane, state(*satellite)));
         states
     }
 
-    /// The elements that satellite 1 has at the epoch, without node and mean anomaly, degrees.
+    /// Elements of satellite 1 at the epoch, with this node and mean anomaly, degrees.
     fn leader(&self, node_longitude_deg: f64, mean_anomaly_deg: f64) -> KeplerElements {
         KeplerElements {
             semi_major_axis_m: self.config.moon_radius_m + self.config.altitude_m,
@@ -192,32 +202,33 @@ impl<'a> Flight<'a> {
     }
 
     /// States after station keeping.
-    fn kept(&self, time_s: f64, states: &States, group: &[usize]) -> States {
+    fn after_station_keeping(&self, time_s: f64, states: &States, group: &[usize]) -> States {
         let leader = of_lane(states, 0);
         let leader = match self.config.propagate.keep {
             StationKeeping::Formation => leader,
-            StationKeeping::Orbit => self.restored(leader),
+            StationKeeping::Orbit => self.on_initial_orbit(leader),
         };
-        self.released(time_s, leader, group)
+        self.with_followers(time_s, leader, group)
     }
 
-    /// Satellite 1 on the ellipse that it had at the epoch, at its own node and argument of latitude.
-    fn restored(&self, leader: SatelliteState) -> SatelliteState {
+    /// State of satellite 1 on its initial ellipse, at its current node and argument of latitude.
+    fn on_initial_orbit(&self, leader: SatelliteState) -> SatelliteState {
         let normal = unit(cross(leader.position_m, leader.velocity_m_s));
         let node = node_hat(normal);
         let latitude = dot(leader.position_m, cross(normal, node)).atan2(dot(leader.position_m, node));
         let (e, periapsis) = (self.config.eccentricity, self.config.periapsis_deg.to_radians());
         let half = 0.5 * (latitude - periapsis);
-        // Tangents of half of the true and of the eccentric anomaly.
+        // Tangents of half the true and half the eccentric anomaly.
         let anomaly = 2.0 * ((1.0 - e).sqrt() * half.sin()).atan2((1.0 + e).sqrt() * half.cos());
         let mean = anomaly - e * anomaly.sin();
         let elements = self.leader(node[1].atan2(node[0]).to_degrees(), mean.to_degrees());
         KeplerOrbit::about(&elements, GM_M3_S2).state(0.0)
     }
 
-    /// A leader and its followers on its track, each where it was when it had their arc of that time to go, and in a plane of their own.
-    fn released(&self, time_s: f64, leader: SatelliteState, group: &[usize]) -> States {
-        let Some(formation) = &self.formation else { return filled(leader) };
+    /// States of a leader and its followers on its track: each where the leader was when it had the follower's arc of
+    /// that time to go, in the follower's own plane.
+    fn with_followers(&self, time_s: f64, leader: SatelliteState, group: &[usize]) -> States {
+        let Some(formation) = &self.formation else { return all_lanes(leader) };
         let axis_m = self.config.moon_radius_m + self.config.altitude_m;
         let mut arcs_m = [0.0; LANES];
         for (arc_m, satellite) in arcs_m.iter_mut().zip(group) {
@@ -226,7 +237,7 @@ impl<'a> Flight<'a> {
         let delays_s = arcs_m.map(|arc_m| arc_m / (GM_M3_S2 / axis_m).sqrt());
         let steps = (delays_s.iter().fold(0.0, |a: f64, b| a.max(*b)) / STEP_S).ceil().max(1.0);
         let step_s = delays_s.map(|delay_s| -delay_s / steps);
-        let mut states = filled(leader);
+        let mut states = all_lanes(leader);
         let mut now_s = [time_s; LANES];
         for _ in 0..steps as usize {
             let slopes = |time_s: &Lanes, states: &States| self.forces.slopes(time_s, states);
@@ -240,8 +251,8 @@ impl<'a> Flight<'a> {
             let tilt = self.config.cross_track_ratio * arc_m / axis_m;
             let state = of_lane(&states, lane);
             let tilted = SatelliteState {
-                position_m: turned(state.position_m, axis, tilt),
-                velocity_m_s: turned(state.velocity_m_s, axis, tilt),
+                position_m: rotated(state.position_m, axis, tilt),
+                velocity_m_s: rotated(state.velocity_m_s, axis, tilt),
             };
             put(&mut states, lane, tilted);
         }
@@ -255,7 +266,7 @@ impl<'a> Flight<'a> {
         dot(unit(of_lane(states, 0).position_m), [cos, sin, 0.0])
     }
 
-    /// Requires that all are above the surface, and at the Moon.
+    /// Checks that all satellites are above the surface and within the Moon's sphere of influence.
     fn check(&self, group: &[usize], time_s: f64, states: &States) -> Result<(), ArrayError> {
         for (lane, satellite) in group.iter().enumerate() {
             let radius_m = norm(of_lane(states, lane).position_m);
@@ -275,20 +286,20 @@ fn append(out: &mut [Vec<OrbitArc>], time_s: f64, states: &States) {
     }
 }
 
-/// The direction of the ascending node of a plane with this normal; of the ecliptic itself, longitude 0.
+/// Direction of the ascending node of a plane with this normal; longitude 0 for the ecliptic itself.
 fn node_hat(normal: Vec3) -> Vec3 {
     let node = [-normal[1], normal[0], 0.0];
     if norm(node) > 1e-12 * norm(normal) { unit(node) } else { [1.0, 0.0, 0.0] }
 }
 
-/// A vector turned about a unit axis.
-fn turned(v: Vec3, axis: Vec3, angle: f64) -> Vec3 {
+/// Rotates a vector about a unit axis.
+fn rotated(v: Vec3, axis: Vec3, angle: f64) -> Vec3 {
     let (sin, cos) = angle.sin_cos();
     add(add(scale(cos, v), scale(sin, cross(axis, v))), scale((1.0 - cos) * dot(axis, v), axis))
 }
 
-/// One state in all lanes.
-fn filled(state: SatelliteState) -> States {
+/// Copies one state to all lanes.
+fn all_lanes(state: SatelliteState) -> States {
     let mut states = [[0.0; LANES]; 6];
     (0..LANES).for_each(|lane| put(&mut states, lane, state));
     states

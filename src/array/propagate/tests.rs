@@ -4,14 +4,15 @@ use crate::array::{Array, Ephemeris, ObservingWindows, segments_for};
 use crate::units::MissionTime;
 use crate::units::vector::sub;
 
-/// Eight satellites, flown for `days`.
-fn flown(days: f64) -> ArrayConfig {
+/// Eight satellites, propagated for `days`.
+fn propagated_config(days: f64) -> ArrayConfig {
     let propagate = PropagateConfig { days, ..PropagateConfig::default() };
     ArrayConfig { propagate, ..ArrayConfig::default() }
 }
 
-/// The potential of the field less that of a point mass, m^2/s^2, at a place on axes that turn with the Moon: Legendre functions of full
-/// norm by the recursion over degrees (Holmes and Featherstone 2002, Eq. 11 to 13), which the forces do not use.
+/// Potential of the field minus that of a point mass, m^2/s^2, at a position on axes that rotate with the Moon: fully
+/// normalised Legendre functions by the recursion over degrees (Holmes and Featherstone 2002, Eq. 11 to 13), which
+/// the forces do not use.
 fn potential(degree: usize, r_m: Vec3) -> f64 {
     let radius_m = norm(r_m);
     let sine = r_m[2] / radius_m;
@@ -46,42 +47,43 @@ fn potential(degree: usize, r_m: Vec3) -> f64 {
 }
 
 #[test]
-fn the_pull_is_the_slope_of_the_potential() {
+fn the_acceleration_is_the_gradient_of_the_potential() {
     let place = |lane: usize| -> Vec3 {
         let angle = 0.7 * lane as f64;
         [1.8e6 * angle.cos(), 1.7e6 * angle.sin(), 1.1e6 * (1.3 * angle).cos() - 0.3e6]
     };
     for degree in [0, 2, 3, 8, DEGREE_MAX] {
-        let mut states = filled(SatelliteState { position_m: [0.0; 3], velocity_m_s: [1.0, 2.0, 3.0] });
+        let mut states = all_lanes(SatelliteState { position_m: [0.0; 3], velocity_m_s: [1.0, 2.0, 3.0] });
         for lane in 0..LANES {
             put(&mut states, lane, SatelliteState { position_m: place(lane), velocity_m_s: [1.0, 2.0, 3.0] });
         }
-        // The prime meridian at longitude 0.4, so that places are turned.
+        // The prime meridian is at longitude 0.4, so that positions are rotated.
         let slopes = Forces::new(degree, false, 0.4).slopes(&[0.0; LANES], &states);
         for lane in 0..LANES {
             assert_eq!(of_lane(&slopes, lane).position_m, [1.0, 2.0, 3.0]);
             let radius_m = norm(place(lane));
             let middle = scale(-GM_M3_S2 / radius_m.powi(3), place(lane));
             let rest = sub(of_lane(&slopes, lane).velocity_m_s, middle);
-            let at =
-                |offset_m: Vec3| potential(degree, turned(add(place(lane), offset_m), [0.0, 0.0, 1.0], -0.4));
+            let at = |offset_m: Vec3| {
+                potential(degree, rotated(add(place(lane), offset_m), [0.0, 0.0, 1.0], -0.4))
+            };
             let slope: Vec3 = std::array::from_fn(|axis| {
                 let mut offset_m = [0.0; 3];
                 offset_m[axis] = 20.0;
                 (at(offset_m) - at(scale(-1.0, offset_m))) / 40.0
             });
-            // Differences err by (16 x 20 m / 1700 km)^2 / 6 of a slope of up to 1e-3 m/s^2, and by rounding of 1e3 m^2/s^2 over 40 m;
-            // what is left after the point mass by rounding of 1.6 m/s^2.
+            // Differences err by (16 x 20 m / 1700 km)^2 / 6 of a slope of up to 1e-3 m/s^2, and by rounding of 1e3
+            // m^2/s^2 over 40 m; the remainder after the point mass by rounding of 1.6 m/s^2.
             assert!(norm(sub(rest, slope)) < 2e-11, "{degree} {lane}: {rest:?} {slope:?}");
             assert!(degree == 0 || norm(rest) > 1e-5);
         }
     }
 }
 
-/// The table against what others published: GL0660B of another group (Konopliv et al. 2013, J. Geophys. Res. Planets 118, 1415), rounded to
-/// five digits, and its J2 and C22 without norm.
+/// The table against GL0660B of another group (Konopliv et al. 2013, J. Geophys. Res. Planets 118, 1415), rounded to
+/// five digits, and its unnormalised J2 and C22.
 #[test]
-fn the_table_is_the_moons() {
+fn the_table_agrees_with_another_field_of_the_moon() {
     let of = |n: usize, m: usize| COEFFICIENTS[(2..n).map(|k| k + 1).sum::<usize>() + m];
     for (n, m, c, s) in [
         (2, 0, -9.0880e-5, 0.0),
@@ -96,11 +98,12 @@ fn the_table_is_the_moons() {
         let bound = if (n, m) == (2, 0) { 1e-8 } else { 2e-9 };
         assert!((found_c - c).abs() < bound && (found_s - s).abs() < bound, "{n} {m}: {found_c} {found_s}");
     }
-    // Without norm: J2 = 2.033e-4 and C22 = 2.24e-5, as the IAU and most textbooks have them.
+    // Unnormalised: J2 = 2.033e-4 and C22 = 2.24e-5, as by the IAU and in most textbooks.
     assert!((-5_f64.sqrt() * of(2, 0)[0] - 2.033e-4).abs() < 2e-7);
     assert!(((5.0 / 12.0_f64).sqrt() * of(2, 2)[0] - 2.24e-5).abs() < 3e-8);
     assert_eq!(COEFFICIENTS.len(), (2..=DEGREE_MAX).map(|n| n + 1).sum::<usize>());
-    // Zonal terms have no sine; power falls with the degree about as Kaula's rule for the Moon, 2.5e-4 / n^2 (Lemoine et al., Fig. 2).
+    // Zonal terms have no sine; the power decreases with the degree roughly by Kaula's rule for the Moon, 2.5e-4 /
+    // n^2 (Lemoine et al., Fig. 2).
     for n in 2..=DEGREE_MAX {
         assert_eq!(of(n, 0)[1], 0.0);
         let power: f64 = (0..=n).flat_map(|m| of(n, m)).map(|value| value * value).sum();
@@ -112,21 +115,21 @@ fn the_table_is_the_moons() {
 
 #[test]
 fn without_a_field_orbits_are_ellipses() {
-    let mut config = flown(20.0);
+    let mut config = propagated_config(20.0);
     config.propagate.degree = 0;
     config.propagate.earth = false;
     for eccentricity in [0.0, 0.1] {
         config.eccentricity = eccentricity;
         let array = Array::new(&config).unwrap();
-        let flight = Flight::new(&config).unwrap();
-        let leader = KeplerOrbit::about(&flight.leader(0.0, 0.0), GM_M3_S2);
+        let propagation = Propagation::new(&config).unwrap();
+        let leader = KeplerOrbit::about(&propagation.leader(0.0, 0.0), GM_M3_S2);
         for t_s in [0.0, 100.0, 5e4, 20.0 * DAY_S - 77.0] {
-            // 209 turns. Each closes to 1e-4 m at most, and 1e-13 of the energy is worth 3 pi 1e-13 of a turn and radius in each
-            // that follows.
+            // There are 209 revolutions. Each closes to 1e-4 m at most, and a change of 1e-13 of the energy shifts
+            // each later revolution by 3 pi 1e-13 of a turn times the radius.
             let error_m = norm(sub(array.position_m(0, t_s), leader.state(t_s).position_m));
             assert!(error_m < 0.02, "{eccentricity} {t_s}: {error_m}");
-            // Followers are on the same track, in planes of their own.
-            let arc_m = flight.formation.as_ref().unwrap().arc_m(7, 0.0).0;
+            // Followers are on the same track, each in its own plane.
+            let arc_m = propagation.formation.as_ref().unwrap().arc_m(7, 0.0).0;
             let delay_s = arc_m / (GM_M3_S2 / leader.semi_major_axis_m()).sqrt();
             let behind_m = leader.state(t_s - delay_s).position_m;
             assert!(norm(sub(array.position_m(7, t_s), behind_m)) < 0.02, "{eccentricity} {t_s}");
@@ -134,12 +137,12 @@ fn without_a_field_orbits_are_ellipses() {
     }
 }
 
-/// The energy in the frame that turns with the Moon and the Earth (Jacobi's constant) of each satellite.
+/// Energy of each satellite in the frame that rotates with the Moon and the Earth (Jacobi's constant).
 fn jacobi(array: &Array, n: usize, t_s: f64, degree: usize) -> f64 {
     let rate = TAU / SIDEREAL_MONTH_S;
     let SatelliteState { position_m, velocity_m_s } = array.state(n, t_s);
     let turning = rate * cross(position_m, velocity_m_s)[2];
-    let own_m = turned(position_m, [0.0, 0.0, 1.0], -rate * t_s);
+    let own_m = rotated(position_m, [0.0, 0.0, 1.0], -rate * t_s);
     // GM and distance of the Earth, from textbooks.
     let (gm, distance_m) = (3.986_004_355e14, 3.844e8);
     let away_m = norm(sub([distance_m, 0.0, 0.0], own_m));
@@ -152,30 +155,30 @@ fn jacobi(array: &Array, n: usize, t_s: f64, degree: usize) -> f64 {
 }
 
 #[test]
-fn jacobis_constant_is_kept() {
-    let array = Array::new(&flown(30.0)).unwrap();
+fn jacobis_constant_is_conserved() {
+    let array = Array::new(&propagated_config(30.0)).unwrap();
     for n in [0, 7] {
         let start = jacobi(&array, n, 0.0, 12);
         let mut terms = [f64::INFINITY, f64::NEG_INFINITY];
         for k in 1..=50 {
-            // Nodes of the table, where nothing is interpolated.
+            // The times are nodes of the table, where nothing is interpolated.
             let t_s = f64::from(k) * 0.6 * DAY_S;
             let position_m = array.position_m(n, t_s);
-            let own_m = turned(position_m, [0.0, 0.0, 1.0], -TAU * t_s / SIDEREAL_MONTH_S);
+            let own_m = rotated(position_m, [0.0, 0.0, 1.0], -TAU * t_s / SIDEREAL_MONTH_S);
             let disturbing = potential(12, own_m);
             terms = [terms[0].min(disturbing), terms[1].max(disturbing)];
             let change = jacobi(&array, n, t_s, 12) / start - 1.0;
-            // Rounding of 22,000 steps of the method, 1e-16 each, and 1e-13 of each of its 314 turns.
+            // Rounding of 22,000 steps of the method, 1e-16 each, and 1e-13 of each of its 314 revolutions.
             assert!(change.abs() < 1e-10, "{n} {k}: {change}");
         }
-        // What would be missed, were the field wrong by a thousandth, is more than that.
+        // A field that is wrong by a thousandth would change it by more than that.
         assert!(terms[1] - terms[0] > 1e-4 * start.abs(), "{terms:?} {start}");
     }
 }
 
 #[test]
-fn the_node_regresses_as_oblateness_says() {
-    let mut config = flown(27.321_661);
+fn the_node_regresses_by_oblateness() {
+    let mut config = propagated_config(27.321_661);
     config.propagate.degree = 2;
     config.propagate.earth = false;
     let array = Array::new(&config).unwrap();
@@ -183,7 +186,7 @@ fn the_node_regresses_as_oblateness_says() {
         let normal = array.normal_hat(0, t_s);
         normal[0].atan2(-normal[1])
     };
-    // Averages over an orbit, a month apart, so that what C22 does comes to nothing.
+    // Averages over an orbit, a month apart, so that the effect of C22 cancels.
     let mean = |from_s: f64| {
         (0..64).map(|k| node(from_s + array.orbital_period_s() * f64::from(k) / 64.0)).sum::<f64>() / 64.0
     };
@@ -192,13 +195,13 @@ fn the_node_regresses_as_oblateness_says() {
     let axis_m = 2_037_100.0_f64;
     let motion = (GM_M3_S2 / axis_m.powi(3)).sqrt();
     let expected = -1.5 * motion * 2.0323e-4 * (1.738e6 / axis_m).powi(2) * 30_f64.to_radians().cos();
-    // J2's first order; the rest is of the order of C22, a tenth of J2, and of the remainder of a month.
+    // First order in J2; the rest is of the order of C22, a tenth of J2, and of the remainder of a month.
     assert!((rate / expected - 1.0).abs() < 0.05, "{rate} {expected}");
 }
 
 #[test]
-fn followers_go_where_the_leader_went_and_station_keeping_puts_them_back() {
-    let mut config = flown(8.0);
+fn followers_follow_the_track_and_station_keeping_restores_them() {
+    let mut config = propagated_config(8.0);
     config.cross_track_ratio = 0.02;
     let free = Array::new(&config).unwrap();
     config.propagate.keep_every_days = 2.0;
@@ -210,11 +213,12 @@ fn followers_go_where_the_leader_went_and_station_keeping_puts_them_back() {
         |array: &Array, n: usize, t_s: f64| norm(sub(array.position_m(0, t_s), array.position_m(n, t_s)));
     for n in 1..8 {
         let arc_m = formation.arc_m(n, 0.0).0;
-        // The chord of the arc; the field moves the leader off its ellipse by 1e-4 of an arc within a minute.
+        // The distance is the chord of the arc; the field moves the leader off its ellipse by 1e-4 of an arc within a
+        // minute.
         assert!((apart(&free, n, 0.0) / arc_m - 1.0).abs() < 2e-3, "{n}");
     }
     let reset = |array: &Array| -> Vec<f64> {
-        // Where satellite 8 jumps: the formation breathes by 100 km in a week, so that it is put nearer by kilometres.
+        // Satellite 8 jumps by kilometres, as the formation breathes by 100 km in a week.
         let jumps = (0..8 * 720).map(|k| f64::from(k) * STEP_S).filter(|t_s| {
             norm(sub(array.position_m(7, t_s + 1e-6), array.position_m(7, t_s - 1e-6))) > 100.0
         });
@@ -225,7 +229,7 @@ fn followers_go_where_the_leader_went_and_station_keeping_puts_them_back() {
         let times = reset(array);
         assert_eq!(times.len(), 3, "{times:?}");
         for (k, t_s) in times.into_iter().enumerate() {
-            // Within an orbit after it was due.
+            // The jump is within an orbit after it was due.
             let late_s = t_s - 2.0 * DAY_S * (k + 1) as f64;
             assert!((0.0..8500.0).contains(&late_s), "{late_s}");
             for n in 1..8 {
@@ -241,14 +245,14 @@ fn followers_go_where_the_leader_went_and_station_keeping_puts_them_back() {
     assert!((norm(held.position_m(0, t_s)) - 2_037_100.0).abs() < 1e-3);
     assert!((held.normal_hat(0, t_s)[2].acos().to_degrees() - 30.0).abs() < 1e-9);
     assert!((norm(kept.position_m(0, t_s)) - 2_037_100.0).abs() > 100.0);
-    // Where it was put is where it was, but for its height and the tilt that the field has made in two days.
+    // Its position is unchanged, except for its height and the tilt caused by the field in two days.
     let jump_m = norm(sub(held.position_m(0, t_s + 1e-6), held.position_m(0, t_s - 1e-6)));
     assert!(jump_m > 10.0 && jump_m < 20e3, "{jump_m}");
 }
 
 #[test]
 fn packets_carry_propagated_orbits_to_less_than_a_centimetre() {
-    let mut config = flown(10.0);
+    let mut config = propagated_config(10.0);
     config.propagate.keep_every_days = 1.0;
     let array = Array::new(&config).unwrap();
     let mut worst_m: f64 = 0.0;
@@ -273,7 +277,7 @@ fn packets_carry_propagated_orbits_to_less_than_a_centimetre() {
 }
 
 #[test]
-fn elements_fly_too_and_what_falls_is_told() {
+fn elements_are_propagated_and_impacts_are_reported() {
     let elements = |mean_anomaly_deg: f64, axis_m: f64| KeplerElements {
         semi_major_axis_m: axis_m,
         eccentricity: 0.1,
@@ -285,17 +289,18 @@ fn elements_fly_too_and_what_falls_is_told() {
         periapsis_rate_deg_per_day: 0.0,
     };
     let kepler: Vec<_> = (0..9).map(|n| elements(-0.01 * f64::from(n), 2.3e6)).collect();
-    let config = ArrayConfig { satellites: 9, kepler, ..flown(1.0) };
+    let config = ArrayConfig { satellites: 9, kepler, ..propagated_config(1.0) };
     let array = Array::new(&config).unwrap();
     assert_eq!((array.satellites(), array.known_s()), (9, Some([0.0, DAY_S])));
     for n in [0, 8] {
         let start = KeplerOrbit::about(&config.kepler[n], GM_M3_S2).state(0.0);
         assert_eq!(array.state(n, 0.0), start);
     }
-    // 2 km above the surface at its lowest: the field lowers it further within days.
+    // The lowest point is 2 km above the surface: the field lowers it further within days.
     let low: Vec<_> = (0..3).map(|n| elements(-0.01 * f64::from(n), 1.9325e6)).collect();
-    let said =
-        Array::new(&ArrayConfig { satellites: 3, kepler: low, ..flown(30.0) }).unwrap_err().to_string();
+    let said = Array::new(&ArrayConfig { satellites: 3, kepler: low, ..propagated_config(30.0) })
+        .unwrap_err()
+        .to_string();
     assert!(
         said.contains("array.propagate: satellite") && said.contains("km from the Moon's centre"),
         "{said}"

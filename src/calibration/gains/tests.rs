@@ -22,7 +22,7 @@ fn file(interpolation: Interpolation, solutions: Vec<(f64, Vec<Complex64>)>) -> 
     }
 }
 
-/// A block of pair 1-3 whose arrays can be told apart and matched up.
+/// A block of pair 1-3 with a different value in each element of its arrays.
 fn block(time_s: Vec<f64>) -> PlacedVisibilities {
     let by_time = |f: fn(f64) -> f64| time_s.iter().map(|&t| f(t)).collect::<Vec<f64>>();
     PlacedVisibilities {
@@ -39,7 +39,7 @@ fn block(time_s: Vec<f64>) -> PlacedVisibilities {
     }
 }
 
-fn one(gains: [(f64, f64); 3]) -> AntennaGains {
+fn constant_gains(gains: [(f64, f64); 3]) -> AntennaGains {
     let gains = gains.map(|(re, im)| Complex64::new(re, im)).to_vec();
     AntennaGains::new(&file(Interpolation::LogLinear, vec![(0.0, gains)])).unwrap()
 }
@@ -62,7 +62,7 @@ fn solutions() -> impl Strategy<Value = Vec<(f64, Vec<Complex64>)>> {
 
 proptest! {
     #[test]
-    fn what_the_gains_did_is_undone(
+    fn apply_divides_by_the_gains(
         solutions in solutions(),
         nearest in any::<bool>(),
         mut times in proptest::collection::vec(-2e5..5e5_f64, 0..40),
@@ -75,13 +75,13 @@ proptest! {
         for k in 0..truth.len() {
             let factor = gains.factor(FREQUENCY_HZ, truth.pair, truth.time_s[k]).unwrap();
             measured.value_k_sr[k] *= factor;
-            // Noise of the same origin is louder by |factor|.
+            // Noise of the sky and receiver is multiplied by |factor|, too.
             measured.weight[k] /= factor.norm_sqr();
         }
         let report = gains.apply(&mut measured).unwrap();
         prop_assert_eq!(report, CalibrationReport { kept: truth.len(), unusable_gain: 0 });
         for k in 0..truth.len() {
-            // One multiplication and one division of complex numbers: some units in the last place.
+            // One multiplication and constant_gains division of complex numbers: some units in the last place.
             let (found, expected) = (measured.value_k_sr[k], truth.value_k_sr[k]);
             prop_assert!((found - expected).norm() < 1e-14 * expected.norm());
             prop_assert!((measured.weight[k] / truth.weight[k] - 1.0).abs() < 1e-14);
@@ -96,7 +96,7 @@ proptest! {
         decay in -1e-2..1e-2_f64,
         time_s in 0.0..40.0_f64,
     ) {
-        // g_3 = exp((decay + i rate) t), known every 3 s: the phase turns by less than pi between.
+        // g_3 = exp((decay + i rate) t), given every 3 s: the phase changes by less than pi between.
         let drift = Complex64::new(decay, rate);
         let unity = Complex64::new(1.0, 0.0);
         let times = (0..15).map(|k| 3.0 * f64::from(k));
@@ -112,7 +112,7 @@ proptest! {
 #[test]
 fn the_first_satellite_is_not_conjugated() {
     // E'_1 = i E_1, E'_3 = 2 E_3: V' = 2 i V.
-    let mut gains = one([(0.0, 1.0), (7.0, 0.0), (2.0, 0.0)]);
+    let mut gains = constant_gains([(0.0, 1.0), (7.0, 0.0), (2.0, 0.0)]);
     let mut block = block(vec![0.0]);
     block.value_k_sr[0] = Complex64::new(0.0, 6.0);
     block.weight[0] = 0.5;
@@ -122,7 +122,7 @@ fn the_first_satellite_is_not_conjugated() {
 }
 
 #[test]
-fn nearest_and_edges_hold() {
+fn interpolation_is_right_between_and_beyond_solutions() {
     let at = |re| vec![Complex64::new(1.0, 0.0), Complex64::new(1.0, 0.0), Complex64::new(re, 0.0)];
     let solutions = vec![(0.0, at(2.0)), (10.0, at(4.0)), (20.0, at(8.0))];
     let pair = Pair { i: 0, j: 2 };
@@ -145,10 +145,10 @@ fn nearest_and_edges_hold() {
 }
 
 #[test]
-fn unusable_gains_take_their_visibilities_along() {
+fn visibilities_with_unusable_gains_are_removed() {
     let good = Complex64::new(1.0, 0.0);
     for bad in [0.0, f64::NAN, f64::INFINITY, 1e-200, 1e200].map(|re| Complex64::new(re, 0.0)) {
-        // Useless at 10 s, and on the way there and back.
+        // Unusable at 10 s, and between there and the solutions beside it.
         let solutions = [(0.0, good), (10.0, bad), (20.0, good), (30.0, good)]
             .map(|(time_s, g_3)| (time_s, vec![good, good, g_3]));
         let mut nearest = AntennaGains::new(&file(Interpolation::Nearest, solutions.to_vec())).unwrap();
@@ -181,7 +181,7 @@ fn weights_are_inverse_variances_after_correction() {
     const SIGMA_K_SR: f64 = 250.0;
     let mut random = random_stream(7, StreamKind::Probe, [0, 0]);
     let mut normal = || -> f64 { StandardNormal.sample(&mut random) };
-    let mut gains = one([(0.3, -0.8), (1.0, 0.0), (1.7, 0.4)]);
+    let mut gains = constant_gains([(0.3, -0.8), (1.0, 0.0), (1.7, 0.4)]);
     let mut measured = block((0..COUNT).map(|k| k as f64).collect());
     let truth = Complex64::new(2e5, -7e4);
     for k in 0..COUNT {
@@ -194,8 +194,8 @@ fn weights_are_inverse_variances_after_correction() {
     let errors: Vec<Complex64> = measured.value_k_sr.iter().map(|value| value - truth).collect();
     let mean_of = |f: &dyn Fn(&Complex64) -> f64| errors.iter().map(f).sum::<f64>() / COUNT as f64;
     let weight = measured.weight[0];
-    // A variance from n values has a relative error of sqrt(2 / n), a correlation one of 1 / sqrt(n),
-    // a mean one of sigma / sqrt(n); five of each.
+    // The relative error of a variance from n values is sqrt(2 / n), the error of a correlation 1 / sqrt(n), that of
+    // a mean sigma / sqrt(n); the limits are five times these.
     let scatter = 5.0 / (COUNT as f64).sqrt();
     assert!((mean_of(&|e| e.re * e.re) * weight - 1.0).abs() < scatter * 2_f64.sqrt());
     assert!((mean_of(&|e| e.im * e.im) * weight - 1.0).abs() < scatter * 2_f64.sqrt());
@@ -205,7 +205,7 @@ fn weights_are_inverse_variances_after_correction() {
 
 #[test]
 fn blocks_of_another_array_are_refused() {
-    let mut gains = one([(1.0, 0.0); 3]);
+    let mut gains = constant_gains([(1.0, 0.0); 3]);
     let mut other_channel = block(vec![0.0]);
     other_channel.frequency_hz += 4_001.0;
     let error = gains.apply(&mut other_channel).unwrap_err();
@@ -220,12 +220,12 @@ fn blocks_of_another_array_are_refused() {
 }
 
 #[test]
-fn bad_values_are_told_with_their_file() {
+fn invalid_values_are_reported_with_their_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("gains.toml");
     std::fs::write(&path, "channels = []").unwrap();
     let error = AntennaGains::read(&path).unwrap_err();
     assert!(matches!(error, CalibrationError::Values { .. }), "{error}");
     let text = error.to_string();
-    assert!(text.contains("gains.toml") && text.contains("at least one channel"), "{text}");
+    assert!(text.contains("gains.toml") && text.contains("at least constant_gains channel"), "{text}");
 }

@@ -1,7 +1,7 @@
-//! What the data of a pass can tell of gains, clocks and positions at best: the Cramer-Rao bound.
+//! Cramer-Rao bounds of gains, clocks and positions from the data of a pass.
 //!
-//! The inverse of the Fisher information at no errors, with the priors of the settings. Values of visibilities do not enter, so that a
-//! pass can be judged that nobody has observed.
+//! A bound is a diagonal element of the inverse of the Fisher information without errors, with the configured priors.
+//! Values of visibilities do not enter, so that bounds can be computed before a pass is observed.
 
 use serde::Serialize;
 
@@ -16,37 +16,38 @@ use crate::frames::{Instrument, PlacedVisibilities};
 use crate::sky::SkyMap;
 use crate::units::vector::Vec3;
 
-/// Least standard deviations of the gain of a daughter in a channel.
+/// Smallest possible standard deviations of the gain of a daughter in a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct GainBound {
     /// Centre of the channel, Hz.
     pub frequency_hz: f64,
-    /// Of the natural logarithm of the amplitude.
+    /// Standard deviation of the natural logarithm of the amplitude.
     pub amplitude_sigma: f64,
-    /// Of the phase against the reference daughter, clock included, deg.
+    /// Standard deviation of the phase relative to the reference daughter, clock included, deg.
     pub phase_sigma_deg: f64,
-    /// Visibilities of the daughter.
+    /// Number of visibilities of the daughter.
     pub visibilities: u64,
 }
 
-/// Least standard deviations of a daughter's gains, clock and position after a pass.
+/// Smallest possible standard deviations of a daughter's gains, clock and position after a pass.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DaughterBound {
-    /// From 1.
+    /// Number of the daughter, from 1.
     pub daughter: u32,
-    /// Of the clock, ns; 0 where it is not solved for.
+    /// Standard deviation of the clock, ns; 0 where it is not solved for.
     pub clock_sigma_ns: f64,
-    /// Of the position along the track, across it and away from the Moon, m; 0 where it is not solved for.
+    /// Standard deviations of the position along the track, across it and away from the Moon, m; 0 where it is not
+    /// solved for.
     pub position_sigma_m: [f64; 3],
-    /// By channel.
+    /// Bounds of gains, by channel.
     pub gains: Vec<GainBound>,
 }
 
-/// Bounds of all daughters for visibilities of one pass, whose values do not matter, with maps (K) of the sky, one a channel, and the
-/// normal of each daughter's orbit.
+/// Computes the bounds of all daughters for visibilities of one pass, whose values do not matter, with one map (K) of
+/// the sky per channel and the normal of each daughter's orbit.
 ///
 /// # Errors
-/// Maps that the solver does not take.
+/// The solver does not accept the maps.
 pub fn bounds(
     config: &SolverConfig,
     instrument: &Instrument,
@@ -64,32 +65,34 @@ pub fn bounds(
     let sums = sums_of(&blocks, [f64::NEG_INFINITY, f64::INFINITY], &layout, &vec![1.0; blocks.len()]);
     let order = layout.order();
     let (information, _) = layout.normal(&layout.ideal(), &sums, None);
-    // Priors keep it positive definite.
+    // The priors keep the matrix positive definite.
     let covariance = DenseFactor::new(&information, order).map_or_else(Vec::new, |factor| factor.inverse());
-    let of = |a: Option<usize>, b: Option<usize>| match (a, b) {
+    let covariance_of = |a: Option<usize>, b: Option<usize>| match (a, b) {
         (Some(a), Some(b)) => covariance.get(a * order + b).copied().unwrap_or(f64::NAN),
         _ => 0.0,
     };
     let gain = |c: usize, n: usize| {
         let (amplitude, phase, clock) = (layout.amplitude(c, n), layout.phase(c, n), layout.clock(n));
-        let per_ns = layout.per_ns(c);
-        let variance =
-            of(phase, phase) + 2.0 * per_ns * of(phase, clock) + per_ns * per_ns * of(clock, clock);
-        let own = blocks.iter().filter(|block| block.channel == c);
-        let own = own.filter(|block| [block.pair.i, block.pair.j].map(usize::from).contains(&n));
+        let rad_per_ns = layout.rad_per_ns(c);
+        let variance = covariance_of(phase, phase)
+            + 2.0 * rad_per_ns * covariance_of(phase, clock)
+            + rad_per_ns * rad_per_ns * covariance_of(clock, clock);
+        let of_daughter = blocks.iter().filter(|block| block.channel == c);
+        let of_daughter =
+            of_daughter.filter(|block| [block.pair.i, block.pair.j].map(usize::from).contains(&n));
         GainBound {
             frequency_hz: layout.frequencies_hz[c],
-            amplitude_sigma: of(amplitude, amplitude).sqrt(),
+            amplitude_sigma: covariance_of(amplitude, amplitude).sqrt(),
             phase_sigma_deg: variance.max(0.0).sqrt().to_degrees(),
-            visibilities: own.map(|block| block.time_s.len() as u64).sum(),
+            visibilities: of_daughter.map(|block| block.time_s.len() as u64).sum(),
         }
     };
     let daughter = |n: usize| DaughterBound {
         daughter: n as u32 + 1,
-        clock_sigma_ns: of(layout.clock(n), layout.clock(n)).sqrt(),
+        clock_sigma_ns: covariance_of(layout.clock(n), layout.clock(n)).sqrt(),
         position_sigma_m: [0, 1, 2].map(|axis| {
-            let place = layout.position(n, axis);
-            of(place, place).sqrt()
+            let index = layout.position(n, axis);
+            covariance_of(index, index).sqrt()
         }),
         gains: (0..layout.channels()).map(|c| gain(c, n)).collect(),
     };

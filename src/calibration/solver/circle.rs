@@ -1,4 +1,4 @@
-//! The sky of a map by spherical harmonics, for pairs on one circle.
+//! Visibilities of a map by spherical harmonics, for pairs on one circular orbit.
 
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
@@ -16,27 +16,30 @@ use crate::sky::healpix::pixel_count;
 use crate::sky::{Frame, MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Longest baseline of a map, wavelengths, in units of its nside: two and a half times that whose fringe is two pixels wide.
+/// Longest baseline for a map, in wavelengths per nside: two and a half times the one whose fringe is two pixels
+/// wide.
 const WAVELENGTHS_OF_NSIDE: f64 = 2.5;
 
-/// Most of them; bounds the tables.
+/// Maximum baseline, wavelengths; bounds the tables.
 const WAVELENGTHS_MAX: f64 = 320.0;
 
-/// Greatest nside whose tables are made: some 2 GB a channel.
+/// Largest nside for which tables are made: some 2 GB per channel.
 pub(super) const NSIDE_MAX: usize = 256;
 
-/// Phase by which a pair may be off its circle, rad: that of its fringe, and of what the limb of the Moon moves by.
+/// Tolerated phase error of a pair off its circle, rad: of its fringe and of the Moon's limb.
 const PHASE_RAD_MAX: f64 = 1e-3;
 
-/// Circles are multiples of these, far less than what matters, so that a pass has the circle of the one before.
+/// Circles are rounded to multiples of these steps, far below what matters, so that consecutive passes share one
+/// circle.
 const INCLINATION_STEP_DEG: f64 = 5e-5;
 const RADIUS_STEP_M: f64 = 1.0;
 
-/// Longest chord of a circle that is taken, radii.
+/// Longest chord of a circle that is accepted, radii.
 const CHORD_MAX: f64 = 1.99;
 
-/// Visibilities of a pass times pixels from which the tables of a circle are worth their making: sums over the pixels take 1 ns each, the
-/// tables a second and more for all passes of a mission on one circle. Whether they are there already must not count: bits would depend on it.
+/// Minimum number of visibilities of a pass times pixels for which the tables of a circle are made. Sums over pixels
+/// take 1 ns each; the tables take a second or more, for all passes of a mission on one circle. The choice must not
+/// depend on whether tables exist already, as results would depend on it.
 const PRODUCTS_MIN: usize = 5_000_000;
 
 /// A circular orbit.
@@ -47,7 +50,8 @@ struct Circle {
 }
 
 impl Circle {
-    /// The circle of a pass, taken as prograde: that of its longer baselines up to `baseline_m_max`, whose planes are known best.
+    /// The circle of a pass, taken as prograde: the median of its longer baselines up to `baseline_m_max`, whose
+    /// planes are known best.
     fn of(pairs: &[Option<PairOrientation>], baseline_m_max: f64) -> Option<Self> {
         let within = |pair: &&PairOrientation| pair.baseline_m <= baseline_m_max;
         let pairs: Vec<&PairOrientation> = pairs.iter().flatten().filter(within).collect();
@@ -61,8 +65,8 @@ impl Circle {
         })
     }
 
-    /// Whether a pair is on it, to within a negligible phase.
-    fn holds(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
+    /// Whether a pair is on the circle, to within a negligible phase.
+    fn contains(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
         let tilt_rad = (prograde_rad(pair) - self.inclination_rad()).abs();
         let off_rad = tilt_rad + pair.radius_difference_m.abs() / pair.baseline_m;
         (pair.radius_m - self.radius_m).abs() <= RADIUS_STEP_M
@@ -74,7 +78,7 @@ impl Circle {
     }
 }
 
-/// Inclination of a pair's plane, rad, whichever satellite leads.
+/// Inclination of a pair's plane, rad, taken as prograde.
 fn prograde_rad(pair: &PairOrientation) -> f64 {
     pair.inclination_rad.min(PI - pair.inclination_rad)
 }
@@ -85,44 +89,44 @@ pub fn wavelengths_max(nside: usize) -> f64 {
     (WAVELENGTHS_OF_NSIDE * nside as f64).min(WAVELENGTHS_MAX)
 }
 
-/// The rotations of a circle, which channels share.
+/// Rotation table of the last circle, shared by all channels.
 #[derive(Default)]
 pub(super) struct Rotations {
-    kept: Option<(Circle, Arc<RotationTable<f32>>)>,
+    last: Option<(Circle, Arc<RotationTable<f32>>)>,
 }
 
 impl Rotations {
     fn of(&mut self, circle: Circle, l_max: usize) -> Arc<RotationTable<f32>> {
-        match &self.kept {
-            Some((kept, table)) if *kept == circle && table.l_max() == l_max => Arc::clone(table),
+        match &self.last {
+            Some((last, table)) if *last == circle && table.l_max() == l_max => Arc::clone(table),
             _ => {
                 let table = Arc::new(RotationTable::new(l_max, circle.inclination_rad()));
-                self.kept = Some((circle, Arc::clone(&table)));
+                self.last = Some((circle, Arc::clone(&table)));
                 table
             }
         }
     }
 }
 
-/// The sky of a channel: harmonics where they hold, sums over pixels elsewhere.
+/// Sky of a channel: harmonics for pairs on the circle, sums over pixels for the others.
 pub(super) struct CircleSky {
     alm: Alm,
     nside: usize,
     frequency_hz: f64,
     moon_radius_m: f64,
     response: AntennaResponse,
-    /// Visibilities of a pass times pixels from which there are tables.
+    /// Minimum number of visibilities of a pass times pixels for which tables are made.
     products_min: usize,
-    /// Of the circle seen last.
-    made: Option<(Circle, HarmonicSum)>,
-    elsewhere: DirectSum,
+    /// Tables of the last circle.
+    last_tables: Option<(Circle, HarmonicSum)>,
+    pixel_sum: DirectSum,
 }
 
 impl CircleSky {
-    /// The sky of `map` (K) to degree 5/2 nside; by tables always, or where they save time.
+    /// Creates the sky of `map` (K) to degree 5/2 nside. Tables are used `always`, or where they save time.
     ///
     /// # Errors
-    /// A map with pixels that have no value.
+    /// The map has pixels without value.
     pub(super) fn new(
         map: &SkyMap,
         frequency_hz: f64,
@@ -136,15 +140,25 @@ impl CircleSky {
             Frame::Ecliptic => alm,
             frame => alm.rotated(&frame.to_ecliptic()),
         };
-        let elsewhere = DirectSum::new(map, frequency_hz, moon_radius_m, response);
+        let pixel_sum = DirectSum::new(map, frequency_hz, moon_radius_m, response);
         let products_min = if always { 0 } else { PRODUCTS_MIN };
-        Ok(Self { alm, nside, frequency_hz, moon_radius_m, response, products_min, made: None, elsewhere })
+        Ok(Self {
+            alm,
+            nside,
+            frequency_hz,
+            moon_radius_m,
+            response,
+            products_min,
+            last_tables: None,
+            pixel_sum,
+        })
     }
 
-    /// Visibilities of the positions of a pass, K sr: those on its circle by harmonics if they are many, all others by sums over pixels.
+    /// Visibilities of the positions of a pass, K sr: by harmonics for those on its circle, if they are many; by sums
+    /// over pixels for all others.
     ///
     /// # Errors
-    /// Positions that neither covers.
+    /// Neither covers the positions.
     pub(super) fn predict(
         &mut self,
         positions: &[PairPosition],
@@ -153,12 +167,12 @@ impl CircleSky {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.frequency_hz;
         let longest_m = wavelengths_max(self.nside) * wavelength_m;
         let pairs: Vec<Option<PairOrientation>> =
-            positions.iter().map(|at| PairOrientation::of(at.r_i_m, at.r_j_m).ok()).collect();
+            positions.iter().map(|at| PairOrientation::of_pair(at.r_i_m, at.r_j_m).ok()).collect();
         let circle = Circle::of(&pairs, longest_m).filter(|circle| circle.radius_m > self.moon_radius_m);
         let is_on = |pair: &Option<PairOrientation>| match (circle, pair) {
             (Some(circle), Some(pair)) => {
                 pair.baseline_m <= longest_m.min(CHORD_MAX * circle.radius_m)
-                    && circle.holds(pair, wavelength_m)
+                    && circle.contains(pair, wavelength_m)
             }
             _ => false,
         };
@@ -170,28 +184,28 @@ impl CircleSky {
         let chosen = |which: bool| -> Vec<PairPosition> {
             positions.iter().zip(&on).filter(|(_, on)| **on == which).map(|(position, _)| *position).collect()
         };
-        let (on_it, off_it) = (chosen(true), chosen(false));
-        let [mut found, mut summed] =
-            [&on_it, &off_it].map(|positions| vec![Complex64::ZERO; positions.len()]);
-        if let (Some(circle), false) = (circle, on_it.is_empty()) {
-            self.on(circle, rotations)?.predict(&on_it, &mut found)?;
+        let (on_circle, off_circle) = (chosen(true), chosen(false));
+        let [mut found, mut pixel_values] =
+            [&on_circle, &off_circle].map(|positions| vec![Complex64::ZERO; positions.len()]);
+        if let (Some(circle), false) = (circle, on_circle.is_empty()) {
+            self.tables(circle, rotations)?.predict(&on_circle, &mut found)?;
         }
-        self.elsewhere.predict(&off_it, &mut summed)?;
-        let (mut found, mut summed) = (found.into_iter(), summed.into_iter());
-        let next = |on: bool| if on { found.next() } else { summed.next() };
+        self.pixel_sum.predict(&off_circle, &mut pixel_values)?;
+        let (mut found, mut pixel_values) = (found.into_iter(), pixel_values.into_iter());
+        let next = |on: bool| if on { found.next() } else { pixel_values.next() };
         Ok(on.into_iter().map(next).map(Option::unwrap_or_default).collect())
     }
 
-    /// The model on a circle.
-    fn on(&mut self, circle: Circle, rotations: &mut Rotations) -> Result<&mut HarmonicSum, ModelError> {
-        let made = match self.made.take() {
+    /// Tables of a circle, from the last call or new.
+    fn tables(&mut self, circle: Circle, rotations: &mut Rotations) -> Result<&mut HarmonicSum, ModelError> {
+        let last_tables = match self.last_tables.take() {
             Some((before, sum)) if before == circle => sum,
-            _ => self.sum(circle, rotations)?,
+            _ => self.new_tables(circle, rotations)?,
         };
-        Ok(&mut self.made.insert((circle, made)).1)
+        Ok(&mut self.last_tables.insert((circle, last_tables)).1)
     }
 
-    fn sum(&self, circle: Circle, rotations: &mut Rotations) -> Result<HarmonicSum, ModelError> {
+    fn new_tables(&self, circle: Circle, rotations: &mut Rotations) -> Result<HarmonicSum, ModelError> {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.frequency_hz;
         let u_max = wavelengths_max(self.nside).min(CHORD_MAX * circle.radius_m / wavelength_m);
         let setup = HarmonicSumSetup {
@@ -201,7 +215,7 @@ impl CircleSky {
             moon_radius_m: self.moon_radius_m,
             baseline_wavelengths_max: u_max,
             response: self.response,
-            // What is on the circle was decided before.
+            // Positions on the circle were selected before.
             limits: GeometryLimits {
                 out_of_track_deg_max: 1.0,
                 inclination_deg_max: 0.0,
@@ -245,21 +259,21 @@ mod tests {
         SkyMap::new(Frame::Ecliptic, values).unwrap()
     }
 
-    /// Visibilities of a pass.
+    /// Number of visibilities of a pass.
     const COUNT: usize = 60;
 
-    /// Two daughters of an array over part of an orbit.
+    /// Positions of two daughters of an array over part of an orbit.
     fn pass(array: &Array, [i, j]: [usize; 2]) -> Vec<PairPosition> {
         let at = |t_s: f64| PairPosition {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         (0..COUNT).map(|k| at(1000.0 + 20.0 * k as f64)).collect()
     }
 
-    /// The same, with the first further from the Moon.
+    /// Positions as of `pass`, with the first daughter further from the Moon.
     fn raised(array: &Array, pair: [usize; 2], by_m: f64) -> Vec<PairPosition> {
         let raise = |position: PairPosition| {
             let r_i_m = add(position.r_i_m, scale(by_m, unit(position.r_i_m)));
@@ -283,17 +297,18 @@ mod tests {
         values.iter().map(|value| [value.re.to_bits(), value.im.to_bits()]).collect()
     }
 
-    /// Requires visibilities of the sky; one of every `step` is looked at.
+    /// Asserts that visibilities are those of the sky; checks one of every `step`.
     fn assert_of_the_sky(array: &Array, positions: &[PairPosition], found: &[Complex64], step: usize) {
         const FINE: usize = 256;
         let some: Vec<PairPosition> = positions.iter().step_by(step).copied().collect();
         let expected = direct(array, FINE, &some);
-        // Direct sums count the 4 nside pixels on the limb whole: half a pixel each, at random, of some 12 K.
+        // Direct sums count the 4 nside pixels on the limb as whole: a random error of half a pixel each, of some 12
+        // K.
         let limb = 0.5 * (4.0 * FINE as f64).sqrt() * pixel_area_sr(FINE) * 12.0;
         for (found, expected) in found.iter().step_by(step).zip(&expected) {
             assert!((found - expected).norm() < 4.0 * limb, "{found} {expected} {limb}");
         }
-        // It is not all limb.
+        // The signal is well above this limb error.
         let power = expected.iter().map(Complex64::norm_sqr).sum::<f64>() / expected.len() as f64;
         assert!(power.sqrt() > 20.0 * limb, "{power}");
     }
@@ -305,24 +320,24 @@ mod tests {
         let mut sky_of_circle = circle_sky(&array);
         let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
         assert_of_the_sky(&array, &positions, &found, 4);
-        assert!(sky_of_circle.made.is_some());
+        assert!(sky_of_circle.last_tables.is_some());
     }
 
     #[test]
-    fn a_phase_that_does_not_matter_leaves_a_pair_on_its_circle() {
+    fn a_negligible_phase_leaves_a_pair_on_its_circle() {
         let array = array();
-        // 1 mm of 600 m, 2e-6 rad: 2e-4 rad of phase at 10 MHz. A pair of 2 km tells the plane.
+        // 1 mm of 600 m is 2e-6 rad: 2e-4 rad of phase at 10 MHz. A pair of 2 km determines the plane.
         let mut positions = pass(&array, [0, 2]);
         positions.extend(raised(&array, [0, 1], 1e-3));
         let mut sky_of_circle = circle_sky(&array);
         let found = sky_of_circle.predict(&positions, &mut Rotations::default()).unwrap();
-        let summed = direct(&array, 64, &positions);
-        assert!(found.iter().zip(&summed).all(|(found, summed)| found != summed));
+        let pixel_values = direct(&array, 64, &positions);
+        assert!(found.iter().zip(&pixel_values).all(|(found, pixel_values)| found != pixel_values));
         assert_of_the_sky(&array, &positions[COUNT..], &found[COUNT..], 10);
     }
 
     #[test]
-    fn what_is_off_the_circle_or_too_long_is_summed_over_pixels() {
+    fn pairs_off_the_circle_or_too_long_are_summed_over_pixels() {
         let array = array();
         let mut positions = pass(&array, [0, 1]);
         let wavelength_m = SPEED_OF_LIGHT_M_S / FREQUENCY_HZ;
@@ -336,22 +351,22 @@ mod tests {
         let expected = direct(&array, 64, &positions);
         assert_eq!(bits(&found[COUNT..]), bits(&expected[COUNT..]));
         assert!(found[..COUNT].iter().zip(&expected[..COUNT]).all(|(found, expected)| found != expected));
-        // The last by themselves: no circle fits them, not even their own, and none is made.
+        // The raised pairs alone: no circle fits them, not even their own, and none is made.
         let mut alone = circle_sky(&array);
         let found = alone.predict(&positions[moved..], &mut Rotations::default()).unwrap();
         assert_eq!(bits(&found), bits(&expected[moved..]));
-        assert!(alone.made.is_none());
+        assert!(alone.last_tables.is_none());
     }
 
     #[test]
-    fn few_are_summed_over_pixels_sooner_than_tables_are_made() {
+    fn few_visibilities_are_summed_over_pixels() {
         let array = array();
         let positions = pass(&array, [0, 1]);
         let predict = |positions: &[PairPosition]| {
             let mut auto =
                 CircleSky::new(&sky(64), FREQUENCY_HZ, array.moon_radius_m(), ISOTROPIC, false).unwrap();
             let found = auto.predict(positions, &mut Rotations::default()).unwrap();
-            (found, auto.made.is_some())
+            (found, auto.last_tables.is_some())
         };
         let (found, is_made) = predict(&positions);
         assert!(!is_made);
@@ -383,8 +398,8 @@ mod tests {
         let mut rotations = Rotations::default();
         let mut sky_of_circle = circle_sky(&array);
         let first = sky_of_circle.predict(&positions, &mut rotations).unwrap();
-        let elsewhere = sky_of_circle.predict(&pass(&higher, [1, 2]), &mut rotations).unwrap();
-        assert_ne!(bits(&elsewhere), bits(&first));
+        let pixel_sum = sky_of_circle.predict(&pass(&higher, [1, 2]), &mut rotations).unwrap();
+        assert_ne!(bits(&pixel_sum), bits(&first));
         assert_eq!(bits(&sky_of_circle.predict(&positions, &mut rotations).unwrap()), bits(&first));
         let mut other = circle_sky(&array);
         assert_eq!(bits(&other.predict(&positions, &mut Rotations::default()).unwrap()), bits(&first));

@@ -19,7 +19,7 @@ pub enum CalibrationMode {
     /// The sky, from a map.
     #[default]
     Sky,
-    /// An artificial signal, in the integrations flagged for it; the sky under it counts as an error.
+    /// An artificial signal, in the integrations flagged for it. The sky under it counts as an error.
     Beacon,
     /// Both: the sky everywhere, and the artificial signal where it is on.
     Joint,
@@ -29,14 +29,14 @@ pub enum CalibrationMode {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum AmplitudeScale {
-    /// The model: its strength is true.
+    /// The model, whose flux scale is taken as true.
     #[default]
     Model,
     /// A geometric mean of one over the daughters: the sky keeps its scale.
     UnitMean,
 }
 
-/// How the visibilities of the known sky are computed.
+/// Method of computing the visibilities of the known sky.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SkyModel {
@@ -51,7 +51,7 @@ pub enum SkyModel {
     Harmonic,
 }
 
-/// nside from which harmonics are chosen: fewer pixels are summed fast enough.
+/// Smallest nside for which harmonics are chosen: sums over fewer pixels are fast enough.
 const HARMONIC_NSIDE_MIN: usize = 64;
 
 keys! {
@@ -115,10 +115,10 @@ impl SolverConfig {
         Beacon { k_sr: self.beacon_k_sr, direction_deg: self.beacon_direction_deg }
     }
 
-    /// Requires that `sky_model` takes maps of the known sky.
+    /// Checks that `sky_model` accepts maps of the known sky.
     ///
     /// # Errors
-    /// A map that is too fine for harmonics.
+    /// A map is too fine for harmonics.
     pub(super) fn can_model(&self, maps: &[SkyMap]) -> Result<(), InvalidValue> {
         let nside = maps.iter().map(SkyMap::nside).max().unwrap_or(0);
         if self.sky_model != SkyModel::Harmonic || nside <= NSIDE_MAX {
@@ -134,20 +134,20 @@ impl SolverConfig {
         })
     }
 
-    /// Whether the sky of a map of this nside is by harmonics.
+    /// Whether the sky of a map of this nside is computed by harmonics.
     #[must_use]
     pub fn is_harmonic(&self, nside: usize) -> bool {
         match self.sky_model {
             SkyModel::Direct => false,
             SkyModel::Harmonic => true,
             SkyModel::Auto => {
-                let is_alone = self.position_sigma_m == 0.0 && self.model_nside == 0;
-                is_alone && (HARMONIC_NSIDE_MIN..=NSIDE_MAX).contains(&nside)
+                let is_plain = self.position_sigma_m == 0.0 && self.model_nside == 0;
+                is_plain && (HARMONIC_NSIDE_MIN..=NSIDE_MAX).contains(&nside)
             }
         }
     }
 
-    /// The signal that is known with maps of the sky, or without: without a map both is the artificial signal.
+    /// The known signal, with or without maps of the sky: joint mode without a map is beacon mode.
     #[must_use]
     pub fn known_signal(&self, has_maps: bool) -> CalibrationMode {
         match (self.mode, has_maps) {
@@ -156,46 +156,45 @@ impl SolverConfig {
         }
     }
 
-    /// The maps of the known sky.
+    /// Reads the maps of the known sky.
     ///
     /// # Errors
-    /// A map that cannot be read.
+    /// A map cannot be read.
     pub fn models(&self) -> Result<Vec<SkyMap>, CalibrationError> {
         let read = |path: &PathBuf| Ok(read_known_sky(path, &ReadOptions::default())?);
         self.model_files.iter().map(read).collect()
     }
 
-    /// Everything that keeps it from being used while the data arrive; empty if nothing does.
+    /// All settings that cannot be used while the data arrive; empty if there are none.
     #[must_use]
     pub fn problems_of_hook(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
-        let known = self.mode != CalibrationMode::Sky || !self.model_files.is_empty();
-        let expected =
-            "maps of the sky, one a channel, with calibration.hook = \"solve\" and calibrate.mode = \"sky\"";
-        checks.require("model_files", "[]", known, expected);
+        let mut checks = Checks::new("calibrate");
+        let has_signal = self.mode != CalibrationMode::Sky || !self.model_files.is_empty();
+        let expected = "maps of the sky, one for each channel, with calibration.hook = \"solve\" and calibrate.mode = \"sky\"";
+        checks.require("model_files", "[]", has_signal, expected);
         let rounds = self.map_rounds;
         let expected =
-            "0 with calibration.hook = \"solve\": data that are gone cannot be calibrated with a later map";
+            "0 with calibration.hook = \"solve\": data are not kept for calibration with a later map";
         checks.require("map_rounds", rounds, rounds == 0, expected);
         checks.finish()
     }
 
-    /// Says that positions may be further off than they are searched in channels of these frequencies, if they may be.
+    /// Note for the user if positions may be further off than the search in channels of these frequencies extends.
     #[must_use]
     pub fn reach_note(&self, frequencies_hz: &[f64]) -> Option<String> {
         let lowest_hz = frequencies_hz.iter().copied().reduce(f64::min)?;
         reach_note(self.position_sigma_m, lowest_hz)
     }
 
-    /// What the data of channels of these frequencies do not determine, and what decides it instead.
+    /// Notes for the user on what the data of channels of these frequencies do not determine, and how it is fixed.
     #[must_use]
     pub fn conventions(&self, frequencies_hz: &[f64]) -> Vec<String> {
-        let mut told = vec![format!(
+        let mut notes = vec![format!(
             "phases, clocks and positions are relative to daughter {}: a phase that all have leaves no trace, and a shift of all \
              positions only a rotation of the sky",
             self.reference_daughter
         )];
-        told.push(match self.amplitude_scale {
+        notes.push(match self.amplitude_scale {
             AmplitudeScale::Model => {
                 "the common amplitude is that of the model: a sky of other strength gives other gains"
                     .to_owned()
@@ -206,18 +205,18 @@ impl SolverConfig {
             }
         });
         if self.clock_sigma_ns > 0.0 && self.phase_sigma_deg > 0.0 {
-            told.push(
+            notes.push(
                 "a clock and the phases of its channels differ by their priors alone; their sum is what is measured".to_owned(),
             );
         }
-        told.extend(self.reach_note(frequencies_hz));
-        told
+        notes.extend(self.reach_note(frequencies_hz));
+        notes
     }
 
-    /// Everything that is wrong with the section; empty if it is good.
+    /// All invalid values; empty if there are none.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("calibrate");
+        let mut checks = Checks::new("calibrate");
         for (key, value, most) in [
             ("amplitude_sigma", self.amplitude_sigma, 10.0),
             ("phase_sigma_deg", self.phase_sigma_deg, 1e4),
@@ -237,8 +236,13 @@ impl SolverConfig {
         ] {
             checks.require(key, value, (least..=most).contains(&value), format!("{least} to {most}"));
         }
-        let one = self.hold_out_every;
-        checks.require("hold_out_every", one, one != 1, "0 or at least 2: some passes have to make the map");
+        let period = self.hold_out_every;
+        checks.require(
+            "hold_out_every",
+            period,
+            period != 1,
+            "0 or at least 2: some passes have to make the map",
+        );
         let gap_s = self.pass_gap_s;
         checks.number("pass_gap_s", gap_s, (1.0..=1e6).contains(&gap_s), "1 s to 1e6 s");
         let cut = self.outlier_sigma;
@@ -269,9 +273,9 @@ impl SolverConfig {
         let expected = "\"direct\" or \"auto\" with position_sigma_m: its derivatives are sums over pixels";
         checks.require("sky_model", "harmonic", !is_harmonic || self.position_sigma_m == 0.0, expected);
         self.beacon().check("beacon", &mut checks);
-        let lit = self.mode == CalibrationMode::Sky || self.beacon_k_sr > 0.0;
+        let has_power = self.mode == CalibrationMode::Sky || self.beacon_k_sr > 0.0;
         let expected = "the power of the artificial signal, K sr, for mode = \"beacon\" and \"joint\"";
-        checks.number("beacon_k_sr", self.beacon_k_sr, lit, expected);
+        checks.number("beacon_k_sr", self.beacon_k_sr, has_power, expected);
         checks.finish()
     }
 }

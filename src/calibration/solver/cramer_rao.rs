@@ -1,8 +1,9 @@
 //! Solved phases against the Cramer-Rao bound, with a known sky and the real array: one pass, one channel of 8 kHz.
 //!
-//! The sky is the generated one with its 600 brightest sources, and five as strong and as wide as the strongest of the real sky,
-//! which long baselines calibrate on. Diffuse emission, in pixels of nside 32, counts on baselines that those resolve.
-#![allow(clippy::print_stderr)] // They say what they measured.
+//! The sky is the generated one with its 600 brightest sources, and five as strong and as wide as the strongest of
+//! the real sky, with which long baselines are calibrated. Diffuse emission, in pixels of nside 32, is included on
+//! baselines that resolve it.
+#![allow(clippy::print_stderr)] // The test prints what it measured.
 
 use std::f64::consts::{LN_2, PI, TAU};
 
@@ -21,7 +22,7 @@ use crate::units::vector::{Vec3, dot, norm, sub};
 use crate::units::{Pair, StreamKind, all_pairs, random_stream};
 
 const NSIDE: usize = 32;
-/// Instants of a pass; each stands for the time to the next.
+/// Number of instants of a pass; each stands for the time to the next.
 const INSTANTS: usize = 48;
 const DAUGHTERS: usize = 8;
 /// Ecliptic longitude and latitude (deg), flux density at 38 MHz (Jy), spectral index and diameter (arcsec), rounded:
@@ -34,7 +35,7 @@ const STRONGEST: [[f64; 5]; 5] = [
     [251.0, 27.0, 1600.0, -1.0, 100.0],
 ];
 
-/// What one pair measures without noise and errors.
+/// Visibilities of one pair without noise and errors.
 struct PairData {
     pair: Pair,
     time_s: Vec<f64>,
@@ -63,10 +64,10 @@ fn sources(frequency_hz: f64) -> Vec<Source> {
     drawn.chain(named).collect()
 }
 
-/// The first pass after a time, as all pairs see it.
+/// Data of all pairs in the first pass after a time.
 fn pass(frequency_hz: f64, after_s: f64) -> Vec<PairData> {
     let array = Array::new(&ArrayConfig::default()).unwrap();
-    // Whole: the first may have begun before.
+    // The first window may have started before that time.
     let mut windows = ObservingWindows::new(&array, after_s, after_s + 2e4);
     let window = windows.find(|window| window.start.seconds() > after_s).unwrap();
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
@@ -77,14 +78,14 @@ fn pass(frequency_hz: f64, after_s: f64) -> Vec<PairData> {
     let mut diffuse = DirectSum::new(&sky, frequency_hz, array.moon_radius_m(), AntennaResponse::Isotropic);
     let sources = sources(frequency_hz);
     let sees = |r_m: Vec3, n_hat: Vec3| !hidden_by_moon(r_m, n_hat, array.moon_radius_m());
-    // System powers: all that a daughter sees.
+    // System powers: the total sky power that a daughter receives.
     let places: Vec<DaughterPosition> = time_s
         .iter()
         .flat_map(|t_s| (0..DAUGHTERS).map(|n| (n, *t_s)))
         .map(|(n, t_s)| DaughterPosition {
             r_m: array.position_m(n, t_s),
             normal_hat: array.orbit_normal_hat(t_s),
-            at: None,
+            daughter_time: None,
         })
         .collect();
     let mut powers = vec![0.0; places.len()];
@@ -139,9 +140,9 @@ fn determinant(mut a: Vec<Vec<f64>>) -> f64 {
     product
 }
 
-/// Bounds on the phases of daughters 2 to 8 against daughter 1, deg. The information on phases is a network of resistors with
-/// conductances sum |M|^2 / sigma^2 (amplitudes are orthogonal to phases); a variance is the resistance between two nodes, which
-/// Kirchhoff's theorem gives as a ratio of the weights of spanning forests.
+/// Bounds on the phases of daughters 2 to 8 relative to daughter 1, deg. The information on phases is a network of
+/// resistors with conductances sum |M|^2 / sigma^2 (amplitudes are orthogonal to phases); a variance is the
+/// resistance between two nodes, which Kirchhoff's theorem gives as a ratio of the weights of spanning forests.
 fn bounds_deg(data: &[PairData]) -> Vec<f64> {
     let mut laplacian = vec![vec![0.0; DAUGHTERS]; DAUGHTERS];
     for PairData { pair, model, sigma, .. } in data {
@@ -158,15 +159,15 @@ fn bounds_deg(data: &[PairData]) -> Vec<f64> {
     (1..DAUGHTERS).map(|n| (without(&[0, n]) / without(&[0])).sqrt().to_degrees()).collect()
 }
 
-/// Root mean square error, deg, of the phase of a vector of length one in noise whose parts have a deviation of `bound_deg` (as an
-/// angle): beyond some 15 deg phases wrap, and no estimate of them alone reaches the bound.
+/// Rms error, deg, of the phase of a unit vector in noise whose parts have the deviation `bound_deg` (as an angle):
+/// beyond some 15 deg phases wrap, and no estimate of the phase alone reaches the bound.
 fn phase_rms_deg(bound_deg: f64) -> f64 {
     const STEPS: usize = 400;
     let signal = bound_deg.to_radians().recip();
     let (mut sum, mut square) = (0.0, 0.0);
     for k in 0..STEPS {
         let phase = PI * (k as f64 + 0.5) / STEPS as f64;
-        // The density of a vector (r, phase), over r.
+        // Density of a vector (r, phase), integrated over r below.
         let density = |r: f64| r * (-0.5 * (r * r - 2.0 * r * signal * phase.cos() + signal * signal)).exp();
         let most = signal + 8.0;
         let radial: f64 = (0..STEPS).map(|m| density(most * (m as f64 + 0.5) / STEPS as f64)).sum();
@@ -176,12 +177,12 @@ fn phase_rms_deg(bound_deg: f64) -> f64 {
     (square / sum).sqrt().to_degrees()
 }
 
-/// Solves a pass with the errors and the noise of a seed; errors of the phases of daughters 2 to 8, and what they are said to be,
-/// deg. `None` if it does not converge.
+/// Solves a pass with the errors and the noise of a seed; returns the errors of the phases of daughters 2 to 8, and
+/// their stated errors, deg. `None` if it does not converge.
 fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Option<Vec<[f64; 2]>> {
     let mut stream = random_stream(seed, StreamKind::Probe, [3, 3]);
     let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
-    // 10 % and 60 deg.
+    // Gains scatter by 10 % and 60 deg.
     let gains: [Complex64; DAUGHTERS] = std::array::from_fn(|_| {
         Complex64::from_polar((0.1 * normal()).exp(), 60_f64.to_radians() * normal())
     });
@@ -189,7 +190,7 @@ fn solve(data: &[PairData], frequency_hz: f64, seed: u64) -> Option<Vec<[f64; 2]
         let gain = gains[usize::from(data.pair.i)] * gains[usize::from(data.pair.j)].conj();
         let mut block = ModelledBlock { pair: data.pair, time_s: data.time_s.clone(), ..Default::default() };
         for (model, sigma) in data.model.iter().zip(&data.sigma) {
-            // Noise passes the gain, too.
+            // Noise is multiplied by the gain, too.
             let noise = sigma * Complex64::new(normal(), normal());
             block.value_k_sr.push(gain * (model + noise));
             block.weight.push((sigma * gain.norm()).powi(-2));
@@ -242,9 +243,9 @@ fn phases_of_every_daughter_reach_the_bound_in_one_pass() {
             );
             assert!(count >= 0.99 * SOLUTIONS as f64, "{name}: {count}");
             for (bound, ratio) in bounds.iter().zip(&ratios) {
-                // 1,000 solutions give a root mean square to 2.2 %; four of that below the bound would be a bound that is none. Above it
-                // a fifth, which is asked for, or where phases wrap what the phase of a vector in noise has. Where even that is more than 20 deg a
-                // daughter is not always detected, and then left out: no phase is further off than a uniform one.
+                // 1,000 solutions give an rms to 2.2 %, and the lower limit is four times that below the bound. The
+                // upper limit is 1.2 times the bound. Above 20 deg a daughter is not always detected, and then left
+                // out: there no phase may be further off than a uniform one.
                 let reachable = (phase_rms_deg(*bound) / bound).max(1.0);
                 let uniform = 360.0 / 12_f64.sqrt() / bound;
                 let most = if *bound < 20.0 { 1.2 } else { uniform };

@@ -1,4 +1,4 @@
-//! Small dense symmetric systems.
+//! Cholesky factors of small dense symmetric matrices.
 
 /// Lower triangle of a Cholesky factor.
 pub(super) struct DenseFactor {
@@ -7,46 +7,45 @@ pub(super) struct DenseFactor {
 }
 
 impl DenseFactor {
-    /// Factors a symmetric matrix, row after row; `None` if it is not positive definite.
+    /// Factorises a symmetric matrix, given row by row; `None` if it is not positive definite.
     pub(super) fn new(matrix: &[f64], order: usize) -> Option<Self> {
         let mut rows = matrix.to_vec();
         for j in 0..order {
             for i in j..order {
-                let done: f64 = (0..j).map(|k| rows[i * order + k] * rows[j * order + k]).sum();
-                let left = rows[i * order + j] - done;
+                let sum: f64 = (0..j).map(|k| rows[i * order + k] * rows[j * order + k]).sum();
+                let remainder = rows[i * order + j] - sum;
                 if i == j {
-                    if left <= 0.0 || !left.is_finite() {
+                    if remainder <= 0.0 || !remainder.is_finite() {
                         return None;
                     }
-                    rows[i * order + j] = left.sqrt();
+                    rows[i * order + j] = remainder.sqrt();
                 } else {
-                    rows[i * order + j] = left / rows[j * order + j];
+                    rows[i * order + j] = remainder / rows[j * order + j];
                 }
             }
         }
         Some(Self { order, rows })
     }
 
-    /// Solves for one right side.
+    /// Solves in place for one right-hand side.
     pub(super) fn solve(&self, x: &mut [f64]) {
         let Self { order, rows } = self;
         for i in 0..*order {
-            let done: f64 = (0..i).map(|k| rows[i * order + k] * x[k]).sum();
-            x[i] = (x[i] - done) / rows[i * order + i];
+            let sum: f64 = (0..i).map(|k| rows[i * order + k] * x[k]).sum();
+            x[i] = (x[i] - sum) / rows[i * order + i];
         }
         for i in (0..*order).rev() {
-            let done: f64 = (i + 1..*order).map(|k| rows[k * order + i] * x[k]).sum();
-            x[i] = (x[i] - done) / rows[i * order + i];
+            let sum: f64 = (i + 1..*order).map(|k| rows[k * order + i] * x[k]).sum();
+            x[i] = (x[i] - sum) / rows[i * order + i];
         }
     }
 
-    /// The inverse, row after row.
+    /// The inverse matrix, row by row.
     pub(super) fn inverse(&self) -> Vec<f64> {
         let order = self.order;
         let mut inverse = vec![0.0; order * order];
-        for column in inverse.chunks_exact_mut(order).enumerate() {
-            let (place, column) = column;
-            column[place] = 1.0;
+        for (index, column) in inverse.chunks_exact_mut(order).enumerate() {
+            column[index] = 1.0;
             self.solve(column);
         }
         inverse

@@ -1,230 +1,244 @@
-//! Whether a daughter delivers any of the known signal in a channel.
+//! Detection of the known signal in the data of a daughter in a channel.
 //!
-//! With the gains of all others as they are, the data say by themselves what the gain of one daughter is, in amplitude and phase, without
-//! prior: `above / below`, with the noise `1 / below` of either part. `|above|^2 / below` is the square of its signal-to-noise ratio;
-//! noise alone exceeds x with a probability of exp(-x / 2). A daughter that is not seen has no part in the solution of the others.
+//! With the gains of the others fixed, a daughter's data determine its gain, amplitude and phase, without a prior:
+//! `numerator / denominator`, with variance `1 / denominator` of the real and imaginary part. `|numerator|^2 /
+//! denominator` is the squared signal-to-noise ratio; noise alone exceeds x with probability exp(-x / 2). A daughter
+//! that is not detected is left out of the solution of the others.
 
 use num_complex::Complex64;
 
 use super::config::SolverConfig;
-use super::layout::{ParameterLayout, Values};
+use super::layout::{ParameterLayout, ParameterValues};
 use super::sums::{MODEL_TERMS, PairSums};
 
-/// Square of the signal-to-noise ratio of a gain from which it is seen: noise alone has it in 4 of a million cases, and a phase is known to
-/// 11.5 deg.
-pub(super) const SEEN: f64 = 25.0;
+/// Squared signal-to-noise ratio from which a gain is detected: noise alone reaches it in 4 of a million cases, and a
+/// phase is known to 11.5 deg.
+pub(super) const DETECTED_SNR2: f64 = 25.0;
 
-/// By so much the square of the ratio of all pairs together has to be above it for each daughter beyond two: gains of all that are fitted to
-/// noise reach some ten a daughter.
-const SEEN_MORE: f64 = 10.0;
+/// Increase of the squared signal-to-noise ratio required of all pairs of a channel together, for each daughter
+/// beyond two: gains fitted to noise reach about ten for each daughter.
+const DETECTED_SNR2_PER_DAUGHTER: f64 = 10.0;
 
-/// Square of the signal-to-noise ratio that a receiver that works has to have before one that is not seen is dead.
-const TOLD: f64 = 100.0;
+/// Squared signal-to-noise ratio that a working receiver must have before an undetected one counts as dead.
+const DEAD_SNR2: f64 = 100.0;
 
-/// Standard deviations of its prior that the amplitude of a receiver that works is below one, at most.
+/// Prior standard deviations by which the amplitude of a working receiver can be below one.
 const PRIOR_SIGMAS: f64 = 3.0;
 
-/// Standard deviations of the power of noise.
-const SIGNIFICANT: f64 = 3.0;
+/// Significance, in standard deviations, of power beyond noise.
+const SIGMAS: f64 = 3.0;
 
-/// What the data say of a gain.
+/// Presence of the known signal in the data of a gain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum SignalPresence {
-    /// No data.
-    None,
-    /// The known signal is there.
-    Seen,
-    /// Too few data to tell.
-    Weak,
-    /// Noise, where a receiver that works would deliver signal.
+    /// There are no data.
+    NoData,
+    /// The known signal is detected.
+    Detected,
+    /// The data are too few to decide.
+    Undetermined,
+    /// There is only noise, where a working receiver would deliver signal.
     Dead,
-    /// A signal that is not the known one.
-    Other,
+    /// There is a signal other than the known one.
+    Unmodelled,
 }
 
-/// The gain of a daughter in a channel, from its own data and the gains of the others.
+/// Gain of a daughter in a channel, from its own data and the gains of the others.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct OwnGain {
     pub(super) gain: Complex64,
-    /// Inverse variance of either part.
+    /// Inverse variance of the real and imaginary part.
     pub(super) information: f64,
-    /// The same if the gains of the others were one.
+    /// Information if the gains of the others were one.
     ideal: f64,
-    /// The same with all daughters, whether they take part or not, and noise alone.
-    of_all: f64,
+    /// Information with all daughters, dropped ones included, gains of one, and noise alone.
+    ideal_of_all: f64,
     pub(super) presence: SignalPresence,
 }
 
 impl OwnGain {
-    /// What one is that is not seen, by what a receiver that works would deliver.
-    fn unseen(&self, config: &SolverConfig) -> SignalPresence {
-        if self.is_visible(config) { SignalPresence::Other } else { SignalPresence::Weak }
+    /// State of an undetected gain, by the signal that a working receiver would deliver.
+    fn undetected_presence(&self, config: &SolverConfig) -> SignalPresence {
+        if self.is_detectable(config) { SignalPresence::Unmodelled } else { SignalPresence::Undetermined }
     }
 
-    /// Least square of the signal-to-noise ratio of a receiver that works.
-    pub(super) fn expected(&self, config: &SolverConfig) -> f64 {
-        let least = (-PRIOR_SIGMAS * config.amplitude_sigma).exp().max(config.dead_amplitude);
-        self.ideal * least * least
+    /// Smallest squared signal-to-noise ratio of a working receiver.
+    pub(super) fn expected_snr_squared(&self, config: &SolverConfig) -> f64 {
+        let amplitude_min = (-PRIOR_SIGMAS * config.amplitude_sigma).exp().max(config.dead_amplitude);
+        self.ideal * amplitude_min * amplitude_min
     }
 
-    /// Whether a receiver that works would be seen, if all others do.
-    pub(super) fn is_visible(&self, config: &SolverConfig) -> bool {
-        Self { ideal: self.of_all, ..*self }.expected(config) >= TOLD
+    /// Whether a working receiver would be detected if all other daughters work.
+    pub(super) fn is_detectable(&self, config: &SolverConfig) -> bool {
+        Self { ideal: self.ideal_of_all, ..*self }.expected_snr_squared(config) >= DEAD_SNR2
     }
 
-    /// Square of the signal-to-noise ratio.
-    pub(super) fn signal(&self) -> f64 {
+    /// Squared signal-to-noise ratio.
+    pub(super) fn snr_squared(&self) -> f64 {
         self.gain.norm_sqr() * self.information
     }
 }
 
-/// By channel, then daughter: which have no part in the solution.
-pub(super) type DroppedDaughters = Vec<bool>;
+/// Whether each gain is left out of the solution; by channel, then daughter.
+pub(super) type DroppedGains = Vec<bool>;
 
-/// Whether a pair takes part.
-pub(super) fn takes_part(layout: &ParameterLayout, dropped: &[bool], sums: &PairSums) -> bool {
+/// Whether both gains of a pair are in the solution.
+pub(super) fn is_pair_used(layout: &ParameterLayout, dropped_gains: &[bool], sums: &PairSums) -> bool {
     let [i, j] = [sums.pair.i, sums.pair.j].map(usize::from);
     let at = sums.channel * layout.satellites;
-    !dropped[at + i] && !dropped[at + j]
+    !dropped_gains[at + i] && !dropped_gains[at + j]
 }
 
-/// The gains of all daughters, by channel, then daughter, each from its pairs with daughters that take part.
-pub(super) fn own_gains(
+/// Gains of all daughters, by channel, then daughter, each from its pairs with daughters in the solution.
+pub(super) fn solve_own_gains(
     config: &SolverConfig,
     layout: &ParameterLayout,
-    values: &Values,
+    values: &ParameterValues,
     sums: &[PairSums],
-    dropped: &[bool],
+    dropped_gains: &[bool],
 ) -> Vec<OwnGain> {
     let n = layout.satellites;
-    let mut found = vec![Sums::default(); n * layout.channels()];
-    // Where nobody takes part all do.
-    let mut left_out = dropped.to_vec();
-    for channel in left_out.chunks_mut(n.max(1)).filter(|channel| channel.iter().all(|dropped| *dropped)) {
+    let mut found = vec![GainSums::default(); n * layout.channels()];
+    // If all daughters of a channel are left out, all are used.
+    let mut left_out = dropped_gains.to_vec();
+    for channel in
+        left_out.chunks_mut(n.max(1)).filter(|channel| channel.iter().all(|is_dropped| *is_dropped))
+    {
         channel.fill(false);
     }
-    let dropped = &left_out[..];
+    let dropped_gains = &left_out[..];
     for sums in sums {
         let [i, j] = [sums.pair.i, sums.pair.j].map(usize::from);
         let at = sums.channel * n;
         let (_, u) = layout.pair(values, sums.channel, sums.pair);
-        let gram = sums.gram_of(&u);
-        let along: Complex64 = (0..MODEL_TERMS).map(|k| u[k] * sums.cross[k]).sum();
+        let gram = sums.gram_times(&u);
+        let projection: Complex64 = (0..MODEL_TERMS).map(|k| u[k] * sums.cross[k]).sum();
         let model: f64 = (0..MODEL_TERMS).map(|k| u[k] * gram[k].re).sum();
-        for (own, other, along) in [(i, j, along), (j, i, along.conj())] {
+        for (own, other, projection) in [(i, j, projection), (j, i, projection.conj())] {
             found[at + own].has_data |= sums.count > 0.0;
-            found[at + own].of_all += model * sums.spread;
-            if !dropped[at + other] {
+            found[at + own].ideal_of_all += model * sums.variance_factor;
+            if !dropped_gains[at + other] {
                 let gain = layout.gain(values, sums.channel, other);
-                found[at + own].add(along * gain, [model * gain.norm_sqr(), model], sums);
+                found[at + own].add(projection * gain, [model * gain.norm_sqr(), model], sums);
             }
         }
     }
     let mut own: Vec<OwnGain> = found.into_iter().map(|sums| sums.gain(config)).collect();
     for (c, channel) in own.chunks_mut(n.max(1)).enumerate() {
-        // Gains of all that are fitted to noise agree with it.
-        let part = channel.iter().enumerate().filter(|(n_own, _)| !dropped[c * n + n_own]);
-        let part = part.filter(|(_, own)| own.presence != SignalPresence::None).count();
-        let least = SEEN + SEEN_MORE * part.saturating_sub(2) as f64;
-        if signal_of(layout, values, sums, dropped, c) < least {
-            let seen = channel.iter_mut().filter(|own| own.presence == SignalPresence::Seen);
-            seen.for_each(|own| own.presence = own.unseen(config));
+        // Gains fitted to noise agree with it.
+        let used = channel.iter().enumerate().filter(|(n_own, _)| !dropped_gains[c * n + n_own]);
+        let used = used.filter(|(_, own)| own.presence != SignalPresence::NoData).count();
+        let required = DETECTED_SNR2 + DETECTED_SNR2_PER_DAUGHTER * used.saturating_sub(2) as f64;
+        if channel_snr_squared(layout, values, sums, dropped_gains, c) < required {
+            let detected = channel.iter_mut().filter(|own| own.presence == SignalPresence::Detected);
+            detected.for_each(|own| own.presence = own.undetected_presence(config));
         }
-        // Where nobody is seen it is not the daughters.
-        if channel.iter().all(|own| own.presence != SignalPresence::Seen) {
+        // If no daughter is detected, the daughters are not the cause.
+        if channel.iter().all(|own| own.presence != SignalPresence::Detected) {
             let dead = channel.iter_mut().filter(|own| own.presence == SignalPresence::Dead);
-            dead.for_each(|own| own.presence = SignalPresence::Other);
+            dead.for_each(|own| own.presence = SignalPresence::Unmodelled);
         }
     }
     own
 }
 
-/// Square of the signal-to-noise ratio of all pairs of a channel together, with the gains of all.
-fn signal_of(
+/// Squared signal-to-noise ratio of all pairs of a channel together, with the gains of the solution.
+fn channel_snr_squared(
     layout: &ParameterLayout,
-    values: &Values,
+    values: &ParameterValues,
     sums: &[PairSums],
-    dropped: &[bool],
+    dropped_gains: &[bool],
     channel: usize,
 ) -> f64 {
     let of_channel = sums.iter().filter(|sums| sums.channel == channel);
-    let (mut along, mut model) = (0.0, 0.0);
-    for sums in of_channel.filter(|sums| takes_part(layout, dropped, sums)) {
+    let (mut projection, mut model) = (0.0, 0.0);
+    for sums in of_channel.filter(|sums| is_pair_used(layout, dropped_gains, sums)) {
         let (gain, u) = layout.pair(values, channel, sums.pair);
-        let gram = sums.gram_of(&u);
-        along += (0..MODEL_TERMS).map(|k| (gain.conj() * u[k] * sums.cross[k]).re).sum::<f64>();
+        let gram = sums.gram_times(&u);
+        projection += (0..MODEL_TERMS).map(|k| (gain.conj() * u[k] * sums.cross[k]).re).sum::<f64>();
         model += gain.norm_sqr() * (0..MODEL_TERMS).map(|k| u[k] * gram[k].re).sum::<f64>();
     }
-    if model > 0.0 && along > 0.0 { along * along / model } else { 0.0 }
+    if model > 0.0 && projection > 0.0 { projection * projection / model } else { 0.0 }
 }
 
 #[derive(Clone, Copy, Default)]
-struct Sums {
-    above: Complex64,
-    below: f64,
+struct GainSums {
+    numerator: Complex64,
+    denominator: f64,
     ideal: f64,
     power: f64,
     count: f64,
     has_data: bool,
-    of_all: f64,
+    ideal_of_all: f64,
 }
 
-impl Sums {
-    fn add(&mut self, above: Complex64, [below, ideal]: [f64; 2], sums: &PairSums) {
-        self.above += above;
-        self.below += below;
+impl GainSums {
+    fn add(&mut self, numerator: Complex64, [denominator, ideal]: [f64; 2], sums: &PairSums) {
+        self.numerator += numerator;
+        self.denominator += denominator;
         self.ideal += ideal;
         self.power += sums.power;
         self.count += sums.count;
     }
 
     fn gain(self, config: &SolverConfig) -> OwnGain {
-        let Self { above, below, ideal, power, count, has_data, of_all } = self;
-        if below <= 0.0 || count == 0.0 {
-            let presence = if has_data { SignalPresence::Weak } else { SignalPresence::None };
-            return OwnGain { gain: Complex64::ONE, information: 0.0, ideal: 0.0, of_all, presence };
+        let Self { numerator, denominator, ideal, power, count, has_data, ideal_of_all } = self;
+        if denominator <= 0.0 || count == 0.0 {
+            let presence = if has_data { SignalPresence::Undetermined } else { SignalPresence::NoData };
+            return OwnGain { gain: Complex64::ONE, information: 0.0, ideal: 0.0, ideal_of_all, presence };
         }
-        let gain = above / below;
-        let own = OwnGain { gain, information: below, ideal, of_all, presence: SignalPresence::Weak };
-        let expected = own.expected(config);
-        // Of |V|^2 in units of its noise, beyond that of noise.
-        let beyond = power - 2.0 * count;
+        let gain = numerator / denominator;
+        let own = OwnGain {
+            gain,
+            information: denominator,
+            ideal,
+            ideal_of_all,
+            presence: SignalPresence::Undetermined,
+        };
+        let expected_snr_squared = own.expected_snr_squared(config);
+        // Sum of |V|^2 in units of its noise, minus its expectation for noise alone.
+        let excess = power - 2.0 * count;
         let presence = match () {
-            () if own.signal() >= SEEN && gain.norm() >= config.dead_amplitude => SignalPresence::Seen,
-            () if own.signal() >= SEEN => SignalPresence::Dead,
-            () if expected < TOLD => own.unseen(config),
-            () if beyond > 0.5 * expected + SIGNIFICANT * 2.0 * count.sqrt() => SignalPresence::Other,
+            () if own.snr_squared() >= DETECTED_SNR2 && gain.norm() >= config.dead_amplitude => {
+                SignalPresence::Detected
+            }
+            () if own.snr_squared() >= DETECTED_SNR2 => SignalPresence::Dead,
+            () if expected_snr_squared < DEAD_SNR2 => own.undetected_presence(config),
+            () if excess > 0.5 * expected_snr_squared + SIGMAS * 2.0 * count.sqrt() => {
+                SignalPresence::Unmodelled
+            }
             () => SignalPresence::Dead,
         };
         OwnGain { presence, ..own }
     }
 }
 
-/// Which daughters have no part in a solution: all that are not seen, but those that others of their channels tell of.
-pub(super) fn dropped(layout: &ParameterLayout, own: &[OwnGain]) -> DroppedDaughters {
-    // A clock or a position is found from all channels together.
-    let is_joint = layout.channels() > 1 && layout.clock_sigma_ns > 0.0 || layout.terms() > 1;
+/// Gains left out of the solution: those not detected, unless other channels determine them.
+pub(super) fn dropped_gains(layout: &ParameterLayout, own: &[OwnGain]) -> DroppedGains {
+    // All channels together determine a clock or a position.
+    let is_determined_jointly =
+        layout.channels() > 1 && layout.clock_sigma_ns > 0.0 || layout.model_terms() > 1;
     own.iter()
         .map(|own| match own.presence {
-            SignalPresence::Seen | SignalPresence::None => false,
-            SignalPresence::Weak => !is_joint,
-            // With positions that are not known yet little of the signal is seen.
-            SignalPresence::Other => layout.terms() == 1,
+            SignalPresence::Detected | SignalPresence::NoData => false,
+            SignalPresence::Undetermined => !is_determined_jointly,
+            // With unknown positions little of the signal is detected.
+            SignalPresence::Unmodelled => layout.model_terms() == 1,
             SignalPresence::Dead => true,
         })
         .collect()
 }
 
-/// The daughter that phases are relative to: the one of the settings, unless another is seen in more channels.
-pub(super) fn reference(layout: &ParameterLayout, own: &[OwnGain], wanted: usize) -> usize {
+/// Daughter that phases are relative to: the configured one, unless another is detected in more channels.
+pub(super) fn best_reference(layout: &ParameterLayout, own: &[OwnGain], configured: usize) -> usize {
     let n = layout.satellites;
-    let seen = |daughter: usize| {
-        (0..layout.channels()).filter(|c| own[c * n + daughter].presence == SignalPresence::Seen).count()
+    let detected_channels = |daughter: usize| {
+        (0..layout.channels()).filter(|c| own[c * n + daughter].presence == SignalPresence::Detected).count()
     };
-    let best = (0..n).map(seen).max().unwrap_or(0);
-    if seen(wanted) == best {
-        wanted
+    let best = (0..n).map(detected_channels).max().unwrap_or(0);
+    if detected_channels(configured) == best {
+        configured
     } else {
-        (0..n).find(|daughter| seen(*daughter) == best).unwrap_or(wanted)
+        (0..n).find(|daughter| detected_channels(*daughter) == best).unwrap_or(configured)
     }
 }

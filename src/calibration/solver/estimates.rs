@@ -1,36 +1,36 @@
-//! What is told of gains and daughters, and of the visibilities behind it.
+//! Estimates of gains and daughters, and counts of the visibilities behind them.
 
 use bincode::{Decode, Encode};
 use serde::Serialize;
 
 use super::layout::ParameterLayout;
-use super::robust_fit::Fitted;
+use super::robust_fit::RobustFit;
 use super::sums::ModelledBlock;
 
-/// What became of the gain of a daughter in a channel.
+/// Quality state of the gain of a daughter in a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Encode, Decode)]
 #[serde(rename_all = "kebab-case")]
 pub enum GainState {
-    /// Known.
+    /// The gain is good.
     Good,
-    /// No data.
+    /// There are no data.
     NoData,
-    /// Noise where a receiver that works would deliver signal, or an amplitude of almost nothing.
+    /// There is only noise where a working receiver would deliver signal, or the amplitude is almost zero.
     Dead,
-    /// Too little signal to tell, or a phase less well known than asked for.
+    /// There is too little signal to decide, or the phase is less certain than required.
     Uncertain,
     /// The iteration did not converge.
     NotConverged,
-    /// The model is not that of the data: the solution leaves too much of the signal unexplained.
+    /// The model does not match the data: the solution leaves too much of the signal unexplained.
     PoorFit,
     /// Another position explains the data as well, or daughters contradict one another.
     Ambiguous,
-    /// The gain changes within the interval by more than a phase may be uncertain.
+    /// The gain changes within the interval by more than the permitted phase uncertainty.
     Unstable,
 }
 
 impl GainState {
-    /// Its word in tables.
+    /// Name of the state in tables.
     #[must_use]
     pub fn word(self) -> &'static str {
         match self {
@@ -53,81 +53,84 @@ pub struct GainEstimate {
     pub frequency_hz: f64,
     /// Amplitude of the voltage gain.
     pub amplitude: f64,
-    /// Standard deviation of its natural logarithm, with what residuals show beyond noise.
+    /// Standard deviation of the natural logarithm of the amplitude, with the excess of residuals over noise.
     pub amplitude_sigma: f64,
-    /// Phase against the reference daughter, clock included, deg, -180 to 180.
+    /// Phase relative to the reference daughter, clock included, deg, -180 to 180.
     pub phase_deg: f64,
-    /// Its standard deviation, deg, with what residuals show beyond noise: changes within the interval and errors of the model.
+    /// Standard deviation of the phase, deg, with the excess of residuals over noise: changes within the interval and
+    /// errors of the model.
     pub phase_sigma_deg: f64,
-    /// Root mean square change of the phase within the interval, deg; 0 where it may be noise.
+    /// Rms change of the phase within the interval, deg; 0 where it may be noise.
     pub phase_scatter_deg: f64,
-    /// Part of the daughter's signal that the solution leaves; 0 where it may be noise.
+    /// Fraction of the daughter's signal that the solution leaves unexplained; 0 where it may be noise.
     pub unexplained: f64,
-    /// Visibilities used.
+    /// Number of visibilities used.
     pub visibilities: u64,
-    /// Left out as outliers.
+    /// Number of visibilities left out as outliers.
     pub outliers: u64,
-    /// What became of it.
+    /// Quality state.
     pub state: GainState,
 }
 
-/// What is known of one daughter.
+/// Estimates of one daughter.
 #[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
 pub struct DaughterEstimate {
-    /// From 1.
+    /// Number of the daughter, from 1.
     pub daughter: u32,
-    /// Offset of the clock against the reference's, ns; 0 where it is not solved for.
+    /// Clock offset relative to the reference's, ns; 0 where it is not solved for.
     pub clock_ns: f64,
-    /// Its standard deviation, ns.
+    /// Standard deviation of the clock offset, ns.
     pub clock_sigma_ns: f64,
-    /// Error of the positions in packets against the reference's: along the track, across it, away from the Moon, m.
+    /// Error of the positions in packets relative to the reference's: along the track, across it, away from the Moon,
+    /// m.
     pub position_m: [f64; 3],
-    /// Its standard deviations, m.
+    /// Standard deviations of the position error, m.
     pub position_sigma_m: [f64; 3],
     /// Gains by channel.
     pub gains: Vec<GainEstimate>,
 }
 
-/// Where outliers are.
+/// Distribution of outliers over channels and time.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Encode, Decode)]
-pub struct OutlierParts {
-    /// Part of the visibilities that are outliers, by channel and by sixtieth of the interval; not a number without any.
+pub struct OutlierFractions {
+    /// Fraction of visibilities that are outliers, by channel and by sixtieth of the interval; NaN without
+    /// visibilities.
     pub by_channel_and_time: Vec<Vec<f64>>,
 }
 
-impl OutlierParts {
-    /// Whether they have this number of channels.
-    pub(in crate::calibration) fn is_of(&self, channels: usize) -> bool {
+impl OutlierFractions {
+    /// Whether there are fractions for this number of channels.
+    pub(in crate::calibration) fn has_channels(&self, channels: usize) -> bool {
         let parts = &self.by_channel_and_time;
         parts.len() == channels && parts.iter().all(|times| times.len() == TIME_PARTS)
     }
 }
 
-/// Parts of an interval by which outliers are counted.
+/// Number of parts of an interval in which outliers are counted.
 const TIME_PARTS: usize = 60;
 
-/// Visibilities by channel and daughter.
+/// Counts of visibilities and outliers.
 pub(super) struct Counts {
     pub(super) used: u64,
     pub(super) out: u64,
     pub(super) by_gain: Vec<[u64; 2]>,
-    /// By channel and part of the interval: all, and outliers.
+    /// Counts of all visibilities and of outliers, by channel and part of the interval.
     by_time: Vec<[[u64; 2]; TIME_PARTS]>,
 }
 
 impl Counts {
-    pub(super) fn of(blocks: &[ModelledBlock], [from_s, until_s]: [f64; 2], fitted: &Fitted) -> Self {
+    pub(super) fn of(blocks: &[ModelledBlock], [from_s, until_s]: [f64; 2], fitted: &RobustFit) -> Self {
         let layout: &ParameterLayout = &fitted.layout;
         let gains = layout.satellites * layout.frequencies_hz.len();
         let by_time = vec![[[0; 2]; TIME_PARTS]; layout.frequencies_hz.len()];
         let mut counts = Self { used: 0, out: 0, by_gain: vec![[0; 2]; gains], by_time };
-        for (block, takes_part) in blocks.iter().zip(&fitted.takes_part) {
+        for (block, is_pair_used) in blocks.iter().zip(&fitted.is_pair_used) {
             let inside = (0..block.time_s.len()).filter(|&k| (from_s..until_s).contains(&block.time_s[k]));
-            if !takes_part {
-                // They count for who is left out alone.
+            if !is_pair_used {
+                // The pair counts only for its daughters that are left out of the solution.
                 let of = |n: u8| block.channel * layout.satellites + usize::from(n);
                 let left_out =
-                    [of(block.pair.i), of(block.pair.j)].into_iter().filter(|k| fitted.dropped[*k]);
+                    [of(block.pair.i), of(block.pair.j)].into_iter().filter(|k| fitted.dropped_gains[*k]);
                 let count = inside.count() as u64;
                 left_out.for_each(|k| counts.by_gain[k][0] += count);
                 continue;
@@ -148,10 +151,10 @@ impl Counts {
         counts
     }
 
-    pub(super) fn parts(&self) -> OutlierParts {
+    pub(super) fn parts(&self) -> OutlierFractions {
         let row = |times: &[[u64; 2]; TIME_PARTS]| {
             times.iter().map(|[all, out]| *out as f64 / *all as f64).collect::<Vec<f64>>()
         };
-        OutlierParts { by_channel_and_time: self.by_time.iter().map(row).collect() }
+        OutlierFractions { by_channel_and_time: self.by_time.iter().map(row).collect() }
     }
 }

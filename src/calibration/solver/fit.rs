@@ -1,36 +1,37 @@
-//! Whether a solution explains the data.
+//! Fraction of the signal that a solution leaves unexplained.
 //!
-//! A search over positions can end in a wrong minimum, whose formal errors are as small as those of the right one. What tells them
-//! apart is how much of the signal they leave unexplained. Chi-square alone is no measure of that: with much signal, a sky that is
-//! right within a few percent has a large one, and with little signal a wrong minimum has a small one. So the test has two parts:
-//! what is left beyond the noise has to be significant, and a good part of the signal.
+//! A search over positions can end in a wrong minimum, whose formal errors are as small as those of the right one. It
+//! differs by the fraction of the signal that it leaves unexplained. Chi-square alone does not measure that: with
+//! much signal, a sky that is right within a few percent has a large chi-square, and with little signal a wrong
+//! minimum has a small one. So the test has two parts: the residual beyond noise must be significant, and a large
+//! fraction of the signal.
 
 use super::layout::ParameterLayout;
 use super::newton::NewtonFit;
-use super::robust_fit::Fitted;
+use super::robust_fit::RobustFit;
 use super::sums::ModelledBlock;
 
-/// Standard deviations of noise beyond which something is left.
-const SIGNIFICANT: f64 = 3.0;
+/// Significance, in standard deviations of noise, of a residual.
+const SIGMAS: f64 = 3.0;
 
-/// What is left of the signal of a pair in a channel, and the signal, in units of the variance of signal and noise together:
-/// beams, beacons and pairs of any strength count by the number of their visibilities.
+/// Residual signal of a pair in a channel, and the signal, in units of the variance of signal and noise together: so
+/// pairs of any strength count by the number of their visibilities.
 #[derive(Clone, Copy, Default)]
 struct Residual {
     left: f64,
     signal: f64,
-    /// Variance of `left` by noise.
+    /// Variance of `left` due to noise.
     variance: f64,
 }
 
 impl Residual {
     fn of(
         layout: &ParameterLayout,
-        found: &NewtonFit,
+        newton: &NewtonFit,
         block: &ModelledBlock,
         [from_s, until_s]: [f64; 2],
     ) -> Self {
-        let (gain, u) = layout.pair(&found.values, block.channel, block.pair);
+        let (gain, u) = layout.pair(&newton.values, block.channel, block.pair);
         let (mut count, mut residual, mut power) = (0.0, 0.0, 0.0);
         let is_used = |k: &usize| !block.is_out[*k] && (from_s..until_s).contains(&block.time_s[*k]);
         for k in (0..block.time_s.len()).filter(is_used) {
@@ -52,7 +53,7 @@ impl Residual {
         }
     }
 
-    fn with(self, other: Self) -> Self {
+    fn plus(self, other: Self) -> Self {
         Self {
             left: self.left + other.left,
             signal: self.signal + other.signal,
@@ -60,53 +61,55 @@ impl Residual {
         }
     }
 
-    /// Part of the signal that is left; none if it may be noise.
-    fn part(&self) -> f64 {
-        if self.left > SIGNIFICANT * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
+    /// Unexplained fraction of the signal; 0 if the residual may be noise.
+    fn fraction(&self) -> f64 {
+        if self.left > SIGMAS * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
     }
 }
 
-/// Part of the signal of each daughter in each channel (by channel, then daughter) that its solution leaves. The worst daughter of a
-/// channel answers for its pairs, if it is above `most`; the next one for what remains.
+/// Unexplained fraction of the signal of each daughter in each channel; by channel, then daughter. If the worst
+/// daughter of a channel is above `fraction_max`, its pairs are attributed to it, and the others are judged by the
+/// remaining pairs.
 pub(super) fn unexplained(
-    fitted: &Fitted,
+    fitted: &RobustFit,
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
-    most: f64,
+    fraction_max: f64,
 ) -> Vec<f64> {
-    let Fitted { layout, found, takes_part, .. } = fitted;
+    let RobustFit { layout, newton, is_pair_used, .. } = fitted;
     let n = layout.satellites;
-    let mut parts = vec![0.0; n * layout.channels()];
-    for (channel, parts) in parts.chunks_mut(n.max(1)).enumerate() {
+    let mut fractions = vec![0.0; n * layout.channels()];
+    for (channel, fractions) in fractions.chunks_mut(n.max(1)).enumerate() {
         let mut pairs: Vec<([usize; 2], Residual)> = blocks
             .iter()
-            .zip(takes_part)
-            .filter(|(block, takes_part)| block.channel == channel && **takes_part)
+            .zip(is_pair_used)
+            .filter(|(block, is_pair_used)| block.channel == channel && **is_pair_used)
             .map(|(block, _)| {
                 let pair = [block.pair.i, block.pair.j].map(usize::from);
-                (pair, Residual::of(layout, found, block, span_s))
+                (pair, Residual::of(layout, newton, block, span_s))
             })
             .collect();
         loop {
-            let of = |daughter: usize| {
-                let own = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
-                own.fold(Residual::default(), |sum, (_, left)| sum.with(*left)).part()
+            let fraction_of = |daughter: usize| {
+                let of_daughter = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
+                of_daughter.fold(Residual::default(), |sum, (_, left)| sum.plus(*left)).fraction()
             };
-            let open: Vec<(usize, f64)> = (0..n).filter(|k| parts[*k] == 0.0).map(|k| (k, of(k))).collect();
-            // Of two that are equally bad the reference stays.
+            let open: Vec<(usize, f64)> =
+                (0..n).filter(|k| fractions[*k] == 0.0).map(|k| (k, fraction_of(k))).collect();
+            // Of equally bad daughters the reference is the last to be chosen.
             let worst = open
                 .iter()
                 .copied()
                 .filter(|(k, _)| *k != layout.reference)
                 .chain(open.iter().copied().filter(|(k, _)| *k == layout.reference));
             let worst = worst.fold((0, 0.0), |worst, one| if one.1 > worst.1 { one } else { worst });
-            if worst.1 <= most {
-                open.into_iter().for_each(|(k, part)| parts[k] = part);
+            if worst.1 <= fraction_max {
+                open.into_iter().for_each(|(k, fraction)| fractions[k] = fraction);
                 break;
             }
-            parts[worst.0] = worst.1;
+            fractions[worst.0] = worst.1;
             pairs.retain(|(pair, _)| !pair.contains(&worst.0));
         }
     }
-    parts
+    fractions
 }

@@ -1,4 +1,4 @@
-//! The parameters of one solution: which there are, where each is in the vector that is solved for, and what they do to a pair.
+//! Parameters of one solution: their order in the solution vector, and their effect on a pair.
 
 use std::f64::consts::TAU;
 
@@ -8,7 +8,7 @@ use super::config::{AmplitudeScale, SolverConfig};
 use super::sums::MODEL_TERMS;
 use crate::units::Pair;
 
-/// Parameters, and where each is in the vector that is solved for.
+/// Which parameters are solved for, and their indices in the solution vector.
 #[derive(Clone, Debug)]
 pub(super) struct ParameterLayout {
     pub(super) satellites: usize,
@@ -23,14 +23,14 @@ pub(super) struct ParameterLayout {
 
 /// Values of all parameters.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Values {
-    /// By channel and daughter.
+pub(super) struct ParameterValues {
+    /// Log amplitudes, by channel, then daughter.
     pub(super) amplitude: Vec<f64>,
-    /// By channel and daughter, rad.
+    /// Phases, by channel, then daughter, rad.
     pub(super) phase: Vec<f64>,
-    /// By daughter.
+    /// Clocks, by daughter.
     pub(super) clock_ns: Vec<f64>,
-    /// By daughter.
+    /// Position offsets, by daughter.
     pub(super) position_m: Vec<[f64; 3]>,
 }
 impl ParameterLayout {
@@ -56,16 +56,16 @@ impl ParameterLayout {
     /// Number of parameters.
     pub(super) fn order(&self) -> usize {
         let (n, c) = (self.satellites, self.channels());
-        let on = |sigma: f64| usize::from(sigma > 0.0);
-        let relative = n.saturating_sub(1);
-        on(self.amplitude_sigma) * n * c
-            + on(self.phase_sigma) * relative * c
-            + on(self.clock_sigma_ns) * relative
-            + on(self.position_sigma_m) * relative * 3
+        let count_if_solved = |sigma: f64| usize::from(sigma > 0.0);
+        let others = n.saturating_sub(1);
+        count_if_solved(self.amplitude_sigma) * n * c
+            + count_if_solved(self.phase_sigma) * others * c
+            + count_if_solved(self.clock_sigma_ns) * others
+            + count_if_solved(self.position_sigma_m) * others * 3
     }
 
-    /// Place of a daughter among those that are not the reference.
-    fn relative(&self, daughter: usize) -> Option<usize> {
+    /// Index of a daughter among those that are not the reference.
+    fn relative_index(&self, daughter: usize) -> Option<usize> {
         (daughter != self.reference).then(|| daughter - usize::from(daughter > self.reference))
     }
 
@@ -73,45 +73,50 @@ impl ParameterLayout {
         (self.amplitude_sigma > 0.0).then_some(channel * self.satellites + daughter)
     }
 
-    fn phases_from(&self) -> usize {
+    fn first_phase(&self) -> usize {
         if self.amplitude_sigma > 0.0 { self.satellites * self.channels() } else { 0 }
     }
 
     pub(super) fn phase(&self, channel: usize, daughter: usize) -> Option<usize> {
-        let place = self.relative(daughter).filter(|_| self.phase_sigma > 0.0)?;
-        Some(self.phases_from() + channel * (self.satellites - 1) + place)
+        let index = self.relative_index(daughter).filter(|_| self.phase_sigma > 0.0)?;
+        Some(self.first_phase() + channel * (self.satellites - 1) + index)
     }
 
-    fn clocks_from(&self) -> usize {
+    fn first_clock(&self) -> usize {
         let phases = if self.phase_sigma > 0.0 { (self.satellites - 1) * self.channels() } else { 0 };
-        self.phases_from() + phases
+        self.first_phase() + phases
     }
 
     pub(super) fn clock(&self, daughter: usize) -> Option<usize> {
-        let place = self.relative(daughter).filter(|_| self.clock_sigma_ns > 0.0)?;
-        Some(self.clocks_from() + place)
+        let index = self.relative_index(daughter).filter(|_| self.clock_sigma_ns > 0.0)?;
+        Some(self.first_clock() + index)
     }
 
     pub(super) fn position(&self, daughter: usize, axis: usize) -> Option<usize> {
-        let place = self.relative(daughter).filter(|_| self.position_sigma_m > 0.0)?;
+        let index = self.relative_index(daughter).filter(|_| self.position_sigma_m > 0.0)?;
         let clocks = if self.clock_sigma_ns > 0.0 { self.satellites - 1 } else { 0 };
-        Some(self.clocks_from() + clocks + 3 * place + axis)
+        Some(self.first_clock() + clocks + 3 * index + axis)
     }
 
-    /// Terms of the model that are used.
-    pub(super) fn terms(&self) -> usize {
+    /// Whether positions are solved for.
+    pub(super) fn solves_positions(&self) -> bool {
+        self.position_sigma_m > 0.0
+    }
+
+    /// Number of model terms that are used.
+    pub(super) fn model_terms(&self) -> usize {
         if self.position_sigma_m > 0.0 { MODEL_TERMS } else { 1 }
     }
 
-    /// Phase of a nanosecond of a clock, rad.
-    pub(super) fn per_ns(&self, channel: usize) -> f64 {
+    /// Phase per nanosecond of a clock, rad.
+    pub(super) fn rad_per_ns(&self, channel: usize) -> f64 {
         -TAU * self.frequencies_hz[channel] * 1e-9
     }
 
-    /// No errors.
-    pub(super) fn ideal(&self) -> Values {
+    /// Values without errors.
+    pub(super) fn ideal(&self) -> ParameterValues {
         let (n, c) = (self.satellites, self.channels());
-        Values {
+        ParameterValues {
             amplitude: vec![0.0; n * c],
             phase: vec![0.0; n * c],
             clock_ns: vec![0.0; n],
@@ -119,58 +124,58 @@ impl ParameterLayout {
         }
     }
 
-    /// Calls `each` with every parameter's place, value and prior's standard deviation.
-    pub(super) fn for_each(&self, values: &Values, mut each: impl FnMut(usize, f64, f64)) {
+    /// Calls `visit` with the index, value and prior standard deviation of every parameter.
+    pub(super) fn for_each_prior(&self, values: &ParameterValues, mut visit: impl FnMut(usize, f64, f64)) {
         for n in 0..self.satellites {
             for c in 0..self.channels() {
                 let k = c * self.satellites + n;
-                if let Some(place) = self.amplitude(c, n) {
-                    each(place, values.amplitude[k], self.amplitude_sigma);
+                if let Some(index) = self.amplitude(c, n) {
+                    visit(index, values.amplitude[k], self.amplitude_sigma);
                 }
-                if let Some(place) = self.phase(c, n) {
-                    each(place, values.phase[k], self.phase_sigma);
+                if let Some(index) = self.phase(c, n) {
+                    visit(index, values.phase[k], self.phase_sigma);
                 }
             }
-            if let Some(place) = self.clock(n) {
-                each(place, values.clock_ns[n], self.clock_sigma_ns);
+            if let Some(index) = self.clock(n) {
+                visit(index, values.clock_ns[n], self.clock_sigma_ns);
             }
             for axis in 0..3 {
-                if let Some(place) = self.position(n, axis) {
-                    each(place, values.position_m[n][axis], self.position_sigma_m);
+                if let Some(index) = self.position(n, axis) {
+                    visit(index, values.position_m[n][axis], self.position_sigma_m);
                 }
             }
         }
     }
 
-    /// Values after a step.
-    pub(super) fn stepped(&self, values: &Values, step: &[f64]) -> Values {
+    /// Values after adding a step.
+    pub(super) fn values_after(&self, values: &ParameterValues, step: &[f64]) -> ParameterValues {
         let mut out = values.clone();
-        let at = |place: Option<usize>| place.map_or(0.0, |place| step[place]);
+        let step_at = |index: Option<usize>| index.map_or(0.0, |index| step[index]);
         for n in 0..self.satellites {
             for c in 0..self.channels() {
                 let k = c * self.satellites + n;
-                out.amplitude[k] += at(self.amplitude(c, n));
-                out.phase[k] += at(self.phase(c, n));
+                out.amplitude[k] += step_at(self.amplitude(c, n));
+                out.phase[k] += step_at(self.phase(c, n));
             }
-            out.clock_ns[n] += at(self.clock(n));
+            out.clock_ns[n] += step_at(self.clock(n));
             for axis in 0..3 {
-                out.position_m[n][axis] += at(self.position(n, axis));
+                out.position_m[n][axis] += step_at(self.position(n, axis));
             }
         }
         out
     }
 
     /// Gain of a daughter in a channel, clock included.
-    pub(super) fn gain(&self, values: &Values, channel: usize, daughter: usize) -> Complex64 {
+    pub(super) fn gain(&self, values: &ParameterValues, channel: usize, daughter: usize) -> Complex64 {
         let k = channel * self.satellites + daughter;
-        let phase = values.phase[k] + self.per_ns(channel) * values.clock_ns[daughter];
+        let phase = values.phase[k] + self.rad_per_ns(channel) * values.clock_ns[daughter];
         Complex64::from_polar(values.amplitude[k].exp(), phase)
     }
 
-    /// The product of the gains of a pair, and the factors of the model's terms.
+    /// Product of the gains of a pair, and the factors of the model's terms.
     pub(super) fn pair(
         &self,
-        values: &Values,
+        values: &ParameterValues,
         channel: usize,
         pair: Pair,
     ) -> (Complex64, [f64; MODEL_TERMS]) {

@@ -4,29 +4,30 @@
 //! |---|---|
 //! | `model` | the known signal: a map, an artificial signal, or both |
 //! | `circle` | the sky of a map by spherical harmonics |
-//! | `sums` | what a solution needs of the data, by channel and pair |
-//! | `layout` | parameters and priors |
+//! | `sums` | weighted sums of the data by channel and pair, from which a solution is computed |
+//! | `layout` | parameters, their priors and their order |
 //! | `start` | starting values |
 //! | `newton` | Gauss-Newton |
 //! | `detect` | whether a daughter delivers signal |
-//! | `robust` | outliers, and pairs whose model is not as good as their noise |
-//! | `robust_fit` | robust rounds among the daughters that deliver signal |
-//! | `stability` | gains that change within an interval, jumps, errors of the model |
-//! | `fit` | how much of the signal a solution leaves |
-//! | `verdict` | stated errors, and which gains are good |
-//! | `solution` | solutions of a pass, in parts where gains jump |
+//! | `robust` | outliers, and pairs whose residuals exceed their noise |
+//! | `robust_fit` | robust fit to the daughters that deliver signal |
+//! | `stability` | drifts and jumps of gains within an interval, errors of the model |
+//! | `fit` | fraction of the signal that a solution leaves unexplained |
+//! | `assessment` | uncertainty and quality state of each gain |
+//! | `solution` | solutions of a pass, divided where gains jump |
 //! | `agree` | whether daughters contradict one another |
-//! | `positions` | positions that are off by a good part of a wavelength |
-//! | `global` | positions that are off by radians: a search over all offsets |
-//! | `reach` | how far they are searched |
-//! | `moments` | a pair at any offset |
-//! | `expansion` | a plane wave of an offset by spherical harmonics |
-//! | `passes` | a pass from packets to its solutions |
-//! | `bound` | what a pass can tell at best |
-//! | `monitor` | what happened to the instrument |
-//! | `table` | tables, and the file of gains |
+//! | `positions` | position errors of a large fraction of a wavelength |
+//! | `global` | position errors of radians of phase: a search over all offsets |
+//! | `reach` | radius of the search for offsets |
+//! | `moments` | the model of a pair at any offset, from moments of its fringe |
+//! | `expansion` | expansion of a plane wave in spherical harmonics |
+//! | `passes` | a pass, from packets to solutions |
+//! | `bound` | Cramer-Rao bounds of a pass |
+//! | `monitor` | instrument events, detected from solutions |
+//! | `table` | solutions as a table and as a gains file |
 
 mod agree;
+mod assessment;
 mod bound;
 mod circle;
 mod config;
@@ -59,12 +60,11 @@ mod sums;
 mod table;
 #[cfg(test)]
 mod tests;
-mod verdict;
 
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
-pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierParts};
+pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierFractions};
 pub use model::{KnownSignal, Offsets};
 pub use monitor::{InstrumentEvent, instrument_events};
 pub use passes::{PassBlocks, PassSolver, SolvedPass};

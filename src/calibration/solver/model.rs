@@ -15,46 +15,46 @@ use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, sub};
 
-/// Sums over a map, or its harmonics; where positions are solved for sums over the map and over the map times each component of the
-/// direction, which give the derivatives by the baseline.
+/// Model of the sky in a channel. Where positions are solved for it sums over the map and over the map times each
+/// component of the direction, which gives the derivatives by the baseline.
 enum ChannelSky {
     Value(DirectSum),
     Circle(Box<CircleSky>),
     Gradient(DirectMoments),
 }
 
-/// What a sky makes: visibilities, and where positions are solved for their derivatives by the baseline, per m.
+/// Visibilities of a sky, and where positions are solved for their derivatives by the baseline, per m.
 #[derive(Default)]
 struct Predicted {
     values: Vec<Complex64>,
     gradients: Vec<[Complex64; 3]>,
 }
 
-/// The known signal in every channel.
+/// Known signal in all channels.
 pub struct KnownSignal {
     sky: Vec<ChannelSky>,
     rotations: Rotations,
     beacon: Beacon,
     frequencies_hz: Vec<f64>,
-    moves: bool,
+    solves_positions: bool,
 }
 
-/// Position errors of all daughters about which the model is linear, and the normals of their orbits.
+/// Position errors of all daughters about which the model is linearised, and the normals of their orbits.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Offsets {
-    /// Along the track, across it, away from the Moon, by daughter, m.
+    /// Errors along the track, across it and away from the Moon, by daughter, m.
     pub offset_m: Vec<[f64; 3]>,
     /// Normal of each daughter's orbit.
     pub normal_hat: Vec<Vec3>,
 }
 
 impl KnownSignal {
-    /// The signal for an instrument: a map (K) for each channel, or none with mode `beacon`.
+    /// Creates the signal for an instrument, with a map (K) for each channel; mode `beacon` uses no map.
     ///
     /// # Errors
-    /// A map with pixels that have no value.
+    /// A map has pixels without value.
     pub fn new(config: &SolverConfig, instrument: &Instrument, maps: &[SkyMap]) -> Result<Self, MapError> {
-        let moves = config.position_sigma_m > 0.0;
+        let solves_positions = config.position_sigma_m > 0.0;
         let uses_sky = config.mode != CalibrationMode::Beacon;
         let sky = |(map, channel): (&SkyMap, &Channel)| {
             map.check_whole()?;
@@ -64,7 +64,7 @@ impl KnownSignal {
             };
             let (hz, moon_m, response) =
                 (channel.frequency_hz, instrument.moon_radius_m, instrument.response);
-            Ok(match moves {
+            Ok(match solves_positions {
                 true => ChannelSky::Gradient(DirectMoments::new(&map, hz, moon_m, response)),
                 false if config.is_harmonic(map.nside()) => {
                     let always = config.sky_model == SkyModel::Harmonic;
@@ -79,11 +79,11 @@ impl KnownSignal {
             rotations: Rotations::default(),
             beacon: config.beacon(),
             frequencies_hz: instrument.channels.iter().map(|channel| channel.frequency_hz).collect(),
-            moves,
+            solves_positions,
         })
     }
 
-    /// Directions of the pixels of a channel's sky, where positions are solved for.
+    /// Directions of the pixels of a channel's sky; empty unless positions are solved for.
     pub(super) fn directions(&self, channel: usize) -> Vec<Vec3> {
         match self.sky.get(channel) {
             Some(ChannelSky::Gradient(sum)) => sum.directions(),
@@ -91,10 +91,10 @@ impl KnownSignal {
         }
     }
 
-    /// Sums over the sky of a channel as [`DirectMoments::sums_with`] gives them; nothing without a sky.
+    /// Sums over the sky of a channel, see [`DirectMoments::weighted_sums`]; empty without a sky.
     ///
     /// # Errors
-    /// Positions that the model does not cover.
+    /// The model does not cover the positions.
     pub(super) fn sums_with(
         &self,
         channel: usize,
@@ -102,21 +102,21 @@ impl KnownSignal {
         functions: &[f32],
     ) -> Result<Vec<f32>, ModelError> {
         match self.sky.get(channel) {
-            Some(ChannelSky::Gradient(sum)) => sum.sums_with(positions, functions),
+            Some(ChannelSky::Gradient(sum)) => sum.weighted_sums(positions, functions),
             _ => Ok(Vec::new()),
         }
     }
 
-    /// The artificial signal, and the frequency of a channel.
+    /// The artificial signal and the frequency of a channel.
     pub(super) fn beacon(&self, channel: usize) -> (Beacon, f64) {
         (self.beacon, self.frequencies_hz[channel])
     }
 
-    /// The model of blocks of placed visibilities, about offsets of the positions; of each block the flag says whether the artificial
-    /// signal is on in it. Many blocks at a time are fastest.
+    /// Model terms of blocks of placed visibilities, linearised about `offsets`; the flag of each block says whether
+    /// the artificial signal is on. Many blocks in one call are fastest.
     ///
     /// # Errors
-    /// Positions that the model does not cover.
+    /// The model does not cover the positions.
     pub fn models(
         &mut self,
         blocks: &[(&PlacedVisibilities, bool)],
@@ -127,51 +127,53 @@ impl KnownSignal {
         let mut skies: Vec<Predicted> = positions.iter().map(|_| Predicted::default()).collect();
         for channel in 0..self.frequencies_hz.len() {
             let of_channel = |&k: &usize| usize::from(blocks[k].0.channel.0) == channel;
-            let chosen: Vec<usize> = (0..blocks.len()).filter(of_channel).collect();
-            let all: Vec<PairPosition> = chosen.iter().flat_map(|&k| positions[k].iter().copied()).collect();
-            let Predicted { values, gradients } = self.sky_of(channel, &all)?;
+            let block_indices: Vec<usize> = (0..blocks.len()).filter(of_channel).collect();
+            let all: Vec<PairPosition> =
+                block_indices.iter().flat_map(|&k| positions[k].iter().copied()).collect();
+            let Predicted { values, gradients } = self.predict_sky(channel, &all)?;
             let (mut values, mut gradients) = (values.into_iter(), gradients.into_iter());
-            for k in chosen {
+            for k in block_indices {
                 let count = positions[k].len();
                 skies[k].values = values.by_ref().take(count).collect();
                 skies[k].gradients = gradients.by_ref().take(count).collect();
             }
         }
         let terms = |(k, sky): (usize, Predicted)| {
-            let (placed, is_on) = blocks[k];
-            self.terms(placed, offsets, sky, is_on.then_some(&positions[k]))
+            let (placed, beacon_is_on) = blocks[k];
+            self.terms(placed, offsets, sky, beacon_is_on.then_some(&positions[k]))
         };
         Ok(skies.into_iter().enumerate().map(terms).collect())
     }
 
-    /// The positions flown.
+    /// True positions: those of the packets minus the offsets.
     fn positions(&self, placed: &PlacedVisibilities, offsets: &Offsets) -> Vec<PairPosition> {
         let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
-        let flown = |r_m: Vec3, n: usize| match self.moves {
+        let true_position = |r_m: Vec3, n: usize| match self.solves_positions {
             true => sub(r_m, track_offset_m(r_m, offsets.normal_hat[n], offsets.offset_m[n])),
             false => r_m,
         };
         let position = |(&r_i_m, &r_j_m): (&Vec3, &Vec3)| PairPosition {
-            r_i_m: flown(r_i_m, i),
-            r_j_m: flown(r_j_m, j),
+            r_i_m: true_position(r_i_m, i),
+            r_j_m: true_position(r_j_m, j),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         placed.r_i_m.iter().zip(&placed.r_j_m).map(position).collect()
     }
 
-    /// What the sky of a channel makes at positions; zero without one.
-    fn sky_of(&mut self, channel: usize, positions: &[PairPosition]) -> Result<Predicted, ModelError> {
+    /// Predicts the sky of a channel at positions; zero without a sky.
+    fn predict_sky(&mut self, channel: usize, positions: &[PairPosition]) -> Result<Predicted, ModelError> {
         let mut values = vec![Complex64::ZERO; positions.len()];
-        let mut gradients = vec![[Complex64::ZERO; 3]; if self.moves { positions.len() } else { 0 }];
-        let per_m = self.per_m(channel);
+        let mut gradients =
+            vec![[Complex64::ZERO; 3]; if self.solves_positions { positions.len() } else { 0 }];
+        let gradient_factor_per_m = self.gradient_factor_per_m(channel);
         match self.sky.get_mut(channel) {
             Some(ChannelSky::Value(sum)) => sum.predict(positions, &mut values)?,
             Some(ChannelSky::Circle(sky)) => values = sky.predict(positions, &mut self.rotations)?,
             Some(ChannelSky::Gradient(sum)) => {
                 for (k, [value, moments @ ..]) in sum.predict(positions)?.into_iter().enumerate() {
                     values[k] = value;
-                    gradients[k] = moments.map(|moment| per_m * moment);
+                    gradients[k] = moments.map(|moment| gradient_factor_per_m * moment);
                 }
             }
             None => {}
@@ -179,29 +181,32 @@ impl KnownSignal {
         Ok(Predicted { values, gradients })
     }
 
-    /// Derivative of a fringe by a component of its baseline, over that of the direction, per m.
-    fn per_m(&self, channel: usize) -> Complex64 {
+    /// Derivative of a fringe by a component of its baseline, divided by the fringe and that component of the
+    /// direction, per m.
+    fn gradient_factor_per_m(&self, channel: usize) -> Complex64 {
         Complex64::new(0.0, -TAU * self.frequencies_hz[channel] / SPEED_OF_LIGHT_M_S)
     }
 
-    /// The terms of a block, with the artificial signal at positions where it is on.
+    /// Model terms of a block. The artificial signal is added at `beacon_positions`, which are `None` while it is
+    /// off.
     fn terms(
         &self,
         placed: &PlacedVisibilities,
         offsets: &Offsets,
         sky: Predicted,
-        lit: Option<&Vec<PairPosition>>,
+        beacon_positions: Option<&Vec<PairPosition>>,
     ) -> Vec<ModelTerms> {
         let Predicted { mut values, mut gradients } = sky;
         let [i, j] = [placed.pair.i, placed.pair.j].map(usize::from);
         let channel = usize::from(placed.channel.0);
-        let (from_hat, per_m) = (self.beacon.from_hat(), self.per_m(channel));
-        for (k, position) in lit.into_iter().flatten().enumerate() {
+        let (from_hat, gradient_factor_per_m) =
+            (self.beacon.source_hat(), self.gradient_factor_per_m(channel));
+        for (k, position) in beacon_positions.into_iter().flatten().enumerate() {
             let hz = self.frequencies_hz[channel];
             let wave = self.beacon.visibility_k_sr(position.r_i_m, position.r_j_m, hz);
             values[k] += wave;
             if let Some(gradient) = gradients.get_mut(k) {
-                (0..3).for_each(|axis| gradient[axis] += per_m * from_hat[axis] * wave);
+                (0..3).for_each(|axis| gradient[axis] += gradient_factor_per_m * from_hat[axis] * wave);
             }
         }
         let terms = |(k, &value): (usize, &Complex64)| {
@@ -209,7 +214,8 @@ impl KnownSignal {
             terms[0] = value;
             let Some(gradient) = gradients.get(k) else { return terms };
             let along = |axis: Vec3| -> Complex64 { (0..3).map(|a| gradient[a] * axis[a]).sum() };
-            // Packets say more than was flown by the offset: it is subtracted from r_i, and so from the baseline.
+            // Packets report the true position plus the offset, which is subtracted from r_i and so from the
+            // baseline.
             for (first, sign, r_m, n) in [(1, -1.0, placed.r_i_m[k], i), (4, 1.0, placed.r_j_m[k], j)] {
                 let axes = track_axes(r_m, offsets.normal_hat[n]);
                 for (axis, axis_hat) in axes.into_iter().enumerate() {

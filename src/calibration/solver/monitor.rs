@@ -1,17 +1,17 @@
-//! What happened to the instrument, told apart by its pattern over daughters, channels, pairs and time.
+//! Detection of instrument events, classified by their pattern over daughters, channels, pairs and time.
 //!
 //! | event | pattern |
 //! |---|---|
 //! | clock jump | phases of one daughter change in proportion to the frequency |
 //! | phase step | phases of one daughter change otherwise |
 //! | gain step | amplitudes of one daughter change |
-//! | dead | a daughter delivers noise |
-//! | drift | a gain changes within an interval, and not at once |
-//! | wrong model | pairs have residuals that no gains explain |
-//! | interference | outliers in one channel, of most pairs and most of the time |
-//! | burst | outliers at one time, of most pairs and channels |
+//! | dead | a daughter delivers only noise |
+//! | drift | phases of one daughter change gradually within a pass |
+//! | wrong model | residuals of pairs that gains cannot explain |
+//! | interference | outliers in one channel, in most pairs and most of the time |
+//! | burst | outliers at one time, in most pairs and channels |
 //!
-//! Phases of all daughters against the reference that change alike are a change of the reference's.
+//! If the phases of most daughters relative to the reference change by the same amount, the reference itself changed.
 
 use std::f64::consts::{PI, TAU};
 use std::fmt;
@@ -21,79 +21,79 @@ use serde::Serialize;
 use super::estimates::{GainEstimate, GainState};
 use super::solution::PassSolution;
 
-/// A change counts beyond this many times its standard deviation, and the usual change from pass to pass.
+/// Threshold of a step, in standard deviations; these are at least the usual scatter from pass to pass.
 const JUMP_SIGMAS: f64 = 6.0;
-/// Least change of a logarithmic amplitude, and of a phase (rad), that is told.
+/// Smallest change of a log amplitude, or of a phase (rad), that is reported.
 const CHANGE_MIN: f64 = 0.01;
-/// Part of visibilities that are outliers in a channel or a time that is spoilt.
-const SPOILT: f64 = 0.1;
-/// Channels that tell a clock from phases.
+/// Fraction of outliers above which a channel or a time bin is disturbed.
+const OUTLIER_FRACTION_MAX: f64 = 0.1;
+/// Minimum number of channels to distinguish a clock jump from a phase step.
 const CHANNELS_MIN: usize = 3;
-/// Mean squared residual of a fit that holds, in units of the variance.
-const FIT: f64 = 9.0;
+/// Maximum reduced chi-square of an acceptable fit.
+const CHI2_REDUCED_MAX: f64 = 9.0;
 
-/// Something that happened.
+/// An event of the instrument.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "kebab-case")]
 pub enum InstrumentEvent {
-    /// A clock jumped.
+    /// The clock of a daughter jumped.
     ClockJump {
-        /// Pass after it, or in which it happened.
+        /// Pass in which the event happened, or the first one after it.
         pass: u64,
-        /// Last time before it and first time after it, s since the epoch.
+        /// Last time before the event and first time after it, s since the epoch.
         between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
-        /// By this much, ns.
+        /// Change of the clock, ns.
         change_ns: f64,
     },
-    /// Phases changed.
+    /// Phases of a daughter changed.
     PhaseStep {
-        /// Pass after it, or in which it happened.
+        /// Pass in which the event happened, or the first one after it.
         pass: u64,
-        /// Last time before it and first time after it, s since the epoch.
+        /// Last time before the event and first time after it, s since the epoch.
         between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 0, and changes, deg.
+        /// Channels, from 0, and phase changes, deg.
         channels: Vec<(usize, f64)>,
     },
-    /// Amplitudes changed.
+    /// Amplitudes of a daughter changed.
     GainStep {
-        /// Pass after it, or in which it happened.
+        /// Pass in which the event happened, or the first one after it.
         pass: u64,
-        /// Last time before it and first time after it, s since the epoch.
+        /// Last time before the event and first time after it, s since the epoch.
         between_s: [f64; 2],
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 0, and factors.
+        /// Channels, from 0, and factors of the amplitude.
         channels: Vec<(usize, f64)>,
     },
-    /// A daughter delivers noise from this pass on.
+    /// A daughter delivers only noise from this pass on.
     Dead {
-        /// First such pass.
+        /// First pass of this state.
         pass: u64,
         /// Daughter, from 1.
         daughter: u32,
         /// Channels, from 0.
         channels: Vec<usize>,
     },
-    /// A phase changes within an interval, and not at once.
+    /// Phases of a daughter drift within a pass.
     Drift {
         /// Pass.
         pass: u64,
         /// Daughter, from 1.
         daughter: u32,
-        /// Channels, from 0, and root mean square changes, deg.
+        /// Channels, from 0, and rms phase changes, deg.
         channels: Vec<(usize, f64)>,
     },
-    /// The model is not that of the data: the sky's, or the artificial signal's.
+    /// The model of the sky, or of the artificial signal, does not match the data.
     WrongModel {
-        /// First such pass.
+        /// First pass of this state.
         pass: u64,
         /// Channel, from 0.
         channel: usize,
-        /// Part of the signal that no gains explain.
+        /// Fraction of the signal that no gains explain.
         unexplained: f64,
     },
     /// A channel is disturbed.
@@ -102,7 +102,7 @@ pub enum InstrumentEvent {
         pass: u64,
         /// Channel, from 0.
         channel: usize,
-        /// Part of its visibilities that are outliers.
+        /// Fraction of its visibilities that are outliers.
         outliers: f64,
     },
     /// All channels are disturbed for a time.
@@ -117,7 +117,7 @@ pub enum InstrumentEvent {
 }
 
 impl InstrumentEvent {
-    /// The pass of it, or after it.
+    /// Pass in which the event happened, or the first one after it.
     #[must_use]
     pub fn pass(&self) -> u64 {
         match self {
@@ -142,18 +142,21 @@ impl fmt::Display for InstrumentEvent {
         };
         match self {
             Self::ClockJump { pass, daughter, change_ns, between_s } => {
-                let when = when(between_s);
-                write!(f, "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns{when}")
-            }
-            Self::PhaseStep { pass, daughter, channels, between_s } => {
-                let (list, when) = (list(channels, " deg"), when(between_s));
-                write!(f, "pass {pass}: phases of daughter {daughter} changed by {list}{when}")
-            }
-            Self::GainStep { pass, daughter, channels, between_s } => {
-                let (factors, when) = (list(channels, ""), when(between_s));
+                let time_suffix = time_suffix(between_s);
                 write!(
                     f,
-                    "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{when}"
+                    "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns{time_suffix}"
+                )
+            }
+            Self::PhaseStep { pass, daughter, channels, between_s } => {
+                let (list, time_suffix) = (list(channels, " deg"), time_suffix(between_s));
+                write!(f, "pass {pass}: phases of daughter {daughter} changed by {list}{time_suffix}")
+            }
+            Self::GainStep { pass, daughter, channels, between_s } => {
+                let (factors, time_suffix) = (list(channels, ""), time_suffix(between_s));
+                write!(
+                    f,
+                    "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{time_suffix}"
                 )
             }
             Self::Dead { pass, daughter, channels } => {
@@ -170,7 +173,7 @@ impl fmt::Display for InstrumentEvent {
             }
             Self::WrongModel { pass, channel, unexplained } => write!(
                 f,
-                "pass {pass}: the model is not that of the data in channel {channel}: no gains explain {:.1} % of the signal",
+                "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal",
                 100.0 * unexplained
             ),
             Self::Interference { pass, channel, outliers } => write!(
@@ -185,65 +188,81 @@ impl fmt::Display for InstrumentEvent {
     }
 }
 
-/// When something happened within a pass.
-fn when([from_s, until_s]: &[f64; 2]) -> String {
+/// Text with the time of an event, if it is known to 1 s.
+fn time_suffix([from_s, until_s]: &[f64; 2]) -> String {
     if until_s - from_s > 1.0 { String::new() } else { format!(", at {:.1} s", 0.5 * (from_s + until_s)) }
 }
 
-/// Changes of a daughter from one solution to the next, by channel.
+/// Changes of a daughter's gains from one solution to the next.
 struct Change {
-    /// Place of the later solution.
-    at: usize,
+    /// Index of the later solution.
+    solution: usize,
     daughter: usize,
-    /// Channel, change (rad), its standard deviation.
-    phases: Vec<(usize, f64, f64)>,
-    /// The same of logarithmic amplitudes.
-    amplitudes: Vec<(usize, f64, f64)>,
+    /// Changes of phases, rad.
+    phases: Vec<ChannelChange>,
+    /// Changes of log amplitudes.
+    amplitudes: Vec<ChannelChange>,
 }
 
-/// Events in solutions that follow each other.
+/// Change of a phase (rad) or log amplitude in a channel.
+#[derive(Clone, Copy)]
+struct ChannelChange {
+    channel: usize,
+    change: f64,
+    sigma: f64,
+}
+
+/// Detects events in solutions of consecutive passes.
 #[must_use]
 pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
-    let mut changes = changes(solutions);
+    let mut changes = changes_between(solutions);
     widen(&mut changes, |change| &mut change.phases);
     widen(&mut changes, |change| &mut change.amplitudes);
-    for (at, solution) in solutions.iter().enumerate().skip(1) {
-        let mut of_pass: Vec<&mut Change> = changes.iter_mut().filter(|change| change.at == at).collect();
-        find_reference(&mut of_pass, solution.reference as usize - 1);
+    for (index, solution) in solutions.iter().enumerate().skip(1) {
+        let mut of_solution: Vec<&mut Change> =
+            changes.iter_mut().filter(|change| change.solution == index).collect();
+        attribute_to_reference(&mut of_solution, solution.reference as usize - 1);
     }
     let mut events = Vec::new();
-    for (at, solution) in solutions.iter().enumerate() {
-        let of_pass: Vec<&Change> = changes.iter().filter(|change| change.at == at).collect();
-        let before = at.checked_sub(1).map(|before| &solutions[before]);
-        daughters(&of_pass, before, solution, &mut events);
-        states(before, solution, &mut events);
-        disturbances(solution, &mut events);
+    for (index, solution) in solutions.iter().enumerate() {
+        let of_solution: Vec<&Change> = changes.iter().filter(|change| change.solution == index).collect();
+        let before = index.checked_sub(1).map(|previous| &solutions[previous]);
+        add_step_events(&of_solution, before, solution, &mut events);
+        add_state_events(before, solution, &mut events);
+        add_disturbance_events(solution, &mut events);
     }
     events
 }
 
-fn changes(solutions: &[PassSolution]) -> Vec<Change> {
+fn changes_between(solutions: &[PassSolution]) -> Vec<Change> {
     let mut found = Vec::new();
-    let spoilt: Vec<Vec<bool>> = solutions.iter().map(spoilt_channels).collect();
-    let is_spoilt = |at: usize, channel: usize| spoilt[at].get(channel) == Some(&true);
-    for (at, two) in solutions.windows(2).enumerate() {
+    let disturbed: Vec<Vec<bool>> = solutions.iter().map(disturbed_channels).collect();
+    let is_disturbed = |index: usize, channel: usize| disturbed[index].get(channel) == Some(&true);
+    for (index, two) in solutions.windows(2).enumerate() {
         for (n, (before, after)) in two[0].daughters.iter().zip(&two[1].daughters).enumerate() {
-            // What outliers leave of a disturbed channel is no gain to judge the daughter by; phases against another reference are others.
-            let is_same = two[0].reference == two[1].reference;
-            let known = |gain: &GainEstimate| is_same && gain.state == GainState::Good;
+            // Gains of disturbed channels are unreliable. Phases relative to different references cannot be compared.
+            let has_same_reference = two[0].reference == two[1].reference;
+            let is_comparable = |gain: &GainEstimate| has_same_reference && gain.state == GainState::Good;
             let pairs = before.gains.iter().zip(&after.gains).enumerate();
             let pairs: Vec<_> = pairs
-                .filter(|(c, (a, b))| known(a) && known(b) && !is_spoilt(at, *c) && !is_spoilt(at + 1, *c))
+                .filter(|(c, (a, b))| {
+                    is_comparable(a)
+                        && is_comparable(b)
+                        && !is_disturbed(index, *c)
+                        && !is_disturbed(index + 1, *c)
+                })
                 .collect();
             let phase = |(c, (a, b)): &(usize, (&GainEstimate, &GainEstimate))| {
                 let change = wrapped((b.phase_deg - a.phase_deg).to_radians());
-                (*c, change, a.phase_sigma_deg.hypot(b.phase_sigma_deg).to_radians())
+                let sigma = a.phase_sigma_deg.hypot(b.phase_sigma_deg).to_radians();
+                ChannelChange { channel: *c, change, sigma }
             };
             let amplitude = |(c, (a, b)): &(usize, (&GainEstimate, &GainEstimate))| {
-                (*c, (b.amplitude / a.amplitude).ln(), a.amplitude_sigma.hypot(b.amplitude_sigma))
+                let change = (b.amplitude / a.amplitude).ln();
+                ChannelChange { channel: *c, change, sigma: a.amplitude_sigma.hypot(b.amplitude_sigma) }
             };
             found.push(Change {
-                at: at + 1,
+                solution: index + 1,
                 daughter: n,
                 phases: pairs.iter().map(phase).collect(),
                 amplitudes: pairs.iter().map(amplitude).collect(),
@@ -253,12 +272,12 @@ fn changes(solutions: &[PassSolution]) -> Vec<Change> {
     found
 }
 
-/// Widens standard deviations to what is usual from pass to pass for the daughter and channel.
-fn widen(changes: &mut [Change], of: impl Fn(&mut Change) -> &mut Vec<(usize, f64, f64)>) {
+/// Raises standard deviations to the usual scatter of the daughter and channel from pass to pass.
+fn widen(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut Vec<ChannelChange>) {
     let mut sizes: std::collections::BTreeMap<(usize, usize), Vec<f64>> = Default::default();
     for change in &mut *changes {
         let daughter = change.daughter;
-        for (channel, change, _) in of(change) {
+        for ChannelChange { channel, change, .. } in select(change) {
             sizes.entry((daughter, *channel)).or_default().push(change.abs());
         }
     }
@@ -267,9 +286,9 @@ fn widen(changes: &mut [Change], of: impl Fn(&mut Change) -> &mut Vec<(usize, f6
     }
     for change in changes {
         let daughter = change.daughter;
-        for (channel, _, sigma) in of(change) {
+        for ChannelChange { channel, sigma, .. } in select(change) {
             let list = &sizes[&(daughter, *channel)];
-            // Two values have no usual one.
+            // A median of fewer than three values says nothing about outliers.
             if list.len() >= 3 {
                 *sigma = sigma.max(1.4826 * list[list.len() / 2]);
             }
@@ -281,55 +300,69 @@ fn wrapped(rad: f64) -> f64 {
     (rad + PI).rem_euclid(TAU) - PI
 }
 
-fn jumped((_, change, sigma): &&(usize, f64, f64)) -> bool {
-    change.abs() > (JUMP_SIGMAS * sigma).max(CHANGE_MIN)
+fn is_jump(change: &&ChannelChange) -> bool {
+    change.change.abs() > (JUMP_SIGMAS * change.sigma).max(CHANGE_MIN)
 }
 
-/// Part of a common change by which changes may differ, and standard deviations.
-const ALIKE: f64 = 0.05;
-const ALIKE_SIGMAS: f64 = 4.0;
+/// Relative difference within which two changes count as equal.
+const EQUAL_FRACTION: f64 = 0.05;
 
-/// Takes phases of most daughters that change alike, against the reference, for a change of the reference.
-fn find_reference(changes: &mut [&mut Change], reference: usize) {
-    let mut channels: Vec<usize> = changes.iter().flat_map(|one| one.phases.iter().map(|p| p.0)).collect();
+/// Difference within which two changes count as equal, in standard deviations.
+const EQUAL_SIGMAS: f64 = 4.0;
+
+/// If the phases of most daughters change equally relative to the reference, attributes the change to the reference.
+fn attribute_to_reference(changes: &mut [&mut Change], reference: usize) {
+    let mut channels: Vec<usize> =
+        changes.iter().flat_map(|change| change.phases.iter().map(|phase| phase.channel)).collect();
     channels.sort_unstable();
     channels.dedup();
     for channel in channels {
-        let phase = |one: &Change| one.phases.iter().find(|phase| phase.0 == channel).copied();
-        let others: Vec<(usize, f64, f64)> =
-            changes.iter().filter(|one| one.daughter != reference).filter_map(|one| phase(one)).collect();
-        let is_alike = |one: &&(usize, f64, f64), about: &(usize, f64, f64)| {
-            let most = (ALIKE * about.1.abs()).max(ALIKE_SIGMAS * one.2.hypot(about.2));
-            wrapped(one.1 - about.1).abs() < most
+        let phase = |change: &Change| change.phases.iter().find(|phase| phase.channel == channel).copied();
+        let others: Vec<ChannelChange> = changes
+            .iter()
+            .filter(|change| change.daughter != reference)
+            .filter_map(|change| phase(change))
+            .collect();
+        let is_equal = |phase: &&ChannelChange, centre: &ChannelChange| {
+            let tolerance =
+                (EQUAL_FRACTION * centre.change.abs()).max(EQUAL_SIGMAS * phase.sigma.hypot(centre.sigma));
+            wrapped(phase.change - centre.change).abs() < tolerance
         };
-        let count = |about: &(usize, f64, f64)| others.iter().filter(|one| is_alike(one, about)).count();
-        // Of the reference nothing is known but by all others.
-        let of_reference = changes.iter_mut().filter(|one| one.daughter == reference);
-        of_reference.for_each(|one| one.phases.retain(|phase| phase.0 != channel));
-        let Some(most) = others.iter().filter(jumped).max_by_key(|jump| count(jump)) else { continue };
-        let jumps = others.iter().filter(jumped).filter(|one| is_alike(one, most));
-        let alike: Vec<(f64, f64)> = jumps.map(|jump| (wrapped(jump.1 - most.1), jump.2)).collect();
-        // Two daughters alone cannot say which of them it was.
-        if alike.len() < 2 || 2 * count(most) <= others.len() {
+        let count = |centre: &ChannelChange| others.iter().filter(|phase| is_equal(phase, centre)).count();
+        // The reference's own phase is zero by definition: its change is only inferred from the others.
+        let of_reference = changes.iter_mut().filter(|change| change.daughter == reference);
+        of_reference.for_each(|change| change.phases.retain(|phase| phase.channel != channel));
+        let Some(common) = others.iter().filter(is_jump).max_by_key(|jump| count(jump)) else { continue };
+        let jumps = others.iter().filter(is_jump).filter(|phase| is_equal(phase, common));
+        let equal: Vec<(f64, f64)> =
+            jumps.map(|jump| (wrapped(jump.change - common.change), jump.sigma)).collect();
+        // With two daughters alone it is undetermined which of them changed.
+        if equal.len() < 2 || 2 * count(common) <= others.len() {
             continue;
         }
-        let weight: f64 = alike.iter().map(|one| one.1.max(1e-6).powi(-2)).sum();
-        let mean = alike.iter().map(|one| one.0 * one.1.max(1e-6).powi(-2)).sum::<f64>() / weight;
-        let (change, sigma) = (most.1 + mean, weight.recip().sqrt());
-        for one in &mut *changes {
-            if one.daughter == reference {
-                one.phases.push((channel, -wrapped(change), sigma));
+        let weight: f64 = equal.iter().map(|(_, sigma)| sigma.max(1e-6).powi(-2)).sum();
+        let mean = equal.iter().map(|(difference, sigma)| difference * sigma.max(1e-6).powi(-2)).sum::<f64>()
+            / weight;
+        let (common_change, common_sigma) = (common.change + mean, weight.recip().sqrt());
+        for change in &mut *changes {
+            if change.daughter == reference {
+                change.phases.push(ChannelChange {
+                    channel,
+                    change: -wrapped(common_change),
+                    sigma: common_sigma,
+                });
                 continue;
             }
-            for phase in one.phases.iter_mut().filter(|phase| phase.0 == channel) {
-                *phase = (channel, wrapped(phase.1 - change), phase.2.hypot(sigma));
+            for phase in change.phases.iter_mut().filter(|phase| phase.channel == channel) {
+                phase.change = wrapped(phase.change - common_change);
+                phase.sigma = phase.sigma.hypot(common_sigma);
             }
         }
     }
 }
 
-/// Events of daughters between a solution and the one before.
-fn daughters(
+/// Adds the clock jumps, phase steps and gain steps between a solution and the one before.
+fn add_step_events(
     changes: &[&Change],
     before: Option<&PassSolution>,
     solution: &PassSolution,
@@ -339,120 +372,133 @@ fn daughters(
     let between_s = [before.map_or(solution.from_s, |before| before.until_s), solution.from_s];
     for change in changes {
         let daughter = change.daughter as u32 + 1;
-        let list = |list: &[(usize, f64, f64)], of: fn(f64) -> f64| -> Vec<(usize, f64)> {
-            list.iter().filter(jumped).map(|(channel, change, _)| (*channel, of(*change))).collect()
+        let jumps = |changes: &[ChannelChange], convert: fn(f64) -> f64| -> Vec<(usize, f64)> {
+            changes.iter().filter(is_jump).map(|jump| (jump.channel, convert(jump.change))).collect()
         };
-        let amplitudes = list(&change.amplitudes, f64::exp);
+        let amplitudes = jumps(&change.amplitudes, f64::exp);
         if !amplitudes.is_empty() {
             events.push(InstrumentEvent::GainStep { pass, daughter, channels: amplitudes, between_s });
         }
-        let phases = list(&change.phases, f64::to_degrees);
+        let phases = jumps(&change.phases, f64::to_degrees);
         if phases.is_empty() {
             continue;
         }
-        events.push(match clock_ns(change, solution) {
+        events.push(match fit_clock_jump_ns(change, solution) {
             Some(change_ns) => InstrumentEvent::ClockJump { pass, daughter, change_ns, between_s },
             None => InstrumentEvent::PhaseStep { pass, daughter, channels: phases, between_s },
         });
     }
 }
 
-/// Least change of a phase within an interval, deg, least part of the variance of a phase that it is, and least part of the signal that a
-/// model leaves, that are told.
+/// Smallest rms phase change within a pass that is reported, deg.
 const DRIFT_MIN_DEG: f64 = 4.0;
-const DRIFT_PART: f64 = 0.92;
-const MODEL_MIN: f64 = 0.01;
 
-/// What solutions say of themselves, where the one before did not.
-fn states(before: Option<&PassSolution>, solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
+/// Smallest fraction of a phase's variance that a reported drift contributes.
+const DRIFT_FRACTION: f64 = 0.92;
+
+/// Smallest unexplained fraction of the signal that is reported.
+const UNEXPLAINED_MIN: f64 = 0.01;
+
+/// Adds events that follow from the state of a solution's gains: when a state begins, and drifts.
+fn add_state_events(
+    before: Option<&PassSolution>,
+    solution: &PassSolution,
+    events: &mut Vec<InstrumentEvent>,
+) {
     let pass = solution.pass;
     let channels = solution.model_error.len();
-    let spoilt = spoilt_channels(solution);
-    let is_spoilt = |c: usize| spoilt.get(c) == Some(&true);
+    let disturbed = disturbed_channels(solution);
+    let is_disturbed = |c: usize| disturbed.get(c) == Some(&true);
     for (n, daughter) in solution.daughters.iter().enumerate() {
         let number = daughter.daughter;
-        let is_dead = |of: &PassSolution, c: usize| of.daughters[n].gains[c].state == GainState::Dead;
+        let is_dead =
+            |solution: &PassSolution, c: usize| solution.daughters[n].gains[c].state == GainState::Dead;
         let dead = (0..channels).filter(|c| is_dead(solution, *c));
         let dead: Vec<usize> = dead.filter(|c| before.is_none_or(|before| !is_dead(before, *c))).collect();
         if !dead.is_empty() {
             events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
         }
-        // Where it is most of what is not known of the phase: noise alone seems to be as much as nine tenths of it.
-        let drifts = |gain: &GainEstimate| {
-            let known = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
-            gain.phase_scatter_deg > DRIFT_MIN_DEG && (gain.phase_scatter_deg / known).powi(2) > DRIFT_PART
+        // A drift is reported only if it dominates the variance of the phase: noise alone can contribute a fraction
+        // of 0.9.
+        let is_drifting = |gain: &GainEstimate| {
+            let sigma_deg = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
+            gain.phase_scatter_deg > DRIFT_MIN_DEG
+                && (gain.phase_scatter_deg / sigma_deg).powi(2) > DRIFT_FRACTION
         };
-        let drifting = daughter.gains.iter().enumerate().filter(|(c, gain)| drifts(gain) && !is_spoilt(*c));
+        let drifting =
+            daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(gain) && !is_disturbed(*c));
         let drifting: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
         if !drifting.is_empty() {
             events.push(InstrumentEvent::Drift { pass, daughter: number, channels: drifting });
         }
     }
-    let part = |of: &PassSolution, c: usize| {
-        // A good part of the daughters: one alone may have another trouble.
-        let gains: Vec<&GainEstimate> = of.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
-        let known = |gain: &&&GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
-        let known = gains.iter().filter(known).count();
+    let unexplained_if_wrong = |solution: &PassSolution, c: usize| {
+        // The median over daughters: a single daughter may have another problem.
+        let gains: Vec<&GainEstimate> =
+            solution.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
+        let has_signal = |gain: &&&GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
+        let count = gains.iter().filter(has_signal).count();
         let poor = gains.iter().filter(|gain| gain.state == GainState::PoorFit).count();
-        let mut parts: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
-        parts.sort_unstable_by(f64::total_cmp);
-        let median = parts.get(parts.len() / 2).copied().unwrap_or(0.0);
-        let is_foreign = known > 0 && 2 * poor > known;
-        let part = of.model_error[c].max(median);
-        (is_foreign || part > MODEL_MIN).then_some(part)
+        let mut fractions: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
+        fractions.sort_unstable_by(f64::total_cmp);
+        let median = fractions.get(fractions.len() / 2).copied().unwrap_or(0.0);
+        let most_fit_poorly = count > 0 && 2 * poor > count;
+        let fraction = solution.model_error[c].max(median);
+        (most_fit_poorly || fraction > UNEXPLAINED_MIN).then_some(fraction)
     };
-    for channel in (0..channels).filter(|c| !is_spoilt(*c)) {
-        let was = before.and_then(|before| part(before, channel)).is_some();
-        if let Some(unexplained) = part(solution, channel).filter(|_| !was) {
+    for channel in (0..channels).filter(|c| !is_disturbed(*c)) {
+        let was_wrong = before.and_then(|before| unexplained_if_wrong(before, channel)).is_some();
+        if let Some(unexplained) = unexplained_if_wrong(solution, channel).filter(|_| !was_wrong) {
             events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
         }
     }
 }
 
-/// The jump of a clock that explains changes of phases, ns; `None` if none does.
-fn clock_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
+/// Clock jump that explains the changes of the phases, ns; `None` if none does.
+fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let gains = &solution.daughters[change.daughter].gains;
     let hz = |channel: usize| gains[channel].frequency_hz;
-    let highest = change.phases.iter().map(|(c, ..)| hz(*c)).fold(0.0, f64::max);
-    let lowest = change.phases.iter().map(|(c, ..)| hz(*c)).fold(f64::INFINITY, f64::min);
+    let highest = change.phases.iter().map(|phase| hz(phase.channel)).fold(0.0, f64::max);
+    let lowest = change.phases.iter().map(|phase| hz(phase.channel)).fold(f64::INFINITY, f64::min);
     if change.phases.len() < CHANNELS_MIN || lowest <= 0.0 || highest < 1.1 * lowest {
         return None;
     }
-    // Half a turn of the lowest frequency either way, in steps of a hundredth of a turn of the highest.
+    // Candidates span half a turn of the lowest frequency either way, in steps of a hundredth of a turn of the
+    // highest.
     let step_s = 0.01 / highest;
-    let reach = (0.5 / lowest / step_s) as i64;
-    let cost = |late_s: f64| -> f64 {
-        let square = |(c, change, sigma): &(usize, f64, f64)| {
-            (wrapped(change + TAU * hz(*c) * late_s) / sigma.max(1e-4)).powi(2)
+    let steps = (0.5 / lowest / step_s) as i64;
+    let cost = |delay_s: f64| -> f64 {
+        let square = |ChannelChange { channel, change, sigma }: &ChannelChange| {
+            (wrapped(change + TAU * hz(*channel) * delay_s) / sigma.max(1e-4)).powi(2)
         };
         change.phases.iter().map(square).sum::<f64>() / change.phases.len() as f64
     };
-    let best = |from_s: f64, step_s: f64, reach: i64| {
-        let candidates = (-reach..=reach).map(|k| from_s + step_s * k as f64);
+    let best = |from_s: f64, step_s: f64, steps: i64| {
+        let candidates = (-steps..=steps).map(|k| from_s + step_s * k as f64);
         candidates.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(from_s)
     };
-    let coarse_s = best(0.0, step_s, reach);
-    let late_s = best(coarse_s, 0.01 * step_s, 100);
-    (cost(late_s) < FIT).then_some(1e9 * late_s)
+    let coarse_s = best(0.0, step_s, steps);
+    let delay_s = best(coarse_s, 0.01 * step_s, 100);
+    (cost(delay_s) < CHI2_REDUCED_MAX).then_some(1e9 * delay_s)
 }
 
-/// Whether most known values of a list are spoilt.
-fn most(list: &[f64]) -> bool {
-    let known: Vec<&f64> = list.iter().filter(|part| part.is_finite()).collect();
-    known.iter().filter(|part| ***part > SPOILT).count() * 2 > known.len()
+/// Whether more than half of the finite outlier fractions of a list exceed the threshold.
+fn is_mostly_disturbed(fractions: &[f64]) -> bool {
+    let finite: Vec<&f64> = fractions.iter().filter(|fraction| fraction.is_finite()).collect();
+    finite.iter().filter(|fraction| ***fraction > OUTLIER_FRACTION_MAX).count() * 2 > finite.len()
 }
 
 /// Whether each channel is disturbed most of the time.
-fn spoilt_channels(solution: &PassSolution) -> Vec<bool> {
-    solution.outlier_parts.by_channel_and_time.iter().map(|times| most(times)).collect()
+fn disturbed_channels(solution: &PassSolution) -> Vec<bool> {
+    solution.outlier_fractions.by_channel_and_time.iter().map(|times| is_mostly_disturbed(times)).collect()
 }
 
-/// Disturbances within a pass.
-fn disturbances(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
-    let (pass, parts) = (solution.pass, &solution.outlier_parts);
+/// Adds interference and bursts within a pass.
+fn add_disturbance_events(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
+    let (pass, parts) = (solution.pass, &solution.outlier_fractions);
     let channels = parts.by_channel_and_time.len();
-    let spoilt = spoilt_channels(solution);
-    for (channel, _) in spoilt.iter().enumerate().filter(|(_, spoilt)| **spoilt) {
+    let disturbed = disturbed_channels(solution);
+    for (channel, _) in disturbed.iter().enumerate().filter(|(_, disturbed)| **disturbed) {
         let times: Vec<f64> =
             parts.by_channel_and_time[channel].iter().copied().filter(|part| part.is_finite()).collect();
         let outliers = times.iter().sum::<f64>() / times.len() as f64;
@@ -461,20 +507,20 @@ fn disturbances(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
     let bins = parts.by_channel_and_time.first().map_or(0, Vec::len);
     let is_hit = |bin: usize| {
         let column: Vec<f64> = (0..channels)
-            .filter(|channel| !spoilt[*channel])
+            .filter(|channel| !disturbed[*channel])
             .map(|channel| parts.by_channel_and_time[channel][bin])
             .collect();
-        !column.is_empty() && most(&column)
+        !column.is_empty() && is_mostly_disturbed(&column)
     };
     let bin_s = (solution.until_s - solution.from_s) / bins.max(1) as f64;
-    let mut begun = None;
+    let mut first_bin = None;
     for bin in 0..=bins {
-        match (begun, bin < bins && is_hit(bin)) {
-            (None, true) => begun = Some(bin),
+        match (first_bin, bin < bins && is_hit(bin)) {
+            (None, true) => first_bin = Some(bin),
             (Some(first), false) => {
                 let at = |bin: usize| solution.from_s + bin_s * bin as f64;
                 events.push(InstrumentEvent::Burst { pass, from_s: at(first), until_s: at(bin) });
-                begun = None;
+                first_bin = None;
             }
             _ => {}
         }

@@ -1,5 +1,5 @@
-//! Positions that are off by radians, and errors of gains, in data that are summed here over the pixels of a sky.
-#![allow(clippy::print_stderr)] // They say what they measured.
+//! Position errors of radians of phase, with errors of gains, in data summed here over the pixels of a sky.
+#![allow(clippy::print_stderr)] // The tests print what they measured.
 
 use std::f64::consts::{PI, TAU};
 
@@ -7,7 +7,7 @@ use num_complex::Complex64;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use super::passes::Task;
+use super::passes::PassTask;
 use super::solution::solve_from;
 use super::*;
 use crate::array::{Array, ArrayConfig, ObservingWindows, hidden_by_moon};
@@ -18,11 +18,11 @@ use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
 use crate::units::{ChannelId, StreamKind, all_pairs, random_stream};
 
 const DAUGHTERS: usize = 8;
-/// Instants of a pass.
+/// Number of instants of a pass.
 const INSTANTS: usize = 120;
-/// Longest baseline: three to six daughters at 10 MHz.
+/// Maximum baseline: that of three to six daughters at 10 MHz.
 const WAVELENGTHS_MAX: f64 = 100.0;
-/// Of every phase (deg), amplitude, clock (ns) and position (m).
+/// Standard deviations of phases (deg), amplitudes, clocks (ns) and positions (m).
 const ERRORS: [f64; 4] = [60.0, 0.1, 30.0, 10.0];
 
 /// A sky of a few hundred sources at the centres of pixels: sums over the pixels are exact on any baseline.
@@ -30,12 +30,12 @@ struct Scene {
     frequencies_hz: Vec<f64>,
     sky: SkyMap,
     directions: Vec<Vec3>,
-    /// What the sum over the sky of the squares of the visibilities, over their noise, is.
+    /// Sum of the squares of the visibilities over the sky, over their noise.
     signal_to_noise: f64,
     beacon_k_sr: f64,
 }
 
-/// Errors of all daughters.
+/// True errors of all daughters.
 struct Truth {
     gains: Vec<Vec<Complex64>>,
     position_m: Vec<[f64; 3]>,
@@ -47,7 +47,7 @@ impl Scene {
     fn new(frequencies_hz: &[f64], signal_to_noise: f64) -> Self {
         let mut stream = random_stream(5, StreamKind::Probe, [0, 0]);
         let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
-        // A few hundred sources, of which some are strong, above a level.
+        // The sky has a few hundred sources, some of them strong, above a level.
         let values = (0..12 * 8 * 8).map(|_| 1e4 * (1.5 * normal()).exp()).collect();
         let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let directions = sky.directions_ecliptic();
@@ -103,7 +103,7 @@ impl Scene {
         if with_beacon { sky + beacon } else { sky }
     }
 
-    /// A pass with errors: what is sent, with the positions that packets have.
+    /// Data of a pass with errors, with the positions in packets.
     fn pass(&self, truth: &Truth, seed: u64) -> (Vec<(PlacedVisibilities, bool)>, [f64; 2], Vec<Vec3>) {
         let array = array();
         let start_s = 2e4 + 86_400.0 * (seed % 7) as f64;
@@ -115,7 +115,7 @@ impl Scene {
             .collect();
         let normal_hat: Vec<Vec3> =
             (0..DAUGHTERS).map(|n| array.normal_hat(n, 0.5 * (span_s[0] + span_s[1]))).collect();
-        let told_m = |n: usize, t_s: f64| {
+        let reported_m = |n: usize, t_s: f64| {
             let r_m = array.position_m(n, t_s);
             let (up, normal) = (unit(r_m), normal_hat[n]);
             let [along_m, across_m, radial_m] = truth.position_m[n];
@@ -144,15 +144,15 @@ impl Scene {
                     pair: *pair,
                     ..PlacedVisibilities::default()
                 };
-                // A beacon is on in every tenth integration.
+                // The beacon is on in every tenth integration.
                 let is_on = |k: usize| self.beacon_k_sr > 0.0 && k % 10 == 4;
                 for (k, &t_s) in time_s.iter().enumerate().filter(|(k, _)| is_on(*k) == with_beacon) {
                     let _ = k;
                     let [r_i_m, r_j_m] = [i, j].map(|n| array.position_m(n, t_s));
                     let value = self.visibility(r_i_m, r_j_m, hz, with_beacon);
                     placed.time_s.push(t_s);
-                    placed.r_i_m.push(told_m(i, t_s));
-                    placed.r_j_m.push(told_m(j, t_s));
+                    placed.r_i_m.push(reported_m(i, t_s));
+                    placed.r_j_m.push(reported_m(j, t_s));
                     placed.value_k_sr.push(gain * value);
                 }
                 let power = placed.value_k_sr.iter().map(|value| value.norm_sqr()).sum::<f64>();
@@ -178,11 +178,11 @@ impl Scene {
         self.solve_with(&self.sky, config, truth, seed)
     }
 
-    /// With another sky as the known one.
+    /// Solves with another sky as the known one.
     fn solve_with(&self, sky: &SkyMap, config: &SolverConfig, truth: &Truth, seed: u64) -> PassSolution {
         let (placed, span_s, normal_hat) = self.pass(truth, seed);
         let mut signal = self.signal(sky, config);
-        let task = Task { config, frequencies: &self.frequencies_hz, number: 0, span_s, normal_hat };
+        let task = PassTask { config, frequencies: &self.frequencies_hz, number: 0, span_s, normal_hat };
         task.solve(&placed, &mut signal).unwrap().remove(0)
     }
 
@@ -191,7 +191,7 @@ impl Scene {
         KnownSignal::new(config, &self.instrument(), &maps).unwrap()
     }
 
-    /// A solution that begins with the positions of daughters 2, 3 and 4 off by shifts.
+    /// Solves starting with the positions of daughters 2, 3 and 4 off by shifts.
     fn solve_off(
         &self,
         config: &SolverConfig,
@@ -215,7 +215,7 @@ impl Scene {
     }
 }
 
-/// Positions against those of the first daughter.
+/// Positions relative to those of the first daughter.
 fn relative(truth: &Truth) -> Vec<[f64; 3]> {
     truth.position_m.iter().map(|position_m| sub(*position_m, truth.position_m[0])).collect()
 }
@@ -233,8 +233,8 @@ fn config() -> SolverConfig {
     }
 }
 
-/// Whether each daughter that takes part in the highest channel is good there, and right: its position, in units of what it is said
-/// to be known by, and within a tenth of a wavelength.
+/// For each daughter that is used in the highest channel: whether it is good there, and whether its position is
+/// right, in units of its stated error, and within a tenth of a wavelength.
 fn right(scene: &Scene, truth: &Truth, found: &PassSolution) -> Vec<(bool, bool, f64)> {
     let highest = scene.frequencies_hz.len() - 1;
     let wavelength_m = SPEED_OF_LIGHT_M_S / scene.frequencies_hz[highest];
@@ -252,9 +252,9 @@ fn right(scene: &Scene, truth: &Truth, found: &PassSolution) -> Vec<(bool, bool,
     (1..DAUGHTERS).filter_map(of).collect()
 }
 
-/// Solves passes with the errors; how many solutions of daughters are there, good, right, good and wrong, and the median of the worst
-/// component's error in its standard deviations.
-fn tried(scene: &Scene, config: &SolverConfig, passes: u64) -> ([usize; 4], f64) {
+/// Solves passes with the errors; counts solutions of daughters (all, good, right, good but wrong), and the median of
+/// the worst component's error in its standard deviations.
+fn solve_passes(scene: &Scene, config: &SolverConfig, passes: u64) -> ([usize; 4], f64) {
     let all: Vec<(bool, bool, f64)> = (0..passes)
         .flat_map(|seed| {
             let truth = scene.truth(seed, ERRORS);
@@ -277,7 +277,7 @@ fn tried(scene: &Scene, config: &SolverConfig, passes: u64) -> ([usize; 4], f64)
 #[test]
 fn positions_of_ten_metres_are_found_from_the_lowest_channel_upwards() {
     let scene = Scene::new(&[3e6, 10e6, 30e6], 1.0);
-    let ([all, good, right, wrong], sigmas) = tried(&scene, &config(), 6);
+    let ([all, good, right, wrong], sigmas) = solve_passes(&scene, &config(), 6);
     eprintln!("{good} good and {right} right of {all}, {wrong} good but wrong; median {sigmas:.2} sigma");
     assert!(
         all >= 8 && right * 20 >= all * 19 && wrong == 0,
@@ -290,7 +290,7 @@ fn positions_of_ten_metres_are_found_from_the_lowest_channel_upwards() {
 #[test]
 fn positions_of_two_radians_are_found_in_one_channel() {
     let scene = Scene::new(&[10e6], 1.0);
-    let ([all, good, right, wrong], sigmas) = tried(&scene, &config(), 6);
+    let ([all, good, right, wrong], sigmas) = solve_passes(&scene, &config(), 6);
     eprintln!("{good} good and {right} right of {all}, {wrong} good but wrong; median {sigmas:.2} sigma");
     assert!(
         all >= 16 && right * 20 >= all * 19 && wrong == 0,
@@ -299,7 +299,7 @@ fn positions_of_two_radians_are_found_in_one_channel() {
 }
 
 #[test]
-fn a_strong_beacon_does_not_lead_positions_astray() {
+fn a_strong_beacon_does_not_mislead_positions() {
     let scene = Scene { beacon_k_sr: 1e10, ..Scene::new(&[3e6, 10e6, 30e6], 30.0) };
     let config = SolverConfig {
         mode: CalibrationMode::Joint,
@@ -307,7 +307,7 @@ fn a_strong_beacon_does_not_lead_positions_astray() {
         beacon_direction_deg: BEACON_DEG,
         ..config()
     };
-    let ([all, good, right, wrong], _) = tried(&scene, &config, 6);
+    let ([all, good, right, wrong], _) = solve_passes(&scene, &config, 6);
     eprintln!("{good} good and {right} right of {all}, {wrong} good but wrong");
     assert!(
         all >= 8 && right * 20 >= all * 19 && wrong == 0,
@@ -315,20 +315,20 @@ fn a_strong_beacon_does_not_lead_positions_astray() {
     );
 }
 
-/// Solutions that begin off by what `shifts_m` makes of a seed and a shift: wrong ones, those that are good all the same, right ones, and
-/// those that are not good.
-fn tried_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
+/// Solves starting off by what `shifts_m` makes of a seed and a shift. Counts wrong solutions, wrong ones that are
+/// good, right ones, and right ones that are not good.
+fn solve_passes_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
     let scene = Scene::new(&[10e6], 1.0);
     let (mut wrong, mut missed, mut right_ones, mut refused) = (0, 0, 0, 0);
     let (mut undisturbed, mut undisturbed_refused) = (0, 0);
     for seed in 0..6 {
         let truth = scene.truth(seed, ERRORS);
-        // From a hundredth to a half of a wavelength away.
+        // Shifts range from a hundredth to a half of a wavelength.
         for shift_m in
             [[0.3, 0.0, 0.0], [0.0, 0.3, 0.3], [9.0, -5.0, 0.0], [0.0, 9.0, 9.0], [-12.0, 0.0, 9.0]]
         {
             let found = scene.solve_off(&config(), &truth, seed, shifts_m(seed, shift_m));
-            // Where they are not known better, a tenth of a wavelength may be noise.
+            // Where positions are not known better, a tenth of a wavelength may be noise.
             let daughters: Vec<(bool, bool)> = right(&scene, &truth, &found)
                 .into_iter()
                 .map(|(is_good, is_near, sigmas)| (is_good, is_near || sigmas < 4.0))
@@ -352,13 +352,13 @@ fn tried_off(shifts_m: impl Fn(u64, Vec3) -> [Vec3; 3]) -> [u32; 4] {
 }
 
 #[test]
-fn wrong_minima_are_no_good_solutions() {
-    // One daughter.
-    let [wrong, missed, right_ones, refused] = tried_off(|seed, shift_m| {
+fn wrong_minima_are_not_good_solutions() {
+    // First one daughter is off.
+    let [wrong, missed, right_ones, refused] = solve_passes_off(|seed, shift_m| {
         std::array::from_fn(|k| if k as u64 == seed % 3 { shift_m } else { [0.0; 3] })
     });
     assert!(wrong >= 5 && right_ones >= 30);
-    // A wrong daughter leads others astray: those that are off by less than itself leave less of their signal.
+    // A wrong daughter misleads others: those with smaller errors leave less of their signal unexplained.
     assert!(
         missed * 4 <= wrong && refused * 4 <= right_ones,
         "{missed} of {wrong}, {refused} of {right_ones}"
@@ -367,7 +367,7 @@ fn wrong_minima_are_no_good_solutions() {
 
 #[test]
 fn three_wrong_daughters_contradict_one_another() {
-    let [wrong, missed, right_ones, refused] = tried_off(|seed, shift_m| {
+    let [wrong, missed, right_ones, refused] = solve_passes_off(|seed, shift_m| {
         let mut stream = random_stream(seed, StreamKind::Probe, [7, (shift_m[0] * 10.0 + 500.0) as u64]);
         let size_m = norm(shift_m) / 3.0_f64.sqrt();
         std::array::from_fn(|_| {
@@ -378,7 +378,7 @@ fn three_wrong_daughters_contradict_one_another() {
         })
     });
     assert!(wrong >= 15 && right_ones >= 30);
-    // Where daughters contradict one another, right ones are doubted, too.
+    // Where daughters contradict one another, right ones are rejected too.
     assert!(
         missed * 6 <= wrong && refused * 3 <= right_ones,
         "{missed} of {wrong}, {refused} of {right_ones}"

@@ -1,10 +1,11 @@
-//! Positions that are off by a good part of a wavelength.
+//! Position errors of a large fraction of a wavelength.
 //!
-//! The model of a visibility is linear in a position within a tenth of a wavelength at most. So positions are found from the lowest
-//! frequency upwards: first from the lowest channel alone, where they are the smallest part of a wavelength, then with the next one of
-//! twice its frequency or less, and so on. At each step the model is made again about the positions found so far, which may move by
-//! part of a wavelength of the highest channel, and only where the data then fit better (a trust region). A part of the visibilities
-//! is enough for that; the solution is of all.
+//! The model of a visibility is linear in a position within a tenth of a wavelength at most. So positions are found
+//! from the lowest frequency upwards: first from the lowest channel alone, where errors are the smallest fraction of
+//! a wavelength, then with the next channel of at most twice its frequency, and so on. Each step recomputes the model
+//! about the positions found so far, and moves by a fraction of a wavelength of the highest channel, only where the
+//! data then fit better (a trust region). A subset of the visibilities suffices for that; the final solution uses
+//! all.
 
 use std::collections::BTreeMap;
 
@@ -12,11 +13,11 @@ use rayon::prelude::*;
 
 use super::config::SolverConfig;
 use super::global::{GlobalSearch, KEPT_COST};
-use super::layout::{ParameterLayout, Values};
+use super::layout::{ParameterLayout, ParameterValues};
 use super::model::{KnownSignal, Offsets};
-use super::newton::{NewtonFit, PositionPrior};
+use super::newton::{NewtonFit, TrustRegion};
 use super::reach::is_searched;
-use super::robust::{judge, misfit};
+use super::robust::{mark_outliers, robust_cost};
 use super::robust_fit::sums_of;
 use super::sums::{ModelTerms, ModelledBlock, PairSums};
 use crate::frames::PlacedVisibilities;
@@ -24,78 +25,81 @@ use crate::response::model::ModelError;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, norm, sub};
 
-/// Most visibilities of a pair in a channel that positions are sought with.
-const THINNED: usize = 320;
+/// Maximum number of visibilities of a pair in a channel used to find positions.
+const THINNED_MAX: usize = 320;
 
-/// Most of them that all offsets are searched with.
-const SEARCHED: usize = 160;
+/// Maximum number used to search all offsets.
+const SEARCHED_MAX: usize = 160;
 
-/// Distance, in wavelengths of the highest channel, that a position may move at first without a new model, and the most.
+/// Initial and maximum trust radius, in wavelengths of the highest channel.
 const TRUST_WAVELENGTHS: [f64; 2] = [0.1, 0.25];
 
-/// Most models of one step.
-const ROUNDS: usize = 30;
+/// Maximum number of models in one step.
+const MODELS_MAX: usize = 30;
 
-/// Movement, in wavelengths, that is none.
-const SETTLED_WAVELENGTHS: f64 = 1e-3;
+/// Movement, in wavelengths, below which positions have converged.
+const CONVERGED_WAVELENGTHS: f64 = 1e-3;
 
-/// Positions closer than this, in wavelengths of the highest channel, are the same.
+/// Distance, in wavelengths of the highest channel, within which positions count as the same.
 const SAME_WAVELENGTHS: f64 = 0.1;
 
-/// Cost above the least within which other positions explain the data as well: three and a half standard deviations.
+/// Cost above the minimum within which other positions explain the data as well: three and a half standard
+/// deviations.
 const AMBIGUOUS_COST: f64 = 12.0;
 
-/// Most iterations of Gauss-Newton for one model.
-const ITERATIONS: usize = 20;
+/// Maximum number of Gauss-Newton iterations for one model.
+const ITERATIONS_MAX: usize = 20;
 
-/// Ratio of frequencies of one step and the next, if channels allow.
-const OCTAVE: f64 = 2.0;
+/// Largest ratio of the highest frequencies of consecutive steps, if channels allow.
+const FREQUENCY_RATIO_MAX: f64 = 2.0;
 
-/// Data of a pass with positions to be found.
+/// Search for the position errors of a pass.
 pub(super) struct Search<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) frequencies_hz: &'a [f64],
     pub(super) span_s: [f64; 2],
     pub(super) normal_hat: &'a [Vec3],
-    /// Visibilities, and whether the artificial signal is on in them.
+    /// Visibilities, and whether the artificial signal is on.
     pub(super) placed: &'a [(PlacedVisibilities, bool)],
 }
 
-/// Positions that were found.
+/// Result of a position search.
 pub(super) struct FoundPositions {
     /// Offsets of the daughters, m.
     pub(super) position_m: Vec<[f64; 3]>,
-    /// Others that explain the data as well.
+    /// Other offsets that explain the data as well.
     others_m: Vec<Vec<[f64; 3]>>,
 }
 
 impl FoundPositions {
-    /// Whether the position of a daughter may be another one, as far as a frequency can tell.
+    /// Whether another position of a daughter explains the data as well and differs at a frequency.
     pub(super) fn is_ambiguous(&self, daughter: usize, frequency_hz: f64) -> bool {
-        let most_m = SAME_WAVELENGTHS * SPEED_OF_LIGHT_M_S / frequency_hz;
-        self.others_m.iter().any(|other_m| norm(sub(other_m[daughter], self.position_m[daughter])) > most_m)
+        let same_m = SAME_WAVELENGTHS * SPEED_OF_LIGHT_M_S / frequency_hz;
+        self.others_m.iter().any(|other_m| norm(sub(other_m[daughter], self.position_m[daughter])) > same_m)
     }
 }
 
-/// Offsets of the daughters, and their cost.
-type Place = (Vec<[f64; 3]>, f64);
+/// Offsets of the daughters, m, and their cost.
+struct Candidate {
+    position_m: Vec<[f64; 3]>,
+    cost: f64,
+}
 
 impl Search<'_> {
     /// Finds the offsets of the daughters.
     pub(super) fn find(&self, signal: &mut KnownSignal) -> Result<FoundPositions, ModelError> {
-        let ladder = ladder(self.frequencies_hz);
-        let mut kept = self.start(&ladder, signal)?;
-        for top in 1..=ladder.len() {
-            let step = Step::new(self, &ladder[..top], THINNED);
-            kept =
-                step.best(kept, KEPT_COST, signal)?.into_iter().map(|(position_m, _)| position_m).collect();
+        let highest_channels = highest_channels(self.frequencies_hz);
+        let mut kept = self.initial_offsets(&highest_channels, signal)?;
+        for top in 1..=highest_channels.len() {
+            let step = Step::new(self, &highest_channels[..top], THINNED_MAX);
+            kept = step.minima(kept, KEPT_COST, signal)?.into_iter().map(|found| found.position_m).collect();
         }
         if kept.len() > 1 {
-            let step = Step::new(self, &ladder, usize::MAX);
+            let step = Step::new(self, &highest_channels, usize::MAX);
             kept = step
-                .best(kept, AMBIGUOUS_COST, signal)?
+                .minima(kept, AMBIGUOUS_COST, signal)?
                 .into_iter()
-                .map(|(position_m, _)| position_m)
+                .map(|found| found.position_m)
                 .collect();
         }
         let mut kept = kept.into_iter();
@@ -103,56 +107,64 @@ impl Search<'_> {
         Ok(FoundPositions { position_m, others_m: kept.collect() })
     }
 
-    /// Offsets to begin with: none, or the best of all where they are radians in the lowest channel.
-    fn start(&self, ladder: &[usize], signal: &KnownSignal) -> Result<Vec<Vec<[f64; 3]>>, ModelError> {
+    /// Initial offsets: zero, or the best of a search over all offsets where errors may be radians in the lowest
+    /// channel.
+    fn initial_offsets(
+        &self,
+        highest_channels: &[usize],
+        signal: &KnownSignal,
+    ) -> Result<Vec<Vec<[f64; 3]>>, ModelError> {
         let Self { config, normal_hat, .. } = *self;
         let SolverConfig { position_sigma_m, amplitude_sigma, .. } = *config;
-        let lowest = ladder.first().copied();
+        let lowest = highest_channels.first().copied();
         let lowest = lowest.filter(|c| is_searched(position_sigma_m, self.frequencies_hz[*c]));
         let Some(channel) = lowest else { return Ok(vec![vec![[0.0; 3]; normal_hat.len()]]) };
-        let thinned = self.thinned(&[channel], SEARCHED);
-        let data: Vec<_> = thinned.into_iter().map(|(placed, is_on, _)| (placed, is_on)).collect();
+        let thinned = self.thinned(&[channel], SEARCHED_MAX);
+        let data: Vec<_> =
+            thinned.into_iter().map(|(placed, beacon_is_on, _)| (placed, beacon_is_on)).collect();
         let reference = (config.reference_daughter as usize).saturating_sub(1);
         let search =
             GlobalSearch { channel, normal_hat, reference, position_sigma_m, amplitude_sigma, data: &data };
         search.find(signal)
     }
 
-    /// At most so many visibilities of each pair in some channels, spread over the pass, each with its channel's place among them.
-    fn thinned(&self, channels: &[usize], most: usize) -> Vec<(PlacedVisibilities, bool, usize)> {
+    /// Up to `count_max` visibilities of each pair in some channels, spread over the pass, each with the index of its
+    /// channel in `channels`.
+    fn thinned(&self, channels: &[usize], count_max: usize) -> Vec<(PlacedVisibilities, bool, usize)> {
         let mut all: BTreeMap<(usize, [u8; 2], bool), Vec<&PlacedVisibilities>> = BTreeMap::new();
-        for (placed, is_on) in self.placed {
-            if let Some(place) = channels.iter().position(|c| *c == usize::from(placed.channel.0)) {
-                all.entry((place, [placed.pair.i, placed.pair.j], *is_on)).or_default().push(placed);
+        for (placed, beacon_is_on) in self.placed {
+            if let Some(index) = channels.iter().position(|c| *c == usize::from(placed.channel.0)) {
+                all.entry((index, [placed.pair.i, placed.pair.j], *beacon_is_on)).or_default().push(placed);
             }
         }
-        let thin = |((place, _, is_on), parts): ((usize, [u8; 2], bool), Vec<&PlacedVisibilities>)| {
-            let every = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(most);
+        let thin = |((index, _, beacon_is_on), parts): ((usize, [u8; 2], bool), Vec<&PlacedVisibilities>)| {
+            let stride = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(count_max);
             let mut thinned = parts.first()?.without_visibilities();
-            let each = parts.iter().flat_map(|part| (0..part.len()).map(move |k| (part, k)));
-            each.step_by(every.max(1)).for_each(|(part, k)| thinned.push_of(part, k));
-            Some((thinned, is_on, place))
+            let visibilities = parts.iter().flat_map(|part| (0..part.len()).map(move |k| (part, k)));
+            visibilities.step_by(stride.max(1)).for_each(|(part, k)| thinned.push_of(part, k));
+            Some((thinned, beacon_is_on, index))
         };
         all.into_iter().filter_map(thin).collect()
     }
 }
 
-/// Channels by which to climb, from the lowest to the highest.
-fn ladder(frequencies_hz: &[f64]) -> Vec<usize> {
+/// Highest channel of each step, from the lowest to the highest frequency.
+fn highest_channels(frequencies_hz: &[f64]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..frequencies_hz.len()).collect();
     order.sort_by(|a, b| frequencies_hz[*a].total_cmp(&frequencies_hz[*b]));
-    let mut ladder: Vec<usize> = order.first().copied().into_iter().collect();
+    let mut highest_channels: Vec<usize> = order.first().copied().into_iter().collect();
     for (k, &channel) in order.iter().enumerate().skip(1) {
-        let reach_hz = ladder.last().map_or(0.0, |last| OCTAVE * frequencies_hz[*last]);
-        let next_is_too_far = order.get(k + 1).is_none_or(|next| frequencies_hz[*next] > reach_hz);
+        let limit_hz =
+            highest_channels.last().map_or(0.0, |last| FREQUENCY_RATIO_MAX * frequencies_hz[*last]);
+        let next_is_too_far = order.get(k + 1).is_none_or(|next| frequencies_hz[*next] > limit_hz);
         if next_is_too_far {
-            ladder.push(channel);
+            highest_channels.push(channel);
         }
     }
-    ladder
+    highest_channels
 }
 
-/// A step of the ladder.
+/// A step of the search: the data of some channels, and their parameters.
 struct Step<'a> {
     search: &'a Search<'a>,
     layout: ParameterLayout,
@@ -161,93 +173,103 @@ struct Step<'a> {
 }
 
 impl<'a> Step<'a> {
-    fn new(search: &'a Search<'a>, channels: &[usize], most: usize) -> Self {
+    fn new(search: &'a Search<'a>, channels: &[usize], count_max: usize) -> Self {
         let frequencies_hz: Vec<f64> = channels.iter().map(|c| search.frequencies_hz[*c]).collect();
         let highest_hz = frequencies_hz.iter().copied().fold(0.0, f64::max);
         Self {
             search,
             layout: ParameterLayout::new(search.config, search.normal_hat.len(), &frequencies_hz),
-            data: search.thinned(channels, most),
+            data: search.thinned(channels, count_max),
             wavelength_m: SPEED_OF_LIGHT_M_S / highest_hz,
         }
     }
 
-    /// Where one comes to from some positions, best first, up to a cost above the least.
-    fn best(
+    /// Minimises from each starting position. Returns distinct minima, best first, with costs up to `cost_range`
+    /// above the lowest.
+    fn minima(
         &self,
-        from_m: Vec<Vec<[f64; 3]>>,
-        cost: f64,
+        starts_m: Vec<Vec<[f64; 3]>>,
+        cost_range: f64,
         signal: &mut KnownSignal,
-    ) -> Result<Vec<Place>, ModelError> {
-        let mut places = Vec::new();
-        for position_m in from_m {
-            places.push(self.climb(position_m, signal)?);
+    ) -> Result<Vec<Candidate>, ModelError> {
+        let mut candidates = Vec::new();
+        for position_m in starts_m {
+            candidates.push(self.minimise(position_m, signal)?);
         }
-        places.sort_by(|a: &Place, b: &Place| a.1.total_cmp(&b.1));
-        let most = places.first().map_or(0.0, |best| best.1 + cost);
-        let mut apart: Vec<Place> = Vec::new();
-        for place in places {
-            let is_other = |other: &Place| moved_m(&other.0, &place.0) > SAME_WAVELENGTHS * self.wavelength_m;
-            if apart.is_empty() || (place.1 <= most && apart.iter().all(is_other)) {
-                apart.push(place);
+        candidates.sort_by(|a, b| a.cost.total_cmp(&b.cost));
+        let cost_max = candidates.first().map_or(0.0, |best| best.cost + cost_range);
+        let same_m = SAME_WAVELENGTHS * self.wavelength_m;
+        let mut distinct: Vec<Candidate> = Vec::new();
+        for candidate in candidates {
+            let is_other = |other: &Candidate| moved_m(&other.position_m, &candidate.position_m) > same_m;
+            if distinct.is_empty() || (candidate.cost <= cost_max && distinct.iter().all(is_other)) {
+                distinct.push(candidate);
             }
         }
-        Ok(apart)
+        Ok(distinct)
     }
 
-    /// Goes from positions to better ones.
-    fn climb(&self, mut position_m: Vec<[f64; 3]>, signal: &mut KnownSignal) -> Result<Place, ModelError> {
-        let [first, most] = TRUST_WAVELENGTHS.map(|part| part * self.wavelength_m);
-        let mut radius_m = first;
+    /// Minimises the cost from given positions.
+    fn minimise(
+        &self,
+        mut position_m: Vec<[f64; 3]>,
+        signal: &mut KnownSignal,
+    ) -> Result<Candidate, ModelError> {
+        let [initial_m, radius_m_max] = TRUST_WAVELENGTHS.map(|wavelengths| wavelengths * self.wavelength_m);
+        let mut radius_m = initial_m;
         let mut blocks = self.model(&position_m, signal)?;
-        let even = vec![1.0; blocks.len()];
-        let sums = sums_of(&blocks, self.search.span_s, &self.layout, &even);
-        let mut values = self.layout.start(&sums, &position_m);
+        let variance_factors = vec![1.0; blocks.len()];
+        let sums = sums_of(&blocks, self.search.span_s, &self.layout, &variance_factors);
+        let mut values = self.layout.starting_values(&sums, &position_m);
         let mut cost = self.cost(&blocks, &values);
-        for _ in 0..ROUNDS {
+        for _ in 0..MODELS_MAX {
             let found = self.step(&mut blocks, &values, (&position_m, radius_m));
             let next_m = found.values.position_m.clone();
             let moved_m = moved_m(&position_m, &next_m);
             let next_blocks = self.model(&next_m, signal)?;
             let next_cost = self.cost(&next_blocks, &found.values);
             if next_cost >= cost || next_cost.is_nan() {
-                if moved_m < SETTLED_WAVELENGTHS * self.wavelength_m {
+                if moved_m < CONVERGED_WAVELENGTHS * self.wavelength_m {
                     break;
                 }
                 radius_m = 0.3 * moved_m.min(radius_m);
                 continue;
             }
             if moved_m > 0.7 * radius_m {
-                radius_m = (2.0 * radius_m).min(most);
+                radius_m = (2.0 * radius_m).min(radius_m_max);
             }
             (position_m, blocks, values, cost) = (next_m, next_blocks, found.values, next_cost);
-            if moved_m < SETTLED_WAVELENGTHS * self.wavelength_m {
+            if moved_m < CONVERGED_WAVELENGTHS * self.wavelength_m {
                 break;
             }
         }
-        Ok((position_m, cost))
+        Ok(Candidate { position_m, cost })
     }
 
-    /// Values of least cost with positions that stay within a distance.
-    fn step(&self, blocks: &mut [ModelledBlock], values: &Values, near: (&[[f64; 3]], f64)) -> NewtonFit {
-        let (position_m, radius_m) = near;
-        let mut spreads = vec![1.0; blocks.len()];
+    /// Parameter values of least cost with positions in a trust region.
+    fn step(
+        &self,
+        blocks: &mut [ModelledBlock],
+        values: &ParameterValues,
+        (centre_m, radius_m): (&[[f64; 3]], f64),
+    ) -> NewtonFit {
+        let mut variance_factors = vec![1.0; blocks.len()];
         let (span_s, cut) = (self.search.span_s, self.search.config.outlier_sigma);
-        blocks.par_iter_mut().zip(&mut spreads).for_each(|(block, spread)| {
+        blocks.par_iter_mut().zip(&mut variance_factors).for_each(|(block, variance_factor)| {
             let (gain, u) = self.layout.pair(values, block.channel, block.pair);
-            judge(block, span_s, cut, gain, &u, spread);
+            mark_outliers(block, span_s, cut, gain, &u, variance_factor);
         });
-        let sums: Vec<PairSums> = sums_of(blocks, span_s, &self.layout, &spreads);
-        let mut found = self.layout.minimise(values.clone(), &sums, None, ITERATIONS);
+        let sums: Vec<PairSums> = sums_of(blocks, span_s, &self.layout, &variance_factors);
+        let mut found = self.layout.minimise(values.clone(), &sums, None, ITERATIONS_MAX);
         let mut sigma_m = radius_m;
-        // The data may hold positions a thousand times better than they are known.
+        // The data may constrain positions a thousand times better than the trust radius.
         for _ in 0..24 {
-            let moved_m = moved_m(position_m, &found.values.position_m);
+            let moved_m = moved_m(centre_m, &found.values.position_m);
             if moved_m <= 1.5 * radius_m {
                 break;
             }
-            let near = PositionPrior { position_m, sigma_m };
-            found = self.layout.minimise(values.clone(), &sums, Some(&near), ITERATIONS);
+            let trust_region = TrustRegion { centre_m, sigma_m };
+            found = self.layout.minimise(values.clone(), &sums, Some(&trust_region), ITERATIONS_MAX);
             sigma_m *= 0.5;
         }
         found
@@ -260,28 +282,28 @@ impl<'a> Step<'a> {
     ) -> Result<Vec<ModelledBlock>, ModelError> {
         let offsets = Offsets { offset_m: position_m.to_vec(), normal_hat: self.search.normal_hat.to_vec() };
         let placed: Vec<(&PlacedVisibilities, bool)> =
-            self.data.iter().map(|(placed, is_on, _)| (placed, *is_on)).collect();
+            self.data.iter().map(|(placed, beacon_is_on, _)| (placed, *beacon_is_on)).collect();
         let blocks = modelled(&placed, signal, &offsets)?.into_iter().zip(&self.data);
-        Ok(blocks.map(|(block, (_, _, place))| ModelledBlock { channel: *place, ..block }).collect())
+        Ok(blocks.map(|(block, (_, _, channel))| ModelledBlock { channel: *channel, ..block }).collect())
     }
 
-    fn cost(&self, blocks: &[ModelledBlock], values: &Values) -> f64 {
+    fn cost(&self, blocks: &[ModelledBlock], values: &ParameterValues) -> f64 {
         let (span_s, cut) = (self.search.span_s, self.search.config.outlier_sigma);
-        let of = |block: &ModelledBlock| {
+        let block_cost = |block: &ModelledBlock| {
             let (gain, u) = self.layout.pair(values, block.channel, block.pair);
-            misfit(block, span_s, cut, gain, &u)
+            robust_cost(block, span_s, cut, gain, &u)
         };
-        let costs: Vec<f64> = blocks.par_iter().map(of).collect();
+        let costs: Vec<f64> = blocks.par_iter().map(block_cost).collect();
         self.layout.with_priors(values, costs.iter().sum())
     }
 }
 
-/// The farthest that a daughter moves.
+/// Largest movement of a daughter.
 fn moved_m(before_m: &[[f64; 3]], after_m: &[[f64; 3]]) -> f64 {
     before_m.iter().zip(after_m).map(|(before, after)| norm(sub(*after, *before))).fold(0.0, f64::max)
 }
 
-/// Visibilities with their model about offsets.
+/// Visibilities with their model, linearised about offsets.
 pub(super) fn modelled(
     placed: &[(&PlacedVisibilities, bool)],
     signal: &mut KnownSignal,

@@ -1,157 +1,180 @@
-//! Robust rounds about Gauss-Newton, among the daughters that deliver signal.
+//! Robust fit: rounds of Gauss-Newton and outlier rejection, with the daughters that deliver signal.
 
 use rayon::prelude::*;
 
 use super::config::SolverConfig;
-use super::detect::{DroppedDaughters, OwnGain, SignalPresence, dropped, own_gains, reference, takes_part};
-use super::layout::{ParameterLayout, Values};
+use super::detect::{
+    DroppedGains, OwnGain, SignalPresence, best_reference, dropped_gains, is_pair_used, solve_own_gains,
+};
+use super::layout::{ParameterLayout, ParameterValues};
 use super::newton::NewtonFit;
-use super::robust::judge;
+use super::robust::mark_outliers;
 use super::stability::Residuals;
 use super::sums::{ModelledBlock, PairSums};
 
-/// Change of a pair's spread below which a round settles.
-const SPREAD_SETTLED: f64 = 0.02;
+/// Relative change of a pair's variance factor below which a round has converged.
+const VARIANCE_FACTOR_TOLERANCE: f64 = 0.02;
 
-/// Most rounds of leaving out outliers.
+/// Maximum number of rounds of outlier rejection.
 const OUTLIER_ROUNDS: u32 = 3;
 
-/// Most changes of who takes part.
-const CHANGES_MAX: usize = 3;
+/// Maximum number of changes of the set of gains that are solved for.
+const SET_CHANGES_MAX: usize = 3;
 
-/// What is fitted: blocks of an interval.
+/// An interval, with the settings for fitting its data.
 #[derive(Clone, Copy)]
 pub(super) struct Interval<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) frequencies_hz: &'a [f64],
     pub(super) satellites: usize,
     pub(super) span_s: [f64; 2],
-    /// Offsets of the daughters to begin with, m.
+    /// Initial position offsets of the daughters, m.
     pub(super) position_m: &'a [[f64; 3]],
 }
 
-/// A solution with its residuals and counts.
-pub(super) struct Fitted {
+/// Result of a robust fit.
+pub(super) struct RobustFit {
     pub(super) layout: ParameterLayout,
-    pub(super) found: NewtonFit,
+    pub(super) newton: NewtonFit,
     /// Sums of all blocks.
     pub(super) sums: Vec<PairSums>,
-    /// Mean squared residual of each block in units of its noise, where above one.
-    pub(super) spreads: Vec<f64>,
-    /// Blocks of two daughters that take part.
-    pub(super) takes_part: Vec<bool>,
-    /// By channel, then daughter.
-    pub(super) dropped: DroppedDaughters,
-    /// The gain of each as its own data have it.
-    pub(super) own: Vec<OwnGain>,
-    /// Sum of squared residuals, and number, by block.
+    /// Variance factor of each block: reduced chi-square where above one, else one.
+    pub(super) variance_factors: Vec<f64>,
+    /// Whether each block is used: both of its gains are in the solution.
+    pub(super) is_pair_used: Vec<bool>,
+    /// Whether each gain is left out of the solution; by channel, then daughter.
+    pub(super) dropped_gains: DroppedGains,
+    /// Each gain by itself, from its own data and the gains of the other daughters.
+    pub(super) own_gains: Vec<OwnGain>,
+    /// Sum of squared residuals and their number, by block.
     pub(super) chi_squares: Vec<(f64, f64)>,
 }
 
 impl Interval<'_> {
-    /// Fits; marks outliers in the blocks. Phases are relative to `reference`, or to that of the settings if it is seen.
-    pub(super) fn fit(&self, blocks: &mut [ModelledBlock], wanted: Option<usize>) -> Fitted {
+    /// Fits the blocks and marks their outliers. Phases are relative to daughter `wanted_reference`, by default to
+    /// the configured reference unless another daughter is detected in more channels.
+    pub(super) fn fit(&self, blocks: &mut [ModelledBlock], wanted_reference: Option<usize>) -> RobustFit {
         let Self { config, span_s, position_m, .. } = *self;
         let mut layout = ParameterLayout::new(config, self.satellites, self.frequencies_hz);
-        let mut spreads = vec![1.0; blocks.len()];
+        let mut variance_factors = vec![1.0; blocks.len()];
         blocks.par_iter_mut().for_each(|block| block.is_out.fill(false));
-        let mut sums = sums_of(blocks, span_s, &layout, &spreads);
-        let mut values = layout.start(&sums, position_m);
-        let mut left_out = vec![false; layout.satellites * layout.channels()];
-        let mut own = own_gains(config, &layout, &values, &sums, &left_out);
-        // Once more without those that are not seen.
-        left_out = dropped(&layout, &own);
-        own = own_gains(config, &layout, &values, &sums, &left_out);
-        left_out = dropped(&layout, &own);
-        let set = layout.reference;
-        layout.reference = wanted.unwrap_or_else(|| reference(&layout, &own, set));
-        if layout.reference != set {
-            values = layout.start(&sums, position_m);
+        let mut sums = sums_of(blocks, span_s, &layout, &variance_factors);
+        let mut values = layout.starting_values(&sums, position_m);
+        let mut is_dropped = vec![false; layout.satellites * layout.channels()];
+        let mut own_gains = solve_own_gains(config, &layout, &values, &sums, &is_dropped);
+        // Once more without the gains that are not detected.
+        is_dropped = dropped_gains(&layout, &own_gains);
+        own_gains = solve_own_gains(config, &layout, &values, &sums, &is_dropped);
+        is_dropped = dropped_gains(&layout, &own_gains);
+        let configured = layout.reference;
+        layout.reference =
+            wanted_reference.unwrap_or_else(|| best_reference(&layout, &own_gains, configured));
+        if layout.reference != configured {
+            values = layout.starting_values(&sums, position_m);
         }
-        let mut changes = 0;
+        let mut set_changes = 0;
         loop {
-            silence(&mut values, &left_out);
-            let (found, chi_squares) =
-                self.rounds(&layout, values, (&mut *blocks, &mut sums, &mut spreads), &left_out);
-            own = own_gains(config, &layout, &found.values, &sums, &left_out);
-            let now = dropped(&layout, &own);
-            changes += 1;
-            if now == left_out || changes == CHANGES_MAX {
-                let takes_part = sums.iter().map(|sums| takes_part(&layout, &left_out, sums)).collect();
-                let dropped = left_out;
-                return Fitted { layout, found, sums, spreads, takes_part, dropped, own, chi_squares };
+            reset_dropped(&mut values, &is_dropped);
+            let (newton, chi_squares) =
+                self.rounds(&layout, values, (&mut *blocks, &mut sums, &mut variance_factors), &is_dropped);
+            own_gains = solve_own_gains(config, &layout, &newton.values, &sums, &is_dropped);
+            let next_dropped = dropped_gains(&layout, &own_gains);
+            set_changes += 1;
+            if next_dropped == is_dropped || set_changes == SET_CHANGES_MAX {
+                let is_pair_used = sums.iter().map(|sums| is_pair_used(&layout, &is_dropped, sums)).collect();
+                let dropped_gains = is_dropped;
+                return RobustFit {
+                    layout,
+                    newton,
+                    sums,
+                    variance_factors,
+                    is_pair_used,
+                    dropped_gains,
+                    own_gains,
+                    chi_squares,
+                };
             }
-            values = found.values;
-            for (k, own) in own.iter().enumerate().filter(|(k, _)| left_out[*k] && !now[*k]) {
-                values.amplitude[k] = own.gain.norm().max(config.dead_amplitude).ln();
-                values.phase[k] = own.gain.arg();
+            values = newton.values;
+            for (k, own_gain) in
+                own_gains.iter().enumerate().filter(|(k, _)| is_dropped[*k] && !next_dropped[*k])
+            {
+                values.amplitude[k] = own_gain.gain.norm().max(config.dead_amplitude).ln();
+                values.phase[k] = own_gain.gain.arg();
             }
-            left_out = now;
+            is_dropped = next_dropped;
         }
     }
 
     fn rounds(
         &self,
         layout: &ParameterLayout,
-        values: Values,
-        (blocks, sums, spreads): (&mut [ModelledBlock], &mut Vec<PairSums>, &mut Vec<f64>),
-        dropped: &[bool],
+        values: ParameterValues,
+        (blocks, sums, variance_factors): (&mut [ModelledBlock], &mut Vec<PairSums>, &mut Vec<f64>),
+        dropped_gains: &[bool],
     ) -> (NewtonFit, Vec<(f64, f64)>) {
         let Self { config, span_s, .. } = *self;
-        let used = |sums: &[PairSums]| -> Vec<PairSums> {
-            sums.iter().filter(|sums| takes_part(layout, dropped, sums)).copied().collect()
+        let used_sums = |sums: &[PairSums]| -> Vec<PairSums> {
+            sums.iter().filter(|sums| is_pair_used(layout, dropped_gains, sums)).copied().collect()
         };
-        let most = config.iterations_max as usize;
-        let mut found = layout.minimise(values, &used(sums), None, most);
+        let iterations_max = config.iterations_max as usize;
+        let mut newton = layout.minimise(values, &used_sums(sums), None, iterations_max);
         let mut chi_squares = vec![(0.0, 0.0); blocks.len()];
         for round in 0..=OUTLIER_ROUNDS {
-            let judge = |((block, spread), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
-                if !takes_part(layout, dropped, sums) {
-                    return ((0.0, 0.0), false);
-                }
-                let before = (block.is_out.clone(), *spread);
-                let (gain, u) = layout.pair(&found.values, sums.channel, sums.pair);
-                let chi_square = judge(block, span_s, config.outlier_sigma, gain, &u, spread);
-                let changed = block.is_out != before.0 || (*spread / before.1 - 1.0).abs() > SPREAD_SETTLED;
-                (chi_square, changed)
-            };
+            let mark_outliers =
+                |((block, variance_factor), sums): ((&mut ModelledBlock, &mut f64), &PairSums)| {
+                    if !is_pair_used(layout, dropped_gains, sums) {
+                        return ((0.0, 0.0), false);
+                    }
+                    let before = (block.is_out.clone(), *variance_factor);
+                    let (gain, u) = layout.pair(&newton.values, sums.channel, sums.pair);
+                    let chi_square =
+                        mark_outliers(block, span_s, config.outlier_sigma, gain, &u, variance_factor);
+                    let changed = block.is_out != before.0
+                        || (*variance_factor / before.1 - 1.0).abs() > VARIANCE_FACTOR_TOLERANCE;
+                    (chi_square, changed)
+                };
             let judged: Vec<((f64, f64), bool)> =
-                blocks.par_iter_mut().zip(&mut *spreads).zip(&*sums).map(judge).collect();
+                blocks.par_iter_mut().zip(&mut *variance_factors).zip(&*sums).map(mark_outliers).collect();
             let changed = judged.iter().any(|(_, changed)| *changed);
             chi_squares = judged.into_iter().map(|(chi_square, _)| chi_square).collect();
             if !changed || round == OUTLIER_ROUNDS {
                 break;
             }
-            *sums = sums_of(blocks, span_s, layout, spreads);
-            found = layout.minimise(found.values, &used(sums), None, most);
+            *sums = sums_of(blocks, span_s, layout, variance_factors);
+            newton = layout.minimise(newton.values, &used_sums(sums), None, iterations_max);
         }
-        (found, chi_squares)
+        (newton, chi_squares)
     }
 
-    /// Residuals of a fit; with a cut also of outliers.
-    pub(super) fn residuals(&self, fitted: &Fitted, blocks: &[ModelledBlock], cut: Option<f64>) -> Residuals {
-        let Fitted { layout, found, spreads, takes_part, .. } = fitted;
-        Residuals::of(layout, &found.values, blocks, (spreads, takes_part), self.span_s, cut)
+    /// Residuals of a fit; with a `cut` outliers are included.
+    pub(super) fn residuals(
+        &self,
+        fitted: &RobustFit,
+        blocks: &[ModelledBlock],
+        cut: Option<f64>,
+    ) -> Residuals {
+        let RobustFit { layout, newton, variance_factors, is_pair_used, .. } = fitted;
+        Residuals::of(layout, &newton.values, blocks, (variance_factors, is_pair_used), self.span_s, cut)
     }
 }
 
-impl Fitted {
-    /// What takes part.
-    pub(super) fn used(&self) -> Vec<PairSums> {
-        let chosen = self.sums.iter().zip(&self.takes_part).filter(|(_, takes_part)| **takes_part);
+impl RobustFit {
+    /// Sums of the pairs that are used.
+    pub(super) fn used_sums(&self) -> Vec<PairSums> {
+        let chosen = self.sums.iter().zip(&self.is_pair_used).filter(|(_, is_pair_used)| **is_pair_used);
         chosen.map(|(sums, _)| *sums).collect()
     }
 
-    /// Whether the gain of a daughter is seen in a channel, and is in the solution.
-    pub(super) fn is_seen(&self, channel: usize, daughter: usize) -> bool {
+    /// Whether the gain of a daughter is detected in a channel and is in the solution.
+    pub(super) fn is_detected(&self, channel: usize, daughter: usize) -> bool {
         let k = channel * self.layout.satellites + daughter;
-        !self.dropped[k] && self.own[k].presence == SignalPresence::Seen
+        !self.dropped_gains[k] && self.own_gains[k].presence == SignalPresence::Detected
     }
 }
 
-/// Daughters that take no part have no errors.
-fn silence(values: &mut Values, dropped: &[bool]) {
-    for k in (0..dropped.len()).filter(|&k| dropped[k]) {
+/// Sets the gains that are not in the solution to one.
+fn reset_dropped(values: &mut ParameterValues, dropped_gains: &[bool]) {
+    for k in (0..dropped_gains.len()).filter(|&k| dropped_gains[k]) {
         (values.amplitude[k], values.phase[k]) = (0.0, 0.0);
     }
 }
@@ -160,8 +183,10 @@ pub(super) fn sums_of(
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
     layout: &ParameterLayout,
-    spreads: &[f64],
+    variance_factors: &[f64],
 ) -> Vec<PairSums> {
-    let of = |(block, spread): (&ModelledBlock, &f64)| PairSums::of(block, span_s, layout.terms(), *spread);
-    blocks.par_iter().zip(spreads).map(of).collect()
+    let sums_of_block = |(block, variance_factor): (&ModelledBlock, &f64)| {
+        PairSums::of(block, span_s, layout.model_terms(), *variance_factor)
+    };
+    blocks.par_iter().zip(variance_factors).map(sums_of_block).collect()
 }

@@ -1,5 +1,5 @@
-//! Ten things that happen to an array, each named as what it is, and no good gain that is wrong.
-#![allow(clippy::print_stderr)] // They say what they measured.
+//! Ten events of an array, each identified, without a good gain that is wrong.
+#![allow(clippy::print_stderr)] // The tests print what they measured.
 
 use std::f64::consts::TAU;
 
@@ -14,18 +14,20 @@ use crate::units::{StreamKind, all_pairs, random_stream};
 
 const DAUGHTERS: usize = 8;
 const SPAN_S: [f64; 2] = [0.0, 2700.0];
-/// Integrations of a pair in a pass.
+/// Number of integrations of a pair in a pass.
 const INSTANTS: usize = 60;
 const FREQUENCIES_HZ: [f64; 3] = [3e6, 10e6, 20e6];
-/// Places along the track, m.
+/// Positions along the track, m.
 const ALONG_M: [f64; DAUGHTERS] = [0.0, 150.0, 470.0, 990.0, 1790.0, 2990.0, 4690.0, 6990.0];
-/// Passes of each scenario: 24 gains each. `LUNARRAY_SEED=1200` takes other passes, from that number (a multiple of 12) on.
+/// Number of passes of each scenario: 24 gains each. `LUNARRAY_SEED=1200` takes other passes, starting with that
+/// number (a multiple of 12).
 const PASSES: u64 = 60;
 
 fn first_seed() -> u64 {
     std::env::var("LUNARRAY_SEED").map_or(0, |text| text.parse().expect("LUNARRAY_SEED is a number"))
 }
-/// Noise of either part of a visibility; the sources of a channel have a flux of about a hundred together.
+/// Noise of the real and imaginary part of a visibility; the sources of a channel have a flux of about a hundred
+/// together.
 const NOISE: f64 = 4.0;
 
 type Random = rand_chacha::ChaCha8Rng;
@@ -47,7 +49,7 @@ fn sky(seed: u64) -> Sky {
     (0..60).map(source).collect()
 }
 
-/// What a pair sees of a sky: baselines turn with the orbit.
+/// Visibility of a sky for a pair; baselines rotate with the orbit.
 fn visibility(sky: &Sky, hz: f64, [i, j]: [usize; 2], time_s: f64) -> Complex64 {
     let turn = TAU * time_s / 8258.0;
     let length = (ALONG_M[j] - ALONG_M[i]) * hz / SPEED_OF_LIGHT_M_S;
@@ -57,14 +59,14 @@ fn visibility(sky: &Sky, hz: f64, [i, j]: [usize; 2], time_s: f64) -> Complex64 
     sky.iter().map(wave).sum()
 }
 
-/// One pass of an array: what it sees, what it is, and what the model says.
+/// One pass of an array: sky, gains, model and disturbances.
 struct Pass<'a> {
     seed: u64,
     sky: Sky,
     model: Sky,
-    /// Of the model's frequency to the true one.
+    /// Ratio of the model's frequency to the true one.
     model_frequency: f64,
-    /// Of all fluxes.
+    /// Factor of all fluxes.
     strength: f64,
     /// Gain of a channel and daughter at a time.
     gain: &'a (dyn Fn(usize, usize, f64) -> Complex64 + Sync),
@@ -126,7 +128,8 @@ fn gains(seed: u64) -> Vec<[Complex64; DAUGHTERS]> {
     FREQUENCIES_HZ.iter().map(|_| std::array::from_fn(|_| gain(&mut random))).collect()
 }
 
-/// Good gains, gains, and good ones whose phase or amplitude is off by more than four stated deviations.
+/// Numbers of good gains, of gains, and of good ones whose phase or amplitude is off by more than four stated
+/// deviations.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Tally {
     good: usize,
@@ -161,7 +164,7 @@ fn tally(solutions: &[PassSolution], gain: &dyn Fn(usize, usize, f64) -> Complex
     tally
 }
 
-/// What passes of a scenario gave.
+/// Results of the passes of a scenario.
 struct Outcome {
     tally: Tally,
     passes: Vec<Vec<PassSolution>>,
@@ -178,7 +181,7 @@ impl Outcome {
     }
 }
 
-/// Solves all passes; `at` says of a seed's pass what it is.
+/// Solves all passes of a scenario.
 fn outcome(name: &str, solve: impl Fn(u64) -> (Vec<PassSolution>, Tally) + Send + Sync) -> Outcome {
     let each: Vec<(Vec<PassSolution>, Tally)> =
         (0..PASSES).into_par_iter().map(|number| solve(first_seed() + number)).collect();
@@ -211,22 +214,23 @@ fn solved(pass: &Pass<'_>, number: u64) -> (Vec<PassSolution>, Tally) {
 }
 
 #[test]
-fn all_is_well() {
+fn a_stable_array_has_good_gains() {
     let found = outcome("well", |seed| {
         let gains = gains(seed);
         solved(&plain(seed, &|c, n, _| gains[c][n]), seed)
     });
     assert_eq!(found.tally.wrong, 0);
-    // All are seen with a ratio of signal to noise of ten and more; one in fifty gains seems to change by chance.
+    // All gains have a signal-to-noise ratio of ten and more; one in fifty seems to change by chance.
     assert!(found.tally.good > found.tally.all * 99 / 100, "{:?}", found.tally);
-    // Gains are new in each pass here: steps are no news, all else is.
+    // Gains are new in each pass here: steps are expected, other events are not.
     let steps = |event: &InstrumentEvent| {
         matches!(event, InstrumentEvent::PhaseStep { .. } | InstrumentEvent::GainStep { .. })
     };
     let others: Vec<InstrumentEvent> = found.events().into_iter().filter(|event| !steps(event)).collect();
     assert!(others.len() <= 2, "{others:?}");
     assert!(found.passes.iter().all(|parts| parts.len() == 1));
-    // Within 1.2 times the bound: information on phases is a network of conductances, computed here by itself.
+    // Errors are within 1.2 times the bound: the information on phases is a network of conductances, computed here
+    // independently.
     let mut ratios: Vec<f64> = Vec::new();
     for (seed, parts) in found.passes.iter().enumerate() {
         let gains = gains(first_seed() + seed as u64);
@@ -274,7 +278,7 @@ fn bounds_deg(sky: &Sky, hz: f64, gains: &[Complex64; DAUGHTERS]) -> Vec<f64> {
 }
 
 #[test]
-fn a_dead_daughter_is_named_and_costs_the_others_nothing() {
+fn a_dead_daughter_is_identified_and_does_not_affect_the_others() {
     // All channels of daughter 5, of the reference, and one channel of daughter 3.
     let is_dead = |seed: u64, c: usize, n: usize| match seed % 3 {
         0 => n == 4,
@@ -299,7 +303,8 @@ fn a_dead_daughter_is_named_and_costs_the_others_nothing() {
                 let n = one.daughter as usize - 1;
                 let dead = is_dead(seed, c, n);
                 assert_eq!(a.state == GainState::Dead, dead, "{seed} {c} {n}: {a:?}");
-                // Started from other values: equal to what iterations leave, a thousandth of a deviation.
+                // Solutions with other starting values agree up to the convergence limit, a thousandth of a
+                // deviation.
                 let close = |a: f64, b: f64, sigma: f64| (a - b).abs() <= 2e-3 * sigma + 1e-9;
                 assert!(
                     dead || close(a.phase_deg, b.phase_deg, b.phase_sigma_deg)
@@ -328,7 +333,7 @@ fn jump(seed: u64) -> (usize, usize, f64, f64) {
 }
 
 #[test]
-fn jumps_within_a_pass_are_placed_and_solved_on_both_sides() {
+fn jumps_within_a_pass_are_located_and_solved_on_both_sides() {
     let found = outcome("steps", |seed| {
         let gains = gains(seed);
         let (channel, daughter, at_s, turn) = jump(seed);
@@ -342,13 +347,13 @@ fn jumps_within_a_pass_are_placed_and_solved_on_both_sides() {
     assert!(found.tally.good > found.tally.all * 96 / 100, "{:?}", found.tally);
     for (seed, parts) in found.passes.iter().enumerate() {
         let (channel, daughter, at_s, turn) = jump(first_seed() + seed as u64);
-        // Where it is twenty deviations and more.
+        // Jumps of twenty deviations and more must be found.
         let sigma_deg = parts[0].daughters[daughter.max(1)].gains[channel].phase_sigma_deg;
         if turn.abs().to_degrees() < 40.0 * sigma_deg.min(3.0) {
             continue;
         }
         assert_eq!(parts.len(), 2, "{seed}: {channel} {daughter} {at_s} {}", turn.to_degrees());
-        // Between the integrations on either side, 45 s apart.
+        // The instant lies between the integrations on either side, 45 s apart.
         assert!((parts[1].from_s - at_s).abs() < 45.0, "{seed}: {} {at_s}", parts[1].from_s);
         let events = instrument_events(parts);
         let [InstrumentEvent::PhaseStep { daughter: told, ref channels, .. }] = events[..] else {
@@ -361,7 +366,7 @@ fn jumps_within_a_pass_are_placed_and_solved_on_both_sides() {
 }
 
 #[test]
-fn a_jump_of_the_reference_is_told_from_one_of_all() {
+fn a_jump_of_the_reference_is_distinguished_from_one_of_all() {
     let solve = |seed: u64, all: bool| {
         let gains = gains(seed);
         let turns: Vec<f64> = {
@@ -406,8 +411,8 @@ fn wander(seed: u64, identity: u64, rms: f64, time_s: f64) -> Vec<f64> {
 }
 
 #[test]
-fn drifts_are_told_from_jumps() {
-    // Daughter 4 by 25 deg within one to twenty minutes.
+fn drifts_are_distinguished_from_jumps() {
+    // Daughter 4 drifts by 25 deg within one to twenty minutes.
     let times_s = [60.0, 200.0, 600.0, 1200.0];
     let found = outcome("drift", |seed| {
         let gains = gains(seed);
@@ -423,7 +428,7 @@ fn drifts_are_told_from_jumps() {
         let of = |event: &InstrumentEvent| matches!(event, InstrumentEvent::Drift { daughter: 4, .. });
         instrument_events(parts).iter().any(of)
     });
-    // What changes slowly may change little in a pass.
+    // A slow drift may be small in a pass.
     assert!(told.count() >= PASSES as usize * 9 / 10);
     assert!(found.passes.iter().filter(|parts| parts.len() > 1).count() < PASSES as usize / 5);
     // Seven of eight daughters are steady.
@@ -436,19 +441,19 @@ fn a_weak_signal_is_uncertain() {
         let gains = gains(seed);
         let gain = |c: usize, n: usize, _: f64| gains[c][n];
         let mut pass = plain(seed, &gain);
-        // One wave, of a thirtieth of the noise.
+        // The signal is one wave of a thirtieth of the noise.
         pass.sky = vec![([0.3, 0.2], NOISE / 30.0)];
         pass.model = pass.sky.clone();
         solved(&pass, seed)
     });
     assert_eq!((found.tally.wrong, found.tally.good), (0, 0), "{:?}", found.tally);
-    // Noise seems to be a gain in 4 of a million cases.
+    // Noise looks like a gain in 4 of a million cases.
     assert_eq!(found.count(GainState::Uncertain), found.tally.all);
     assert!(found.events().is_empty(), "{:?}", found.events());
 }
 
-/// Whether every pass is told to have a model that is wrong, in all channels.
-fn names_the_model(found: &Outcome) -> bool {
+/// Whether every pass is reported to have a wrong model, in all channels.
+fn reports_a_wrong_model(found: &Outcome) -> bool {
     found.passes.iter().all(|parts| {
         let events = instrument_events(parts);
         (0..FREQUENCIES_HZ.len()).all(|c| {
@@ -470,13 +475,13 @@ fn modelled(name: &str, change: impl Fn(u64, &mut Pass<'_>) + Sync) -> Outcome {
         solved(&pass, seed)
     });
     assert_eq!(found.tally.wrong, 0, "{name}");
-    assert!(names_the_model(&found), "{name}");
+    assert!(reports_a_wrong_model(&found), "{name}");
     found
 }
 
 #[test]
-fn a_wrong_sky_is_named() {
-    // Every flux off by a factor of 1.3 either way, or by a factor of 3.
+fn a_wrong_sky_is_reported() {
+    // Every flux is off by a factor of 1.3 either way, or by a factor of 3.
     modelled("near sky", |seed, pass| {
         let mut random = random_stream(seed, StreamKind::Probe, [25, 0]);
         pass.model.iter_mut().for_each(|source| source.1 *= (0.26 * normal(&mut random)).exp());
@@ -486,18 +491,18 @@ fn a_wrong_sky_is_named() {
 }
 
 #[test]
-fn a_missing_bright_source_is_named() {
+fn a_missing_bright_source_is_reported() {
     modelled("missing source", |_, pass| pass.sky.push(([0.5, -0.4], 25.0)));
 }
 
 #[test]
-fn a_wrong_frequency_is_named() {
+fn a_wrong_frequency_is_reported() {
     let found = modelled("wrong frequency", |_, pass| pass.model_frequency = 1.5);
     assert!(found.tally.good < found.tally.all / 20, "{:?}", found.tally);
 }
 
 #[test]
-fn outliers_do_not_matter() {
+fn outliers_are_rejected() {
     let found = outcome("outliers", |seed| {
         let gains = gains(seed);
         let gain = |c: usize, n: usize, _: f64| gains[c][n];

@@ -1,4 +1,4 @@
-//! Solutions as a table, and as a file of gains that a replay applies.
+//! Solutions as a table, and as a gains file that a replay applies.
 
 use std::fmt::Write;
 
@@ -7,10 +7,10 @@ use super::solution::PassSolution;
 use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
 use crate::frames::Channel;
 
-/// Time that a jump takes in a file of gains, s.
+/// Duration of a jump in a gains file, s.
 const JUMP_S: f64 = 1e-6;
 
-/// Comma-separated values, one line a solution, daughter and channel.
+/// Comma-separated values, one line for each solution, daughter and channel.
 #[must_use]
 pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     let mut text = String::from(
@@ -54,14 +54,15 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
-/// The gains as a file for `antenna-gains`: nothing is left of a gain that is not known, which removes its visibilities.
-/// With `without_held_out`, passes that test have no gains either.
+/// Gains file for `antenna-gains`: gains that are not good are zero, which removes their visibilities. With
+/// `without_held_out`, held-out passes have no gains either.
 ///
-/// Gains hold over the whole of a pass with one solution, and of each part between jumps; those of several are joined by their middles.
+/// A single solution of a pass, or of a part between jumps, applies to all of it; several are interpolated between
+/// their middles.
 #[must_use]
 pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held_out: bool) -> GainsFile {
     let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
-        let of = |daughter: &super::DaughterEstimate| {
+        let gain_of = |daughter: &super::DaughterEstimate| {
             let gain = &daughter.gains[c];
             if gain.state != GainState::Good || (without_held_out && solution.is_held_out) {
                 return [0.0, 0.0];
@@ -69,12 +70,12 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
             let (sin, cos) = gain.phase_deg.to_radians().sin_cos();
             [gain.amplitude * cos, gain.amplitude * sin]
         };
-        solution.daughters.iter().map(of).collect()
+        solution.daughters.iter().map(gain_of).collect()
     };
     let channel = |(c, channel): (usize, &Channel)| {
         let mut found: Vec<GainSolution> = Vec::new();
         let mut push = |time_s: f64, solution: &PassSolution| {
-            // Times increase; of two that are equal the first holds.
+            // Times must increase: of two equal ones the first is used.
             if found.last().is_none_or(|last| last.time_s < time_s) {
                 found.push(GainSolution { time_s, gains: gains(c, solution) });
             }
@@ -84,7 +85,7 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
             let is_last =
                 solutions.get(k + 1).is_none_or(|next| next.pass != solution.pass || next.begins_with_jump);
             if is_first {
-                // Times increase: the part before ends where this one begins.
+                // Times must increase: the part before ends where this one begins.
                 push(solution.from_s + if solution.begins_with_jump { JUMP_S } else { 0.0 }, solution);
             }
             if !(is_first && is_last) {
@@ -96,7 +97,7 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         }
         ChannelGains { frequency_hz: channel.frequency_hz, solutions: found }
     };
-    let moved =
+    let has_offsets =
         |solution: &&PassSolution| solution.daughters.iter().any(|daughter| daughter.position_m != [0.0; 3]);
     let position = |solution: &PassSolution| PositionSolution {
         from_s: solution.from_s,
@@ -109,6 +110,6 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         interpolation: Interpolation::LogLinear,
         frequency_tolerance_hz: channels.iter().map(half_hz).fold(f64::INFINITY, f64::min),
         channels: channels.iter().enumerate().map(channel).collect(),
-        positions: solutions.iter().filter(moved).map(position).collect(),
+        positions: solutions.iter().filter(has_offsets).map(position).collect(),
     }
 }

@@ -1,5 +1,5 @@
 //! The solver against data whose errors are known, and against bounds computed here.
-#![allow(clippy::print_stderr)] // They say what they measured.
+#![allow(clippy::print_stderr)] // The tests print what they measured.
 
 use std::f64::consts::TAU;
 
@@ -13,7 +13,7 @@ use crate::units::{Pair, StreamKind, all_pairs, random_stream};
 
 const SPAN_S: [f64; 2] = [0.0, 2700.0];
 
-/// Errors of an array.
+/// True errors of an array.
 #[derive(Clone)]
 struct True {
     /// By channel and daughter.
@@ -25,9 +25,9 @@ struct True {
 struct Scene {
     satellites: usize,
     frequencies_hz: Vec<f64>,
-    /// Visibilities of a pair in a pass.
+    /// Number of visibilities of a pair in a pass.
     count: usize,
-    /// Noise of either part, by pair.
+    /// Noise of the real and imaginary part, by pair.
     noise: fn(Pair) -> f64,
 }
 
@@ -36,17 +36,17 @@ impl Scene {
         vec![[0.0, 0.0, 1.0]; self.satellites]
     }
 
-    /// The model of visibility k: known, of unit power on average, and turning.
+    /// Model of visibility k: of unit power on average, with a rotating phase.
     fn model(&self, channel: usize, pair: Pair, k: usize) -> Complex64 {
         let identity = (channel as u64) << 40 | u64::from(pair.i) << 32 | u64::from(pair.j) << 24 | k as u64;
         let mut stream = random_stream(77, StreamKind::Probe, [identity, 0]);
         let [re, im]: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(&mut stream));
-        // Longer baselines see less.
+        // Longer baselines have weaker signals.
         let length = f64::from(pair.j - pair.i);
         Complex64::new(re, im) / length
     }
 
-    /// Data with errors and noise of a seed.
+    /// Data with errors, and with the noise of a seed.
     fn blocks(&self, truth: &True, seed: u64) -> Vec<ModelledBlock> {
         let mut blocks = Vec::new();
         for (channel, hz) in self.frequencies_hz.iter().enumerate() {
@@ -114,7 +114,7 @@ fn scene(frequencies_hz: &[f64]) -> Scene {
     }
 }
 
-/// Inverse of a symmetric matrix by Gauss-Jordan, and nothing of the solver.
+/// Inverse of a symmetric matrix by Gauss-Jordan elimination, independent of the solver.
 fn inverse(mut a: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     let n = a.len();
     for (k, row) in a.iter_mut().enumerate() {
@@ -133,8 +133,8 @@ fn inverse(mut a: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
     a.into_iter().map(|row| row[n..].to_vec()).collect()
 }
 
-/// Cramer-Rao bound of the phases against daughter 1, rad: the Fisher information of phases is the Laplacian of the pairs
-/// with weights sum |M|^2 / sigma^2; amplitudes are orthogonal to phases.
+/// Cramer-Rao bound of the phases relative to daughter 1, rad: the Fisher information of phases is the Laplacian of
+/// the pairs with weights sum |M|^2 / sigma^2; amplitudes are orthogonal to phases.
 fn bounds(scene: &Scene, channel: usize) -> Vec<f64> {
     let n = scene.satellites;
     let mut fisher = vec![vec![0.0; n - 1]; n - 1];
@@ -159,7 +159,7 @@ fn turned(deg: f64) -> f64 {
 }
 
 #[test]
-fn phases_reach_the_cramer_rao_bound_and_say_how_well_they_are_known() {
+fn phases_reach_the_cramer_rao_bound_and_state_their_errors() {
     let scene = scene(&[10e6]);
     let bounds = bounds(&scene, 0);
     let config = SolverConfig { phase_sigma_deg_max: 1e3, ..SolverConfig::default() };
@@ -172,7 +172,7 @@ fn phases_reach_the_cramer_rao_bound_and_say_how_well_they_are_known() {
         let of = |n: usize| truth.gains[0][n].arg().to_degrees();
         for n in 1..8 {
             let gain = solution.daughters[n].gains[0];
-            // Gains other than one change the weights; in units of the bound they are some 10 % either way.
+            // Gains other than one change the weights, by some 10 % either way in units of the bound.
             let error_deg = turned(gain.phase_deg - (of(n) - of(0)));
             squares[n - 1] += error_deg * error_deg;
             inside += usize::from(error_deg.abs() < 3.0 * gain.phase_sigma_deg);
@@ -192,7 +192,7 @@ fn phases_reach_the_cramer_rao_bound_and_say_how_well_they_are_known() {
 
 #[test]
 fn clocks_are_found_jointly_over_channels() {
-    // The phases are known to 2 deg beforehand; a clock of 30 ns turns by most of a turn at 30 MHz.
+    // The prior of the phases is 2 deg; a clock of 30 ns shifts the phase by most of a turn at 30 MHz.
     let scene = scene(&[3e6, 10e6, 21e6, 30e6]);
     let config = SolverConfig {
         phase_sigma_deg: 2.0,
@@ -207,7 +207,7 @@ fn clocks_are_found_jointly_over_channels() {
         for n in 1..8 {
             let daughter = &solution.daughters[n];
             let error_ns = daughter.clock_ns - (truth.clock_ns[n] - truth.clock_ns[0]);
-            // Against the reference, whose phases are not known either.
+            // Relative to the reference, whose phases are unknown too.
             assert!(
                 error_ns.abs() < 4.0 * daughter.clock_sigma_ns + 1.0,
                 "{seed}, {n}: {error_ns} {daughter:?}"
@@ -217,7 +217,7 @@ fn clocks_are_found_jointly_over_channels() {
 }
 
 #[test]
-fn outliers_are_counted_and_do_not_matter() {
+fn outliers_are_counted_and_rejected() {
     let scene = scene(&[10e6]);
     let truth = scene.errors(3, [0.1, 60.0, 0.0]);
     let clean = scene.solve(&SolverConfig::default(), &mut scene.blocks(&truth, 3));
@@ -237,14 +237,14 @@ fn outliers_are_counted_and_do_not_matter() {
     assert!(found.outliers >= spoilt && found.outliers < spoilt + 5, "{} of {spoilt}", found.outliers);
     assert_eq!(found.outliers + found.visibilities, clean.visibilities + clean.outliers);
     for (one, other) in clean.daughters.iter().zip(&found.daughters).skip(1) {
-        // Two percent of the data are gone: a tenth of a standard deviation, typically.
+        // Losing two percent of the data costs a tenth of a standard deviation, typically.
         let apart = turned(one.gains[0].phase_deg - other.gains[0].phase_deg);
         assert!(apart.abs() < 1.0 * one.gains[0].phase_sigma_deg, "{apart}");
     }
 }
 
 #[test]
-fn dead_and_silent_daughters_are_named() {
+fn dead_and_missing_daughters_are_identified() {
     let scene = scene(&[10e6]);
     let mut truth = scene.errors(4, [0.1, 60.0, 0.0]);
     truth.gains[0][3] = Complex64::ZERO;
@@ -264,7 +264,7 @@ fn dead_and_silent_daughters_are_named() {
 }
 
 #[test]
-fn the_scale_of_amplitudes_is_what_is_asked_for() {
+fn the_scale_of_amplitudes_is_as_configured() {
     let scene = scene(&[10e6]);
     let mut truth = scene.errors(8, [0.1, 10.0, 0.0]);
     truth.gains[0].iter_mut().for_each(|gain| *gain *= 1.3);
@@ -290,9 +290,9 @@ fn a_solution_depends_on_the_data_alone() {
     assert_eq!(solve(1), solve(3));
 }
 
-/// Visibilities a second of sums and robust rounds; printed, as machines differ.
+/// Visibilities per second of sums and robust rounds; printed, as machines differ.
 #[test]
-fn the_rate_is_told() {
+fn the_solver_rate_is_printed() {
     let scene = Scene { count: 10_000, ..scene(&[10e6]) };
     let truth = scene.errors(6, [0.1, 60.0, 0.0]);
     let mut blocks = scene.blocks(&truth, 6);
@@ -304,18 +304,18 @@ fn the_rate_is_told() {
     assert_eq!(count, 280_000.0);
 }
 
-/// Six passes with errors that stay, but for what `spoil` does to the truth and the data of one.
+/// Six passes with constant errors, except for the changes that `disturb` makes to the truth and the data of one pass.
 fn monitored(
-    spoil: impl Fn(u64, &mut True, &mut dyn FnMut(&dyn Fn(&mut ModelledBlock))),
+    disturb: impl Fn(u64, &mut True, &mut dyn FnMut(&dyn Fn(&mut ModelledBlock))),
 ) -> Vec<InstrumentEvent> {
     let scene = scene(&[3e6, 10e6, 21e6, 30e6]);
     let mut solutions = Vec::new();
     for pass in 0..6 {
         let mut truth = scene.errors(9, [0.1, 60.0, 0.0]);
         let mut changes: Vec<ModelledBlock> = Vec::new();
-        spoil(pass, &mut truth, &mut |_| {});
+        disturb(pass, &mut truth, &mut |_| {});
         let mut blocks = scene.blocks(&truth, pass);
-        spoil(pass, &mut truth, &mut |change| blocks.iter_mut().for_each(change));
+        disturb(pass, &mut truth, &mut |change| blocks.iter_mut().for_each(change));
         changes.append(&mut blocks);
         let data = PassData { pass, span_s: SPAN_S, blocks: &mut changes, normal_hat: scene.normal() };
         solutions.push(solve_pass(&SolverConfig::default(), &scene.frequencies_hz, data));
@@ -324,12 +324,12 @@ fn monitored(
 }
 
 #[test]
-fn nothing_is_told_of_a_quiet_instrument() {
+fn a_stable_instrument_has_no_events() {
     assert_eq!(monitored(|_, _, _| {}), []);
 }
 
 #[test]
-fn a_clock_jump_is_told_from_other_events() {
+fn a_clock_jump_is_distinguished_from_other_events() {
     let jump = |daughter: usize| {
         monitored(move |pass, truth, _| {
             if pass >= 3 {
@@ -347,7 +347,7 @@ fn a_clock_jump_is_told_from_other_events() {
 }
 
 #[test]
-fn gain_and_phase_steps_are_told_with_their_channels() {
+fn gain_and_phase_steps_are_reported_with_their_channels() {
     let events = monitored(|pass, truth, _| {
         if pass >= 2 {
             truth.gains[1][1] *= 1.5;
@@ -369,9 +369,9 @@ fn gain_and_phase_steps_are_told_with_their_channels() {
 }
 
 #[test]
-fn interference_and_bursts_are_told_apart() {
-    // A channel with one visibility in four spoilt; all channels for three minutes.
-    let spoil = |block: &mut ModelledBlock, is_hit: &dyn Fn(usize, f64) -> bool| {
+fn interference_and_bursts_are_distinguished() {
+    // First a channel with one disturbed visibility in four, then all channels for three minutes.
+    let disturb = |block: &mut ModelledBlock, is_hit: &dyn Fn(usize, f64) -> bool| {
         for k in 0..block.time_s.len() {
             if is_hit(k + usize::from(block.pair.i + 2 * block.pair.j), block.time_s[k]) {
                 block.value_k_sr[k] += 100.0 * block.weight[k].powf(-0.5);
@@ -381,7 +381,7 @@ fn interference_and_bursts_are_told_apart() {
     let events = monitored(|pass, _, blocks| {
         blocks(&|block| {
             if pass == 4 && block.channel == 2 {
-                spoil(block, &|k, _| k % 4 == 0);
+                disturb(block, &|k, _| k % 4 == 0);
             }
         });
     });
@@ -391,7 +391,7 @@ fn interference_and_bursts_are_told_apart() {
     let events = monitored(|pass, _, blocks| {
         blocks(&|block| {
             if pass == 4 {
-                spoil(block, &|_, time_s| (900.0..1080.0).contains(&time_s));
+                disturb(block, &|_, time_s| (900.0..1080.0).contains(&time_s));
             }
         });
     });

@@ -1,4 +1,4 @@
-//! Antennas that are tilted, or whose pattern is not the ideal one.
+//! Antennas that are tilted, or have patterns other than the ideal one.
 
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ pub struct OrbitAntennas {
 }
 
 impl OrbitAntennas {
-    /// The ideal antennas of an array.
+    /// Creates the ideal antennas of an array.
     #[must_use]
     pub fn new(array: Arc<Array>, elements: AntennaResponse) -> Self {
         Self { array, elements }
@@ -37,25 +37,25 @@ impl AntennaPatterns for OrbitAntennas {
     }
 }
 
-/// The antennas of an instrument over its passes, in all channels.
+/// Antennas of an instrument over its passes, in all channels.
 pub struct AntennaErrors {
     array: Arc<Array>,
     elements: AntennaResponse,
     /// The daughters' patterns by frequency, without their errors.
     patterns: PatternsByFrequency,
     has_patterns: bool,
-    /// Start and end, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
+    /// Start and end of each pass, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
     passes: Vec<([f64; 2], Vec<[Series; 3]>)>,
 }
 
-/// The antennas of an instrument at the frequency of a channel.
+/// Antennas of an instrument at the frequency of a channel.
 pub struct ChannelAntennas {
     antennas: Arc<AntennaErrors>,
     frequency_hz: f64,
 }
 
 impl AntennaErrors {
-    /// The antennas with their errors in these windows; `None` if all are ideal.
+    /// Creates the antennas with their errors in these windows; `None` if all are ideal.
     #[must_use]
     pub fn new(
         errors: &InstrumentErrors,
@@ -84,7 +84,7 @@ impl AntennaErrors {
         ChannelAntennas { antennas: Arc::clone(self), frequency_hz }
     }
 
-    /// The pass of a time, or the nearest one: powers are tabulated beyond a pass's ends.
+    /// Errors in the pass of a time, or the nearest one: powers are tabulated beyond a pass's ends.
     fn pass(&self, t_s: f64) -> Option<&[[Series; 3]]> {
         let begun = self.passes.partition_point(|([start_s, _], _)| *start_s <= t_s);
         let before = self.passes.get(begun.wrapping_sub(1));

@@ -4,10 +4,10 @@ use crate::response::PatternsByFrequency;
 use crate::response::beacon::Beacon;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Shortest correlation time of a drift, s: some thousand nodes in a pass.
+/// Minimum correlation time of a drift, s: some thousand nodes in a pass.
 const DRIFT_TIME_S_MIN: f64 = 60.0;
 
-/// Shortest time in which clocks are steered, s.
+/// Minimum time constant of clock steering, s.
 const STEERING_S_MIN: f64 = 600.0;
 
 keys! {
@@ -101,13 +101,13 @@ keys! {
 }
 
 impl BeaconSchedule {
-    /// The signal.
+    /// The beacon signal.
     #[must_use]
     pub fn signal(&self) -> Beacon {
         Beacon { k_sr: self.k_sr, direction_deg: self.direction_deg }
     }
 
-    /// Whether it is on at a time after the start of a pass, s.
+    /// Whether the beacon is on at a time after the start of a pass, s.
     #[must_use]
     pub fn is_on(&self, after_s: f64) -> bool {
         let since_s = if self.every_s > 0.0 { after_s.rem_euclid(self.every_s) } else { after_s };
@@ -124,15 +124,15 @@ impl ErrorTerms {
         given && rms.iter().all(|value| *value == 0.0)
     }
 
-    /// Whether it may change within a pass.
+    /// Whether the error may change within a pass.
     #[must_use]
     pub fn changes_in_a_pass(&self) -> bool {
         let rms = [self.orbit_rms, self.drift_rms, self.step_rms];
         rms.iter().chain(&self.rate_per_day).any(|value| *value != 0.0)
     }
 
-    /// Requires what terms can be; `of` says how many have values of their own, and what they are; `[most, most_per_day]` bounds
-    /// values and rates.
+    /// Checks the terms. `of` gives the number of items with values of their own, and their name; `[most,
+    /// most_per_day]` bounds values and rates.
     pub(super) fn check(
         &self,
         name: &str,
@@ -189,8 +189,9 @@ impl ErrorTerms {
     }
 }
 
-/// Greatest values of an error, and greatest rates a day: receivers and clocks that would still be used, over years.
-fn most_of(name: &str) -> [f64; 2] {
+/// Maximum values of an error, and maximum rates per day: those of receivers and clocks that would still be used,
+/// over years.
+fn maxima_of(name: &str) -> [f64; 2] {
     match name {
         "amplitude" => [5.0, 0.01],
         "pattern" => [10.0, 0.01],
@@ -215,7 +216,7 @@ impl InstrumentConfig {
             || !self.pattern_by_frequency.is_ideal()
     }
 
-    /// The same schedule of the artificial signal, and no errors.
+    /// Keeps the schedule of the beacon, without errors.
     #[must_use]
     pub fn without_errors(&self) -> Self {
         Self { beacon: self.beacon.clone(), ..Self::default() }
@@ -253,7 +254,7 @@ impl InstrumentConfig {
         ]
     }
 
-    /// Requires what tilts, clocks and leaks can be.
+    /// Checks tilts, clocks and leaks.
     fn check_rest(&self, checks: &mut Checks) {
         for (name, terms) in
             [("tilt_along_deg", &self.tilt_along_deg), ("tilt_radial_deg", &self.tilt_radial_deg)]
@@ -272,29 +273,29 @@ impl InstrumentConfig {
         checks.number("leak_depth_deg", depth_deg, (1e-3..=180.0).contains(&depth_deg), "0.001 to 180 deg");
     }
 
-    /// Everything that is wrong with the section for an array of `satellites` and a number of channels; `samples` says
-    /// whether it is of samples. Empty if it is good.
+    /// All invalid values for an array of `satellites` and a number of channels; `samples` is true with sample
+    /// fidelity. Empty if there are none.
     #[must_use]
     pub fn problems(&self, satellites: usize, channels: usize, samples: bool) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("instrument");
+        let mut checks = Checks::new("instrument");
         for (name, terms) in self.terms() {
             let smooth = !["amplitude", "phase_deg", "clock_ns"].contains(&name);
-            terms.check(name, (satellites, "a daughter"), most_of(name), smooth, &mut checks);
+            terms.check(name, (satellites, "a daughter"), maxima_of(name), smooth, &mut checks);
         }
         self.pattern_by_frequency.check("pattern_by_frequency", Some(satellites), &mut checks);
         self.check_rest(&mut checks);
-        let known = |number: u32, count: usize| (1..=count).contains(&(number as usize));
+        let exists = |number: u32, count: usize| (1..=count).contains(&(number as usize));
         for (index, &daughter) in self.dead_daughters.iter().enumerate() {
             let expected = format!("a daughter, 1 to {satellites}");
             checks.require(
                 format!("dead_daughters[{index}]"),
                 daughter,
-                known(daughter, satellites),
+                exists(daughter, satellites),
                 expected,
             );
         }
         for (index, &[daughter, channel]) in self.dead_channels.iter().enumerate() {
-            let good = known(daughter, satellites) && (channel as usize) < channels;
+            let good = exists(daughter, satellites) && (channel as usize) < channels;
             let expected =
                 format!("a daughter, 1 to {satellites}, and a channel, 0 to {}", channels.saturating_sub(1));
             checks.require(
@@ -320,7 +321,7 @@ impl InstrumentConfig {
         let (burst_s, every_s) = (self.burst_s, self.burst_every_s);
         checks.number("burst_s", burst_s, every_s == 0.0 || burst_s <= every_s, "at most burst_every_s");
         self.beacon.signal().check("beacon", &mut checks);
-        // Samples have tones and interference of their own.
+        // Samples have their own tones and interference.
         let expected = "none with spacecraft.fidelity = \"samples\", which have daughters.tones";
         for (key, on) in [
             ("dead_daughters", !self.dead_daughters.is_empty()),

@@ -1,10 +1,10 @@
-//! Errors of the instrument, the same for integrated visibilities and for samples: gains, clocks, positions, antennas,
-//! dead receivers, outliers, bursts and leaks.
+//! Errors of the instrument, for integrated visibilities and for samples: gains, clocks, positions, antennas, dead
+//! receivers, outliers, bursts and leaks.
 //!
-//! A daughter's signal is multiplied by its voltage gain `g = exp(a + i p)`, `p = phase - 2 pi nu tau` (signals rotate
-//! as exp(-2 pi i nu t), so a clock that is late by tau turns them back), and a visibility by `g_i conj(g_j)`. Noise
-//! passes the same gain. The packets' positions are those flown plus an error along the track, along the orbit's normal
-//! and away from the Moon, and their time tags are the true times plus an error.
+//! A daughter's signal is multiplied by its voltage gain `g = exp(a + i p)`, `p = phase - 2 pi nu tau` (signals
+//! rotate as exp(-2 pi i nu t), so a clock that is late by tau turns them back), and a visibility by `g_i conj(g_j)`.
+//! Noise is multiplied by the same gain. The positions in packets are the true ones plus an error along the track,
+//! along the orbit's normal and away from the Moon; time tags are the true times plus an error.
 
 mod attitude;
 mod config;
@@ -29,7 +29,7 @@ use crate::units::{MissionTime, Pair, StreamKind, TICKS_PER_SECOND, random_strea
 use navigation::TIME_TAG_S_MAX;
 use series::{Draws, Series};
 
-/// The errors of an instrument, drawn from a seed.
+/// Errors of an instrument, drawn from a seed.
 #[derive(Clone, Debug)]
 pub struct InstrumentErrors {
     config: InstrumentConfig,
@@ -40,26 +40,26 @@ pub struct InstrumentErrors {
     orbital_period_s: f64,
 }
 
-/// The errors over one pass.
+/// Errors over one pass.
 #[derive(Clone, Debug)]
 pub struct PassErrors {
     channels: Vec<Channel>,
-    /// By daughter and channel.
+    /// Log amplitude, phase and failures, by daughter and channel.
     amplitude: Vec<Vec<Series>>,
     phase_deg: Vec<Vec<Series>>,
     dead: Vec<Vec<bool>>,
-    /// By daughter.
+    /// Clock error, by daughter.
     clock_ns: Vec<Series>,
-    /// By daughter: along, across, radial.
+    /// Position error along the track, across it and away from the Moon, by daughter.
     offset_m: Vec<[Series; 3]>,
-    /// Errors of the formation's time tags; `None` if tags are true.
+    /// Errors of the formation's time tags; `None` if tags are exact.
     time_tag_ms: Option<Series>,
-    /// By daughter: tilt along the track, tilt away from the Moon (deg), distortion.
+    /// Tilt along the track, tilt away from the Moon (deg) and distortion, by daughter.
     antennas: Vec<[Series; 3]>,
 }
 
 impl InstrumentErrors {
-    /// The errors of an array with these channels; `None` if there are none.
+    /// Creates the errors of an array with these channels; `None` if there are none.
     #[must_use]
     pub fn new(
         config: &InstrumentConfig,
@@ -71,7 +71,7 @@ impl InstrumentErrors {
         (config.is_on() || navigation.is_on()).then(|| Self {
             config: config.clone(),
             navigation: navigation.clone(),
-            // Realisations are far from each other and from seeds that users choose.
+            // Seeds of realisations differ from each other and from seeds that users choose.
             seed: seed.wrapping_add(u64::from(config.realisation).wrapping_mul(0x9E37_79B9_7F4A_7C15)),
             satellites: array.satellites(),
             channels: channels.to_vec(),
@@ -90,7 +90,7 @@ impl InstrumentErrors {
         self.config.changes_in_a_pass() || self.navigation.changes_in_a_pass()
     }
 
-    /// One error of a daughter over a pass.
+    /// Series of one error of a daughter over a pass.
     fn series(&self, window: ObservingWindow, error: u8, terms: &ErrorTerms, [n, c]: [usize; 2]) -> Series {
         let span = (window.index, [window.start.seconds(), window.end.seconds()]);
         let draws = Draws { seed: self.seed, error, daughter: n, channel: c };
@@ -105,7 +105,7 @@ impl InstrumentErrors {
         (0..self.satellites).map(of).collect()
     }
 
-    /// The clock of a daughter over a pass, ns.
+    /// Clock error of a daughter over a pass, ns.
     fn clock_ns(&self, window: ObservingWindow, n: usize) -> Series {
         let InstrumentConfig { clock_ns, clock_allan_deviation, clock_steering_s, .. } = &self.config;
         let draws = Draws { seed: self.seed, error: 2, daughter: n, channel: 0 };
@@ -118,7 +118,7 @@ impl InstrumentErrors {
         )
     }
 
-    /// The errors over a pass.
+    /// Draws the errors over a pass.
     #[must_use]
     pub fn pass(&self, window: ObservingWindow) -> PassErrors {
         let Self { config, navigation, satellites, channels, .. } = self;
@@ -146,7 +146,7 @@ impl InstrumentErrors {
                     axes.map(|(error, terms)| series(error, terms, n, 0))
                 })
                 .collect(),
-            time_tag_ms: navigation.moves_tags().then(|| series(9, &navigation.time_tag_ms, 0, 0)),
+            time_tag_ms: navigation.has_tag_errors().then(|| series(9, &navigation.time_tag_ms, 0, 0)),
             antennas: self.antennas(window),
         }
     }
@@ -159,8 +159,8 @@ impl InstrumentErrors {
         (self.config.outlier_probability > 0.0 && self.config.outlier_sigma > 0.0).then(stream)
     }
 
-    /// Power of the interference that leaks about the Moon's limb to a daughter at a time, K sr: whole with the Earth at the
-    /// limb or above it, less by a factor e for each `leak_depth_deg` below it.
+    /// Power at a daughter of interference that leaks about the Moon's limb, K sr: full with the Earth at the limb or
+    /// above it, less by a factor e for each `leak_depth_deg` below it.
     #[must_use]
     pub fn leak_k_sr(&self, array: &Array, daughter: usize, t_s: f64) -> f64 {
         if self.config.leak_k_sr == 0.0 {
@@ -187,7 +187,7 @@ impl PassErrors {
         Complex64::from_polar(amplitude.exp(), phase_rad)
     }
 
-    /// Time by which a daughter's clock is late, s.
+    /// Delay of a daughter's clock, s.
     #[must_use]
     pub fn clock_s(&self, daughter: usize, t_s: f64) -> f64 {
         1e-9 * self.clock_ns[daughter].at(t_s)
@@ -206,26 +206,26 @@ impl PassErrors {
         self.dead[daughter][channel]
     }
 
-    /// Error of a position, m: along the track, along the orbit's normal, away from the Moon.
+    /// Position error, m: along the track, along the orbit's normal, away from the Moon.
     #[must_use]
     pub fn offset_m(&self, daughter: usize, t_s: f64) -> [f64; 3] {
         self.offset_m[daughter].each_ref().map(|series| series.at(t_s))
     }
 
-    /// Error of the time tag of what is measured at a time, s.
+    /// Error of the time tag of data taken at a time, s.
     #[must_use]
     pub fn time_tag_s(&self, t_s: f64) -> f64 {
         let tag_s = self.time_tag_ms.as_ref().map_or(0.0, |series| 1e-3 * series.at(t_s));
         tag_s.clamp(-TIME_TAG_S_MAX, TIME_TAG_S_MAX)
     }
 
-    /// By how much positions have to be known before and after a pass, s, for all that is tagged in it.
+    /// Maximum time tag error in a pass, s: positions must be known for so long before and after it.
     #[must_use]
-    pub fn reach_s(&self) -> f64 {
+    pub fn tag_error_max_s(&self) -> f64 {
         if self.time_tag_ms.is_some() { TIME_TAG_S_MAX } else { 0.0 }
     }
 
-    /// Replaces the times of a block by those that packets say, to whole ticks.
+    /// Replaces the times of a block by the reported ones, in whole ticks.
     pub fn tag(&self, block: &mut VisibilityBlock) {
         if self.time_tag_ms.is_none() {
             return;
@@ -234,7 +234,7 @@ impl PassErrors {
         let middles: Vec<i64> = (0..block.len()).map(|k| ticks(block.middle_s(k))).collect();
         let of_start = middles.first().copied().unwrap_or_default();
         block.start = block.start.plus_ticks(of_start);
-        // A clock that is set back does not change the order: tags stand until it has caught up.
+        // A clock that is set back does not change the order: tags stand still until it has caught up.
         let mut after_half_ticks = 0;
         for ((offset, duration), of_middle) in
             block.offset_ticks.iter_mut().zip(&block.duration_ticks).zip(middles)
@@ -247,7 +247,7 @@ impl PassErrors {
         }
     }
 
-    /// Replaces the positions flown of a segment by those that packets say.
+    /// Replaces the true positions of a segment by the reported ones.
     pub fn add_errors(&self, segment: &mut EphemerisSegment, array: &Array) {
         let satellites = usize::from(segment.satellites);
         for (place, position_m) in segment.positions_m.iter_mut().enumerate() {

@@ -1,12 +1,12 @@
-//! What the packets say of positions and times, and what was flown: orbit determination and the formation's clock.
+//! Errors of reported positions and times: orbit determination and the formation's clock.
 
 use super::config::ErrorTerms;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Greatest error of a time tag, s. Ephemeris packets reach as far beyond a pass, so that tags find positions.
+/// Maximum error of a time tag, s. Ephemeris packets reach as far beyond a pass, so that tags find positions.
 pub(super) const TIME_TAG_S_MAX: f64 = 10.0;
 
-/// Greatest errors, m or ms, and greatest rates a day: farther satellites are not where a formation is.
+/// Maximum errors, m or ms, and maximum rates per day. Beyond these the satellites would not form an array.
 const MOST: f64 = 1e6;
 
 keys! {
@@ -25,15 +25,15 @@ keys! {
 }
 
 impl NavigationConfig {
-    /// Whether anything in the packets is off.
+    /// Whether reported positions or times have errors.
     #[must_use]
     pub fn is_on(&self) -> bool {
         self.terms().iter().any(|(_, terms)| !terms.is_none())
     }
 
-    /// Whether time tags are off.
+    /// Whether time tags have errors.
     #[must_use]
-    pub fn moves_tags(&self) -> bool {
+    pub fn has_tag_errors(&self) -> bool {
         !self.time_tag_ms.is_none()
     }
 
@@ -52,10 +52,10 @@ impl NavigationConfig {
         ]
     }
 
-    /// Everything that is wrong with the section for an array of `satellites`. Empty if it is good.
+    /// All invalid values for an array of `satellites`; empty if there are none.
     #[must_use]
     pub fn problems(&self, satellites: usize) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("navigation");
+        let mut checks = Checks::new("navigation");
         for (name, terms) in self.terms() {
             let of_tags = name == "time_tag_ms";
             let of = if of_tags { (1, "for the formation") } else { (satellites, "a daughter") };

@@ -1,5 +1,5 @@
-//! One error of one daughter over a pass, drawn from the seed alone: the same at any time, in whatever order passes are
-//! asked for.
+//! Time series of one error of one daughter over a pass, drawn from the seed alone: independent of the order in which
+//! passes are requested.
 
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -8,16 +8,16 @@ use super::config::ErrorTerms;
 use crate::units::constants::DAY_S;
 use crate::units::{StreamKind, random_stream};
 
-/// Nodes of a Gauss-Markov process in a correlation time. Between them it is linear, which lacks
-/// 1 / (6 x 64) of its variance half-way.
+/// Number of nodes of a Gauss-Markov process per correlation time. Linear interpolation between them lacks 1 / (6 x
+/// 64) of its variance half-way.
 const NODES_PER_TIME: f64 = 64.0;
-/// Correlation times from one independent value of a process to the next, at least: exp(-32) = 1e-14 of the correlation would be
-/// left. The number of nodes between is a power of two.
+/// Minimum number of correlation times between independent values of a process: the neglected correlation is exp(-32)
+/// = 1e-14. The number of nodes between is a power of two.
 const INDEPENDENT_TIMES: f64 = 32.0;
 /// Spacing of the nodes of a clock's noise, s.
 const WALK_STEP_S: f64 = 1.0;
 
-/// Which error of what is drawn.
+/// Identity of an error in the random streams.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Draws {
     /// Seed of the realisation.
@@ -56,52 +56,52 @@ impl Draws {
 /// An error over a pass.
 #[derive(Clone, Debug)]
 pub(super) struct Series {
-    /// All that does not change in the pass.
+    /// Constant part in the pass.
     level: f64,
-    /// 1/s since the epoch.
+    /// Rate since the epoch, per second.
     rate_per_s: f64,
-    /// Factors of the cosine and the sine of the orbit's phase since the epoch.
+    /// Factors of the cosine and the sine of the orbital phase since the epoch.
     orbit: [f64; 2],
     orbit_rad_per_s: f64,
-    /// Number of the first node, step (s), values.
+    /// Index of the first node, step (s), and values of the drift.
     drift: Option<(i64, f64, Vec<f64>)>,
-    /// The same of a clock's noise.
+    /// Index of the first node, step (s), and values of a clock's noise.
     walk: Option<(i64, f64, Vec<f64>)>,
-    /// Level since each of these times, s; the first holds before, too.
+    /// Level since each of these times, s; the first applies before, too.
     steps: Vec<(f64, f64)>,
 }
 
 impl Series {
-    /// The error over pass `index` from `from_s` to `to_s`, with a period of the orbit.
+    /// Draws the error over pass `index` from `from_s` to `until_s`, with an orbital period.
     pub(super) fn new(
         terms: &ErrorTerms,
         draws: Draws,
-        (index, [from_s, to_s]): (u64, [f64; 2]),
+        (index, [from_s, until_s]): (u64, [f64; 2]),
         period_s: f64,
     ) -> Self {
-        let given = |list: &[f64]| list.get(draws.daughter).copied().unwrap_or(0.0);
+        let value_of = |list: &[f64]| list.get(draws.daughter).copied().unwrap_or(0.0);
         let random = |rms: f64, term, index: i64| {
             if rms > 0.0 { rms * draws.normal(term, index) } else { 0.0 }
         };
         Self {
-            level: given(&terms.constant)
+            level: value_of(&terms.constant)
                 + random(terms.constant_rms, Term::Constant, 0)
                 + random(terms.pass_rms, Term::Pass, index as i64),
-            rate_per_s: given(&terms.rate_per_day) / DAY_S,
+            rate_per_s: value_of(&terms.rate_per_day) / DAY_S,
             orbit: [0, 1].map(|part| random(terms.orbit_rms, Term::Orbit, part)),
             orbit_rad_per_s: std::f64::consts::TAU / period_s,
             drift: (terms.drift_rms > 0.0).then(|| {
                 let process =
                     Process { rms: terms.drift_rms, time_s: terms.drift_time_s, nodes: NODES_PER_TIME };
-                process.over([from_s, to_s], &|node| draws.normal(Term::Drift, node))
+                process.values_over([from_s, until_s], &|node| draws.normal(Term::Drift, node))
             }),
             walk: None,
-            steps: if terms.step_rms > 0.0 { steps(terms, draws, [from_s, to_s]) } else { Vec::new() },
+            steps: if terms.step_rms > 0.0 { steps(terms, draws, [from_s, until_s]) } else { Vec::new() },
         }
     }
 
-    /// Adds a random walk over an interval whose increments have a variance of `per_root_s`^2 each second, and which is
-    /// forgotten within `steering_s`.
+    /// Adds a random walk over an interval, whose increments have a variance of `per_root_s`^2 per second, and which
+    /// steering removes within `steering_s`.
     pub(super) fn with_walk(self, per_root_s: f64, steering_s: f64, draws: Draws, span_s: [f64; 2]) -> Self {
         // Increments over t of a Gauss-Markov process have 2 rms^2 (1 - exp(-t / time)).
         let process = Process {
@@ -109,11 +109,11 @@ impl Series {
             time_s: steering_s,
             nodes: steering_s / WALK_STEP_S,
         };
-        let walk = || process.over(span_s, &|node| draws.normal(Term::Walk, node));
+        let walk = || process.values_over(span_s, &|node| draws.normal(Term::Walk, node));
         Self { walk: (per_root_s > 0.0).then(walk), ..self }
     }
 
-    /// Its value at a time, s since the epoch.
+    /// Value at a time, s since the epoch.
     pub(super) fn at(&self, t_s: f64) -> f64 {
         let mut value = self.level + self.rate_per_s * t_s;
         if self.orbit != [0.0; 2] {
@@ -121,7 +121,7 @@ impl Series {
             value += self.orbit[0] * cos + self.orbit[1] * sin;
         }
         for (first, step_s, nodes) in [&self.drift, &self.walk].into_iter().flatten() {
-            // From whole nodes since the epoch, so that no bit depends on where the pass begins.
+            // Time is counted in whole nodes since the epoch, so that no bit depends on the start of the pass.
             let place = t_s / step_s;
             let node = (place.floor() as i64).clamp(*first, first + nodes.len() as i64 - 2);
             let [before, after] = [0, 1].map(|k| nodes[(node - first) as usize + k]);
@@ -137,17 +137,17 @@ struct Process {
     rms: f64,
     /// Correlation time, s.
     time_s: f64,
-    /// Nodes in a correlation time.
+    /// Number of nodes per correlation time.
     nodes: f64,
 }
 
 impl Process {
-    /// Number of the first node, step (s) and values over an interval. The value at a node is drawn between two nodes that
-    /// are known, from the coarsest to the finest, so that any interval has the same values without what was before.
-    fn over(&self, [from_s, to_s]: [f64; 2], draw: &dyn Fn(i64) -> f64) -> (i64, f64, Vec<f64>) {
+    /// Index of the first node, step (s) and values over an interval. A node is drawn between two known nodes, from
+    /// the coarsest level to the finest, so that any interval has the same values independent of earlier ones.
+    fn values_over(&self, [from_s, until_s]: [f64; 2], draw: &dyn Fn(i64) -> f64) -> (i64, f64, Vec<f64>) {
         let step_s = self.time_s / self.nodes;
         let independent = ((INDEPENDENT_TIMES * self.nodes).ceil() as u64).next_power_of_two() as i64;
-        let [first, last] = [(from_s / step_s).floor() as i64, (to_s / step_s).ceil() as i64 + 1];
+        let [first, last] = [(from_s / step_s).floor() as i64, (until_s / step_s).ceil() as i64 + 1];
         let mut nodes = vec![0.0; (last - first + 1) as usize];
         let mut bridge = Bridge { draw, first, nodes: &mut nodes, nodes_per_time: self.nodes };
         let mut left = first.div_euclid(independent) * independent;
@@ -164,7 +164,7 @@ impl Process {
     }
 }
 
-/// Nodes between two known ones.
+/// Midpoint sampling of nodes between two known ones.
 struct Bridge<'a> {
     draw: &'a dyn Fn(i64) -> f64,
     first: i64,
@@ -186,7 +186,7 @@ impl Bridge<'_> {
             return;
         }
         let middle = left + (right - left) / 2;
-        // With correlation r to either end, whose own is r^2.
+        // The correlation is r to either end, and r^2 between the ends.
         let r = (-((middle - left) as f64) / self.nodes_per_time).exp();
         let deviation = ((1.0 - r * r) / (1.0 + r * r)).sqrt();
         let value = (ends[0] + ends[1]) * r / (1.0 + r * r) + deviation * (self.draw)(middle);
@@ -197,7 +197,7 @@ impl Bridge<'_> {
 }
 
 /// Levels over an interval, each with the time of its jump.
-fn steps(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> Vec<(f64, f64)> {
+fn steps(terms: &ErrorTerms, draws: Draws, [from_s, until_s]: [f64; 2]) -> Vec<(f64, f64)> {
     let every_s = terms.step_every_s;
     let cell = |k: i64| {
         let mut stream = draws.stream(Term::Step, k);
@@ -205,19 +205,19 @@ fn steps(terms: &ErrorTerms, draws: Draws, [from_s, to_s]: [f64; 2]) -> Vec<(f64
         let level: f64 = StandardNormal.sample(&mut stream);
         ((k as f64 + part) * every_s, terms.step_rms * level)
     };
-    let [first, last] = [from_s, to_s].map(|t_s| (t_s / every_s).floor() as i64);
+    let [first, last] = [from_s, until_s].map(|t_s| (t_s / every_s).floor() as i64);
     (first - 1..=last).map(cell).collect()
 }
 
-/// Whether a burst that comes once in each `every_s` and lasts `length_s` is on at a time.
+/// Whether a burst that occurs once in each `every_s` and lasts `length_s` is on at a time.
 pub(super) fn burst_is_on(seed: u64, [every_s, length_s]: [f64; 2], t_s: f64) -> bool {
     let draws = Draws { seed, error: u8::MAX, daughter: 0, channel: 0 };
     let cell = (t_s / every_s).floor() as i64;
-    let begins_s = |k: i64| {
+    let start_s = |k: i64| {
         let part = f64::from(draws.stream(Term::Step, k).next_u32()) / 2.0_f64.powi(32);
         (k as f64 + part) * every_s
     };
-    [cell - 1, cell].into_iter().any(|k| (0.0..length_s).contains(&(t_s - begins_s(k))))
+    [cell - 1, cell].into_iter().any(|k| (0.0..length_s).contains(&(t_s - start_s(k))))
 }
 
 #[cfg(test)]
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn a_drift_has_the_variance_and_correlation_of_its_process() {
         let terms = ErrorTerms { drift_rms: 2.0, drift_time_s: 640.0, ..ErrorTerms::default() };
-        // Times one and a half correlation times apart, in passes far from each other.
+        // Times are one and a half correlation times apart, in passes far from each other.
         let (mut squares, mut products, mut far, mut count) = (0.0, 0.0, 0.0, 0.0);
         for pass in 0..4000_u64 {
             let from_s = 1e5 * pass as f64 + 0.37 * pass as f64;
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_has_the_allan_deviation_it_was_given() {
+    fn a_clock_has_the_configured_allan_deviation() {
         // 3e-11 at 1 s, in ns; steered within some thirty hours.
         let (at_1_s, steering_s) = (0.03, 1e5);
         let none = ErrorTerms::default();
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn levels_jump_once_in_their_time() {
+    fn levels_jump_once_per_interval() {
         let terms = ErrorTerms { step_rms: 1.0, step_every_s: 100.0, ..ErrorTerms::default() };
         let series = Series::new(&terms, draws(0), (0, [1000.0, 3000.0]), 8000.0);
         let values: Vec<f64> = (0..20_000).map(|k| series.at(1000.0 + 0.1 * f64::from(k))).collect();
@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn bursts_are_on_for_their_part_of_the_time() {
+    fn bursts_are_on_for_their_fraction_of_time() {
         let on = (0..100_000).filter(|k| burst_is_on(9, [1000.0, 50.0], f64::from(*k))).count();
         // One of 50 s in each 1000 s; the one cut at an end counts less.
         assert!((4900..=5000).contains(&on), "{on}");

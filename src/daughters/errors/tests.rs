@@ -1,4 +1,4 @@
-//! Power that is left of a coherent average over errors, against its laws.
+//! Power kept by a coherent average over errors, against analytic laws.
 
 use std::f64::consts::TAU;
 
@@ -17,8 +17,8 @@ const CHANNELS: [Channel; 3] = [
     Channel { frequency_hz: 30e6, width_hz: 8e3 },
 ];
 
-/// Passes of a test. The mean of cos over some 4 independent pairs of each of 20,000 passes is good to
-/// 0.5 / sqrt(80,000) = 0.002, its square to 0.4 %.
+/// Number of passes of a test. The mean of cos over some 4 independent pairs of each of 20,000 passes is good to 0.5
+/// / sqrt(80,000) = 0.002, its square to 0.4 %.
 const PASSES: u64 = 20_000;
 
 fn window(index: u64) -> ObservingWindow {
@@ -30,7 +30,7 @@ fn errors(config: InstrumentConfig) -> InstrumentErrors {
     errors_of(&config, &NavigationConfig::default())
 }
 
-fn led_astray(navigation: &NavigationConfig) -> InstrumentErrors {
+fn with_navigation_errors(navigation: &NavigationConfig) -> InstrumentErrors {
     errors_of(&InstrumentConfig::default(), navigation)
 }
 
@@ -39,8 +39,8 @@ fn errors_of(config: &InstrumentConfig, navigation: &NavigationConfig) -> Instru
     InstrumentErrors::new(config, navigation, 11, &array, &CHANNELS).unwrap()
 }
 
-/// Power that a coherent average over passes and pairs keeps, by channel.
-fn kept(errors: &InstrumentErrors, passes: u64) -> [f64; 3] {
+/// Fraction of the power kept by a coherent average over passes and pairs, by channel.
+fn kept_power(errors: &InstrumentErrors, passes: u64) -> [f64; 3] {
     let pairs = all_pairs(8);
     let mut sums = [Complex64::ZERO; 3];
     for index in 0..passes {
@@ -58,60 +58,64 @@ fn kept(errors: &InstrumentErrors, passes: u64) -> [f64; 3] {
 }
 
 #[test]
-fn random_phases_keep_exp_of_less_their_variance() {
+fn random_phases_keep_exp_of_minus_their_variance() {
     for sigma_deg in [0.0, 5.0, 12.0, 20.0, 30.0, 40.0_f64] {
-        // Of a baseline: that of an antenna is the root of one half of it.
+        // The variance is that of a baseline; an antenna has half of it.
         let pass_rms = sigma_deg / 2.0_f64.sqrt();
         let mut config =
             InstrumentConfig { outlier_probability: 1.0, outlier_sigma: 1.0, ..Default::default() };
         config.phase_deg.pass_rms = pass_rms;
         let law = (-sigma_deg.to_radians().powi(2)).exp();
-        for kept in kept(&errors(config), PASSES) {
-            assert!((kept / law - 1.0).abs() < 0.01, "{sigma_deg} deg: {kept} for {law}");
+        for kept_power in kept_power(&errors(config), PASSES) {
+            assert!((kept_power / law - 1.0).abs() < 0.01, "{sigma_deg} deg: {kept_power} for {law}");
         }
     }
 }
 
 #[test]
-fn constant_phases_and_clocks_keep_what_their_laws_say() {
-    // Over realisations: 12 deg of a baseline, and 1.1 ns, which is 11.9 deg at 30 MHz.
+fn constant_phases_and_clocks_keep_the_analytic_power() {
+    // The averages are over realisations: 12 deg of a baseline, and 1.1 ns, which is 11.9 deg at 30 MHz.
     let sum = |change: &dyn Fn(&mut InstrumentConfig)| {
-        let (mut kept, mut count) = ([Complex64::ZERO; 3], 0.0);
+        let (mut kept_power, mut count) = ([Complex64::ZERO; 3], 0.0);
         for realisation in 0..PASSES as u32 {
             let mut config = InstrumentConfig { realisation, ..Default::default() };
             change(&mut config);
             let pass = errors(config).pass(window(3));
             for pair in all_pairs(8) {
-                for (channel, kept) in kept.iter_mut().enumerate() {
+                for (channel, kept_power) in kept_power.iter_mut().enumerate() {
                     let [i, j] = [pair.i, pair.j].map(|n| pass.gain(n.into(), channel, 3e4));
-                    *kept += i * j.conj();
+                    *kept_power += i * j.conj();
                 }
                 count += 1.0;
             }
         }
-        kept.map(|sum| (sum / count).norm_sqr())
+        kept_power.map(|sum| (sum / count).norm_sqr())
     };
     let half = 0.5_f64.sqrt();
-    for kept in sum(&|config| config.phase_deg.constant_rms = 12.0 * half) {
-        assert!((kept / (-12.0_f64.to_radians().powi(2)).exp() - 1.0).abs() < 0.01, "{kept}");
+    for kept_power in sum(&|config| config.phase_deg.constant_rms = 12.0 * half) {
+        assert!((kept_power / (-12.0_f64.to_radians().powi(2)).exp() - 1.0).abs() < 0.01, "{kept_power}");
     }
     let of_clock = sum(&|config| config.clock_ns.constant_rms = 1.1 * half);
-    for (kept, channel) in of_clock.into_iter().zip(CHANNELS) {
+    for (kept_power, channel) in of_clock.into_iter().zip(CHANNELS) {
         let sigma = TAU * channel.frequency_hz * 1.1e-9;
-        assert!((kept / (-sigma * sigma).exp() - 1.0).abs() < 0.01, "{}: {kept}", channel.frequency_hz);
+        assert!(
+            (kept_power / (-sigma * sigma).exp() - 1.0).abs() < 0.01,
+            "{}: {kept_power}",
+            channel.frequency_hz
+        );
     }
-    // The published tolerance: 95 % are kept at 1.1 ns up to 30 MHz.
+    // The published tolerance keeps 95 % at 1.1 ns up to 30 MHz.
     assert!(of_clock[2] > 0.95 && of_clock[2] < 0.965, "{of_clock:?}");
 }
 
 #[test]
-fn positions_keep_what_their_law_says() {
-    // 1 m of a baseline along each axis: 12 deg at 10 MHz in any direction.
+fn position_errors_keep_the_analytic_power() {
+    // The error is 1 m of a baseline along each axis: 12 deg at 10 MHz in any direction.
     let mut config = NavigationConfig::default();
     for terms in [&mut config.along_m, &mut config.across_m, &mut config.radial_m] {
         terms.pass_rms = 0.5_f64.sqrt();
     }
-    let errors = led_astray(&config);
+    let errors = with_navigation_errors(&config);
     let n_hat = [0.48, 0.6, 0.64];
     let (mut sums, mut count) = ([Complex64::ZERO; 3], 0.0);
     for index in 0..PASSES {
@@ -128,20 +132,20 @@ fn positions_keep_what_their_law_says() {
     }
     for (sum, channel) in sums.into_iter().zip(CHANNELS) {
         let sigma = TAU * channel.frequency_hz / SPEED_OF_LIGHT_M_S;
-        let (kept, law) = ((sum / count).norm_sqr(), (-sigma * sigma).exp());
-        assert!((kept / law - 1.0).abs() < 0.01, "{}: {kept} for {law}", channel.frequency_hz);
+        let (kept_power, law) = ((sum / count).norm_sqr(), (-sigma * sigma).exp());
+        assert!((kept_power / law - 1.0).abs() < 0.01, "{}: {kept_power} for {law}", channel.frequency_hz);
     }
 }
 
 #[test]
-fn packets_say_positions_that_are_off_along_the_named_axes() {
+fn reported_positions_are_off_along_the_configured_axes() {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let mut config = NavigationConfig::default();
     config.along_m.constant = (0..8).map(f64::from).collect();
     config.radial_m.constant = vec![2.0; 8];
     config.across_m.constant = vec![-3.0; 8];
     let window = window(5);
-    let pass = led_astray(&config).pass(window);
+    let pass = with_navigation_errors(&config).pass(window);
     for flown in crate::array::segments_for(&array, window.start, window.end, 60.0) {
         let mut said = flown.clone();
         pass.add_errors(&mut said, &array);
@@ -149,7 +153,7 @@ fn packets_say_positions_that_are_off_along_the_named_axes() {
             let (node, n) = (k / 8, k % 8);
             let t_s = flown.start.plus_ticks(node as i64 * i64::from(flown.step_ticks)).seconds();
             let off = sub(*said, *flown_m);
-            // The velocity is along the track but for the breathing, some 1e-4 of it.
+            // The velocity is along the track, except for breathing, some 1e-4 of it.
             let along = unit(array.state(n, t_s).velocity_m_s);
             assert!((dot(off, along) - n as f64).abs() < 2e-3, "{off:?}");
             assert!((dot(off, unit(*flown_m)) - 2.0).abs() < 1e-6);
@@ -159,7 +163,7 @@ fn packets_say_positions_that_are_off_along_the_named_axes() {
 }
 
 #[test]
-fn dipoles_lean_by_the_angles_that_are_given() {
+fn dipoles_are_tilted_by_the_configured_angles() {
     let array = std::sync::Arc::new(Array::new(&ArrayConfig::default()).unwrap());
     let mut config = InstrumentConfig::default();
     config.tilt_along_deg.constant = (0..8).map(|n| 2.0 * f64::from(n)).collect();
@@ -177,12 +181,12 @@ fn dipoles_lean_by_the_angles_that_are_given() {
             let [along_deg, radial_deg, distortion] = pass.antenna(n.into(), t_s);
             assert!(along_deg == 2.0 * f64::from(n) && distortion == 0.01 * f64::from(n));
             assert!(found.elements == AntennaResponse::DipoleNormal && found.distortion == distortion);
-            // Seen along the radius the axis is off by one angle, seen along the track by the other.
+            // Seen along the radius the axis is tilted by one angle, seen along the track by the other.
             let (up, normal) = (unit(array.position_m(n.into(), t_s)), array.normal_hat(n.into(), t_s));
             let track = unit(array.state(n.into(), t_s).velocity_m_s);
             let seen_deg =
                 |axis| dot(found.axes_hat[0], axis).atan2(dot(found.axes_hat[0], normal)).to_degrees();
-            // The velocity is along the track but for precession and breathing, some 1e-4 of it.
+            // The velocity is along the track, except for precession and breathing, some 1e-4 of it.
             assert!((seen_deg(track) - along_deg).abs() < 0.02, "{n}: {}", seen_deg(track));
             assert!((seen_deg(up) - radial_deg).abs() < 1e-6, "{n}: {}", seen_deg(up));
         }
@@ -215,7 +219,7 @@ fn a_leak_falls_with_the_angle_below_the_limb() {
 }
 
 #[test]
-fn everything_wrong_with_the_section_is_said() {
+fn all_invalid_values_of_the_section_are_reported() {
     let text = "dead_daughters = [9]\ndead_channels = [[1, 4]]\noutlier_probability = 2.0\nburst_every_s = 1.0\nburst_s = 2.0\n\
         phase_deg = { constant = [1.0], pass_rms = -1.0, drift_time_s = 1.0 }\n\
         tilt_along_deg = { constant_rms = 60.0 }\npattern = { step_rms = 1.0 }\nclock_allan_deviation = 1.0\n\
@@ -247,7 +251,7 @@ fn everything_wrong_with_the_section_is_said() {
 }
 
 #[test]
-fn once_per_orbit_is_a_sine_of_the_given_strength() {
+fn orbital_terms_are_sines_of_the_given_rms() {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let mut config = NavigationConfig::default();
     config.radial_m.orbit_rms = 3.0;
@@ -266,14 +270,14 @@ fn once_per_orbit_is_a_sine_of_the_given_strength() {
             };
             let t_s =
                 |node: usize| segment.start.plus_ticks(node as i64 * i64::from(segment.step_ticks)).seconds();
-            // Two nodes give cosine and sine; all others follow.
+            // Two nodes determine cosine and sine; all others follow.
             let [(s0, c0), (s1, c1)] = [0, 20].map(|node| (rad_per_s * t_s(node)).sin_cos());
             let (e0, e1) = (radial_m(0), radial_m(20));
             let det = c0 * s1 - c1 * s0;
             let (cosine, sine) = ((e0 * s1 - e1 * s0) / det, (c0 * e1 - c1 * e0) / det);
             for node in 0..segment.nodes() {
                 let (s, c) = (rad_per_s * t_s(node)).sin_cos();
-                // Positions of 2e6 m have 2e-10 m in f64; the two nodes are 50 deg apart.
+                // Positions of 2e6 m are rounded to 2e-10 m in f64; the two nodes are 50 deg apart.
                 assert!((radial_m(node) - cosine * c - sine * s).abs() < 1e-7, "{node}");
             }
             (squares, count) = (squares + cosine * cosine + sine * sine, count + 2.0);
@@ -288,7 +292,7 @@ fn time_tags_are_off_by_a_constant_and_a_drift() {
     let mut config = NavigationConfig::default();
     config.time_tag_ms.constant = vec![250.0];
     config.time_tag_ms.rate_per_day = vec![-864.0]; // 10 us/s
-    let pass = led_astray(&config).pass(window(3));
+    let pass = with_navigation_errors(&config).pass(window(3));
     let start = window(3).start;
     let count = 2000_u32;
     let true_block = VisibilityBlock {
@@ -305,7 +309,7 @@ fn time_tags_are_off_by_a_constant_and_a_drift() {
     for k in 0..count as usize {
         let t_s = true_block.middle_s(k);
         let late_s = 0.25 - 1e-5 * t_s;
-        // Half a tick each for the start, the offset and the rate's whole ticks.
+        // The tolerance is half a tick each for the start, the offset and the rate's whole ticks.
         assert!((said.middle_s(k) - t_s - late_s).abs() < 2e-6, "{k}");
     }
     assert_eq!((said.duration_ticks, said.value_k_sr), (true_block.duration_ticks, true_block.value_k_sr));
@@ -316,7 +320,7 @@ fn a_clock_that_is_set_back_keeps_the_order_of_tags() {
     let mut config = NavigationConfig::default();
     config.time_tag_ms.step_rms = 3000.0;
     config.time_tag_ms.step_every_s = 100.0;
-    let pass = led_astray(&config).pass(window(3));
+    let pass = with_navigation_errors(&config).pass(window(3));
     let count = 5000_u32;
     let true_block = VisibilityBlock {
         start: window(3).start,
@@ -334,13 +338,13 @@ fn a_clock_that_is_set_back_keeps_the_order_of_tags() {
     let off =
         (0..count as usize).filter(|&k| (late_s(k) - pass.time_tag_s(true_block.middle_s(k))).abs() > 2e-6);
     assert!((1..count as usize).all(|k| said.middle_s(k) > said.middle_s(k - 1)));
-    // Some twelve of 25 jumps are back, by seconds, which is a few integrations each.
+    // About twelve of 25 jumps are backwards, by seconds, which is a few integrations each.
     assert!(stood > 10 && off.count() < 400, "{stood}");
     assert!((0..count as usize).any(|k| late_s(k) > 1.0) && (0..count as usize).any(|k| late_s(k) < -1.0));
 }
 
 #[test]
-fn everything_wrong_with_navigation_is_said() {
+fn all_invalid_values_of_navigation_are_reported() {
     let text = "along_m = { drift_rms = 1.0 }\nacross_m = { constant = [1.0, 2.0] }\nradial_m = { step_rms = 1.0 }\n\
         time_tag_ms = { constant = [2e4], rate_per_day = [1.0, 1.0], drift_rms = 5.0 }";
     let config: NavigationConfig = toml::from_str(text).unwrap();

@@ -1,15 +1,16 @@
-//! The true errors as a table.
+//! Table of the true errors.
 
 use std::fmt::Write;
 
 use super::InstrumentErrors;
 use crate::frames::ObservingWindow;
 
-/// Comma-separated values, one line a pass, instant (its middle; also start and end if
-/// errors change within a pass), daughter and channel: the natural
-/// logarithm of the gain's amplitude, its phase (deg, -180 to 180, clock included, as in tables of solutions), the clock (ns), the error of the position (m,
-/// along, across and away from the Moon), 1 for a dead receiver, the tilt of the antenna (deg, along the track and away from the
-/// Moon), the distortion of its pattern, the error of the time tags (ms), and the phase without the clock (deg: `instrument.phase_deg`).
+/// Comma-separated values, one line for each pass, instant (its middle; also start and end if errors change within a
+/// pass), daughter and channel: the natural logarithm of the gain's amplitude, its phase (deg, -180 to 180, clock
+/// included, as in tables of solutions), the clock (ns), the error of the position (m, along, across and away from
+/// the Moon), 1 for a dead receiver, the tilt of the antenna (deg, along the track and away from the Moon), the
+/// distortion of its pattern, the error of the time tags (ms), and the phase without the clock (deg:
+/// `instrument.phase_deg`).
 #[must_use]
 pub fn truth_csv(errors: &InstrumentErrors, windows: &[ObservingWindow]) -> String {
     let mut text = String::from(

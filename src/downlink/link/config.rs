@@ -63,7 +63,7 @@ impl LinkConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("downlink.link");
+        let mut checks = Checks::new("downlink.link");
         for (key, value) in [
             ("bit_error_rate", self.bit_error_rate),
             ("burst_bit_error_rate", self.burst_bit_error_rate),

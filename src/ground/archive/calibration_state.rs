@@ -1,4 +1,4 @@
-//! What a checkpoint knows of the calibration of its sums.
+//! State of the calibration in a checkpoint.
 
 use bincode::de::Decoder;
 use bincode::enc::Encoder;
@@ -7,12 +7,10 @@ use bincode::{Decode, Encode};
 
 use crate::ground::PassGateState;
 
-/// The number of the calibration, and what is known of passes.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct CalibrationState {
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
-    /// Passes, where gains are found.
     pub(super) passes: PassGateState,
 }
 
@@ -23,14 +21,12 @@ impl Default for CalibrationState {
 }
 
 impl CalibrationState {
-    /// Whether gains were found for it.
     pub(super) fn is_solved(&self) -> bool {
         self.passes != PassGateState::default()
     }
 }
 
-/// Nothing is written of the first calibration without passes: most states are like that, and are as they were before there
-/// were others.
+/// Writes nothing for the first calibration without passes, so that such checkpoints keep the format from before recalibration.
 impl Encode for CalibrationState {
     fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
         if *self == Self::default() {

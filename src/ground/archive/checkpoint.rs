@@ -1,4 +1,4 @@
-//! Checkpoints, written and read.
+//! Reads and writes checkpoint files.
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter, ErrorKind, Read, Seek, SeekFrom, Write};
@@ -17,37 +17,35 @@ use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA06";
-/// Beginning of the magic in every version.
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of the ground's state, version 06; earlier versions keep less: make a new state by `lunarray \
-                       rebuild`, or replay the files into a new folder";
-/// Bytes of magic, length of the head, and checksum.
+const VERSION: &str = "a checkpoint of version 06; earlier versions lack data: make a new state with `lunarray rebuild`, or \
+replay the files into a new folder";
+/// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
 
-/// Bytes read at a time.
-const PIECE_BYTES: u64 = 1 << 20;
+const CHUNK_BYTES: u64 = 1 << 20;
 
-/// Most memory that a decoded head may take for each of its bytes on disk: of its parts, a record of a packet of
-/// positions needs most, 120 bytes for at least 14.
-const MEMORY_A_BYTE: usize = 16;
+/// Maximum memory of a decoded head per byte on disk. The record of an ephemeris packet needs the most, 120 bytes for at
+/// least 14.
+const MEMORY_PER_BYTE: usize = 16;
 
-/// A checkpoint without its engines: data, and the journal.
+/// The head of a checkpoint: data and the journal, without the sums.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ArchiveHead {
-    /// Keys and values of the settings that shape sums.
+    /// Keys and values of the settings on which the sums depend.
     pub(super) settings: Vec<(String, String)>,
     pub(super) collector: CollectorState,
     pub(super) ephemeris: Vec<EphemerisSegment>,
     pub(super) autos: AutoTable,
     pub(super) accumulator: AccumulatorState,
     pub(super) journal: Journal,
-    /// The first, without passes, if the head ends before it.
+    /// Default if the head ends before it.
     pub(super) calibration: CalibrationState,
-    /// Checksum of the bytes that it was read from: heads of the same bytes are equal, whatever is not a number in them.
+    /// Checksum of the encoded head. Heads with equal bytes are equal even if they contain NaN.
     pub(super) checksum: u64,
 }
 
-/// An [`ArchiveHead`] borrowed for writing: the same fields, without copies of the large ones.
+/// A borrowed [`ArchiveHead`] for writing without copies of large fields.
 #[derive(Encode)]
 pub(super) struct ArchiveHeadView<'a> {
     pub(super) settings: &'a Vec<(String, String)>,
@@ -59,7 +57,6 @@ pub(super) struct ArchiveHeadView<'a> {
     pub(super) calibration: CalibrationState,
 }
 
-/// Forms a checksum of what is written.
 struct ChecksumWriter<'a, W> {
     inner: &'a mut W,
     crc: Digest,
@@ -77,7 +74,7 @@ impl<W: Write> Write for ChecksumWriter<'_, W> {
     }
 }
 
-/// Writes a checkpoint whose engines `engines` writes.
+/// Writes a checkpoint; `engines` writes the sums.
 pub(super) fn write(
     out: &mut impl Write,
     path: &Path,
@@ -97,37 +94,37 @@ pub(super) fn write(
     let mut summed = ChecksumWriter { inner: out, crc: Digest::new(CrcAlgorithm::Crc64Nvme) };
     summed.write_all(MAGIC).map_err(failed())?;
     summed.write_all(&(size.bytes_written as u64).to_le_bytes()).map_err(failed())?;
-    // Many small pieces.
-    let mut pieces = BufWriter::with_capacity(1 << 16, &mut summed);
-    bincode::encode_into_std_write(head, &mut pieces, config).map_err(|error| match error {
+    // The encoder makes many small writes.
+    let mut buffered = BufWriter::with_capacity(1 << 16, &mut summed);
+    bincode::encode_into_std_write(head, &mut buffered, config).map_err(|error| match error {
         EncodeError::Io { inner, .. } => failed()(inner),
         other => refused(other),
     })?;
-    pieces.flush().map_err(failed())?;
-    drop(pieces);
+    buffered.flush().map_err(failed())?;
+    drop(buffered);
     engines(&mut summed)?;
     let crc = summed.crc.finalize();
     out.write_all(&crc.to_le_bytes()).map_err(failed())
 }
 
-/// Whether a checkpoint holds, and has this head.
+/// Whether a checkpoint is intact and has this head.
 pub(super) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
     let found = read(path, |head, engines| {
         std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
         Ok(head.checksum)
     });
     let crc = Digest::new(CrcAlgorithm::Crc64Nvme);
-    let mut nothing = std::io::sink();
-    let mut pieces = BufWriter::with_capacity(1 << 16, ChecksumWriter { inner: &mut nothing, crc });
-    let encoded = bincode::encode_into_std_write(head, &mut pieces, bincode::config::standard());
-    let crc = match pieces.into_inner() {
+    let mut sink = std::io::sink();
+    let mut buffered = BufWriter::with_capacity(1 << 16, ChecksumWriter { inner: &mut sink, crc });
+    let encoded = bincode::encode_into_std_write(head, &mut buffered, bincode::config::standard());
+    let crc = match buffered.into_inner() {
         Ok(summed) => summed.crc,
         Err(_) => return Ok(false),
     };
     Ok(encoded.is_ok() && found.is_ok_and(|found| found == crc.finalize()))
 }
 
-/// Whether a file begins as a checkpoint of any version does.
+/// Whether a file starts like a checkpoint of any version.
 pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
     let mut magic = Vec::new();
     let file = File::open(path).map_err(GroundError::io(path, "open the file"))?;
@@ -135,7 +132,7 @@ pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
     Ok(magic.len() == MAGIC.len() && magic.starts_with(ANY_VERSION))
 }
 
-/// Reads a checkpoint; `rest` makes something of the head and the engines.
+/// Reads a checkpoint; `rest` takes the head and the reader of the sums.
 pub(super) fn read<T>(
     path: &Path,
     rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
@@ -143,18 +140,15 @@ pub(super) fn read<T>(
     read_from(&mut open(path)?, path, rest)
 }
 
-/// Requires that the checksum of a checkpoint holds.
 pub(super) fn verify(path: &Path) -> Result<(), GroundError> {
-    checked_length(&mut open(path)?, path).map(|_| ())
+    verified_length(&mut open(path)?, path).map(|_| ())
 }
 
 fn open(path: &Path) -> Result<File, GroundError> {
     File::open(path).map_err(GroundError::io(path, "open the checkpoint"))
 }
 
-/// Reads a checkpoint from anything; messages call it `path`.
-///
-/// The checksum is verified before anything is decoded.
+/// Reads a checkpoint from any reader, after verifying its checksum. Messages call it `path`.
 pub(super) fn read_from<T>(
     from: &mut (impl Read + Seek),
     path: &Path,
@@ -162,9 +156,9 @@ pub(super) fn read_from<T>(
 ) -> Result<T, GroundError> {
     let failed = || GroundError::io(path, "read");
     let damaged = |found: String, expected| GroundError::Damaged { path: path.to_owned(), found, expected };
-    let bytes = checked_length(from, path)?;
+    let bytes = verified_length(from, path)?;
     from.rewind().map_err(failed())?;
-    let mut from = BufReader::with_capacity(bytes.min(PIECE_BYTES) as usize, from);
+    let mut from = BufReader::with_capacity(bytes.min(CHUNK_BYTES) as usize, from);
     let mut fixed = [0; 16];
     from.read_exact(&mut fixed).map_err(failed())?;
     let (magic, length) = fixed.split_at(8);
@@ -180,27 +174,27 @@ pub(super) fn read_from<T>(
     let (mut head, used) = decode(&encoded).map_err(|error| damaged(error.to_string(), "a head"))?;
     head.checksum = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &encoded);
     if used as u64 != length {
-        return Err(damaged("bytes behind the head".into(), "none"));
+        return Err(damaged("bytes after the head".into(), "none"));
     }
     if !head.collector.is_sound() || !head.journal.is_sound() {
-        return Err(damaged("packets that cannot exist".into(), "packets that were received"));
+        return Err(damaged("invalid packets".into(), "packets that can be received"));
     }
     if !head.calibration.passes.is_sound(head.collector.instrument()) {
-        return Err(damaged("passes that cannot exist".into(), "passes of the instrument"));
+        return Err(damaged("invalid passes".into(), "passes of the instrument"));
     }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
     match engines.limit() {
         0 => Ok(found),
-        left => Err(damaged(format!("{left} bytes behind the engines"), "none")),
+        left => Err(damaged(format!("{left} bytes after the sums"), "none")),
     }
 }
 
-/// A head and its length in bytes. Claimed lengths are limited by the bytes present before memory is reserved: the
-/// decoder's limit is the smallest of its fixed ones that covers them, at most four times as much.
+/// Decodes a head, and returns it with its length in bytes. Memory is limited in proportion to the bytes present, whatever lengths
+/// they claim: by the smallest of a few fixed limits that suffices, at most four times as much.
 fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
-    let most = bytes.len().saturating_mul(MEMORY_A_BYTE);
-    match usize::BITS - most.leading_zeros() {
+    let limit = bytes.len().saturating_mul(MEMORY_PER_BYTE);
+    match usize::BITS - limit.leading_zeros() {
         0..=20 => decode_within::<{ 1 << 20 }>(bytes),
         21..=22 => decode_within::<{ 1 << 22 }>(bytes),
         23..=24 => decode_within::<{ 1 << 24 }>(bytes),
@@ -226,8 +220,8 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize
     Ok((head, used + more))
 }
 
-/// Length of a checkpoint whose checksum holds.
-fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, GroundError> {
+/// Length of a checkpoint, bytes, after verifying its checksum.
+fn verified_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, GroundError> {
     let failed = || GroundError::io(path, "read");
     let damaged = |found: String, expected| GroundError::Damaged { path: path.to_owned(), found, expected };
     let bytes = from.seek(SeekFrom::End(0)).map_err(failed())?;
@@ -237,7 +231,7 @@ fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, Gro
     from.rewind().map_err(failed())?;
     let mut body = from.by_ref().take(bytes - 8);
     let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
-    let mut chunk = vec![0; bytes.min(PIECE_BYTES) as usize];
+    let mut chunk = vec![0; bytes.min(CHUNK_BYTES) as usize];
     loop {
         match body.read(&mut chunk) {
             Ok(0) => break,
@@ -250,7 +244,7 @@ fn checked_length(from: &mut (impl Read + Seek), path: &Path) -> Result<u64, Gro
     from.read_exact(&mut stored).map_err(failed())?;
     let found = crc.finalize();
     if found != u64::from_le_bytes(stored) {
-        return Err(damaged(format!("checksum {found:016x}"), "the checksum that it was written with"));
+        return Err(damaged(format!("checksum {found:016x}"), "the checksum in the file"));
     }
     Ok(bytes)
 }
@@ -277,7 +271,7 @@ mod tests {
     use crate::runtime::{Ledger, Outlet, Stage};
     use crate::units::MissionTime;
 
-    /// Every part of a head has something in it.
+    /// Calls `take` with a head whose parts are all non-empty.
     fn with_head<T>(take: impl FnOnce(&ArchiveHeadView<'_>) -> T) -> T {
         let channels = vec![Channel { frequency_hz: 3e6, width_hz: 8e3 }];
         let instrument = Instrument {
@@ -309,7 +303,7 @@ mod tests {
             GroundFrame::Housekeeping(Housekeeping { time: MissionTime(5), sampled: 9, dropped: 1 }),
         ];
         let ledger = Ledger::new();
-        ledger.left_out(VisibilityReason::BaselineBeyondMap, 4);
+        ledger.add_left_out(VisibilityReason::BaselineBeyondMap, 4);
         let mut accumulator = Accumulator::new(Default::default(), ledger.clone());
         let mut calibrator = Calibrator::new(Box::new(Identity), ledger.clone()).with_autos();
         let mut collector = Collector::new(1000);
@@ -326,7 +320,7 @@ mod tests {
         let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
-        let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
+        let packet = DeliveredPacket { header, checksum: 1, counts: PacketReading::default() };
         journal.record_visibilities(&packet, RecordDraft::default(), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
         take(&ArchiveHeadView {
@@ -357,7 +351,7 @@ mod tests {
         })
     }
 
-    /// Where each field stands, in the order in which they are written.
+    /// The byte range of each field, in the order of writing.
     fn fields(head: &ArchiveHeadView<'_>, bytes: usize) -> Vec<(&'static str, Range<usize>)> {
         let length = |size: Result<Vec<u8>, EncodeError>| size.unwrap().len();
         let config = bincode::config::standard();
@@ -405,14 +399,14 @@ mod tests {
             let good = written(head);
             for (_, range) in fields(head, good.len()) {
                 for at in range.filter(|at| *at < good.len() - 8) {
-                    // Lengths grow by most where 0xFD announces eight bytes of one.
+                    // 0xFD announces a length of eight bytes, which gives the largest lengths.
                     for forged in [0xFD, 0xFC, 0x00] {
                         let mut bad = good.clone();
                         bad[at] = forged;
                         let body = bad.len() - 8;
                         let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &bad[..body]);
                         bad[body..].copy_from_slice(&crc.to_le_bytes());
-                        // A checksum that holds: no panic, whatever it says.
+                        // With a valid checksum there must be no panic.
                         let _ = read_back(&bad);
                     }
                 }
@@ -422,8 +416,8 @@ mod tests {
 
     #[test]
     fn announced_lengths_reserve_no_more_than_the_bytes_there_allow() {
-        // A list of settings that announces as many as 4 GiB of memory hold, in heads of 60 bytes and of a megabyte;
-        // the same that they really may be is read on, to where the bytes end.
+        // A list of settings that announces 4 GiB of memory, or just more than the limit, in heads of 60 bytes and of a
+        // megabyte, is refused. Just below the limit, decoding fails only at the end of the bytes.
         let settings = size_of::<(String, String)>() as u64;
         for (bytes, limit) in [(60, 1 << 20), (1 << 20, 1 << 26)] {
             for (announced, is_refused) in [

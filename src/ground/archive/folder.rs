@@ -1,8 +1,8 @@
-//! The folder of an archive: numbered checkpoints; the newest two are kept. Room for three lets both stay until
-//! another is whole; room for two is enough.
+//! The folder of an archive, with numbered checkpoints of which the newest two are kept. With disk space for three, both stay
+//! until the next is complete; space for two is enough.
 //!
-//! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream, and nobody waits for the
-//! others: a checkpoint counts once all its parts are there, and an older one goes once there are two newer ones.
+//! Ranks of a job share a folder. Each writes its part of every checkpoint at the same place of the stream without waiting for the
+//! others. A checkpoint is complete once all its parts exist, and removed once there are two newer ones.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,18 +16,17 @@ use crate::ground::GroundError;
 use crate::imaging::anywhere::ArchiveSegment;
 use crate::ranks::Ranks;
 
-/// Checkpoints that are kept.
 const KEPT: usize = 2;
 
 /// A folder that one process, or one job of ranks, uses at a time.
 #[derive(Debug)]
 pub(super) struct StateFolder {
     path: PathBuf,
-    /// Its checkpoints, oldest first.
-    held: Vec<CheckpointSet>,
-    /// The segments that checkpoints name, of those checkpoints that this process has read or written.
+    /// The checkpoints in the folder, oldest first.
+    checkpoints: Vec<CheckpointSet>,
+    /// The segment files of each checkpoint that this process has read or written.
     segments: BTreeMap<u64, Vec<ArchiveSegment>>,
-    /// Only the first rank has it.
+    /// Held by the first rank only.
     lock: Option<FolderLock>,
     ranks: Ranks,
 }
@@ -35,77 +34,74 @@ pub(super) struct StateFolder {
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
     pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
-        Self::open_with_ranks(path, &Ranks::one())
+        Self::open_with_ranks(path, &Ranks::single())
     }
 
-    /// As [`StateFolder::open`], together with the other ranks.
+    /// Like [`StateFolder::open`], together with the other ranks.
     pub(super) fn open_with_ranks(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
         let lock = ranks.is_first().then(|| FolderLock::acquire(path, LOCK, false)).transpose();
         let lock = lock.map_err(|error| match error.kind() {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
             _ => GroundError::io(path, "lock the folder")(error),
         })?;
-        Self::of_locked(path, ranks, lock)
+        Self::new(path, ranks, lock)
     }
 
-    /// Opens a folder to read it. One on a read-only file system, which nobody can change, needs no lock.
+    /// Opens a folder to read it. A folder on a read-only file system cannot change and needs no lock.
     pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
         match Self::open(path) {
             Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
-                Self::of_locked(path, &Ranks::one(), None)
+                Self::new(path, &Ranks::single(), None)
             }
             opened => opened,
         }
     }
 
-    fn of_locked(path: &Path, ranks: &Ranks, lock: Option<FolderLock>) -> Result<Self, GroundError> {
+    fn new(path: &Path, ranks: &Ranks, lock: Option<FolderLock>) -> Result<Self, GroundError> {
         if ranks.is_first() && lock.is_some() {
             let [_, unfinished] = numbered(path)?;
-            // What a job left that was ended meanwhile must not become whole by parts of another.
+            // Parts left by an interrupted job must not be completed by parts of another.
             for set in unfinished {
                 set.remove(path);
             }
         }
-        // None of them looks before it is clean, and locked.
+        // Ranks read the folder only after it is cleaned and locked.
         let _ = ranks.all(true);
         if !ranks.is_first() && !path.join(LOCK).is_file() {
             return Err(GroundError::NotShared { path: path.to_owned() });
         }
-        let [held, _] = numbered(path)?;
-        Ok(Self { path: path.to_owned(), held, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
+        let [checkpoints, _] = numbered(path)?;
+        Ok(Self { path: path.to_owned(), checkpoints, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
     }
 
-    /// Where it is.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Number of the newest checkpoint, and of all of them.
     pub(super) fn newest(&self) -> Option<u64> {
-        self.held.last().map(|newest| newest.number)
+        self.checkpoints.last().map(|newest| newest.number)
     }
 
     pub(super) fn numbers(&self) -> Vec<u64> {
-        self.held.iter().map(|held| held.number).collect()
+        self.checkpoints.iter().map(|checkpoint| checkpoint.number).collect()
     }
 
-    /// The ranks that share it.
     pub(super) fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// The newest usable checkpoint, read by `read`, or `None` if there is none; and notes on newer ones that
-    /// are damaged, which are renamed if `sets_aside`. `read` gets the first of its files.
+    /// Reads the newest usable checkpoint with `read`, which gets the first of its files; `None` if there is no checkpoint.
     ///
-    /// A checkpoint that the system does not let us read may well hold: that is an error, and changes nothing.
+    /// Also returns notes on newer checkpoints that are damaged; these are renamed if `renames_damaged`. A checkpoint
+    /// that the system cannot read may be intact, so that this is an error and changes nothing.
     pub(super) fn load<T>(
         &mut self,
-        sets_aside: bool,
+        renames_damaged: bool,
         read: impl Fn(&Path) -> Result<T, GroundError>,
     ) -> Result<(Option<T>, Vec<String>), GroundError> {
         let mut bad: Vec<(CheckpointSet, GroundError)> = Vec::new();
         let mut found = None;
-        for (index, checkpoint) in self.held.iter().enumerate().rev() {
+        for (index, checkpoint) in self.checkpoints.iter().enumerate().rev() {
             match read(&checkpoint.path(&self.path, 0)) {
                 Ok(read) => {
                     found = Some((index, read));
@@ -115,10 +111,10 @@ impl StateFolder {
                 Err(error) => return Err(error),
             }
         }
-        let used = found.as_ref().and_then(|(index, _)| self.held.get(*index)).copied();
-        // Others may be reading what is to be renamed.
+        let used = found.as_ref().and_then(|(index, _)| self.checkpoints.get(*index)).copied();
+        // Other ranks may still be reading files that are about to be renamed.
         let chosen = used.map_or([0; 2], |used| [used.number as i64, used.parts as i64]);
-        if !self.ranks.agree(&chosen) {
+        if !self.ranks.have_equal(&chosen) {
             return Err(GroundError::NotShared { path: self.path.clone() });
         }
         let Some((index, read)) = found else {
@@ -127,46 +123,49 @@ impl StateFolder {
                 None => Ok((None, Vec::new())),
                 Some((_, newest)) => {
                     let (path, newest) = (self.path.clone(), Box::new(newest));
-                    Err(GroundError::NoneHolds { path, checkpoints, newest })
+                    Err(GroundError::NoUsableCheckpoint { path, checkpoints, newest })
                 }
             };
         };
-        if sets_aside && self.ranks.is_first() {
-            bad.iter().try_for_each(|(checkpoint, _)| self.set_aside(*checkpoint))?;
+        if renames_damaged && self.ranks.is_first() {
+            bad.iter().try_for_each(|(checkpoint, _)| self.rename_damaged(*checkpoint))?;
         }
-        // Nobody writes before that.
+        // Ranks write only after the renaming.
         let _ = self.ranks.all(true);
-        self.held.truncate(index + 1);
+        self.checkpoints.truncate(index + 1);
         let path = used.map_or_else(PathBuf::new, |used| used.path(&self.path, 0));
         Ok((Some(read), bad.iter().map(|(_, error)| note(error, &path)).collect()))
     }
 
-    fn set_aside(&self, checkpoint: CheckpointSet) -> Result<(), GroundError> {
+    fn rename_damaged(&self, checkpoint: CheckpointSet) -> Result<(), GroundError> {
         for path in checkpoint.paths(&self.path) {
-            let mut aside = path.clone().into_os_string();
-            aside.push(".damaged");
-            fs::rename(&path, aside).map_err(GroundError::io(&path, "rename"))?;
+            let mut renamed = path.clone().into_os_string();
+            renamed.push(".damaged");
+            fs::rename(&path, renamed).map_err(GroundError::io(&path, "rename"))?;
         }
         Ok(())
     }
 
-    /// Where the next checkpoint will be, and its number.
     pub(super) fn next(&self) -> (PathBuf, u64) {
-        (self.path.clone(), self.held.last().map_or(1, |newest| newest.number + 1))
+        (self.path.clone(), self.checkpoints.last().map_or(1, |newest| newest.number + 1))
     }
 
-    /// Says which segments the newest checkpoint names.
-    pub(super) fn names<'a>(&mut self, segments: impl Iterator<Item = &'a ArchiveSegment>) {
-        if let Some(newest) = self.held.last() {
+    /// Notes the segment files of the newest checkpoint.
+    pub(super) fn set_segments<'a>(&mut self, segments: impl Iterator<Item = &'a ArchiveSegment>) {
+        if let Some(newest) = self.checkpoints.last() {
             self.segments.insert(newest.number, segments.copied().collect());
         }
     }
 
-    /// Removes segments that no checkpoint names, of older ones or of one that was never finished, once it is known what all of them
-    /// name. One that stays takes room and does no harm. Ranks have none.
+    /// Removes segment files that no checkpoint names, once the segments of all checkpoints are known. A file that cannot be removed
+    /// only takes space. Ranks have no segments.
     pub(super) fn remove_unnamed(&mut self) {
-        self.segments.retain(|number, _| self.held.iter().any(|held| held.number == *number));
-        if self.segments.len() < self.held.len() || self.check_place().is_err() || self.ranks.are_many() {
+        self.segments
+            .retain(|number, _| self.checkpoints.iter().any(|checkpoint| checkpoint.number == *number));
+        if self.segments.len() < self.checkpoints.len()
+            || self.require_same_folder().is_err()
+            || self.ranks.is_distributed()
+        {
             return;
         }
         let named = || self.segments.values().flatten().flat_map(ArchiveSegment::file_names);
@@ -179,19 +178,20 @@ impl StateFolder {
         }
     }
 
-    /// Writes a checkpoint, or this rank's part of one, whole or not at all, and removes all but the newest two. If there is no room
-    /// for a third, the older of the two gives way, once the newer one has been found to hold; not to a part.
+    /// Writes a checkpoint, or this rank's part of one, atomically, and removes all but the newest two.
+    ///
+    /// A single process that has no disk space for a third deletes the older one first, after verifying the newer one.
     pub(super) fn save(
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
-        self.check_place()?;
-        let saved = self.save_here(&mut write);
-        // What fails because the folder has gone is to be told as that.
-        saved.or_else(|error| self.check_place().and(Err(error)))
+        self.require_same_folder()?;
+        let saved = self.save_in_folder(&mut write);
+        // If the folder has been moved or deleted, report that as the cause.
+        saved.or_else(|error| self.require_same_folder().and(Err(error)))
     }
 
-    fn save_here(
+    fn save_in_folder(
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
@@ -203,14 +203,16 @@ impl StateFolder {
             return Err(GroundError::CheckpointName { path: greatest.path(&self.path, 0) });
         }
         match self.write(&path, &mut write) {
-            Err(error) if is_out_of_room(&error) && self.held.len() > 1 && !self.ranks.are_many() => {
+            Err(error)
+                if is_out_of_room(&error) && self.checkpoints.len() > 1 && !self.ranks.is_distributed() =>
+            {
                 self.drop_older()?;
                 self.write(&path, &mut write)?;
             }
             written => written?,
         }
-        self.held.push(next);
-        match self.ranks.are_many() {
+        self.checkpoints.push(next);
+        match self.ranks.is_distributed() {
             true => self.remove_superseded(),
             false => self.remove_all_but(KEPT),
         }
@@ -225,13 +227,13 @@ impl StateFolder {
         let file = AtomicFile::create(path, IfUnfinished::Remove);
         let mut file = file.map_err(GroundError::io(path, "create the file"))?;
         write(&mut file, path)?;
-        self.check_place()?;
+        self.require_same_folder()?;
         file.finish().map_err(GroundError::io(path, "finish the file")).map(|_| ())
     }
 
-    /// Removes all checkpoints but the newest. If that is damaged, it is an error, and nothing is removed.
+    /// Removes all checkpoints except the newest. If the newest is damaged, this is an error and nothing is removed.
     pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
-        if let Some(newest) = self.held.last().copied() {
+        if let Some(newest) = self.checkpoints.last().copied() {
             newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;
             for segment in self.segments.get(&newest.number).into_iter().flatten() {
                 segment.verify(&self.path)?;
@@ -242,60 +244,58 @@ impl StateFolder {
         Ok(())
     }
 
-    /// Checks that the path still leads to the folder that was locked: another process may use the folder that is there now.
-    fn check_place(&self) -> Result<(), GroundError> {
+    /// Checks that the path still leads to the locked folder, as another process may use a folder that replaced it.
+    fn require_same_folder(&self) -> Result<(), GroundError> {
         match self.lock.as_ref().and_then(FolderLock::lost) {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }
     }
 
-    /// Removes all checkpoints but the newest ones. One that stays takes room and does no harm: the next time again.
-    fn remove_all_but(&mut self, most: usize) {
-        let oldest = self.held.len().saturating_sub(most);
+    /// Removes all checkpoints except the newest ones. A file that cannot be removed only takes space, and is tried again next time.
+    fn remove_all_but(&mut self, kept: usize) {
+        let oldest = self.checkpoints.len().saturating_sub(kept);
         let (path, mut index) = (&self.path, 0);
-        self.held.retain(|checkpoint| {
+        self.checkpoints.retain(|checkpoint| {
             index += 1;
             index > oldest || !checkpoint.remove(path)
         });
     }
 
-    /// Removes what all ranks have written two newer ones of: this rank its own part, the first one also those of other jobs. What
-    /// stays takes room and does no harm.
+    /// Removes checkpoints that are older than two complete ones. Each rank removes its own part; the first also removes
+    /// parts of other jobs. A file that cannot be removed only takes space.
     fn remove_superseded(&mut self) {
         let Ok([whole, _]) = numbered(&self.path) else { return };
         let Some(oldest) = whole.iter().rev().nth(KEPT - 1).map(|kept| kept.number) else { return };
         let share = self.ranks.share();
         let path = &self.path;
-        self.held.retain(|held| {
-            if held.number >= oldest {
+        self.checkpoints.retain(|checkpoint| {
+            if checkpoint.number >= oldest {
                 return true;
             }
-            if held.parts == share.count {
-                let _ = fs::remove_file(held.path(path, share.rank));
+            if checkpoint.parts == share.count {
+                let _ = fs::remove_file(checkpoint.path(path, share.rank));
             } else if share.rank == 0 {
-                held.remove(path);
+                checkpoint.remove(path);
             }
             false
         });
     }
 }
 
-/// Name of the lock of a folder.
 const LOCK: &str = "lock";
 
-/// A note on a checkpoint that cannot be used when an older one is.
+/// The note on a damaged checkpoint in place of which an older one is used.
 pub(super) fn note(error: &GroundError, used: &Path) -> String {
     format!("{error}; resuming from the previous checkpoint, {}", used.display())
 }
 
-/// The checkpoints in a folder, oldest first: the first file of each.
+/// The first file of each checkpoint in a folder, oldest first.
 pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
     let [whole, _] = numbered(folder)?;
     Ok(whole.into_iter().map(|checkpoint| checkpoint.path(folder, 0)).collect())
 }
 
-/// Whether the disk or a quota is full.
 fn is_out_of_room(error: &GroundError) -> bool {
     use ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error, GroundError::Io { source, .. }
@@ -312,23 +312,23 @@ mod tests {
         GroundError::io(path, "write")(io::Error::from(ErrorKind::StorageFull))
     }
 
-    /// A checkpoint of no ground, whose checksum holds.
-    fn sealed(text: &str) -> Vec<u8> {
-        let mut bytes = format!("{text:>32}").into_bytes();
+    /// A file with the checksum of a checkpoint.
+    fn sealed(content: &str) -> Vec<u8> {
+        let mut bytes = format!("{content:>32}").into_bytes();
         let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes);
         bytes.extend(crc.to_le_bytes());
         bytes
     }
 
-    fn save(folder: &mut StateFolder, text: &str) -> Result<(), GroundError> {
-        folder.save(|file, path| file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")))
+    fn save(folder: &mut StateFolder, content: &str) -> Result<(), GroundError> {
+        folder.save(|file, path| file.write_all(&sealed(content)).map_err(GroundError::io(path, "write")))
     }
 
-    /// As [`save`], on a disk with room for this number of checkpoints.
-    fn save_in(folder: &mut StateFolder, room: usize, text: &str) -> Result<(), GroundError> {
+    /// Like [`save`], on a disk with space for this number of checkpoints.
+    fn save_in(folder: &mut StateFolder, room: usize, content: &str) -> Result<(), GroundError> {
         let place = folder.path.clone();
         folder.save(|file, path| match checkpoints(&place)?.len() < room {
-            true => file.write_all(&sealed(text)).map_err(GroundError::io(path, "write")),
+            true => file.write_all(&sealed(content)).map_err(GroundError::io(path, "write")),
             false => Err(full(path)),
         })
     }
@@ -357,11 +357,11 @@ mod tests {
         for (number, room) in [(1, 3), (2, 3), (3, 3), (4, 2), (5, 2)] {
             save_in(&mut folder, room, &number.to_string()).unwrap();
             assert_eq!(fs::read(name(&folder, number)).unwrap(), sealed(&number.to_string()));
-            // Both stay where there is room for a third.
+            // Both stay if there is space for a third.
             let kept = if room == 3 { number.min(2) } else { 2 };
             assert_eq!(checkpoints(place.path()).unwrap().len() as u64, kept);
         }
-        // Without room for a second, nothing is lost.
+        // Without space for a second, nothing is lost.
         assert!(is_out_of_room(&save_in(&mut folder, 1, "6").unwrap_err()));
         assert_eq!(names(place.path()), ["checkpoint-00000005.lunarray"]);
         save(&mut folder, "7").unwrap();
@@ -372,7 +372,7 @@ mod tests {
     fn the_older_checkpoint_gives_way_only_to_one_that_holds() {
         let place = tempfile::tempdir().unwrap();
         let mut folder = StateFolder::open(place.path()).unwrap();
-        ["1", "2"].iter().for_each(|text| save(&mut folder, text).unwrap());
+        ["1", "2"].iter().for_each(|content| save(&mut folder, content).unwrap());
         fs::write(name(&folder, 2), b"damaged, and more than twenty-four bytes").unwrap();
         assert!(matches!(save_in(&mut folder, 2, "3"), Err(GroundError::Damaged { .. })));
         assert_eq!(names(place.path()), [1, 2].map(file_name));
@@ -416,13 +416,12 @@ mod tests {
         fs::write(place.path().join(file_name(NUMBER_MAX)), sealed("")).unwrap();
         let mut folder = StateFolder::open(place.path()).unwrap();
         assert!(matches!(save(&mut folder, ""), Err(GroundError::CheckpointName { .. })));
-        // Other files are nobody's business.
         let place = tempfile::tempdir().unwrap();
         for name in
             ["notes.txt", "checkpoint-00000001.lunarray.damaged", "checkpoint-00000002.lunarray.partial"]
         {
             fs::write(place.path().join(name), b"x").unwrap();
         }
-        assert!(StateFolder::open(place.path()).unwrap().held.is_empty());
+        assert!(StateFolder::open(place.path()).unwrap().checkpoints.is_empty());
     }
 }

@@ -1,4 +1,4 @@
-//! A gap, and the packets that it is estimated from.
+//! Report on a gap, and the packets from which its content is estimated.
 
 use std::ops::Range;
 
@@ -8,17 +8,17 @@ use super::entry::JournalEntry;
 use crate::downlink::Kind;
 use crate::units::{ChannelId, Pair};
 
-/// Channel and pair: each sends its packets in turn, pass by pass.
+/// Channel and pair of a stream of packets. In each window the streams are sent one after another.
 pub(super) type Stream = (ChannelId, Pair);
 
-/// A packet of visibilities.
+/// A received packet of visibilities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisibilityPacket {
-    /// Its content.
+    /// Summary of its content.
     pub entry: JournalEntry,
-    /// Whether its positions are missing.
-    pub waits: bool,
-    /// Share of its placed visibilities that are in the map; `None` if it is not known.
+    /// Whether the ephemeris does not cover it.
+    pub is_waiting: bool,
+    /// Fraction of its visibilities offered to the sums that were accumulated; `None` if unknown.
     pub share: Option<f64>,
 }
 
@@ -27,37 +27,37 @@ impl VisibilityPacket {
         (self.entry.channel, self.entry.pair)
     }
 
-    /// Whether it holds auto-correlations, which are in no map.
+    /// Whether it holds auto-correlations, which are not mapped.
     pub(super) fn is_auto(&self) -> bool {
         self.entry.pair.i == self.entry.pair.j
     }
 }
 
-/// An estimate of what the missing packets of one channel and pair held; or held packets that wait for missing positions.
+/// Estimated content of the missing packets of one channel and pair, or packets that wait for a missing ephemeris.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LostStream {
     /// Channel, from 0.
     pub channel: u16,
     /// Pair, as in "1-2".
     pub pair: String,
-    /// Packets.
+    /// Number of packets.
     pub packets: u64,
-    /// Integration time in them, s.
+    /// Integration time in the packets, s.
     pub integration_s: f64,
-    /// Sum of their weights in the map, (K sr)^-2.
+    /// Sum of the weights in the map, (K sr)^-2.
     pub weight: f64,
 }
 
 impl LostStream {
-    pub(super) fn nothing((channel, pair): Stream) -> Self {
+    pub(super) fn empty((channel, pair): Stream) -> Self {
         Self { channel: channel.0, pair: pair.to_string(), packets: 0, integration_s: 0.0, weight: 0.0 }
     }
 }
 
-/// A run of missing packets, to be requested again.
+/// A range of missing packets, to be requested again.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapReport {
-    /// Kind.
+    /// Kind of the packets.
     pub kind: Kind,
     /// Application process identifier.
     pub apid: u16,
@@ -65,14 +65,14 @@ pub struct GapReport {
     pub from: u64,
     /// Count of the last missing packet.
     pub to: u64,
-    /// Mission time of the last visibility before it and the first after it, s, if there are any.
+    /// Mission times of the last visibility before and the first after the gap, s; `None` if there is none.
     pub between_s: [Option<f64>; 2],
-    /// Integration time in it, s, over all channels and pairs.
+    /// Integration time in the gap, s, over all channels and pairs.
     pub integration_s: f64,
-    /// Its weight over that in the map of the same channel, in the mean over all channels; 1 for a channel of
-    /// which the map has nothing.
+    /// Weight relative to the weight in the map of the same channel, averaged over all channels; 1 for a channel without
+    /// data in the map.
     pub gain: f64,
-    /// By channel and pair: missing visibilities, or those that wait for missing positions.
+    /// Missing visibilities, or those that wait for a missing ephemeris, by channel and pair.
     pub lost: Vec<LostStream>,
 }
 

@@ -1,4 +1,4 @@
-//! What is missing, in packets and in what they would add to the map.
+//! Finds missing packets, and estimates what they would add to the map.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -10,49 +10,49 @@ use super::packet_order::{PacketStreams, SendingOrder, windows_of};
 use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
 use crate::units::MissionTime;
 
-/// What has been received, as input to [`find_gaps`].
+/// The received packets, as input to [`find_gaps`].
 #[derive(Clone, Debug, Default)]
 pub struct ReceivedPackets {
     /// Every packet of visibilities that was decoded, in the order of sending.
-    pub readings: Vec<VisibilityPacket>,
-    /// Every packet of positions that was decoded, in the order of sending.
-    pub positions: Vec<PositionsPacket>,
-    /// Packets received, by kind.
+    pub packets: Vec<VisibilityPacket>,
+    /// Every ephemeris packet that was decoded, in the order of sending.
+    pub ephemerides: Vec<EphemerisPacket>,
+    /// Received sets by kind.
     pub sets: Vec<(Kind, ReceivedSet)>,
     /// Frequencies of the instrument's channels, Hz.
     pub frequencies_hz: Vec<f64>,
 }
 
-/// A packet of positions.
+/// A received ephemeris packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PositionsPacket {
+pub struct EphemerisPacket {
     /// Count of the packet.
     pub count: u64,
     /// Time at which the packet was made.
     pub made: CucTime,
-    /// First and last instant of the positions.
+    /// First and last instant of the ephemeris.
     pub span: [MissionTime; 2],
 }
 
-/// A restart of the spacecraft's counts.
+/// A restart of the packet counts of the spacecraft.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RestartReport {
-    /// Kind.
+    /// Kind of the packets.
     pub kind: Kind,
     /// Application process identifier.
     pub apid: u16,
-    /// Count of the last packet received before it. What was sent after that one is not known.
+    /// Count of the last packet received before the restart. Whether more were sent is unknown.
     pub last: u64,
 }
 
-/// What has been received of one channel; of pairs of two daughters.
+/// Cross-correlations of one channel that were received.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ChannelCoverage {
     /// Channel, from 0.
     pub channel: u16,
-    /// Its frequency, Hz, once the instrument is known.
+    /// Frequency, Hz; `None` if the instrument is unknown.
     pub frequency_hz: Option<f64>,
-    /// Packets received.
+    /// Number of packets received.
     pub packets: u64,
     /// Integration time received, s, over all pairs.
     pub integration_s: f64,
@@ -64,23 +64,22 @@ pub struct ChannelCoverage {
     pub missing_weight: f64,
 }
 
-/// All that is missing.
+/// All gaps in the received packets.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Gaps {
     /// The instrument's channels, with or without data.
     pub channels: Vec<ChannelCoverage>,
-    /// Gaps: the one whose recovery adds most first.
+    /// Gaps, with the largest gain first.
     pub gaps: Vec<GapReport>,
-    /// Restarts of the spacecraft's counts.
+    /// Restarts of the packet counts of the spacecraft.
     pub restarts: Vec<RestartReport>,
 }
 
-/// Finds what is missing between the packets received.
+/// Finds the packets missing between received ones, and estimates their content.
 ///
-/// Of every window, channel after channel and pair after pair is sent, each in as many packets as it takes. A gap is filled with
-/// packets like those of a whole window near it that fits the gap's number of packets best, from the place of the packet before it to
-/// that of the packet after it. Missing positions are worth
-/// the visibilities that wait between the positions on either side. What was sent after the last packet received is not
+/// Every window is sent channel by channel and pair by pair, each in as many packets as needed. The content of a gap is modelled by
+/// the packets of a nearby complete window that fits its number of packets best, from the packet before the gap to the packet after
+/// it. Missing ephemeris packets count as the visibilities that wait for them. Packets after the last one received are not
 /// known to be missing.
 #[must_use]
 pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
@@ -128,24 +127,24 @@ fn gaps_of_era(
     if era.missing.is_empty() {
         return Vec::new();
     }
-    let visibilities = received.readings.iter().filter(|reading| in_era(reading.entry.made));
-    let schedule = SendingOrder::learn(match kind {
+    let visibilities = received.packets.iter().filter(|packet| in_era(packet.entry.made));
+    let schedule = SendingOrder::new(match kind {
         Kind::Visibilities => visibilities.copied().collect(),
         _ => Vec::new(),
     });
-    let mut positions: Vec<PositionsPacket> = match kind {
-        Kind::Ephemeris => received.positions.iter().filter(|known| in_era(known.made)).copied().collect(),
+    let mut positions: Vec<EphemerisPacket> = match kind {
+        Kind::Ephemeris => received.ephemerides.iter().filter(|known| in_era(known.made)).copied().collect(),
         _ => Vec::new(),
     };
     positions.sort_by_key(|known| known.count);
     let report = |gap: &Range<u64>| match kind {
-        Kind::Ephemeris => positions_missing(&received.readings, &positions, &era.missing, gap),
+        Kind::Ephemeris => missing_ephemeris(&received.packets, &positions, &era.missing, gap),
         _ => schedule.report(kind, gap),
     };
     era.missing.iter().map(report).collect()
 }
 
-/// What was received of each of the instrument's channels.
+/// Sums the received visibilities by channel.
 fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
     let frequencies = received.frequencies_hz.iter().zip(0..);
     let mut channels: BTreeMap<u16, ChannelCoverage> = frequencies
@@ -153,56 +152,56 @@ fn coverage(received: &ReceivedPackets) -> BTreeMap<u16, ChannelCoverage> {
             (channel, ChannelCoverage { channel, frequency_hz: Some(hz), ..ChannelCoverage::default() })
         })
         .collect();
-    for VisibilityPacket { entry, waits, share } in
-        received.readings.iter().filter(|reading| !reading.is_auto())
+    for VisibilityPacket { entry, is_waiting, share } in
+        received.packets.iter().filter(|packet| !packet.is_auto())
     {
         let channel = entry.channel.0;
         let new = || ChannelCoverage { channel, ..ChannelCoverage::default() };
         let coverage = channels.entry(channel).or_insert_with(new);
         coverage.packets += 1;
         coverage.integration_s += entry.integration_s;
-        coverage.weight += if *waits { 0.0 } else { entry.weight * share.unwrap_or(1.0) };
+        coverage.weight += if *is_waiting { 0.0 } else { entry.weight * share.unwrap_or(1.0) };
     }
     channels
 }
 
-/// The visibilities that wait for positions in missing packets, of the windows that these packets are of.
+/// Sums the visibilities that wait for the ephemeris in missing packets.
 ///
-/// There may be several windows between the last positions before and the next received, each of some packets; others of these may be
-/// missing, too, or be held as parts. The windows of the visibilities that wait, in the order of time, are taken to share the packets
-/// between in equal parts; what waits for a window counts for the missing packets of it, together once.
-fn positions_missing(
-    readings: &[VisibilityPacket],
-    positions: &[PositionsPacket],
+/// Several windows may lie between the ephemeris packets received before and after the gap, each with several packets. The windows of
+/// the waiting visibilities, in the order of time, are assumed to have equal numbers of these packets. The visibilities of a window
+/// count once, divided among its missing packets.
+fn missing_ephemeris(
+    packets: &[VisibilityPacket],
+    positions: &[EphemerisPacket],
     missing: &[Range<u64>],
     gap: &Range<u64>,
 ) -> GapReport {
     let next = positions.partition_point(|known| known.count < gap.start);
     let before = next.checked_sub(1).map(|at| positions[at]);
-    // What follows may be a repeat of what came before.
-    let is_later = |known: &&PositionsPacket| before.is_none_or(|before| known.span[0] > before.span[0]);
+    // The next packet may repeat an earlier one.
+    let is_later = |known: &&EphemerisPacket| before.is_none_or(|before| known.span[0] > before.span[0]);
     let after = positions[next..].iter().find(is_later);
-    let waits = |reading: &&VisibilityPacket| {
-        let entry = &reading.entry;
-        reading.waits
+    let waits_for_gap = |packet: &&VisibilityPacket| {
+        let entry = &packet.entry;
+        packet.is_waiting
             && before.is_none_or(|before| entry.end > before.span[0])
             && after.is_none_or(|after| entry.start < after.span[0])
     };
-    let mut waiting: Vec<&VisibilityPacket> = readings.iter().filter(waits).collect();
-    waiting.sort_by_key(|reading| reading.entry.start);
+    let mut waiting: Vec<&VisibilityPacket> = packets.iter().filter(waits_for_gap).collect();
+    waiting.sort_by_key(|packet| packet.entry.start);
     let windows = windows_of(&waiting);
     let first = before.map_or(0, |before| before.count + 1);
     let hole = first..after.map_or(gap.end, |after| after.count).max(gap.end);
-    let shares = shares_of(gap, missing, &hole, windows.len());
-    let streams = PacketStreams::of(readings.iter().filter(|reading| reading.share.is_some()).copied());
+    let shares = loss_fractions(gap, missing, &hole, windows.len());
+    let streams = PacketStreams::new(packets.iter().filter(|packet| packet.share.is_some()).copied());
     let mut lost: BTreeMap<Stream, LostStream> = BTreeMap::new();
     for (window, share) in windows.into_iter().zip(shares).filter(|(_, share)| *share > 0.0) {
-        for reading in &waiting[window] {
-            let stream = reading.stream();
-            let sum = lost.entry(stream).or_insert_with(|| LostStream::nothing(stream));
+        for packet in &waiting[window] {
+            let stream = packet.stream();
+            let sum = lost.entry(stream).or_insert_with(|| LostStream::empty(stream));
             sum.packets += 1;
-            sum.integration_s += share * reading.entry.integration_s;
-            sum.weight += share * reading.entry.weight * streams.share(stream, reading.entry.sent());
+            sum.integration_s += share * packet.entry.integration_s;
+            sum.weight += share * packet.entry.weight * streams.share(stream, packet.entry.sent());
         }
     }
     let [before_s, after_s] = [before.map(|before| before.span[1]), after.map(|after| after.span[0])];
@@ -210,9 +209,9 @@ fn positions_missing(
     GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
 }
 
-/// Share of each window's loss that a gap accounts for, where `windows` share the packets of a hole in equal parts: its missing packets of
-/// the window over all missing ones of it.
-fn shares_of(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, windows: usize) -> Vec<f64> {
+/// Fraction of the loss of each window due to a gap: the missing packets of the window in the gap, over all its missing packets.
+/// `windows` divide the packets of a `hole` between received ones equally.
+fn loss_fractions(gap: &Range<u64>, missing: &[Range<u64>], hole: &Range<u64>, windows: usize) -> Vec<f64> {
     let per_window = (hole.end - hole.start) as f64 / windows.max(1) as f64;
     let overlap = |packets: &Range<u64>, [from, to]: [f64; 2]| {
         let [start, end] = [packets.start, packets.end].map(|count| count as f64 - hole.start as f64);
@@ -233,38 +232,38 @@ mod tests {
     use crate::ground::archive::entry::JournalEntry;
     use crate::units::{ChannelId, Pair};
 
-    const PASSES: u64 = 6;
+    const WINDOWS: u64 = 6;
     const STREAMS: u64 = 6;
 
     #[test]
     fn missing_positions_count_for_their_own_window_and_once() {
-        // Eight packets of four windows, of which one part each is missing but for the last, which lacks both.
+        // Eight packets of four windows: three lack one packet each, the last lacks both.
         let missing = [14..15, 16..17, 18..19, 20..22, 27..29];
-        let of = |gap: usize| shares_of(&missing[gap], &missing, &(14..22), 4);
-        assert_eq!(of(0), [1.0, 0.0, 0.0, 0.0]);
-        assert_eq!(of(1), [0.0, 1.0, 0.0, 0.0]);
-        assert_eq!(of(3), [0.0, 0.0, 0.0, 1.0]);
-        // A window whose two packets are missing apart counts for both together once.
-        let apart = [0..1, 1..2];
-        assert_eq!(apart.each_ref().map(|gap| shares_of(gap, &apart, &(0..2), 1)), [[0.5], [0.5]]);
-        // Five packets of one hole, of which nothing is between: all of it, once.
+        let fractions = |gap: usize| loss_fractions(&missing[gap], &missing, &(14..22), 4);
+        assert_eq!(fractions(0), [1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(fractions(1), [0.0, 1.0, 0.0, 0.0]);
+        assert_eq!(fractions(3), [0.0, 0.0, 0.0, 1.0]);
+        // A window with two separate gaps counts once for both together.
+        let separate = [0..1, 1..2];
+        assert_eq!(separate.each_ref().map(|gap| loss_fractions(gap, &separate, &(0..2), 1)), [[0.5], [0.5]]);
+        // A gap that fills its hole accounts for the whole loss.
         let hole = 3..8;
         let whole = std::slice::from_ref(&hole);
-        assert_eq!(shares_of(&hole, whole, &hole, 2), [1.0, 1.0]);
-        assert!(shares_of(&hole, whole, &hole, 0).is_empty());
+        assert_eq!(loss_fractions(&hole, whole, &hole, 2), [1.0, 1.0]);
+        assert!(loss_fractions(&hole, whole, &hole, 0).is_empty());
     }
 
-    /// Six passes of two channels and three pairs; channel 1 sends three packets a pass and pair, channel 0 one.
+    /// Six windows of two channels and three pairs. Per window and pair, channel 1 sends three packets and channel 0 one.
     fn journal() -> Vec<JournalEntry> {
         let mut entries = Vec::new();
-        for pass in 0..PASSES {
+        for window in 0..WINDOWS {
             for stream in 0..STREAMS {
                 let channel = (stream / 3) as u16;
                 for part in 0..1 + 2 * u64::from(channel) {
-                    let start_s = 9000.0 * pass as f64 + 600.0 * part as f64;
+                    let start_s = 9000.0 * window as f64 + 600.0 * part as f64;
                     entries.push(JournalEntry {
                         count: entries.len() as u64,
-                        made: CucTime((1 + pass) << 24),
+                        made: CucTime((1 + window) << 24),
                         channel: ChannelId(channel),
                         pair: Pair { i: 0, j: 1 + (stream % 3) as u8 },
                         start: MissionTime::from_seconds(start_s),
@@ -280,10 +279,10 @@ mod tests {
     }
 
     fn read(entry: JournalEntry) -> VisibilityPacket {
-        VisibilityPacket { entry, waits: false, share: Some(1.0) }
+        VisibilityPacket { entry, is_waiting: false, share: Some(1.0) }
     }
 
-    /// Gaps found when packets are left out, and their content by channel and pair.
+    /// Gaps found if packets are left out, and the content left out by channel and pair.
     fn without(lost: &[Range<u64>]) -> (Gaps, BTreeMap<(u16, String), f64>) {
         let mut set = ReceivedSet::default();
         let mut held = BTreeMap::new();
@@ -296,42 +295,42 @@ mod tests {
                 kept.push(entry);
             }
         }
-        let readings = kept.into_iter().map(read).collect();
+        let packets = kept.into_iter().map(read).collect();
         let sets = vec![(Kind::Visibilities, set)];
-        (find_gaps(&ReceivedPackets { readings, sets, ..ReceivedPackets::default() }), held)
+        (find_gaps(&ReceivedPackets { packets, sets, ..ReceivedPackets::default() }), held)
     }
 
     #[test]
-    fn a_gap_is_told_by_channel_and_pair() {
-        // In one pair; over the ends of several; a whole pass; the first packets of all.
+    fn a_gap_is_reported_by_channel_and_pair() {
+        // Within one pair; across several; a whole window; the first packets.
         for gap in [14..15, 20..22, 2..5, 18..25, 24..36, 0..2, 33..40] {
             let (found, held) = without(std::slice::from_ref(&gap));
             assert_eq!(found.gaps.len(), 1);
             let report = &found.gaps[0];
             assert_eq!((report.apid, report.from, report.to), (0x103, gap.start, gap.end - 1));
-            let told: BTreeMap<_, _> = report
+            let reported: BTreeMap<_, _> = report
                 .lost
                 .iter()
                 .map(|lost| ((lost.channel, lost.pair.clone()), lost.integration_s))
                 .collect();
-            assert_eq!(told, held, "{gap:?}");
+            assert_eq!(reported, held, "{gap:?}");
         }
     }
 
     #[test]
-    fn a_gap_of_any_length_is_told_at_once() {
-        // As many whole passes as fit 2^46 packets, of 12 each, and four packets: one of each pair of channel 0, and the
-        // first of channel 1, pair by pair behind the six passes that came.
+    fn a_gap_of_any_length_is_reported_at_once() {
+        // As many windows of 12 packets as fit into 2^46 packets, and four more after the six received windows: one of each
+        // pair of channel 0, and the first of channel 1.
         let entries = journal();
         let last = entries.len() as u64;
         let missing = ((1 << 46) - last - 5) / 12 * 12 + 4;
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
-        let schedule = SendingOrder::learn([entries, vec![far]].concat().into_iter().map(read).collect());
+        let schedule = SendingOrder::new([entries, vec![far]].concat().into_iter().map(read).collect());
         let report = schedule.report(Kind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
-        let passes = missing / 12;
-        let [one, three] = [passes + 1, 3 * passes];
+        let windows = missing / 12;
+        let [one, three] = [windows + 1, 3 * windows];
         assert_eq!(packets, [one, one, one, three + 1, three, three]);
     }
 

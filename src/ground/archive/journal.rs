@@ -1,4 +1,4 @@
-//! The journal: a record of every packet that was applied, and what became of it.
+//! The journal, with a record of every applied packet and its outcome.
 
 use std::collections::BTreeMap;
 
@@ -14,80 +14,71 @@ use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{Kind, PacketHeader};
 use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
-pub(super) use crate::ground::hold_buffer::Sent;
+pub(super) use crate::ground::hold_buffer::SendingKey;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 
-/// A packet of visibilities, and what became of them.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
 pub(super) struct JournalRecord {
     pub(super) entry: JournalEntry,
     /// Start of the window of the visibilities.
     pub(super) window: MissionTime,
-    /// The packet's checksum.
-    pub(super) check: u32,
-    /// The packet's bytes.
+    pub(super) checksum: u32,
     pub(super) bytes: u32,
-    pub(super) reading: PacketReading,
+    pub(super) counts: PacketReading,
     /// Whether its block had been received already, in another packet.
     pub(super) is_duplicate: bool,
-    /// Digest of what was offered to the sums: positions, values, weights.
+    /// Digest of the positions, values and weights offered to the sums.
     pub(super) digest: u32,
-    /// Visibilities that could be placed and were offered to the sums.
+    /// Number of visibilities with positions, which were offered to the sums.
     pub(super) offered: u32,
-    /// Visibilities in the sums.
     pub(super) accumulated: u32,
-    /// Visibilities flagged or lost, by reason.
+    /// Number of visibilities flagged or lost, by reason.
     pub(super) left_out: Vec<(VisibilityReason, u32)>,
-    /// Visibilities that were offered to an engine.
+    /// Channel and span of the visibilities offered to an engine.
     pub(super) used: Option<SumsSpan>,
 }
 
-/// Channel of the sums, which sub-bands share, and first and last mission time, s, of what was offered to its engine.
+/// Channel of the sums, which sub-bands share, and first and last mission time, s, of the data offered to its engine.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
 pub(super) struct SumsSpan {
     pub(super) channel: ChannelId,
     pub(super) span_s: [f64; 2],
 }
 
-/// A packet of another kind.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
 pub(super) struct OtherRecord {
-    /// The packet's checksum.
-    pub(super) check: u32,
-    /// The packet's bytes.
+    pub(super) checksum: u32,
     pub(super) bytes: u32,
-    pub(super) reading: PacketReading,
+    pub(super) counts: PacketReading,
     /// First and last count of the packets of its payload.
     pub(super) payload: [u64; 2],
-    /// Start of the positions in it, if they are those that are used.
-    pub(super) segment: Option<MissionTime>,
-    /// The spacecraft's report in it.
+    /// Start of the ephemeris segment in it; `None` if another segment with that start is used.
+    pub(super) ephemeris_start: Option<MissionTime>,
+    /// Housekeeping report of the spacecraft in it.
     pub(super) report: Option<Housekeeping>,
 }
 
-/// Records of all packets that were applied, in the order of sending.
+/// Records of all applied packets, in the order of sending.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
-    pub(super) visibilities: BTreeMap<Sent, JournalRecord>,
-    pub(super) others: BTreeMap<(Kind, Sent), OtherRecord>,
+    pub(super) visibilities: BTreeMap<SendingKey, JournalRecord>,
+    pub(super) others: BTreeMap<(Kind, SendingKey), OtherRecord>,
 }
 
 impl Journal {
-    /// Whether no packet was applied.
     pub(super) fn is_empty(&self) -> bool {
         self.visibilities.is_empty() && self.others.is_empty()
     }
 
-    /// Whether it has records of packets that can exist; a forged checkpoint may hold anything.
+    /// Whether all records are of valid packets. Checkpoints are untrusted.
     pub(super) fn is_sound(&self) -> bool {
-        let can_exist =
-            |(_, count): &Sent, bytes: u32| *count <= COUNT_MAX && bytes <= PACKET_BYTES_MAX as u32;
-        self.visibilities.iter().all(|(sent, record)| can_exist(sent, record.bytes))
-            && self.others.iter().all(|((_, sent), record)| can_exist(sent, record.bytes))
+        let is_valid =
+            |(_, count): &SendingKey, bytes: u32| *count <= COUNT_MAX && bytes <= PACKET_BYTES_MAX as u32;
+        self.visibilities.iter().all(|(key, record)| is_valid(key, record.bytes))
+            && self.others.iter().all(|((_, key), record)| is_valid(key, record.bytes))
     }
 
-    /// Whether there is a record of a packet.
     pub(super) fn contains(&self, header: &PacketHeader) -> bool {
         let sent = (header.time, header.count);
         match header.kind {
@@ -96,23 +87,23 @@ impl Journal {
         }
     }
 
-    /// Records a packet of visibilities that became what the ledger's `posts` say.
+    /// Records a packet of visibilities whose outcome is in the ledger entries `posts`.
     pub(super) fn record_visibilities(
         &mut self,
         packet: &DeliveredPacket,
         draft: RecordDraft,
         posts: &LedgerReport<VisibilityReason>,
     ) {
-        let DeliveredPacket { header, check, reading } = *packet;
+        let DeliveredPacket { header, checksum, counts } = *packet;
         let entry = JournalEntry { count: header.count, made: header.time, ..draft.entry };
         let left_out = posts.left_out.iter().map(|(&reason, &count)| (reason, count as u32)).collect();
         let record = JournalRecord {
             entry,
             window: draft.window,
-            check,
+            checksum,
             bytes: header.bytes as u32,
-            reading,
-            // The first of its blocks is counted as sampled at the end.
+            counts,
+            // Only a duplicate posts its visibilities as sampled at once; others are counted at the end.
             is_duplicate: posts.sampled > 0,
             digest: draft.digest,
             offered: draft.offered,
@@ -123,7 +114,7 @@ impl Journal {
         self.visibilities.insert((header.time, header.count), record);
     }
 
-    /// Adds the records of another journal. A packet of visibilities that is in both is an error: its count.
+    /// Adds the records of another journal. A packet of visibilities in both is an error, which is its count.
     pub(super) fn merge(&mut self, other: Self) -> Result<(), u64> {
         let Self { visibilities, others } = other;
         if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
@@ -132,13 +123,13 @@ impl Journal {
         self.visibilities.extend(visibilities);
         for (key, record) in others {
             let ours = self.others.entry(key).or_insert(record);
-            ours.segment = ours.segment.or(record.segment);
+            ours.ephemeris_start = ours.ephemeris_start.or(record.ephemeris_start);
         }
         Ok(())
     }
 }
 
-/// As a list of records: a record of visibilities names its packet itself.
+/// Encodes visibilities as a list of records, as each contains its key.
 impl Encode for Journal {
     fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
         (self.visibilities.len() as u64).encode(encoder)?;
@@ -164,10 +155,10 @@ mod tests {
     use super::*;
     use crate::downlink::{CucTime, FORMAT_VERSION, PacketSegment};
 
-    fn packet(count: u64, check: u32) -> DeliveredPacket {
+    fn packet(count: u64, checksum: u32) -> DeliveredPacket {
         let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
         let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
-        DeliveredPacket { header, check, reading: PacketReading::default() }
+        DeliveredPacket { header, checksum, counts: PacketReading::default() }
     }
 
     const FAR: VisibilityReason = VisibilityReason::BaselineBeyondMap;
@@ -178,31 +169,31 @@ mod tests {
         LedgerReport { accumulated: 5, left_out, ..LedgerReport::default() }
     }
 
-    type Told = Vec<(u64, Vec<(VisibilityReason, u32)>)>;
+    type Reasons = Vec<(u64, Vec<(VisibilityReason, u32)>)>;
 
-    fn told(journal: &Journal) -> Told {
+    fn reasons(journal: &Journal) -> Reasons {
         journal.visibilities.values().map(|record| (record.entry.count, record.left_out.clone())).collect()
     }
 
     #[test]
-    fn reasons_are_told_again_whatever_was_merged_and_kept() {
+    fn reasons_survive_merging_and_storing() {
         let (mut ours, mut theirs) = (Journal::default(), Journal::default());
         ours.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[(FAR, 2)]));
         theirs.record_visibilities(&packet(2, 12), RecordDraft::default(), &posts(&[(BRIGHT, 3), (FAR, 4)]));
         theirs.record_visibilities(&packet(0, 13), RecordDraft::default(), &posts(&[]));
         assert_eq!(ours.merge(theirs.clone()), Ok(()));
-        let expected: Told = vec![(0, vec![]), (1, vec![(FAR, 2)]), (2, vec![(BRIGHT, 3), (FAR, 4)])];
-        assert_eq!(told(&ours), expected);
-        assert_eq!(told(&ours), expected);
+        let expected: Reasons = vec![(0, vec![]), (1, vec![(FAR, 2)]), (2, vec![(BRIGHT, 3), (FAR, 4)])];
+        assert_eq!(reasons(&ours), expected);
+        assert_eq!(reasons(&ours), expected);
         let bytes = bincode::encode_to_vec(&ours, bincode::config::standard()).unwrap();
         let (kept, used) =
             bincode::decode_from_slice::<Journal, _>(&bytes, bincode::config::standard()).unwrap();
         assert_eq!((&kept, used), (&ours, bytes.len()));
-        // The other way round the same is told.
+        // Merging the other way round gives the same.
         let mut first = Journal::default();
         first.record_visibilities(&packet(1, 11), RecordDraft::default(), &posts(&[(FAR, 2)]));
         assert_eq!(theirs.merge(first.clone()), Ok(()));
-        assert_eq!((told(&theirs), &theirs), (expected, &ours));
+        assert_eq!((reasons(&theirs), &theirs), (expected, &ours));
         assert_eq!(theirs.merge(first), Err(1));
     }
     #[test]
@@ -217,11 +208,12 @@ mod tests {
         assert!(Journal::default().is_sound() && with(COUNT_MAX, PACKET_BYTES_MAX).is_sound());
         assert!(!with(COUNT_MAX + 1, 60).is_sound() && !with(u64::MAX, 60).is_sound());
         assert!(!with(1, PACKET_BYTES_MAX + 1).is_sound());
-        let (mut others, of) = (Journal::default(), with(1, 60));
-        let (check, bytes, reading) = (1, 60, PacketReading::default());
-        let record = OtherRecord { check, bytes, reading, payload: [1, 1], segment: None, report: None };
+        let (mut others, visibilities) = (Journal::default(), with(1, 60));
+        let (checksum, bytes, counts) = (1, 60, PacketReading::default());
+        let record =
+            OtherRecord { checksum, bytes, counts, payload: [1, 1], ephemeris_start: None, report: None };
         others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
-        assert!(others.is_sound() && of.is_sound());
+        assert!(others.is_sound() && visibilities.is_sound());
         others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
         assert!(!others.is_sound());
     }

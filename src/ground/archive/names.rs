@@ -1,7 +1,7 @@
-//! Names of checkpoints: a file of a process, or a file of each rank of a job.
+//! File names of checkpoints, which consist of one file, or of one file per rank of a job.
 //!
-//! `checkpoint-00000007.lunarray` is a whole one; `checkpoint-00000007.2-of-4.lunarray` is the second rank's part of a set of four. A
-//! set counts once all of its parts are there. Every part has the whole head; of the sums it has those that its rank held.
+//! `checkpoint-00000007.lunarray` is a complete checkpoint; `checkpoint-00000007.2-of-4.lunarray` is the part of the second of four
+//! ranks. A set is complete once all its parts exist. Every part has the whole head and the sums of its rank.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -14,21 +14,17 @@ use crate::ranks::RankShare;
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
-/// Greatest number of a checkpoint, which no state that counts from 1 reaches.
 pub(super) const NUMBER_MAX: u64 = u64::MAX / 2;
-/// Most parts of a set.
 const PARTS_MAX: usize = 1 << 20;
 
-/// A checkpoint of a folder.
+/// A checkpoint, which consists of one or more files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct CheckpointSet {
     pub(super) number: u64,
-    /// Files that it consists of.
     pub(super) parts: usize,
 }
 
 impl CheckpointSet {
-    /// Name of one of its files.
     pub(super) fn file_name(self, part: usize) -> String {
         let Self { number, parts } = self;
         match parts {
@@ -37,26 +33,24 @@ impl CheckpointSet {
         }
     }
 
-    /// One of its files.
     pub(super) fn path(self, folder: &Path, part: usize) -> PathBuf {
         folder.join(self.file_name(part))
     }
 
-    /// Its files.
     pub(super) fn paths(self, folder: &Path) -> Vec<PathBuf> {
         (0..self.parts).map(|part| self.path(folder, part)).collect()
     }
 
-    /// Removes its files; returns whether all are gone.
+    /// Removes all files, and returns whether none is left.
     pub(super) fn remove(self, folder: &Path) -> bool {
         let stays =
             |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
-        // All of them, also after one that stays.
+        // `count` visits all files, even after a failure.
         self.paths(folder).iter().filter(|path| stays(path)).count() == 0
     }
 
-    /// The checkpoint and the part that a file is by its name; `None` for other files, or names that none has.
-    fn of_name(text: &str) -> Option<(Self, usize)> {
+    /// Parses a file name into the checkpoint and the part; `None` for other or invalid names.
+    fn parse(text: &str) -> Option<(Self, usize)> {
         let name = inner(text)?;
         let (number, part) = name.split_once('.').unwrap_or((name, ""));
         let (part, parts) = match part.split_once("-of-") {
@@ -64,26 +58,25 @@ impl CheckpointSet {
             None => (0, 1),
         };
         let found = Self { number: number.parse().ok()?, parts };
-        let is_one = found.number <= NUMBER_MAX && part < parts && parts <= PARTS_MAX;
-        (is_one && found.file_name(part) == text).then_some((found, part))
+        let is_valid = found.number <= NUMBER_MAX && part < parts && parts <= PARTS_MAX;
+        (is_valid && found.file_name(part) == text).then_some((found, part))
     }
 }
 
-/// Number of the checkpoint that a file belongs to.
 pub(super) fn number_of(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_string_lossy().into_owned();
-    CheckpointSet::of_name(&name).map(|(found, _)| found.number)
+    CheckpointSet::parse(&name).map(|(found, _)| found.number)
 }
 
-/// The middle of a checkpoint's name: number and part.
+/// The part of a checkpoint's file name with its number and part.
 fn inner(text: &str) -> Option<&str> {
     text.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)
 }
 
-/// The files of the checkpoint to which a file belongs, and which parts they hold; of other names the file alone, as a whole.
+/// All files of the checkpoint to which a file belongs, each with its share. A file with another name is a checkpoint by itself.
 pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    match (CheckpointSet::of_name(&name), path.parent()) {
+    match (CheckpointSet::parse(&name), path.parent()) {
         (Some((found, _)), Some(folder)) if found.parts > 1 => {
             let share = |rank| RankShare { rank, count: found.parts };
             found.paths(folder).into_iter().enumerate().map(|(rank, path)| (path, share(rank))).collect()
@@ -92,8 +85,8 @@ pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     }
 }
 
-/// The checkpoints in a folder, oldest first: complete ones, and those that lack parts. A name that is like theirs and that
-/// none can have may hide one: it is refused.
+/// The complete and the incomplete checkpoints in a folder, oldest first. An invalid checkpoint name is an error, as the file may be
+/// a checkpoint.
 pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundError> {
     let mut found: BTreeMap<CheckpointSet, BTreeSet<usize>> = BTreeMap::new();
     for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
@@ -102,14 +95,14 @@ pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundE
         if inner(&text).is_none() {
             continue;
         }
-        let Some((checkpoint, part)) = CheckpointSet::of_name(&text) else {
+        let Some((checkpoint, part)) = CheckpointSet::parse(&text) else {
             return Err(GroundError::CheckpointName { path: folder.join(&name) });
         };
         found.entry(checkpoint).or_default().insert(part);
     }
-    let is_whole = |checkpoint: &CheckpointSet| found[checkpoint].len() == checkpoint.parts;
-    let (whole, others) = found.keys().partition(|checkpoint| is_whole(checkpoint));
-    Ok([whole, others])
+    let is_complete = |checkpoint: &CheckpointSet| found[checkpoint].len() == checkpoint.parts;
+    let (complete, incomplete) = found.keys().partition(|checkpoint| is_complete(checkpoint));
+    Ok([complete, incomplete])
 }
 
 #[cfg(test)]

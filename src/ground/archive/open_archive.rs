@@ -1,4 +1,4 @@
-//! A folder of checkpoints that is open, and the ground that goes on from it.
+//! An open archive folder, and the ground stage that resumes from it.
 
 use std::io::ErrorKind;
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::checkpoint::{self, ArchiveHead};
 use super::folder::StateFolder;
 use super::journal::Journal;
 use super::names::parts_with;
-use super::settings::{compare, settings_of};
+use super::settings::{require_equal, settings_of};
 use super::store::Archive;
 use crate::calibration::AutoTable;
 use crate::downlink::{DownlinkError, Kind};
@@ -21,10 +21,9 @@ use crate::imaging::{AccumulationError, Accumulator};
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger};
 
-/// What is expected of a file that a checkpoint names.
 const SEGMENT: &str = "the visibilities that the checkpoint beside it names";
 
-/// All that a checkpoint holds: data, and the journal.
+/// The contents of a checkpoint: data and the journal.
 pub(super) struct ArchiveContents {
     pub(super) collector: CollectorState,
     pub(super) ephemeris: Vec<EphemerisSegment>,
@@ -35,7 +34,6 @@ pub(super) struct ArchiveContents {
 }
 
 impl ArchiveContents {
-    /// The contents of a ground that has received nothing.
     pub(super) fn empty(config: &GroundConfig, posts: &Ledger<VisibilityReason>) -> Self {
         Self {
             collector: CollectorState::new(config.wait_bytes),
@@ -47,13 +45,13 @@ impl ArchiveContents {
         }
     }
 
-    /// Adds what another ground has received: records, sums, and data that only it has.
+    /// Adds the records, sums and other data of another archive.
     ///
     /// # Errors
-    /// Another instrument; a packet of visibilities that is in both journals.
+    /// A different instrument; a packet of visibilities in both journals.
     pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
         if self.calibration.is_solved() || other.calibration.is_solved() {
-            return Err(GroundError::SolvedApart);
+            return Err(GroundError::SeparateSolutions);
         }
         self.calibration.version = self.calibration.version.max(other.calibration.version);
         self.journal.merge(other.journal).map_err(|count| {
@@ -61,20 +59,20 @@ impl ArchiveContents {
             DownlinkError::TakenTwice { apid, count }
         })?;
         self.collector.merge(other.collector, |header| self.journal.contains(header))?;
-        // Of segments that start at the same time the first is used.
+        // If two segments start at the same time, the first is used.
         self.ephemeris.extend(other.ephemeris);
         self.autos.merge(other.autos);
         Ok(self.accumulator.merge(other.accumulator)?)
     }
 }
 
-/// Reads all parts of a checkpoint into an accumulator without sums; `check` looks at its head first.
+/// Reads all parts of a checkpoint into a copy of the accumulator `empty`, after `check` has accepted its head.
 fn read_parts(
     path: &Path,
     empty: &Accumulator,
     check: impl Fn(&ArchiveHead) -> Result<(), GroundError>,
 ) -> Result<(ArchiveHead, Accumulator), GroundError> {
-    let of_part = |path: &Path, part: RankShare, empty: Accumulator| {
+    let read_part = |path: &Path, part: RankShare, empty: Accumulator| {
         checkpoint::read(path, |head, engines| {
             check(&head)?;
             let sums = empty.resume_part(head.accumulator.clone(), engines, path.parent(), part);
@@ -83,11 +81,11 @@ fn read_parts(
     };
     let mut whole: Option<(ArchiveHead, Accumulator)> = None;
     for (path, part) in parts_with(path) {
-        let (head, sums) = of_part(&path, part, empty.without_sums())?;
+        let (head, sums) = read_part(&path, part, empty.without_data())?;
         match &mut whole {
             None => whole = Some((head, sums)),
             Some((first, _)) if first.checksum != head.checksum => {
-                let found = "another state than that of the first part".to_owned();
+                let found = "a different state from that of the first part".to_owned();
                 return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
             }
             Some((_, joined)) => joined.join(sums)?,
@@ -96,7 +94,7 @@ fn read_parts(
     whole.ok_or_else(|| GroundError::without_checkpoint(path))
 }
 
-/// Translates a reader's error: data that end too early are damaged; a system's error says nothing of the data.
+/// Converts an error of reading sums. Data that end too early are damaged; an error of the system does not mean damage.
 fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
     match error {
         AccumulationError::Io(source) if source.kind() != ErrorKind::UnexpectedEof => {
@@ -107,7 +105,7 @@ fn unreadable(path: &Path, error: AccumulationError) -> GroundError {
     }
 }
 
-/// A folder that is open, and what its newest usable checkpoint holds.
+/// An open folder and the contents of its newest usable checkpoint.
 pub(super) struct OpenArchive {
     pub(super) folder: StateFolder,
     contents: Option<ArchiveContents>,
@@ -117,49 +115,52 @@ pub(super) struct OpenArchive {
 }
 
 impl OpenArchive {
-    /// Opens a folder. Checkpoints that cannot be used get another name if `sets_aside`.
-    pub(super) fn new(folder: &Path, config: &GroundConfig, sets_aside: bool) -> Result<Self, GroundError> {
-        Self::with_ranks(folder, config, sets_aside, &Ranks::one())
+    /// Opens a folder. Damaged checkpoints are renamed if `renames_damaged`.
+    pub(super) fn new(
+        folder: &Path,
+        config: &GroundConfig,
+        renames_damaged: bool,
+    ) -> Result<Self, GroundError> {
+        Self::with_ranks(folder, config, renames_damaged, &Ranks::single())
     }
 
-    /// As [`OpenArchive::new`], as one rank of several.
+    /// Like [`OpenArchive::new`], as one of several ranks.
     pub(super) fn with_ranks(
         folder: &Path,
         config: &GroundConfig,
-        sets_aside: bool,
+        renames_damaged: bool,
         ranks: &Ranks,
     ) -> Result<Self, GroundError> {
-        if config.map.holds_visibilities() && ranks.are_many() {
+        if config.map.holds_visibilities() && ranks.is_distributed() {
             return Err(AccumulationError::HeldByRank.into());
         }
-        let mut folder = match sets_aside || ranks.are_many() {
+        let mut folder = match renames_damaged || ranks.is_distributed() {
             true => StateFolder::open_with_ranks(folder, ranks)?,
             false => StateFolder::open_to_read(folder)?,
         };
         let settings = settings_of(config)?;
         let posts = Ledger::new();
-        let (contents, notes) = folder.load(sets_aside, |path| {
+        let (contents, notes) = folder.load(renames_damaged, |path| {
             let empty = config.accumulator(&posts).with_ranks(ranks);
             let (head, accumulator) =
-                read_parts(path, &empty, |head| compare(path, &head.settings, &settings))?;
+                read_parts(path, &empty, |head| require_equal(path, &head.settings, &settings))?;
             let ArchiveHead { collector, ephemeris, autos, journal, calibration, .. } = head;
             Ok(ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration })
         })?;
         if let Some(contents) = &contents {
-            folder.names(contents.accumulator.segments());
+            folder.set_segments(contents.accumulator.segments());
         }
         Ok(Self { folder, contents, notes, settings, posts })
     }
 
-    /// From now on the contents belong into another folder, which is new.
+    /// Moves the contents to another folder, which is new.
     pub(super) fn move_to(&mut self, folder: StateFolder) {
         self.folder = folder;
         if let Some(contents) = &mut self.contents {
-            contents.accumulator.leave_segments();
+            contents.accumulator.forget_segments();
         }
     }
 
-    /// Merges the contents of another folder into these.
     pub(super) fn merge(&mut self, other: Self) -> Result<(), GroundError> {
         self.notes.extend(other.notes);
         match (&mut self.contents, other.contents) {
@@ -170,17 +171,16 @@ impl OpenArchive {
         Ok(())
     }
 
-    /// A ground that resumes from these contents.
     pub(super) fn resume(self, config: &GroundConfig, interval: u64) -> Result<Ground, GroundError> {
         let Self { folder, contents, notes, settings, posts } = self;
         let contents = contents.unwrap_or_else(|| ArchiveContents::empty(config, &posts));
         let ArchiveContents { collector, ephemeris, autos, accumulator, journal, calibration } = contents;
-        // Also of a new archive.
+        // Needed for a new archive.
         let mut accumulator = accumulator.with_ranks(folder.ranks());
         let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let mut gate = config.gate()?;
         if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {
@@ -209,9 +209,9 @@ impl OpenArchive {
             saving,
             packets: None,
         };
-        let (cancel, linger, steps) = (Cancel::new(), Duration::ZERO, 0);
+        let (cancel, cancel_grace, steps) = (Cancel::new(), Duration::ZERO, 0);
         let promises = SenderPromises::since(collector.packets());
-        let live_view_writer = LiveViewWriter::of(&outcome.live_view);
+        let live_view_writer = LiveViewWriter::new(&outcome.live_view);
         Ok(Ground {
             collector,
             calibrator,
@@ -220,8 +220,8 @@ impl OpenArchive {
             outcome,
             archive: Some(archive),
             cancel,
-            linger,
-            begins_with_maps: false,
+            cancel_grace,
+            has_initial_snapshot: false,
             steps,
             promises,
             live_view_writer,

@@ -1,4 +1,4 @@
-//! Other gains for the visibilities of an archive.
+//! Recalibrates the visibilities of an archive with new gains.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::draft::{RecordDraft, digest};
 use super::folder::checkpoints;
-use super::journal::{Journal, JournalRecord, Sent};
+use super::journal::{Journal, JournalRecord, SendingKey};
 use super::settings::settings_of;
 use crate::calibration::{AntennaGains, AutoTable, CalibrationHook, Calibrator, ReceivedBlocks};
 use crate::downlink::receive::EventReader;
@@ -18,43 +18,41 @@ use crate::imaging::EngineKind;
 use crate::runtime::Outlet;
 use crate::units::ChannelId;
 
-/// Counts of a recalibration.
+/// Report on a recalibration.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Recalibrated {
-    /// Packets whose visibilities were taken out under the old gains and added under the new ones.
+    /// Number of packets whose visibilities were subtracted with the old gains and added with the new ones.
     pub packets: u64,
-    /// Packets of visibilities to which the new gains do what the old ones did.
+    /// Number of packets of visibilities whose gains did not change.
     pub unchanged: u64,
-    /// Visibilities of the packets in the sums, under the old gains.
+    /// Number of visibilities of the packets that were in the sums with the old gains.
     pub accumulated_before: u64,
-    /// Under the new ones.
+    /// Number of visibilities of the packets that are in the sums with the new gains.
     pub accumulated: u64,
-    /// Number of the calibration that the sums are made with now; a state begins with 1.
+    /// Number of the calibration of the sums now; a state starts with 1.
     pub version: u32,
-    /// The new gains, by their contents.
+    /// Checksum of the new gains, as text.
     pub gains: String,
 }
 
-/// A change of gains under way.
 struct Recalibration {
     ground: Ground,
     journal: Journal,
-    /// Packets that are to be taken out.
-    due: BTreeSet<Sent>,
-    /// Records of packets that have been taken out.
-    removed: BTreeMap<Sent, JournalRecord>,
+    due: BTreeSet<SendingKey>,
+    /// Records of packets that have been subtracted.
+    removed: BTreeMap<SendingKey, JournalRecord>,
     report: Recalibrated,
 }
 
 impl Ground {
-    /// Takes the visibilities of `files` out of the archive in `folder` under its gains, which `config` names, and adds them under
-    /// those of `new`. Packets for which nothing changes need not be in the files; all others have to be. The sums are then those
-    /// of an archive that was made with the new gains. Returns what became of them, and notes on checkpoints that could not be
-    /// used. The archive holds the new contents as a whole, or the old ones.
+    /// Recalibrates the archive in `folder` from the gains of `config` to those of `new`, with the packets in `files`.
+    ///
+    /// The files have to contain all packets whose gains change. The sums are then those of an archive made with the new gains.
+    /// Returns a report, and notes on checkpoints that could not be used. The change is atomic.
     ///
     /// # Errors
-    /// Those of [`Ground::open`] and [`Ground::retract`]; packets whose gains change and that are in no file; channels that
-    /// would begin with other positions.
+    /// Errors of [`Ground::open`] and [`Ground::retract`]; packets whose gains change and that are in no file; channels whose
+    /// first data would change.
     #[doc(hidden)]
     pub fn recalibrate(
         folder: &Path,
@@ -66,44 +64,47 @@ impl Ground {
             return Err(GroundError::without_checkpoint(folder));
         }
         let (mut config, mut new) = (config.clone(), new.clone());
-        // Snapshots are not made again.
+        // Without snapshots.
         (config.map.snapshot_every_s, new.map.snapshot_every_s) = (0.0, 0.0);
         let gains = [gains_of(&config)?, gains_of(&new)?];
         let mut ground = Self::open(folder, &config, u64::MAX)?;
         let notes = ground.notes().map(str::to_owned).collect();
         let journal = ground.archive.as_mut().map(|archive| std::mem::take(&mut archive.journal));
         let journal = journal.unwrap_or_default();
-        let due = due(&ground, &journal, &gains);
+        let due = packets_to_change(&ground, &journal, &gains);
         let report = Recalibrated {
             unchanged: (journal.visibilities.len() - due.len()) as u64,
             ..Recalibrated::default()
         };
         let firsts = first_used(&journal);
         let mut work = Recalibration { ground, journal, due, removed: BTreeMap::new(), report };
-        each_packet(files, &mut |packet| work.take_out(packet))?;
+        for_each_packet(files, &mut |packet| work.subtract(packet))?;
         if let Some((_, count)) = work.due.iter().find(|sent| !work.removed.contains_key(*sent)) {
             let missing = work.due.len() - work.removed.len();
             return Err(GroundError::GainsWithoutData { missing, count: *count });
         }
-        work.add_again(files, &new)?;
-        let moves = gains.iter().flatten().any(AntennaGains::moves);
+        work.add(files, &new)?;
+        let moves = gains.iter().flatten().any(AntennaGains::corrects_positions);
         if config.map.engine == EngineKind::Harmonic {
-            work.check_beginnings(&firsts, moves)?;
+            work.check_first_data(&firsts, moves)?;
         }
         let report = work.write(&new)?;
         Ok((report, notes))
     }
 }
 
-/// The gains of a file; `None` where they are not of one.
+/// The gains of the gains file; `None` if the configuration uses none.
 fn gains_of(config: &GroundConfig) -> Result<Option<AntennaGains>, GroundError> {
     let file = config.calibration.gains_file.as_ref();
     let file = file.filter(|_| config.calibration.hook == CalibrationHook::AntennaGains);
     Ok(file.map(|file| AntennaGains::read(file)).transpose()?)
 }
 
-/// Packets to which the new gains do something else.
-fn due(ground: &Ground, journal: &Journal, gains: &[Option<AntennaGains>; 2]) -> BTreeSet<Sent> {
+fn packets_to_change(
+    ground: &Ground,
+    journal: &Journal,
+    gains: &[Option<AntennaGains>; 2],
+) -> BTreeSet<SendingKey> {
     let Some(instrument) = ground.instrument() else { return BTreeSet::new() };
     let is_due = |record: &JournalRecord| {
         let entry = &record.entry;
@@ -113,7 +114,7 @@ fn due(ground: &Ground, journal: &Journal, gains: &[Option<AntennaGains>; 2]) ->
         }
         let span_s = [entry.start, entry.end].map(|time| time.seconds());
         match gains {
-            [Some(old), Some(new)] => !old.does_as(new, channel.frequency_hz, entry.pair, span_s),
+            [Some(old), Some(new)] => !old.is_equivalent(new, channel.frequency_hz, entry.pair, span_s),
             _ => true,
         }
     };
@@ -121,8 +122,8 @@ fn due(ground: &Ground, journal: &Journal, gains: &[Option<AntennaGains>; 2]) ->
     changed.map(|(sent, _)| *sent).collect()
 }
 
-/// The packet that was sent first of those in the sums of each channel. Its positions are those of the channel's circle.
-fn first_used(journal: &Journal) -> BTreeMap<ChannelId, Sent> {
+/// The first packet in the order of sending that is in the sums of each channel. Its positions define the channel's orbit.
+fn first_used(journal: &Journal) -> BTreeMap<ChannelId, SendingKey> {
     let mut firsts = BTreeMap::new();
     for (sent, record) in &journal.visibilities {
         if let Some(used) = record.used {
@@ -132,7 +133,7 @@ fn first_used(journal: &Journal) -> BTreeMap<ChannelId, Sent> {
     firsts
 }
 
-fn each_packet(
+fn for_each_packet(
     files: &[PathBuf],
     take: &mut dyn FnMut(&HeldPacket) -> Result<(), GroundError>,
 ) -> Result<(), GroundError> {
@@ -140,13 +141,13 @@ fn each_packet(
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
             Event::Packet(packet) if packet.header.kind == Kind::Visibilities => {
-                take(&HeldPacket::of(packet))
+                take(&HeldPacket::new(packet))
             }
             _ => Ok(()),
         })?;
         if events.packets() == 0 {
-            let (path, found) = (path.clone(), "not one packet".into());
-            let expected = "a downlink file, as `lunarray replay` takes";
+            let (path, found) = (path.clone(), "no packet".into());
+            let expected = "a downlink file, as for `lunarray replay`";
             return Err(GroundError::Damaged { path, found, expected });
         }
     }
@@ -154,11 +155,11 @@ fn each_packet(
 }
 
 impl Recalibration {
-    /// Takes the visibilities of a packet out of the sums; its record waits.
-    fn take_out(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
+    /// Subtracts the visibilities of a packet from the sums, and keeps its record.
+    fn subtract(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
         let sent = (packet.header.time, packet.header.count);
         let Some(record) = self.journal.visibilities.get(&sent) else { return Ok(()) };
-        if !self.due.contains(&sent) || record.check != packet.check {
+        if !self.due.contains(&sent) || record.checksum != packet.checksum {
             return Ok(());
         }
         let accumulated = u64::from(record.accumulated);
@@ -171,7 +172,7 @@ impl Recalibration {
             } else {
                 let placed = calibrator.calibrated(block)?;
                 if digest(&placed) != record.digest {
-                    return Err(GroundError::OtherPositions { count });
+                    return Err(GroundError::EphemerisChanged { count });
                 }
                 accumulator.remove(&placed)?.visibilities
             };
@@ -186,13 +187,13 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Adds the visibilities that were taken out, in the order of the files. A channel without remaining data begins anew.
-    fn add_again(&mut self, files: &[PathBuf], new: &GroundConfig) -> Result<(), GroundError> {
+    /// Adds the subtracted visibilities with the new gains, in the order of the files. A channel without remaining data starts anew.
+    fn add(&mut self, files: &[PathBuf], new: &GroundConfig) -> Result<(), GroundError> {
         let Self { ground, journal, removed, report, .. } = self;
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
             return Ok(());
         };
-        accumulator.set_spans(&journal.spans_s());
+        accumulator.retain_spans(&journal.spans_s());
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
@@ -201,24 +202,24 @@ impl Recalibration {
         let posts = archive.posts();
         let mut calibrator =
             resume(new.calibrator(None, &posts)?, AutoTable::default(), ReceivedBlocks::default());
-        each_packet(files, &mut |packet| {
+        for_each_packet(files, &mut |packet| {
             let sent = (packet.header.time, packet.header.count);
-            let Some(record) = removed.get(&sent).filter(|record| record.check == packet.check) else {
+            let Some(record) = removed.get(&sent).filter(|record| record.checksum == packet.checksum) else {
                 return Ok(());
             };
             if journal.visibilities.contains_key(&sent) {
                 return Ok(());
             }
             let frame = GroundFrame::Visibilities(collector.decoded(packet).unwrap_or_default());
-            let mut draft = RecordDraft::of(Some(&frame));
+            let mut draft = RecordDraft::new(Some(&frame));
             if let Some(placed) = calibrator.accept(frame)? {
                 draft.offer(&placed);
                 draft.used_s = accumulator.accept(placed, &mut Outlet::collect())?;
             }
             let posted = archive.take_posts();
             report.accumulated += posted.accumulated;
-            let (header, check) = (packet.header, packet.check);
-            let delivered = DeliveredPacket { header, check, reading: record.reading };
+            let (header, checksum) = (packet.header, packet.checksum);
+            let delivered = DeliveredPacket { header, checksum, counts: record.counts };
             journal.record_visibilities(&delivered, draft, &posted);
             Ok(())
         })?;
@@ -229,25 +230,29 @@ impl Recalibration {
         Ok(())
     }
 
-    /// Requires that channels with remaining data have the circle that they would have in a new archive.
-    fn check_beginnings(&self, before: &BTreeMap<ChannelId, Sent>, moves: bool) -> Result<(), GroundError> {
+    /// Checks that channels with remaining data keep the orbit that they would have in a new archive.
+    fn check_first_data(
+        &self,
+        before: &BTreeMap<ChannelId, SendingKey>,
+        moves: bool,
+    ) -> Result<(), GroundError> {
         let kept = self.journal.visibilities.iter().filter(|(sent, _)| !self.removed.contains_key(*sent));
         let kept: BTreeSet<ChannelId> = kept.filter_map(|(_, record)| Some(record.used?.channel)).collect();
         let now = first_used(&self.journal);
-        let same = |channel: &ChannelId| {
+        let keeps_first = |channel: &ChannelId| {
             let first = before.get(channel);
             first == now.get(channel) && first.is_none_or(|sent| !moves || !self.removed.contains_key(sent))
         };
-        match kept.iter().find(|channel| !same(channel)) {
-            Some(channel) => Err(GroundError::OtherBeginning { channel: *channel }),
+        match kept.iter().find(|channel| !keeps_first(channel)) {
+            Some(channel) => Err(GroundError::FirstDataChanged { channel: *channel }),
             None => Ok(()),
         }
     }
 
-    /// Writes the archive: twice, so that the checkpoint before the newest does not bring the old gains back.
+    /// Writes the archive twice, so that falling back to the older checkpoint does not bring the old gains back.
     fn write(self, new: &GroundConfig) -> Result<Recalibrated, GroundError> {
         let Self { mut ground, journal, mut report, .. } = self;
-        ground.accumulator.set_spans(&journal.spans_s());
+        ground.accumulator.retain_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             let settings = settings_of(new)?;
             let gains = settings.iter().find(|(key, _)| key == "calibration.gains_file");

@@ -1,4 +1,4 @@
-//! What the raw archive has beyond a checkpoint, and a state made from the raw archive alone.
+//! Applies packets of the raw archive that are newer than the checkpoint, and makes a state from a raw archive alone.
 
 use std::path::{Path, PathBuf};
 
@@ -10,33 +10,31 @@ use crate::files::write_atomically;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::runtime::{Outlet, Stage};
 
-/// Name of the raw archive in the folder of a state.
 const PACKETS: &str = "archive";
 
-/// Name of the settings in a raw archive.
 const SETTINGS: &str = "settings.json";
 
-/// Greatest size of a raw archive, bytes, unless another is given: 64 GiB, four missions of 30 channels.
+/// Default limit of a raw archive, bytes: 64 GiB, enough for four missions of 30 channels.
 pub const ARCHIVE_BYTES_MAX: u64 = 1 << 36;
 
-/// Where the raw archive of a state is.
+/// Path of the raw archive of a state.
 #[must_use]
 pub fn packets_folder(state: &Path) -> PathBuf {
     state.join(PACKETS)
 }
 
 impl Ground {
-    /// Applies what the raw archive of `state` has and the checkpoint lacks, as if it arrived now; then goes on with that archive
-    /// if `keeps`. Without an archive there is nothing to do.
-    pub(super) fn recover(&mut self, state: &Path, keeps: bool) -> Result<(), GroundError> {
+    /// Applies packets of the raw archive of `state`, if there is one, that the checkpoint lacks. If `continues_archive`, later
+    /// packets are added to it.
+    pub(super) fn recover(&mut self, state: &Path, continues_archive: bool) -> Result<(), GroundError> {
         let folder = packets_folder(state);
         if !folder.is_dir() {
             return Ok(());
         }
         let checkpoint = self.archive.as_ref().and_then(|archive| archive.folder.newest());
-        // Nobody else writes there from now on.
-        let packets = keeps.then(|| PacketArchive::open(&folder, u64::MAX)).transpose()?;
-        let reading = read_behind(&folder, checkpoint, |piece| self.take_piece(piece))?;
+        // Opened first, so that no other process writes to it.
+        let packets = continues_archive.then(|| PacketArchive::open(&folder, u64::MAX)).transpose()?;
+        let reading = read_behind(&folder, checkpoint, |chunk| self.take_chunk(chunk))?;
         self.note_recovered(&folder, reading);
         if let Some(archive) = &mut self.archive {
             archive.packets = packets;
@@ -45,11 +43,13 @@ impl Ground {
         Ok(())
     }
 
-    /// Keeps received packets in the raw archive of its state from now on, which is `elsewhere` if that is given, and has at most
-    /// `bytes_max` as far as checkpoints allow. `None` without a state.
+    /// Stores received packets in the raw archive from now on; returns `None` if there is no state.
+    ///
+    /// The raw archive is in the folder `elsewhere` if that is given. It has at most `bytes_max` bytes, except packets that no
+    /// checkpoint has.
     ///
     /// # Errors
-    /// A folder that cannot be used; a state whose archive is at another place.
+    /// A folder that cannot be used; a state whose raw archive is in another folder.
     #[doc(hidden)]
     pub fn keep_packets(
         &mut self,
@@ -72,10 +72,10 @@ impl Ground {
         Ok(Some(packets))
     }
 
-    /// Makes a new state in `folder` from the raw archive in `archive`; returns it and what was read.
+    /// Makes a new state in `folder` from the raw archive in `archive`. Also returns a report on the archive.
     ///
     /// # Errors
-    /// A folder that has a state; an archive without a packet, or that cannot be read.
+    /// A folder that has a state; an archive without packets, or that cannot be read.
     pub fn rebuild(
         folder: &Path,
         archive: &Path,
@@ -85,7 +85,7 @@ impl Ground {
             return Err(GroundError::Occupied { path: folder.to_owned() });
         }
         let mut ground = Self::open_anew(folder, config)?;
-        let reading = read_archive(archive, |piece| ground.take_piece(piece))?;
+        let reading = read_archive(archive, |chunk| ground.take_chunk(chunk))?;
         if reading.packets == 0 {
             return Err(GroundError::Damaged {
                 path: archive.to_owned(),
@@ -99,9 +99,9 @@ impl Ground {
         Ok((ground, reading))
     }
 
-    /// Takes a piece of the archive. Snapshots that are due on the way are not made.
-    fn take_piece(&mut self, piece: Vec<u8>) -> Result<(), GroundError> {
-        self.step(piece, &mut Outlet::collect())
+    /// Takes a chunk of the archive, without emitting snapshots.
+    fn take_chunk(&mut self, chunk: Vec<u8>) -> Result<(), GroundError> {
+        self.step(chunk, &mut Outlet::collect())
     }
 
     fn note_recovered(&mut self, folder: &Path, reading: ArchiveReading) {
@@ -109,18 +109,18 @@ impl Ground {
         let Some(archive) = &mut self.archive else { return };
         if packets > 0 {
             let folder = folder.display();
-            archive.notes.push(format!("{folder}: {packets} packets ({bytes} bytes) came after the last checkpoint, and are taken from here"));
+            archive.notes.push(format!("{folder}: {packets} packets ({bytes} bytes) are newer than the last checkpoint, and were added from this raw archive"));
         }
         if damaged > 0 {
             let folder = folder.display();
             archive.notes.push(format!(
-                "{folder}: {damaged} stretches are damaged and were left out; `lunarray gaps` names what is missing now"
+                "{folder}: {damaged} stretches are damaged and were left out; `lunarray gaps` lists the missing packets"
             ));
         }
     }
 }
 
-/// Keeps the settings of a state beside its packets, for a state that has no checkpoint.
+/// Stores the settings of a state in its raw archive, for a state without a checkpoint.
 fn keep_settings(folder: &Path, settings: &[(String, String)]) -> Result<(), GroundError> {
     let (path, text) = (folder.join(SETTINGS), serde_json::to_vec_pretty(settings).unwrap_or_default());
     if std::fs::read(&path).is_ok_and(|found| found == text) {
@@ -129,14 +129,14 @@ fn keep_settings(folder: &Path, settings: &[(String, String)]) -> Result<(), Gro
     write_atomically(&path, &text).map_err(GroundError::io(&path, "write"))
 }
 
-/// The settings beside the packets of a state, or of a raw archive by itself.
+/// Reads the settings in the raw archive of a state, or in a separate raw archive.
 pub(super) fn kept_settings(folder: &Path) -> Option<Vec<(String, String)>> {
     let read = |folder: &Path| std::fs::read(folder.join(SETTINGS)).ok();
     let text = read(&packets_folder(folder)).or_else(|| read(folder))?;
     serde_json::from_slice(&text).ok()
 }
 
-/// Refuses a state whose raw archive has packets that its checkpoint may lack.
+/// Returns an error if the raw archive of a state has packets that its checkpoint may lack.
 pub(super) fn require_saved(state: &Path, checkpoint: Option<u64>) -> Result<(), GroundError> {
     match bytes_behind(&packets_folder(state), checkpoint)? {
         0 => Ok(()),
@@ -144,12 +144,11 @@ pub(super) fn require_saved(state: &Path, checkpoint: Option<u64>) -> Result<(),
     }
 }
 
-/// Says so if the raw archive of a state has packets that its checkpoint may lack.
+/// The note on a raw archive with packets that the checkpoint of the state may lack.
 pub(super) fn unsaved_note(state: &Path, checkpoint: Option<u64>) -> Option<String> {
     require_saved(state, checkpoint).err().map(|error| error.to_string())
 }
 
-/// Makes `folder` lead to another one.
 fn link_to(folder: &Path, elsewhere: &Path) -> Result<(), GroundError> {
     std::fs::create_dir_all(elsewhere).map_err(GroundError::io(elsewhere, "create the folder"))?;
     let place = elsewhere.canonicalize().map_err(GroundError::io(elsewhere, "find"))?;
@@ -158,7 +157,7 @@ fn link_to(folder: &Path, elsewhere: &Path) -> Result<(), GroundError> {
         Ok(found) => Err(GroundError::Damaged {
             path: folder.to_owned(),
             found: format!("the raw archive at {}", found.display()),
-            expected: "the one that --archive names: leave --archive out, or move the folder there yourself",
+            expected: "the folder given by --archive: omit --archive, or move the raw archive there first",
         }),
         #[cfg(unix)]
         Err(_) => {
@@ -169,8 +168,8 @@ fn link_to(folder: &Path, elsewhere: &Path) -> Result<(), GroundError> {
     }
 }
 
-/// Tells the raw archive of a state which packets were removed from it.
-pub(super) fn forget(
+/// Adds packets to the raw archive's list of retracted packets.
+pub(super) fn record_retraction(
     packets: Option<&PacketArchive>,
     names: &[PacketName],
     state: &Path,

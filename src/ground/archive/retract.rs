@@ -1,4 +1,4 @@
-//! Removing packets from an archive.
+//! Retracts packets from an archive.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -7,76 +7,73 @@ use serde::Serialize;
 
 use super::draft::digest;
 use super::folder::checkpoints;
-use super::journal::{Journal, OtherRecord, Sent};
-use super::recovery::forget;
+use super::journal::{Journal, OtherRecord, SendingKey};
+use super::recovery::record_retraction;
 use crate::downlink::receive::EventReader;
 use crate::downlink::transport::packet_archive::PacketName;
 use crate::downlink::{Event, Kind, PacketHeader};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
 
-/// Most packets that are listed as refused.
 const REFUSED_LISTED: usize = 20;
 
-/// A packet that stays in the archive.
+/// A packet that cannot be removed from the archive.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RefusedPacket {
-    /// Kind.
+    /// Kind of the packet.
     pub kind: Kind,
-    /// Packet count.
+    /// Count of the packet.
     pub count: u64,
-    /// Why.
+    /// Reason for keeping it.
     pub reason: &'static str,
 }
 
-/// Counts of a retraction.
+/// Report on a retraction.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Retracted {
-    /// Packets removed, held ones included.
+    /// Number of packets removed, held ones included.
     pub packets: u64,
-    /// Packets removed that were held.
-    pub waited: u64,
-    /// Visibilities in the packets removed that had been applied.
+    /// Number of removed packets that were held.
+    #[serde(rename = "waited")]
+    pub held: u64,
+    /// Number of visibilities in removed packets that had been applied.
     pub visibilities: u64,
-    /// Of these, packets that were in the sums.
+    /// Number of these visibilities that were in the sums.
     pub accumulated: u64,
-    /// Packets that are not in the archive.
+    /// Number of packets that are not in the archive.
     pub absent: u64,
-    /// Packets of positions by which other visibilities were placed, and parts of payloads: they stay.
+    /// Number of packets kept: ephemeris packets that remaining visibilities need, and segments of payloads not given completely.
     pub kept: u64,
-    /// Packets that stay because their removal would remove something else.
+    /// Number of packets that differ from the ones in the archive, or whose positions have changed. They are kept.
     pub refused: u64,
-    /// The first of those.
-    pub named: Vec<RefusedPacket>,
+    /// The first of the refused packets.
+    #[serde(rename = "named")]
+    pub refused_packets: Vec<RefusedPacket>,
 }
 
-/// Place of a packet in the journal.
-type RecordKey = (Kind, Sent);
+type RecordKey = (Kind, SendingKey);
 
-/// A retraction under way. Records are removed and their visibilities subtracted; the views of the journal are folded
-/// again when the checkpoint is next opened.
+/// A retraction in progress. It removes records and subtracts their visibilities; derived data follow from the journal when
+/// the checkpoint is next opened.
 struct Retraction {
     ground: Ground,
     journal: Journal,
     report: Retracted,
-    /// Only visibilities within this span of time, if it is given.
+    /// If given, only visibilities within this time span are removed.
     span: Option<[MissionTime; 2]>,
-    /// Packets that were considered.
     done: BTreeSet<RecordKey>,
-    /// Packets of other kinds that were applied.
+    /// Packets of other kinds that had been applied.
     others: BTreeSet<RecordKey>,
-    /// Packets that are removed, or had been.
+    /// Packets removed by this or an earlier retraction.
     removed: Vec<PacketName>,
 }
 
 impl Ground {
-    /// Removes every packet of `files` from the archive in `folder`, or, with a span of mission time, only the packets
-    /// of visibilities within it. Returns what became of them, and notes on checkpoints that could not be used. The
-    /// archive holds the new contents as a whole, or the old ones.
+    /// Removes every packet of `files` from the archive in `folder`, or, with a span of mission time, only packets
+    /// of visibilities within it. Returns a report, and notes on checkpoints that could not be used. The change is atomic.
     ///
     /// # Errors
-    /// Those of [`Ground::open`]; a folder without an archive; a file that cannot be read; sums that do not hold what
-    /// the journal says.
+    /// Errors of [`Ground::open`]; a folder without an archive; a file that cannot be read; sums that do not match the journal.
     pub fn retract(
         folder: &Path,
         files: &[PathBuf],
@@ -105,7 +102,7 @@ impl Ground {
             retraction.retract_others();
         }
         let report = retraction.report.clone();
-        // Also if all had gone: an earlier retraction may have been ended before the older checkpoint was replaced.
+        // Even if all packets were absent: an earlier retraction may have been interrupted before it replaced the older checkpoint.
         if report.packets > 0 || report.absent > 0 {
             retraction.write(config)?;
         }
@@ -117,15 +114,15 @@ impl Retraction {
     fn retract_file(&mut self, path: &Path) -> Result<(), GroundError> {
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
-            Event::Packet(packet) => self.retract_packet(&HeldPacket::of(packet)),
+            Event::Packet(packet) => self.retract_packet(&HeldPacket::new(packet)),
             _ => Ok(()),
         })?;
         if events.packets() == 0 {
-            let (path, found) = (path.to_owned(), "not one packet".into());
+            let (path, found) = (path.to_owned(), "no packet".into());
             return Err(GroundError::Damaged {
                 path,
                 found,
-                expected: "a downlink file, as `lunarray replay` takes",
+                expected: "a downlink file, as for `lunarray replay`",
             });
         }
         Ok(())
@@ -137,38 +134,44 @@ impl Retraction {
         if self.span.is_some_and(|span| !lies_in(packet, span)) || !self.done.insert(key) {
             return Ok(());
         }
-        let held = self.ground.collector.held().get(&header).map(|held| held.check);
-        let check = held.or_else(|| match header.kind {
-            Kind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.check),
-            _ => self.journal.others.get(&key).map(|record| record.check),
+        let held = self.ground.collector.held().get(&header).map(|held| held.checksum);
+        let checksum = held.or_else(|| match header.kind {
+            Kind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.checksum),
+            _ => self.journal.others.get(&key).map(|record| record.checksum),
         });
-        match check {
+        match checksum {
             None => {
-                // Of an earlier retraction that was ended, or of a packet that never came.
+                // An earlier retraction was interrupted, or the packet was never received.
                 self.removed.push((header.kind, header.count, header.time));
                 self.report.absent += 1;
             }
-            Some(check) if check != packet.check => self.refuse(&header, OTHER_CONTENT),
+            Some(checksum) if checksum != packet.checksum => self.refuse(&header, DIFFERENT_CONTENT),
             Some(_) if held.is_some() => {
                 self.ground.collector.remove_held(&header);
                 self.removed.push((header.kind, header.count, header.time));
                 self.report.packets += 1;
-                self.report.waited += 1;
+                self.report.held += 1;
             }
             Some(_) if header.kind == Kind::Visibilities => return self.retract_visibilities(packet),
-            Some(_) => drop(self.others.insert(key)),
+            Some(_) => {
+                self.others.insert(key);
+            }
         }
         Ok(())
     }
 
     fn refuse(&mut self, header: &PacketHeader, reason: &'static str) {
         self.report.refused += 1;
-        if self.report.named.len() < REFUSED_LISTED {
-            self.report.named.push(RefusedPacket { kind: header.kind, count: header.count, reason });
+        if self.report.refused_packets.len() < REFUSED_LISTED {
+            self.report.refused_packets.push(RefusedPacket {
+                kind: header.kind,
+                count: header.count,
+                reason,
+            });
         }
     }
 
-    /// Removes a packet of visibilities that was applied with this content.
+    /// Removes an applied packet of visibilities with equal content.
     fn retract_visibilities(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
         let header = packet.header;
         let sent = (header.time, header.count);
@@ -182,7 +185,7 @@ impl Retraction {
             } else {
                 let placed = calibrator.calibrated(block)?;
                 if digest(&placed) != record.digest {
-                    self.refuse(&header, OTHER_POSITIONS);
+                    self.refuse(&header, EPHEMERIS_CHANGED);
                     return Ok(());
                 }
                 accumulator.remove(&placed)?.visibilities
@@ -200,19 +203,19 @@ impl Retraction {
         Ok(())
     }
 
-    /// Removes payloads of other kinds whose packets were all found, unless something depends on them.
+    /// Removes payloads of other kinds of which all packets were given, except ephemeris segments that remaining visibilities need.
     fn retract_others(&mut self) {
-        let mut payloads: BTreeMap<(Kind, Sent), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
+        let mut payloads: BTreeMap<(Kind, SendingKey), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {
             let Some(record) = self.journal.others.get(key) else { continue };
             let first = (*kind, (*time, record.payload[0]));
             payloads.entry(first).or_insert_with(|| (*record, Vec::new())).1.push(*key);
         }
-        let needed = self.segments_needed();
+        let needed = self.needed_segments();
         for (record, keys) in payloads.into_values() {
             let [first, last] = record.payload;
             let is_whole = last.checked_sub(first).is_some_and(|more| more == keys.len() as u64 - 1);
-            if !is_whole || record.segment.is_some_and(|start| needed.contains(&start)) {
+            if !is_whole || record.ephemeris_start.is_some_and(|start| needed.contains(&start)) {
                 self.report.kept += keys.len() as u64;
                 continue;
             }
@@ -222,20 +225,20 @@ impl Retraction {
                 let (kind, (time, count)) = *key;
                 self.removed.push((kind, count, time));
             }
-            if let Some(start) = record.segment
-                && !self.journal.others.values().any(|other| other.segment == Some(start))
+            if let Some(start) = record.ephemeris_start
+                && !self.journal.others.values().any(|other| other.ephemeris_start == Some(start))
             {
                 self.ground.calibrator.remove_segment(start);
             }
         }
     }
 
-    /// Starts of the positions that came only from the packets found, and by which visibilities that stay were placed.
-    fn segments_needed(&self) -> BTreeSet<MissionTime> {
+    /// Start times of ephemeris segments that only the given packets contain and that remaining visibilities need.
+    fn needed_segments(&self) -> BTreeSet<MissionTime> {
         let starts = |is_found: bool| -> BTreeSet<MissionTime> {
             let records = self.journal.others.iter();
             let records = records.filter(|(key, _)| self.others.contains(key) == is_found);
-            records.filter_map(|(_, record)| record.segment).collect()
+            records.filter_map(|(_, record)| record.ephemeris_start).collect()
         };
         let (found, others) = (starts(true), starts(false));
         let is_needed = |start: &MissionTime| {
@@ -246,18 +249,18 @@ impl Retraction {
         found.into_iter().filter(is_needed).collect()
     }
 
-    /// Writes the archive without the packets: twice, so that the checkpoint before the newest does not bring them back.
+    /// Writes the archive twice, so that falling back to the older checkpoint does not bring the packets back.
     fn write(self, config: &GroundConfig) -> Result<(), GroundError> {
         let Self { mut ground, journal, removed, .. } = self;
         let is_empty = journal.is_empty() && ground.collector.held().packets().next().is_none();
-        ground.accumulator.set_spans(&journal.spans_s());
+        ground.accumulator.retain_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             archive.journal = journal;
-            // First: a retraction that is ended before the checkpoints are written is repeated.
-            forget(archive.packets.as_ref(), &removed, archive.folder.path())?;
+            // Before the checkpoints: if the command is interrupted in between, running it again completes it.
+            record_retraction(archive.packets.as_ref(), &removed, archive.folder.path())?;
         }
         if is_empty {
-            // As if nothing had ever been received.
+            // Reset to the state of a new archive.
             ground.collector = Collector::new(ground.collector.held().bytes_max());
             ground.gate = config.gate()?;
             ground.calibrator = config.calibrator(ground.gate.as_ref(), &ground.outcome.ledger)?;
@@ -265,17 +268,17 @@ impl Retraction {
         }
         ground.checkpoint()?;
         if let Some(archive) = &mut ground.archive {
-            // The old contents have to go, whether or not there is room for another copy of the new ones.
+            // The old contents must be removed even if there is no space for a second copy of the new ones.
             archive.folder.drop_older()?;
         }
         ground.checkpoint()
     }
 }
 
-const OTHER_CONTENT: &str = "its content differs from that of the packet in the state";
-const OTHER_POSITIONS: &str = "the positions that are known now are others than those that it was placed by";
+const DIFFERENT_CONTENT: &str = "its content differs from the packet in the state";
+const EPHEMERIS_CHANGED: &str = "the ephemeris has changed since the packet was added to the sums";
 
-/// Whether a packet holds visibilities that all lie in a span of mission time.
+/// Whether a packet holds visibilities that all lie within a span of mission time.
 fn lies_in(packet: &HeldPacket, [from, to]: [MissionTime; 2]) -> bool {
     packet.span().is_some_and(|[first, last]| from <= first && last <= to)
 }

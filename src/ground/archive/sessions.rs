@@ -1,4 +1,4 @@
-//! Opening an archive, and merging several.
+//! Opens archives and merges them.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -14,19 +14,19 @@ use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
 
 impl Ground {
-    /// A ground that resumes from the newest checkpoint in `folder`, or starts a new archive there.
+    /// A ground stage that resumes from the newest checkpoint in `folder`, or starts a new archive there.
     ///
-    /// A checkpoint is written whenever `checkpoint_every` visibilities have been received, and at the end.
+    /// It writes a checkpoint after every `checkpoint_every` visibilities received, and at the end.
     ///
     /// # Errors
     /// A folder that cannot be used or is in use; an archive that was made with other settings, or without a usable
     /// checkpoint; calibration that cannot be read.
     pub fn open(folder: &Path, config: &GroundConfig, checkpoint_every: u64) -> Result<Self, GroundError> {
-        Self::open_with_ranks(folder, config, checkpoint_every, &Ranks::one())
+        Self::open_with_ranks(folder, config, checkpoint_every, &Ranks::single())
     }
 
-    /// As [`Ground::open`], as one rank of several, all of which open the folder: each writes its part of every checkpoint. The
-    /// checkpoint may be one of other ranks, or of a process alone.
+    /// Like [`Ground::open`], as one of several ranks that open the folder together. Each writes its part of every checkpoint.
+    /// The existing checkpoint may be from another number of ranks, or from a single process.
     ///
     /// # Errors
     /// As [`Ground::open`]; a folder that ranks do not share.
@@ -39,23 +39,23 @@ impl Ground {
     ) -> Result<Self, GroundError> {
         let mut ground =
             OpenArchive::with_ranks(folder, config, true, ranks)?.resume(config, checkpoint_every)?;
-        // One of several ranks applies what there is, and leaves the archive to grounds that listen.
-        ground.recover(folder, !ranks.are_many())?;
+        // Ranks apply the raw archive but do not write to it; only a stage that listens does.
+        ground.recover(folder, !ranks.is_distributed())?;
         let latest_s = ground.archive.as_ref().and_then(|archive| archive.journal.latest_s());
         ground.show_state(latest_s);
         Ok(ground)
     }
 
-    /// A new archive in `folder`; what may be in its raw archive stays out.
+    /// Opens a new archive in `folder` without applying its raw archive.
     pub(super) fn open_anew(folder: &Path, config: &GroundConfig) -> Result<Self, GroundError> {
         OpenArchive::new(folder, config, true)?.resume(config, u64::MAX)
     }
 
-    /// Merges archives into a new one, in the folder `into`; those of `parts` stay as they are.
+    /// Merges the archives in `parts`, which stay unchanged, into a new one in the folder `into`.
     ///
     /// # Errors
-    /// A folder that holds another archive already, or is one of the parts; an archive that is named twice; archives of different instruments or
-    /// settings, or that hold the same visibilities.
+    /// A folder that holds another archive, or is one of the parts; an archive given twice; archives of different instruments or
+    /// settings, or with common visibilities.
     pub fn merge(into: &Path, parts: &[PathBuf], config: &GroundConfig) -> Result<Self, GroundError> {
         let mut whole: Option<OpenArchive> = None;
         let mut seen = BTreeSet::new();
@@ -63,10 +63,10 @@ impl Ground {
         for path in parts {
             let real = path.canonicalize().map_err(GroundError::io(path, "find"))?;
             if is_into.as_ref() == Some(&real) {
-                return Err(GroundError::MergedIntoPart { path: into.to_owned() });
+                return Err(GroundError::MergeIntoPart { path: into.to_owned() });
             }
             if !seen.insert(real) {
-                return Err(GroundError::NamedTwice { path: path.clone() });
+                return Err(GroundError::GivenTwice { path: path.clone() });
             }
             if checkpoints(path)?.is_empty() {
                 return Err(GroundError::without_checkpoint(path));
@@ -85,14 +85,14 @@ impl Ground {
         ground.advance(&mut Outlet::collect())?;
         match is_new {
             true => ground.checkpoint()?,
-            // A merge that was ended after its checkpoint was written, and is repeated.
+            // An earlier merge was interrupted after it had written its checkpoint.
             false if ground.is_written()? => {}
             false => return Err(GroundError::Occupied { path: into.to_owned() }),
         }
         Ok(ground)
     }
 
-    /// The settings on which the sums of an archive depend, keys and values, as its newest usable checkpoint has them, or its raw
+    /// Keys and values of the settings on which the sums of an archive depend, from its newest usable checkpoint or its raw
     /// archive.
     ///
     /// # Errors
@@ -106,13 +106,13 @@ impl Ground {
         match of_checkpoint {
             Ok((Some(found), _)) => Ok(found),
             Ok((None, _)) => Err(GroundError::without_checkpoint(folder)),
-            // Of a ground that was killed before its first checkpoint, or of another version.
+            // The stage was killed before its first checkpoint, or the checkpoint is of another version.
             Err(error @ GroundError::Locked { .. }) => Err(error),
             Err(error) => kept_settings(folder).ok_or(error),
         }
     }
 
-    /// As [`Ground::settings_in`], for each of several ranks before they open the folder: it is not locked.
+    /// Like [`Ground::settings_in`], without a lock, for ranks before they open the folder together.
     ///
     /// # Errors
     /// A folder without a usable checkpoint.
@@ -127,7 +127,7 @@ impl Ground {
         Err(GroundError::without_checkpoint(folder))
     }
 
-    /// The sums of an archive, with the packets that it holds, as at the end of a session. The archive stays as it is.
+    /// The sums of an archive including its held packets, as at the end of a session. The archive stays unchanged.
     ///
     /// # Errors
     /// As [`Ground::open`]; a folder without a checkpoint.
@@ -145,21 +145,20 @@ impl Ground {
         Ok(out.into_vec())
     }
 
-    /// Packets of visibilities in the archive.
+    /// Number of packets of visibilities in the archive.
     #[must_use]
     #[doc(hidden)]
     pub fn packets(&self) -> usize {
         self.archive.as_ref().map_or(0, |archive| archive.journal.packets())
     }
 
-    /// Checkpoints that could not be used, in words.
+    /// Notes on checkpoints that could not be used.
     #[doc(hidden)]
     pub fn notes(&self) -> impl Iterator<Item = &str> {
         self.archive.iter().flat_map(Archive::notes)
     }
 }
 
-/// The settings in a checkpoint.
 fn settings_at(path: &Path) -> Result<Vec<(String, String)>, GroundError> {
     checkpoint::read(path, |head, engines| {
         std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;

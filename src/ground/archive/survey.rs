@@ -1,4 +1,4 @@
-//! What an archive or a downlink file holds.
+//! Surveys the packets in an archive or a downlink file.
 
 use std::io::{Cursor, ErrorKind};
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use super::checkpoint::ArchiveHead;
 use super::entry::JournalEntry;
 use super::folder::{checkpoints, note};
 use super::gap_report::VisibilityPacket;
-use super::gaps::{Gaps, PositionsPacket, ReceivedPackets, find_gaps};
+use super::gaps::{EphemerisPacket, Gaps, ReceivedPackets, find_gaps};
 use super::names::number_of;
 use super::recovery::unsaved_note;
 use crate::array::Ephemeris;
@@ -18,62 +18,61 @@ use crate::ground::{Collector, DeliveredPacket, Delivery, GroundError};
 use crate::imaging::{Accumulator, MapConfig};
 use crate::runtime::Ledger;
 
-/// Capacity of the hold buffer while a file is read.
+/// Capacity of the hold buffer while reading a file, bytes.
 const WAIT_BYTES: u64 = 1 << 24;
-/// Most segments of positions.
 const SEGMENTS_MAX: usize = 1 << 14;
 
-/// What has been received.
+/// The packets in an archive or a downlink file.
 #[derive(Clone, Debug, Default)]
 pub struct CoverageSurvey {
     received: ReceivedPackets,
-    /// Known positions.
     ephemeris: Ephemeris,
     notes: Vec<String>,
 }
 
 impl CoverageSurvey {
-    /// Surveys an archive's folder, one of its checkpoints, or a downlink file.
+    /// Surveys the folder of an archive, one of its checkpoints, or a downlink file.
     ///
     /// # Errors
-    /// A folder without a usable checkpoint, a file that cannot be read or is neither.
-    pub fn of(path: &Path) -> Result<Self, GroundError> {
+    /// A folder without a usable checkpoint; a file that cannot be read, or is of neither format.
+    pub fn read(path: &Path) -> Result<Self, GroundError> {
         if path.is_dir() {
-            return Self::of_folder(path);
+            return Self::read_folder(path);
         }
         if checkpoint::is_checkpoint(path)? {
-            return Self::of_checkpoint(path);
+            return Self::read_checkpoint(path);
         }
         let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         let mut collector = Collector::new(WAIT_BYTES);
-        collector.read_file(path, &mut |found| survey.see(found))?;
+        collector.read_file(path, &mut |found| survey.add(found))?;
         let Self { received, ephemeris, .. } = &mut survey;
-        for reading in &mut received.readings {
-            reading.waits = !ephemeris.covers([reading.entry.start, reading.entry.end]);
+        for packet in &mut received.packets {
+            packet.is_waiting = !ephemeris.covers([packet.entry.start, packet.entry.end]);
         }
-        survey.conclude(&collector);
+        survey.finish(&collector);
         Ok(survey)
     }
 
-    fn of_folder(path: &Path) -> Result<Self, GroundError> {
-        let mut again = 0;
+    fn read_folder(path: &Path) -> Result<Self, GroundError> {
+        let mut retries = 0;
         loop {
-            match Self::of_newest(path) {
-                // A ground at work has written newer ones and removed it since the folder was read.
-                Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::NotFound && again < 10 => {
-                    again += 1;
+            match Self::read_newest(path) {
+                // A running ground stage has replaced the checkpoint since the folder was read.
+                Err(GroundError::Io { source, .. })
+                    if source.kind() == ErrorKind::NotFound && retries < 10 =>
+                {
+                    retries += 1;
                 }
                 found => return found,
             }
         }
     }
 
-    /// The newest checkpoint of a folder that holds.
-    fn of_newest(path: &Path) -> Result<Self, GroundError> {
+    fn read_newest(path: &Path) -> Result<Self, GroundError> {
         let files: Vec<PathBuf> = checkpoints(path)?;
         let mut bad = Vec::new();
         for file in files.iter().rev() {
-            match Self::of_checkpoint(file) {
+            match Self::read_checkpoint(file) {
                 Ok(found) => {
                     let notes = bad.iter().map(|error| note(error, file));
                     let notes = notes.chain(unsaved_note(path, number_of(file))).collect();
@@ -84,7 +83,7 @@ impl CoverageSurvey {
             }
         }
         match bad.into_iter().next() {
-            Some(newest) => Err(GroundError::NoneHolds {
+            Some(newest) => Err(GroundError::NoUsableCheckpoint {
                 path: path.to_owned(),
                 checkpoints: files.len(),
                 newest: Box::new(newest),
@@ -93,108 +92,111 @@ impl CoverageSurvey {
         }
     }
 
-    fn of_checkpoint(path: &Path) -> Result<Self, GroundError> {
+    fn read_checkpoint(path: &Path) -> Result<Self, GroundError> {
         let head: ArchiveHead = checkpoint::read(path, |head, engines| {
             std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
             Ok(head)
         })?;
-        Ok(Self::of_head(head))
+        Ok(Self::from_head(head))
     }
 
-    /// Surveys a checkpoint in memory, and reads its engines too, as a session of `map` that resumes from it.
+    /// Surveys a checkpoint in memory, and reads its sums as a session with settings `map` does.
     ///
     /// # Errors
     /// A damaged checkpoint.
-    pub fn of_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, GroundError> {
+    pub fn from_bytes(bytes: &[u8], map: &MapConfig) -> Result<Self, GroundError> {
         let head: ArchiveHead =
             checkpoint::read_from(&mut Cursor::new(bytes), Path::new("memory"), |head, engines| {
                 let accumulator = Accumulator::new(map.clone(), Ledger::default());
                 accumulator.resume(head.accumulator.clone(), engines, None)?;
                 Ok(head)
             })?;
-        Ok(Self::of_head(head))
+        Ok(Self::from_head(head))
     }
 
-    fn of_head(head: ArchiveHead) -> Self {
+    fn from_head(head: ArchiveHead) -> Self {
         let ArchiveHead { journal, ephemeris, collector, .. } = head;
         let mut survey = Self { ephemeris: Ephemeris::new(SEGMENTS_MAX), ..Self::default() };
         for segment in ephemeris {
             survey.ephemeris.insert(segment);
         }
-        let readings =
-            journal.shares().map(|(entry, share)| VisibilityPacket { entry: *entry, waits: false, share });
-        survey.received.readings = readings.collect();
+        let packets = journal.accumulated_fractions().map(|(entry, share)| VisibilityPacket {
+            entry: *entry,
+            is_waiting: false,
+            share,
+        });
+        survey.received.packets = packets.collect();
         for ((_, (made, count)), record) in &journal.others {
-            let segment = record.segment.and_then(|start| survey.ephemeris.segment(start));
+            let segment = record.ephemeris_start.and_then(|start| survey.ephemeris.segment(start));
             let span = segment.map(|segment| [segment.start, segment.end()]);
-            survey.received.positions.extend(span.map(|span| PositionsPacket {
+            survey.received.ephemerides.extend(span.map(|span| EphemerisPacket {
                 count: *count,
                 made: *made,
                 span,
             }));
         }
-        // Held packets were received too, and are not in the journal.
+        // Held packets are not in the journal.
         let counters = ReceptionCounters::default();
         let mut collector = Collector::resume(collector, journal.delivered(), counters);
-        let read = survey.received.readings.len();
+        let applied = survey.received.packets.len();
         while let Some(delivery) = collector.flush_next() {
-            survey.see(delivery);
+            survey.add(delivery);
         }
-        survey.received.readings[read..].iter_mut().for_each(|reading| reading.waits = true);
-        survey.conclude(&collector);
+        survey.received.packets[applied..].iter_mut().for_each(|packet| packet.is_waiting = true);
+        survey.finish(&collector);
         survey
     }
 
-    fn see(&mut self, delivery: Delivery) {
+    fn add(&mut self, delivery: Delivery) {
         let Delivery { packets, frame } = delivery;
         match frame {
             Some(GroundFrame::Visibilities(block)) if !block.is_empty() => {
                 let entry = packets
                     .first()
-                    .map(|packet| JournalEntry::of(packet.header.time, packet.header.count, &block));
-                let reading = entry.map(|entry| VisibilityPacket { entry, waits: false, share: None });
-                self.received.readings.extend(reading);
+                    .map(|packet| JournalEntry::new(packet.header.time, packet.header.count, &block));
+                let packet = entry.map(|entry| VisibilityPacket { entry, is_waiting: false, share: None });
+                self.received.packets.extend(packet);
             }
             Some(GroundFrame::Ephemeris(segment)) => {
                 let span = [segment.start, segment.end()];
-                let positions = |packet: &DeliveredPacket| PositionsPacket {
+                let ephemeris = |packet: &DeliveredPacket| EphemerisPacket {
                     count: packet.header.count,
                     made: packet.header.time,
                     span,
                 };
-                self.received.positions.extend(packets.iter().map(positions));
+                self.received.ephemerides.extend(packets.iter().map(ephemeris));
                 self.ephemeris.insert(segment);
             }
             _ => {}
         }
     }
 
-    fn conclude(&mut self, collector: &Collector) {
+    fn finish(&mut self, collector: &Collector) {
         let channels = collector.instrument().into_iter().flat_map(|instrument| &instrument.channels);
         self.received.frequencies_hz = channels.map(|channel| channel.frequency_hz).collect();
         self.received.sets = collector.received().map(|(kind, set)| (kind, set.clone())).collect();
     }
 
-    /// Checkpoints that could not be used, in words.
+    /// Notes on checkpoints that could not be used.
     #[doc(hidden)]
     pub fn notes(&self) -> impl Iterator<Item = &str> {
         self.notes.iter().map(String::as_str)
     }
 
-    /// What has been received.
+    /// The received packets.
     #[must_use]
     pub fn received(&self) -> &ReceivedPackets {
         &self.received
     }
 
-    /// What is missing.
+    /// The missing packets.
     #[must_use]
     pub fn gaps(&self) -> Gaps {
         find_gaps(&self.received)
     }
 
-    /// The parts of a span of time, s, in which the array observed: those covered by positions, without their edges. If
-    /// there are none, all of it, at least a second.
+    /// The parts of a time span, s, during which the array observed: those with an ephemeris. Without any, the
+    /// whole span, of at least a second.
     #[must_use]
     pub fn observed_s(&self, [a, b]: [f64; 2]) -> Vec<[f64; 2]> {
         let (from, to) = (a.min(b), a.max(b));
@@ -215,7 +217,7 @@ mod tests {
     #[test]
     fn what_is_missing_was_observed_where_positions_tell() {
         let mut survey = CoverageSurvey::default();
-        // Windows of 2400 s in every 9000 s; of the fourth no positions came.
+        // Windows of 2400 s in every 9000 s; the ephemeris of the fourth is missing.
         for window in [0, 1, 2, 4] {
             survey.ephemeris.insert(EphemerisSegment {
                 start: MissionTime::from_seconds(9e3 * f64::from(window)),
@@ -224,8 +226,8 @@ mod tests {
                 positions_m: vec![[0.0; 3]; 9],
             });
         }
-        // The second window, of which the first and third came but for their edges; the third, by its last stream and its
-        // own beginning; a part of one; and the fourth, whose time is unknown.
+        // The second window, from the edges of its neighbours; the third, from its end and beginning in reverse order; a
+        // part of the third; and the fourth, whose time is unknown.
         assert_eq!(survey.observed_s([2399.0, 18_001.0]), [[9000.0, 11_400.0]]);
         assert_eq!(survey.observed_s([20_400.0, 18_000.0]), [[18_000.0, 20_400.0]]);
         assert_eq!(survey.observed_s([18_100.0, 18_900.0]), [[18_100.0, 18_900.0]]);

@@ -1,9 +1,9 @@
-//! Views of the journal: counters, the ledger, received packets and blocks, spans. Each is a fold over its records.
+//! Data derived from the records of the journal: counters, the ledger, received packets and blocks, and time spans.
 
 use std::collections::BTreeMap;
 
 use super::entry::JournalEntry;
-use super::journal::{Journal, JournalRecord, Sent, SumsSpan};
+use super::journal::{Journal, JournalRecord, SendingKey, SumsSpan};
 use crate::calibration::{BlockKey, ReceivedBlocks};
 use crate::downlink::{Kind, ReceptionCounters};
 use crate::frames::VisibilityReason;
@@ -11,18 +11,16 @@ use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 
 impl Journal {
-    /// Records of packets with visibilities.
     fn with_visibilities(&self) -> impl Iterator<Item = &JournalRecord> {
         self.visibilities.values().filter(|record| record.entry.visibilities > 0)
     }
 
-    /// Number of packets with visibilities.
     pub(super) fn packets(&self) -> usize {
         self.with_visibilities().count()
     }
 
     /// Packets with visibilities, each with the fraction of its offered visibilities that was accumulated.
-    pub(super) fn shares(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+    pub(super) fn accumulated_fractions(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
         self.with_visibilities().map(|record| {
             let offered = (record.offered > 0).then_some(record.offered);
             let share = offered.map(|offered| f64::from(record.accumulated) / f64::from(offered));
@@ -30,25 +28,23 @@ impl Journal {
         })
     }
 
-    /// Packets that were delivered.
-    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, Sent)> {
+    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, SendingKey)> {
         let visibilities = self.visibilities.keys().map(|sent| (Kind::Visibilities, *sent));
         visibilities.chain(self.others.keys().copied())
     }
 
-    /// Counters of the packets that were delivered.
     pub(super) fn reception(&self) -> ReceptionCounters {
         let mut counters = ReceptionCounters::default();
         for record in self.visibilities.values() {
-            counters.add_packet(Kind::Visibilities, record.bytes, &record.reading);
+            counters.add_packet(Kind::Visibilities, record.bytes, &record.counts);
         }
         for ((kind, _), record) in &self.others {
-            counters.add_packet(*kind, record.bytes, &record.reading);
+            counters.add_packet(*kind, record.bytes, &record.counts);
         }
         counters
     }
 
-    /// Blocks that were received, and the spacecraft's reports.
+    /// The received blocks and the spacecraft's reports.
     pub(super) fn blocks(&self) -> ReceivedBlocks {
         let mut blocks = ReceivedBlocks::default();
         for record in self.with_visibilities() {
@@ -59,13 +55,12 @@ impl Journal {
             }
         }
         for record in self.visibilities.values() {
-            blocks.count_bad(record.window, u64::from(record.reading.visibilities_bad_value));
+            blocks.count_bad(record.window, u64::from(record.counts.visibilities_bad_value));
         }
         self.others.values().filter_map(|record| record.report).for_each(|report| blocks.report(report));
         blocks
     }
 
-    /// What applying all packets has posted to the ledger.
     pub(super) fn ledger(&self) -> LedgerReport<VisibilityReason> {
         let mut ledger = LedgerReport::default();
         for record in self.visibilities.values() {
@@ -81,7 +76,7 @@ impl Journal {
         ledger
     }
 
-    /// First and last mission time, s, of what was offered to the engine of each channel of the sums.
+    /// First and last mission time, s, of the data offered to the engine of each channel of the sums.
     pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
         let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
         for record in self.visibilities.values() {
@@ -97,7 +92,7 @@ impl Journal {
         self.spans_s().values().map(|[_, last]| *last).reduce(f64::max)
     }
 
-    /// Whether the sums hold visibilities of pairs whose positions lie in a span of time.
+    /// Whether the sums hold cross-correlations that overlap a time span.
     pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
         self.visibilities.values().any(|JournalRecord { entry, accumulated, .. }| {
             *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
@@ -142,7 +137,7 @@ mod tests {
         })
     }
 
-    /// An instrument; auto-correlations; a pair without positions, sent twice in different packets; reports.
+    /// An instrument; auto-correlations; a pair without ephemeris, sent twice in different packets; reports.
     fn transmission() -> Vec<u8> {
         let instrument = Instrument {
             name: "test".to_owned(),
@@ -175,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_ground_counts_is_what_is_folded() {
+    fn counts_of_a_ground_equal_those_derived_from_its_journal() {
         let folder = tempfile::tempdir().unwrap();
         let (calibration, map) = (CalibrationConfig::default(), MapConfig::default());
         let config = GroundConfig {
@@ -198,12 +193,12 @@ mod tests {
             assert_eq!(journal.delivered().count(), 7);
         }
         ground.finish(&mut Outlet::collect()).unwrap();
-        let said = (ground.outcome.ledger.close().unwrap(), ground.collector.counters());
+        let counts = (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters());
         drop(ground);
-        // A session without data counts the same.
+        // A session without data has the same counts.
         let mut again = Ground::open(folder.path(), &config, u64::MAX).unwrap();
         again.finish(&mut Outlet::collect()).unwrap();
-        assert_eq!((again.outcome.ledger.close().unwrap(), again.collector.counters()), said);
+        assert_eq!((again.outcome.ledger.balanced_report().unwrap(), again.collector.counters()), counts);
     }
 
     #[test]
@@ -227,11 +222,11 @@ mod tests {
             assert_eq!(ground.ranks().share(), ranks.share());
             ground.step(bytes.to_vec(), &mut Outlet::collect()).unwrap();
             ground.finish(&mut Outlet::collect()).unwrap();
-            let told: Vec<String> = ground.notes().map(str::to_owned).collect();
-            (ground.outcome.ledger.close().unwrap(), ground.collector.counters(), told)
+            let notes: Vec<String> = ground.notes().map(str::to_owned).collect();
+            (ground.outcome.ledger.balanced_report().unwrap(), ground.collector.counters(), notes)
         };
         let session = |ranks: &Ranks, bytes: &[u8]| session_in(folder.path(), ranks, bytes);
-        let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::one(), bytes));
+        let expected = [first, &bytes, &[]].map(|bytes| session_in(other.path(), &Ranks::single(), bytes));
         let names = || {
             let entries = std::fs::read_dir(folder.path()).unwrap();
             let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
@@ -242,7 +237,7 @@ mod tests {
         };
         assert!(on_threads(3, |ranks| session(ranks, first)).iter().all(|found| *found == expected[0]));
         assert_eq!(names(), set(1, 3).collect());
-        // Another number of ranks goes on; a part of a job that was ended does not count, and goes.
+        // Another number of ranks resumes; a part left by an interrupted job is not used, and removed.
         std::fs::copy(
             folder.path().join("checkpoint-00000001.2-of-3.lunarray"),
             folder.path().join("checkpoint-00000002.2-of-3.lunarray"),
@@ -251,18 +246,18 @@ mod tests {
         let whole = on_threads(2, |ranks| session(ranks, &bytes));
         assert_eq!(names(), set(1, 3).chain(set(2, 2)).collect());
         assert!(whole.iter().all(|found| *found == expected[1]));
-        // A part that is damaged, or of another place in the stream, takes its set with it.
+        // A part that is damaged, or from another place in the stream, makes its set unusable.
         let damaged = folder.path().join("checkpoint-00000002.2-of-2.lunarray");
         std::fs::copy(folder.path().join("checkpoint-00000001.2-of-3.lunarray"), damaged).unwrap();
         let again = on_threads(2, |ranks| session(ranks, &bytes));
         assert!(again[0].2[0].contains("parts of one checkpoint"), "{:?}", again[0].2);
         assert_eq!((&again[1].0, &again[1].1), (&expected[1].0, &expected[1].1));
-        // A process alone goes on, and what it writes takes the place of the sets before.
-        let alone = session(&Ranks::one(), &[]);
+        // A single process resumes, and its checkpoints replace the earlier sets.
+        let alone = session(&Ranks::single(), &[]);
         assert_eq!((&alone.0, &alone.1), (&expected[2].0, &expected[2].1));
-        session(&Ranks::one(), &[]);
-        let own = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
-        assert_eq!(names(), own.into_iter().collect());
+        session(&Ranks::single(), &[]);
+        let expected_names = [3, 4].map(|number| format!("checkpoint-{number:08}.lunarray"));
+        assert_eq!(names(), expected_names.into_iter().collect());
     }
 
     #[test]
@@ -271,13 +266,13 @@ mod tests {
         for (count, times_s) in [(0, [3.0, 4.0]), (1, [1.0, 2.0])] {
             let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(count));
             let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
-            let mut draft = RecordDraft::of(Some(&block(Pair { i: 0, j: 1 }, 200)));
+            let mut draft = RecordDraft::new(Some(&block(Pair { i: 0, j: 1 }, 200)));
             // The second of two sub-bands of channel 2.
             draft.entry.channel = ChannelId(5);
             let channel = ChannelId(2);
             draft.offer(&PlacedFrame::Visibilities(PlacedVisibilities { channel, ..Default::default() }));
             draft.used_s = Some(times_s);
-            let packet = DeliveredPacket { header, check: 1, reading: PacketReading::default() };
+            let packet = DeliveredPacket { header, checksum: 1, counts: PacketReading::default() };
             journal.record_visibilities(&packet, draft, &LedgerReport::default());
         }
         assert_eq!(journal.spans_s(), BTreeMap::from([(ChannelId(2), [1.0, 4.0])]));

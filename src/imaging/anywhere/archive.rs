@@ -1,8 +1,7 @@
-//! The visibilities of one channel, held one by one for a map that is refined with their own positions.
+//! An archive of the individual visibilities of one channel, for maps that need them again in each iteration.
 //!
-//! They are in memory, and in segments beside the checkpoints of a saved state. They are sorted before anything is summed, so that
-//! maps depend on which visibilities are held and on nothing else: not on the order in which they arrived, nor on sessions, merges, or
-//! what was held and removed again.
+//! Visibilities are held in memory, and in segments beside the checkpoints of a saved state. They are sorted before they are used, so that
+//! maps depend only on which visibilities are held: not on their order, sessions or merges, nor on what was added and removed again.
 
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
@@ -12,21 +11,22 @@ use rayon::prelude::*;
 
 use super::archived::{ArchivedVisibility, RefinedSetup, VisibilitiesHead};
 use super::assumed_instrument::AssumedInstrument;
-use super::segments::{ArchiveSegment, SEGMENTS_MAX, SegmentPlace};
+use super::segments::{ArchiveSegment, SEGMENTS_MAX, SegmentFolder};
 use super::sums::{
-    BLOCK, Departures, RefinedData, RefinedSums, circle_engine, nearest_circle, refined_sums, taken_apart,
+    BLOCK, Departures, RefinedData, RefinedSums, VisibilityColumns, circle_engine, nearest_circle,
+    refined_sums,
 };
 use crate::frames::PlacedVisibilities;
 use crate::imaging::circle::{HarmonicEngine, HarmonicSums};
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};
 use crate::imaging::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 
-/// Memory of a visibility while it is held, sorted and refined with, bytes: the arrays' elements, and what they grow by.
+/// Memory of a visibility while it is stored, sorted and used for refinement, bytes, including spare capacity of arrays.
 pub const REFINED_VISIBILITY_BYTES: u64 = 400;
 
-/// The visibilities of one channel.
+/// An archive of the visibilities of one channel.
 #[derive(Debug)]
 pub struct VisibilityArchive {
     setup: RefinedSetup,
@@ -34,27 +34,27 @@ pub struct VisibilityArchive {
     totals: Totals,
     held: Vec<ArchivedVisibility>,
     is_sorted: bool,
-    /// Those on disk: the first of `held`, in their order.
+    /// Segments on disk, which hold the first of `held` in the same order.
     segments: Vec<ArchiveSegment>,
-    /// Places in `held`, which is sorted, of visibilities that are to go.
+    /// Indices into `held`, which is then sorted, of visibilities to be removed.
     removed: BTreeSet<usize>,
-    /// For maps on the way.
-    circle: Option<QuickCircle>,
+    /// Circle sums for snapshots.
+    circle: Option<SnapshotCircle>,
 }
 
 /// Sums on the nearest circle while data arrive.
 #[derive(Debug)]
-struct QuickCircle {
+struct SnapshotCircle {
     engine: HarmonicEngine,
-    /// How many of those held are in them.
-    taken: usize,
+    /// How many of the held visibilities the sums contain.
+    summed: usize,
 }
 
 impl VisibilityArchive {
-    /// An empty archive.
+    /// Creates an empty archive.
     ///
     /// # Errors
-    /// A greatest weight out of range.
+    /// The maximum weight is out of range.
     pub fn new(setup: RefinedSetup) -> Result<Self, AccumulationError> {
         Ok(Self {
             setup,
@@ -68,16 +68,16 @@ impl VisibilityArchive {
         })
     }
 
-    /// Takes visibilities.
+    /// Adds visibilities. One without a row of B, or without room, is counted as refused.
     ///
     /// # Errors
-    /// A block of another frequency, or with arrays of unequal lengths. A visibility without a row of B, or for which there is no room, is counted as refused.
+    /// The block has another frequency, or arrays of unequal lengths.
     pub fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         self.check(placed)?;
         self.flush();
         let mut added = Added::default();
         for k in 0..placed.len() {
-            match self.checked(placed, k).and_then(|held| Ok((self.with(&held)?, held))) {
+            match self.checked(placed, k).and_then(|held| Ok((self.totals_with(&held)?, held))) {
                 Ok((totals, held)) => {
                     self.totals = totals;
                     self.held.push(held);
@@ -90,25 +90,26 @@ impl VisibilityArchive {
         Ok(added)
     }
 
-    /// Removes visibilities that were taken. One that is not held was left out for want of room, and is counted so.
+    /// Removes visibilities that were added. One that is not held is counted as refused for lack of room, the reason why it was not added.
     ///
     /// # Errors
-    /// A block of another frequency.
+    /// The block has another frequency.
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         self.check(placed)?;
         self.sort();
         let mut removed = Added::default();
         for k in 0..placed.len() {
             let found = self.checked(placed, k).and_then(|held| {
-                let place = self.find(&held).ok_or(Refusal::Full)?;
-                let totals =
-                    self.totals.and(Totals::one(self.scale, held.weight, held.value_k_sr), Direction::Out);
-                Ok((place, totals.ok_or(Refusal::Full)?))
+                let index = self.find(&held).ok_or(Refusal::Full)?;
+                let totals = self
+                    .totals
+                    .combined(Totals::single(self.scale, held.weight, held.value_k_sr), Direction::Out);
+                Ok((index, totals.ok_or(Refusal::Full)?))
             });
             match found {
-                Ok((place, totals)) => {
+                Ok((index, totals)) => {
                     self.totals = totals;
-                    self.removed.insert(place);
+                    self.removed.insert(index);
                     removed.visibilities += 1;
                 }
                 Err(reason) => removed.refuse(reason),
@@ -117,46 +118,46 @@ impl VisibilityArchive {
         Ok(removed)
     }
 
-    /// Takes all that another archive of the same setup holds.
+    /// Adds all visibilities of another archive of the same setup.
     ///
     /// # Errors
-    /// Archives of different setups; more visibilities than may be held.
+    /// The setups differ, or together there are too many visibilities.
     pub fn merge(&mut self, mut other: Self) -> Result<(), AccumulationError> {
-        let of_ours = RefinedSetup { visibilities_max: self.setup.visibilities_max, ..other.setup };
-        if of_ours != self.setup {
-            let what = "map sizes, frequencies, baselines, limits, responses, seeds or greatest weights";
+        let setup = RefinedSetup { visibilities_max: self.setup.visibilities_max, ..other.setup };
+        if setup != self.setup {
+            let what = "map sizes, frequencies, baselines, limits, responses, seeds or maximum weights";
             return Err(AccumulationError::Mismatch { what });
         }
         self.flush();
         other.flush();
-        let (found, most) = ((self.held.len() + other.held.len()) as u64, self.setup.visibilities_max);
-        if found > most {
-            return Err(AccumulationError::TooManyVisibilities { channel: self.setup.channel, found, most });
+        let (found, limit) = ((self.held.len() + other.held.len()) as u64, self.setup.visibilities_max);
+        if found > limit {
+            return Err(AccumulationError::TooManyVisibilities { channel: self.setup.channel, found, limit });
         }
-        self.totals = self.totals.and(other.totals, Direction::In).ok_or(AccumulationError::Range)?;
+        self.totals = self.totals.combined(other.totals, Direction::In).ok_or(AccumulationError::Range)?;
         self.is_sorted = self.held.is_empty() && other.is_sorted;
         self.held.append(&mut other.held);
         Ok(())
     }
 
-    /// Number and weight of the visibilities.
+    /// Number, weight and power of the visibilities.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
         self.totals.counts(self.scale)
     }
 
-    /// The segments on disk that hold what was written or read last.
+    /// The segments on disk, as they were last written or read.
     #[must_use]
     pub fn segments(&self) -> &[ArchiveSegment] {
         &self.segments
     }
 
-    /// Forgets its segments: the next checkpoint goes into another folder.
-    pub fn leave_segments(&mut self) {
+    /// Forgets its segments, so that the next checkpoint can go into another folder.
+    pub fn forget_segments(&mut self) {
         self.segments.clear();
     }
 
-    /// A copy of the visibilities, without their files.
+    /// A copy of the visibilities without their segments.
     pub(in crate::imaging) fn copy(&mut self) -> Self {
         self.flush();
         Self {
@@ -171,19 +172,19 @@ impl VisibilityArchive {
         }
     }
 
-    /// The visibilities, sorted, and the noise of their companion.
-    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<PairAt>, RefinedData) {
+    /// The setup, and the sorted positions and data with their simulated noise.
+    pub(in crate::imaging) fn into_data(mut self) -> (RefinedSetup, Vec<TimedPair>, RefinedData) {
         self.circle = None;
         self.sort();
         self.flush();
-        let parts = taken_apart(&self.setup, self.held);
-        (self.setup, parts.at, parts.data)
+        let columns = VisibilityColumns::new(&self.setup, self.held);
+        (self.setup, columns.at, columns.data)
     }
 
     /// Sorts the visibilities, plans their rows for the `assumed` instrument, and sums them on the nearest circle.
     ///
     /// # Errors
-    /// A setup that an engine does not take; no data.
+    /// The engine refuses the setup, or there is no data.
     pub fn into_sums(mut self, assumed: &AssumedInstrument) -> Result<RefinedSums, AccumulationError> {
         self.circle = None;
         self.sort();
@@ -191,48 +192,48 @@ impl VisibilityArchive {
         refined_sums(&self.setup, self.held, assumed)
     }
 
-    /// Sums on the circle that was nearest when this was first called, for a map on the way: it costs no pass, and has the errors of
-    /// the circle's rows.
+    /// Harmonic sums on the circle that was nearest when this was first called, for a snapshot. Its map needs no refinement, but has the errors
+    /// of the circle's rows.
     ///
     /// # Errors
-    /// A setup that an engine does not take.
+    /// The engine refuses the setup.
     pub fn circle_sums(&mut self) -> Result<HarmonicSums, AccumulationError> {
         self.flush();
         let mut circle = match self.circle.take() {
             Some(circle) => circle,
             None => {
                 let (orbit, _) = nearest_circle(&self.setup, &|k| self.held[k].at, self.held.len());
-                QuickCircle { engine: circle_engine(&self.setup, orbit)?, taken: 0 }
+                SnapshotCircle { engine: circle_engine(&self.setup, orbit)?, summed: 0 }
             }
         };
-        for piece in self.held[circle.taken..].chunk_by(|a, b| a.at.pair == b.at.pair && a.band == b.band) {
-            for block in piece.chunks(BLOCK) {
+        for run in self.held[circle.summed..].chunk_by(|a, b| a.at.pair == b.at.pair && a.band == b.band) {
+            for block in run.chunks(BLOCK) {
                 let _ = circle.engine.add(&placed(&self.setup, block))?;
             }
         }
-        circle.taken = self.held.len();
+        circle.summed = self.held.len();
         let sums = circle.engine.sums();
         self.circle = Some(circle);
         Ok(sums)
     }
 
-    /// How far the visibilities are from their circle.
+    /// The departures of the visibilities from their nearest circle.
     #[must_use]
     pub fn departures(&self) -> Departures {
         nearest_circle(&self.setup, &|k| self.held[k].at, self.held.len()).1
     }
 
-    /// Writes what is new as a segment, and a checkpoint that names all of them.
+    /// Writes new visibilities as a segment, and a checkpoint that names all segments.
     ///
     /// # Errors
-    /// The writer's, and the system's.
+    /// The writer's or the system's.
     pub fn checkpoint(
         &mut self,
         out: &mut dyn Write,
-        place: SegmentPlace<'_>,
+        folder: SegmentFolder<'_>,
     ) -> Result<(), AccumulationError> {
         self.flush();
-        self.save(place)?;
+        self.save(folder)?;
         let mut out =
             FrameWriter::new(out, BasisKind::Archive, (VisibilitiesHead::new(&self.setup), self.totals))?;
         out.write(&(self.segments.len() as u32).to_le_bytes())?;
@@ -244,9 +245,10 @@ impl VisibilityArchive {
         Ok(out.finish()?)
     }
 
-    fn save(&mut self, place: SegmentPlace<'_>) -> Result<(), AccumulationError> {
-        // One of this number belongs to a checkpoint that failed, and may be gone: it is written again.
-        while self.segments.pop_if(|last| last.number >= place.number).is_some() {}
+    /// Writes new visibilities as a segment, merged with short segments before them.
+    fn save(&mut self, folder: SegmentFolder<'_>) -> Result<(), AccumulationError> {
+        // A segment of this number belongs to a checkpoint that failed; it may be missing, so it is written again.
+        while self.segments.pop_if(|last| last.number >= folder.number).is_some() {}
         let all = self.held.len() as u64;
         let mut saved: u64 = self.segments.iter().map(|segment| segment.visibilities).sum();
         if all == saved {
@@ -259,14 +261,14 @@ impl VisibilityArchive {
             self.segments.pop();
         }
         let new = &self.held[saved as usize..];
-        self.segments.push(ArchiveSegment::write(place, self.setup.channel, new)?);
+        self.segments.push(ArchiveSegment::write(folder, self.setup.channel, new)?);
         Ok(())
     }
 
-    /// Reads a checkpoint and the segments that it names, in `folder`; at most `visibilities_max` may be added to what they hold.
+    /// Reads a checkpoint and the segments that it names from `folder`. Later additions are limited to `visibilities_max` in all.
     ///
     /// # Errors
-    /// A checkpoint or a segment that is damaged, missing, or does not fit the other.
+    /// The checkpoint or a segment is damaged or missing, or they do not match.
     pub fn restore(
         from: &mut dyn Read,
         folder: Option<&Path>,
@@ -297,7 +299,7 @@ impl VisibilityArchive {
             segment.read(folder.unwrap_or(Path::new("")), &mut |piece| archive.held.extend(piece))?;
         }
         let found = archive.held.iter().try_fold(Totals::default(), |totals, held| {
-            totals.and(Totals::one(archive.scale, held.weight, held.value_k_sr), Direction::In)
+            totals.combined(Totals::single(archive.scale, held.weight, held.value_k_sr), Direction::In)
         });
         if found != Some(totals) {
             return Err(refused("other visibilities in the segments".into(), "those of the checkpoint"));
@@ -315,26 +317,26 @@ impl VisibilityArchive {
     }
 
     fn checked(&self, placed: &PlacedVisibilities, k: usize) -> Result<ArchivedVisibility, Refusal> {
-        let held = ArchivedVisibility::of(placed, k, self.setup.moon_radius_m)?;
+        let held = ArchivedVisibility::new(placed, k, self.setup.moon_radius_m)?;
         self.scale.check(held.value_k_sr, held.weight, self.setup.weight_max)?;
         Ok(held)
     }
 
-    /// The totals with one more, if there is room.
-    fn with(&self, held: &ArchivedVisibility) -> Result<Totals, Refusal> {
+    /// The totals with one more visibility, if there is room.
+    fn totals_with(&self, held: &ArchivedVisibility) -> Result<Totals, Refusal> {
         if self.held.len() as u64 >= self.setup.visibilities_max {
             return Err(Refusal::Full);
         }
         self.totals
-            .and(Totals::one(self.scale, held.weight, held.value_k_sr), Direction::In)
+            .combined(Totals::single(self.scale, held.weight, held.value_k_sr), Direction::In)
             .ok_or(Refusal::Full)
     }
 
-    /// Sorts those held; what stands in segments stands there in another order.
+    /// Sorts the visibilities; segments then have another order and are dropped.
     fn sort(&mut self) {
         if !self.is_sorted {
             self.held.par_sort_unstable_by(|a, b| {
-                a.order().partial_cmp(&b.order()).unwrap_or(std::cmp::Ordering::Equal)
+                a.sort_key().partial_cmp(&b.sort_key()).unwrap_or(std::cmp::Ordering::Equal)
             });
             self.is_sorted = true;
             self.segments.clear();
@@ -342,31 +344,31 @@ impl VisibilityArchive {
         }
     }
 
-    /// The place of a visibility that is held and is not to go.
+    /// The index of a visibility that is held and not marked for removal.
     fn find(&self, held: &ArchivedVisibility) -> Option<usize> {
-        let order = held.order();
-        let first = self.held.partition_point(|other| other.order() < order);
-        let equal = self.held[first..].iter().take_while(|other| other.order() == order);
-        (first..first + equal.count()).find(|place| !self.removed.contains(place))
+        let key = held.sort_key();
+        let first = self.held.partition_point(|other| other.sort_key() < key);
+        let equal = self.held[first..].iter().take_while(|other| other.sort_key() == key);
+        (first..first + equal.count()).find(|index| !self.removed.contains(index))
     }
 
-    /// Lets go what is to go.
+    /// Removes the visibilities that are marked for removal.
     fn flush(&mut self) {
         let removed = std::mem::take(&mut self.removed);
         if removed.is_empty() {
             return;
         }
-        let mut place = 0;
+        let mut index = 0;
         self.held.retain(|_| {
-            place += 1;
-            !removed.contains(&(place - 1))
+            index += 1;
+            !removed.contains(&(index - 1))
         });
         self.segments.clear();
         self.circle = None;
     }
 }
 
-/// A block of one pair and sub-band, as an engine takes it.
+/// Converts visibilities of one pair and sub-band to a block for an engine.
 fn placed(setup: &RefinedSetup, block: &[ArchivedVisibility]) -> PlacedVisibilities {
     PlacedVisibilities {
         channel: setup.channel,

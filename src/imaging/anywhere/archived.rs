@@ -1,11 +1,11 @@
-//! A visibility that is held for a refined map, and the setup of an archive of them.
+//! A stored visibility, and the setup of an archive of visibilities.
 
 use num_complex::Complex64;
 
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::exact::checkpoint::{RESPONSES, number_of, refused};
 use crate::imaging::{AccumulationError, Refusal};
-use crate::response::general::{PairAt, check_positions};
+use crate::response::general::{TimedPair, check_positions};
 use crate::response::harmonic::GeometryLimits;
 use crate::units::ChannelId;
 use crate::units::vector::Vec3;
@@ -15,7 +15,7 @@ use crate::units::vector::Vec3;
 pub struct RefinedSetup {
     /// Channel.
     pub channel: ChannelId,
-    /// Greatest degree of the map.
+    /// Maximum degree of the map.
     pub l_max: usize,
     /// Frequency, Hz.
     pub frequency_hz: f64,
@@ -27,15 +27,15 @@ pub struct RefinedSetup {
     pub response: AntennaResponse,
     /// Seed of the noise-only companion.
     pub companion_seed: u64,
-    /// Greatest weight that is accepted, (K sr)^-2.
+    /// Maximum weight that is accepted, (K sr)^-2.
     pub weight_max: f64,
-    /// Departures from the circle up to which its sums alone would hold.
+    /// Departures from the circle within which the circle's sums need no refinement.
     pub limits: GeometryLimits,
-    /// Most visibilities that are held.
+    /// Maximum number of visibilities.
     pub visibilities_max: u64,
 }
 
-/// The setup of an archive in a checkpoint. The most visibilities are not part of it: a later session may hold more.
+/// The setup of an archive in a checkpoint, without the maximum number of visibilities, which may differ between sessions.
 #[derive(bincode::Encode, bincode::Decode)]
 pub(in crate::imaging) struct VisibilitiesHead {
     channel: u16,
@@ -94,40 +94,40 @@ impl VisibilitiesHead {
     }
 }
 
-/// A visibility that is held.
+/// A stored visibility.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(in crate::imaging) struct ArchivedVisibility {
-    pub(in crate::imaging) at: PairAt,
+    pub(in crate::imaging) at: TimedPair,
     pub(in crate::imaging) band: u16,
     pub(in crate::imaging) value_k_sr: Complex64,
     pub(in crate::imaging) weight: f64,
-    /// Length of the integration, s; 0 for an instant.
+    /// Integration time, s; 0 for an instant.
     pub(in crate::imaging) duration_s: f32,
 }
 
-/// What visibilities are sorted by.
-type ArchiveOrder = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
+/// The key by which visibilities are sorted.
+type SortKey = (u8, u8, f64, u16, f64, f64, f64, Vec3, Vec3, f32);
 
 impl ArchivedVisibility {
-    /// Visibility `k`; refused if it has no row of B.
-    pub(in crate::imaging) fn of(
+    /// Visibility `k` of a block; refused if it has no row of B.
+    pub(in crate::imaging) fn new(
         placed: &PlacedVisibilities,
         k: usize,
         moon_radius_m: f64,
     ) -> Result<Self, Refusal> {
         let (r_i_m, r_j_m) = (placed.r_i_m[k], placed.r_j_m[k]);
         check_positions(r_i_m, r_j_m, moon_radius_m)?;
-        let at = PairAt { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
+        let at = TimedPair { pair: placed.pair, time_s: placed.time_s[k], r_i_m, r_j_m };
         let (value_k_sr, weight) = (placed.value_k_sr[k], placed.weight[k]);
-        // What is no length is that of an instant.
-        let length_s = placed.duration_s.get(k).copied().filter(|length_s| *length_s > 0.0);
-        Ok(Self { at, band: placed.band, value_k_sr, weight, duration_s: length_s.unwrap_or(0.0) })
+        // An invalid integration time counts as an instant.
+        let duration_s = placed.duration_s.get(k).copied().filter(|duration_s| *duration_s > 0.0);
+        Ok(Self { at, band: placed.band, value_k_sr, weight, duration_s: duration_s.unwrap_or(0.0) })
     }
 
-    /// What visibilities are sorted by: all that they are, and nothing of how they arrived.
-    pub(in crate::imaging) fn order(&self) -> ArchiveOrder {
+    /// The sort key: all of the visibility's content, and nothing of how it arrived.
+    pub(in crate::imaging) fn sort_key(&self) -> SortKey {
         let Self { at, band, value_k_sr: value, weight, duration_s } = self;
-        let PairAt { pair, time_s, r_i_m, r_j_m } = *at;
+        let TimedPair { pair, time_s, r_i_m, r_j_m } = *at;
         (pair.i, pair.j, time_s, *band, value.re, value.im, *weight, r_i_m, r_j_m, *duration_s)
     }
 }

@@ -1,50 +1,50 @@
-//! Integration times and antenna responses that the ground assumes.
+//! Integration times and antenna responses that the rows of a refined map assume.
 
 use crate::array::{orbit_normal_hat, tilted_axes};
 use crate::frames::AntennaResponse;
 use crate::response::PatternsByFrequency;
-use crate::response::general::{PairAt, PairResponse};
+use crate::response::general::{PairResponse, TimedPair};
 use crate::response::pixel::SatelliteAntenna;
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
-/// Positions of a satellite further apart in time than this do not define its plane, s: a quarter of a low orbit.
+/// Maximum time between positions that define a satellite's orbital plane, s: a quarter of a low orbit.
 const SAME_PASS_S: f64 = 1500.0;
 
-/// Whether one visibility follows another of the same pair soon after.
-pub(in crate::imaging) fn is_same_pass(before: &PairAt, after: &PairAt) -> bool {
-    let apart_s = after.time_s - before.time_s;
-    before.pair == after.pair && apart_s > 0.0 && apart_s < SAME_PASS_S
+/// Whether `after` follows `before` in the same pass of the same pair.
+pub(in crate::imaging) fn is_same_pass(before: &TimedPair, after: &TimedPair) -> bool {
+    let interval_s = after.time_s - before.time_s;
+    before.pair == after.pair && interval_s > 0.0 && interval_s < SAME_PASS_S
 }
 
-/// Greatest angle between a satellite's orbit normal and that of the pair's plane at which their dipoles count as parallel, rad: rows
-/// err by it.
+/// Maximum angle between a satellite's orbit normal and the normal of the pair's plane at which their dipoles count as parallel, rad. It is
+/// the error of rows.
 const SAME_NORMAL_RAD: f64 = 1e-5;
 
-/// Greatest angle between the attitudes of two satellites at which three dipoles on each count as isotropic, rad: rows err by half its
-/// square.
+/// Maximum angle between the attitudes of two satellites at which three dipoles on each count as isotropic, rad. Half its square is the error
+/// of rows.
 const SAME_ATTITUDE_RAD: f64 = 3e-3;
 
-/// The antenna of a daughter.
+/// The assumed antenna of a daughter.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct AssumedAntenna {
-    /// Tilt of its axis from the orbit's normal towards the track's direction, and away from the Moon, degrees.
+    /// Tilt of its axis from the orbit normal: towards the direction of flight, and away from the Moon, degrees.
     pub tilt_deg: [f64; 2],
-    /// q of a factor `1 + q P_2(cos)` of its voltage, with the angle from the axis.
+    /// Distortion q: a factor `1 + q P_2(cos theta)` of its voltage pattern, theta being the angle from the axis.
     pub distortion: f64,
 }
 
-/// Integration times and antenna responses in the rows at true positions.
+/// The integration times and antenna responses that rows at true positions assume.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct AssumedInstrument {
-    /// Whether visibilities are averages over their integrations, or instants in their middle.
+    /// Whether rows are averaged over integrations; otherwise they are taken in the middle.
     pub smear_integrations: bool,
     /// Antennas by daughter; those beyond the list are ideal.
     pub antennas: Vec<AssumedAntenna>,
-    /// Distortions of their patterns by frequency, which are added to theirs.
+    /// Distortions by frequency, added to those of `antennas`.
     pub patterns: PatternsByFrequency,
 }
 
-/// Antennas of pairs that differ from the response of the rows.
+/// Antennas of pairs whose response differs from that of the rows.
 #[derive(Clone, Debug)]
 pub(in crate::imaging) struct PairAntennas {
     antennas: Vec<AssumedAntenna>,
@@ -54,20 +54,20 @@ pub(in crate::imaging) struct PairAntennas {
 }
 
 impl AssumedInstrument {
-    /// Antennas of the pairs of sorted visibilities, where they differ from the response of the rows.
+    /// The antennas of the pairs of sorted visibilities; `None` if the response of the rows holds for all.
     pub(in crate::imaging) fn antennas_of(
         &self,
         elements: AntennaResponse,
         frequency_hz: f64,
-        at: &[PairAt],
+        at: &[TimedPair],
     ) -> Option<PairAntennas> {
         let (antennas, patterns) = (self.antennas.clone(), self.patterns.clone());
         let found = PairAntennas { antennas, patterns, frequency_hz, elements };
         let is_tilted = || self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
         let differs = match elements {
             AntennaResponse::Isotropic => false,
-            AntennaResponse::DipoleNormal => is_tilted() || leave_the_plane(at),
-            AntennaResponse::ThreeDipoles => is_tilted() || turn_apart(at),
+            AntennaResponse::DipoleNormal => is_tilted() || normals_leave_pair_planes(at),
+            AntennaResponse::ThreeDipoles => is_tilted() || attitudes_differ(at),
         };
         (found.is_distorted() || differs).then_some(found)
     }
@@ -78,19 +78,19 @@ impl PairAntennas {
         !self.patterns.is_ideal() || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
     }
 
-    /// Degree of their responses, which are polynomials.
+    /// The degree of their responses as polynomials.
     pub(in crate::imaging) fn degree(&self) -> usize {
         self.elements.degree() + 4 * usize::from(self.is_distorted())
     }
 
-    /// The response of a pair.
-    pub(in crate::imaging) fn response(&self, at: &[PairAt], k: usize) -> PairResponse {
+    /// The response of the pair of visibility `k`.
+    pub(in crate::imaging) fn response(&self, at: &[TimedPair], k: usize) -> PairResponse {
         let pair = &at[k];
         let [normal_i, normal_j] = normals(at, k);
         let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
-            let known = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
-            let axes_hat = tilted_axes(r_m, normal_hat, known.tilt_deg);
-            let distortion = known.distortion + self.patterns.q(daughter.into(), self.frequency_hz);
+            let assumed = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
+            let axes_hat = tilted_axes(r_m, normal_hat, assumed.tilt_deg);
+            let distortion = assumed.distortion + self.patterns.q(daughter.into(), self.frequency_hz);
             SatelliteAntenna { elements: self.elements, axes_hat, distortion }
         };
         let a = antenna(pair.pair.i, pair.r_i_m, normal_i);
@@ -99,8 +99,8 @@ impl PairAntennas {
     }
 }
 
-/// Whether dipoles along the normals of orbits are not along those of the pairs' planes.
-fn leave_the_plane(at: &[PairAt]) -> bool {
+/// Whether orbit normals, along which dipoles point, differ from the normals of the pairs' planes.
+fn normals_leave_pair_planes(at: &[TimedPair]) -> bool {
     at.iter().enumerate().any(|(k, pair)| {
         let plane = unit(cross(pair.r_i_m, pair.r_j_m));
         normals(at, k).into_iter().any(|normal| {
@@ -110,8 +110,8 @@ fn leave_the_plane(at: &[PairAt]) -> bool {
     })
 }
 
-/// Whether the satellites of a pair, each upright in its own orbit, have different attitudes.
-fn turn_apart(at: &[PairAt]) -> bool {
+/// Whether the satellites of a pair, each aligned with its own orbit, have different attitudes.
+fn attitudes_differ(at: &[TimedPair]) -> bool {
     at.iter().enumerate().any(|(k, pair)| {
         let [a, b] = normals(at, k);
         let (normals, verticals) = (sub(a, b), sub(unit(pair.r_i_m), unit(pair.r_j_m)));
@@ -121,19 +121,19 @@ fn turn_apart(at: &[PairAt]) -> bool {
     })
 }
 
-/// Normals of the orbits of satellites i and j, as they move from or to a neighbouring visibility; without one that of their plane.
-fn normals(at: &[PairAt], k: usize) -> [Vec3; 2] {
+/// The orbit normals of satellites i and j, from their motion to a neighbouring visibility; without one, the normal of the pair's plane.
+fn normals(at: &[TimedPair], k: usize) -> [Vec3; 2] {
     let here = &at[k];
     let after = at.get(k + 1).filter(|after| is_same_pass(here, after)).map(|after| [here, after]);
     let before = k.checked_sub(1).map(|k| &at[k]).filter(|before| is_same_pass(before, here));
-    let moves = after.or(before.map(|before| [before, here]));
+    let interval = after.or(before.map(|before| [before, here]));
     let plane = || {
         let normal = unit(cross(here.r_i_m, here.r_j_m));
-        // A satellite j that leads turns it upside down; orbits are prograde more often than not.
+        // If satellite j leads, this normal is reversed. Orbits are assumed prograde.
         if normal[2] < 0.0 { normal.map(|x| -x) } else { normal }
     };
-    let normal = |of: fn(&PairAt) -> Vec3| {
-        moves.and_then(|[from, to]| orbit_normal_hat(of(from), of(to))).unwrap_or_else(plane)
+    let normal = |position: fn(&TimedPair) -> Vec3| {
+        interval.and_then(|[from, to]| orbit_normal_hat(position(from), position(to))).unwrap_or_else(plane)
     };
     [normal(|at| at.r_i_m), normal(|at| at.r_j_m)]
 }

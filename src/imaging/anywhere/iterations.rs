@@ -1,4 +1,4 @@
-//! The solution after each pass of a refinement, on disk: a pass over all visibilities can take an hour.
+//! Saves the solution after each iteration of a refinement, because one iteration over all visibilities can take an hour.
 
 use std::path::{Path, PathBuf};
 
@@ -8,27 +8,27 @@ use crate::files::write_atomically;
 use crate::units::ChannelId;
 
 const MAGIC: &[u8; 8] = b"LNRPASS1";
-/// Longest file that is read: two maps of harmonics to l = 1024.
+/// Maximum size of a file: two maps of harmonics up to l = 1024.
 const BYTES_MAX: u64 = 64 << 20;
 
-/// Where the passes of one map leave their solution.
+/// The file in which the iterations of one map save their solution.
 ///
-/// A file helps and is never needed: one that cannot be read or written is as good as none.
-pub(in crate::imaging) struct PassFile {
+/// It only saves time, so errors in reading or writing it are ignored.
+pub(in crate::imaging) struct IterationFile {
     path: PathBuf,
-    /// A number that maps of the same data and settings share.
+    /// Hash of the data and settings that the solution belongs to.
     key: u64,
 }
 
-impl PassFile {
-    /// The file of a channel in `folder`, for what the numbers `of` tell apart.
-    pub(in crate::imaging) fn new(folder: &Path, channel: ChannelId, of: &[i64]) -> Self {
-        let bytes: Vec<u8> = of.iter().flat_map(|number| number.to_le_bytes()).collect();
+impl IterationFile {
+    /// The file of a channel in `folder`; `fingerprint` identifies the data and settings.
+    pub(in crate::imaging) fn new(folder: &Path, channel: ChannelId, fingerprint: &[i64]) -> Self {
+        let bytes: Vec<u8> = fingerprint.iter().flat_map(|number| number.to_le_bytes()).collect();
         let path = folder.join(format!(".refining-{channel}"));
         Self { path, key: checksum(CrcAlgorithm::Crc64Nvme, &bytes) }
     }
 
-    /// The map and the noise-only map after the last pass.
+    /// The unknowns of the map and the noise-only map after the last iteration; `None` without a valid file.
     pub(in crate::imaging) fn read(&self) -> Option<[Vec<f64>; 2]> {
         let length = std::fs::metadata(&self.path).ok()?.len();
         let bytes = std::fs::read(&self.path).ok().filter(|_| length <= BYTES_MAX)?;
@@ -40,11 +40,11 @@ impl PassFile {
         let (numbers, rest) = numbers.as_chunks::<8>();
         let values: Vec<f64> = numbers.iter().map(|number| f64::from_le_bytes(*number)).collect();
         let half = values.len() / 2;
-        let is_whole = rest.is_empty() && values.len() == 2 * half && values.iter().all(|x| x.is_finite());
-        is_whole.then(|| [values[..half].to_vec(), values[half..].to_vec()])
+        let is_valid = rest.is_empty() && values.len() == 2 * half && values.iter().all(|x| x.is_finite());
+        is_valid.then(|| [values[..half].to_vec(), values[half..].to_vec()])
     }
 
-    /// Keeps the solutions of a pass.
+    /// Saves the solutions of an iteration.
     pub(in crate::imaging) fn write(&self, x: [&[f64]; 2]) {
         let numbers = x.into_iter().flatten().flat_map(|x| x.to_le_bytes());
         let mut bytes: Vec<u8> = MAGIC.iter().copied().chain(self.key.to_le_bytes()).chain(numbers).collect();
@@ -62,14 +62,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_solution_comes_back_for_the_same_data_alone() {
+    fn a_solution_is_read_again_for_the_same_data_only() {
         let folder = tempfile::tempdir().unwrap();
-        let file = PassFile::new(folder.path(), ChannelId(3), &[1, 2]);
+        let file = IterationFile::new(folder.path(), ChannelId(3), &[1, 2]);
         assert_eq!(file.read(), None);
         file.write([&[1.0, -2.5], &[1e-300, 4.0]]);
         assert_eq!(file.read(), Some([vec![1.0, -2.5], vec![1e-300, 4.0]]));
-        assert_eq!(PassFile::new(folder.path(), ChannelId(3), &[1, 3]).read(), None);
-        assert_eq!(PassFile::new(folder.path(), ChannelId(4), &[1, 2]).read(), None);
+        assert_eq!(IterationFile::new(folder.path(), ChannelId(3), &[1, 3]).read(), None);
+        assert_eq!(IterationFile::new(folder.path(), ChannelId(4), &[1, 2]).read(), None);
         let whole = std::fs::read(&file.path).unwrap();
         for at in 0..whole.len() {
             let mut bytes = whole.clone();
@@ -83,7 +83,7 @@ mod tests {
         assert!(file.read().is_some());
         file.remove();
         assert_eq!(file.read(), None);
-        // Nowhere to write is no failure.
-        PassFile::new(&folder.path().join("gone"), ChannelId(0), &[]).write([&[], &[]]);
+        // A folder that does not exist is no failure.
+        IterationFile::new(&folder.path().join("gone"), ChannelId(0), &[]).write([&[], &[]]);
     }
 }

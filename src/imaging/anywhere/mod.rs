@@ -1,4 +1,5 @@
-//! Maps with rows of B at the true positions: keeps every visibility, and refines the map of the nearest circle.
+//! Iterative refinement of maps with the rows of B at the true positions: stored visibilities, and harmonic sums on the nearest circular
+//! orbit as the preconditioner.
 
 mod archive;
 mod archived;
@@ -13,8 +14,8 @@ mod sums;
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
 pub use archived::RefinedSetup;
 pub use assumed_instrument::{AssumedAntenna, AssumedInstrument};
-pub(super) use iterations::PassFile;
+pub(super) use iterations::IterationFile;
 pub use refinement::{ChiSquares, Refinement};
-pub use segments::{ArchiveSegment, HELD_BYTES, SegmentPlace};
+pub use segments::{ArchiveSegment, HELD_BYTES, SegmentFolder};
 pub use solve::{RefineRule, RefineSteps, solve_refined};
 pub use sums::{Departures, RefinedData, RefinedSums, orbit_phase_deg};

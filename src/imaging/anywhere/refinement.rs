@@ -1,4 +1,4 @@
-//! What is said of a refined map: how it was found, and what it leaves of the data.
+//! The report on a refined map: its convergence, and the residuals of the data.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -10,46 +10,46 @@ use crate::imaging::anywhere::{Departures, RefinedSums, orbit_phase_deg};
 use crate::imaging::solver::Convergence;
 use crate::units::constants::DAY_S;
 
-/// How a map was refined, and what remains of the data.
+/// Convergence of a refined map, and residuals of the data.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Refinement {
-    /// How the iteration for the map ended; its iterations are passes over the visibilities.
+    /// Convergence of the map; each iteration uses all visibilities.
     pub convergence: Convergence,
-    /// Residual of the true equations after each pass.
+    /// Residual of the true equations after each iteration.
     pub residuals: Vec<f64>,
-    /// Whether passes converged too slowly, so that the matrix was formed and the equations solved directly.
+    /// Whether iterations converged too slowly, so that the matrix was formed and the equations solved directly.
     pub direct: bool,
-    /// How far the positions are from the circle of the preconditioner.
+    /// Departures of the positions from the preconditioner's circle.
     pub departures: Departures,
-    /// Rows of B that were computed; the others were interpolated between them.
+    /// Number of rows of B that were computed; the others were interpolated.
     pub rows_computed: u64,
-    /// Averages over integrations that were taken for instants in their middle, as too few others of their pair are near.
+    /// Number of averages over integrations that were treated as instants in their middle, because too few neighbours of the pair are near.
     pub taken_as_instants: u64,
-    /// Mean squares of what the map leaves of the data, in units of their noise.
+    /// Reduced chi-squares of the data.
     pub chi_square: ChiSquares,
 }
 
-/// `|V - B x|^2 w / 2`, the mean over visibilities: 1 for noise alone that the map does not fit.
+/// Reduced chi-squares: means of `|V - B x|^2 w / 2` over visibilities, 1 for residuals of noise only.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChiSquares {
-    /// Of all.
+    /// All visibilities.
     pub all: f64,
-    /// By pair, `1-2`, counted from 1.
+    /// By pair, named `1-2` with daughters from 1.
     pub by_pair: BTreeMap<String, f64>,
-    /// By daughter, from 1: of all pairs that it is part of.
+    /// By daughter, from 1: all pairs that contain it.
     pub by_daughter: BTreeMap<u16, f64>,
     /// By day of mission time, from 0.
     pub by_day: BTreeMap<i64, f64>,
-    /// By phase of the orbit from its ascending node, in bins of 15 degrees named by their beginning. Visibilities without a neighbour,
-    /// whose plane is not known, are in none.
+    /// By orbital phase from the ascending node, in bins of 15 degrees named by their lower edge. Visibilities whose phase is not known are
+    /// left out.
     pub by_phase_deg: BTreeMap<u16, f64>,
 }
 
-/// Width of a bin of phase, degrees.
+/// Width of a phase bin, degrees.
 const PHASE_BIN_DEG: u16 = 15;
 
 impl ChiSquares {
-    /// A table: a line for all, and for each pair, daughter, phase and day.
+    /// Formats a table with a line for all visibilities, and for each pair, daughter, phase and day.
     #[must_use]
     pub fn csv(&self) -> String {
         let mut table = String::from(
@@ -105,8 +105,8 @@ impl fmt::Display for Refinement {
     }
 }
 
-/// Mean squares of residuals in units of their noise.
-pub(super) fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares {
+/// Computes the reduced chi-squares of residuals.
+pub(super) fn chi_squares(sums: &RefinedSums, residuals: &[Complex64]) -> ChiSquares {
     #[derive(Clone, Copy, Default)]
     struct Mean(f64, f64);
     impl Mean {
@@ -125,8 +125,8 @@ pub(super) fn chi_squares(sums: &RefinedSums, left: &[Complex64]) -> ChiSquares 
         BTreeMap::<_, Mean>::new(),
         BTreeMap::<_, Mean>::new(),
     );
-    for (k, ((at, left), weight)) in sums.at.iter().zip(left).zip(&sums.data.weight).enumerate() {
-        let value = 0.5 * left.norm_sqr() * weight;
+    for (k, ((at, residual), weight)) in sums.at.iter().zip(residuals).zip(&sums.data.weight).enumerate() {
+        let value = 0.5 * residual.norm_sqr() * weight;
         all.add(value);
         pairs.entry((at.pair.i, at.pair.j)).or_default().add(value);
         for daughter in [at.pair.i, at.pair.j] {

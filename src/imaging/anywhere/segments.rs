@@ -1,17 +1,17 @@
-//! Held visibilities on disk: segments beside a checkpoint, which names them.
+//! Archived visibilities on disk, as segments that a checkpoint names.
 //!
 //! | field of a segment | bytes |
 //! |---|---|
 //! | magic, `LNRHELD2` | 8 |
 //! | visibilities, u64 | 8 |
-//! | each: pair i and j (u8), sub-band (u16), time (s), positions of i and j (m), value (K sr) and weight ((K sr)^-2), f64; length of the integration (s), f32 | 88 |
+//! | each: pair i and j (u8), sub-band (u16), time (s), positions of i and j (m), value (K sr) and weight ((K sr)^-2), f64; integration time (s), f32 | 88 |
 //! | CRC-64/NVME of all before | 8 |
 //!
-//! A segment is in two files of the same bytes, so that a damaged one loses nothing: it is written again from the other when it is read.
+//! Numbers are little-endian. Each segment is stored in two identical files; a damaged one is restored from the other when it is read.
 //!
-//! All numbers are little-endian. A segment is written once and never changed: a checkpoint that keeps gigabytes of visibilities
-//! writes those that are new. Small segments are written again as one with what follows them, so that each is at least twice as long
-//! as all behind it: there are at most some thirty, and each visibility is written as often at most.
+//! Segments are never changed, so that a checkpoint of gigabytes writes only new visibilities. Short segments are merged with the
+//! following ones, so that each is at least twice as long as all after it. There are thus at most some thirty segments, and each visibility
+//! is written at most as many times.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read, Write};
@@ -23,24 +23,24 @@ use num_complex::Complex64;
 use super::archived::ArchivedVisibility;
 use crate::files::{AtomicFile, IfUnfinished};
 use crate::imaging::AccumulationError;
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 use crate::units::{ChannelId, Pair};
 
-/// Bytes of a held visibility on disk.
+/// Bytes of a visibility on disk.
 pub const HELD_BYTES: u64 = 88;
 
 const MAGIC: &[u8; 8] = b"LNRHELD2";
-const EARLIER: &[u8; 8] = b"LNRHELD1";
+const MAGIC_OF_VERSION_1: &[u8; 8] = b"LNRHELD1";
 /// Bytes of magic, count and checksum.
 const FIXED_BYTES: u64 = 24;
 /// Visibilities that are written or read at a time.
-const PIECE: usize = 1 << 14;
-/// Most segments of a checkpoint; those that are written are fewer than 64 bits of a count.
+const CHUNK: usize = 1 << 14;
+/// Maximum number of segments of a checkpoint: lengths double, so a 64-bit count cannot reach it.
 pub(in crate::imaging) const SEGMENTS_MAX: usize = 64;
 
-/// The folder of a checkpoint, and its number, which stands in the names of the segments that are written with it.
+/// The folder of a checkpoint, and the number of the checkpoint, which names the segments that are written with it.
 #[derive(Clone, Copy, Debug)]
-pub struct SegmentPlace<'a> {
+pub struct SegmentFolder<'a> {
     /// The folder.
     pub folder: &'a Path,
     /// Number of the checkpoint.
@@ -52,48 +52,48 @@ pub struct SegmentPlace<'a> {
 pub struct ArchiveSegment {
     /// Channel.
     pub channel: ChannelId,
-    /// Number of the checkpoint that it was written with.
+    /// Number of the checkpoint with which it was written.
     pub number: u64,
-    /// Visibilities in it.
+    /// Number of visibilities.
     pub visibilities: u64,
-    /// Its checksum.
+    /// CRC-64 of its bytes.
     pub checksum: u64,
 }
 
 impl ArchiveSegment {
-    /// Its file's name.
+    /// Name of its first file.
     #[must_use]
     pub fn file_name(&self) -> String {
         format!("visibilities-{:08}-{:04}.segment", self.number, self.channel.0)
     }
 
-    /// Name of the second file.
+    /// Name of its second file.
     fn copy_name(&self) -> String {
         format!("visibilities-{:08}-{:04}.copy.segment", self.number, self.channel.0)
     }
 
-    /// Names of both.
+    /// Names of both files.
     #[must_use]
     pub fn file_names(&self) -> [String; 2] {
         [self.file_name(), self.copy_name()]
     }
 
-    /// Whether a file may be a segment, by its name.
+    /// Whether a file has the name of a segment.
     #[must_use]
     pub fn is_name(name: &str) -> bool {
         name.starts_with("visibilities-") && name.ends_with(".segment")
     }
 
-    /// Writes visibilities as a segment that is on disk, whole, when this returns.
+    /// Writes visibilities as a segment, which is durable on disk when this returns.
     pub(in crate::imaging) fn write(
-        place: SegmentPlace<'_>,
+        folder: SegmentFolder<'_>,
         channel: ChannelId,
         held: &[ArchivedVisibility],
     ) -> Result<Self, AccumulationError> {
-        let (visibilities, number) = (held.len() as u64, place.number);
+        let (visibilities, number) = (held.len() as u64, folder.number);
         let mut segment = Self { channel, number, visibilities, checksum: 0 };
         for name in segment.file_names() {
-            segment.checksum = segment.write_file(&place.folder.join(name), held)?;
+            segment.checksum = segment.write_file(&folder.folder.join(name), held)?;
         }
         Ok(segment)
     }
@@ -108,8 +108,8 @@ impl ArchiveSegment {
         };
         put(MAGIC)?;
         put(&self.visibilities.to_le_bytes())?;
-        for piece in held.chunks(PIECE) {
-            put(&piece.iter().flat_map(record).collect::<Vec<u8>>())?;
+        for piece in held.chunks(CHUNK) {
+            put(&piece.iter().flat_map(encode).collect::<Vec<u8>>())?;
         }
         let checksum = crc.finalize();
         file.write_all(&checksum.to_le_bytes())?;
@@ -117,19 +117,19 @@ impl ArchiveSegment {
         Ok(checksum)
     }
 
-    /// Reads the visibilities in `folder`, and hands them over piece by piece. Memory follows the bytes that are there.
+    /// Reads the visibilities in `folder` and passes them to `take` in chunks, so that a forged count takes no memory.
     pub(in crate::imaging) fn read(
         &self,
         folder: &Path,
         take: &mut dyn FnMut(&mut dyn Iterator<Item = ArchivedVisibility>),
     ) -> Result<(), AccumulationError> {
-        // Nothing is handed over before it is known to hold.
-        let path = self.sound_file(folder)?;
+        // The whole file is verified before anything is passed on.
+        let path = self.intact_file(folder)?;
         self.read_file(&path, take)
     }
 
-    /// The first of the two files that holds. The other is written again from it, if that is possible.
-    fn sound_file(&self, folder: &Path) -> Result<PathBuf, AccumulationError> {
+    /// The path of an intact file. A damaged first file is restored from the second.
+    fn intact_file(&self, folder: &Path) -> Result<PathBuf, AccumulationError> {
         let [first, second] = self.file_names().map(|name| folder.join(name));
         let verify = |path: &Path| self.read_file(path, &mut |piece| piece.for_each(drop));
         let error = match verify(&first) {
@@ -137,11 +137,11 @@ impl ArchiveSegment {
             Err(error @ AccumulationError::Segment { .. }) => error,
             Err(error) => return Err(error),
         };
-        // Of an earlier version there is one file.
+        // Segments of earlier versions have one file.
         if verify(&second).is_err() {
             return Err(error);
         }
-        // On a disk that cannot be written the second goes on to serve.
+        // If restoring fails, the second file is used.
         let _ = restore(&second, &first);
         Ok(second)
     }
@@ -162,7 +162,7 @@ impl ArchiveSegment {
         if bytes >= FIXED_BYTES {
             file.read_exact(&mut head)?;
         }
-        if head.starts_with(EARLIER) {
+        if head.starts_with(MAGIC_OF_VERSION_1) {
             let found = "visibilities without the length of their integrations, of an earlier version: replay their files into a new folder";
             return Err(damaged(found.into()));
         }
@@ -172,15 +172,15 @@ impl ArchiveSegment {
         let mut crc = Digest::new(CrcAlgorithm::Crc64Nvme);
         crc.update(&head);
         if head[..8] != *MAGIC || head[8..] != self.visibilities.to_le_bytes() {
-            return Err(damaged("another beginning".into()));
+            return Err(damaged("another header".into()));
         }
         let mut left = self.visibilities;
         while left > 0 {
-            let count = left.min(PIECE as u64);
+            let count = left.min(CHUNK as u64);
             let mut piece = vec![0; (count * HELD_BYTES) as usize];
             file.read_exact(&mut piece)?;
             crc.update(&piece);
-            take(&mut piece.as_chunks::<{ HELD_BYTES as usize }>().0.iter().map(held));
+            take(&mut piece.as_chunks::<{ HELD_BYTES as usize }>().0.iter().map(decode));
             left -= count;
         }
         let mut stored = [0; 8];
@@ -192,48 +192,48 @@ impl ArchiveSegment {
         Ok(())
     }
 
-    /// Requires that the segment in `folder` holds, in one file at least.
+    /// Requires that at least one file of the segment in `folder` is intact.
     ///
     /// # Errors
     /// [`AccumulationError::Segment`], or the system's.
     pub fn verify(&self, folder: &Path) -> Result<(), AccumulationError> {
-        self.sound_file(folder).map(drop)
+        self.intact_file(folder).map(drop)
     }
 
-    /// Where it is.
+    /// The path of its first file.
     #[must_use]
     pub fn path(&self, folder: &Path) -> PathBuf {
         folder.join(self.file_name())
     }
 
-    /// Length of the file; `None` for a count that none has.
+    /// Length of the file; `None` for an impossible count.
     fn bytes(&self) -> Option<u64> {
         self.visibilities.checked_mul(HELD_BYTES)?.checked_add(FIXED_BYTES)
     }
 }
 
-/// Writes a file again from its copy.
+/// Restores a file from its copy.
 fn restore(from: &Path, to: &Path) -> std::io::Result<()> {
     let mut file = AtomicFile::create(to, IfUnfinished::Remove)?;
     std::io::copy(&mut File::open(from)?, &mut file)?;
     file.finish().map(drop)
 }
 
-fn record(held: &ArchivedVisibility) -> [u8; HELD_BYTES as usize] {
+fn encode(held: &ArchivedVisibility) -> [u8; HELD_BYTES as usize] {
     let ArchivedVisibility { at, band, value_k_sr: value, weight, duration_s } = held;
     let ([a, b, c], [d, e, f]) = (at.r_i_m, at.r_j_m);
     let mut bytes = [0; HELD_BYTES as usize];
     (bytes[0], bytes[1]) = (at.pair.i, at.pair.j);
     bytes[2..4].copy_from_slice(&band.to_le_bytes());
     let numbers = [at.time_s, a, b, c, d, e, f, value.re, value.im, *weight];
-    for (place, number) in bytes[4..].as_chunks_mut::<8>().0.iter_mut().zip(numbers) {
-        *place = number.to_le_bytes();
+    for (field, number) in bytes[4..].as_chunks_mut::<8>().0.iter_mut().zip(numbers) {
+        *field = number.to_le_bytes();
     }
     bytes[84..].copy_from_slice(&duration_s.to_le_bytes());
     bytes
 }
 
-fn held(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
+fn decode(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
     let mut numbers = [0.0; 10];
     for (number, bytes) in numbers.iter_mut().zip(bytes[4..].as_chunks::<8>().0) {
         *number = f64::from_le_bytes(*bytes);
@@ -241,7 +241,7 @@ fn held(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
     let [time_s, a, b, c, d, e, f, re, im, weight] = numbers;
     let pair = Pair { i: bytes[0], j: bytes[1] };
     ArchivedVisibility {
-        at: PairAt { pair, time_s, r_i_m: [a, b, c], r_j_m: [d, e, f] },
+        at: TimedPair { pair, time_s, r_i_m: [a, b, c], r_j_m: [d, e, f] },
         band: u16::from_le_bytes([bytes[2], bytes[3]]),
         value_k_sr: Complex64::new(re, im),
         weight,
@@ -257,7 +257,7 @@ mod tests {
         let one = |k: usize| {
             let x = k as f64 + 0.25;
             ArchivedVisibility {
-                at: PairAt {
+                at: TimedPair {
                     pair: Pair { i: 1, j: 2 + (k % 5) as u8 },
                     time_s: x,
                     r_i_m: [x, -x, 1e-300],
@@ -278,19 +278,19 @@ mod tests {
     }
 
     #[test]
-    fn a_segment_comes_back_and_damage_anywhere_is_found() {
+    fn a_segment_is_read_again_and_any_damage_is_found() {
         let folder = tempfile::tempdir().unwrap();
-        let place = SegmentPlace { folder: folder.path(), number: 7 };
-        for count in [1, 3, PIECE + 1] {
+        let segment_folder = SegmentFolder { folder: folder.path(), number: 7 };
+        for count in [1, 3, CHUNK + 1] {
             let all = visibilities(count);
-            let segment = ArchiveSegment::write(place, ChannelId(2), &all).unwrap();
+            let segment = ArchiveSegment::write(segment_folder, ChannelId(2), &all).unwrap();
             assert_eq!(segment.file_name(), "visibilities-00000007-0002.segment");
             assert_eq!(read(&segment, folder.path()).unwrap(), all);
         }
-        let segment = ArchiveSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
+        let segment = ArchiveSegment::write(segment_folder, ChannelId(2), &visibilities(3)).unwrap();
         let path = segment.path(folder.path());
         let copy = folder.path().join(segment.copy_name());
-        // While one file holds, nothing is lost, and the other is whole again.
+        // While one file is intact, nothing is lost, and the other is restored.
         let whole = std::fs::read(&path).unwrap();
         for at in (0..whole.len()).step_by(17) {
             for file in [&path, &copy] {
@@ -308,7 +308,7 @@ mod tests {
         std::fs::remove_file(&copy).unwrap();
         let good = std::fs::read(&path).unwrap();
         assert_eq!(good.len() as u64, 3 * HELD_BYTES + FIXED_BYTES);
-        let is_told = || {
+        let assert_damaged = || {
             let error = segment.verify(folder.path()).unwrap_err();
             assert!(matches!(error, AccumulationError::Segment { .. }), "{error}");
         };
@@ -316,23 +316,23 @@ mod tests {
             let mut bad = good.clone();
             bad[at] ^= 0x11;
             std::fs::write(&path, bad).unwrap();
-            is_told();
+            assert_damaged();
             std::fs::write(&path, &good[..at]).unwrap();
-            is_told();
+            assert_damaged();
         }
         let mut earlier = good.clone();
-        earlier[..8].copy_from_slice(EARLIER);
+        earlier[..8].copy_from_slice(MAGIC_OF_VERSION_1);
         std::fs::write(&path, &earlier[..good.len() - 12]).unwrap();
-        let said = segment.verify(folder.path()).unwrap_err().to_string();
-        assert!(said.contains("replay their files into a new folder"), "{said}");
-        // Another one of the same length, which holds in itself, is not the one that was named.
-        ArchiveSegment::write(place, ChannelId(2), &visibilities(4)[1..]).unwrap();
-        is_told();
+        let message = segment.verify(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("replay their files into a new folder"), "{message}");
+        // An intact segment of the same length with other content is not the one that was named.
+        ArchiveSegment::write(segment_folder, ChannelId(2), &visibilities(4)[1..]).unwrap();
+        assert_damaged();
         std::fs::remove_file(&copy).unwrap();
         std::fs::remove_file(&path).unwrap();
-        is_told();
+        assert_damaged();
         // A forged count costs nothing.
-        ArchiveSegment::write(place, ChannelId(2), &visibilities(3)).unwrap();
+        ArchiveSegment::write(segment_folder, ChannelId(2), &visibilities(3)).unwrap();
         for visibilities in [0, u64::MAX, u64::MAX / HELD_BYTES] {
             assert!(ArchiveSegment { visibilities, ..segment }.verify(folder.path()).is_err());
         }

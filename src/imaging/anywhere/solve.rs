@@ -1,21 +1,20 @@
-//! Maps from positions as they are: the true normal equations, with search directions from a circle's.
+//! Solves the normal equations with rows at the true positions, with search directions from the equations of a circular orbit.
 //!
-//! A circle's rows are of no use for data from another orbit, but its normal matrix tells which modes are measured nearly as
-//! well as the true one does. So
+//! Rows of a circular orbit do not fit data from another orbit, but its normal matrix tells nearly as well as the true one which modes are
+//! measured. Therefore
 //!
 //! ```text
-//! (Bt N^-1 B + R) x = Bt N^-1 V,   with directions   z = (Bc^t N^-1 Bc + s R)^-1 r,   r what x leaves of the true equations
+//! (Bt N^-1 B + R) x = Bt N^-1 V,   with directions   z = (Bc^t N^-1 Bc + s R)^-1 r,   r the residual of the true equations
 //! ```
 //!
-//! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the former. The first
-//! directions are the map of the circle's own sums (or an earlier solution) and its solution of the true right-hand side. Each pass over the
-//! visibilities multiplies the directions of the map and of the noise-only map by the true matrix, makes them conjugate, and takes both maps
-//! to the nearest solution in the span of all: inexact inner solutions cost passes, not exactness, and no map moves away from the solution,
-//! in the norm of the equations.
+//! with B the rows of the true positions and Bc those of the nearest circle, converges in a few products with the true matrix. The first
+//! directions are the map of the circle's own sums (or an earlier solution) and the circle's solution of the true right-hand side. Each
+//! iteration multiplies the directions of the map and of the noise-only map by the true matrix, makes them conjugate, and moves both maps to
+//! the best solution in the span of all directions. Inexact inner solutions therefore cost iterations but no accuracy.
 //!
-//! s is 1 while that converges. Where a short time or a wide orbit leaves the circle's matrix without modes that the true one has, its
-//! inverse exaggerates them; directions with larger s, which are nearer to plain conjugate gradients, are then added: products decide which
-//! of them help. Where unknowns are few and that is not enough, the matrix is formed, column by column, and the equations are solved directly.
+//! s is 1 while that converges. The circle's matrix may lack modes that the true one has, after a short time or for an orbit far from
+//! circular, and its inverse then exaggerates them. Directions with larger s, nearer to plain conjugate gradients, are then added. If that is
+//! not enough and the unknowns are few, the true matrix is formed column by column, and the equations are solved directly.
 
 use faer::linalg::solvers::Solve;
 use faer::{Mat, Side};
@@ -36,32 +35,32 @@ use crate::imaging::{AccumulationError, NormalSums, SolveError};
 use crate::sky::harmonics::synthesis;
 use crate::sky::healpix::pixel_area_sr;
 
-/// Residual of the inner iterations: well below the third to tenth that one outer step leaves. More exact ones save no outer step, and
-/// cost more than a pass over the visibilities.
+/// Residual of the inner iterations, well below the factor of three to ten that an outer iteration gains. A smaller one would save no outer
+/// iteration, and take longer than one.
 const INNER_RESIDUAL: f64 = 1e-2;
 
-/// Factors of R in the circle's matrix, whose solutions are directions: the first alone while a pass halves the residual.
+/// Factors s of R in the circle's matrix; only the first is used while an iteration halves the residual.
 const SHIFTS: [f64; 4] = [1.0, 10.0, 100.0, 1000.0];
 
-/// Residual per pass above which convergence is slow.
-const SLOW: f64 = 0.5;
+/// Ratio of successive residuals above which convergence is slow.
+const SLOW_RATIO: f64 = 0.5;
 
-/// Passes after which slow convergence is given up where the matrix can be formed.
-const SLOW_PASSES: usize = 5;
+/// Iterations after which slow convergence is given up if the matrix can be formed.
+const SLOW_ITERATIONS_MAX: usize = 5;
 
-/// Most unknowns (those of nside 16), rows times unknowns, and visibilities for which the matrix is formed: minutes.
+/// Maximum numbers of unknowns (those of nside 16), and of rows times unknowns, for which the matrix is formed: it takes minutes.
 const DIRECT_UNKNOWNS_MAX: usize = 41 * 41;
 const DIRECT_PRODUCTS_MAX: usize = 50_000_000;
 
-/// Columns of the matrix that are formed together: rows of B are made once for all of them.
-const COLUMNS: usize = 16;
+/// Columns of the matrix that are formed together, so that rows of B are computed once for all of them.
+const COLUMNS_AT_ONCE: usize = 16;
 
-/// When a refinement stops.
+/// Stopping rule of a refinement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RefineRule {
-    /// Most passes over the visibilities.
+    /// Maximum number of iterations, each over all visibilities.
     pub passes_max: usize,
-    /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
+    /// Target residual, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
 }
 
@@ -71,19 +70,19 @@ impl From<AccumulationError> for SolveError {
     }
 }
 
-/// Where an iteration begins, and who is told of its steps.
+/// Start of a refinement, and where its iterations are saved.
 pub struct RefineSteps<'a> {
-    /// Earlier solutions: of the map, without its prior, and of the noise-only map.
+    /// Earlier unknowns of the map, without its prior, and of the noise-only map.
     pub start: Option<[Vec<f64>; 2]>,
-    /// Gets both after each pass.
-    pub passed: &'a mut dyn FnMut([&[f64]; 2]),
+    /// Saves both after each iteration.
+    pub save: &'a mut dyn FnMut([&[f64]; 2]),
 }
 
 /// Solves for the map and the noise-only map with the rows of the true positions.
 ///
 /// # Errors
-/// No data, a prior whose size is not a map's, or an R that needs a table that ends before the map's degrees or the data themselves;
-/// [`SolveError::Interrupted`] before the first pass is done.
+/// There is no data, the prior is no map, or R is from the data or from a table that ends before the map's degrees;
+/// [`SolveError::Interrupted`] before the end of the first iteration.
 pub fn solve_refined(
     sums: &RefinedSums,
     request: HarmonicRequest,
@@ -98,8 +97,8 @@ pub fn solve_refined(
     let blocks = sums.circle.order_blocks();
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        let (start, report) = (lifted(&blocks, sums.circle.unknowns()), &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        let (start, report) = (lifted(&blocks, sums.circle.unknowns()), &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         });
         largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
     };
@@ -111,10 +110,14 @@ pub fn solve_refined(
     }
     let problem = RefinedProblem { sums, regularisation, inner: request.rule, rule, watch };
     let right = problem.right(prior.as_deref());
-    let Refined { columns: [map, noise], convergence: [of_map, of_noise], residuals, direct } =
-        problem.solve(right, circle_data, steps)?;
+    let RefinedColumns {
+        columns: [map, noise],
+        convergence: [map_convergence, noise_convergence],
+        residuals,
+        direct,
+    } = problem.solve(right, circle_data, steps)?;
     let area_sr = pixel_area_sr(request.nside);
-    let synthesised = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
+    let synthesise = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = map.x.clone();
     if let Some(prior) = prior {
         add(&mut whole, &prior);
@@ -124,27 +127,30 @@ pub fn solve_refined(
         w_max: Some(w_max * area_sr),
         w_max_iterations: iterations,
         l_max: Some(l_max),
-        convergence: Some(of_map),
-        noise_convergence: Some(of_noise),
+        convergence: Some(map_convergence),
+        noise_convergence: Some(noise_convergence),
         traces: None,
         traces_refused: None,
         fit: None,
     };
-    let mut left = sums.data.value_k_sr.clone();
-    let seen = sums.rows.forward(&sums.plan, &[coefficients(&whole, l_max)]);
-    left.iter_mut().zip(seen.iter().flatten()).for_each(|(left, seen)| *left -= seen);
+    let mut data_residuals = sums.data.value_k_sr.clone();
+    let predicted = sums.rows.forward(&sums.plan, &[coefficients(&whole, l_max)]);
+    data_residuals
+        .iter_mut()
+        .zip(predicted.iter().flatten())
+        .for_each(|(value, predicted)| *value -= predicted);
     let refinement = Refinement {
-        convergence: of_map,
+        convergence: map_convergence,
         residuals,
         direct,
         departures: sums.departures,
         rows_computed: sums.plan.computed() as u64,
         taken_as_instants: sums.plan.instants() as u64,
-        chi_square: chi_squares(sums, &left),
+        chi_square: chi_squares(sums, &data_residuals),
     };
     let solution = HarmonicSolution {
-        map_k: synthesised(&whole)?,
-        noise_k: synthesised(&noise.x)?,
+        map_k: synthesise(&whole)?,
+        noise_k: synthesise(&noise.x)?,
         unknowns: [map.x, noise.x],
         diagnostics,
         uncertainty: None,
@@ -152,27 +158,27 @@ pub fn solve_refined(
     Ok((solution, refinement))
 }
 
-/// The true normal equations and how they are solved.
+/// The true normal equations and the settings of their solution.
 struct RefinedProblem<'a> {
     sums: &'a RefinedSums,
     regularisation: Diagonal,
-    /// When inner iterations stop, besides their residual.
+    /// Iteration limit of inner solutions.
     inner: StoppingRule,
     rule: RefineRule,
     watch: NamedWatch<'a>,
 }
 
-/// The map, the noise-only map, and how they were found.
-struct Refined {
+/// The solutions for the map and the noise-only map, with their convergence.
+struct RefinedColumns {
     columns: [Column; 2],
     convergence: [Convergence; 2],
-    /// Of the map, after each pass.
+    /// Residual of the map after each iteration.
     residuals: Vec<f64>,
     direct: bool,
 }
 
-/// The circle's matrix with a multiple of R.
-struct Shifted {
+/// The circle's matrix plus a multiple of R.
+struct CircleSystem {
     regularisation: Diagonal,
     factors: OrderFactors,
 }
@@ -197,31 +203,31 @@ impl RefinedProblem<'_> {
         [(); 2].map(|()| gradients.next().as_ref().map(unknowns_of_gradient).unwrap_or_default())
     }
 
-    /// Products of the true matrix and R with several vectors, in one pass.
+    /// Products of the true matrix plus R with several vectors, for which rows are computed once.
     fn products(&self, x: &[Vec<f64>]) -> Vec<Vec<f64>> {
         let RefinedSums { rows, plan, data, .. } = self.sums;
         let skies: Vec<_> = x.iter().map(|x| coefficients(x, self.l_max())).collect();
         let products = rows.normal(plan, &skies, &data.weight);
-        let with_r = |(product, x): (_, &Vec<f64>)| {
+        let add_r = |(product, x): (_, &Vec<f64>)| {
             let mut product = unknowns_of_gradient(product);
             self.regularisation.add_product(x, &mut product);
             product
         };
-        products.iter().zip(x).map(with_r).collect()
+        products.iter().zip(x).map(add_r).collect()
     }
 
-    fn shifted(&self, shift: f64) -> Shifted {
+    fn circle_system(&self, shift: f64) -> CircleSystem {
         let regularisation = self.regularisation.times(shift);
         let factors = self.sums.circle.order_blocks().factors_with(&|l| regularisation.at(l));
-        Shifted { regularisation, factors }
+        CircleSystem { regularisation, factors }
     }
 
-    /// Solutions of the circle's equations.
-    fn on_the_circle(&self, with: &Shifted, right: &[&[f64]], residual_max: f64) -> Vec<Vec<f64>> {
+    /// Solves the circle's equations for several right-hand sides.
+    fn solve_on_circle(&self, system: &CircleSystem, right: &[&[f64]], residual_max: f64) -> Vec<Vec<f64>> {
         let circle = System {
             sums: &self.sums.circle,
-            regularisation: with.regularisation.clone(),
-            precondition: &|v| with.factors.solve(v),
+            regularisation: system.regularisation.clone(),
+            precondition: &|v| system.factors.solve(v),
         };
         let mut z: Vec<Vec<f64>> = right.iter().map(|b| vec![0.0; b.len()]).collect();
         let rule = StoppingRule { residual_max, ..self.inner };
@@ -229,29 +235,29 @@ impl RefinedProblem<'_> {
             right,
             &mut z,
             &vec![rule; right.len()],
-            &self.watch.part("on the nearest circle", residual_max),
+            &self.watch.inner("on the nearest circle", residual_max),
         );
         z
     }
 
-    /// Solves for two right-hand sides; `circle_data` is what the first is by the circle's rows.
+    /// Solves for two right-hand sides; `circle_data` is the first one computed with the circle's rows.
     fn solve(
         &self,
         right: [Vec<f64>; 2],
         circle_data: Vec<f64>,
         steps: RefineSteps<'_>,
-    ) -> Result<Refined, SolveError> {
+    ) -> Result<RefinedColumns, SolveError> {
         let RefineRule { passes_max, residual_max } = self.rule;
         let task = self.watch.start("refined map", residual_max);
-        let mut shifts = vec![self.shifted(SHIFTS[0])];
+        let mut shifts = vec![self.circle_system(SHIFTS[0])];
         let both = right.each_ref().map(Vec::as_slice);
-        let mut directions = self.on_the_circle(&shifts[0], &both, INNER_RESIDUAL);
-        let wholes = [0, 1].map(|k| dot(&right[k], &directions[k]));
+        let mut directions = self.solve_on_circle(&shifts[0], &both, INNER_RESIDUAL);
+        let right_norms = [0, 1].map(|k| dot(&right[k], &directions[k]));
         let start = steps.start.filter(|start| right.iter().zip(start).all(|(b, x)| b.len() == x.len()));
         directions.extend(start.map_or_else(
             || {
                 let circle = [circle_data.as_slice(), self.sums.circle.noise_right_hand_side()];
-                self.on_the_circle(&shifts[0], &circle, self.inner.residual_max)
+                self.solve_on_circle(&shifts[0], &circle, self.inner.residual_max)
             },
             Vec::from,
         ));
@@ -263,45 +269,45 @@ impl RefinedProblem<'_> {
             let products = self.products(&directions);
             let added = subspace.extend(directions.into_iter().zip(products), &mut columns);
             let left = columns.each_ref().map(|column| column.residual.as_slice());
-            directions = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
-            relative = [0, 1].map(|k| relative_residual(&columns[k], &directions[k], wholes[k]));
+            directions = self.solve_on_circle(&shifts[0], &left, INNER_RESIDUAL);
+            relative = [0, 1].map(|k| relative_residual(&columns[k], &directions[k], right_norms[k]));
             residuals.push(relative[0]);
-            (steps.passed)([&columns[0].x, &columns[1].x]);
+            (steps.save)([&columns[0].x, &columns[1].x]);
             if added == 0 || worst(&relative) <= residual_max {
                 break;
             }
-            if worst(&relative) > SLOW.powi(residuals.len() as i32) {
-                if residuals.len() >= SLOW_PASSES && self.can_be_formed() {
+            if worst(&relative) > SLOW_RATIO.powi(residuals.len() as i32) {
+                if residuals.len() >= SLOW_ITERATIONS_MAX && self.can_be_formed() {
                     break;
                 }
                 for shift in &SHIFTS[shifts.len()..] {
-                    shifts.push(self.shifted(*shift));
+                    shifts.push(self.circle_system(*shift));
                 }
             }
             let left = columns.each_ref().map(|column| column.residual.as_slice());
             for shift in &shifts[1..] {
-                directions.extend(self.on_the_circle(shift, &left, INNER_RESIDUAL));
+                directions.extend(self.solve_on_circle(shift, &left, INNER_RESIDUAL));
             }
         }
         if residuals.is_empty() {
             return Err(SolveError::Interrupted);
         }
-        let is_formed = worst(&relative) > residual_max && self.can_be_formed();
-        let solved = is_formed.then(|| self.solve_directly(&right, &task, residuals.len())).flatten();
+        let is_direct = worst(&relative) > residual_max && self.can_be_formed();
+        let solved = is_direct.then(|| self.solve_directly(&right, &task, residuals.len())).flatten();
         if let Some(solved) = solved {
             (columns, direct) = (solved, true);
             let left = columns.each_ref().map(|column| column.residual.as_slice());
-            let z = self.on_the_circle(&shifts[0], &left, INNER_RESIDUAL);
-            relative = [0, 1].map(|k| relative_residual(&columns[k], &z[k], wholes[k]));
+            let z = self.solve_on_circle(&shifts[0], &left, INNER_RESIDUAL);
+            relative = [0, 1].map(|k| relative_residual(&columns[k], &z[k], right_norms[k]));
             residuals.push(relative[0]);
-            (steps.passed)([&columns[0].x, &columns[1].x]);
+            (steps.save)([&columns[0].x, &columns[1].x]);
         }
         let convergence = relative.map(|residual| Convergence {
             iterations: residuals.len(),
             residual,
             converged: residual <= residual_max,
         });
-        Ok(Refined { columns, convergence, residuals, direct })
+        Ok(RefinedColumns { columns, convergence, residuals, direct })
     }
 
     fn can_be_formed(&self) -> bool {
@@ -309,25 +315,25 @@ impl RefinedProblem<'_> {
         unknowns <= DIRECT_UNKNOWNS_MAX && rows.saturating_mul(unknowns) <= DIRECT_PRODUCTS_MAX
     }
 
-    /// Forms the matrix and solves by Cholesky's factors; `None` if it is interrupted.
+    /// Forms the matrix and solves by Cholesky factorisation; `None` if it is interrupted.
     fn solve_directly(
         &self,
         right: &[Vec<f64>; 2],
         task: &SolveTask<'_>,
-        passes: usize,
+        iterations: usize,
     ) -> Option<[Column; 2]> {
         let unknowns = right[0].len();
         let mut columns: Vec<Vec<f64>> = Vec::with_capacity(unknowns);
         while columns.len() < unknowns {
-            if !task.report(passes, 1.0) {
+            if !task.report(iterations, 1.0) {
                 return None;
             }
             let unit = |k: usize| (0..unknowns).map(|n| f64::from(u8::from(n == k))).collect();
             let units: Vec<Vec<f64>> =
-                (columns.len()..unknowns.min(columns.len() + COLUMNS)).map(unit).collect();
+                (columns.len()..unknowns.min(columns.len() + COLUMNS_AT_ONCE)).map(unit).collect();
             columns.extend(self.products(&units));
         }
-        // Sums in f32 leave it symmetric to 1e-6.
+        // The matrix is symmetric to 1e-6 only, because of sums in f32.
         let element = |a: usize, b: usize| 0.5 * (columns[a][b] + columns[b][a]);
         let factor = Mat::from_fn(unknowns, unknowns, element).llt(Side::Lower).ok()?;
         Some(right.each_ref().map(|right| {
@@ -342,7 +348,7 @@ impl RefinedProblem<'_> {
     }
 }
 
-/// `sqrt(r.Mr / b.Mb)`, with `z = M r`; 0 without data.
-fn relative_residual(column: &Column, z: &[f64], whole: f64) -> f64 {
-    if whole > 0.0 { (dot(&column.residual, z).max(0.0) / whole).sqrt() } else { 0.0 }
+/// The relative residual `sqrt(r.Mr / b.Mb)`, with `z = M r` and `right_norm = b.Mb`; 0 without data.
+fn relative_residual(column: &Column, z: &[f64], right_norm: f64) -> f64 {
+    if right_norm > 0.0 { (dot(&column.residual, z).max(0.0) / right_norm).sqrt() } else { 0.0 }
 }

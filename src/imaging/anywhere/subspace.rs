@@ -1,30 +1,30 @@
-//! Conjugate directions of a symmetric matrix: the solution that is nearest in their span.
+//! The best solution of a symmetric system in the span of conjugate directions.
 
 use crate::imaging::solver::{dot, subtract};
 
-/// Directions that are kept: each new one is made conjugate to those. Older ones matter to rounding only.
-const KEPT: usize = 64;
+/// Number of directions to which each new one is made conjugate; older ones affect only rounding.
+const DIRECTIONS_MAX: usize = 64;
 
-/// Share of its curvature that a direction keeps when it is made conjugate to others, below which it is a combination of them: products are
-/// good to 1e-6.
-const OWN_SHARE_MIN: f64 = 1e-10;
+/// Minimum fraction of its curvature that a direction keeps when it is made conjugate to the others; below it the direction is taken to be a
+/// combination of them. Products are accurate to 1e-6.
+const NEW_FRACTION_MIN: f64 = 1e-10;
 
-/// Directions of curvature one that are conjugate, and their products with the matrix.
+/// Conjugate directions of unit curvature, and their products with the matrix.
 #[derive(Default)]
 pub(super) struct Subspace {
     directions: Vec<Vec<f64>>,
     products: Vec<Vec<f64>>,
 }
 
-/// A right-hand side, its solution in the subspace and what that leaves.
+/// The best solution for a right-hand side in the subspace, and its residual.
 pub(super) struct Column {
     pub(super) x: Vec<f64>,
     pub(super) residual: Vec<f64>,
 }
 
 impl Subspace {
-    /// Adds directions with their products, and moves each column to the solution that is nearest to the true one in the matrix's own norm:
-    /// none moves away from it. Returns how many of the directions were new.
+    /// Adds directions with their products, and moves each column to the solution nearest to the true one in the norm of the matrix, so that
+    /// no column moves away from it. Returns how many of the directions were new.
     pub(super) fn extend(
         &mut self,
         directions: impl IntoIterator<Item = (Vec<f64>, Vec<f64>)>,
@@ -32,22 +32,22 @@ impl Subspace {
     ) -> usize {
         let mut added = 0;
         for (mut direction, mut product) in directions {
-            let whole = dot(&direction, &product);
-            // The second time takes away what rounding left.
+            let curvature = dot(&direction, &product);
+            // The second round removes rounding errors of the first.
             for _ in 0..2 {
-                for (known, of_known) in self.directions.iter().zip(&self.products) {
-                    let share = dot(of_known, &direction);
+                for (known, known_product) in self.directions.iter().zip(&self.products) {
+                    let share = dot(known_product, &direction);
                     subtract(&mut direction, share, known);
-                    subtract(&mut product, share, of_known);
+                    subtract(&mut product, share, known_product);
                 }
             }
-            let own = dot(&direction, &product);
-            // Also false for what is not a number.
-            let is_new = own > OWN_SHARE_MIN * whole && own.is_finite();
+            let new_curvature = dot(&direction, &product);
+            // Also false for NaN.
+            let is_new = new_curvature > NEW_FRACTION_MIN * curvature && new_curvature.is_finite();
             if !is_new {
                 continue;
             }
-            let scale = own.sqrt().recip();
+            let scale = new_curvature.sqrt().recip();
             direction.iter_mut().chain(&mut product).for_each(|x| *x *= scale);
             for Column { x, residual } in columns.iter_mut() {
                 let step = dot(&direction, residual);
@@ -58,7 +58,7 @@ impl Subspace {
             self.products.push(product);
             added += 1;
         }
-        let old = self.directions.len().saturating_sub(KEPT);
+        let old = self.directions.len().saturating_sub(DIRECTIONS_MAX);
         self.directions.drain(..old);
         self.products.drain(..old);
         added
@@ -69,7 +69,7 @@ impl Subspace {
 mod tests {
     use super::*;
 
-    /// `D + v v'`, whose solution Sherman and Morrison give.
+    /// The matrix is `D + v v'`, whose inverse is the Sherman-Morrison formula.
     #[test]
     fn directions_that_span_all_give_the_solution() {
         const ORDER: usize = 6;
@@ -92,7 +92,7 @@ mod tests {
         let mut subspace = Subspace::default();
         let mut last = distance(&columns[0].x);
         for k in 0..ORDER {
-            // Neither conjugate nor of length one; and one that is known already, one of nothing, one that is no number.
+            // Directions that are neither conjugate nor normalised; and a known one, zero and NaN.
             let direction: Vec<f64> = (0..ORDER).map(|m| ((m + 1) as f64).powi(k as i32)).collect();
             let bad = [direction.clone(), vec![0.0; ORDER], vec![f64::NAN; ORDER]];
             let product = multiply(&direction);
@@ -103,7 +103,7 @@ mod tests {
             assert!(now < last, "{k}: {now} {last}");
             last = now;
         }
-        // Rounding, times the condition of the matrix.
+        // Rounding times the condition number of the matrix.
         for (found, exact) in columns[0].x.iter().zip(&exact) {
             assert!((found / exact - 1.0).abs() < 1e-8, "{found} {exact}");
         }

@@ -1,6 +1,6 @@
-//! The effective beam in some directions: what a map makes of a point there.
+//! Effective beams of harmonic maps.
 //!
-//! `B_eff = (A + R)^-1 A`, A the normal matrix: its column for a pixel is the solution for data of a sky that is 1 K in that pixel alone.
+//! The beam at a pixel is a column of `B_eff = (A + R)^-1 A`, A the normal matrix: the solution for a sky that is 1 K in that pixel only.
 
 use super::solve::HarmonicRequest;
 use super::{HarmonicSums, coefficients, unknowns};
@@ -13,11 +13,11 @@ use crate::imaging::solver::System;
 use crate::sky::harmonics::Transform;
 use crate::sky::healpix::pixel_count;
 
-/// Beams of a harmonic map at pixels of its nside, solved for as the map is; `w_max` is the largest eigenvalue over harmonics. Those
-/// that are reached before an interruption.
+/// Solves for the beams of a harmonic map at pixels of its nside; `w_max` is the largest eigenvalue over harmonics. After an interruption the
+/// beams so far are returned.
 ///
 /// # Errors
-/// A pixel that the map does not have; an nside or degree without a transform; a table of power that ends too early.
+/// The map does not have a pixel; there is no transform for its nside or degree; or a table of power ends too early.
 pub fn harmonic_beams(
     sums: &HarmonicSums,
     request: HarmonicRequest,
@@ -40,7 +40,7 @@ pub fn harmonic_beams(
         let mut beam = [vec![0.0; right.len()]];
         let task = watch.start(&format!("beam at pixel {pixel}"), request.rule.residual_max);
         system.solve(&[&right], &mut beam, &[request.rule], &task);
-        if !watch.goes_on() {
+        if !watch.may_continue() {
             break;
         }
         beams.push(PointBeam { pixel, map_k: transform.synthesis(&coefficients(&beam[0], l_max))? });

@@ -1,4 +1,4 @@
-//! The blocks of BtN^-1B that keep the order m, for preconditioning.
+//! The blocks of BtN^-1B that are diagonal in the order m, for preconditioning.
 
 use std::borrow::Cow;
 
@@ -14,14 +14,14 @@ use super::tori::Tori;
 use crate::imaging::exact::fixed_point::parts::sum_of_parts;
 use crate::imaging::power::Block;
 use crate::ranks::Ranks;
-use crate::response::harmonic::degrees;
+use crate::response::harmonic::degree_count;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::sky::harmonics::WignerTable;
 
-/// For each m the matrix over l = m, m + 2, .. and that over l = m + 1, m + 3, ..: nothing couples even and odd
-/// degrees when all phases are alike, for a pattern has only even l + mu.
+/// For each m two matrices, over l = m, m + 2, .. and over l = m + 1, m + 3, ... Weights averaged over the phase do not couple even and odd
+/// degrees, because patterns have only even l + mu.
 ///
-/// `A_m(l, l') = sum_mu d^l_{m mu} d^l'_{m mu} sum_{kk'} W_kk' f_{l mu}^k f_{l' mu}^k'`, W summed over the torus.
+/// `A_m(l, l') = sum_mu d^l_{m mu} d^l'_{m mu} sum_{kk'} W_kk' f_{l mu}^k f_{l' mu}^k'`, with W summed over the torus.
 #[derive(Clone, Debug)]
 pub struct OrderBlocks {
     l_max: usize,
@@ -29,7 +29,7 @@ pub struct OrderBlocks {
     blocks: Vec<[Mat<f64>; 2]>,
 }
 
-/// Cholesky factors of the blocks, where there are any.
+/// Cholesky factors of the blocks; `None` for a block that is not positive definite.
 pub struct OrderFactors {
     l_max: usize,
     factors: Vec<[Option<Llt<f64>>; 2]>,
@@ -49,7 +49,7 @@ impl OrderBlocks {
         let mut blocks: Vec<[Mat<f64>; 2]> = (0..=l_max)
             .map(|m| [0, 1].map(|parity| Mat::zeros(size(l_max, m, parity), size(l_max, m, parity))))
             .collect();
-        // A few orders mu at a time: their matrices over l and rows of d are held together.
+        // Only a few orders mu at a time, because of the memory of their matrices and rows of d.
         for first in (0..=l_max).step_by(MUS_AT_ONCE) {
             let last = (first + MUS_AT_ONCE - 1).min(l_max);
             let parts: Vec<MuPart> = (first..=last)
@@ -63,7 +63,7 @@ impl OrderBlocks {
         Self { l_max, blocks }
     }
 
-    /// The element of the zonal coefficient of degree `l` with itself, (K sr^(1/2))^-2.
+    /// The diagonal element of the zonal coefficient of degree `l`, (K sr^(1/2))^-2.
     #[must_use]
     pub fn diagonal(&self, l: usize) -> f64 {
         self.blocks[0][l % 2][(l / 2, l / 2)]
@@ -77,13 +77,13 @@ impl OrderBlocks {
             let (of_m, others) = rest.split_at_mut(parts * (self.l_max + 1 - m));
             rest = others;
             for (parity, block) in blocks.iter().enumerate() {
-                let product = block * part_of(of_m, parity, parts, block.nrows());
-                put_part(of_m, parity, parts, &product);
+                let product = block * gather(of_m, parity, parts, block.nrows());
+                scatter(of_m, parity, parts, &product);
             }
         }
     }
 
-    /// The blocks with the places of their unknowns, in the order of m and parity.
+    /// The blocks with the indices of their unknowns, in order of m and parity.
     pub(in crate::imaging) fn blocks(&self) -> Vec<Block<'_>> {
         let mut first = 0;
         let mut all = Vec::new();
@@ -104,13 +104,13 @@ impl OrderBlocks {
         all
     }
 
-    /// Factors of the blocks plus `regularisation` I; a block without a factor leaves its unknowns unchanged.
+    /// Factorises the blocks plus `regularisation` I. A block that is not positive definite leaves its unknowns unchanged in solutions.
     #[must_use]
     pub fn factors(&self, regularisation: f64) -> OrderFactors {
         self.factors_with(&|_| regularisation)
     }
 
-    /// Factors of the blocks plus an R that depends on the degree.
+    /// Factorises the blocks plus an R that depends on the degree.
     #[must_use]
     pub fn factors_with(&self, of_degree: &(dyn Fn(usize) -> f64 + Sync)) -> OrderFactors {
         let factor = |m: usize, parity: usize, block: &Mat<f64>| {
@@ -137,9 +137,9 @@ impl OrderFactors {
             rest = others;
             for (parity, factor) in factors.iter().enumerate() {
                 let Some(factor) = factor else { continue };
-                let mut right = part_of(of_m, parity, parts, size(self.l_max, m, parity));
+                let mut right = gather(of_m, parity, parts, size(self.l_max, m, parity));
                 factor.solve_in_place(&mut right);
-                put_part(of_m, parity, parts, &right);
+                scatter(of_m, parity, parts, &right);
             }
         }
     }
@@ -151,18 +151,18 @@ pub(super) fn orders_of(l_max: usize) -> Vec<usize> {
     (0..=l_max).flat_map(of_order).collect()
 }
 
-/// Numbers of a coefficient of order m.
+/// Number of real unknowns per coefficient of order m.
 fn parts_of(m: usize) -> usize {
     if m == 0 { 1 } else { 2 }
 }
 
-/// Of the unknowns of an order those of every second degree: a row for each of `count` degrees.
-fn part_of(of_m: &[f64], parity: usize, parts: usize, count: usize) -> Mat<f64> {
+/// The unknowns of one order and parity: one row for each of `count` degrees.
+fn gather(of_m: &[f64], parity: usize, parts: usize, count: usize) -> Mat<f64> {
     Mat::from_fn(count, parts, |k, part| of_m[(2 * k + parity) * parts + part])
 }
 
-/// Puts them back.
-fn put_part(of_m: &mut [f64], parity: usize, parts: usize, values: &Mat<f64>) {
+/// Writes back the unknowns of one order and parity.
+fn scatter(of_m: &mut [f64], parity: usize, parts: usize, values: &Mat<f64>) {
     for k in 0..values.nrows() {
         for part in 0..parts {
             of_m[(2 * k + parity) * parts + part] = values[(k, part)];
@@ -170,19 +170,19 @@ fn put_part(of_m: &mut [f64], parity: usize, parts: usize, values: &Mat<f64>) {
     }
 }
 
-/// Orders mu whose parts are in memory at once.
+/// Number of orders mu whose parts are in memory at once.
 const MUS_AT_ONCE: usize = 16;
 
-/// Degrees l = m + parity, + 2, .. <= l_max.
+/// Number of degrees l = m + parity, m + parity + 2, .. <= l_max.
 fn size(l_max: usize, m: usize, parity: usize) -> usize {
     (l_max + 2).saturating_sub(m + parity) / 2
 }
 
-/// Weights of each pair of neighbouring nodes, summed over alpha and gamma: `[node][diagonal]`.
+/// Sums of the weights over alpha and gamma for each pair of neighbouring nodes: `[node][diagonal]`.
 fn totals(grids: &Grids, tori: &Tori, ranks: &Ranks) -> Vec<[f64; NODES]> {
     let stride = grids.weight_stride();
     let len = NODES * grids.nodes.count;
-    // Block by block of alphas, as products are summed.
+    // By blocks of alphas, as in products.
     let part = |block: usize| {
         let mut totals = vec![0.0; len];
         let Some(rows) = tori.block(grids, TorusPart::Weights, block) else { return vec![f64::NAN] };
@@ -203,9 +203,9 @@ fn totals(grids: &Grids, tori: &Tori, ranks: &Ranks) -> Vec<[f64; NODES]> {
     sum_of_parts(ranks, &parts, len, grids.points.div_ceil(ALPHAS)).as_chunks().0.to_vec()
 }
 
-/// The banded matrix of weights times the patterns of order mu, for both signs of mu.
+/// The product of the banded matrix of weights and the patterns of order mu, for both signs of mu.
 fn weighted(patterns: &FilteredPatterns, totals: &[[f64; NODES]], mu: usize, l_max: usize) -> Vec<f32> {
-    let count = degrees(l_max, mu);
+    let count = degree_count(l_max, mu);
     let stride = 2 * patterns.grid.count;
     let pattern = &patterns.order(mu)[..count * stride];
     let mut weighted = vec![0.0_f32; count * stride];
@@ -225,13 +225,13 @@ fn weighted(patterns: &FilteredPatterns, totals: &[[f64; NODES]], mu: usize, l_m
     weighted
 }
 
-/// One order mu: the weights times its patterns, and its rows of d.
+/// The contribution of one order mu: products of weights and patterns, and rows of d.
 struct MuPart {
     mu: usize,
     l_max: usize,
-    /// Over l, l' = mu, mu + 2, ..: the mean of mu and -mu.
+    /// Matrix over l, l' = mu, mu + 2, .., averaged over mu and -mu.
     powers: Mat<f64>,
-    /// For l = mu, mu + 2, ..: d^l_{m mu} for m = -l ..= l.
+    /// Rows d^l_{m mu}, m = -l ..= l, for l = mu, mu + 2, ..
     rows: Vec<Vec<f64>>,
 }
 
@@ -243,7 +243,7 @@ impl MuPart {
         totals: &[[f64; NODES]],
         wigner: &WignerTable,
     ) -> Self {
-        let count = degrees(l_max, mu);
+        let count = degree_count(l_max, mu);
         let stride = 2 * patterns.grid.count;
         let pattern = &patterns.order(mu)[..count * stride];
         let weighted = weighted(patterns, totals, mu, l_max);
@@ -269,7 +269,7 @@ impl MuPart {
     }
 
     fn add(&self, m: usize, blocks: &mut [Mat<f64>; 2]) {
-        // l has the parity of mu.
+        // Patterns have only l of the parity of mu.
         let parity = (self.mu + m) % 2;
         let block = &mut blocks[parity];
         let lowest = m.max(self.mu) + (m.max(self.mu) + self.mu) % 2;

@@ -1,6 +1,7 @@
-//! Setups of the harmonic engine in checkpoints, and its integers there: a byte for every node (1 if it holds
-//! something); of those nodes every row of weights and of right-hand sides: its bound (u64, 0 for an empty row, of which
-//! nothing follows) and its sums, i32 for bounds below 2^31, else i64.
+//! The setup and the sums of the harmonic engine in checkpoints.
+//!
+//! Sums are a byte for every node (1 if it has data), then all rows of weights and right-hand sides of those nodes. A row is its bound (u64)
+//! and its sums: i32 for bounds below 2^31, else i64; only the bound 0 for an empty row.
 
 use super::HarmonicSetup;
 use super::exact::ExactTori;
@@ -13,7 +14,7 @@ use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::ranks::RankShare;
 use crate::response::harmonic::{GeometryLimits, NominalOrbit};
 
-/// A setup of the harmonic engine in a checkpoint.
+/// The setup of a harmonic engine in a checkpoint.
 #[derive(bincode::Encode, bincode::Decode)]
 pub struct HarmonicHead {
     l_max: u32,
@@ -78,8 +79,8 @@ impl HarmonicHead {
 
 impl ExactTori {
     pub(super) fn write(&self, grids: &Grids, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
-        let filled = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
-        let held: Vec<u8> = self.nodes.iter().map(|node| u8::from(filled(node))).collect();
+        let has_data = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
+        let held: Vec<u8> = self.nodes.iter().map(|node| u8::from(has_data(node))).collect();
         out.write(&held)?;
         for node in self.nodes.iter().flatten().filter(|node| !node.is_empty()) {
             node.weights
@@ -90,7 +91,7 @@ impl ExactTori {
         Ok(())
     }
 
-    /// Reads what was written by a process that holds `part`; keeps the rows that `kept` holds.
+    /// Reads the sums that a process with share `part` wrote, and keeps the rows of the share `kept`.
     pub(super) fn read(
         grids: &Grids,
         from: &mut FrameReader<'_>,
@@ -105,11 +106,11 @@ impl ExactTori {
                 return Err(refused(format!("{held} for a node"), "0 or 1"));
             }
             if held == 1 {
-                // Memory follows the data that is there: a forged head ends at the first row that is not.
+                // Memory is allocated row by row, so that a forged head takes none.
                 let mut read = ExactNode::zeros(grids);
                 let rows = [(&mut read.weights, grids.weight_row()), (&mut read.right, grids.data_row())];
                 for (rows, layout) in rows {
-                    for (alpha, place) in rows.iter_mut().enumerate() {
+                    for (alpha, kept_row) in rows.iter_mut().enumerate() {
                         let row = IntegerRow::read(layout, |bytes| from.read(bytes))?;
                         let block = alpha / ALPHAS;
                         if !row.is_empty() && !part.holds(block) {
@@ -117,7 +118,7 @@ impl ExactTori {
                             return Err(refused(found, "those of the rank's own blocks"));
                         }
                         if kept.holds(block) {
-                            *place = row;
+                            *kept_row = row;
                         }
                     }
                 }

@@ -1,17 +1,17 @@
-//! Survey of a downlink before anything is summed: how much of it the harmonic engine covers.
+//! Survey of a downlink: how much of its data the harmonic engine covers.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::Serialize;
 
-use super::orbit_of;
+use super::nominal_orbit;
 use crate::array::Ephemeris;
 use crate::frames::{GroundFrame, Instrument};
 use crate::response::harmonic::{GeometryLimits, GeometryRefusal, NominalOrbit, PairOrientation};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// The common circular orbit, and the visibilities on and off it.
+/// The common circular orbit, and the numbers of visibilities on and off it.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct GeometryCoverage {
     /// Inclination of the common circle, degrees.
@@ -26,7 +26,7 @@ pub struct GeometryCoverage {
     pub without_ephemeris: u64,
 }
 
-/// Surveys received frames.
+/// A survey of received frames.
 #[derive(Debug, Default)]
 pub struct GeometrySurvey {
     instrument: Option<Instrument>,
@@ -38,20 +38,20 @@ pub struct GeometrySurvey {
 }
 
 impl GeometrySurvey {
-    /// A survey with these limits.
+    /// Creates a survey with these limits.
     #[must_use]
     pub fn new(limits: GeometryLimits) -> Self {
         Self { limits, ..Self::default() }
     }
 
-    /// Surveys a frame.
-    pub fn see(&mut self, frame: &GroundFrame) {
+    /// Adds a frame to the survey.
+    pub fn add(&mut self, frame: &GroundFrame) {
         match frame {
             GroundFrame::Instrument(instrument) => {
                 self.instrument.get_or_insert_with(|| instrument.clone());
             }
             GroundFrame::Ephemeris(segment) => {
-                // A segment that cannot be used shows as visibilities without ephemeris.
+                // An invalid segment shows up as visibilities without ephemeris.
                 self.ephemeris.insert(segment.clone());
             }
             // An auto-correlation has no baseline.
@@ -65,11 +65,12 @@ impl GeometrySurvey {
                 let (placed, counts) = self.ephemeris.place(block, channel.frequency_hz);
                 self.coverage.without_ephemeris += counts.without_ephemeris;
                 if self.orbit.is_none() {
-                    self.orbit = orbit_of(&placed, self.limits);
+                    self.orbit = nominal_orbit(&placed, self.limits);
                 }
                 for (&r_i_m, &r_j_m) in placed.r_i_m.iter().zip(&placed.r_j_m) {
                     let orbit = self.orbit.ok_or(GeometryRefusal::Degenerate);
-                    let pair = orbit.and_then(|o| o.pair(&PairOrientation::of(r_i_m, r_j_m)?, wavelength_m));
+                    let pair =
+                        orbit.and_then(|o| o.pair(&PairOrientation::of_pair(r_i_m, r_j_m)?, wavelength_m));
                     match pair {
                         Ok(_) => self.coverage.covered += 1,
                         Err(reason) => *self.refused.entry(reason).or_default() += 1,

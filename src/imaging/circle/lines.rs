@@ -1,26 +1,26 @@
-//! Products with the weights along gamma: the innermost loops of an application.
+//! Products with the weights along gamma, the innermost loops of a matrix product.
 
 use num_complex::Complex32;
 
 use super::grid::NODES;
 
-/// Terms of one node's product: its own weights with itself and those above, theirs with those below.
-const TERMS: usize = 2 * NODES - 1;
+/// Maximum number of terms of one node's product: with itself, the nodes above and the nodes below.
+const TERMS_MAX: usize = 2 * NODES - 1;
 
-/// `line = sum_d W_d z_{+d} + sum_{d > 0} W'_d z_{-d}`, where `rows[d]` are the weights of the node d below: its
-/// diagonal d couples it to this one, and `rows[0]` couples this one to those above.
+/// Computes `line = sum_d W_d z_{+d} + sum_{d > 0} W'_d z_{-d}`. W is `rows[0]`, which couples this node to those above;
+/// `W'_d` is diagonal d of `rows[d]`, which couples the node d below to this one.
 pub(super) fn multiply_line<'a>(
     line: &mut [Complex32],
     rows: &[Option<&'a [f32]>; NODES],
     stride: usize,
     z: impl Fn(isize) -> &'a [Complex32],
 ) {
-    let mut terms: [(&[f32], &[Complex32]); TERMS] = [(&[], &[]); TERMS];
+    let mut terms: [(&[f32], &[Complex32]); TERMS_MAX] = [(&[], &[]); TERMS_MAX];
     let mut count = 0;
     let points = line.len();
     for d in 0..NODES {
-        if let Some(own) = rows[0] {
-            terms[count] = (&own[d * stride..d * stride + points], z(d as isize));
+        if let Some(weights) = rows[0] {
+            terms[count] = (&weights[d * stride..d * stride + points], z(d as isize));
             count += 1;
         }
         if d > 0
@@ -33,7 +33,7 @@ pub(super) fn multiply_line<'a>(
     sum_products(line, &terms[..count]);
 }
 
-/// Points that are summed over all terms in registers.
+/// Points that are summed over all terms in vector registers.
 const CHUNK: usize = 16;
 
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]

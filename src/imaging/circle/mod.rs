@@ -1,21 +1,23 @@
-//! Normal equations over spherical harmonics: sums on tori, from which BtN^-1B acts on harmonic coefficients.
+//! Normal equations over spherical harmonics, for satellites on one circular orbit: gridded sums, with which BtN^-1B is
+//! applied to harmonic coefficients by a non-uniform FFT.
 //!
-//! On a common circular orbit every row of B is one rotation of a pattern that depends on the baseline's length
-//! alone (see [`mod@crate::response::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
+//! On a common circular orbit every row of B is a rotation of a pattern that depends only on the baseline's length
+//! (see [`mod@crate::response::harmonic`]). A row at baseline u is interpolated from nodes u_k by a compact
 //! kernel, `B = sum_k kappa(u_k - u) B_k`, so
 //!
 //! ```text
 //! BtN^-1B = sum_{k k'} B_k^t [ sum_t w_t kappa_k kappa_k' at (alpha_t, gamma_t) ] B_k'
 //! ```
 //!
-//! and the bracket, a weight for every pair of neighbouring nodes on a torus in alpha and gamma, is all that has to be
-//! summed. On the torus it multiplies pointwise. Its grid is fine enough for the products of two
-//! functions of degree `l_max`, so the weights are spread by kernels whose spectra are flat over their band.
+//! and only the bracket has to be summed: a weight for every pair of neighbouring nodes on a torus of two angles. Alpha is
+//! the longitude of the ascending node minus pi/2, gamma the orbital phase plus pi/2. On the torus the bracket multiplies
+//! pointwise. Its grid resolves the products of two functions of degree `l_max`; weights are gridded with kernels whose
+//! spectra are flat over their band.
 //!
-//! Summing a visibility costs some thousand multiply-adds, whatever the map's size, and the size of the sums does not
-//! grow with the data. With M the power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
-//! `2^-24 sqrt(M)`, those above 2^21 of these to 21 bits (see the module `exact`); there is room for a total weight of
-//! `2^32 M`.
+//! Adding a visibility takes some thousand multiply-adds for any map size, and the size of the sums does not grow with
+//! the data. With M the smallest power of four not below `weight_max`, weights are rounded to `2^-30 M` and data to
+//! `2^-24 sqrt(M)`; terms above 2^21 of these quanta keep 21 bits (see the module `exact`). There is room for a total
+//! weight of `2^32 M`.
 
 mod beams;
 mod blocks;
@@ -51,8 +53,8 @@ pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
 pub use setup::{
-    ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory, orbit_of,
-    shared_size,
+    ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory,
+    nominal_orbit, shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 pub(super) use sigma::view_sigma_k;
@@ -75,10 +77,10 @@ use crate::ranks::{RankShare, Ranks};
 use crate::response::harmonic::PairOrientation;
 use crate::units::vector::Vec3;
 
-/// The engine that sums over spherical harmonics. Memory grows as baselines of more lengths arrive.
+/// The engine whose unknowns are spherical harmonics. Its memory grows as baselines of more lengths arrive.
 pub type HarmonicEngine = ExactEngine<HarmonicBasis>;
 
-/// Spherical harmonics, of satellites on one circular orbit.
+/// The basis of spherical harmonics, for satellites on one circular orbit.
 pub struct HarmonicBasis {
     setup: HarmonicSetup,
     quanta: Quanta,
@@ -88,8 +90,8 @@ pub struct HarmonicBasis {
 }
 
 impl HarmonicEngine {
-    /// This engine, without data yet, as one rank's of several: it takes all visibilities, and holds its part of their sums. Every
-    /// rank has such an engine of the same setup, and uses its sums as the others do.
+    /// Makes an empty engine that of one of several ranks: it receives all visibilities and holds its share of the sums. All ranks must have
+    /// engines of the same setup, and use their sums in the same order.
     #[must_use]
     pub fn with_ranks(mut self, ranks: &Ranks) -> Self {
         let grids = Grids { share: ranks.share(), ..Grids::clone(&self.basis.grids) };
@@ -99,11 +101,11 @@ impl HarmonicEngine {
         self
     }
 
-    /// An engine from what one rank of a job wrote of its part (`part`; all of it of a process alone), as one of `ranks`, which may be
-    /// others than those that wrote: it keeps what it holds.
+    /// Restores an engine from what the rank with share `part` wrote, as one of `ranks`. The number of ranks may have changed; only the new
+    /// share is kept.
     ///
     /// # Errors
-    /// As [`NormalEngine::restore`]; sums that the rank which wrote does not hold.
+    /// As [`NormalEngine::restore`]; or there are sums that do not belong to `part`.
     ///
     /// [`NormalEngine::restore`]: crate::imaging::NormalEngine::restore
     pub fn restore_part(
@@ -113,29 +115,29 @@ impl HarmonicEngine {
     ) -> Result<Self, AccumulationError> {
         let (mut from, (head, totals)) = FrameReader::new(from, HarmonicBasis::KIND)?;
         let kept = ranks.share();
-        let engine = Self::of(HarmonicBasis::setup_of(head)?, totals, |basis| {
+        let engine = Self::with_sums(HarmonicBasis::setup_of(head)?, totals, |basis| {
             ExactTori::read(&basis.grids, &mut from, part, kept)
         })?;
         from.finish()?;
         Ok(engine.with_ranks(ranks))
     }
 
-    /// Takes in another part of the same sums: those of the same visibilities at other alphas.
+    /// Adds another share of the same sums: the same visibilities at other alphas.
     ///
     /// # Errors
-    /// Parts of different sums, or of the same alphas.
+    /// The shares are of different sums, or overlap.
     pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
         let basis = Arc::clone(&self.basis);
-        let (ours, theirs) = self.halves(other)?;
+        let (ours, theirs) = self.matching_parts(other)?;
         ours.join(&basis.grids, &theirs)
     }
 }
 
 impl HarmonicBasis {
-    /// The same of a process that holds all sums.
-    fn whole(&self) -> Self {
+    /// The basis for a process that holds all sums.
+    fn unshared(&self) -> Self {
         let grids = Arc::new(Grids { share: RankShare::WHOLE, ..Grids::clone(&self.grids) });
-        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::one() }
+        Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::single() }
     }
 
     fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
@@ -150,7 +152,7 @@ impl HarmonicBasis {
             counts,
             right: OnceLock::new(),
             noise: OnceLock::new(),
-            further: Vec::new(),
+            noise_realisations: Vec::new(),
         }
     }
 }
@@ -163,7 +165,7 @@ impl SkyBasis for HarmonicBasis {
     type Head = HarmonicHead;
 
     const KIND: BasisKind = BasisKind::Harmonic;
-    /// Enough to keep all cores busy over the nodes, in little memory.
+    /// Large enough to keep all cores busy over the nodes, in little memory.
     const BATCH: usize = 16_384;
     const SCALES_MAX: f64 = SCALES_MAX;
 
@@ -174,7 +176,7 @@ impl SkyBasis for HarmonicBasis {
             quanta: Quanta::new(scale),
             grids: Arc::new(setup.grids()),
             tables: Arc::new(OnceLock::new()),
-            ranks: Ranks::one(),
+            ranks: Ranks::single(),
         })
     }
 
@@ -188,7 +190,7 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<TorusPoint, Refusal> {
-        let orientation = PairOrientation::of(r_i_m, r_j_m)?;
+        let orientation = PairOrientation::of_pair(r_i_m, r_j_m)?;
         let pair = self.setup.orbit.pair(&orientation, self.setup.wavelength_m())?;
         if orientation.baseline_m > self.setup.baseline_m_max {
             return Err(Refusal::TooLong);
@@ -197,7 +199,7 @@ impl SkyBasis for HarmonicBasis {
             alpha_rad: pair.state.node_rad - std::f64::consts::FRAC_PI_2,
             gamma_rad: pair.state.phase_rad + std::f64::consts::FRAC_PI_2,
             u: pair.state.baseline_wavelengths,
-            reversed: pair.reversed,
+            is_conjugated: pair.reversed,
         })
     }
 

@@ -1,4 +1,4 @@
-//! Maps of noise of many realisations, which share everything but their right-hand sides.
+//! Noise-only maps of many realisations, which share everything but their right-hand sides.
 
 use super::solve::{HarmonicRequest, NOISES_TOGETHER, W_MAX_TOLERANCE, lifted, power_of_data};
 use super::{HarmonicSums, coefficients};
@@ -11,31 +11,31 @@ use crate::imaging::solver::System;
 use crate::imaging::solver::largest_eigenvalue_from;
 use crate::sky::harmonics::synthesis;
 
-/// The noise-only maps, K, of the further realisations that the sums hold ([`HarmonicSums::further_noises`]): each as
-/// [`crate::imaging::solve_regularised`] makes it of sums with that realisation as their companion.
+/// Solves for the noise-only maps, K, of the additional realisations of the sums ([`HarmonicSums::noise_realisations`]). Each equals the
+/// noise-only map of [`crate::imaging::solve_regularised`] for that realisation.
 ///
 /// # Errors
-/// No data; a table of power that ends before the map's degrees; [`SolveError::Interrupted`].
+/// There is no data, or a table of power ends before the map's degrees; [`SolveError::Interrupted`].
 pub fn solve_noises(
     sums: &HarmonicSums,
     request: HarmonicRequest,
     regulariser: &Regulariser,
     watch: NamedWatch<'_>,
 ) -> Result<Vec<Vec<f64>>, SolveError> {
-    let known = *regulariser != Regulariser::Data;
+    let is_from_data = *regulariser == Regulariser::Data;
     let regulariser = match regulariser {
         Regulariser::Data => &power_of_data(sums, request.rule, watch)?,
-        given => given,
+        other => other,
     };
-    // One over a power is what it is.
-    let epsilon = if known { request.epsilon } else { 1.0 };
+    // epsilon does not apply to an R from the data.
+    let epsilon = if is_from_data { 1.0 } else { request.epsilon };
     check_request(sums, epsilon)?;
     let blocks = sums.order_blocks();
     let w_max = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         })
         .value
     };
@@ -45,12 +45,12 @@ pub fn solve_noises(
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
     let mut maps = Vec::new();
-    for rights in sums.further_noises().chunks(NOISES_TOGETHER) {
-        let rights: Vec<&[f64]> = rights.iter().map(Vec::as_slice).collect();
-        let mut solved = vec![vec![0.0; sums.unknowns()]; rights.len()];
+    for right_hand_sides in sums.noise_realisations().chunks(NOISES_TOGETHER) {
+        let right_hand_sides: Vec<&[f64]> = right_hand_sides.iter().map(Vec::as_slice).collect();
+        let mut solved = vec![vec![0.0; sums.unknowns()]; right_hand_sides.len()];
         let task = watch.start("noise maps", request.rule.residual_max);
-        system.solve(&rights, &mut solved, &vec![request.rule; rights.len()], &task);
-        if !watch.goes_on() {
+        system.solve(&right_hand_sides, &mut solved, &vec![request.rule; right_hand_sides.len()], &task);
+        if !watch.may_continue() {
             return Err(SolveError::Interrupted);
         }
         for unknowns in &solved {

@@ -1,7 +1,7 @@
-//! Noise of further realisations: right-hand sides of noise alone, whose weights an engine sums once for all of them.
+//! Additional noise realisations: further noise-only right-hand sides for the same weights.
 //!
-//! Two realisations take the place of a row of data and noise. Each has the bits that it has as the companion of an engine of its
-//! own: its noise depends on its seed and the visibility alone, and sums of integers on nothing else.
+//! Two realisations are stored in a row like that of data and noise. Each has the same bits as the noise-only companion of an engine with its
+//! seed, because noise depends only on seed and visibility, and integer sums do not depend on order.
 
 use std::sync::Arc;
 
@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::grid::{Grids, NODES};
 use super::operator::{RightHandSide, SharedTori};
 use super::quanta::Quanta;
-use super::spread::{LocatedNoise, TorusPoint, spread_noises};
+use super::spread::{GriddedNoise, TorusPoint, add_noise_pair};
 use super::sums::{HarmonicSums, unknowns_of_gradient};
 use super::tori::{NodeSums, Tori};
 use super::{HarmonicBasis, HarmonicEngine};
@@ -19,7 +19,7 @@ use crate::imaging::exact::engine::SkyBasis;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::exact::noise::{NoiseKey, unit_noise};
 
-/// A visibility whose noise realisations are summed.
+/// A visibility whose noise realisations wait to be summed.
 #[derive(Clone, Copy, Debug)]
 struct NoisyVisibility {
     place: TorusPoint,
@@ -27,43 +27,43 @@ struct NoisyVisibility {
     key: NoiseKey,
 }
 
-/// Sums of noises, a pair of realisations each: `[node][alpha]` of rows `[re, im, other's re, im][gamma]`.
+/// Sums of a pair of noise realisations: `[node][alpha]` of rows `[first re, im, second re, im][gamma]`.
 type PairTori = Vec<Option<Vec<IntegerRow>>>;
 
-/// Sums of noise of several realisations, of the visibilities that an engine takes.
+/// Sums of several noise realisations for the visibilities of an engine.
 #[derive(Debug)]
 pub struct NoiseSums {
     seeds: Vec<u64>,
     grids: Arc<Grids>,
     quanta: Quanta,
-    pairs: Vec<PairTori>,
+    realisation_pairs: Vec<PairTori>,
     pending: Vec<NoisyVisibility>,
 }
 
 impl NoiseSums {
-    /// For the visibilities of an engine without data yet, a realisation for each seed.
+    /// Creates empty sums for an empty engine, with one realisation per seed.
     #[must_use]
     pub fn new(engine: &HarmonicEngine, seeds: &[u64]) -> Self {
         let grids = Arc::clone(&engine.basis.grids);
-        let pairs = vec![vec![None; grids.nodes.count]; seeds.len().div_ceil(2)];
+        let realisation_pairs = vec![vec![None; grids.nodes.count]; seeds.len().div_ceil(2)];
         let pending = Vec::with_capacity(HarmonicBasis::BATCH);
-        Self { seeds: seeds.to_vec(), grids, quanta: engine.basis.quanta, pairs, pending }
+        Self { seeds: seeds.to_vec(), grids, quanta: engine.basis.quanta, realisation_pairs, pending }
     }
 
-    /// Bytes for each realisation of maps up to `l_max` from baselines up to `u_max` wavelengths, at most.
+    /// Maximum bytes per realisation, for maps up to `l_max` from baselines up to `u_max` wavelengths.
     #[must_use]
     pub fn bytes_each(l_max: usize, u_max: f64) -> u64 {
         let grids = Grids::new(l_max, u_max);
-        // Integers of 64 bits at most; two realisations share a row.
+        // At most 64 bits per integer; two realisations share a row.
         (8 * grids.nodes.count * grids.right_len() / 2) as u64
     }
 
-    /// Adds the noises of what the engine takes of these visibilities, as long as its sums have room.
+    /// Adds noise for the visibilities of a block that the engine accepts.
     pub fn add(&mut self, engine: &HarmonicEngine, placed: &PlacedVisibilities) {
         for k in 0..placed.len() {
             if let Ok(accepted) = engine.accept(placed, k) {
                 let (place, weight) = (accepted.place, accepted.weight);
-                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::of(placed, k) });
+                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::new(placed, k) });
             }
             if self.pending.len() >= HarmonicBasis::BATCH {
                 self.flush();
@@ -72,58 +72,58 @@ impl NoiseSums {
     }
 
     fn flush(&mut self) {
-        let Self { seeds, grids, quanta, pairs, pending } = self;
-        let locate = |one: &NoisyVisibility| {
-            let noise = |seed: &u64| unit_noise(*seed, one.key) * one.weight.sqrt();
-            let two = |seeds: &[u64]| [noise(&seeds[0]), seeds.get(1).map(noise).unwrap_or_default()];
-            LocatedNoise::new(grids, *quanta, &one.place, seeds.chunks(2).map(two))
+        let Self { seeds, grids, quanta, realisation_pairs, pending } = self;
+        let grid = |visibility: &NoisyVisibility| {
+            let noise = |seed: &u64| unit_noise(*seed, visibility.key) * visibility.weight.sqrt();
+            let pair = |seeds: &[u64]| [noise(&seeds[0]), seeds.get(1).map(noise).unwrap_or_default()];
+            GriddedNoise::new(grids, *quanta, &visibility.place, seeds.chunks(2).map(pair))
         };
-        let located: Vec<LocatedNoise> = pending.par_iter().map(locate).collect();
-        let mut reaching: Vec<Vec<&LocatedNoise>> = vec![Vec::new(); grids.nodes.count];
-        for visibility in &located {
+        let gridded: Vec<GriddedNoise> = pending.par_iter().map(grid).collect();
+        let mut reaching: Vec<Vec<&GriddedNoise>> = vec![Vec::new(); grids.nodes.count];
+        for visibility in &gridded {
             for list in reaching.iter_mut().skip(visibility.first_node).take(NODES) {
                 list.push(visibility);
             }
         }
-        pairs.par_iter_mut().enumerate().for_each(|(pair, nodes)| {
+        realisation_pairs.par_iter_mut().enumerate().for_each(|(pair_index, nodes)| {
             nodes.par_iter_mut().zip(&reaching).enumerate().for_each(|(index, (node, reaching))| {
                 if !reaching.is_empty() {
                     let rows = node.get_or_insert_with(|| vec![IntegerRow::default(); grids.data_points()]);
-                    spread_noises(grids, index, pair, reaching, rows);
+                    add_noise_pair(grids, index, pair_index, reaching, rows);
                 }
             });
         });
         pending.clear();
     }
 
-    /// The right-hand sides, one a seed, beside the sums of the same visibilities.
+    /// The right-hand sides, one per seed, for the sums of the same visibilities.
     fn into_right_hand_sides(mut self, sums: &HarmonicSums) -> Vec<Vec<f64>> {
         self.flush();
-        let Self { seeds, grids, quanta, pairs, .. } = self;
+        let Self { seeds, grids, quanta, realisation_pairs, .. } = self;
         let of_pair = |nodes: PairTori| {
             let value = |rows: Vec<IntegerRow>| {
                 let mut right = vec![0.0; grids.right_len()];
                 let layout = grids.data_row();
                 let held = (0..).zip(&rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
                 for (row, out) in held.zip(right.chunks_exact_mut(layout.len())) {
-                    row.values(layout, quanta.right, out);
+                    row.write_values(layout, quanta.right, out);
                 }
                 NodeSums { weights: Vec::new(), right }
             };
-            let tori = Tori::held(nodes.into_par_iter().map(|rows| rows.map(value)).collect());
+            let tori = Tori::in_memory(nodes.into_par_iter().map(|rows| rows.map(value)).collect());
             let shared = SharedTori { tori: &tori, ..sums.shared() };
             [RightHandSide::Data, RightHandSide::Noise]
-                .map(|of| unknowns_of_gradient(&sums.operator().project(&shared, of)))
+                .map(|side| unknowns_of_gradient(&sums.operator().project(&shared, side)))
         };
-        pairs.into_iter().flat_map(of_pair).take(seeds.len()).collect()
+        realisation_pairs.into_iter().flat_map(of_pair).take(seeds.len()).collect()
     }
 }
 
 impl HarmonicSums {
-    /// With the noises of further realisations.
+    /// Adds the right-hand sides of additional noise realisations.
     #[must_use]
-    pub fn with_noises(mut self, noises: NoiseSums) -> Self {
-        self.further = noises.into_right_hand_sides(&self);
+    pub fn with_noise_realisations(mut self, realisations: NoiseSums) -> Self {
+        self.noise_realisations = realisations.into_right_hand_sides(&self);
         self
     }
 }

@@ -1,4 +1,4 @@
-//! Sums that memory does not hold: made part by part, by reading the data as many times, each part left on disk.
+//! Sums that exceed memory: the data are read several times, and each reading accumulates one part of the sums, which is stored on disk.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -20,10 +20,10 @@ use crate::imaging::{AccumulationError, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 
 impl StoredTori {
-    /// Writes the sums that `grids` holds, and frees them node by node; the file has none yet.
+    /// Appends the sums of the share of `grids`, and frees them node by node.
     fn append(&mut self, grids: &Grids, quanta: Quanta, exact: ExactTori) -> io::Result<()> {
-        let is_filled = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
-        let filled = exact.nodes.iter().enumerate().filter(|(_, node)| is_filled(node));
+        let has_data = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
+        let filled = exact.nodes.iter().enumerate().filter(|(_, node)| has_data(node));
         let nodes: Arc<Vec<usize>> = Arc::new(filled.map(|(index, _)| index).collect());
         if let (Some(&first), Some(&last)) = (nodes.first(), nodes.last()) {
             let reached = if self.reached.is_empty() { first..last + 1 } else { self.reached.clone() };
@@ -46,7 +46,7 @@ impl StoredTori {
         let written: Vec<[Vec<usize>; 2]> = held
             .into_par_iter()
             .enumerate()
-            .map(|(place, node)| self.write_node(grids, quanta, place, node))
+            .map(|(index, node)| self.write_node(grids, quanta, index, node))
             .collect::<io::Result<_>>()?;
         for (used, part) in written.iter().flat_map(|parts| parts.iter().zip([0, 1])) {
             used.iter().for_each(|&alpha| self.parts[part].alphas[alpha] = true);
@@ -54,12 +54,12 @@ impl StoredTori {
         Ok(())
     }
 
-    /// Writes a node, which is `place` among those that have data; returns the alphas at which it has any, by part.
+    /// Writes the `index`-th node with data, and returns its alphas with data, by part.
     fn write_node(
         &self,
         grids: &Grids,
         quanta: Quanta,
-        place: usize,
+        index: usize,
         node: ExactNode,
     ) -> io::Result<[Vec<usize>; 2]> {
         let ExactNode { weights, right } = node;
@@ -72,13 +72,13 @@ impl StoredTori {
                 }
                 let mut values = vec![0.0_f32; block.alphas * row];
                 for (alpha, (out, integers)) in values.chunks_exact_mut(row).zip(rows).enumerate() {
-                    integers.values(layout, quantum, out);
+                    integers.write_values(layout, quantum, out);
                     if out.iter().any(|x| *x != 0.0) {
                         used.push(number * ALPHAS + alpha);
                     }
                 }
                 let bytes: &[u8] = bytemuck::cast_slice(&values);
-                write_at(&self.file, bytes, block.offset + (place * bytes.len()) as u64)?;
+                write_at(&self.file, bytes, block.offset + (index * bytes.len()) as u64)?;
             }
             Ok(used)
         };
@@ -89,14 +89,14 @@ impl StoredTori {
     }
 }
 
-/// One of the parts in which the sums of a channel are made, by an engine each that takes all data: they wait on disk for one another.
+/// One of the parts in which the sums of a channel are accumulated. An engine for each part receives all data; finished parts are on disk.
 #[derive(Clone, Debug)]
 pub struct SumPart {
     share: RankShare,
-    made: Arc<Mutex<FinishedParts>>,
+    finished: Arc<Mutex<FinishedParts>>,
 }
 
-/// The parts that are finished.
+/// The finished parts.
 #[derive(Debug)]
 struct FinishedParts {
     folder: PathBuf,
@@ -105,50 +105,52 @@ struct FinishedParts {
 }
 
 impl SumPart {
-    /// The first of some parts, which are kept in a folder until the map is solved.
+    /// The first of `count` parts, which are stored in a folder until the map is solved.
     #[must_use]
     pub fn first(count: usize, folder: &Path) -> Self {
-        let made = FinishedParts { folder: folder.to_owned(), tori: None, counts: None };
-        Self { share: RankShare { rank: 0, count: count.max(1) }, made: Arc::new(Mutex::new(made)) }
+        let finished = FinishedParts { folder: folder.to_owned(), tori: None, counts: None };
+        Self { share: RankShare { rank: 0, count: count.max(1) }, finished: Arc::new(Mutex::new(finished)) }
     }
 
-    /// The next one; `None` after the last.
+    /// The next part; `None` after the last.
     #[must_use]
     pub fn next(&self) -> Option<Self> {
         let RankShare { rank, count } = self.share;
-        (rank + 1 < count)
-            .then(|| Self { share: RankShare { rank: rank + 1, count }, made: Arc::clone(&self.made) })
+        (rank + 1 < count).then(|| Self {
+            share: RankShare { rank: rank + 1, count },
+            finished: Arc::clone(&self.finished),
+        })
     }
 
-    /// What an engine of this part holds.
+    /// The share of an engine for this part.
     pub(in crate::imaging) fn ranks(&self) -> Ranks {
-        Ranks::part(self.share)
+        Ranks::single_with_share(self.share)
     }
 }
 
 impl HarmonicEngine {
-    /// Puts the sums of a part beside those before it; returns the whole sums after the last.
+    /// Stores the sums of a part; after the last part, returns the complete sums.
     ///
     /// # Errors
-    /// Data that are not those of the parts before; the system's, in particular a full disk.
+    /// The data differ from those of the earlier parts; or the system's, in particular a full disk.
     pub fn finish_part(self, part: &SumPart) -> Result<Option<HarmonicSums>, AccumulationError> {
-        let mut made = part.made.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut finished = part.finished.lock().unwrap_or_else(PoisonError::into_inner);
         let (basis, exact, counts) = self.into_exact();
-        if made.counts.is_some_and(|before| before != counts) {
-            return Err(AccumulationError::Mismatch { what: "data, of which each holds a part," });
+        if finished.counts.is_some_and(|before| before != counts) {
+            return Err(AccumulationError::Mismatch { what: "data" });
         }
-        made.counts = Some(counts);
-        let folder = made.folder.clone();
-        let unstored = |source| AccumulationError::Store { folder: folder.clone(), source };
-        let mut tori = match made.tori.take() {
+        finished.counts = Some(counts);
+        let folder = finished.folder.clone();
+        let store_error = |source| AccumulationError::Store { folder: folder.clone(), source };
+        let mut tori = match finished.tori.take() {
             Some(tori) => tori,
-            None => StoredTori::create(&folder).map_err(unstored)?,
+            None => StoredTori::create(&folder).map_err(store_error)?,
         };
-        tori.append(&basis.grids, basis.quanta, exact).map_err(unstored)?;
+        tori.append(&basis.grids, basis.quanta, exact).map_err(store_error)?;
         if part.next().is_some() {
-            made.tori = Some(tori);
+            finished.tori = Some(tori);
             return Ok(None);
         }
-        Ok(Some(basis.whole().sums(Tori::stored(tori), counts)))
+        Ok(Some(basis.unshared().sums(Tori::on_disk(tori), counts)))
     }
 }

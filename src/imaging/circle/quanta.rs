@@ -1,21 +1,21 @@
-//! Quanta of the sums on tori, and the sums of one node as integers.
+//! Quanta of the gridded sums, and the sums of one node as integers.
 
 use super::grid::Grids;
 use super::tori::NodeSums;
 use crate::imaging::exact::fixed_point::WeightScale;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 
-/// Quanta of the greatest weight that is accepted; expected ones are 2^-10 of it and keep 20 bits.
+/// Quanta of the maximum weight; expected weights are 2^-10 of it and keep 20 bits.
 const WEIGHT_QUANTA: f64 = 1_073_741_824.0; // 2^30
-/// Quanta of a right-hand side of the greatest weight at a signal-to-noise ratio of one.
+/// Quanta of a right-hand side of the maximum weight at a signal-to-noise ratio of one.
 const RIGHT_QUANTA: f64 = 16_777_216.0; // 2^24
 
-/// Added to a term, it rounds it to a whole number; even, so that a term and its negative are rounded alike.
+/// Rounds a term to a whole number when it is added; even, so that a term and its negative are rounded alike.
 pub(super) const BIAS: f32 = 12_582_912.0; // 1.5 2^23
-/// Greatest term, in its own quanta.
+/// Maximum term, in its own quanta.
 pub(super) const TERM_MAX: f64 = 2_097_152.0; // 2^21
 
-/// The biases in a sum of `terms` biased multiples.
+/// The sum of the biases of `terms` rounded terms.
 #[inline(always)]
 pub(super) fn biases(terms: usize) -> i32 {
     (BIAS.to_bits() as i32).wrapping_mul(terms as i32)
@@ -24,9 +24,9 @@ pub(super) fn biases(terms: usize) -> i32 {
 /// Quanta of weights and of right-hand sides.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Quanta {
-    /// Of weights, (K sr)^-2.
+    /// Quantum of weights, (K sr)^-2.
     pub(super) weight: f64,
-    /// Of right-hand sides, (K sr)^-1.
+    /// Quantum of right-hand sides, (K sr)^-1.
     pub(super) right: f64,
 }
 
@@ -36,12 +36,12 @@ impl Quanta {
     }
 }
 
-/// The sums at one node.
+/// The integer sums at one node.
 #[derive(Clone, Debug)]
 pub(super) struct ExactNode {
-    /// By alpha: `[diagonal][gamma]`.
+    /// Weights by alpha: `[diagonal][gamma]`.
     pub(super) weights: Vec<IntegerRow>,
-    /// By alpha: `[data re, data im, noise re, noise im][gamma]`.
+    /// Right-hand sides by alpha: `[data re, data im, noise re, noise im][gamma]`.
     pub(super) right: Vec<IntegerRow>,
 }
 
@@ -62,13 +62,13 @@ impl ExactNode {
         for (rows, out, layout, quantum) in parts {
             let held = (0..).zip(rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
             for (row, out) in held.zip(out.chunks_exact_mut(layout.len())) {
-                row.values(layout, quantum, out);
+                row.write_values(layout, quantum, out);
             }
         }
         node
     }
 
-    /// Whether it holds nothing, because nothing was added or everything was removed.
+    /// Whether all sums are zero, because nothing was added or everything was removed.
     pub(super) fn is_empty(&self) -> bool {
         self.weights.iter().chain(&self.right).all(IntegerRow::is_empty)
     }

@@ -1,17 +1,19 @@
-//! Setup of a harmonic engine, and the memory it takes.
+//! The setup of a harmonic engine, and its memory.
 
 use super::grid::ALPHAS;
 use super::grid::Grids;
 use super::operator::Operator;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::AccumulationError;
-use crate::response::harmonic::{GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degrees};
+use crate::response::harmonic::{
+    GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degree_count,
+};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Setup of a harmonic engine; only engines of equal setup can be merged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HarmonicSetup {
-    /// Greatest degree of the map.
+    /// Maximum degree of the map.
     pub l_max: usize,
     /// Frequency, Hz.
     pub frequency_hz: f64,
@@ -23,28 +25,28 @@ pub struct HarmonicSetup {
     pub response: AntennaResponse,
     /// The common circular orbit.
     pub orbit: NominalOrbit,
-    /// Seed of the noise-only companion.
+    /// Seed of the noise-only companion map.
     pub companion_seed: u64,
-    /// Greatest weight that is accepted, (K sr)^-2; it sets the resolution of the sums.
+    /// Maximum weight that is accepted, (K sr)^-2; it sets the resolution of the sums.
     pub weight_max: f64,
 }
 
-/// Greatest degree that is accepted. Sums up to it take 0.5 GB a wavelength: beyond short baselines they are for many ranks.
+/// Maximum degree that is accepted. Its sums take 0.5 GB per wavelength, so that all but short baselines need many ranks.
 pub const L_MAX: usize = 1024;
-/// Longest baseline that is accepted, wavelengths.
+/// Maximum baseline that is accepted, wavelengths.
 const U_MAX: f64 = 10_000.0;
 
-/// Nominal inclinations are multiples of this, so that they do not depend on which data arrives first.
+/// Step of nominal inclinations, which are rounded so that they do not depend on which data arrive first.
 pub(in crate::imaging) const INCLINATION_STEP_DEG: f64 = 0.05;
-/// Nominal radii likewise.
+/// Step of nominal radii.
 pub(in crate::imaging) const RADIUS_STEP_M: f64 = 100.0;
 
-/// The orbit of the first pair with a known orientation; `None` if there is none.
+/// The nominal orbit from the first pair with a defined orientation; `None` if there is none.
 #[must_use]
-pub fn orbit_of(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
+pub fn nominal_orbit(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
     let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
-    let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of(r_i_m, r_j_m).ok())?;
-    // A satellite j that leads turns the pair's plane upside down; orbits are assumed prograde.
+    let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of_pair(r_i_m, r_j_m).ok())?;
+    // If satellite j leads, the normal of the pair's plane is reversed; orbits are assumed prograde.
     let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
     let inclination_deg =
         (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
@@ -65,7 +67,7 @@ impl HarmonicSetup {
     pub(super) fn check(&self) -> Result<(), AccumulationError> {
         let orbit = &self.orbit;
         let u_max = self.baseline_m_max / self.wavelength_m();
-        for (name, value, good, expected) in [
+        for (name, value, is_valid, expected) in [
             ("l_max", self.l_max as f64, (1..=L_MAX).contains(&self.l_max), "1 to 1024"),
             ("frequency_hz", self.frequency_hz, self.frequency_hz > 0.0, "a positive number"),
             ("moon_radius_m", self.moon_radius_m, self.moon_radius_m > 0.0, "a positive number"),
@@ -83,7 +85,7 @@ impl HarmonicSetup {
                 "above 0, at most 1e4 wavelengths and less than the orbit's radius",
             ),
         ] {
-            if !(good && value.is_finite()) {
+            if !(is_valid && value.is_finite()) {
                 return Err(AccumulationError::Setup { name, value, expected });
             }
         }
@@ -105,18 +107,19 @@ impl HarmonicSetup {
     }
 }
 
-/// Memory of an engine and its solution, bytes.
+/// The memory of an engine and its solution, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HarmonicMemory {
     /// The sums themselves, if baselines of all lengths occur.
     pub sums: u64,
     /// Patterns and rotations, shared by an engine and its snapshots.
     pub tables: u64,
-    /// Workspaces of the threads during a solution, and what each block of alphas gives to a product.
+    /// Workspaces of the threads during a solution, and the results of all blocks of alphas.
     pub workspace: u64,
 }
 
-/// Memory of an engine for maps up to `l_max` from baselines up to `u_max` wavelengths, solved by `threads` threads, `at_once` maps together.
+/// The memory of an engine for maps up to `l_max` from baselines up to `u_max` wavelengths, when `threads` threads solve for `at_once` maps
+/// together.
 #[must_use]
 pub fn memory(l_max: usize, u_max: f64, threads: usize, at_once: usize) -> HarmonicMemory {
     let grids = Grids::new(l_max, u_max);
@@ -129,16 +132,16 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize, at_once: usize) -> Harmo
     }
 }
 
-/// What ranks that share the sums of maps up to `l_max` divide and exchange.
+/// The amounts that ranks divide and exchange.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SharedSize {
-    /// Blocks of alphas; one rank holds each.
+    /// Number of blocks of alphas, which are divided among ranks.
     pub blocks: usize,
-    /// Bytes that each rank gives to one product with BtN^-1B, and gets.
+    /// Bytes that each rank sends and receives for one product with BtN^-1B.
     pub product_bytes: u64,
 }
 
-/// What ranks that share the sums of maps up to `l_max` divide and exchange.
+/// The amounts that ranks divide and exchange for maps up to `l_max`.
 #[must_use]
 pub fn shared_size(l_max: usize) -> SharedSize {
     SharedSize {
@@ -148,12 +151,12 @@ pub fn shared_size(l_max: usize) -> SharedSize {
     }
 }
 
-/// Size of one product with BtN^-1B when all nodes and phases hold data.
+/// The size of one product with BtN^-1B if all nodes and phases have data.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ApplicationSize {
-    /// Points of a line of phases.
+    /// Number of points of a line of phases.
     pub points: usize,
-    /// Lines: alphas times nodes.
+    /// Number of lines: alphas times nodes.
     pub lines: usize,
     /// Multiply-adds of its matrix products.
     pub matrix_multiply_adds: f64,
@@ -164,8 +167,8 @@ pub struct ApplicationSize {
 pub fn application_size(l_max: usize, u_max: f64) -> ApplicationSize {
     let grids = Grids::new(l_max, u_max);
     let (points, nodes) = (grids.points, grids.nodes.count);
-    let patterns: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
-    // Forth and back; real and imaginary parts; both signs of mu.
+    let patterns: usize = (0..=l_max).map(|mu| degree_count(l_max, mu)).sum();
+    // Forward and back, real and imaginary parts, both signs of mu.
     let matrix_multiply_adds = (2 * 2 * 2 * points * nodes * patterns) as f64;
     ApplicationSize { points, lines: points * nodes, matrix_multiply_adds }
 }

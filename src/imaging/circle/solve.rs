@@ -1,11 +1,11 @@
-//! The regularised solution over harmonic coefficients.
+//! Solves the regularised normal equations over harmonic coefficients.
 
 use super::sigma::pixel_sigma_k;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
 use crate::imaging::power::{
-    Covariance, Drawn, Factors, FoundPower, PowerProblem, SAMPLE_SETTLED, Uncertainty,
+    Factors, FoundPower, PosteriorPrecision, PosteriorSample, PowerProblem, SAMPLE_TOLERANCE, Uncertainty,
 };
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::FitInputs;
@@ -19,17 +19,17 @@ use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
-/// Change of W_max from product to product, relative, at which it is found: it only scales R, and no map knows epsilon to a percent.
+/// Relative change of W_max at which it has converged. It only scales R, and epsilon is never needed to a percent.
 pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
 
-/// Realisations or samples that are solved for together: a thread has a workspace for each.
+/// Number of realisations or samples that are solved for together; each thread has a workspace for each.
 pub const NOISES_TOGETHER: usize = 4;
 
 /// Residual of the error of the mean: an error of an error.
 const BESIDE: f64 = 1e-3;
 
-/// Products with the blocks before the iteration for W_max.
-const LIFTS: usize = 6;
+/// Number of products with the blocks before the iteration for W_max.
+const POWER_STEPS: usize = 6;
 
 /// Parameters of a harmonic solution.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,38 +38,38 @@ pub struct HarmonicRequest {
     pub epsilon: f64,
     /// nside of the maps.
     pub nside: usize,
-    /// When to stop.
+    /// Stopping rule.
     pub rule: StoppingRule,
-    /// Maps as likely as the map itself to be drawn beside it; with R from the data.
+    /// Number of posterior samples; with R from the data.
     pub samples: usize,
-    /// Random probes for the traces of the covariances where the matrix is too large to be held; 0 for no traces. Traces are those of
-    /// an R that is a multiple of the identity.
+    /// Number of random probes for traces of covariances if the matrix is too large to store; 0 for no traces. Traces require a multiple of the
+    /// identity as R.
     pub probes: usize,
 }
 
-/// A map and its noise-only companion, and their coefficients.
+/// A map and its noise-only companion, with their coefficients.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HarmonicSolution {
     /// Map, K, HEALPix RING.
     pub map_k: Vec<f64>,
-    /// Map of noise alone, K.
+    /// Noise-only map, K.
     pub noise_k: Vec<f64>,
-    /// The unknowns, without the prior, and those of the noise; a warm start for more data.
+    /// The unknowns of the map, without the prior, and of the noise-only map: a warm start for more data.
     pub unknowns: [Vec<f64>; 2],
-    /// How they were found.
+    /// Diagnostics of the solution.
     pub diagnostics: Diagnostics,
-    /// Errors of the map; with R from the data.
+    /// Errors of the map; only with R from the data.
     pub uncertainty: Option<Uncertainty>,
 }
 
-/// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that keep m.
+/// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that are diagonal in m.
 ///
-/// As [`crate::imaging::solve_pixels`] with `T` among the functions of degree up to `l_max`; R is epsilon times the largest
-/// eigenvalue times the identity of orthonormal harmonics, which is that of equal pixels up to their area.
-/// `start` is an earlier solution's [`HarmonicSolution::unknowns`].
+/// The equations are those of [`crate::imaging::solve_pixels`] for functions of degree up to `l_max`. R is epsilon times the
+/// largest eigenvalue times the identity over orthonormal harmonics, which equals that over pixels up to their area.
+/// `start` holds the [`HarmonicSolution::unknowns`] of an earlier solution.
 ///
 /// # Errors
-/// No data, or a prior whose size is not a map's.
+/// There is no data, or the size of the prior is not that of a map.
 pub fn solve_harmonics(
     sums: &HarmonicSums,
     request: HarmonicRequest,
@@ -80,10 +80,10 @@ pub fn solve_harmonics(
     solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
 }
 
-/// As [`solve_harmonics`], with an R that may depend on the degree.
+/// Solves as [`solve_harmonics`], with an R that may depend on the degree.
 ///
 /// # Errors
-/// Also a table of power that ends before the map's degrees.
+/// As [`solve_harmonics`]; or a table of power ends before the map's degrees.
 pub fn solve_regularised(
     sums: &HarmonicSums,
     request: HarmonicRequest,
@@ -102,8 +102,8 @@ pub fn solve_regularised(
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
         let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
+        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+            task.report_step(needs_step, step, change)
         })
     };
     let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
@@ -113,7 +113,7 @@ pub fn solve_regularised(
     }
     let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
     let factors = blocks.factors_with(&|l| regularisation.at(l));
-    // At high degrees they take as much as the factors.
+    // Frees memory: at high degrees blocks are as large as the factors.
     drop(blocks);
     let system = System { sums, regularisation, precondition: &|v| factors.solve(v) };
     let (solved, convergence) = iterate(&system, right_hand_sides, start, request.rule, watch);
@@ -159,10 +159,7 @@ pub fn solve_regularised(
     })
 }
 
-/// The R of the data, by degree: for what is solved for beside their map.
-///
-/// # Errors
-/// No data, or numbers that are not finite.
+/// Estimates R from the data for solutions without a map.
 pub(super) fn power_of_data(
     sums: &HarmonicSums,
     rule: StoppingRule,
@@ -174,16 +171,16 @@ pub(super) fn power_of_data(
     let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let sought = PowerProblem { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
-    Ok(Regulariser::Wiener(sought.found(None, rule, watch)?.power.over_noise_k2()))
+    let problem = PowerProblem { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
+    Ok(Regulariser::Wiener(problem.solve(None, rule, watch)?.power.over_noise_k2()))
 }
 
-/// By how much a prior lessens `V'N^-1V`: `p.(2 b - A p)`, with `right` what it leaves of b.
+/// The part of `V'N^-1V` that a prior p explains, `p.(2 b - A p)`, with `right` = b - A p.
 fn predicted_power(sums: &HarmonicSums, prior: &[f64], right: &[f64]) -> f64 {
     dot(prior, sums.right_hand_side()) + dot(prior, right)
 }
 
-/// As [`solve_regularised`], with R from the data.
+/// Solves as [`solve_regularised`], with R from the data.
 fn solve_with_power(
     sums: &HarmonicSums,
     request: HarmonicRequest,
@@ -202,7 +199,7 @@ fn solve_with_power(
     let order_blocks = sums.order_blocks();
     let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
     let SumCounts { visibilities, power, .. } = sums.counts();
-    let sought = PowerProblem {
+    let problem = PowerProblem {
         sums,
         blocks: &blocks,
         degrees: &degrees,
@@ -210,7 +207,7 @@ fn solve_with_power(
         power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
         numbers: 2.0 * visibilities as f64,
     };
-    let found = sought.found(start.map(|[map, _]| map.as_slice()), rule, watch)?;
+    let found = problem.solve(start.map(|[map, _]| map.as_slice()), rule, watch)?;
     let factor = found.noise_factor();
     let FoundPower { regularisation, solution, power, ratio } = found;
     let factors = Factors::new(&blocks, &regularisation);
@@ -226,7 +223,7 @@ fn solve_with_power(
     monopole[0] = 1.0;
     let right_hand_sides = [&right, sums.noise_right_hand_side(), &monopole];
     let mut columns = [solution, noise, vec![0.0; right.len()]];
-    let count = if watch.is_wanted() { 3 } else { 2 };
+    let count = if watch.has_priority() { 3 } else { 2 };
     let beside = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
     let convergence = {
         let task = watch.start("map, noise map and error of the mean", rule.residual_max);
@@ -239,9 +236,9 @@ fn solve_with_power(
         add(&mut whole, &prior);
     }
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
-    let covariance = Covariance { sums, regularisation: &regularisation, factors: &factors };
+    let covariance = PosteriorPrecision { sums, regularisation: &regularisation, factors: &factors };
     let mut uncertainty = None;
-    if watch.is_wanted() {
+    if watch.has_priority() {
         let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
         sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
         let mean_sigma_k = factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt();
@@ -263,7 +260,7 @@ type Synthesis<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
 
 /// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
 fn samples_k(
-    covariance: &Covariance<'_>,
+    covariance: &PosteriorPrecision<'_>,
     count: usize,
     (whole, factor): (&[f64], f64),
     map: Synthesis<'_>,
@@ -272,8 +269,8 @@ fn samples_k(
     let mut samples_k = Vec::new();
     let numbers: Vec<u64> = (0..count as u64).collect();
     for which in numbers.chunks(NOISES_TOGETHER) {
-        let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_SETTLED);
-        for Drawn { whole: mut sample, .. } in covariance.draw(which, SAMPLE_SETTLED, &task) {
+        let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_TOLERANCE);
+        for PosteriorSample { exact: mut sample, .. } in covariance.draw(which, SAMPLE_TOLERANCE, &task) {
             sample.iter_mut().for_each(|value| *value *= factor);
             add(&mut sample, whole);
             samples_k.push(map(&sample)?);
@@ -282,11 +279,11 @@ fn samples_k(
     Ok(samples_k)
 }
 
-/// A random vector times the blocks of BtN^-1B that keep m, several times over: a beginning near the vectors with the largest
-/// eigenvalues, at the cost of less than a product.
+/// A start vector near the eigenvectors of the largest eigenvalues: a random vector after several power iterations with the blocks of BtN^-1B,
+/// which take less time than one product.
 pub(in crate::imaging) fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
     let mut vector = random_vector(unknowns);
-    for _ in 0..LIFTS {
+    for _ in 0..POWER_STEPS {
         blocks.multiply(&mut vector);
         vector = normalised(vector);
     }
@@ -311,6 +308,7 @@ fn iterate(
     (solved, convergence)
 }
 
+/// The unknowns of a prior map.
 pub(in crate::imaging) fn prior_unknowns(map: &[f64], l_max: usize) -> Result<Vec<f64>, SolveError> {
     if nside_of(map.len()).is_none() {
         return Err(SolveError::PriorLength { found: map.len(), expected: 12 });

@@ -1,4 +1,4 @@
-//! Spreads visibilities onto the sums at the nodes.
+//! Gridding: adds each visibility to the sums at the neighbouring baseline nodes, with the spreading kernels of a non-uniform FFT.
 
 use num_complex::Complex64;
 use pulp::{Arch, Simd, WithSimd};
@@ -10,64 +10,64 @@ use crate::imaging::exact::engine::Accepted;
 use crate::imaging::exact::fixed_point::Direction;
 use crate::imaging::exact::fixed_point::rows::{IntegerRow, Integers};
 use crate::ranks::RankShare;
-use crate::response::harmonic::kernel::{Kernel, LANES};
+use crate::response::harmonic::gridding_kernel::{Kernel, LANES};
 
-/// A visibility's place among the sums, on a torus at a baseline length.
+/// The position of a visibility in the sums: a point on the torus at a baseline length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TorusPoint {
-    /// Omega - pi/2, rad.
+    /// Longitude of the ascending node minus pi/2, rad.
     pub(super) alpha_rad: f64,
-    /// phi + pi/2, rad.
+    /// Orbital phase plus pi/2, rad.
     pub(super) gamma_rad: f64,
-    /// Baseline, wavelengths.
+    /// Baseline length, wavelengths.
     pub(super) u: f64,
-    /// Whether the sums hold the conjugate: the visibility of the pair with its satellites exchanged.
-    pub(super) reversed: bool,
+    /// Whether the sums contain the conjugate, which is the visibility of the pair with its satellites exchanged.
+    pub(super) is_conjugated: bool,
 }
 
 impl Accepted<TorusPoint> {
-    /// Weight times visibility, real and imaginary part; root of the weight times unit noise, likewise.
+    /// Real and imaginary parts of the weight times the visibility, and of the square root of the weight times unit noise.
     pub(super) fn right_hand_sides(&self) -> [f64; 4] {
-        let value = if self.place.reversed { self.value_k_sr.conj() } else { self.value_k_sr };
+        let value = if self.place.is_conjugated { self.value_k_sr.conj() } else { self.value_k_sr };
         let noise = self.noise * self.weight.sqrt();
         [self.weight * value.re, self.weight * value.im, noise.re, noise.im]
     }
 }
 
-/// A visibility's place on every grid, and its weight and data in quanta.
+/// A visibility with its kernels on every grid, and its weight and data in quanta.
 #[derive(Clone, Debug)]
-pub(super) struct Located {
+pub(super) struct GriddedVisibility {
     pub(super) first_node: usize,
     u: [f32; LANES],
     weight_first: [u32; 2],
-    weight_alpha: [f32; LANES],
-    weight_parts: [u16; LANES],
-    weight_gamma: [f32; LANES],
+    weight_kernel_alpha: [f32; LANES],
+    weight_kernel_bounds: [u16; LANES],
+    weight_kernel_gamma: [f32; LANES],
     data_first: [u32; 2],
-    data_alpha: [f32; LANES],
-    data_parts: [u16; LANES],
-    data_gamma: [f32; LANES],
-    /// In 2^shift quanta.
+    data_kernel_alpha: [f32; LANES],
+    data_kernel_bounds: [u16; LANES],
+    data_kernel_gamma: [f32; LANES],
+    /// Weight, in 2^shift quanta.
     weight: f32,
     weight_shift: u32,
-    /// Likewise.
-    right: [f32; 4],
-    right_shifts: [u32; 4],
+    /// Data and noise terms, each in 2^shift quanta.
+    rhs: [f32; 4],
+    rhs_shifts: [u32; 4],
 }
 
-/// Numbers of quanta in multiples of the least power of two for which none exceeds [`TERM_MAX`].
-fn shifted<const N: usize>(quanta: [f64; N]) -> ([f32; N], u32) {
-    let greatest = quanta.iter().fold(0.0_f64, |most, x| most.max(x.abs()));
+/// Divides by the smallest power of two for which no value exceeds [`TERM_MAX`]; returns the values and the exponent.
+fn scale_to_term_max<const N: usize>(quanta: [f64; N]) -> ([f32; N], u32) {
+    let largest = quanta.iter().fold(0.0_f64, |largest, x| largest.max(x.abs()));
     let (mut shift, mut step) = (0, 1.0);
-    while greatest * step > TERM_MAX {
+    while largest * step > TERM_MAX {
         shift += 1;
         step *= 0.5;
     }
     (quanta.map(|x| (x * step) as f32), shift)
 }
 
-impl Located {
-    /// `u` must lie within the grid.
+impl GriddedVisibility {
+    /// Computes kernels and terms; `u` must lie within the grid.
     pub(super) fn new(
         grids: &Grids,
         quanta: Quanta,
@@ -77,35 +77,35 @@ impl Located {
         let TorusPoint { alpha_rad, gamma_rad, u, .. } = visibility.place;
         let (first_node, u) = grids.u.spread((u - grids.nodes.first) / grids.nodes.step);
         let (points, data_points) = (grids.points, grids.data_points());
-        let (a, weight_alpha) = Grids::on_circle(&grids.weight_alpha, points, alpha_rad);
-        let (g, weight_gamma) = Grids::on_circle(&grids.weight_gamma, points, gamma_rad);
-        let (da, data_alpha) = Grids::on_circle(&grids.data, data_points, alpha_rad);
-        let (dg, data_gamma) = Grids::on_circle(&grids.data, data_points, gamma_rad);
+        let (a, weight_kernel_alpha) = Grids::kernel_at(&grids.weight_alpha, points, alpha_rad);
+        let (g, weight_kernel_gamma) = Grids::kernel_at(&grids.weight_gamma, points, gamma_rad);
+        let (da, data_kernel_alpha) = Grids::kernel_at(&grids.data, data_points, alpha_rad);
+        let (dg, data_kernel_gamma) = Grids::kernel_at(&grids.data, data_points, gamma_rad);
         let sign = direction.sign();
-        let ([weight], weight_shift) = shifted([sign * visibility.weight / quanta.weight]);
+        let ([weight], weight_shift) = scale_to_term_max([sign * visibility.weight / quanta.weight]);
         let [data_re, data_im, noise_re, noise_im] =
             visibility.right_hand_sides().map(|term| sign * term / quanta.right);
-        let ([data_re, data_im], data_shift) = shifted([data_re, data_im]);
-        let ([noise_re, noise_im], noise_shift) = shifted([noise_re, noise_im]);
+        let ([data_re, data_im], data_shift) = scale_to_term_max([data_re, data_im]);
+        let ([noise_re, noise_im], noise_shift) = scale_to_term_max([noise_re, noise_im]);
         Self {
             first_node: first_node.max(0) as usize,
             u,
             weight_first: [a, g],
-            weight_alpha,
-            weight_parts: parts(&weight_alpha),
-            weight_gamma,
+            weight_kernel_alpha,
+            weight_kernel_bounds: kernel_bounds(&weight_kernel_alpha),
+            weight_kernel_gamma,
             data_first: [da, dg],
-            data_alpha,
-            data_parts: parts(&data_alpha),
-            data_gamma,
+            data_kernel_alpha,
+            data_kernel_bounds: kernel_bounds(&data_kernel_alpha),
+            data_kernel_gamma,
             weight,
             weight_shift,
-            right: [data_re, data_im, noise_re, noise_im],
-            right_shifts: [data_shift, data_shift, noise_shift, noise_shift],
+            rhs: [data_re, data_im, noise_re, noise_im],
+            rhs_shifts: [data_shift, data_shift, noise_shift, noise_shift],
         }
     }
 
-    /// Whether it adds to sums that this process holds.
+    /// Whether it contributes to sums that this process holds.
     pub(super) fn reaches(&self, grids: &Grids) -> bool {
         let holds = |first: u32, kernel: &Kernel, points: usize| {
             (0..kernel.width()).any(|k| grids.holds((first as usize + k) % points))
@@ -114,234 +114,244 @@ impl Located {
             || holds(self.data_first[0], &grids.data, grids.data_points())
     }
 
-    /// Weights of one of its nodes with itself and with those above; the first node is 0.
-    fn diagonals(&self, at: usize) -> [f32; NODES] {
-        let mut diagonals = [0.0; NODES];
-        for (diagonal, other) in diagonals.iter_mut().zip(&self.u[at..NODES]) {
-            *diagonal = self.weight * self.u[at] * other;
+    /// The weight times the products of the u kernel at `node` (from the first node of the visibility) and at each node from there up.
+    fn node_products(&self, node: usize) -> [f32; NODES] {
+        let mut products = [0.0; NODES];
+        for (product, other) in products.iter_mut().zip(&self.u[node..NODES]) {
+            *product = self.weight * self.u[node] * other;
         }
-        diagonals
+        products
     }
 }
 
-/// Adds visibilities to the sums at node `index`, which all of them reach.
-pub(super) fn spread(
+/// Adds visibilities to the sums at node `index`, which must be within the kernels of all of them.
+pub(super) fn add_visibilities(
     grids: &Grids,
     direction: Direction,
     index: usize,
-    reaching: &[&Located],
+    reaching: &[&GriddedVisibility],
     node: &mut ExactNode,
 ) {
     let arch = Arch::new();
-    let at = |one: &Located| index - one.first_node;
+    let offset_of = |visibility: &GriddedVisibility| index - visibility.first_node;
     in_groups(
         reaching,
-        |one| (one.first_node, one.weight_first, one.weight_shift),
+        |visibility| (visibility.first_node, visibility.weight_first, visibility.weight_shift),
         |first, group| {
             let rows = Rows {
                 rows: &mut node.weights,
                 share: grids.share,
                 stride: grids.weight_stride(),
                 first: first.weight_first,
-                alphas: grids.weight_alpha.width(),
-                used: NODES - at(first),
+                kernel_width: grids.weight_alpha.width(),
+                rows_used: NODES - offset_of(first),
                 shifts: [first.weight_shift; NODES],
                 direction,
             };
-            rows.add(arch, group, |one| Term {
-                values: one.diagonals(at(one)),
-                alphas: &one.weight_alpha,
-                parts: &one.weight_parts,
-                gammas: &one.weight_gamma,
+            rows.add(arch, group, |visibility| Term {
+                values: visibility.node_products(offset_of(visibility)),
+                kernel_alpha: &visibility.weight_kernel_alpha,
+                kernel_bounds: &visibility.weight_kernel_bounds,
+                kernel_gamma: &visibility.weight_kernel_gamma,
             });
         },
     );
     in_groups(
         reaching,
-        |one| (one.first_node, one.data_first, one.right_shifts),
+        |visibility| (visibility.first_node, visibility.data_first, visibility.rhs_shifts),
         |first, group| {
             let rows = Rows {
                 rows: &mut node.right,
                 share: grids.share,
                 stride: grids.data_stride(),
                 first: first.data_first,
-                alphas: grids.data.width(),
-                used: 4,
-                shifts: first.right_shifts,
+                kernel_width: grids.data.width(),
+                rows_used: 4,
+                shifts: first.rhs_shifts,
                 direction,
             };
-            rows.add(arch, group, |one| Term {
-                values: one.right.map(|term| term * one.u[at(one)]),
-                alphas: &one.data_alpha,
-                parts: &one.data_parts,
-                gammas: &one.data_gamma,
+            rows.add(arch, group, |visibility| Term {
+                values: visibility.rhs.map(|term| term * visibility.u[offset_of(visibility)]),
+                kernel_alpha: &visibility.data_kernel_alpha,
+                kernel_bounds: &visibility.data_kernel_bounds,
+                kernel_gamma: &visibility.data_kernel_gamma,
             });
         },
     );
 }
 
-/// A visibility's place on the grid of data, and noises of it in quanta.
+/// Noise realisations of a visibility in quanta, with its kernels on the grid of data.
 #[derive(Clone, Debug)]
-pub(super) struct LocatedNoise {
+pub(super) struct GriddedNoise {
     pub(super) first_node: usize,
     u: [f32; LANES],
     first: [u32; 2],
-    alpha: [f32; LANES],
-    parts: [u16; LANES],
-    gamma: [f32; LANES],
-    /// Of two realisations each, in 2^shift quanta.
-    pairs: Vec<([f32; 4], [u32; 4])>,
+    kernel_alpha: [f32; LANES],
+    kernel_bounds: [u16; LANES],
+    kernel_gamma: [f32; LANES],
+    /// Pairs of realisations: four terms in 2^shift quanta, and their shifts.
+    realisation_pairs: Vec<([f32; 4], [u32; 4])>,
 }
 
-impl LocatedNoise {
-    /// Of noises in (K sr)^-1, two realisations each.
+impl GriddedNoise {
+    /// Computes kernels and terms from pairs of noise realisations in (K sr)^-1.
     pub(super) fn new(
         grids: &Grids,
         quanta: Quanta,
         place: &TorusPoint,
-        noises: impl Iterator<Item = [Complex64; 2]>,
+        realisation_pairs: impl Iterator<Item = [Complex64; 2]>,
     ) -> Self {
         let (first_node, u) = grids.u.spread((place.u - grids.nodes.first) / grids.nodes.step);
         let points = grids.data_points();
-        let (a, alpha) = Grids::on_circle(&grids.data, points, place.alpha_rad);
-        let (g, gamma) = Grids::on_circle(&grids.data, points, place.gamma_rad);
-        let of_one = |noise: Complex64| shifted([noise.re, noise.im].map(|term| term / quanta.right));
-        let of_two = |[one, other]: [Complex64; 2]| {
-            let (([a, b], one), ([c, d], other)) = (of_one(one), of_one(other));
-            ([a, b, c, d], [one, one, other, other])
+        let (a, kernel_alpha) = Grids::kernel_at(&grids.data, points, place.alpha_rad);
+        let (g, kernel_gamma) = Grids::kernel_at(&grids.data, points, place.gamma_rad);
+        let to_quanta =
+            |noise: Complex64| scale_to_term_max([noise.re, noise.im].map(|term| term / quanta.right));
+        let pair_to_quanta = |[first, second]: [Complex64; 2]| {
+            let ([a, b], first_shift) = to_quanta(first);
+            let ([c, d], second_shift) = to_quanta(second);
+            ([a, b, c, d], [first_shift, first_shift, second_shift, second_shift])
         };
         Self {
             first_node: first_node.max(0) as usize,
             u,
             first: [a, g],
-            alpha,
-            parts: parts(&alpha),
-            gamma,
-            pairs: noises.map(of_two).collect(),
+            kernel_alpha,
+            kernel_bounds: kernel_bounds(&kernel_alpha),
+            kernel_gamma,
+            realisation_pairs: realisation_pairs.map(pair_to_quanta).collect(),
         }
     }
 }
 
-/// Adds the noises of two realisations, number `pair` of each visibility's, to their sums at node `index`, which all of them reach.
-pub(super) fn spread_noises(
+/// Adds the realisation pair `pair_index` of visibilities to the sums at node `index`, which must be within the kernels of all of them.
+pub(super) fn add_noise_pair(
     grids: &Grids,
     index: usize,
-    pair: usize,
-    reaching: &[&LocatedNoise],
+    pair_index: usize,
+    reaching: &[&GriddedNoise],
     rows: &mut [IntegerRow],
 ) {
     let arch = Arch::new();
     in_groups(
         reaching,
-        |one| (one.first_node, one.first, one.pairs[pair].1),
+        |noise| (noise.first_node, noise.first, noise.realisation_pairs[pair_index].1),
         |first, group| {
             let rows = Rows {
                 rows: &mut *rows,
                 share: grids.share,
                 stride: grids.data_stride(),
                 first: first.first,
-                alphas: grids.data.width(),
-                used: 4,
-                shifts: first.pairs[pair].1,
+                kernel_width: grids.data.width(),
+                rows_used: 4,
+                shifts: first.realisation_pairs[pair_index].1,
                 direction: Direction::In,
             };
-            rows.add(arch, group, |one| Term {
-                values: one.pairs[pair].0.map(|term| term * one.u[index - one.first_node]),
-                alphas: &one.alpha,
-                parts: &one.parts,
-                gammas: &one.gamma,
+            rows.add(arch, group, |noise| Term {
+                values: noise.realisation_pairs[pair_index]
+                    .0
+                    .map(|term| term * noise.u[index - noise.first_node]),
+                kernel_alpha: &noise.kernel_alpha,
+                kernel_bounds: &noise.kernel_bounds,
+                kernel_gamma: &noise.kernel_gamma,
             });
         },
     );
 }
 
-/// Calls `add` with groups of consecutive visibilities in one cell of the grid, and of one power of two.
+/// Calls `add` with groups of consecutive visibilities that share a grid cell and a shift.
 fn in_groups<T, C: PartialEq>(reaching: &[&T], cell: impl Fn(&T) -> C, mut add: impl FnMut(&T, &[&T])) {
     for run in reaching.chunk_by(|a, b| cell(a) == cell(b)) {
-        for group in run.chunks(GROUP) {
+        for group in run.chunks(GROUP_MAX) {
             add(group[0], group);
         }
     }
 }
 
-/// Most visibilities that are added at once: their terms of up to 2^22 sum within 32 bits.
-const GROUP: usize = 8;
+/// Maximum number of visibilities that are added at once, so that the sum of their terms fits 32 bits (see [`bounds`]).
+const GROUP_MAX: usize = 8;
 
-/// By alpha `[K][gamma]`, and the first point in alpha and gamma to add to.
+/// The rows of a grid, one per alpha, each `[K][gamma]`, with the region that a kernel covers.
 struct Rows<'a, const K: usize> {
     rows: &'a mut [IntegerRow],
-    /// The blocks of alphas that are held; others are left out.
+    /// The blocks of alphas that this process holds.
     share: RankShare,
     stride: usize,
+    /// First alpha and gamma that the kernel covers.
     first: [u32; 2],
-    /// Alphas that are reached.
-    alphas: usize,
-    /// Of K.
-    used: usize,
-    /// Powers of two, in quanta, that values of each of K are multiples of.
+    /// Number of alphas that the kernel covers.
+    kernel_width: usize,
+    /// Number of the K parts that are written.
+    rows_used: usize,
+    /// Exponents of the powers of two, in quanta, of which the values of each part are multiples.
     shifts: [u32; K],
     direction: Direction,
 }
 
 impl<const K: usize> Rows<'_, K> {
-    /// Adds the terms of a group of at most [`GROUP`] visibilities together, in registers.
+    /// Adds the terms of a group of at most [`GROUP_MAX`] visibilities, summed in registers.
     #[inline(always)]
     fn add<'t, T>(self, arch: Arch, group: &[&'t T], term: impl Fn(&'t T) -> Term<'t, K>) {
-        let mut terms = [Term::EMPTY; GROUP];
-        for (to, one) in terms.iter_mut().zip(group) {
-            *to = term(one);
+        let mut terms = [Term::EMPTY; GROUP_MAX];
+        for (to, visibility) in terms.iter_mut().zip(group) {
+            *to = term(visibility);
         }
         arch.dispatch(SpreadRows { rows: self, terms: &terms[..group.len()] });
     }
 }
 
-/// One visibility's factors.
+/// The factors of one visibility's term.
 #[derive(Clone, Copy)]
 struct Term<'a, const K: usize> {
     values: [f32; K],
-    alphas: &'a [f32; LANES],
-    /// Bounds of the alphas.
-    parts: &'a [u16; LANES],
-    gammas: &'a [f32; LANES],
+    kernel_alpha: &'a [f32; LANES],
+    /// Upper bounds of the magnitudes of `kernel_alpha`, in units of 2^-8.
+    kernel_bounds: &'a [u16; LANES],
+    kernel_gamma: &'a [f32; LANES],
 }
 
 impl<const K: usize> Term<'_, K> {
-    const EMPTY: Self =
-        Self { values: [0.0; K], alphas: &[0.0; LANES], parts: &[0; LANES], gammas: &[0.0; LANES] };
+    const EMPTY: Self = Self {
+        values: [0.0; K],
+        kernel_alpha: &[0.0; LANES],
+        kernel_bounds: &[0; LANES],
+        kernel_gamma: &[0.0; LANES],
+    };
 
-    /// Bound of its values, in quanta times the power of two that each is a multiple of, rounded up.
+    /// Upper bound of its values, in units of their power of two.
     #[inline(always)]
-    fn greatest(&self) -> u32 {
-        self.values.iter().fold(0, |most, value| most.max(value.abs() as i32 as u32)) + 1
+    fn value_bound(&self) -> u32 {
+        self.values.iter().fold(0, |bound, value| bound.max(value.abs() as i32 as u32)) + 1
     }
 }
 
-/// Bounds of kernels are counted in units of 2^-8.
-const PARTS: u32 = 8;
+/// Bounds of kernels are in units of 2^-8.
+const BOUND_FRACTION_BITS: u32 = 8;
 
-/// Bounds of kernels, which are at most one up to rounding: a sixteenth more, for roundings of kernels and products.
+/// Upper bounds of kernel values (at most 1), enlarged by 1/16 to cover rounding of kernels and products.
 #[inline(always)]
-fn parts(kernel: &[f32; LANES]) -> [u16; LANES] {
-    kernel.map(|alpha| (alpha.abs() * 1.0625 * (1 << PARTS) as f32) as u16 + 1)
+fn kernel_bounds(kernel: &[f32; LANES]) -> [u16; LANES] {
+    kernel.map(|value| (value.abs() * 1.0625 * (1 << BOUND_FRACTION_BITS) as f32) as u16 + 1)
 }
 
-/// For each alpha the most that terms add to a sum, in quanta times the greatest power of two that values are multiples
-/// of: their values times their kernels, and half of the step to which they are rounded.
+/// For each alpha an upper bound of what a group adds to one sum, in units of the largest shift, including rounding of terms.
 ///
-/// 32 bits hold it: 2^21 times 2^8 and an eighth, and 2^22 for each term of a group.
+/// Nothing overflows 32 bits: a product is at most 2^21 x 2^8 x 1.125, and the sum at most 2^22 per term of the group.
 #[inline(always)]
 fn bounds<const K: usize>(terms: &[Term<'_, K>]) -> [u32; LANES] {
     let mut bounds = [0_u32; LANES];
     for term in terms {
-        let greatest = term.greatest();
-        for (bound, part) in bounds.iter_mut().zip(term.parts) {
-            *bound = bound.wrapping_add((greatest.wrapping_mul(u32::from(*part)) >> PARTS) + 1);
+        let value_bound = term.value_bound();
+        for (bound, kernel_bound) in bounds.iter_mut().zip(term.kernel_bounds) {
+            *bound = bound.wrapping_add(
+                (value_bound.wrapping_mul(u32::from(*kernel_bound)) >> BOUND_FRACTION_BITS) + 1,
+            );
         }
     }
     bounds
 }
 
-/// Adds the outer products of values, alphas and gammas, each term rounded to a whole number.
+/// Adds the outer products of values, alpha kernels and gamma kernels, each term rounded to a whole number.
 struct SpreadRows<'a, const K: usize> {
     rows: Rows<'a, K>,
     terms: &'a [Term<'a, K>],
@@ -357,8 +367,8 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
         let points = rows.rows.len();
         let mut alpha = first;
         let bounds = bounds(terms);
-        let shift = rows.shifts.iter().fold(0, |most, shift| *shift.max(&most));
-        for (lane, bound) in bounds.iter().enumerate().take(rows.alphas) {
+        let shift = rows.shifts.iter().fold(0, |largest, shift| *shift.max(&largest));
+        for (lane, bound) in bounds.iter().enumerate().take(rows.kernel_width) {
             let here = alpha;
             alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
             if !rows.share.holds(here / ALPHAS) {
@@ -366,14 +376,14 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
             }
             let Some(row) = rows.rows.get_mut(here) else { return };
             row.make_room(u64::from(*bound) << shift, rows.direction, K * rows.stride);
-            for k in 0..rows.used {
+            for k in 0..rows.rows_used {
                 let multiples = multiples(simd, terms, lane, k);
-                let at = k * rows.stride + gamma;
+                let start = k * rows.stride + gamma;
                 match &mut row.integers {
-                    Integers::Narrow(sums) => add(sums, at, &multiples, |sum, multiple| {
+                    Integers::Narrow(sums) => add_lanes(sums, start, &multiples, |sum, multiple| {
                         sum.wrapping_add(multiple << rows.shifts[k])
                     }),
-                    Integers::Wide(sums) => add(sums, at, &multiples, |sum, multiple| {
+                    Integers::Wide(sums) => add_lanes(sums, start, &multiples, |sum, multiple| {
                         sum.wrapping_add(i64::from(multiple) << rows.shifts[k])
                     }),
                     Integers::None => {}
@@ -385,26 +395,32 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
 
 /// The rounded terms of one alpha, summed over visibilities.
 ///
-/// With named registers: the compiler would otherwise vectorise over visibilities, with gathers.
+/// Uses explicit SIMD vectors, because the compiler would vectorise over visibilities and need gathers.
 #[inline(always)]
 fn multiples<S: Simd, const K: usize>(simd: S, terms: &[Term<'_, K>], lane: usize, k: usize) -> [u32; LANES] {
     let mut multiples = [biases(terms.len()).wrapping_neg().cast_unsigned(); LANES];
     let (sums, _) = S::as_mut_simd_u32s(&mut multiples);
     let bias = simd.splat_f32s(BIAS);
     for term in terms {
-        let factor = simd.splat_f32s(term.values[k] * term.alphas[lane]);
-        for (sum, gammas) in sums.iter_mut().zip(S::as_simd_f32s(term.gammas).0) {
-            let biased = simd.mul_add_f32s(factor, *gammas, bias);
+        let factor = simd.splat_f32s(term.values[k] * term.kernel_alpha[lane]);
+        for (sum, kernel_gamma) in sums.iter_mut().zip(S::as_simd_f32s(term.kernel_gamma).0) {
+            let biased = simd.mul_add_f32s(factor, *kernel_gamma, bias);
             *sum = simd.add_u32s(*sum, simd.transmute_u32s_f32s(biased));
         }
     }
     multiples
 }
 
+/// Adds one multiple per lane to the sums from `start` on.
 #[inline(always)]
-fn add<T: Copy>(sums: &mut [T], at: usize, multiples: &[u32; LANES], add: impl Fn(T, i32) -> T) {
-    let Some(sums) = sums.get_mut(at..).and_then(|sums| sums.first_chunk_mut::<LANES>()) else { return };
+fn add_lanes<T: Copy>(
+    sums: &mut [T],
+    start: usize,
+    multiples: &[u32; LANES],
+    accumulate: impl Fn(T, i32) -> T,
+) {
+    let Some(sums) = sums.get_mut(start..).and_then(|sums| sums.first_chunk_mut::<LANES>()) else { return };
     for (sum, multiple) in sums.iter_mut().zip(multiples) {
-        *sum = add(*sum, multiple.cast_signed());
+        *sum = accumulate(*sum, multiple.cast_signed());
     }
 }

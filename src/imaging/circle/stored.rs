@@ -1,4 +1,4 @@
-//! Sums on disk, as a product reads them: block of alphas after block.
+//! Sums on disk, which matrix products read by blocks of alphas.
 
 use std::fs::File;
 use std::io;
@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use super::grid::{Grids, NODES};
 use crate::files::{nameless_file, read_at};
 
-/// Which sums of a node.
+/// The two parts of a node's sums.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum TorusPart {
     Weights,
@@ -18,7 +18,7 @@ pub(super) enum TorusPart {
 }
 
 impl TorusPart {
-    /// Points of the grid in alpha.
+    /// Number of points of the grid in alpha.
     pub(super) fn points(self, grids: &Grids) -> usize {
         match self {
             Self::Weights => grids.points,
@@ -26,7 +26,7 @@ impl TorusPart {
         }
     }
 
-    /// Floats of a row: of one node at one alpha.
+    /// Number of elements of a row, which is of one node at one alpha.
     pub(super) fn row(self, grids: &Grids) -> usize {
         match self {
             Self::Weights => NODES * grids.weight_stride(),
@@ -35,20 +35,20 @@ impl TorusPart {
     }
 }
 
-/// The rows of a block of alphas as they were read.
+/// The rows of a block of alphas, read from disk.
 pub(super) struct ReadRows<'a> {
     from: &'a StoredTori,
     values: Vec<f32>,
-    /// Where each node begins, of those that have data.
+    /// Offset of each node with data.
     nodes: Vec<Option<usize>>,
     row: usize,
 }
 
 impl ReadRows<'_> {
-    /// The row of a node at the alpha `place` of the block, if it has data.
+    /// The row of a node at the alpha number `alpha` of the block, if it has data.
     #[inline]
-    pub(super) fn row(&self, node: usize, place: usize) -> Option<&[f32]> {
-        let first = (*self.nodes.get(node)?)? + place * self.row;
+    pub(super) fn row(&self, node: usize, alpha: usize) -> Option<&[f32]> {
+        let first = (*self.nodes.get(node)?)? + alpha * self.row;
         self.values.get(first..first + self.row)
     }
 }
@@ -59,22 +59,22 @@ impl Drop for ReadRows<'_> {
     }
 }
 
-/// Sums of all nodes in a file that has no name, so that it goes with the process: of each block of alphas, of each node that has data,
-/// row after row of its sums in f32.
+/// Sums of all nodes in an unnamed file, which the system deletes with the process. For each block of alphas and each node with data it holds
+/// rows in f32.
 #[derive(Debug)]
 pub(super) struct StoredTori {
     pub(super) file: File,
-    /// The folder that it is in, for messages.
+    /// The folder of the file, for messages.
     folder: PathBuf,
     pub(super) end: u64,
-    /// By part of the sums.
+    /// Weights and right-hand sides.
     pub(super) parts: [StoredPart; 2],
-    /// Nodes of the grid that have data.
+    /// The range of nodes with data.
     pub(super) reached: Range<usize>,
-    /// Memory of blocks that were read: new memory costs as much as reading into it.
+    /// Buffers for reuse, because allocating memory takes as long as reading into it.
     unused: Mutex<Vec<Vec<f32>>>,
-    /// Whether the last product took the blocks from the first to the last.
-    forth: AtomicBool,
+    /// Whether the last product took the blocks in forward order.
+    was_forward: AtomicBool,
     /// Why a block could not be read.
     failure: OnceLock<String>,
 }
@@ -82,25 +82,22 @@ pub(super) struct StoredTori {
 /// The weights of all nodes, or their right-hand sides.
 #[derive(Debug, Default)]
 pub(super) struct StoredPart {
-    /// By block of alphas.
     pub(super) blocks: Vec<StoredBlock>,
-    /// Which alphas hold data.
+    /// Whether each alpha has data.
     pub(super) alphas: Vec<bool>,
 }
 
 /// One block of alphas.
 #[derive(Clone, Debug, Default)]
 pub(super) struct StoredBlock {
-    /// Where it begins in the file.
     pub(super) offset: u64,
-    /// Alphas in it.
     pub(super) alphas: usize,
-    /// Nodes that have data, in order.
+    /// Nodes with data, in order.
     pub(super) nodes: Arc<Vec<usize>>,
 }
 
 impl StoredTori {
-    /// Without sums, in a folder.
+    /// Creates an empty file in a folder.
     pub(super) fn create(folder: &Path) -> io::Result<Self> {
         let file = nameless_file(folder)?;
         Ok(Self {
@@ -110,7 +107,7 @@ impl StoredTori {
             parts: Default::default(),
             reached: 0..0,
             unused: Mutex::default(),
-            forth: AtomicBool::new(false),
+            was_forward: AtomicBool::new(false),
             failure: OnceLock::new(),
         })
     }
@@ -119,25 +116,25 @@ impl StoredTori {
         self.reached.clone()
     }
 
-    /// Whether the next product is to take the blocks from the last to the first: the other way than the one before.
-    pub(super) fn turns_back(&self) -> bool {
-        self.forth.fetch_not(Ordering::Relaxed)
+    /// Whether the next product takes the blocks in reverse order, which alternates.
+    pub(super) fn next_is_reversed(&self) -> bool {
+        self.was_forward.fetch_not(Ordering::Relaxed)
     }
 
     pub(super) fn alphas(&self, part: TorusPart) -> &[bool] {
         &self.parts[part as usize].alphas
     }
 
-    /// Bytes of the weights with rows of this many floats.
+    /// Bytes of the weights, with rows of `row` elements.
     pub(super) fn weight_bytes(&self, row: usize) -> u64 {
         let rows = |block: &StoredBlock| block.nodes.len() * block.alphas;
         let [weights, _] = &self.parts;
         (weights.blocks.iter().map(rows).sum::<usize>() * row * size_of::<f32>()) as u64
     }
 
-    /// Shortens the file, as a broken disk would.
+    /// Truncates the file, as a broken disk would.
     #[cfg(test)]
-    pub(super) fn cut(&self, bytes: u64) {
+    pub(super) fn truncate(&self, bytes: u64) {
         self.file.set_len(bytes).unwrap();
     }
 
@@ -149,7 +146,7 @@ impl StoredTori {
         self.unused.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The rows of a block, with `row` floats each; `None` if they cannot be read.
+    /// Reads the rows of a block, with `row` elements each; `None` if they cannot be read.
     pub(super) fn block(&self, part: TorusPart, block: usize, row: usize) -> Option<ReadRows<'_>> {
         if self.failure.get().is_some() {
             return None;
@@ -158,7 +155,7 @@ impl StoredTori {
         let floats = block.alphas * row;
         let (mut values, length) = (self.buffers().pop().unwrap_or_default(), block.nodes.len() * floats);
         if values.capacity() < length {
-            // No copy of what is to be read over, and no more room than that.
+            // A new buffer: old content need not be copied, and spare capacity not be allocated.
             values = Vec::new();
             values.reserve_exact(length);
         }

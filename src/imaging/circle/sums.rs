@@ -13,37 +13,37 @@ use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::ranks::Ranks;
 use crate::sky::harmonics::Alm;
 
-/// Interpolation between nodes and kernels of the weights err by up to 4e-4 of an eigenvalue, and by some 1e-7 of W_max where
-/// large terms cancel. Against rows in f64 of other code (`tests/maps/traces.rs`), l_max 20, eigenvalues are apart by this beyond
-/// the relative part: none at 3 MHz up to 250 m, 2.1e-7 of W_max at 10 MHz up to 234 m, 3e-9 up to 470 m.
+/// Interpolation between nodes and gridding of weights have errors of up to 4e-4 of an eigenvalue, and of some 1e-7 of W_max where large terms
+/// cancel. Compared with rows in f64 from other code (`tests/maps/traces.rs`, l_max 20), the absolute part is 0 at 3 MHz up to 250 m, 2.1e-7 of
+/// W_max at 10 MHz up to 234 m, and 3e-9 up to 470 m.
 const ACCURACY: Accuracy = Accuracy { relative: 1e-3, absolute: 1e-6 };
 
 /// Normal equations of one channel over the real orthonormal harmonics up to `l_max`.
 ///
-/// A vector of unknowns holds, m after m: for m = 0 the `T_l0`, for m > 0 `sqrt(2) Re T_lm` and `sqrt(2) Im T_lm`
-/// of l = m, m + 1, ..: (l_max + 1)^2 numbers, in K sr^(1/2).
+/// A vector of unknowns has (l_max + 1)^2 elements in K sr^(1/2), by increasing m: `T_l0` for m = 0, `sqrt(2) Re T_lm` and
+/// `sqrt(2) Im T_lm` for m > 0, each for l = m, m + 1, ..
 #[derive(Clone, Debug)]
 pub struct HarmonicSums {
     pub(super) setup: HarmonicSetup,
     pub(super) grids: Arc<Grids>,
     pub(super) tables: Arc<OnceLock<Operator>>,
-    /// What this process holds of the sums.
+    /// The share of the sums that this process holds.
     pub(super) tori: Tori,
-    /// Those that hold the rest. Whatever needs all of the sums is asked of all of them at once.
+    /// The ranks that share the sums. All of them must take part in whatever needs all sums.
     pub(super) ranks: Ranks,
-    /// The range of nodes that hold data, of any rank.
+    /// The range of nodes with data on any rank.
     pub(super) reached: OnceLock<Range<usize>>,
-    /// Which alphas hold weights here: to find out takes as long as a product.
+    /// Whether each alpha has weights here; cached, because it takes as long to compute as a product.
     pub(super) used: OnceLock<Vec<bool>>,
     pub(super) counts: SumCounts,
     pub(super) right: OnceLock<Vec<f64>>,
     pub(super) noise: OnceLock<Vec<f64>>,
-    /// Of noise of further realisations.
-    pub(super) further: Vec<Vec<f64>>,
+    /// Right-hand sides of additional noise realisations.
+    pub(super) noise_realisations: Vec<Vec<f64>>,
 }
 
 impl HarmonicSums {
-    /// Setup.
+    /// The setup of the sums.
     #[must_use]
     pub fn setup(&self) -> &HarmonicSetup {
         &self.setup
@@ -53,10 +53,10 @@ impl HarmonicSums {
         self.tables.get_or_init(|| self.setup.operator(&self.grids))
     }
 
-    /// Right-hand sides of noise of further realisations than the companion's.
+    /// Right-hand sides of the additional noise realisations.
     #[must_use]
-    pub fn further_noises(&self) -> &[Vec<f64>] {
-        &self.further
+    pub fn noise_realisations(&self) -> &[Vec<f64>] {
+        &self.noise_realisations
     }
 
     pub(super) fn shared(&self) -> SharedTori<'_> {
@@ -71,14 +71,14 @@ impl HarmonicSums {
         self.operator().matrix_product_flops(&self.shared())
     }
 
-    /// Bytes of this process's weights; one [`NormalSums::apply`] reads each once.
+    /// Bytes of this process's weights, which each [`NormalSums::apply`] reads once.
     #[must_use]
     pub fn weight_bytes(&self) -> u64 {
         self.tori.weight_bytes(&self.grids)
     }
 
-    /// The blocks of BtN^-1B that keep m, with weights averaged over the phase: all of it once the orbit has swept all nodes
-    /// and phases evenly.
+    /// The blocks of BtN^-1B that are diagonal in m, with weights averaged over the phase. They are the whole matrix once the orbit has covered
+    /// all nodes and phases evenly.
     #[must_use]
     pub fn order_blocks(&self) -> OrderBlocks {
         OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup, &self.ranks)
@@ -126,14 +126,14 @@ impl NormalSums for HarmonicSums {
     }
 }
 
-/// The degree of each unknown.
+/// The degree of each unknown, in order.
 pub fn degrees(l_max: usize) -> impl Iterator<Item = usize> {
     let of_order =
         move |m: usize| (m..=l_max).flat_map(move |l| std::iter::repeat_n(l, if m == 0 { 1 } else { 2 }));
     (0..=l_max).flat_map(of_order)
 }
 
-/// Coefficients from a vector of unknowns; missing ones are zero.
+/// Converts a vector of unknowns to coefficients; missing ones are zero.
 #[must_use]
 pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
     let half = std::f64::consts::FRAC_1_SQRT_2;
@@ -150,13 +150,13 @@ pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
     alm
 }
 
-/// The vector of unknowns of these coefficients.
+/// Converts coefficients to a vector of unknowns.
 #[must_use]
 pub fn unknowns(alm: &Alm) -> Vec<f64> {
     scaled(alm, std::f64::consts::SQRT_2)
 }
 
-/// The gradient with respect to the unknowns, from that with respect to `Re T_lm` and `Im T_lm`.
+/// Converts a gradient with respect to `Re T_lm` and `Im T_lm` to one with respect to the unknowns.
 #[must_use]
 pub fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
     scaled(gradient, std::f64::consts::FRAC_1_SQRT_2)

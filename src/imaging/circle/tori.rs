@@ -1,4 +1,4 @@
-//! Sums at the nodes in baseline length as numbers: for each node a torus in alpha and gamma.
+//! The sums as floating-point numbers: for each node in baseline length a torus in alpha and gamma.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -10,29 +10,29 @@ use super::grid::Grids;
 use super::stored::{ReadRows, StoredTori, TorusPart};
 use crate::ranks::Ranks;
 
-/// The sums at one node.
+/// The sums at one node, for the alphas that this process holds.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct NodeSums {
-    /// `[alpha][diagonal][gamma]`, of the alphas that this process holds: weights of this node with itself and with the nodes above, (K sr)^-2.
+    /// `[alpha][diagonal][gamma]`: weights that couple this node with itself and with the nodes above, (K sr)^-2.
     pub(super) weights: Vec<f32>,
-    /// `[alpha][data re, data im, noise re, noise im][gamma]`, likewise, (K sr)^-1.
+    /// `[alpha][data re, data im, noise re, noise im][gamma]`: right-hand sides, (K sr)^-1.
     pub(super) right: Vec<f32>,
 }
 
-/// All nodes; those that no visibility has reached take no memory.
+/// The sums at all nodes; nodes without data take no memory.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Tori {
     pub(super) nodes: Vec<Option<NodeSums>>,
-    /// What is on disk, all of it; `nodes` are empty then.
+    /// All sums, if they are on disk; `nodes` is empty then.
     pub(super) stored: Option<Arc<StoredTori>>,
 }
 
-/// The rows of a block of alphas, of all nodes.
+/// The rows of all nodes for a block of alphas.
 pub(super) enum BlockRows<'a> {
     Held {
         tori: &'a Tori,
         part: TorusPart,
-        /// Where the block begins in each node's sums.
+        /// Offset of the block in each node's sums.
         first: usize,
         row: usize,
     },
@@ -53,29 +53,29 @@ impl NodeSums {
 }
 
 impl BlockRows<'_> {
-    /// The row of a node at the alpha `place` of the block, if it has data.
+    /// The row of a node at the alpha number `alpha` of the block, if it has data.
     #[inline]
-    pub(super) fn row(&self, node: usize, place: usize) -> Option<&[f32]> {
+    pub(super) fn row(&self, node: usize, alpha: usize) -> Option<&[f32]> {
         match self {
             Self::Held { tori, part, first, row } => {
                 let sums = tori.nodes.get(node)?.as_ref()?.part(*part);
-                sums.get(first + place * row..first + (place + 1) * row)
+                sums.get(first + alpha * row..first + (alpha + 1) * row)
             }
-            Self::Read(read) => read.row(node, place),
+            Self::Read(read) => read.row(node, alpha),
         }
     }
 }
 
 impl Tori {
-    pub(super) fn held(nodes: Vec<Option<NodeSums>>) -> Self {
+    pub(super) fn in_memory(nodes: Vec<Option<NodeSums>>) -> Self {
         Self { nodes, stored: None }
     }
 
-    pub(super) fn stored(stored: StoredTori) -> Self {
+    pub(super) fn on_disk(stored: StoredTori) -> Self {
         Self { nodes: Vec::new(), stored: Some(Arc::new(stored)) }
     }
 
-    /// The range of nodes that hold data, of any rank.
+    /// The range of nodes with data on any rank.
     pub(super) fn reached(&self, ranks: &Ranks) -> Range<usize> {
         if let Some(stored) = &self.stored {
             return stored.reached();
@@ -84,12 +84,12 @@ impl Tori {
         let first = self.nodes.iter().position(Option::is_some).unwrap_or(count);
         let last = self.nodes.iter().rposition(Option::is_some).map_or(0, |last| last + 1);
         let mut ends = [(count - first) as i64, last as i64];
-        ranks.greatest(&mut ends);
+        ranks.max(&mut ends);
         let [from_first, last] = ends.map(|end| end as usize);
         (count - from_first).min(last)..last
     }
 
-    /// Which alphas of the grid of a part hold data here.
+    /// Whether each alpha of the grid of a part has data here.
     pub(super) fn alphas(&self, grids: &Grids, part: TorusPart) -> Vec<bool> {
         if let Some(stored) = &self.stored {
             return stored.alphas(part).to_vec();
@@ -105,7 +105,7 @@ impl Tori {
         (0..part.points(grids)).into_par_iter().map(used).collect()
     }
 
-    /// The rows of a block of alphas that is held here; `None` if they could not be read.
+    /// The rows of a block of alphas that this process holds; `None` if they could not be read.
     pub(super) fn block(&self, grids: &Grids, part: TorusPart, block: usize) -> Option<BlockRows<'_>> {
         match &self.stored {
             Some(stored) => stored.block(part, block, part.row(grids)).map(BlockRows::Read),
@@ -116,10 +116,10 @@ impl Tori {
         }
     }
 
-    /// Whether the next product takes the blocks from the last to the first. Of sums on disk every second one does: what memory has kept
-    /// of the file is what was read last.
-    pub(super) fn turns_back(&self) -> bool {
-        self.stored.as_ref().is_some_and(|stored| stored.turns_back())
+    /// Whether the next product takes the blocks in reverse order. For sums on disk every second product does, because the blocks read last are
+    /// still in the file cache.
+    pub(super) fn next_is_reversed(&self) -> bool {
+        self.stored.as_ref().is_some_and(|stored| stored.next_is_reversed())
     }
 
     /// Bytes of the weights that a product reads.

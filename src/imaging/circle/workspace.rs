@@ -1,4 +1,4 @@
-//! Buffers with which a thread applies the operator to a block of alphas, for one sky or several.
+//! Buffers of one thread for applying the operator to a block of alphas, for one or several skies.
 
 use std::sync::Arc;
 
@@ -6,35 +6,35 @@ use num_complex::Complex32;
 use rustfft::{Fft, FftPlanner};
 
 use super::grid::{ALPHAS, NODE_GROUP};
-use crate::response::harmonic::degrees;
+use crate::response::harmonic::degree_count;
 
-/// Whole groups of nodes that hold all sums.
+/// The range of nodes with data, extended to whole groups.
 #[derive(Clone, Copy)]
 pub(super) struct NodeRange {
     pub(super) first: usize,
     pub(super) count: usize,
 }
 
-/// Transforms along gamma, and their scratch.
+/// Fourier transforms along gamma, with scratch memory.
 pub(super) struct Transforms {
     forward: Arc<dyn Fft<f32>>,
     inverse: Arc<dyn Fft<f32>>,
     scratch: Vec<Complex32>,
 }
 
-/// Memory of one thread.
+/// The buffers of one thread.
 pub(super) struct Workspace {
     l_max: usize,
     range: NodeRange,
-    /// Alphas of every sky, one sky after another.
+    /// Number of columns: the alphas of the first sky, of the second, and so on.
     pub(super) columns: usize,
-    /// By mu: the turned skies, `[re of columns, im of columns][l]`.
-    pub(super) turned: Vec<f32>,
-    /// By mu: `[re of columns, im of columns][node][mu, -mu]`.
+    /// The rotated skies by mu: `[re of columns, im of columns][l]`.
+    pub(super) rotated: Vec<f32>,
+    /// Products with the patterns by mu: `[re of columns, im of columns][node][mu, -mu]`.
     pub(super) products: Vec<f32>,
-    /// Two groups of nodes on the grid in gamma.
+    /// A ring buffer of two groups of nodes on the grid in gamma.
     pub(super) ring: Vec<Vec<Complex32>>,
-    /// A group of nodes on its way back.
+    /// Results for one group of nodes.
     pub(super) group: Vec<Vec<Complex32>>,
     pub(super) transforms: Transforms,
 }
@@ -43,12 +43,12 @@ impl Workspace {
     pub(super) fn new(l_max: usize, points: usize, range: NodeRange, skies: usize) -> Self {
         let columns = skies * ALPHAS;
         let line = || vec![Complex32::ZERO; points];
-        let turned: usize = (0..=l_max).map(|mu| degrees(l_max, mu)).sum();
+        let rotated: usize = (0..=l_max).map(|mu| degree_count(l_max, mu)).sum();
         Self {
             l_max,
             range,
             columns,
-            turned: vec![0.0; 2 * columns * turned],
+            rotated: vec![0.0; 2 * columns * rotated],
             products: vec![0.0; (l_max + 1) * 2 * columns * 2 * range.count],
             ring: (0..2 * NODE_GROUP).map(|_| line()).collect(),
             group: (0..NODE_GROUP).map(|_| line()).collect(),
@@ -56,8 +56,8 @@ impl Workspace {
         }
     }
 
-    /// Copies the nodes from `group` on, of the column `place`, from the products onto circles of orders: into one half of the ring, which is transformed to gamma.
-    pub(super) fn gather(&mut self, place: usize, group: usize) {
+    /// Copies the products of a group of nodes and a column to one half of the ring, and transforms them from orders to gamma.
+    pub(super) fn gather(&mut self, column: usize, group: usize) {
         let half = group % (2 * NODE_GROUP);
         let lines = &mut self.ring[half..half + NODE_GROUP];
         if group >= self.range.count {
@@ -65,13 +65,13 @@ impl Workspace {
             return;
         }
         let points = lines[0].len();
-        let column = 2 * self.range.count;
+        let stride = 2 * self.range.count;
         for line in lines.iter_mut() {
             line[self.l_max + 1..points - self.l_max].fill(Complex32::ZERO);
         }
-        for (mu, products) in self.products.chunks_exact(2 * self.columns * column).enumerate() {
-            let (re, im) = products.split_at(self.columns * column);
-            let [re, im] = [re, im].map(|part| &part[place * column + 2 * group..][..2 * NODE_GROUP]);
+        for (mu, products) in self.products.chunks_exact(2 * self.columns * stride).enumerate() {
+            let (re, im) = products.split_at(self.columns * stride);
+            let [re, im] = [re, im].map(|part| &part[column * stride + 2 * group..][..2 * NODE_GROUP]);
             for (k, line) in lines.iter_mut().enumerate() {
                 line[mu] = Complex32::new(re[2 * k], im[2 * k]);
                 if mu > 0 {
@@ -82,22 +82,22 @@ impl Workspace {
         lines.iter_mut().for_each(|line| self.transforms.forward(line));
     }
 
-    /// Copies the lines of the group, but for the first `skipped`, into the products of the nodes from `first` on:
-    /// orders mu and -mu, the second conjugated.
-    pub(super) fn scatter(&mut self, place: usize, skipped: usize, first: usize) {
-        let column = 2 * self.range.count;
+    /// Copies the lines of the group, except the first `skipped`, to the products of a column for the nodes from `first` on: orders mu and
+    /// -mu, the latter conjugated.
+    pub(super) fn scatter(&mut self, column: usize, skipped: usize, first: usize) {
+        let stride = 2 * self.range.count;
         let lines = &self.group[skipped..];
         let points = self.group[0].len();
         let count = lines.len().min(self.range.count.saturating_sub(first));
-        for (mu, products) in self.products.chunks_exact_mut(2 * self.columns * column).enumerate() {
-            let (re, im) = products.split_at_mut(self.columns * column);
+        for (mu, products) in self.products.chunks_exact_mut(2 * self.columns * stride).enumerate() {
+            let (re, im) = products.split_at_mut(self.columns * stride);
             for (k, line) in lines[..count].iter().enumerate() {
                 let minus = if mu > 0 { line[points - mu] } else { Complex32::ZERO };
-                let at = place * column + 2 * (first + k);
-                re[at] = line[mu].re;
-                re[at + 1] = minus.re;
-                im[at] = line[mu].im;
-                im[at + 1] = -minus.im;
+                let index = column * stride + 2 * (first + k);
+                re[index] = line[mu].re;
+                re[index + 1] = minus.re;
+                im[index] = line[mu].im;
+                im[index + 1] = -minus.im;
             }
         }
     }

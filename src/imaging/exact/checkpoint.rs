@@ -1,4 +1,4 @@
-//! Checkpoints of engines: one frame for sums over any basis.
+//! Checkpoints of engines: one format for sums over any basis.
 //!
 //! | field | bytes |
 //! |---|---|
@@ -10,8 +10,8 @@
 //! | integers of the sums | as the basis writes them |
 //! | CRC-32C of all before, u32 | 4 |
 //!
-//! All numbers are little-endian. The bytes depend on the visibilities in the sums alone, not on how they arrived.
-//! Readers reserve memory for data that is there, never for what a head announces.
+//! Numbers are little-endian. The bytes depend only on which visibilities are in the sums, not on how they arrived.
+//! Readers allocate memory for data that they have read, not for what a head announces.
 
 use std::io::{Read, Write};
 
@@ -23,17 +23,17 @@ use crate::imaging::error::AccumulationError;
 const MAGIC: &[u8; 8] = b"LNRENGIN";
 const VERSION: u16 = 3;
 const CURRENT: &str = "an engine's checkpoint, version 3: sum the data again";
-/// Beginnings of the magics of earlier formats, one for each engine.
-const EARLIER: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
+/// Prefixes of the magics of earlier formats, one for each engine.
+const EARLIER_MAGICS: [&[u8]; 2] = [b"LNRPIX", b"LNRHRM"];
 
-/// Basis of an engine in a checkpoint; the numbers are never to be changed.
+/// The kind of sums in a checkpoint; the numbers must never change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BasisKind {
-    /// Over pixels.
+    /// Sums over pixels.
     Pixel = 1,
-    /// Over spherical harmonics.
+    /// Sums over spherical harmonics.
     Harmonic = 2,
-    /// None: visibilities one by one.
+    /// Individual visibilities.
     Archive = 3,
 }
 
@@ -47,20 +47,22 @@ impl BasisKind {
     }
 }
 
-/// Greatest head that is read: real ones take some 100 bytes.
+/// Maximum size of a head; real ones take some 100 bytes.
 const HEAD_BYTES_MAX: usize = 4096;
 
 const CODEC: Configuration<LittleEndian, Fixint, Limit<HEAD_BYTES_MAX>> =
     bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<HEAD_BYTES_MAX>();
 
-/// Antenna responses by their number in checkpoints: append only.
+/// Antenna responses, numbered in checkpoints by their position; only append.
 pub(in crate::imaging) const RESPONSES: [AntennaResponse; 3] =
     [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal, AntennaResponse::ThreeDipoles];
 
+/// The position of a variant, by which it is numbered in checkpoints.
 pub(in crate::imaging) fn number_of<T: PartialEq>(variants: &[T], variant: &T) -> u8 {
     variants.iter().position(|v| v == variant).map_or(u8::MAX, |k| k as u8)
 }
 
+/// The error for a checkpoint that is not accepted.
 pub(in crate::imaging) fn refused(found: String, expected: &'static str) -> AccumulationError {
     AccumulationError::Checkpoint { found, expected }
 }
@@ -72,7 +74,7 @@ pub struct FrameWriter<'a> {
 }
 
 impl<'a> FrameWriter<'a> {
-    /// Begins a frame.
+    /// Writes the start of a frame.
     pub(in crate::imaging) fn new(
         inner: &'a mut dyn Write,
         kind: BasisKind,
@@ -94,7 +96,7 @@ impl<'a> FrameWriter<'a> {
         self.inner.write_all(bytes)
     }
 
-    /// Integers, little-endian.
+    /// Writes integers by `to_bytes`.
     pub(in crate::imaging) fn integers<T: Copy, const N: usize>(
         &mut self,
         values: &[T],
@@ -107,7 +109,7 @@ impl<'a> FrameWriter<'a> {
         Ok(())
     }
 
-    /// Ends the frame with its checksum.
+    /// Writes the checksum that ends the frame.
     pub(in crate::imaging) fn finish(self) -> std::io::Result<()> {
         let crc = self.crc.finalize() as u32;
         self.inner.write_all(&crc.to_le_bytes())
@@ -121,7 +123,7 @@ pub struct FrameReader<'a> {
 }
 
 impl<'a> FrameReader<'a> {
-    /// Begins to read a frame of this kind; gives its head.
+    /// Reads the start of a frame of this kind, with its head.
     pub(in crate::imaging) fn new<H: bincode::Decode<()>>(
         inner: &'a mut dyn Read,
         kind: BasisKind,
@@ -129,7 +131,7 @@ impl<'a> FrameReader<'a> {
         let crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
         let mut from = Self { inner, crc };
         let magic: [u8; 8] = from.array()?;
-        if EARLIER.iter().any(|earlier| magic.starts_with(earlier)) {
+        if EARLIER_MAGICS.iter().any(|earlier| magic.starts_with(earlier)) {
             let found = format!("an engine of an earlier format ({})", magic.escape_ascii());
             return Err(refused(found, CURRENT));
         }
@@ -174,17 +176,17 @@ impl<'a> FrameReader<'a> {
         }
     }
 
-    /// Integers, little-endian.
+    /// Reads integers by `from_bytes`.
     pub(in crate::imaging) fn integers<T, const N: usize>(
         &mut self,
         values: &mut [T],
-        of_bytes: impl Fn([u8; N]) -> T,
+        from_bytes: impl Fn([u8; N]) -> T,
     ) -> std::io::Result<()> {
         for values in values.chunks_mut(1 << 16) {
             let mut bytes = vec![0; N * values.len()];
             self.read(&mut bytes)?;
             for (value, bytes) in values.iter_mut().zip(bytes.as_chunks::<N>().0) {
-                *value = of_bytes(*bytes);
+                *value = from_bytes(*bytes);
             }
         }
         Ok(())
@@ -208,7 +210,7 @@ mod tests {
     use crate::imaging::circle::HarmonicEngine;
     use crate::imaging::{NormalEngine, PixelEngine};
 
-    /// A frame of some kind, version and magic around nothing.
+    /// A frame with this kind, version and magic, and zeros for content.
     fn frame(magic: &[u8; 8], version: u16, kind: u8) -> Vec<u8> {
         [magic.as_slice(), &version.to_le_bytes(), &[kind], &[0; 200]].concat()
     }
@@ -225,8 +227,8 @@ mod tests {
         for magic in [b"LNRPIX01", b"LNRPIX02", b"LNRHRM02", b"LNRHRM03"] {
             let name = std::str::from_utf8(magic).unwrap();
             let bytes = frame(magic, 0, 0);
-            for said in [refusal::<PixelEngine>(&bytes), refusal::<HarmonicEngine>(&bytes)] {
-                assert!(said.contains(name) && said.contains("sum the data again"), "{said}");
+            for message in [refusal::<PixelEngine>(&bytes), refusal::<HarmonicEngine>(&bytes)] {
+                assert!(message.contains(name) && message.contains("sum the data again"), "{message}");
             }
         }
     }
@@ -243,11 +245,11 @@ mod tests {
             (frame(MAGIC, VERSION, 2), "found sums of kind 2, expected sums over pixels"),
             (frame(MAGIC, VERSION, 3), "found sums of kind 3"),
         ] {
-            let said = refusal::<PixelEngine>(&bytes);
-            assert!(said.contains(expected), "{said}");
+            let message = refusal::<PixelEngine>(&bytes);
+            assert!(message.contains(expected), "{message}");
         }
-        let said = refusal::<HarmonicEngine>(&frame(MAGIC, VERSION, 1));
-        assert!(said.contains("found sums of kind 1, expected sums over harmonics"), "{said}");
+        let message = refusal::<HarmonicEngine>(&frame(MAGIC, VERSION, 1));
+        assert!(message.contains("found sums of kind 1, expected sums over harmonics"), "{message}");
     }
 
     #[test]

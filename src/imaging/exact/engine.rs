@@ -1,7 +1,7 @@
-//! The engine without its basis.
+//! The engine of exact sums over any basis of the sky.
 //!
-//! An [`ExactEngine`] checks and counts visibilities, collects them in batches, and hands each batch to its [`SkyBasis`],
-//! which rounds it to integers and adds them to the exact sums, while the next batch is collected.
+//! An [`ExactEngine`] checks and counts visibilities and collects them in batches. Its [`SkyBasis`] rounds each batch to integers and adds
+//! them to the sums, while the next batch is collected.
 
 use std::fmt;
 use std::io::{Read, Write};
@@ -16,65 +16,65 @@ use crate::imaging::{AccumulationError, Added, NormalEngine, NormalSums, Refusal
 use crate::units::vector::Vec3;
 use num_complex::Complex64;
 
-/// A basis of the sky: how visibilities enter the sums, and how the sums become equations.
+/// A basis of the sky, which defines how visibilities are added to the sums, and how equations follow from the sums.
 pub trait SkyBasis: Sized + Send + Sync + 'static {
-    /// Everything on which the sums depend besides the data; only engines of equal setup can be merged.
+    /// All settings that determine the sums; only engines of equal setup can be merged.
     type Setup: Copy + fmt::Debug + PartialEq + Send + Sync;
-    /// Where a visibility belongs in the sums.
+    /// The position of a visibility in the sums.
     type Place: Copy + Send + Sync + 'static;
     /// The sums as integers.
     type Exact: Clone + Send + Sync + 'static;
-    /// The sums as numbers, ready to be solved.
+    /// The sums as floating-point numbers, ready to be solved.
     type Equations: NormalSums;
-    /// A setup as it stands in a checkpoint.
+    /// A setup as it is stored in a checkpoint.
     type Head: bincode::Encode + bincode::Decode<()>;
 
-    /// The basis in checkpoints.
+    /// Identifies the basis in checkpoints.
     const KIND: BasisKind;
-    /// Visibilities that are summed together.
+    /// Number of visibilities in a batch.
     const BATCH: usize;
-    /// Most weight that the sums have room for, in units of the scale.
+    /// Maximum total weight of the sums, in units of the scale.
     const SCALES_MAX: f64;
 
-    /// The tables for a setup; no sums yet.
+    /// Creates the tables for a setup.
     ///
     /// # Errors
-    /// A setup that cannot be used.
+    /// The setup is out of range.
     fn new(setup: &Self::Setup, scale: WeightScale) -> Result<Self, AccumulationError>;
 
-    /// The settings that every engine has.
+    /// The settings that all engines share.
     fn common(setup: &Self::Setup) -> CommonSetup;
 
-    /// Sums of nothing.
+    /// Empty sums.
     fn zeros(&self) -> Self::Exact;
 
-    /// Where a visibility of satellites at these positions belongs.
+    /// The position in the sums of a visibility of satellites at these positions.
     ///
     /// # Errors
-    /// Positions that the basis does not cover.
+    /// The basis does not cover these positions.
     fn place(&self, r_i_m: Vec3, r_j_m: Vec3) -> Result<Self::Place, Refusal>;
 
-    /// Adds a batch to the sums, or removes it.
+    /// Adds a batch to the sums or removes it, depending on the direction.
     fn sum(&self, exact: &mut Self::Exact, batch: &[Accepted<Self::Place>], direction: Direction);
 
-    /// Adds other sums, or removes them.
+    /// Adds other sums or removes them, depending on the direction.
     fn combine(&self, exact: &mut Self::Exact, other: &Self::Exact, direction: Direction);
 
-    /// The sums as numbers.
+    /// Converts a copy of the sums to floating point.
     fn equations(&self, exact: &Self::Exact, counts: SumCounts) -> Self::Equations {
         self.finish(exact.clone(), counts)
     }
 
-    /// The sums as numbers; the integers are given up.
+    /// Converts the sums to floating point, and frees the integers.
     fn finish(&self, exact: Self::Exact, counts: SumCounts) -> Self::Equations;
 
     /// The setup for a checkpoint.
     fn head(setup: &Self::Setup) -> Self::Head;
 
-    /// The setup from a checkpoint.
+    /// Restores the setup from a checkpoint.
     ///
     /// # Errors
-    /// Values out of range.
+    /// A value is out of range.
     fn setup_of(head: Self::Head) -> Result<Self::Setup, AccumulationError>;
 
     /// Writes the sums.
@@ -83,34 +83,34 @@ pub trait SkyBasis: Sized + Send + Sync + 'static {
     /// The writer's.
     fn write(&self, exact: &Self::Exact, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError>;
 
-    /// Reads the sums; memory follows the data that could be read.
+    /// Reads the sums, and allocates memory only for data that could be read.
     ///
     /// # Errors
     /// The reader's, or values out of range.
     fn read(&self, from: &mut FrameReader<'_>) -> Result<Self::Exact, AccumulationError>;
 }
 
-/// The settings that every engine has.
+/// The settings that all engines share.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CommonSetup {
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Greatest weight of a visibility, (K sr)^-2.
+    /// Maximum weight of a visibility, (K sr)^-2.
     pub weight_max: f64,
     /// Seed of the noise-only companion.
     pub companion_seed: u64,
 }
 
-/// A visibility that was accepted and waits for its batch.
+/// An accepted visibility that waits for its batch.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Accepted<P> {
-    /// Where it belongs.
+    /// Position in the sums.
     pub place: P,
     /// Inverse variance, (K sr)^-2.
     pub weight: f64,
     /// Value, K sr.
     pub value_k_sr: Complex64,
-    /// Noise of the noise-only companion, in units of the standard deviation.
+    /// Simulated noise for the noise-only map, in units of the standard deviation.
     pub noise: Complex64,
 }
 
@@ -120,7 +120,7 @@ pub struct ExactEngine<B: SkyBasis> {
     scale: WeightScale,
     pub(in crate::imaging) basis: Arc<B>,
     exact: Deferred<B::Exact>,
-    /// All that the engine holds, pending visibilities included.
+    /// Totals of the engine, pending visibilities included.
     totals: Totals,
     pending: Vec<Accepted<B::Place>>,
     /// Whether the pending visibilities are to be added or removed.
@@ -137,16 +137,16 @@ impl<B: SkyBasis> fmt::Debug for ExactEngine<B> {
 }
 
 impl<B: SkyBasis> ExactEngine<B> {
-    /// An empty engine.
+    /// Creates an empty engine.
     ///
     /// # Errors
-    /// A setup out of range.
+    /// The setup is out of range.
     pub fn new(setup: B::Setup) -> Result<Self, AccumulationError> {
-        Self::of(setup, Totals::default(), |basis| Ok(basis.zeros()))
+        Self::with_sums(setup, Totals::default(), |basis| Ok(basis.zeros()))
     }
 
-    /// An engine that holds the sums made by `exact`, which is called only if the setup is valid.
-    pub(in crate::imaging) fn of(
+    /// Creates an engine with the sums that `exact` returns, which is called only if the setup is valid.
+    pub(in crate::imaging) fn with_sums(
         setup: B::Setup,
         totals: Totals,
         exact: impl FnOnce(&B) -> Result<B::Exact, AccumulationError>,
@@ -154,7 +154,7 @@ impl<B: SkyBasis> ExactEngine<B> {
         let scale = WeightScale::new(B::common(&setup).weight_max)?;
         let basis = B::new(&setup, scale)?;
         Ok(Self {
-            exact: Deferred::Here(exact(&basis)?),
+            exact: Deferred::Ready(exact(&basis)?),
             setup,
             scale,
             basis: Arc::new(basis),
@@ -171,7 +171,7 @@ impl<B: SkyBasis> ExactEngine<B> {
         &self.setup
     }
 
-    /// Visibility `k` as it enters the sums, or why it does not.
+    /// Visibility `k` as it enters the sums, or why it is refused.
     pub(in crate::imaging) fn accept(
         &self,
         placed: &PlacedVisibilities,
@@ -185,7 +185,7 @@ impl<B: SkyBasis> ExactEngine<B> {
     }
 
     /// Adds visibilities or removes them.
-    fn take(
+    fn change(
         &mut self,
         placed: &PlacedVisibilities,
         direction: Direction,
@@ -195,14 +195,16 @@ impl<B: SkyBasis> ExactEngine<B> {
             return Err(AccumulationError::Frequency { expected_hz, found_hz });
         }
         placed.check_lengths()?;
-        // Not in the pool, which sums the batch before: this is the other half of the work.
+        // Done on this thread, while the pool sums the previous batch.
         let found: Vec<_> = (0..placed.len()).map(|k| self.accept(placed, k)).collect();
         let scale = self.scale;
-        let one = |accepted: &Accepted<B::Place>| Totals::one(scale, accepted.weight, accepted.value_k_sr);
+        let totals_of =
+            |accepted: &Accepted<B::Place>| Totals::single(scale, accepted.weight, accepted.value_k_sr);
         if direction == Direction::Out {
             let mut accepted = found.iter().flatten();
-            let left = accepted.try_fold(self.totals, |totals, removed| totals.and(one(removed), direction));
-            left.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+            let remaining = accepted
+                .try_fold(self.totals, |totals, removed| totals.combined(totals_of(removed), direction));
+            remaining.ok_or(AccumulationError::NothingHeld(placed.channel))?;
         }
         if self.direction != direction {
             self.flush();
@@ -210,7 +212,9 @@ impl<B: SkyBasis> ExactEngine<B> {
         }
         let mut added = Added::default();
         for found in found {
-            match found.and_then(|accepted| Ok((self.with(one(&accepted), direction)?, accepted))) {
+            match found
+                .and_then(|accepted| Ok((self.totals_with(totals_of(&accepted), direction)?, accepted)))
+            {
                 Ok((totals, accepted)) => {
                     added.visibilities += 1;
                     self.totals = totals;
@@ -225,14 +229,14 @@ impl<B: SkyBasis> ExactEngine<B> {
         Ok(added)
     }
 
-    /// The totals with others, if the integers have room for both: no element exceeds what the weights allow.
-    fn with(&self, others: Totals, direction: Direction) -> Result<Totals, Refusal> {
-        let totals = self.totals.and(others, direction).ok_or(Refusal::Full)?;
+    /// The combined totals, if the integers have room for them; the total weight bounds every element.
+    fn totals_with(&self, others: Totals, direction: Direction) -> Result<Totals, Refusal> {
+        let totals = self.totals.combined(others, direction).ok_or(Refusal::Full)?;
         let is_full = direction == Direction::In && totals.scales() > B::SCALES_MAX;
         if is_full { Err(Refusal::Full) } else { Ok(totals) }
     }
 
-    /// Hands the pending visibilities to the pool.
+    /// Starts to sum the pending visibilities in the thread pool.
     fn sum_pending(&mut self) {
         if !self.pending.is_empty() {
             let batch = std::mem::replace(&mut self.pending, Vec::with_capacity(B::BATCH));
@@ -241,32 +245,32 @@ impl<B: SkyBasis> ExactEngine<B> {
         }
     }
 
-    /// Its basis, and all that it holds.
+    /// The basis, the sums and their counts.
     pub(in crate::imaging) fn into_exact(mut self) -> (Arc<B>, B::Exact, SumCounts) {
         self.flush();
         let counts = self.counts();
-        (self.basis, self.exact.here(), counts)
+        (self.basis, self.exact.into_value(), counts)
     }
 
-    /// These sums and those of another part of them, which are of the same visibilities.
-    pub(in crate::imaging) fn halves(
+    /// The sums of this engine and of another one, which must hold other parts of the sums of the same visibilities.
+    pub(in crate::imaging) fn matching_parts(
         &mut self,
         other: Self,
     ) -> Result<(&mut B::Exact, B::Exact), AccumulationError> {
         if self.setup != other.setup || self.totals != other.totals {
-            return Err(AccumulationError::Mismatch { what: "data, of which each holds a part," });
+            return Err(AccumulationError::Mismatch { what: "data" });
         }
         self.flush();
-        Ok((self.exact.get(), other.exact.here()))
+        Ok((self.exact.get(), other.exact.into_value()))
     }
 
     fn combine(&mut self, mut other: Self, direction: Direction) -> Result<(), AccumulationError> {
         if self.setup != other.setup {
             return Err(AccumulationError::Mismatch {
-                what: "map sizes, frequencies, baselines, orbits, responses, seeds or greatest weights",
+                what: "map sizes, frequencies, baselines, orbits, responses, seeds or maximum weights",
             });
         }
-        let totals = self.with(other.totals, direction).map_err(|_| AccumulationError::Range)?;
+        let totals = self.totals_with(other.totals, direction).map_err(|_| AccumulationError::Range)?;
         self.flush();
         other.flush();
         self.basis.combine(self.exact.get(), other.exact.get(), direction);
@@ -279,11 +283,11 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
     type Equations = B::Equations;
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.take(placed, Direction::In)
+        self.change(placed, Direction::In)
     }
 
     fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        self.take(placed, Direction::Out)
+        self.change(placed, Direction::Out)
     }
 
     fn flush(&mut self) {
@@ -312,7 +316,7 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
     fn into_sums(mut self) -> B::Equations {
         self.flush();
         let counts = self.counts();
-        self.basis.finish(self.exact.here(), counts)
+        self.basis.finish(self.exact.into_value(), counts)
     }
 
     fn checkpoint(&mut self, out: &mut dyn Write) -> Result<(), AccumulationError> {
@@ -324,7 +328,7 @@ impl<B: SkyBasis> NormalEngine for ExactEngine<B> {
 
     fn restore(from: &mut dyn Read) -> Result<Self, AccumulationError> {
         let (mut from, (head, totals)) = FrameReader::new(from, B::KIND)?;
-        let engine = Self::of(B::setup_of(head)?, totals, |basis| basis.read(&mut from))?;
+        let engine = Self::with_sums(B::setup_of(head)?, totals, |basis| basis.read(&mut from))?;
         from.finish()?;
         Ok(engine)
     }

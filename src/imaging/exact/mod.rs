@@ -1,4 +1,4 @@
-//! Sums of visibilities as integers, which depend on the visibilities in them alone, and their checkpoints.
+//! Sums of visibilities as integers, which depend only on the visibilities in them, and their checkpoints.
 
 pub(super) mod checkpoint;
 mod deferred;

@@ -1,4 +1,4 @@
-//! Noise drawn on the ground, for a map of noise alone.
+//! Simulated noise of visibilities, for noise-only maps.
 
 use num_complex::Complex64;
 use rand_distr::{Distribution, StandardNormal};
@@ -6,29 +6,29 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::frames::PlacedVisibilities;
 use crate::units::{MissionTime, StreamKind, random_stream};
 
-/// What tells a visibility's noise from that of others: channel, sub-band, pair and time alone.
+/// The identity that determines a visibility's noise: channel, sub-band, pair and time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::imaging) struct NoiseKey([u64; 2]);
 
 impl NoiseKey {
-    pub(in crate::imaging) fn of(placed: &PlacedVisibilities, k: usize) -> Self {
+    pub(in crate::imaging) fn new(placed: &PlacedVisibilities, k: usize) -> Self {
         let pair = u64::from(placed.pair.i) << 8 | u64::from(placed.pair.j);
-        let what = u64::from(placed.channel.0) << 32 | u64::from(placed.band) << 16 | pair;
-        Self([what, MissionTime::from_seconds(placed.time_s[k]).0 as u64])
+        let source = u64::from(placed.channel.0) << 32 | u64::from(placed.band) << 16 | pair;
+        Self([source, MissionTime::from_seconds(placed.time_s[k]).0 as u64])
     }
 }
 
-/// Unit normal noise of a visibility's real and imaginary part.
+/// Standard normal noise of the real and imaginary part of a visibility.
 pub(in crate::imaging) fn companion_noise(seed: u64, placed: &PlacedVisibilities, k: usize) -> Complex64 {
-    unit_noise(seed, NoiseKey::of(placed, k))
+    unit_noise(seed, NoiseKey::new(placed, k))
 }
 
-/// That of the visibility with this key.
+/// Standard normal noise of the real and imaginary part of the visibility with this key.
 pub(in crate::imaging) fn unit_noise(seed: u64, NoiseKey(identity): NoiseKey) -> Complex64 {
     let mut stream = random_stream(seed, StreamKind::CompanionNoise, identity);
-    let mut draw = || -> f64 { StandardNormal.sample(&mut stream) };
-    let re = draw();
-    Complex64::new(re, draw())
+    let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
+    let re = normal();
+    Complex64::new(re, normal())
 }
 
 #[cfg(test)]
@@ -37,9 +37,9 @@ mod tests {
     use crate::units::{ChannelId, Pair};
 
     #[test]
-    fn sub_bands_of_a_channel_have_noises_of_their_own() {
+    fn sub_bands_of_a_channel_have_independent_noise() {
         const COUNT: usize = 4_000;
-        let of = |channel: u16, band: u16| {
+        let noise = |channel: u16, band: u16| {
             let placed = PlacedVisibilities {
                 channel: ChannelId(channel),
                 band,
@@ -50,12 +50,12 @@ mod tests {
             (0..COUNT).map(|k| companion_noise(3, &placed, k)).collect::<Vec<_>>()
         };
         let noises: Vec<Vec<Complex64>> =
-            [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0)].map(|(c, b)| of(c, b)).to_vec();
+            [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0)].map(|(c, b)| noise(c, b)).to_vec();
         for (first, one) in noises.iter().enumerate() {
             for (second, other) in noises.iter().enumerate().skip(first) {
                 let product = one.iter().zip(other).map(|(a, b)| a * b.conj()).sum::<Complex64>();
                 let mean = product / COUNT as f64;
-                // <|z|^2> = 2, of variance 4; products of independent ones have 2 in each part. Five standard errors.
+                // <|z|^2> = 2 with variance 4; products of independent values have variance 2 in each part. Five standard errors.
                 let expected = if first == second { 2.0 } else { 0.0 };
                 assert!(
                     (mean - expected).norm() < 5.0 * (4.0 / COUNT as f64).sqrt(),

@@ -1,8 +1,8 @@
-//! Maps of several channels at once: scales that one frequency does not see come from its neighbours.
+//! Joint maps of several channels, in which neighbouring frequencies fill in modes that one frequency does not measure.
 //!
-//! The sky's structure changes slowly with frequency. [`solve_jointly`] takes the sums of each channel as they are, estimates how alike the
-//! channels are ([`Likeness`]) with the map, and solves for all of them together: maps at every channel and at frequencies between, the
-//! spectral index of every pixel, each with errors. No visibility is read again.
+//! The structure of the sky changes slowly with frequency. [`solve_jointly`] takes the sums of each channel, estimates the correlation
+//! between channels ([`Correlation`]), and solves for all channels together. It returns maps at every channel and at frequencies between
+//! them, and the spectral index of every pixel, each with errors. No visibility is read again.
 
 mod amplitude;
 mod prior;
@@ -13,6 +13,6 @@ mod sums;
 mod tests;
 
 pub use amplitude::RelativeAmplitude;
-pub use prior::Likeness;
+pub use prior::Correlation;
 pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

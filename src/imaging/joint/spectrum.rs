@@ -1,56 +1,58 @@
-//! Spectra of pixels: `ln T = ln T_0 + beta ln(nu / nu_0) + 1/2 c ln(nu / nu_0)^2` fitted to the maps of all channels.
+//! Fits the spectrum of every pixel, `ln T = ln T_0 + beta ln(nu / nu_0) + 1/2 c ln(nu / nu_0)^2`, to the maps of all channels.
 
-/// Spectral index and curvature of every pixel, with their standard deviations; NaN where a channel's map is not positive.
+/// Spectral index and curvature of every pixel with their standard deviations; NaN where the map of a channel is not positive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SpectralMaps {
-    /// nu_0, Hz: the geometric mean of the channels.
+    /// Reference frequency nu_0, the geometric mean of the channels, Hz.
     pub reference_hz: f64,
-    /// beta: d ln T / d ln nu at nu_0.
+    /// Spectral index beta = d ln T / d ln nu at nu_0.
     pub index: Vec<f64>,
-    /// Its standard deviation.
+    /// Standard deviation of the index.
     pub index_sigma: Vec<f64>,
-    /// c: the change of beta an e-folding of frequency; empty with fewer than three channels.
+    /// Curvature c, the change of beta per e-folding of frequency; empty with fewer than three channels.
     pub curvature: Vec<f64>,
-    /// Its standard deviation.
+    /// Standard deviation of the curvature.
     pub curvature_sigma: Vec<f64>,
 }
 
-/// Index and curvature as sums over ln T of channels, and what samples scatter.
-pub(super) struct Spectra {
+/// Accumulates index and curvature of a map, and their scatter over samples.
+pub(super) struct SpectrumFit {
     reference_hz: f64,
-    /// Weights of ln T of each channel in ln T_0, beta and, with three channels or more, c.
+    /// Weights of ln T of each channel in beta and, with three channels or more, in c.
     weights: Vec<Vec<f64>>,
-    /// [beta, c][pixel].
+    /// Values `[beta, c][pixel]` of the map.
     fitted: Vec<Vec<f64>>,
+    /// Sums over samples of squared deviations, `[beta, c][pixel]`.
     squares: Vec<Vec<f64>>,
-    /// Samples that counted in each pixel.
+    /// Number of valid samples of each pixel.
     counts: Vec<f64>,
 }
 
-impl Spectra {
+impl SpectrumFit {
     pub(super) fn new(frequencies_hz: &[f64], maps_k: &[Vec<f64>]) -> Self {
         let logarithms: Vec<f64> = frequencies_hz.iter().map(|hz| hz.ln()).collect();
         let centre = logarithms.iter().sum::<f64>() / logarithms.len() as f64;
         let x: Vec<f64> = logarithms.iter().map(|ln| ln - centre).collect();
         let weights = fit_weights(&x);
-        let fitted = fits(&weights, maps_k);
+        let fitted = fit_maps(&weights, maps_k);
         let pixels = maps_k.first().map_or(0, Vec::len);
         let squares = vec![vec![0.0; pixels]; fitted.len()];
         Self { reference_hz: centre.exp(), weights, fitted, squares, counts: vec![0.0; pixels] }
     }
 
     pub(super) fn add_sample(&mut self, maps_k: &[Vec<f64>]) {
-        let sample = fits(&self.weights, maps_k);
+        let sample = fit_maps(&self.weights, maps_k);
         for pixel in 0..self.counts.len() {
-            let off: Vec<f64> = sample.iter().zip(&self.fitted).map(|(a, b)| a[pixel] - b[pixel]).collect();
-            if off.iter().all(|off| off.is_finite()) {
+            let deviation: Vec<f64> =
+                sample.iter().zip(&self.fitted).map(|(a, b)| a[pixel] - b[pixel]).collect();
+            if deviation.iter().all(|x| x.is_finite()) {
                 self.counts[pixel] += 1.0;
-                self.squares.iter_mut().zip(off).for_each(|(sum, off)| sum[pixel] += off * off);
+                self.squares.iter_mut().zip(deviation).for_each(|(sum, x)| sum[pixel] += x * x);
             }
         }
     }
 
-    pub(super) fn end(self) -> SpectralMaps {
+    pub(super) fn finish(self) -> SpectralMaps {
         let Self { reference_hz, fitted, squares, counts, .. } = self;
         let sigma = |which: usize| {
             let of_pixel =
@@ -70,30 +72,30 @@ impl Spectra {
     }
 }
 
-/// The rows of the least-squares inverse for beta and c: of orthogonal polynomials, so that no matrix is inverted.
+/// The weights of a least-squares fit for beta and c, from orthogonal polynomials.
 fn fit_weights(x: &[f64]) -> Vec<Vec<f64>> {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let square: Vec<f64> = x.iter().map(|x| x * x).collect();
     let mean = square.iter().sum::<f64>() / x.len() as f64;
     let slope = dot(&square, x) / dot(x, x);
-    // x^2 less its mean and its slope: x has no mean.
-    let bent: Vec<f64> = square.iter().zip(x).map(|(s, x)| s - mean - slope * x).collect();
-    let norm = dot(&bent, &bent);
+    // x^2 minus its mean and its linear trend; the mean of x is 0.
+    let residual: Vec<f64> = square.iter().zip(x).map(|(s, x)| s - mean - slope * x).collect();
+    let norm = dot(&residual, &residual);
     if x.len() < 3 || norm <= 0.0 {
         return vec![x.iter().map(|value| value / dot(x, x)).collect()];
     }
-    // y = a + b x + q bent: c = 2 q, and the slope at x = 0 is b - q slope.
-    let of = |value: &f64, bent: &f64| value / dot(x, x) - slope * bent / norm;
+    // For y = a + b x + q residual, c = 2 q, and the slope at x = 0 is b - q slope.
+    let weight = |value: &f64, residual: &f64| value / dot(x, x) - slope * residual / norm;
     vec![
-        x.iter().zip(&bent).map(|(value, bent)| of(value, bent)).collect(),
-        bent.iter().map(|bent| 2.0 * bent / norm).collect(),
+        x.iter().zip(&residual).map(|(value, residual)| weight(value, residual)).collect(),
+        residual.iter().map(|residual| 2.0 * residual / norm).collect(),
     ]
 }
 
-fn fits(weights: &[Vec<f64>], maps_k: &[Vec<f64>]) -> Vec<Vec<f64>> {
+fn fit_maps(weights: &[Vec<f64>], maps_k: &[Vec<f64>]) -> Vec<Vec<f64>> {
     let pixels = maps_k.first().map_or(0, Vec::len);
     let of_pixel = |weights: &Vec<f64>, pixel: usize| {
-        // The logarithm of what is not positive is no number, and so is the sum.
+        // The sum is not finite if a value is not positive.
         let term = |(weight, map): (&f64, &Vec<f64>)| weight * map[pixel].max(0.0).ln();
         let sum: f64 = weights.iter().zip(maps_k).map(term).sum();
         if sum.is_finite() { sum } else { f64::NAN }
@@ -106,7 +108,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn index_and_curvature_of_a_bent_power_law_come_back() {
+    fn index_and_curvature_of_a_curved_power_law_are_found() {
         let frequencies_hz = [1e6, 3e6, 10e6, 12e6];
         let reference_hz = f64::powf(1e6 * 3e6 * 10e6 * 12e6, 0.25);
         // Three pixels; the last is not positive at one frequency.
@@ -118,11 +120,11 @@ mod tests {
             .iter()
             .map(|hz| vec![law(*hz, -2.5, 0.0), law(*hz, -2.1, -0.7), if *hz == 3e6 { -1.0 } else { 1.0 }])
             .collect();
-        let mut spectra = Spectra::new(&frequencies_hz, &maps);
+        let mut spectra = SpectrumFit::new(&frequencies_hz, &maps);
         let shifted: Vec<Vec<f64>> =
             frequencies_hz.iter().map(|hz| vec![law(*hz, -2.4, 0.0), law(*hz, -2.1, -0.5), 1.0]).collect();
         spectra.add_sample(&shifted);
-        let found = spectra.end();
+        let found = spectra.finish();
         assert!((found.reference_hz / reference_hz - 1.0).abs() < 1e-12);
         for (values, expected) in [
             (&found.index, [-2.5, -2.1]),
@@ -136,7 +138,7 @@ mod tests {
             );
             assert!(values[2].is_nan());
         }
-        let two = Spectra::new(&[1e6, 4e6], &[vec![16.0], vec![1.0]]).end();
+        let two = SpectrumFit::new(&[1e6, 4e6], &[vec![16.0], vec![1.0]]).finish();
         assert!((two.index[0] + 2.0).abs() < 1e-12 && two.curvature.is_empty());
     }
 }

@@ -5,15 +5,15 @@ use std::borrow::Cow;
 use faer::Mat;
 use rayon::prelude::*;
 
-use super::prior::{Prior, place_of};
+use super::prior::{Prior, index_of};
 use crate::imaging::power::Block;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
-/// Sums of all channels. What a channel's data scatter more than their noise counts as noise.
+/// The sums of all channels. Residuals of a channel in excess of its noise count as noise.
 pub(super) struct JointSums<'a> {
     pub(super) prior: &'a Prior,
     pub(super) channels: Vec<&'a (dyn NormalSums + Sync)>,
-    /// s of each channel: weights are divided by s^2.
+    /// Noise factor s of each channel; weights are divided by s^2.
     pub(super) noise_factors: Vec<f64>,
     right: Vec<f64>,
     noise_right: Vec<f64>,
@@ -25,15 +25,15 @@ impl<'a> JointSums<'a> {
         channels: Vec<&'a (dyn NormalSums + Sync)>,
         noise_factors: Vec<f64>,
     ) -> Self {
-        let of = |right: &dyn Fn(&(dyn NormalSums + Sync)) -> Vec<f64>, exponent: i32| {
+        let transposed = |right: &dyn Fn(&(dyn NormalSums + Sync)) -> Vec<f64>, exponent: i32| {
             let scaled = |(sums, factor): (&&'a (dyn NormalSums + Sync), &f64)| {
                 right(*sums).into_iter().map(|b| b / factor.powi(exponent)).collect::<Vec<f64>>()
             };
             prior.transposed(&channels.iter().zip(&noise_factors).map(scaled).collect::<Vec<_>>())
         };
-        let right = of(&|sums| sums.right_hand_side().to_vec(), 2);
-        // Noise that is s times as large.
-        let noise_right = of(&|sums| sums.noise_right_hand_side().to_vec(), 1);
+        let right = transposed(&|sums| sums.right_hand_side().to_vec(), 2);
+        // The noise is s times as large.
+        let noise_right = transposed(&|sums| sums.noise_right_hand_side().to_vec(), 1);
         Self { prior, channels, noise_factors, right, noise_right }
     }
 }
@@ -50,12 +50,12 @@ impl NormalSums for JointSums<'_> {
     }
 
     fn apply_all(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
-        // [vector][channel]
+        // By vector, then by channel.
         let skies: Vec<Vec<Vec<f64>>> = x.iter().map(|x| self.prior.skies(x)).collect();
         let mut products: Vec<Vec<Vec<f64>>> = vec![Vec::new(); x.len()];
         for (channel, (sums, factor)) in self.channels.iter().zip(&self.noise_factors).enumerate() {
-            let of: Vec<&[f64]> = skies.iter().map(|skies| skies[channel].as_slice()).collect();
-            for (product, all) in sums.apply_all(&of).into_iter().zip(&mut products) {
+            let channel_skies: Vec<&[f64]> = skies.iter().map(|skies| skies[channel].as_slice()).collect();
+            for (product, all) in sums.apply_all(&channel_skies).into_iter().zip(&mut products) {
                 all.push(product.into_iter().map(|y| y / factor.powi(2)).collect());
             }
         }
@@ -93,28 +93,28 @@ impl NormalSums for JointSums<'_> {
     }
 }
 
-/// Order and parity of each block of a channel, in their order.
+/// Order and parity of each block of a channel, in the order of blocks.
 fn orders(l_max: usize) -> impl Iterator<Item = (usize, usize)> {
     (0..=l_max).flat_map(move |m| [(m, 0), (m, 1)]).filter(move |(m, parity)| m + parity <= l_max)
 }
 
-/// The blocks of one order and parity that channels have, scaled by what they are divided by: `s_l A s_l' / s^2`.
+/// The scaled blocks `s_l A s_l' / s^2` of one order and parity.
 pub(super) struct ScaledBlocks {
     m: usize,
     parity: usize,
-    /// Of the channels that reach this order.
+    /// Blocks of the channels that reach this order.
     of_channel: Vec<Mat<f64>>,
 }
 
-/// Of all channels; `blocks` are those of each.
+/// Scales the blocks of all channels; `blocks` holds those of each channel.
 pub(super) fn scaled_blocks(
     prior: &Prior,
     blocks: &[Vec<Block<'_>>],
     noise_factors: &[f64],
 ) -> Vec<ScaledBlocks> {
     let scaled = |(index, (m, parity)): (usize, (usize, usize))| {
-        // Channels of lesser degree have no fewer blocks before this one, order by order.
-        let of_channel = (0..prior.of_degree(m + parity)).map(|channel| {
+        // A block has the same index in all channels that have it.
+        let of_channel = (0..prior.channels_with_degree(m + parity)).map(|channel| {
             let block = &blocks[channel][index_in(prior.l_max[channel], m, parity)];
             let scale = |k: usize| prior.scale[channel][block.degrees[k]] / noise_factors[channel];
             Mat::from_fn(block.degrees.len(), block.degrees.len(), |i, j| {
@@ -128,13 +128,13 @@ pub(super) fn scaled_blocks(
     all.into_par_iter().map(scaled).collect()
 }
 
-/// Number of the block of an order and parity: two an order, but one where the other parity has no degree.
+/// The index of the block of an order and parity; each order has two blocks, except the last, which has one.
 fn index_in(l_max: usize, m: usize, parity: usize) -> usize {
     debug_assert!(m + parity <= l_max);
     2 * m + parity
 }
 
-/// The blocks of `T' A T`.
+/// Computes the blocks of `T' A T`.
 pub(super) fn joint_blocks(prior: &Prior, scaled: &[ScaledBlocks]) -> Vec<Block<'static>> {
     let (offsets, _) = prior.offsets();
     scaled.par_iter().map(|scaled| joint_block(prior, scaled, &offsets)).collect()
@@ -149,7 +149,7 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
     let mut matrix = Mat::<f64>::zeros(count, count);
     for a in 0..sizes.len() {
         for b in 0..=a {
-            // Channel c sees unknowns of channels up to c, at its own degrees.
+            // Channel c depends on the unknowns of channels up to c, at its own degrees.
             for c in a..sizes.len() {
                 let share = prior.share(c, a) * prior.share(c, b);
                 for j in 0..sizes[c] {
@@ -173,7 +173,7 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
     let parts = if *m == 0 { 1 } else { 2 };
     let places = |part: usize| {
         let place =
-            |(channel, l): &(usize, usize)| offsets[*channel] + place_of(prior.l_max[*channel], *l, *m, part);
+            |(channel, l): &(usize, usize)| offsets[*channel] + index_of(prior.l_max[*channel], *l, *m, part);
         rows.iter().map(place).collect()
     };
     Block {
@@ -186,13 +186,13 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::imaging::joint::prior::Likeness;
+    use crate::imaging::joint::prior::Correlation;
 
-    /// The blocks times unknowns are what `T'`, the channels' own blocks and T give one after the other.
+    /// The product with the blocks equals successive products with T, the channels' blocks and `T'`.
     #[test]
     fn blocks_are_the_channels_blocks_between_t_and_its_transpose() {
         let scale = vec![vec![1.0, 0.5, 0.3, 0.2], vec![2.0, 1.5, 0.7], vec![1.2, 0.9, 0.4]];
-        let likeness = Likeness { length: 2.0, own_share: 0.05 };
+        let likeness = Correlation { length: 2.0, own_share: 0.05 };
         let prior = Prior::new(vec![3e6, 10e6, 5e6], scale, likeness).unwrap();
         let factors = [1.0, 1.5, 1.2];
         let of = |channel: usize| -> Vec<Block<'static>> {
@@ -204,7 +204,7 @@ mod tests {
                     ((1 + channel) * (m + 1)) as f64 / (1.0 + (i + j) as f64) + f64::from(u8::from(i == j))
                 };
                 let parts = if m == 0 { 1 } else { 2 };
-                let place = |part| degrees.iter().map(|l| place_of(l_max, *l, m, part)).collect();
+                let place = |part| degrees.iter().map(|l| index_of(l_max, *l, m, part)).collect();
                 let places = (0..parts).map(place).collect();
                 Block { matrix: Cow::Owned(Mat::from_fn(n, n, element)), degrees, places }
             };

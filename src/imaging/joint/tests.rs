@@ -1,4 +1,4 @@
-//! Against dense matrices by other formulas.
+//! Tests against dense matrices and other formulas.
 
 use std::borrow::Cow;
 
@@ -6,7 +6,7 @@ use faer::linalg::solvers::{DenseSolveCore, Solve};
 use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::prior::{Likeness, Prior, place_of};
+use super::prior::{Correlation, Prior, index_of};
 use super::solve::{JointRequest, Posterior, most_likely};
 use super::sums::{JointSums, scaled_blocks};
 use crate::imaging::power::Block;
@@ -14,7 +14,7 @@ use crate::imaging::solver::{SolveWatch, StoppingRule};
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::units::{StreamKind, random_stream};
 
-/// Sums that are a matrix.
+/// Sums with a dense matrix.
 struct Dense {
     matrix: Mat<f64>,
     right: Vec<f64>,
@@ -53,7 +53,7 @@ fn normal(seed: u64) -> impl FnMut() -> f64 {
     move || StandardNormal.sample(&mut stream)
 }
 
-/// Random sums of a channel, some combinations of which see nearly nothing.
+/// Random sums of a channel, with some badly measured combinations.
 fn dense(l_max: usize, seed: u64) -> Dense {
     let mut normal = normal(seed);
     let order = (l_max + 1).pow(2);
@@ -62,11 +62,11 @@ fn dense(l_max: usize, seed: u64) -> Dense {
     Dense { matrix: b.transpose() * &b, right: (0..order).map(|_| normal()).collect() }
 }
 
-/// The blocks of one order and parity in a matrix, cosine and sine alike.
+/// The blocks of each order and parity of a matrix, taken from the cosine unknowns.
 fn order_blocks(dense: &Dense, l_max: usize) -> Vec<Block<'static>> {
     let of = |(m, parity): (usize, usize)| {
         let degrees: Vec<usize> = (m + parity..=l_max).step_by(2).collect();
-        let at = |k: usize, part| place_of(l_max, degrees[k], m, part);
+        let at = |k: usize, part| index_of(l_max, degrees[k], m, part);
         let matrix = Mat::from_fn(degrees.len(), degrees.len(), |i, j| dense.matrix[(at(i, 0), at(j, 0))]);
         let parts = if m == 0 { 1 } else { 2 };
         let places = (0..parts).map(|part| (0..degrees.len()).map(|k| at(k, part)).collect()).collect();
@@ -76,7 +76,7 @@ fn order_blocks(dense: &Dense, l_max: usize) -> Vec<Block<'static>> {
     orders.filter(|(m, parity)| m + parity <= l_max).map(of).collect()
 }
 
-/// Mean and covariance of the coefficients of 10 MHz, then 5 MHz, then 7 MHz, which no data see: `(A + C^-1)^-1 b` written out.
+/// The mean `(A + C^-1)^-1 b` and covariance of the coefficients of 10 MHz, 5 MHz, and 7 MHz without data.
 fn posterior_of_dense(scales: [&Vec<f64>; 3], channels: &[Dense; 2]) -> (Mat<f64>, Mat<f64>) {
     let hz = [10e6, 5e6, 7e6];
     let rows: Vec<(usize, usize, usize)> = [4, 3, 3]
@@ -119,11 +119,10 @@ fn posterior_of_dense(scales: [&Vec<f64>; 3], channels: &[Dense; 2]) -> (Mat<f64
     (factor.solve(&b), factor.inverse())
 }
 
-/// Against `(A + C^-1)^-1 b` with all matrices written out, by other formulas than T: solution, errors of pixels and of a frequency
-/// between.
+/// Compares solution, errors of pixels and an intermediate frequency with `(A + C^-1)^-1 b` from dense matrices, without T.
 #[test]
 fn the_joint_map_is_that_of_the_dense_matrices() {
-    let (l_max, likeness) = ([4, 3], Likeness { length: 0.8, own_share: 0.02 });
+    let (l_max, likeness) = ([4, 3], Correlation { length: 0.8, own_share: 0.02 });
     let channels = [dense(4, 1), dense(3, 2)];
     let scale = vec![vec![3.0, 2.0, 1.0, 0.7, 0.5], vec![5.0, 4.0, 2.0, 1.0]];
     let prior = Prior::new(vec![10e6, 5e6], scale.clone(), likeness).unwrap();
@@ -137,18 +136,18 @@ fn the_joint_map_is_that_of_the_dense_matrices() {
     let rule = StoppingRule { residual_max: 1e-11, iterations_max: 500 };
     let request = JointRequest { rule, samples: 400, at_hz: Vec::new() };
     let watch = SolveWatch::default();
-    let found = Posterior::of(&joint, &scaled, &request, watch.named("test")).unwrap();
+    let found = Posterior::new(&joint, &scaled, &request, watch.named("test")).unwrap();
     assert!(found.convergence.converged);
 
     let at_seven = prior.view_at(7e6).unwrap();
     let (expected, covariance) = posterior_of_dense([&scale[0], &scale[1], &at_seven.scale], &channels);
     let count = covariance.nrows();
     let views = [prior.view_of(0), prior.view_of(1), at_seven];
-    let solved: Vec<f64> = views.iter().flat_map(|view| found.seen(view, &found.solution)).collect();
-    // Mean and dipole between channels have a law of their own.
-    let own = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1)].map(|(l, m, part)| 41 + place_of(3, l, m, part));
+    let solved: Vec<f64> = views.iter().flat_map(|view| found.coefficients(view, &found.solution)).collect();
+    // Mean and dipole between channels have another prior.
+    let own = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1)].map(|(l, m, part)| 41 + index_of(3, l, m, part));
     for (i, value) in solved.iter().enumerate().filter(|(i, _)| !own.contains(i)) {
-        // The iteration ends at 1e-11; C^-1 loses some digits.
+        // The iteration stops at 1e-11, and C^-1 loses some digits.
         assert!(
             (value - expected[(i, 0)]).abs() < 1e-7 * (1.0 + value.abs()),
             "{i}: {value} {}",
@@ -161,10 +160,10 @@ fn the_joint_map_is_that_of_the_dense_matrices() {
     for i in (0..count).filter(|i| !own.contains(i)) {
         let variance: f64 =
             samples.iter().map(|sample| (sample[i] - solved[i]).powi(2)).sum::<f64>() / samples.len() as f64;
-        // Five standard errors of a variance of 400.
+        // Five standard errors of a variance from 400 samples.
         assert!((variance / covariance[(i, i)] - 1.0).abs() < 0.36, "{i}: {variance} {}", covariance[(i, i)]);
     }
-    // Pixels: the variance of Y' x, mean over a map; blocks alone leave out coupling, which the draws' ratio puts back by degree.
+    // Mean variance over pixels. Blocks neglect coupling, for which the ratio of samples corrects by degree.
     for (view, at) in views.iter().zip([0..25, 25..41]) {
         let map = found.map(view, 4).unwrap();
         let found: f64 = map.sigma_k.iter().map(|sigma| sigma * sigma).sum::<f64>() / 192.0;
@@ -174,28 +173,28 @@ fn the_joint_map_is_that_of_the_dense_matrices() {
     }
 }
 
-/// Skies drawn with a likeness, seen by sums that couple orders a little and by blocks that leave that out: it is found again.
+/// The correlation of simulated skies is recovered.
 #[test]
-fn the_likeness_of_the_sky_is_found() {
-    let truth = Likeness { length: 1.4, own_share: 0.03 };
+fn the_correlation_of_the_sky_is_found() {
+    let truth = Correlation { length: 1.4, own_share: 0.03 };
     let frequencies_hz = vec![4e6, 6e6, 9e6];
     let scale = vec![vec![1.0; 11]; 3];
     let prior = Prior::new(frequencies_hz, scale, truth).unwrap();
     let mut normal = normal(5);
     let (_, count) = prior.offsets();
     let unit: Vec<f64> = (0..count).map(|_| normal()).collect();
-    // Each coefficient is measured alone, with an error of 0.01: A = 1e4.
+    // Each coefficient is measured separately with an error of 0.01, so A = 1e4.
     let rights: Vec<Vec<f64>> = prior
         .skies(&unit)
         .into_iter()
         .map(|sky| sky.into_iter().map(|x| 1e4 * x + 1e2 * normal()).collect())
         .collect();
-    let plain = prior.with(Likeness { length: 2.0, own_share: 1e-3 }).unwrap();
+    let plain = prior.with_correlation(Correlation { length: 2.0, own_share: 1e-3 }).unwrap();
     let of = |(m, parity): (usize, usize)| {
         let degrees: Vec<usize> = (m + parity..=10).step_by(2).collect();
         let n = degrees.len();
         let matrix = Cow::Owned(Mat::from_fn(n, n, |i, j| if i == j { 1e4 } else { 0.0 }));
-        let place = |part| degrees.iter().map(|l| place_of(10, *l, m, part)).collect();
+        let place = |part| degrees.iter().map(|l| index_of(10, *l, m, part)).collect();
         Block { matrix, places: (0..if m == 0 { 1 } else { 2 }).map(place).collect(), degrees }
     };
     let orders = (0..=10).flat_map(|m| [(m, 0), (m, 1)]).filter(|(m, parity)| m + parity <= 10);
@@ -203,7 +202,7 @@ fn the_likeness_of_the_sky_is_found() {
     let scaled = scaled_blocks(&plain, &[blocks.clone(), blocks.clone(), blocks], &[1.0; 3]);
     let watch = SolveWatch::default();
     let found = most_likely(&plain, &scaled, &rights, watch.named("test")).unwrap();
-    // 121 modes of three channels tell logarithms to some sqrt(2 / 121) = 0.13 for one parameter alone; three of that, and the last step.
+    // With 121 modes a single parameter's logarithm has an error of sqrt(2 / 121) = 0.13; three times that, and the last step.
     assert!((found.length / truth.length).ln().abs() < 0.5, "{found:?}");
     assert!((found.own_share / truth.own_share).ln().abs() < 0.8, "{found:?}");
 }

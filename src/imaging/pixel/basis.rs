@@ -4,7 +4,8 @@ use rayon::prelude::*;
 use super::checkpoint::PixelHead;
 use super::exact::{BLOCK, Panels, SCALES_MAX, WEIGHT_QUANTA};
 use super::{
-    ColumnBlock, ExactPixels, FACTORS, PADDING, PixelSetup, PixelSums, RIGHT_STEPS, SymmetricTiles, Whitened,
+    ColumnBlock, ExactPixels, FACTOR_SCALE, PADDING, PixelSetup, PixelSums, RIGHT_STEPS, SymmetricTiles,
+    Whitened,
 };
 use crate::frames::AntennaResponse;
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter};
@@ -17,10 +18,10 @@ use crate::response::pixel::{PairGeometry, RowMaker};
 use crate::sky::healpix::{pixel_area_sr, pixel_count};
 use crate::units::vector::{Vec3, norm};
 
-/// The engine that sums over the pixels of a HEALPix map.
+/// The engine whose unknowns are the pixels of a HEALPix map.
 pub type PixelEngine = ExactEngine<PixelBasis>;
 
-/// Pixels of a HEALPix map.
+/// The pixels of a HEALPix map as a basis.
 pub struct PixelBasis {
     setup: PixelSetup,
     scale: WeightScale,
@@ -35,7 +36,7 @@ pub struct PairPositions {
 }
 
 impl PixelEngine {
-    /// Memory of an engine, bytes: the matrix and a block of rows, twice more in the order of their products.
+    /// Memory of an engine, bytes: the matrix, a block of rows, and two copies of it in the order of the products.
     #[must_use]
     pub fn memory_bytes(nside: usize) -> u64 {
         let pixels = pixel_count(nside);
@@ -54,16 +55,16 @@ impl PixelBasis {
         }
     }
 
-    /// Steps of the matrix and of the right-hand sides, K^-2 and K^-1.
-    fn units(&self) -> (f64, f64) {
+    /// Quanta of the matrix and of the right-hand sides, K^-2 and K^-1.
+    fn quanta(&self) -> (f64, f64) {
         let area_sr = pixel_area_sr(self.setup.nside);
         (
             area_sr * area_sr * self.scale.weight / WEIGHT_QUANTA,
-            area_sr * self.scale.root / (FACTORS * RIGHT_STEPS),
+            area_sr * self.scale.root / (FACTOR_SCALE * RIGHT_STEPS),
         )
     }
 
-    /// Rows of B times the roots of the weights, rounded to factors: two for each visibility.
+    /// Rows of B times the square roots of the weights, rounded: two rows per visibility.
     fn factors(&self, batch: &[Accepted<PairPositions>], stride: usize) -> Vec<f64> {
         let pixels = self.rows.pixels();
         let pairs: Vec<PairGeometry> = batch.iter().map(|visibility| self.pair(visibility.place)).collect();
@@ -72,7 +73,7 @@ impl PixelBasis {
         a.par_chunks_exact_mut(2 * stride).zip(batch.par_iter().zip(&pairs)).for_each(
             |(rows, (visibility, pair))| {
                 let (re, im) = rows.split_at_mut(stride);
-                let factor = FACTORS * visibility.weight.sqrt() / self.scale.root;
+                let factor = FACTOR_SCALE * visibility.weight.sqrt() / self.scale.root;
                 self.rows.fill(pair, factor, &mut re[..pixels], &mut im[..pixels]);
                 round_factors(rows);
             },
@@ -110,15 +111,14 @@ impl SkyBasis for PixelBasis {
         if [r_i_m, r_j_m].into_iter().any(|r_m| !norm(r_m).is_normal()) {
             return Err(Refusal::Geometry(GeometryRefusal::NotFinite));
         }
-        // Within the Moon nothing is seen, and satellites at one place are none.
         if [r_i_m, r_j_m].into_iter().any(|r_m| norm(r_m) <= self.setup.moon_radius_m) {
             return Err(Refusal::Geometry(GeometryRefusal::Altitude));
         }
         if r_i_m == r_j_m {
             return Err(Refusal::Geometry(GeometryRefusal::Degenerate));
         }
-        let dipoles = self.setup.response == AntennaResponse::DipoleNormal;
-        if dipoles && self.pair(positions).orbit_normal().is_none() {
+        let has_dipoles = self.setup.response == AntennaResponse::DipoleNormal;
+        if has_dipoles && self.pair(positions).orbit_normal().is_none() {
             return Err(Refusal::Geometry(GeometryRefusal::Degenerate));
         }
         Ok(positions)
@@ -141,7 +141,7 @@ impl SkyBasis for PixelBasis {
     }
 
     fn finish(&self, exact: ExactPixels, counts: SumCounts) -> PixelSums {
-        let (unit, right_unit) = self.units();
+        let (unit, right_unit) = self.quanta();
         let values = |sums: Vec<i128>| sums.into_iter().map(|sum| sum as f64 * right_unit).collect();
         PixelSums {
             nside: self.setup.nside,

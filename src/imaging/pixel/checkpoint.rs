@@ -1,5 +1,5 @@
-//! Setups of the pixel engine in checkpoints, and its integers there: the matrix's tiles column by column (i64), then
-//! both right-hand sides (i128).
+//! The setup and the sums of the pixel engine in checkpoints. Sums are the matrix's tiles column by column (i64), then both right-hand
+//! sides (i128).
 
 use super::exact::ExactTiles;
 use super::{ExactPixels, PixelSetup};
@@ -8,10 +8,10 @@ use crate::imaging::exact::checkpoint::{FrameReader, FrameWriter, RESPONSES, num
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::{is_valid_nside, pixel_count};
 
-/// Greatest nside that is accepted.
+/// Maximum nside that is accepted.
 const NSIDE_MAX: u32 = 64;
 
-/// A setup of the pixel engine in a checkpoint.
+/// The setup of a pixel engine in a checkpoint.
 #[derive(bincode::Encode, bincode::Decode)]
 pub struct PixelHead {
     nside: u32,
@@ -23,7 +23,7 @@ pub struct PixelHead {
     weight_max: f64,
 }
 
-/// Methods by their number in checkpoints: append only.
+/// Methods, numbered in checkpoints by their position; only append.
 const METHODS: [PixelMethod; 3] = [PixelMethod::Centre, PixelMethod::Average, PixelMethod::AverageExact];
 
 impl PixelHead {
@@ -68,7 +68,7 @@ impl ExactPixels {
         Ok(out.integers(&self.noise, i128::to_le_bytes)?)
     }
 
-    /// Memory follows the data that is there, not what the head announces: gigabytes for the finest map.
+    /// Reads the sums. Memory is allocated only for data that could be read, not for what a forged head announces.
     pub(in crate::imaging) fn read(
         nside: usize,
         from: &mut FrameReader<'_>,
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn an_engine_goes_on_to_the_same_bits() {
+    fn a_resumed_engine_has_the_same_bits() {
         let (first, second) = (visibilities(0.0, 200), visibilities(5e6, 171));
         let mut whole = PixelEngine::new(setup()).unwrap();
         let mut stopped = PixelEngine::new(setup()).unwrap();
@@ -180,21 +180,21 @@ mod tests {
         assert_eq!(merged.counts.visibilities, whole.counts.visibilities);
         let scale = whole.normal.get(0, 0);
         for k in [0, 17, 191] {
-            // The same 500 terms in another order.
+            // The sums have the same terms in another order.
             assert!((merged.normal.get(k, 3) - whole.normal.get(k, 3)).abs() < 1e-13 * scale);
         }
     }
 
     #[test]
-    fn damage_is_found_wherever_it_is() {
+    fn any_damage_is_found() {
         let mut engine = PixelEngine::new(setup()).unwrap();
         let _ = engine.add(&visibilities(0.0, 140)).unwrap();
         let good = checkpoint(&mut engine);
         assert!(PixelEngine::restore(&mut good.as_slice()).is_ok());
-        for place in [0, 7, 8, 11, 12, 16, 24, 40, 60, 80, good.len() / 2, good.len() - 5, good.len() - 1] {
+        for index in [0, 7, 8, 11, 12, 16, 24, 40, 60, 80, good.len() / 2, good.len() - 5, good.len() - 1] {
             let mut bad = good.clone();
-            bad[place] ^= 0x10;
-            assert!(PixelEngine::restore(&mut bad.as_slice()).is_err(), "byte {place}");
+            bad[index] ^= 0x10;
+            assert!(PixelEngine::restore(&mut bad.as_slice()).is_err(), "byte {index}");
         }
         for length in [0, 5, 11, 50, good.len() / 3, good.len() - 1] {
             assert!(PixelEngine::restore(&mut &good[..length]).is_err(), "{length} bytes");

@@ -1,4 +1,4 @@
-//! Cholesky factorisation of a matrix of tiles, in place.
+//! In-place Cholesky factorisation of a tiled matrix.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{
@@ -12,8 +12,8 @@ use super::tiles::{SymmetricTiles, TILE, add_product};
 
 /// The factor L of `M = L Lt`, in the tiles that held M.
 ///
-/// Right-looking by tiles: a column of tiles is finished, then its products are subtracted from the rest.
-/// Every tile undergoes the same operations on any number of threads, so the factor has the same bits.
+/// The factorisation is right-looking: a column of tiles is finished, then its products are subtracted from the rest.
+/// The operations on each tile, and so the bits, do not depend on the number of threads.
 #[derive(Clone, Debug)]
 pub struct Cholesky(SymmetricTiles);
 
@@ -30,18 +30,18 @@ impl Cholesky {
         for step in 0..matrix.along() {
             Self::advance(&mut matrix, step)?;
         }
-        Ok(Self::of(matrix))
+        Ok(Self::from_factor(matrix))
     }
 
-    /// One step of the factorisation, of `matrix.along()`, in their order.
+    /// Performs one of the `matrix.along()` steps of the factorisation, in order.
     pub(in crate::imaging) fn advance(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPositive> {
         factor_column(matrix, step)?;
         subtract_column(matrix, step);
         Ok(())
     }
 
-    /// The factor, after all steps.
-    pub(in crate::imaging) fn of(matrix: SymmetricTiles) -> Self {
+    /// Wraps the factor after all steps.
+    pub(in crate::imaging) fn from_factor(matrix: SymmetricTiles) -> Self {
         Self(matrix)
     }
 
@@ -75,7 +75,7 @@ impl Cholesky {
     }
 }
 
-/// Factorises diagonal tile `step`, and solves the tiles below it.
+/// Factorises the diagonal tile `step`, and solves for the tiles below it.
 fn factor_column(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPositive> {
     let size = matrix.rows(step).len();
     let first = matrix.rows(step).start;
@@ -91,10 +91,10 @@ fn factor_column(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPosi
         .map_err(|_| NotPositive(first))?;
     let pivot = pivot.as_ref();
     after.par_iter_mut().enumerate().for_each(|(index, tile)| {
-        let (i, j) = SymmetricTiles::place(index + diagonal + 1);
+        let (i, j) = SymmetricTiles::tile_at(index + diagonal + 1);
         if j == step {
             let rows = (order - i * TILE).min(TILE);
-            // X L^T = B is L X^T = B^T.
+            // X L^T = B is equivalent to L X^T = B^T.
             let tile = SymmetricTiles::view_mut(tile, rows, size);
             solve_lower_triangular_in_place(pivot, tile.transpose_mut(), Par::Seq);
         }
@@ -102,17 +102,17 @@ fn factor_column(matrix: &mut SymmetricTiles, step: usize) -> Result<(), NotPosi
     Ok(())
 }
 
-/// Subtracts the products of column `step`'s tiles from the tiles to its lower right.
+/// Subtracts the products of the tiles of column `step` from the tiles to their lower right.
 fn subtract_column(matrix: &mut SymmetricTiles, step: usize) {
     let order = matrix.order();
     let along = matrix.along();
-    // The column is read while others are written: moved out for that time.
+    // The column is moved out, because it is read while other tiles are written.
     let column: Vec<Vec<f64>> =
         (step + 1..along).map(|i| std::mem::take(&mut matrix.tiles_mut()[i * (i + 1) / 2 + step])).collect();
     let size = matrix.rows(step).len();
     let rows_of = |i: usize| (order - i * TILE).min(TILE);
     matrix.tiles_mut().par_iter_mut().enumerate().for_each(|(index, tile)| {
-        let (i, j) = SymmetricTiles::place(index);
+        let (i, j) = SymmetricTiles::tile_at(index);
         if j <= step || i <= step {
             return;
         }
@@ -127,7 +127,7 @@ fn subtract_column(matrix: &mut SymmetricTiles, step: usize) {
     }
 }
 
-/// `y -= L_ij x`.
+/// Computes `y -= L_ij x`.
 fn subtract(tiles: &SymmetricTiles, i: usize, j: usize, x: &[f64], y: &mut [f64]) {
     let tile = tiles.tile(i, j);
     for (k, &x) in x.iter().enumerate() {
@@ -137,7 +137,7 @@ fn subtract(tiles: &SymmetricTiles, i: usize, j: usize, x: &[f64], y: &mut [f64]
     }
 }
 
-/// `y -= L_ij^T x`.
+/// Computes `y -= L_ij^T x`.
 fn subtract_mirrored(tiles: &SymmetricTiles, i: usize, j: usize, x: &[f64], y: &mut [f64]) {
     let tile = tiles.tile(i, j);
     for (k, y) in y.iter_mut().enumerate() {
@@ -145,17 +145,19 @@ fn subtract_mirrored(tiles: &SymmetricTiles, i: usize, j: usize, x: &[f64], y: &
     }
 }
 
+/// Solves `L_ii y = x` in place.
 fn forward(tiles: &SymmetricTiles, i: usize, x: &mut [f64]) {
     let tile = tiles.tile(i, i);
     for k in 0..x.len() {
         x[k] /= tile[(k, k)];
-        let done = x[k];
+        let solved = x[k];
         for r in k + 1..x.len() {
-            x[r] -= tile[(r, k)] * done;
+            x[r] -= tile[(r, k)] * solved;
         }
     }
 }
 
+/// Solves `L_ii^T y = x` in place.
 fn backward(tiles: &SymmetricTiles, i: usize, x: &mut [f64]) {
     let tile = tiles.tile(i, i);
     for k in (0..x.len()).rev() {

@@ -1,38 +1,38 @@
 //! Exact sums of products: a symmetric matrix of integers in tiles.
 //!
-//! Rounded by fused multiply-adds, see [`crate::imaging::exact::fixed_point::rounding`]. Matrix products need this kernel
-//! of their own: a library's product starts its running sums at zero.
+//! Fused multiply-adds round the products, see [`crate::imaging::exact::fixed_point::rounding`]. Library products cannot be used,
+//! because they start their running sums at zero.
 
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-use super::tiles::{ColumnBlock, STRIDE, SymmetricTiles, TILE, extent, place, tiles_along};
+use super::tiles::{ColumnBlock, STRIDE, SymmetricTiles, TILE, extent, tile_at, tiles_along};
 use crate::imaging::exact::fixed_point::Direction;
 use crate::imaging::exact::fixed_point::rounding::{BIAS, above_bias};
 
-/// Quanta of a term of the greatest weight, 2^42; its factors go up to 2^21.
+/// Quanta of a term of the maximum weight, 2^42; its factors go up to 2^21.
 pub(super) const WEIGHT_QUANTA: f64 = 4_398_046_511_104.0;
-/// Most visibilities whose products are formed together: 2^7 of 2^42 are well within the 2^51 that a running sum holds.
+/// Maximum number of visibilities whose products are formed together: 2^7 terms of 2^42 are well within the 2^51 of a running sum.
 pub(super) const BLOCK: usize = 128;
-/// Most weight, in units of the greatest, that sums of 63 bits hold.
+/// Maximum total weight of sums of 63 bits, in units of the scale.
 pub(super) const SCALES_MAX: f64 = 2_097_152.0 - 1.0;
 
-/// Rows of a panel of left factors, and columns of one of right factors: twelve vectors of sums, which with two of
-/// factors and one that is spread fill the sixteen registers.
+/// Numbers of rows in panels of left and right factors. Their products take twelve vector registers for sums; two for factors and one for a
+/// broadcast factor fill the sixteen registers.
 const LEFT: usize = 8;
 const RIGHT: usize = 6;
 
-/// Factors in the order in which they are multiplied: panels of rows, in each column after column.
+/// Factors in the order of their multiplication: panels of rows, each stored column by column.
 pub(super) struct Panels {
     columns: usize,
-    /// By row of tiles.
+    /// Left factors by row of tiles.
     left: Vec<Vec<[f64; LEFT]>>,
-    /// Likewise, times the sign.
+    /// Right factors by row of tiles, times the sign.
     right: Vec<Vec<[f64; RIGHT]>>,
 }
 
 impl Panels {
-    /// Of rounded factors; the products count `sign` (1 or -1) times.
+    /// Arranges rounded factors; `sign` (1 or -1) multiplies their products.
     pub(super) fn new(a: ColumnBlock<'_, f64>, order: usize, sign: f64) -> Self {
         let by_tile = |i: usize| (a, i * TILE..i * TILE + extent(order, i));
         Self {
@@ -43,7 +43,7 @@ impl Panels {
     }
 }
 
-/// Rows in panels of `N`; where rows end, zeros.
+/// Arranges rows in panels of `N`, padded with zeros.
 fn panels<const N: usize>(
     (a, rows): (ColumnBlock<'_, f64>, std::ops::Range<usize>),
     sign: f64,
@@ -63,7 +63,7 @@ fn panels<const N: usize>(
     out
 }
 
-/// Lower triangle of a symmetric matrix of integers, in tiles as those of [`SymmetricTiles`].
+/// The lower triangle of a symmetric matrix of integers, in the tiles of [`SymmetricTiles`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct ExactTiles {
     order: usize,
@@ -73,51 +73,51 @@ pub(super) struct ExactTiles {
 impl ExactTiles {
     pub(super) fn zeros(order: usize) -> Self {
         let count = tiles_along(order) * (tiles_along(order) + 1) / 2;
-        Self { order, tiles: (0..count).map(|k| vec![0; STRIDE * extent(order, place(k).1)]).collect() }
+        Self { order, tiles: (0..count).map(|k| vec![0; STRIDE * extent(order, tile_at(k).1)]).collect() }
     }
 
     /// Adds the products of all pairs of rows, each product rounded to a whole number.
     pub(super) fn add_products(&mut self, panels: &Panels) {
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {
-            let (i, j) = place(index);
+            let (i, j) = tile_at(index);
             multiply_panels((&panels.left[i], &panels.right[j]), panels.columns, i == j, tile);
         });
     }
 
-    /// Adds another matrix of the same order, or removes it.
+    /// Adds another matrix of the same order or removes it, depending on the direction.
     pub(super) fn combine(&mut self, other: &Self, direction: Direction) {
-        let with = match direction {
+        let combine = match direction {
             Direction::In => i64::wrapping_add,
             Direction::Out => i64::wrapping_sub,
         };
         self.tiles.par_iter_mut().zip(&other.tiles).for_each(|(tile, other)| {
-            tile.iter_mut().zip(other).for_each(|(sum, term)| *sum = with(*sum, *term));
+            tile.iter_mut().zip(other).for_each(|(sum, term)| *sum = combine(*sum, *term));
         });
     }
 
-    /// The matrix in units of `unit`, in the memory of the integers.
+    /// Converts the matrix to floating point, times `unit`, in the memory of the integers.
     pub(super) fn into_values(self, unit: f64) -> SymmetricTiles {
         let tiles = self.tiles.into_par_iter().map(|tile| to_values(tile, unit)).collect();
-        SymmetricTiles::of(self.order, tiles)
+        SymmetricTiles::from_tiles(self.order, tiles)
     }
 
-    /// The numbers in use, tile by tile and column by column, for a checkpoint.
+    /// The used elements of columns, tile by tile, for a checkpoint.
     pub(super) fn columns(&self) -> impl Iterator<Item = &[i64]> {
         self.tiles.iter().enumerate().flat_map(move |(index, tile)| {
-            let rows = extent(self.order, place(index).0);
+            let rows = extent(self.order, tile_at(index).0);
             tile.chunks_exact(STRIDE).map(move |column| &column[..rows])
         })
     }
 
-    /// A matrix whose columns are filled by `read`, in the order of [`Self::columns`]. Memory follows what could be read,
-    /// but for a tile of two megabytes.
+    /// Creates a matrix whose columns `read` fills, in the order of [`Self::columns`]. Tiles of two megabytes are allocated one by one, as
+    /// they are read.
     pub(super) fn read<E>(
         order: usize,
         mut read: impl FnMut(&mut [i64]) -> Result<(), E>,
     ) -> Result<Self, E> {
         let along = tiles_along(order);
         let mut tiles = Vec::new();
-        for (i, j) in (0..along * (along + 1) / 2).map(place) {
+        for (i, j) in (0..along * (along + 1) / 2).map(tile_at) {
             let mut tile = vec![0; STRIDE * extent(order, j)];
             for column in tile.chunks_exact_mut(STRIDE) {
                 read(&mut column[..extent(order, i)])?;
@@ -132,20 +132,20 @@ fn to_values(tile: Vec<i64>, unit: f64) -> Vec<f64> {
     tile.into_iter().map(|sum| sum as f64 * unit).collect()
 }
 
-/// Adds the products of two strips of panels to a tile, of a diagonal one those that reach its lower triangle.
+/// Adds the products of two strips of panels to a tile; in a diagonal tile only those that reach its lower triangle.
 ///
-/// Without fused multiply-add in hardware this is slow, and right.
+/// Without fused multiply-add in hardware this is slow but gives the same result.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply_panels(
     (left, right): (&[[f64; LEFT]], &[[f64; RIGHT]]),
     columns: usize,
-    diagonal: bool,
+    is_diagonal: bool,
     tile: &mut [i64],
 ) {
     for (right_panel, right) in right.chunks_exact(columns).enumerate() {
         for (left_panel, left) in left.chunks_exact(columns).enumerate() {
             let (row, column) = (left_panel * LEFT, right_panel * RIGHT);
-            if diagonal && row + LEFT <= column {
+            if is_diagonal && row + LEFT <= column {
                 continue;
             }
             let mut sums = [[BIAS; LEFT]; RIGHT];
@@ -156,7 +156,7 @@ fn multiply_panels(
                     }
                 }
             }
-            // Columns beyond the last are not there; rows beyond it fall between two columns.
+            // There are no columns beyond the last; rows beyond the last fall into the gap between columns.
             for (sums, column) in sums.iter().zip(column..) {
                 let start = column * STRIDE + row;
                 let Some(tile) = tile.get_mut(start..start + LEFT) else { break };
@@ -177,7 +177,7 @@ mod tests {
     use crate::imaging::exact::fixed_point::rounding::{STEPS, round_factors};
     use crate::units::{StreamKind, random_stream};
 
-    /// Rows of factors of all sizes, rounded.
+    /// Rounded rows of factors of all magnitudes.
     fn rows(order: usize, columns: usize, seed: u64) -> Vec<Vec<f64>> {
         let mut stream = random_stream(seed, StreamKind::Probe, [0, 0]);
         (0..columns)
@@ -206,7 +206,7 @@ mod tests {
         for mut row in rows(301, 9, 1) {
             let before = row.clone();
             round_factors(&mut row);
-            // Once is enough.
+            // Rounding is idempotent.
             assert_eq!(row, before);
             assert_eq!(row[0], 0.0);
             for factor in row.iter().skip(1) {
@@ -220,7 +220,7 @@ mod tests {
         assert!(strange[3].abs() <= 1.0 / STEPS);
     }
 
-    /// In any order and batches the same integers; they are those of every product rounded on its own.
+    /// The sums have the same integers in any order and batches, and equal the sums of separately rounded products.
     #[test]
     fn sums_of_products_do_not_depend_on_order_or_batches() {
         let mut stream = random_stream(5, StreamKind::Probe, [1, 0]);
@@ -252,9 +252,9 @@ mod tests {
         (product + (1 << 55)).div_euclid(1 << 56) as i64
     }
 
-    /// The greatest block of the greatest weights is within the range of the running sums.
+    /// The largest block of the maximum weight is within the range of the running sums.
     #[test]
-    fn the_greatest_block_does_not_overflow() {
+    fn the_largest_block_does_not_overflow() {
         let mut row = vec![WEIGHT_QUANTA.sqrt(); 16];
         round_factors(&mut row);
         let rows = vec![row.clone(); BLOCK];
@@ -262,7 +262,7 @@ mod tests {
         let found = sum(16, &[&rows], 1.0).columns().next().unwrap()[0];
         assert_eq!(found, expected);
         assert!(found < 1 << 50);
-        // And the greatest total within that of the integers.
+        // The maximum total is within the range of the integers.
         assert!(SCALES_MAX * WEIGHT_QUANTA < 2_f64.powi(63));
     }
 }

@@ -1,31 +1,30 @@
-//! Normal equations over pixels whose matrix is not held: the visibilities are, and each product makes the rows of B again.
+//! Normal equations over pixels without a stored matrix: visibilities are stored, and each product computes the rows of B again.
 //!
-//! A product costs a visit of each pixel for each visibility, where the held matrix costs one of each pair of pixels: visibilities are
-//! summed in no time, and solutions take long. The sums are those of sorted visibilities: they depend on which are held and on nothing
-//! else.
+//! A product takes N_vis N_pix operations instead of N_pix^2, so adding visibilities is fast and solutions are slow. Visibilities are sorted,
+//! so that the sums depend only on which are held.
 
 use num_complex::Complex64;
 
 use crate::imaging::anywhere::VisibilityArchive;
 use crate::imaging::{AccumulationError, Accuracy, NormalSums, SumCounts};
-use crate::response::general::PairAt;
+use crate::response::general::TimedPair;
 use crate::response::pixel::{PairGeometry, PixelMethod, RowProducts};
 
-/// Rows are those of the stored matrix, good to 1e-6; their sums in f32 are good to 1e-7 of the greatest.
+/// Rows have a relative error of 1e-6, as those of the stored matrix; sums in f32 have one of 1e-7 of the largest.
 const ACCURACY: Accuracy = Accuracy { relative: 1e-6, absolute: 1e-7 };
 
-/// Visibilities for a map of pixels.
+/// Stored visibilities for a pixel map.
 #[derive(Debug)]
 pub struct MatrixFreeVisibilities {
     /// HEALPix nside of the map.
     pub nside: usize,
-    /// How rows of B are made.
+    /// Method by which rows of B are computed.
     pub method: PixelMethod,
-    /// The visibilities.
+    /// The stored visibilities.
     pub archive: VisibilityArchive,
 }
 
-/// Normal equations whose matrix is made again, row by row, for each product.
+/// Normal equations whose matrix is computed again, row by row, for each product.
 #[derive(Debug)]
 pub struct MatrixFreeSums {
     products: RowProducts,
@@ -37,21 +36,21 @@ pub struct MatrixFreeSums {
 }
 
 impl MatrixFreeVisibilities {
-    /// Number and weight of the visibilities.
+    /// Number, weight and power of the visibilities.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
         self.archive.counts()
     }
 
-    /// Sorts the visibilities, and makes the right-hand sides in one pass over their rows.
+    /// Sorts the visibilities and computes the right-hand sides.
     ///
     /// # Errors
-    /// An nside that rows cannot have.
+    /// The nside is not supported.
     pub fn into_sums(self) -> Result<MatrixFreeSums, AccumulationError> {
         let products = RowProducts::new(self.nside, self.method)?;
         let counts = self.archive.counts();
         let (setup, at, data) = self.archive.into_data();
-        let pair = |PairAt { r_i_m, r_j_m, .. }| PairGeometry {
+        let pair = |TimedPair { r_i_m, r_j_m, .. }| PairGeometry {
             r_i_m,
             r_j_m,
             frequency_hz: setup.frequency_hz,
@@ -63,9 +62,9 @@ impl MatrixFreeVisibilities {
             data.value_k_sr.iter().zip(&data.weight).map(|(value, weight)| value * *weight).collect();
         let noise: Vec<Complex64> =
             data.noise.iter().zip(&data.weight).map(|(noise, weight)| noise * weight.sqrt()).collect();
-        let mut sides = products.adjoint(&pairs, &[&weighted, &noise]).into_iter();
-        let mut side = || sides.next().unwrap_or_default();
-        let (right, noise) = (side(), side());
+        let mut right_hand_sides = products.adjoint(&pairs, &[&weighted, &noise]).into_iter();
+        let mut next = || right_hand_sides.next().unwrap_or_default();
+        let (right, noise) = (next(), next());
         Ok(MatrixFreeSums { products, pairs, weights: data.weight, right, noise, counts })
     }
 }

@@ -1,8 +1,8 @@
 //! Normal equations over pixels: `BtN^-1B` itself, element by element.
 //!
-//! Real and imaginary parts of a visibility are separate rows of B (the paper, Sect. 4). Summing a visibility costs
-//! 2 N_pix^2 multiply-adds, of which symmetry saves half. With M the power of four not below `weight_max`, terms of
-//! the matrix are rounded to `2^-42 M` times the square of a pixel's area, and those of the right-hand sides to
+//! Real and imaginary parts of a visibility are separate rows of B (the paper, Sect. 4). Adding a visibility takes
+//! 2 N_pix^2 multiply-adds, of which symmetry saves half. With M the smallest power of four not below `weight_max`, terms
+//! of the matrix are rounded to `2^-42 M` times the square of a pixel's area, and those of the right-hand sides to
 //! `2^-31 sqrt(M)` times the area; there is room for a total weight of `2^21 M`.
 
 mod basis;
@@ -36,13 +36,12 @@ use crate::imaging::exact::fixed_point::rounding::add_scaled;
 use crate::response::pixel::PixelMethod;
 use crate::sky::healpix::pixel_count;
 
-/// Elements between the rows of B in a block, beyond their length: a stride of a power of two would map all rows to few
-/// cache sets.
+/// Unused elements between the rows of B in a block: with a power of two as stride, all rows would share few cache sets.
 const PADDING: usize = 16;
 
-/// Factors of the greatest weight: a row of B times the root of its weight, in units of the scale's.
-const FACTORS: f64 = 2_097_152.0; // 2^21, the root of WEIGHT_QUANTA
-/// Steps of a whitened visibility or noise in one standard deviation.
+/// Factors are rows of B times the square root of their weight; this is their size for the maximum weight.
+const FACTOR_SCALE: f64 = 2_097_152.0; // 2^21, the root of WEIGHT_QUANTA
+/// Steps per standard deviation of a whitened visibility or noise.
 const RIGHT_STEPS: f64 = 1024.0;
 
 /// Setup of a pixel engine; only engines of equal setup can be merged.
@@ -52,15 +51,15 @@ pub struct PixelSetup {
     pub nside: usize,
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// How rows of B are made.
+    /// Method by which rows of B are computed.
     pub method: PixelMethod,
     /// Radius of the body that hides the sky, m.
     pub moon_radius_m: f64,
     /// Antenna response.
     pub response: AntennaResponse,
-    /// Seed of the noise-only companion.
+    /// Seed of the noise-only companion map.
     pub companion_seed: u64,
-    /// Greatest weight that is accepted, (K sr)^-2; it sets the resolution of the sums.
+    /// Maximum weight that is accepted, (K sr)^-2; it sets the resolution of the sums.
     pub weight_max: f64,
 }
 
@@ -72,7 +71,7 @@ pub struct ExactPixels {
     noise: Vec<i128>,
 }
 
-/// A visibility and the noise of its companion, in standard deviations.
+/// A visibility and its simulated noise, in units of the standard deviation.
 #[derive(Clone, Copy)]
 struct Whitened {
     data: Complex64,
@@ -85,7 +84,7 @@ impl ExactPixels {
         Self { normal: ExactTiles::zeros(pixels), right: vec![0; pixels], noise: vec![0; pixels] }
     }
 
-    /// Adds other sums, or removes them.
+    /// Adds other sums or removes them, depending on the direction.
     fn combine(&mut self, other: &Self, direction: Direction) {
         self.normal.combine(&other.normal, direction);
         for (sums, others) in [(&mut self.right, &other.right), (&mut self.noise, &other.noise)] {

@@ -12,39 +12,39 @@ use crate::imaging::solver::{Traces, UnsupportedEpsilon, traces};
 use crate::imaging::solver::{add, subtract};
 use crate::imaging::{NormalSums, PixelSums};
 
-/// Diagnostics of a solution. Eigenvalues and traces are those of pixels, also for a map of harmonics.
+/// Diagnostics of a solution. Eigenvalues and traces are in pixel units, for harmonic maps too.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct Diagnostics {
-    /// epsilon of `R = epsilon W_max I`; absent where R is from the data.
+    /// epsilon of `R = epsilon W_max I`; absent if R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epsilon: Option<f64>,
-    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent where R is from the data, which need none.
+    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent if R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub w_max: Option<f64>,
-    /// Lanczos iterations for it; 0 without.
+    /// Number of Lanczos iterations for W_max.
     pub w_max_iterations: usize,
-    /// Greatest degree of a map of harmonics; absent for one of pixels.
+    /// Maximum degree of a harmonic map; absent for a pixel map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub l_max: Option<usize>,
-    /// How the iteration for the map ended; absent after a factorisation.
+    /// Convergence of the map; absent after a factorisation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub convergence: Option<Convergence>,
-    /// How the iteration for the noise-only map ended.
+    /// Convergence of the noise-only map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise_convergence: Option<Convergence>,
     /// Traces of the covariances, if requested and not interrupted.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces: Option<Traces>,
-    /// Why there are no traces, if they were requested and cannot be had.
+    /// Why requested traces could not be computed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub traces_refused: Option<UnsupportedEpsilon>,
-    /// What the map leaves of the data, if traces were requested.
+    /// The fit of the map to the data, if traces were requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fit: Option<Fit>,
 }
 
 impl Diagnostics {
-    /// Of a map up to `l_max` with R from the data.
+    /// Diagnostics of a map up to `l_max` with R from the data.
     pub(in crate::imaging) fn of_power(l_max: usize, convergence: &[Convergence]) -> Self {
         Self {
             epsilon: None,
@@ -59,7 +59,7 @@ impl Diagnostics {
         }
     }
 
-    /// With the traces of pixels, whose unknowns have the area `per_area_sr` that those of the sums are without.
+    /// Adds traces in pixel units; `per_area_sr` is a pixel's area for harmonic sums, 1 for pixel sums.
     pub(in crate::imaging) fn with_traces(
         mut self,
         found: Result<Option<Traces>, UnsupportedEpsilon>,
@@ -79,9 +79,9 @@ impl Diagnostics {
 /// The map of a sky that is 1 K in one pixel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PointBeam {
-    /// The pixel.
+    /// Index of the pixel.
     pub pixel: usize,
-    /// Map, K, HEALPix RING; of the pixel's degrees up to the map's, if it is one of harmonics.
+    /// Map, K, HEALPix RING; for harmonic maps the sky is that pixel up to the map's maximum degree.
     pub map_k: Vec<f64>,
 }
 
@@ -90,24 +90,24 @@ pub struct PointBeam {
 pub struct PixelSolution {
     /// Map, K, HEALPix RING.
     pub map_k: Vec<f64>,
-    /// Map of noise alone, K.
+    /// Noise-only map, K.
     pub noise_k: Vec<f64>,
-    /// Effective beams that were asked for.
+    /// Requested effective beams.
     pub beams: Vec<PointBeam>,
-    /// How they were found.
+    /// Diagnostics of the solution.
     pub diagnostics: Diagnostics,
 }
 
-/// What is solved for besides the maps.
+/// Optional results of a solution.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PixelExtras<'a> {
-    /// Probes for traces, where the matrix is too large to be decomposed; 0 for neither traces nor fit.
+    /// Number of probes for traces if the matrix is too large to be decomposed; 0 for neither traces nor fit.
     pub probes: usize,
-    /// Pixels whose effective beams are wanted.
+    /// Pixels whose effective beams are computed.
     pub beams: &'a [usize],
 }
 
-/// Whether there is data, and a regularisation.
+/// Requires that there is data and a positive regularisation.
 pub(in crate::imaging) fn check_request(sums: &dyn NormalSums, epsilon: f64) -> Result<(), SolveError> {
     if sums.counts().visibilities == 0 {
         return Err(SolveError::NoData);
@@ -118,7 +118,7 @@ pub(in crate::imaging) fn check_request(sums: &dyn NormalSums, epsilon: f64) -> 
     Ok(())
 }
 
-/// `right -= BtN^-1B prior`.
+/// Computes `right -= BtN^-1B prior`.
 pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f64], right: &mut [f64]) {
     let mut predicted = vec![0.0; prior.len()];
     sums.apply(prior, &mut predicted);
@@ -131,7 +131,7 @@ pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f6
 /// `BtN^-1n`, without a prior.
 ///
 /// # Errors
-/// No data, a prior of another size, or a matrix that is not positive definite.
+/// There is no data, the prior has another size, or the matrix is not positive definite.
 ///
 /// ```
 /// use lunarray::prelude::*;
@@ -139,7 +139,7 @@ pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f6
 /// use lunarray::units::constants::MOON_RADIUS_M;
 ///
 /// # fn main() -> Result<(), Box<dyn std::error::Error>> {
-/// // Visibilities from elsewhere: here of a sky of 1e6 K, of two satellites that turn about the Moon.
+/// // External visibilities: here of a sky of 1e6 K, from two satellites in orbit about the Moon.
 /// let (sky, frequency_hz) = (SkyMap::constant(16, Frame::Ecliptic, 1e6)?, 3e6);
 /// let pair = |k: u32| {
 ///     let (sin, cos) = (0.1 * f64::from(k)).sin_cos();
@@ -186,10 +186,10 @@ pub fn solve_pixels(
     solve_pixels_with(sums, epsilon, prior_k, PixelExtras::default(), SolveWatch::default().named("map"))
 }
 
-/// As [`solve_pixels`], with more besides, as long as `watch` says so.
+/// Solves as [`solve_pixels`], with optional results; `watch` can interrupt it.
 ///
 /// # Errors
-/// Also [`SolveError::Interrupted`], and a pixel for a beam that the map does not have.
+/// As [`solve_pixels`]; [`SolveError::Interrupted`]; or the map does not have the pixel of a beam.
 pub fn solve_pixels_with(
     sums: PixelSums,
     epsilon: f64,
@@ -201,8 +201,8 @@ pub fn solve_pixels_with(
     let PixelExtras { probes, beams } = extras;
     let pixels = sums.unknowns();
     let LargestEigenvalue { value: w_max, iterations, .. } =
-        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.goes_on());
-    // The solution takes the memory of the sums.
+        largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.may_continue());
+    // Before the factorisation, which overwrites the sums.
     let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
     let mut map_k = sums.right.clone();
     if let Some(prior_k) = prior_k {
@@ -212,17 +212,17 @@ pub fn solve_pixels_with(
         subtract_prediction(&sums, prior_k, &mut map_k);
     }
     let accuracy = sums.accuracy();
-    let mut beams = beams.iter().map(|&pixel| seen_point(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
+    let mut beams = beams.iter().map(|&pixel| point_response(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
     let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;
     normal.add_to_diagonal(epsilon * w_max);
     for step in 0..normal.along() {
-        if !watch.goes_on() {
+        if !watch.may_continue() {
             return Err(SolveError::Interrupted);
         }
         Cholesky::advance(&mut normal, step)
             .map_err(|NotPositive(pixel)| SolveError::NotPositive { pixel, epsilon })?;
     }
-    let factor = Cholesky::of(normal);
+    let factor = Cholesky::from_factor(normal);
     rayon::join(|| factor.solve(&mut map_k), || factor.solve(&mut noise_k));
     beams.iter_mut().for_each(|beam| factor.solve(&mut beam.map_k));
     let solved = (probes > 0).then(|| map_k.clone());
@@ -230,7 +230,7 @@ pub fn solve_pixels_with(
         add(&mut map_k, prior_k);
     }
     let fit = solved.map(|solved| {
-        // (A + R) y = b - A T_p: A (y + T_p) is b - R y.
+        // From (A + R) y = b - A T_p follows A (y + T_p) = b - R y.
         let mut product = right.clone();
         subtract(&mut product, epsilon * w_max, &solved);
         let (right, whole, product, solved) = (&right, &map_k, &product, &solved);
@@ -254,12 +254,12 @@ pub fn solve_pixels_with(
     Ok(PixelSolution { map_k, noise_k, beams, diagnostics })
 }
 
-/// `BtN^-1B` times a sky that is 1 K in one pixel.
-pub(super) fn seen_point(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
+/// The product of `BtN^-1B` and a sky that is 1 K in one pixel.
+pub(super) fn point_response(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
     let pixels = sums.unknowns();
     let mut point = vec![0.0; pixels];
     *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;
-    let mut seen = vec![0.0; pixels];
-    sums.apply(&point, &mut seen);
-    Ok(PointBeam { pixel, map_k: seen })
+    let mut response = vec![0.0; pixels];
+    sums.apply(&point, &mut response);
+    Ok(PointBeam { pixel, map_k: response })
 }

@@ -1,4 +1,4 @@
-//! Maps of pixels without the matrix: conjugate gradients whose products make the rows of B again.
+//! Solves for pixel maps without a stored matrix, by conjugate gradients.
 
 use super::solve::{Diagnostics, PixelSolution, check_request, subtract_prediction};
 use crate::imaging::regulariser::Diagonal;
@@ -9,15 +9,15 @@ use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, random_
 use crate::imaging::solver::{StoppingRule, System};
 use crate::imaging::{MatrixFreeSums, NormalSums};
 
-/// Change of W_max from product to product, relative, at which it is found. Products are good to some 1e-7; and W_max only scales R,
-/// so that it changes the map by less than the iteration leaves.
+/// Relative change of W_max at which it has converged: above the error of products, some 1e-7. W_max only scales R, so its error changes the
+/// map by less than the residual of the iteration does.
 const W_MAX_TOLERANCE: f64 = 1e-6;
 
-/// Solves as [`crate::imaging::solve_pixels`] does, by conjugate gradients: a product for the map and the noise-only map together makes each
-/// row of B once. `start` is an earlier solution of both, without the prior.
+/// Solves as [`crate::imaging::solve_pixels`], by conjugate gradients. Each product computes each row of B once for the map and the
+/// noise-only map. `start` holds earlier solutions of both, without the prior.
 ///
 /// # Errors
-/// No data; a prior of another size; [`SolveError::Interrupted`].
+/// There is no data, or the prior has another size; [`SolveError::Interrupted`].
 pub fn solve_matrix_free(
     sums: &MatrixFreeSums,
     epsilon: f64,
@@ -33,11 +33,14 @@ pub fn solve_matrix_free(
     }
     let LargestEigenvalue { value: w_max, iterations, .. } = {
         let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        largest_eigenvalue_from(random_vector(pixels), sums, W_MAX_TOLERANCE, &mut |wants, step, change| {
-            task.report_wanting(wants, step, change)
-        })
+        largest_eigenvalue_from(
+            random_vector(pixels),
+            sums,
+            W_MAX_TOLERANCE,
+            &mut |needs_step, step, change| task.report_step(needs_step, step, change),
+        )
     };
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let regularisation = epsilon * w_max;
@@ -48,7 +51,7 @@ pub fn solve_matrix_free(
     let system = System {
         sums,
         regularisation: Diagonal::Uniform(regularisation),
-        // The diagonal saved no product in trials with dense matrices of random pairs at nside 16.
+        // Preconditioning by the diagonal saved no product in trials with random pairs at nside 16.
         precondition: &|_| (),
     };
     let mut solved = match start {
@@ -59,7 +62,7 @@ pub fn solve_matrix_free(
     let convergence =
         system.solve(&[&right, sums.noise_right_hand_side()], &mut solved, &[rule, rule], &task);
     drop(task);
-    if solved[0].iter().all(|x| *x == 0.0) && !watch.goes_on() {
+    if solved[0].iter().all(|x| *x == 0.0) && !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let mut columns = solved.into_iter();

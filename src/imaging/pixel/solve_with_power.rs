@@ -1,11 +1,13 @@
-//! Maps of pixels with R from the data: over the harmonics that pixels hold, whose matrix is held.
+//! Pixel maps with R from the data, solved for harmonics up to 2.5 nside with a stored matrix.
 
 use std::borrow::Cow;
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, Par};
 
-use super::solve::{Diagnostics, PixelSolution, PointBeam, check_request, seen_point, subtract_prediction};
+use super::solve::{
+    Diagnostics, PixelSolution, PointBeam, check_request, point_response, subtract_prediction,
+};
 use crate::imaging::circle::{coefficients, degrees, unknowns};
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Uncertainty};
 use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
@@ -15,18 +17,18 @@ use crate::sky::healpix::pixel_area_sr;
 use crate::units::{StreamKind, random_stream};
 use rand_distr::{Distribution, StandardNormal};
 
-/// Greatest nside: 6561 harmonics, and matrices of 1.6 GB besides the sums.
+/// Maximum nside: 6561 harmonics, and matrices of 1.6 GB in addition to the sums.
 pub const POWER_NSIDE_MAX: usize = 32;
-/// Degrees per nside, as of harmonic maps.
+/// Degrees per nside, as for harmonic maps.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 /// Rows of the matrix that are multiplied at once.
-const ROWS: usize = 512;
+const ROWS_AT_ONCE: usize = 512;
 
-/// Solves for the harmonics up to 2.5 nside with `R_l = 1 / C_l`, C_l as the data have it: pixels have no more than that of a sky that
-/// falls with the degree. `samples` maps are drawn beside it.
+/// Solves for the harmonics up to 2.5 nside with `R_l = 1 / C_l`, C_l estimated from the data, and draws `samples` posterior samples. Pixels
+/// represent no higher degrees of a sky whose power falls with the degree.
 ///
 /// # Errors
-/// No data, a prior of another size, numbers that are not finite; [`SolveError::Interrupted`].
+/// There is no data, the prior has another size, or numbers are not finite; [`SolveError::Interrupted`].
 pub fn solve_pixels_with_power(
     sums: &PixelSums,
     prior_k: Option<&[f64]>,
@@ -43,24 +45,24 @@ pub fn solve_pixels_with_power(
             return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
         }
         subtract_prediction(sums, prior_k, &mut right);
-        // p.(2 b - A p), of which `right` is b - A p.
+        // p.(2 b - A p), with b - A p in `right`.
         predicted = dot(prior_k, &sums.right) + dot(prior_k, &right);
     }
     let l_max = (DEGREES_PER_NSIDE * nside as f64) as usize;
     let transform = Transform::new(nside, l_max)?;
     let to_pixels = |x: &[f64]| transform.synthesis(&coefficients(x, l_max)).map_err(SolveError::from);
-    // The transpose of that: the transform's own is times the area of a pixel.
+    // The transpose of `to_pixels`; the adjoint transform includes the area of a pixel.
     let area_sr = pixel_area_sr(nside);
     let from_pixels = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         Ok(unknowns(&transform.adjoint(map)?).into_iter().map(|x| x / area_sr).collect())
     };
     let degrees: Vec<usize> = degrees(l_max).collect();
     let harmonics = harmonics(&to_pixels, pixels, degrees.len())?;
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let matrix = projected(sums, &harmonics);
-    if !watch.goes_on() {
+    if !watch.may_continue() {
         return Err(SolveError::Interrupted);
     }
     let places = vec![(0..degrees.len()).collect()];
@@ -68,7 +70,7 @@ pub fn solve_pixels_with_power(
     let right = from_pixels(&right)?;
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let sought = PowerProblem {
+    let problem = PowerProblem {
         sums,
         blocks: &blocks,
         degrees: &degrees,
@@ -76,7 +78,7 @@ pub fn solve_pixels_with_power(
         power: power - predicted,
         numbers,
     };
-    let found = sought.found_in_blocks()?;
+    let found = problem.solve_blocks()?;
     let factor = found.noise_factor();
     let FoundPower { regularisation, solution, power, .. } = found;
     let factors = Factors::new(&blocks, &regularisation);
@@ -90,8 +92,8 @@ pub fn solve_pixels_with_power(
         add(&mut map_k, prior_k);
     }
     let point = |&pixel: &usize| {
-        let seen = seen_point(sums, pixel)?;
-        Ok(PointBeam { pixel, map_k: solved(&seen.map_k)? })
+        let response = point_response(sums, pixel)?;
+        Ok(PointBeam { pixel, map_k: solved(&response.map_k)? })
     };
     let beams = beams.iter().map(point).collect::<Result<Vec<_>, SolveError>>()?;
     let mut monopole = vec![0.0; degrees.len()];
@@ -128,10 +130,10 @@ fn draw(factors: &Factors<'_>, count: usize, factor: f64, which: usize) -> Vec<f
     draw
 }
 
-/// Values at pixels of coefficients.
+/// Computes the values at pixels of coefficients.
 type ToPixels<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
 
-/// The harmonics at the pixels, a column each.
+/// The values of the harmonics at the pixels, one column each.
 fn harmonics(to_pixels: ToPixels<'_>, pixels: usize, count: usize) -> Result<Mat<f64>, SolveError> {
     let mut columns = Mat::zeros(pixels, count);
     let mut unit = vec![0.0; count];
@@ -145,12 +147,12 @@ fn harmonics(to_pixels: ToPixels<'_>, pixels: usize, count: usize) -> Result<Mat
     Ok(columns)
 }
 
-/// The normal matrix over harmonics.
+/// Transforms the normal matrix from pixels to harmonics.
 fn projected(sums: &PixelSums, harmonics: &Mat<f64>) -> Mat<f64> {
     let (pixels, count) = (harmonics.nrows(), harmonics.ncols());
     let mut matrix = Mat::zeros(count, count);
-    for first in (0..pixels).step_by(ROWS) {
-        let rows = ROWS.min(pixels - first);
+    for first in (0..pixels).step_by(ROWS_AT_ONCE) {
+        let rows = ROWS_AT_ONCE.min(pixels - first);
         let of_rows = Mat::from_fn(rows, pixels, |row, column| sums.normal.get(first + row, column));
         let mut product = Mat::zeros(rows, count);
         matmul(product.as_mut(), Accum::Replace, of_rows.as_ref(), harmonics.as_ref(), 1.0, Par::rayon(0));

@@ -3,8 +3,8 @@
 use super::tiles::SymmetricTiles;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
-/// Terms are rounded to 2^-42 of the greatest weight, which is a thousand times that of an expected visibility: 1e-9 of it,
-/// at random in each of some hundred terms and more.
+/// Terms are rounded to 2^-42 of the maximum weight, which is a thousand times an expected weight: to 1e-9 of that, at random in at least some
+/// hundred terms.
 const ACCURACY: Accuracy = Accuracy { relative: 1e-8, absolute: 1e-11 };
 
 /// Normal equations over pixels.
@@ -12,13 +12,13 @@ const ACCURACY: Accuracy = Accuracy { relative: 1e-8, absolute: 1e-11 };
 pub struct PixelSums {
     /// HEALPix nside.
     pub nside: usize,
-    /// BtN^-1B, K^-2.
+    /// The matrix BtN^-1B, K^-2.
     pub normal: SymmetricTiles,
-    /// BtN^-1V, K^-1.
+    /// The right-hand side BtN^-1V, K^-1.
     pub right: Vec<f64>,
-    /// BtN^-1n, K^-1.
+    /// The right-hand side of the noise-only map, BtN^-1n, K^-1.
     pub noise: Vec<f64>,
-    /// Number and weight of the visibilities in them.
+    /// Number, weight and power of the visibilities.
     pub counts: SumCounts,
 }
 

@@ -1,36 +1,36 @@
-//! A symmetric matrix as square tiles of its lower triangle.
+//! A symmetric matrix, stored as square tiles of its lower triangle.
 //!
-//! Half the memory of the full matrix; every tile is one contiguous piece of work, so that updates,
-//! products and factorisation run on any number of threads with the same bits.
+//! It takes half the memory of the full matrix. Threads work on whole tiles, so that updates, products and factorisation have the same
+//! bits for any number of threads.
 
 use faer::linalg::matmul::{matmul, triangular};
 use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
-/// Rows and columns of a tile: the product of two strips of it fits the second-level cache.
+/// Number of rows and columns of a tile, so that the product of two strips fits the second-level cache.
 pub const TILE: usize = 512;
 
-/// Elements between the columns of a tile: not a power of two, which would map all columns to few cache
-/// sets (155 instead of 229 Gflop/s where it was measured).
+/// Elements from column to column of a tile. It is no power of two, which would map all columns to few cache sets (measured: 155 instead of
+/// 229 Gflop/s).
 pub(super) const STRIDE: usize = TILE + 16;
 
-/// Lower triangle of a symmetric matrix, f64, as tiles.
+/// The lower triangle of a symmetric matrix in f64, as tiles.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SymmetricTiles {
     order: usize,
-    /// Tile (i, j), i >= j, at i (i + 1) / 2 + j; columns of [`STRIDE`] elements. Of a diagonal tile
-    /// only the lower triangle is used.
+    /// Tile (i, j), i >= j, is at i (i + 1) / 2 + j, with columns of [`STRIDE`] elements. Only the lower triangle of a
+    /// diagonal tile is used.
     tiles: Vec<Vec<f64>>,
 }
 
-/// A block of columns of A, for A A^T: `columns` columns of `order` consecutive numbers.
+/// A block of columns of a matrix A, for the product A A^T.
 #[derive(Clone, Copy, Debug)]
 pub struct ColumnBlock<'a, T> {
-    /// Numbers; column k begins at `k stride`.
+    /// Elements; column k starts at `k * stride`.
     pub values: &'a [T],
     /// Number of columns.
     pub columns: usize,
-    /// Elements between columns.
+    /// Elements from column to column.
     pub stride: usize,
 }
 
@@ -39,10 +39,10 @@ pub(super) fn tiles_along(order: usize) -> usize {
     order.div_ceil(TILE)
 }
 
-/// Place of tile (i, j) and back: tiles are stored row by row.
-pub(super) fn place(index: usize) -> (usize, usize) {
+/// The tile (i, j) at an index; tiles are stored row by row.
+pub(super) fn tile_at(index: usize) -> (usize, usize) {
     let mut i = ((((8 * index + 1) as f64).sqrt() - 1.0) / 2.0) as usize;
-    // The root may be off by one rounding.
+    // The square root may be rounded to either side.
     while i * (i + 1) / 2 > index {
         i -= 1;
     }
@@ -59,19 +59,19 @@ impl SymmetricTiles {
         let count = tiles_along(order) * (tiles_along(order) + 1) / 2;
         let tiles = (0..count)
             .map(|index| {
-                let (_, j) = place(index);
+                let (_, j) = tile_at(index);
                 vec![0.0; STRIDE * extent(order, j)]
             })
             .collect();
         Self { order, tiles }
     }
 
-    /// A matrix of these tiles, in their order.
-    pub(super) fn of(order: usize, tiles: Vec<Vec<f64>>) -> Self {
+    /// Creates a matrix from its tiles.
+    pub(super) fn from_tiles(order: usize, tiles: Vec<Vec<f64>>) -> Self {
         Self { order, tiles }
     }
 
-    /// Rows of the matrix.
+    /// Number of rows of the matrix.
     #[must_use]
     pub fn order(&self) -> usize {
         self.order
@@ -85,46 +85,46 @@ impl SymmetricTiles {
         (columns * STRIDE * size_of::<f64>()) as u64
     }
 
-    /// Tiles along the side.
+    /// Number of tiles along the side.
     pub(crate) fn along(&self) -> usize {
         tiles_along(self.order)
     }
 
-    /// First row and number of rows of tile row `i`.
+    /// The rows of tile row `i`.
     pub(crate) fn rows(&self, i: usize) -> std::ops::Range<usize> {
         i * TILE..i * TILE + extent(self.order, i)
     }
 
-    /// Tile (i, j), i >= j.
+    /// The tile (i, j), i >= j.
     pub(crate) fn tile(&self, i: usize, j: usize) -> MatRef<'_, f64> {
         Self::view(&self.tiles[i * (i + 1) / 2 + j], extent(self.order, i), extent(self.order, j))
     }
 
-    /// All tiles, to be changed in parallel.
+    /// All tiles, for changes in parallel.
     pub(crate) fn tiles_mut(&mut self) -> &mut [Vec<f64>] {
         &mut self.tiles
     }
 
-    /// Place (i, j) of the tile at an index of [`Self::tiles_mut`].
-    pub(crate) fn place(index: usize) -> (usize, usize) {
-        place(index)
+    /// The tile (i, j) at an index of [`Self::tiles_mut`].
+    pub(crate) fn tile_at(index: usize) -> (usize, usize) {
+        tile_at(index)
     }
 
-    /// A tile's storage as a matrix.
+    /// Views a tile's storage as a matrix.
     pub(crate) fn view(values: &[f64], rows: usize, columns: usize) -> MatRef<'_, f64> {
         MatRef::from_column_major_slice_with_stride(values, rows, columns, STRIDE)
     }
 
-    /// A tile's storage as a matrix, to be changed.
+    /// Views a tile's storage as a mutable matrix.
     pub(crate) fn view_mut(values: &mut [f64], rows: usize, columns: usize) -> MatMut<'_, f64> {
         MatMut::from_column_major_slice_with_stride_mut(values, rows, columns, STRIDE)
     }
 
-    /// Adds A A^T by the library's products, whose rounding is not fixed; a yardstick for the engine's own.
+    /// Adds A A^T by library products, whose rounding depends on the library; for comparison with the engine's own products.
     pub fn add_products_f64(&mut self, a: ColumnBlock<'_, f64>) {
         let order = self.order;
         self.tiles.par_iter_mut().enumerate().for_each(|(index, tile)| {
-            let (i, j) = place(index);
+            let (i, j) = tile_at(index);
             let (left, right) = (strip(a, order, i), strip(a, order, j));
             let tile = Self::view_mut(tile, left.nrows(), right.nrows());
             add_product(tile, 1.0, left, right, i == j);
@@ -142,13 +142,13 @@ impl SymmetricTiles {
         }
     }
 
-    /// The diagonal.
+    /// The elements of the diagonal.
     #[must_use]
     pub fn diagonal(&self) -> Vec<f64> {
         (0..self.order).map(|k| self.get(k, k)).collect()
     }
 
-    /// Element (row, column).
+    /// The element (row, column).
     #[must_use]
     pub fn get(&self, row: usize, column: usize) -> f64 {
         let (row, column) = (row.max(column), row.min(column));
@@ -156,20 +156,20 @@ impl SymmetricTiles {
         self.tiles[i * (i + 1) / 2 + j][column % TILE * STRIDE + row % TILE]
     }
 
-    /// y = M x; both of length [`Self::order`].
+    /// Computes y = M x; both have length [`Self::order`].
     pub fn multiply(&self, x: &[f64], y: &mut [f64]) {
         let parts: Vec<[Vec<f64>; 2]> = self
             .tiles
             .par_iter()
             .enumerate()
             .map(|(index, tile)| {
-                let (i, j) = place(index);
+                let (i, j) = tile_at(index);
                 multiply_tile(tile, &x[self.rows(i)], &x[self.rows(j)], i == j)
             })
             .collect();
         y.fill(0.0);
         for (index, [below, mirrored]) in parts.iter().enumerate() {
-            let (i, j) = place(index);
+            let (i, j) = tile_at(index);
             for (y, part) in y[self.rows(i)].iter_mut().zip(below) {
                 *y += part;
             }
@@ -180,27 +180,27 @@ impl SymmetricTiles {
     }
 }
 
-/// Rows of tile row `i`.
+/// Number of rows of tile row `i`.
 pub(super) fn extent(order: usize, i: usize) -> usize {
     (order - i * TILE).min(TILE)
 }
 
-/// Rows of A that belong to tile row `i`.
+/// The rows of A that belong to tile row `i`.
 fn strip<T>(a: ColumnBlock<'_, T>, order: usize, i: usize) -> MatRef<'_, T> {
     MatRef::from_column_major_slice_with_stride(a.values, order, a.columns, a.stride)
         .subrows(i * TILE, extent(order, i))
 }
 
-/// `to += factor left right^T`, of a diagonal tile the lower triangle.
+/// Computes `to += factor left right^T`; only the lower triangle of a diagonal tile.
 pub(crate) fn add_product(
     to: MatMut<'_, f64>,
     factor: f64,
     left: MatRef<'_, f64>,
     right: MatRef<'_, f64>,
-    diagonal: bool,
+    is_diagonal: bool,
 ) {
     let (accum, right) = (Accum::Add, right.transpose());
-    if diagonal {
+    if is_diagonal {
         use triangular::BlockStructure::{Rectangular, TriangularLower};
         triangular::matmul(
             to,
@@ -218,16 +218,16 @@ pub(crate) fn add_product(
     }
 }
 
-/// A tile's part of M x: for its own rows, and mirrored for its columns.
-fn multiply_tile(tile: &[f64], x_rows: &[f64], x_columns: &[f64], diagonal: bool) -> [Vec<f64>; 2] {
+/// The contribution of a tile to M x: to its rows, and by symmetry to its columns.
+fn multiply_tile(tile: &[f64], x_rows: &[f64], x_columns: &[f64], is_diagonal: bool) -> [Vec<f64>; 2] {
     let mut below = vec![0.0; x_rows.len()];
     let mut mirrored = vec![0.0; x_columns.len()];
     for (k, column) in tile.chunks_exact(STRIDE).enumerate() {
-        // Of a diagonal tile the elements below the diagonal count twice, the diagonal once.
-        let first = if diagonal { k + 1 } else { 0 };
+        // In a diagonal tile the elements below the diagonal contribute twice, the diagonal once.
+        let first = if is_diagonal { k + 1 } else { 0 };
         let column_below = &column[first..x_rows.len()];
         let x = x_columns[k];
-        if diagonal {
+        if is_diagonal {
             below[k] += column[k] * x;
         }
         for (y, &element) in below[first..].iter_mut().zip(column_below) {
@@ -238,7 +238,7 @@ fn multiply_tile(tile: &[f64], x_rows: &[f64], x_columns: &[f64], diagonal: bool
     [below, mirrored]
 }
 
-/// Scalar product in eight running sums, which the compiler can keep in one vector.
+/// The scalar product in eight running sums, which the compiler can vectorise.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
@@ -264,11 +264,11 @@ mod tests {
     }
 
     #[test]
-    fn places_count_through_the_lower_triangle() {
+    fn indices_run_through_the_lower_triangle() {
         let mut index = 0;
         for i in 0..200 {
             for j in 0..=i {
-                assert_eq!(place(index), (i, j));
+                assert_eq!(tile_at(index), (i, j));
                 index += 1;
             }
         }
@@ -286,7 +286,7 @@ mod tests {
                 (0..columns).map(|k| a[k * stride + r] * a[k * stride + c]).sum()
             };
             for (r, c) in [(0, 0), (order - 1, 0), (order / 2, order - 1), (order - 1, order - 1)] {
-                // Six terms below one: roundings of 1e-16.
+                // Six terms below one, with rounding errors of 1e-16.
                 assert!((exact.get(r, c) - plain(r, c)).abs() < 1e-14);
             }
             let x = random(order, 2);

@@ -1,4 +1,4 @@
-//! A normal matrix as independent blocks: exact, or an approximation of a larger one that it preconditions.
+//! A block-diagonal normal matrix, or the block-diagonal approximation of one that it preconditions.
 
 use std::borrow::Cow;
 
@@ -9,28 +9,28 @@ use rayon::prelude::*;
 
 use super::knots::Knots;
 
-/// Unknowns that are coupled with one another and with no others.
+/// A block of the matrix: unknowns that are coupled only with one another.
 #[derive(Clone, Debug)]
 pub(in crate::imaging) struct Block<'a> {
-    /// The block of BtN^-1B.
+    /// Elements of BtN^-1B.
     pub(in crate::imaging) matrix: Cow<'a, Mat<f64>>,
     /// The degree of each row.
     pub(in crate::imaging) degrees: Vec<usize>,
-    /// Where the unknowns of the rows are among all: a list for each set of unknowns that the matrix couples alike.
+    /// Indices of the unknowns of the rows; one list for each set of unknowns with the same matrix.
     pub(in crate::imaging) places: Vec<Vec<usize>>,
 }
 
-/// The evidence of data for a power, and its derivatives.
+/// The log evidence of a power, and its derivatives.
 pub(super) struct Evidence {
     /// `1/2 b.(A + R)^-1 b + 1/2 ln det R - 1/2 ln det(A + R)`.
     pub(super) value: f64,
-    /// With respect to ln C_l, by degree.
+    /// Gradient with respect to ln C_l, by degree.
     pub(super) gradient: Vec<f64>,
-    /// Fisher's information on the parameters.
+    /// Fisher information on the parameters.
     pub(super) fisher: Mat<f64>,
 }
 
-/// Cholesky factors of the blocks plus R, where there are any.
+/// Cholesky factors of the blocks plus R; `None` for a block that is not positive definite.
 pub(in crate::imaging) struct Factors<'a> {
     blocks: &'a [Block<'a>],
     factors: Vec<Option<Llt<f64>>>,
@@ -53,7 +53,7 @@ impl Block<'_> {
         Mat::from_fn(self.order(), self.places.len(), |k, part| unknowns[self.places[part][k]])
     }
 
-    /// Value alone of the block's evidence.
+    /// The block's log evidence.
     fn value(&self, factor: &Llt<f64>, r: &[f64], right: &Mat<f64>, solved: &Mat<f64>) -> f64 {
         let half_logarithms: f64 =
             self.degrees.iter().enumerate().map(|(k, l)| 0.5 * r[*l].ln() - factor.L()[(k, k)].ln()).sum();
@@ -71,23 +71,23 @@ fn regularisation(power: &[f64]) -> Vec<f64> {
     power.iter().map(|power| power.recip()).collect()
 }
 
-/// The evidence alone; `None` where a block is not positive definite.
+/// The log evidence; `None` if a block is not positive definite.
 pub(in crate::imaging) fn value(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
     let r = regularisation(power);
-    let of = |block: &Block<'_>| {
+    let block_value = |block: &Block<'_>| {
         let factor = block.factor(&r)?;
         let right = block.gather(right);
         let solved = factor.solve(&right);
         Some(block.value(&factor, &r, &right, &solved))
     };
-    let values: Vec<Option<f64>> = blocks.par_iter().map(of).collect();
+    let values: Vec<Option<f64>> = blocks.par_iter().map(block_value).collect();
     values.into_iter().sum::<Option<f64>>().filter(|value| value.is_finite())
 }
 
-/// Of one block: value, gradient and information.
-type Part = (f64, Vec<f64>, Mat<f64>);
+/// The log evidence, gradient and Fisher information of one block.
+type BlockEvidence = (f64, Vec<f64>, Mat<f64>);
 
-/// The evidence with its derivatives.
+/// The log evidence with its derivatives; `None` if a block is not positive definite.
 pub(super) fn evidence(
     blocks: &[Block<'_>],
     knots: &Knots,
@@ -95,7 +95,8 @@ pub(super) fn evidence(
     right: &[f64],
 ) -> Option<Evidence> {
     let r = regularisation(power);
-    let parts: Vec<Option<Part>> = blocks.par_iter().map(|block| part(block, knots, &r, right)).collect();
+    let parts: Vec<Option<BlockEvidence>> =
+        blocks.par_iter().map(|block| block_evidence(block, knots, &r, right)).collect();
     let mut sum = Evidence {
         value: 0.0,
         gradient: vec![0.0; power.len()],
@@ -110,7 +111,7 @@ pub(super) fn evidence(
     sum.value.is_finite().then_some(sum)
 }
 
-fn part(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) -> Option<Part> {
+fn block_evidence(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) -> Option<BlockEvidence> {
     let factor = block.factor(r)?;
     let right = block.gather(right);
     let solved = factor.solve(&right);
@@ -124,7 +125,7 @@ fn part(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) -> Option<Pa
             0.5 * (r_at[k] * square - copies * (1.0 - r_at[k] * inverse[(k, k)]))
         })
         .collect();
-    // G = 1 - R^(1/2) (A + R)^-1 R^(1/2); information on ln C_l and ln C_l': half the sum of its squares.
+    // With G = 1 - R^(1/2) (A + R)^-1 R^(1/2), the information on ln C_l and ln C_l' is half the sum of squares of G.
     let weights: Vec<[(usize, f64); 2]> = block.degrees.iter().map(|l| knots.weights(*l)).collect();
     let roots: Vec<f64> = r_at.iter().map(|r| r.sqrt()).collect();
     let mut half = Mat::<f64>::zeros(order, knots.count());
@@ -148,16 +149,17 @@ fn part(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) -> Option<Pa
 }
 
 impl<'a> Factors<'a> {
-    /// Of the blocks plus R by degree; a block without a factor leaves its unknowns unchanged.
+    /// Factorises the blocks plus R by degree. A block that is not positive definite leaves its unknowns unchanged in solutions.
     pub(in crate::imaging) fn new(blocks: &'a [Block<'a>], r: &[f64]) -> Self {
         Self { blocks, factors: blocks.par_iter().map(|block| block.factor(r)).collect() }
     }
 
-    fn change(&self, unknowns: &mut [f64], with: &dyn Fn(&Llt<f64>, &mut Mat<f64>)) {
+    /// Applies `operation` to the unknowns of each block, in place.
+    fn apply(&self, unknowns: &mut [f64], operation: &dyn Fn(&Llt<f64>, &mut Mat<f64>)) {
         for (block, factor) in self.blocks.iter().zip(&self.factors) {
             let Some(factor) = factor else { continue };
             let mut values = block.gather(unknowns);
-            with(factor, &mut values);
+            operation(factor, &mut values);
             for (part, places) in block.places.iter().enumerate() {
                 places.iter().enumerate().for_each(|(k, place)| unknowns[*place] = values[(k, part)]);
             }
@@ -166,24 +168,24 @@ impl<'a> Factors<'a> {
 
     /// Solves for a vector of unknowns, in place.
     pub(in crate::imaging) fn solve(&self, unknowns: &mut [f64]) {
-        self.change(unknowns, &|factor, values| factor.solve_in_place(values));
+        self.apply(unknowns, &|factor, values| factor.solve_in_place(values));
     }
 
-    /// Solves with the lower factors alone, `L^-1 x`.
+    /// Solves with the lower factors, `L^-1 x`.
     pub(in crate::imaging) fn solve_lower(&self, unknowns: &mut [f64]) {
-        self.change(unknowns, &|factor, values| {
+        self.apply(unknowns, &|factor, values| {
             solve_lower_triangular_in_place(factor.L(), values.as_mut(), Par::Seq);
         });
     }
 
-    /// Solves with the upper factors alone, `L^-t x`: of unit normal numbers a draw from the inverse of the blocks plus R.
+    /// Solves with the upper factors, `L^-t x`. For standard normal x the result is a sample with the inverse of the blocks plus R as covariance.
     pub(in crate::imaging) fn solve_upper(&self, unknowns: &mut [f64]) {
-        self.change(unknowns, &|factor, values| {
+        self.apply(unknowns, &|factor, values| {
             solve_upper_triangular_in_place(factor.L().transpose(), values.as_mut(), Par::Seq);
         });
     }
 
-    /// The trace of the inverse, by degree.
+    /// The trace of the inverse of the blocks plus R, by degree.
     pub(in crate::imaging) fn traces(&self, l_max: usize) -> Vec<f64> {
         let diagonal = |factor: &Option<Llt<f64>>| {
             factor.as_ref().map(|factor| {
@@ -201,7 +203,7 @@ impl<'a> Factors<'a> {
         traces
     }
 
-    /// `v.(A + R)^-1 v` in one block for each column of `v`; zeros without a factor.
+    /// The values `v.(A + R)^-1 v` in one block for each column of `v`; zeros if the block has no factor.
     pub(in crate::imaging) fn quadratic_forms(&self, block: usize, mut v: Mat<f64>) -> Vec<f64> {
         let Some(Some(factor)) = self.factors.get(block) else { return vec![0.0; v.ncols()] };
         solve_lower_triangular_in_place(factor.L(), v.as_mut(), Par::Seq);
@@ -209,7 +211,7 @@ impl<'a> Factors<'a> {
     }
 }
 
-/// Blocks times a vector of unknowns.
+/// Multiplies a vector of unknowns by the blocks.
 pub(in crate::imaging) fn multiply(blocks: &[Block<'_>], unknowns: &[f64]) -> Vec<f64> {
     let mut products = vec![0.0; unknowns.len()];
     for block in blocks {
@@ -221,8 +223,8 @@ pub(in crate::imaging) fn multiply(blocks: &[Block<'_>], unknowns: &[f64]) -> Ve
     products
 }
 
-/// The greatest element of the diagonals.
-pub(super) fn greatest(blocks: &[Block<'_>]) -> f64 {
-    let of = |block: &Block<'_>| (0..block.order()).map(|k| block.matrix[(k, k)]).fold(0.0, f64::max);
-    blocks.iter().map(of).fold(0.0, f64::max)
+/// The largest diagonal element of the blocks.
+pub(super) fn largest_diagonal(blocks: &[Block<'_>]) -> f64 {
+    let block_max = |block: &Block<'_>| (0..block.order()).map(|k| block.matrix[(k, k)]).fold(0.0, f64::max);
+    blocks.iter().map(block_max).fold(0.0, f64::max)
 }

@@ -1,35 +1,36 @@
-//! The angular power as a curve of few parameters: straight lines in logarithms between knots an octave apart.
+//! The angular power as a curve with few parameters: ln C_l is linear in ln(l + 1) between knots an octave apart.
 
 use faer::Mat;
 
-/// Degree of the first knot: those below it are free.
+/// Degree of the first knot; lower degrees are free.
 pub(super) const FIRST: usize = 2;
-/// Degrees whose prior is free: a mean and a dipole are what they are, whatever the power of structure.
+/// Number of degrees with a free prior: mean and dipole do not follow the power of structure.
 pub(super) const FREE: usize = FIRST;
-/// How many times the power at [`FIRST`] a monopole and a dipole have in their prior: far more than any sky.
+/// Prior power of monopole and dipole in units of the power at [`FIRST`]: far more than of any sky.
 const FREE_FACTORS: [f64; FREE] = [1e6, 1e4];
-/// Fall of ln C_l from knot to knot that is expected where the data say nothing, and how far it may be off: the sky between 1 and 100
-/// MHz falls like `l^-2` to `l^-3.5` at all scales.
+/// Prior mean of the fall of ln C_l from knot to knot: the sky between 1 and 100 MHz falls as `l^-2` to `l^-3.5` at all scales.
 const FALL: f64 = 2.7 * std::f64::consts::LN_2;
+/// Prior standard deviation of the fall.
 const FALL_SIGMA: f64 = 1.4;
-/// Change of the fall from knot to knot, likewise.
+/// Prior standard deviation of the change of the fall from knot to knot.
 const BEND_SIGMA: f64 = 0.7;
-/// How far ln C_l of the first knot may be off the amplitude with which the search began.
+/// Prior standard deviation of ln C_l at the first knot from the initial amplitude.
 const LEVEL_SIGMA: f64 = 6.0;
-/// Greatest fall from knot to knot (`l^-8`), and how far beyond it, or above none at all, a curve may go.
+/// Maximum fall from knot to knot (`l^-8`).
 const FALL_MAX: f64 = 8.0 * std::f64::consts::LN_2;
-const EDGE_SIGMA: f64 = 0.1;
+/// Standard deviation of the soft limits: a fall between 0 and [`FALL_MAX`].
+const LIMIT_SIGMA: f64 = 0.1;
 
-/// Knots for the degrees up to `l_max`.
+/// The knots for degrees up to `l_max`.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Knots {
     l_max: usize,
     count: usize,
-    /// ln C_l of the first knot at which the search began.
+    /// Initial ln C_l of the first knot.
     level: f64,
 }
 
-/// Logarithm of the parameters' prior with its derivatives.
+/// The logarithm of the parameters' prior, with its derivatives.
 pub(super) struct Hyperprior {
     pub(super) value: f64,
     pub(super) gradient: Vec<f64>,
@@ -47,33 +48,33 @@ impl Knots {
         self.count
     }
 
-    /// The parameters of `C_l` proportional to `(l + 1)^-2`, with `level` at the first knot.
-    pub(super) fn plain(&self) -> Vec<f64> {
+    /// The initial parameters: `C_l` proportional to `(l + 1)^-2`, with `level` at the first knot.
+    pub(super) fn start(&self) -> Vec<f64> {
         (0..self.count).map(|k| self.level - 2.0 * std::f64::consts::LN_2 * k as f64).collect()
     }
 
-    /// The knots between which a degree lies, with their weights; nothing for a free degree.
+    /// The knots on both sides of a degree with their weights, which are 0 for a free degree.
     pub(super) fn weights(&self, l: usize) -> [(usize, f64); 2] {
         if l < FREE {
             return [(0, 0.0), (0, 0.0)];
         }
-        let place = ((l + 1) as f64 / (FIRST + 1) as f64).log2();
-        let below = (place.floor() as usize).min(self.count - 2);
-        let share = place - below as f64;
+        let position = ((l + 1) as f64 / (FIRST + 1) as f64).log2();
+        let below = (position.floor() as usize).min(self.count - 2);
+        let share = position - below as f64;
         [(below, 1.0 - share), (below + 1, share)]
     }
 
-    /// ln C_l for l = 0 ..= l_max.
+    /// The values ln C_l for l = 0 ..= l_max.
     pub(super) fn log_power(&self, theta: &[f64]) -> Vec<f64> {
         let of_degree = |l: usize| match FREE_FACTORS.get(l) {
-            // Of the beginning: what is free does not follow the structure.
+            // Relative to the initial level, because free degrees do not follow the structure.
             Some(factor) => self.level + factor.ln(),
             None => self.weights(l).iter().map(|(k, share)| share * theta[*k]).sum(),
         };
         (0..=self.l_max).map(of_degree).collect()
     }
 
-    /// What is expected of the parameters before any data.
+    /// The prior of the parameters.
     pub(super) fn hyperprior(&self, theta: &[f64]) -> Hyperprior {
         let mut prior = Hyperprior {
             value: 0.0,
@@ -86,10 +87,10 @@ impl Knots {
             let rise = theta[k] - theta[k - 1];
             prior.add(&terms, rise + FALL, FALL_SIGMA);
             if rise > 0.0 {
-                prior.add(&terms, rise, EDGE_SIGMA);
+                prior.add(&terms, rise, LIMIT_SIGMA);
             }
             if rise < -FALL_MAX {
-                prior.add(&terms, rise + FALL_MAX, EDGE_SIGMA);
+                prior.add(&terms, rise + FALL_MAX, LIMIT_SIGMA);
             }
             if k > 1 {
                 let bend = theta[k] - 2.0 * theta[k - 1] + theta[k - 2];
@@ -101,12 +102,12 @@ impl Knots {
 }
 
 impl Hyperprior {
-    /// A Gaussian of width `sigma` of the sum of `terms`, which is `off` its mean.
-    fn add(&mut self, terms: &[(usize, f64)], off: f64, sigma: f64) {
+    /// Adds a Gaussian prior of width `sigma` for the linear combination `terms`, which deviates from its mean by `deviation`.
+    fn add(&mut self, terms: &[(usize, f64)], deviation: f64, sigma: f64) {
         let weight = sigma.powi(-2);
-        self.value -= 0.5 * weight * off * off;
+        self.value -= 0.5 * weight * deviation * deviation;
         for &(k, factor) in terms {
-            self.gradient[k] -= weight * off * factor;
+            self.gradient[k] -= weight * deviation * factor;
             for &(j, other) in terms {
                 self.precision[(k, j)] += weight * factor * other;
             }

@@ -1,4 +1,4 @@
-//! The sky's angular power from the data: the C_l that make the data most likely, whose inverse is R (empirical Bayes).
+//! Maximum-likelihood estimate of the sky's angular power C_l from the data (empirical Bayes), whose inverse is R.
 //!
 //! With `b = A x + n`, n of covariance A, and a Gaussian sky of power C_l(theta), `R_l = 1 / C_l`,
 //!
@@ -7,18 +7,18 @@
 //! its gradient in ln C_l:  1/2 (R_l |x_l|^2 - gamma_l),   gamma_l = (2 l + 1) - R_l Tr_l (A + R)^-1
 //! ```
 //!
-//! x the solution, gamma_l the number of coefficients that the data decide (MacKay 1992). Where A is known as blocks (exactly, or as an
-//! approximation that preconditions it) all of it costs little. With the true A a round solves for x, and the blocks stand for A with
-//! the data that would make x their solution, and with the true traces where a draw tells them: both have the same gradient at theta, so
-//! that where rounds end is the maximum for the true A.
+//! x is the solution, and gamma_l the number of coefficients that the data determine (MacKay 1992). All of this is cheap if A is block
+//! diagonal, exactly or as an approximation that preconditions it. With the true A, each round solves for x. Then the blocks replace A, with
+//! the data for which x is their solution, and with true traces estimated from posterior samples. Both problems have the same gradient at
+//! theta, so that rounds converge to the maximum for the true A.
 //!
-//! A map ends at some degree and the sky does not. What the map leaves of the data is known (`|V - B x|^2` from sums): where it exceeds the
-//! noise, by a factor s^2, it counts as noise, and all of this is done for data divided by s.
+//! A map is limited in degree and the sky is not. If the residual `|V - B x|^2`, which follows from the sums, exceeds the noise by a factor
+//! s^2, it counts as noise: everything is done for data divided by s.
 
 mod blocks;
-mod draws;
 mod knots;
 mod rounds;
+mod samples;
 #[cfg(test)]
 mod tests;
 
@@ -29,35 +29,37 @@ use faer::{Mat, Side};
 use serde::Serialize;
 
 pub(super) use blocks::{Block, Factors, multiply, value};
-pub(super) use draws::{Covariance, Drawn, SAMPLE_SETTLED};
 pub(super) use rounds::{FoundPower, PowerProblem};
+pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 
-use self::blocks::{evidence, greatest};
+use self::blocks::{evidence, largest_diagonal};
 use self::knots::{FREE, Knots};
 use crate::imaging::solver::SolveError;
 use crate::sky::healpix::pixel_count;
 
-/// Decades of amplitude that are searched, in units of the least variance of noise.
+/// Decades of amplitude that are searched, in units of the smallest noise variance.
 const DECADES: std::ops::RangeInclusive<i32> = -3..=13;
-/// Most steps of Newton's iteration, and the gain in evidence below which it ends.
+/// Maximum number of steps of Newton's iteration.
 const STEPS_MAX: usize = 20;
+/// Gain in evidence per step below which the iteration ends.
 const GAIN_MIN: f64 = 1e-4;
-/// Greatest change of ln C_l in one step.
+/// Maximum change of ln C_l in one step.
 const STEP_MAX: f64 = 2.0;
-/// Halvings of a step that gains nothing.
+/// Maximum number of halvings of a step without gain.
 const HALVINGS: usize = 8;
 
-/// The angular power of the sky (less its prior map) as the data have it, with its uncertainty: R = 1 / C_l of a map.
+/// The angular power of the sky (minus the prior map), estimated from the data, with its uncertainty. R is 1 / C_l.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SkyPower {
-    /// C_l of the ensemble, K^2, from l = 0: a smooth curve. Values at l = 0 and 1 are not estimates but so large that mean and dipole are free.
+    /// C_l of the ensemble, K^2, from l = 0, as a smooth curve. Values at l = 0 and 1 are no estimates, but so large that mean and dipole are
+    /// free.
     pub power_k2: Vec<f64>,
     /// Standard deviation of ln C_l, from the curvature of the evidence; 0 for l = 0 and 1.
     pub sigma_ln: Vec<f64>,
-    /// Number of coefficients that the data decide, of 2 l + 1.
+    /// Number of the 2 l + 1 coefficients that the data determine.
     pub decided: Vec<f64>,
-    /// Scatter of what the map leaves of the data in units of their noise, at least 1: above it is sky beyond the map's degrees, or errors of
-    /// the instrument. It counts as noise.
+    /// Scatter of the residuals in units of the noise, at least 1. The excess, from the sky beyond the map's degrees or from instrument errors,
+    /// counts as noise.
     pub noise_factor: f64,
 }
 
@@ -69,13 +71,13 @@ impl SkyPower {
         Some([power * (-sigma).exp(), power * sigma.exp()])
     }
 
-    /// One over R by degree: the power less what the data scatter more than their noise.
+    /// The inverse of R by degree: C_l divided by the square of the noise factor.
     #[must_use]
     pub fn over_noise_k2(&self) -> Vec<f64> {
         self.power_k2.iter().map(|power| power / self.noise_factor.powi(2)).collect()
     }
 
-    /// Variance that the sky's degrees beyond these have in means over pixels, K^2: of the curve continued as it ends.
+    /// Variance of pixel means from the sky beyond these degrees, K^2, with the curve extrapolated.
     pub(super) fn variance_beyond_k2(&self, nside: usize) -> f64 {
         let [.., before, last] = self.power_k2[..] else { return 0.0 };
         let first = self.power_k2.len();
@@ -87,18 +89,18 @@ impl SkyPower {
             let q = l * l / pixel_count(nside) as f64;
             (2.0 * l + 1.0) / (4.0 * PI) * power_k2 * (-q - q * q / 12.0).exp()
         };
-        // Of w_l^2 a hundredth is left at 8 nside.
+        // w_l^2 falls to a hundredth at 8 nside.
         (first..=8 * nside).map(term).sum()
     }
 
-    /// As found for data that were divided by `factor`.
-    fn of_data_divided_by(mut self, factor: f64) -> Self {
+    /// Converts an estimate from data divided by `factor`.
+    fn scaled_from_divided_data(mut self, factor: f64) -> Self {
         self.power_k2.iter_mut().for_each(|power| *power *= factor * factor);
         self.noise_factor = factor;
         self
     }
 
-    /// A table: a line a degree from l = 2.
+    /// Formats a table with a line for each degree from l = 2.
     #[must_use]
     pub fn csv(&self) -> String {
         let mut table = String::from(
@@ -116,24 +118,24 @@ impl SkyPower {
     }
 }
 
-/// What is known of a map's errors, with R from the data.
+/// Errors of a map with R from the data.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Uncertainty {
-    /// Standard deviation of every pixel, K: of noise and of what the data leave open. Of harmonic maps up to their degrees, of pixels also
-    /// of what the sky has beyond.
+    /// Posterior standard deviation of every pixel, K. Harmonic maps include errors up to their maximum degree, pixel maps also the sky's
+    /// higher degrees.
     pub sigma_k: Vec<f64>,
     /// Standard deviation of the mean, K.
     pub mean_sigma_k: f64,
-    /// The sky's power that R is the inverse of.
+    /// The sky's power, the inverse of R.
     pub power: SkyPower,
-    /// Maps as likely as the map itself (draws from the posterior), K, if any were asked for.
+    /// Posterior samples, K, if requested.
     pub samples_k: Vec<Vec<f64>>,
 }
 
 impl Uncertainty {
-    /// Of a map that is divided by `factor`.
+    /// Converts the errors to those of the map divided by `factor`.
     #[must_use]
-    pub(super) fn reduced(mut self, factor: f64) -> Self {
+    pub(super) fn divided_by(mut self, factor: f64) -> Self {
         let samples = self.samples_k.iter_mut().flatten();
         self.sigma_k.iter_mut().chain(samples).for_each(|value| *value /= factor);
         self.mean_sigma_k /= factor;
@@ -142,24 +144,24 @@ impl Uncertainty {
     }
 }
 
-/// A power on its way to the most likely one.
+/// The state of the search for the maximum-likelihood power.
 #[derive(Clone, Debug)]
 pub(super) struct PowerFit {
     knots: Knots,
+    /// Parameters: ln C_l at the knots.
     theta: Vec<f64>,
     /// C_l, K^2.
     power: Vec<f64>,
 }
 
-/// What a fit takes the data to be.
+/// The data and matrix of a fit.
 #[derive(Clone, Copy)]
 pub(super) struct BlockData<'a> {
-    /// The normal matrix.
+    /// Blocks of the normal matrix.
     pub(super) blocks: &'a [Block<'a>],
-    /// Right-hand side.
     pub(super) right: &'a [f64],
-    /// By how much the gradient in ln C_l is more than that of the blocks.
-    pub(super) tilt: &'a [f64],
+    /// Correction of the gradient in ln C_l for the difference between the true matrix and the blocks.
+    pub(super) gradient_correction: &'a [f64],
 }
 
 impl PowerFit {
@@ -168,15 +170,12 @@ impl PowerFit {
         Self { knots, theta, power }
     }
 
-    /// `C_l` proportional to `(l + 1)^-2` with the most likely amplitude.
-    ///
-    /// # Errors
-    /// A matrix that no R makes positive definite: of numbers that are not finite.
+    /// Starts with `C_l` proportional to `(l + 1)^-2` and the maximum-likelihood amplitude.
     pub(super) fn begin(blocks: &[Block<'_>], l_max: usize, right: &[f64]) -> Result<Self, SolveError> {
-        let unit = greatest(blocks).recip();
+        let unit = largest_diagonal(blocks).recip();
         let of = |decade: i32| {
             let knots = Knots::new(l_max, (unit * 10.0_f64.powi(decade)).ln());
-            let fit = Self::new(knots.clone(), knots.plain());
+            let fit = Self::new(knots.clone(), knots.start());
             Some((value(blocks, &fit.power, right)?, fit))
         };
         let best = DECADES.filter_map(of).max_by(|(a, _), (b, _)| a.total_cmp(b));
@@ -188,8 +187,13 @@ impl PowerFit {
         self.power.iter().map(|power| power.recip()).collect()
     }
 
-    /// The right-hand side for which `solution` solves the equations with this R and the blocks as normal matrix.
-    pub(super) fn data_of(&self, blocks: &[Block<'_>], solution: &[f64], degrees: &[usize]) -> Vec<f64> {
+    /// The right-hand side for which `solution` solves the equations with the blocks and this R.
+    pub(super) fn equivalent_data(
+        &self,
+        blocks: &[Block<'_>],
+        solution: &[f64],
+        degrees: &[usize],
+    ) -> Vec<f64> {
         let mut data = multiply(blocks, solution);
         for ((data, x), l) in data.iter_mut().zip(solution).zip(degrees) {
             *data += x / self.power[*l];
@@ -197,21 +201,22 @@ impl PowerFit {
         data
     }
 
-    /// Evidence and hyperprior at some parameters.
+    /// The sum of log evidence and log hyperprior at some parameters.
     fn objective(&self, theta: &[f64], data: BlockData<'_>) -> Option<f64> {
         let log_power = self.knots.log_power(theta);
         let power: Vec<f64> = log_power.iter().map(|ln| ln.exp()).collect();
-        let tilted: f64 = data.tilt.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
-        Some(value(data.blocks, &power, data.right)? + tilted + self.knots.hyperprior(theta).value)
+        let correction: f64 =
+            data.gradient_correction.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
+        Some(value(data.blocks, &power, data.right)? + correction + self.knots.hyperprior(theta).value)
     }
 
-    /// Gradient and information of the objective.
+    /// Gradient and Fisher information of the objective.
     fn derivatives(&self, data: BlockData<'_>) -> Option<(Vec<f64>, Mat<f64>)> {
         let found = evidence(data.blocks, &self.knots, &self.power, data.right)?;
         let prior = self.knots.hyperprior(&self.theta);
         let mut gradient = prior.gradient;
         for (l, of_degree) in found.gradient.iter().enumerate().skip(FREE) {
-            let of_degree = of_degree + data.tilt.get(l).copied().unwrap_or(0.0);
+            let of_degree = of_degree + data.gradient_correction.get(l).copied().unwrap_or(0.0);
             for (knot, share) in self.knots.weights(l) {
                 gradient[knot] += share * of_degree;
             }
@@ -219,10 +224,7 @@ impl PowerFit {
         Some((gradient, found.fisher + prior.precision))
     }
 
-    /// The most likely power.
-    ///
-    /// # Errors
-    /// As [`PowerFit::begin`].
+    /// Maximises the objective by Newton's iteration.
     pub(super) fn maximised(&self, data: BlockData<'_>) -> Result<Self, SolveError> {
         let mut fit = self.clone();
         let mut best = fit.objective(&fit.theta, data).ok_or(SolveError::NoPower)?;
@@ -233,17 +235,17 @@ impl PowerFit {
             let mut step: Vec<f64> = (0..gradient.len())
                 .map(|k| gradient.iter().enumerate().map(|(j, g)| covariance[(k, j)] * g).sum())
                 .collect();
-            let longest = step.iter().fold(0.0_f64, |most, step| most.max(step.abs()));
+            let longest = step.iter().fold(0.0_f64, |longest, step| longest.max(step.abs()));
             if longest > STEP_MAX {
                 step.iter_mut().for_each(|step| *step *= STEP_MAX / longest);
             }
-            let tried = (0..HALVINGS).find_map(|halving| {
+            let improved = (0..HALVINGS).find_map(|halving| {
                 let share = 0.5_f64.powi(halving as i32);
                 let theta: Vec<f64> = fit.theta.iter().zip(&step).map(|(t, s)| t + share * s).collect();
                 let found = fit.objective(&theta, data).filter(|found| *found > best)?;
                 Some((found, theta))
             });
-            let Some((found, theta)) = tried else { break };
+            let Some((found, theta)) = improved else { break };
             let gain = found - best;
             (best, fit) = (found, Self::new(fit.knots, theta));
             if gain < GAIN_MIN {
@@ -253,15 +255,12 @@ impl PowerFit {
         Ok(fit)
     }
 
-    /// Greatest change of ln C_l at a knot.
+    /// Maximum change of ln C_l at a knot.
     pub(super) fn change(&self, from: &Self) -> f64 {
         self.theta.iter().zip(&from.theta).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
     }
 
     /// The estimate with its uncertainty; `traces` are those of `(A + R)^-1` by degree.
-    ///
-    /// # Errors
-    /// As [`PowerFit::begin`].
     pub(super) fn estimate(&self, data: BlockData<'_>, traces: &[f64]) -> Result<SkyPower, SolveError> {
         let (_, information) = self.derivatives(data).ok_or(SolveError::NoPower)?;
         let covariance = information.llt(Side::Lower).map_err(|_| SolveError::NoPower)?.inverse();
@@ -270,17 +269,17 @@ impl PowerFit {
             let term = |(k, a): (usize, f64)| weights.iter().map(move |(j, b)| (k, *j, a * b));
             let variance: f64 = weights
                 .iter()
-                .flat_map(|one| term(*one))
+                .flat_map(|pair| term(*pair))
                 .map(|(k, j, share)| share * covariance[(k, j)])
                 .sum();
             variance.max(0.0).sqrt()
         };
-        let mut count = vec![0.0; self.power.len()];
+        let mut counts = vec![0.0; self.power.len()];
         for block in data.blocks {
-            block.degrees.iter().for_each(|l| count[*l] += block.places.len() as f64);
+            block.degrees.iter().for_each(|l| counts[*l] += block.places.len() as f64);
         }
         let decided =
-            (count.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
+            (counts.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
         Ok(SkyPower {
             power_k2: self.power.clone(),
             sigma_ln: (0..self.power.len()).map(sigma).collect(),

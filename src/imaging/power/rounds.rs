@@ -1,56 +1,55 @@
-//! Rounds of solution and power, until neither changes.
+//! Alternates between solutions and power estimates until both have converged.
 
 use super::blocks::{Block, Factors};
-use super::draws::{Covariance, Drawn, TRACE_SETTLED};
 use super::knots::FREE;
+use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 
-/// Most rounds, and the change of ln C_l at a knot at which they end: a tenth in C_l changes a map by far less than its error. Maps on the
-/// way are content with more.
+/// Maximum number of rounds.
 const ROUNDS_MAX: usize = 6;
-const SETTLED: f64 = 0.1;
-const SETTLED_ON_THE_WAY: f64 = 0.5;
-/// Error of a map on the way in units of what the data leave open of it.
-const SOLVED: f64 = 0.1;
-/// The draws for the traces, always the same; samples have others. One is enough where the blocks are near: it tells what traces differ by.
-const TRACES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
-/// How far the logarithm of a trace may be from that of the blocks for one draw to be enough.
-const NEAR: f64 = 0.2;
-/// By how much traces may differ from those of the blocks.
+/// Change of ln C_l at which rounds have converged: a tenth in C_l changes a map by far less than its error.
+const TOLERANCE: f64 = 0.1;
+/// Tolerance for intermediate maps.
+const INTERMEDIATE_TOLERANCE: f64 = 0.5;
+/// Error of an intermediate solution in units of its posterior error.
+const INTERMEDIATE_ERROR: f64 = 0.1;
+/// Ids of the posterior samples for trace estimates, different from those of maps. The first alone suffices if the preconditioner is accurate.
+const TRACE_SAMPLES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
+/// Maximum difference of ln(trace) between the true matrix and the preconditioner for which one sample suffices.
+const LN_RATIO_ACCURATE: f64 = 0.2;
+/// Maximum ratio of true traces to those of the preconditioner.
 const RATIO_MAX: f64 = 30.0;
-/// Change of the logarithm of the noise's factor at which it is found.
-const FACTOR_SETTLED: f64 = 0.03;
+/// Change of the logarithm of the noise factor at which it has converged.
+const FACTOR_TOLERANCE: f64 = 0.03;
 
-/// Normal equations for which R is to be found from the data.
+/// Normal equations whose R is estimated from the data.
 pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
-    /// Blocks near the normal matrix, with which it is preconditioned.
+    /// Blocks of the normal matrix, or of an approximation that preconditions it.
     pub(in crate::imaging) blocks: &'a [Block<'a>],
-    /// Degree of each unknown.
     pub(in crate::imaging) degrees: &'a [usize],
     pub(in crate::imaging) right: &'a [f64],
-    /// `V'N^-1V` of the data that these are the right-hand side of.
+    /// `V'N^-1V` of the data.
     pub(in crate::imaging) power: f64,
-    /// Real numbers in them.
+    /// Number of real data.
     pub(in crate::imaging) numbers: f64,
 }
 
-/// What was found.
+/// The estimated power and the solution.
 pub(in crate::imaging) struct FoundPower {
-    /// R by degree.
     pub(in crate::imaging) regularisation: Vec<f64>,
-    /// The last solution: of an R near this one.
+    /// The last solution, for nearly this R.
     pub(in crate::imaging) solution: Vec<f64>,
     pub(in crate::imaging) power: SkyPower,
-    /// Traces of `(A + R)^-1` over those of the blocks, by degree.
+    /// Ratio of the traces of `(A + R)^-1` to those of the preconditioner, by degree.
     pub(in crate::imaging) ratio: Vec<f64>,
 }
 
 impl FoundPower {
-    /// By which the standard deviations of `(A + R)^-1` are multiplied.
+    /// The factor by which standard deviations from `(A + R)^-1` are multiplied.
     pub(in crate::imaging) fn noise_factor(&self) -> f64 {
         self.power.noise_factor
     }
@@ -61,26 +60,24 @@ impl PowerProblem<'_> {
         self.degrees.iter().copied().max().unwrap_or(0)
     }
 
-    /// Of blocks that are the normal matrix.
-    ///
-    /// # Errors
-    /// Numbers that are not finite.
-    pub(in crate::imaging) fn found_in_blocks(&self) -> Result<FoundPower, SolveError> {
+    /// Estimates the power if the blocks are the whole normal matrix.
+    pub(in crate::imaging) fn solve_blocks(&self) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
-        let tilt = vec![0.0; l_max + 1];
+        let gradient_correction = vec![0.0; l_max + 1];
         let mut fit = PowerFit::begin(self.blocks, l_max, self.right)?;
         let mut factor = 1.0;
         for round in 1.. {
-            let right = self.right_over(factor);
-            let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
+            let right = self.right_divided_by(factor);
+            let data =
+                BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
             fit = fit.maximised(data)?;
             let regularisation = fit.regularisation();
             let factors = Factors::new(self.blocks, &regularisation);
             let mut solution = self.right.to_vec();
             factors.solve(&mut solution);
             let next = self.noise_factor(&solution, &regularisation);
-            if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_SETTLED {
-                let power = fit.estimate(data, &factors.traces(l_max))?.of_data_divided_by(factor);
+            if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_TOLERANCE {
+                let power = fit.estimate(data, &factors.traces(l_max))?.scaled_from_divided_data(factor);
                 return Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] });
             }
             factor = next;
@@ -88,24 +85,22 @@ impl PowerProblem<'_> {
         Err(SolveError::NoPower)
     }
 
-    fn right_over(&self, factor: f64) -> Vec<f64> {
+    /// The right-hand side divided by a factor.
+    fn right_divided_by(&self, factor: f64) -> Vec<f64> {
         self.right.iter().map(|b| b / factor).collect()
     }
 
-    /// Scatter of what a solution leaves of the data, in units of their noise; 1 if it is less.
+    /// Scatter of the residuals of a solution in units of the noise, at least 1.
     fn noise_factor(&self, x: &[f64], r: &[f64]) -> f64 {
         // |V - B x|^2 = V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
         let regularised: f64 = x.iter().zip(self.degrees).map(|(x, l)| r[*l] * x * x).sum();
-        let left = self.power - dot(x, self.right) - regularised;
-        // As many numbers as the solution decides are no noise of it, but they are few.
-        (left / self.numbers).max(1.0).sqrt()
+        let residual = self.power - dot(x, self.right) - regularised;
+        // The few degrees of freedom that the solution takes are neglected.
+        (residual / self.numbers).max(1.0).sqrt()
     }
 
-    /// In rounds, from the solution `start`.
-    ///
-    /// # Errors
-    /// Likewise.
-    pub(in crate::imaging) fn found(
+    /// Estimates the power in rounds, from the initial solution `start`.
+    pub(in crate::imaging) fn solve(
         &self,
         start: Option<&[f64]>,
         rule: StoppingRule,
@@ -119,19 +114,19 @@ impl PowerProblem<'_> {
         }];
         let mut ratio = vec![1.0; l_max + 1];
         let mut factor = 1.0;
-        // Maps on the way do without draws. The blocks know more than data of a short time do, so that the power comes out too small, and
-        // the map too smooth: on the safe side.
-        let is_wanted = watch.is_wanted();
-        let settled = if is_wanted { SETTLED } else { SETTLED_ON_THE_WAY };
+        // Intermediate maps do without samples. For data of a short time the blocks overestimate the information, so that the power is too small
+        // and the map too smooth, which is safe.
+        let is_final = watch.has_priority();
+        let tolerance = if is_final { TOLERANCE } else { INTERMEDIATE_TOLERANCE };
         for round in 1..=ROUNDS_MAX {
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
-            if is_wanted {
-                ratio = self.drawn_ratio(&regularisation, &factors, &ratio, watch);
+            if is_final {
+                ratio = self.sampled_ratio(&regularisation, &factors, &ratio, watch);
             } else {
-                rule = self.rule(&factors, factor, rule);
+                rule = self.intermediate_rule(&factors, factor, rule);
             }
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
@@ -139,22 +134,24 @@ impl PowerProblem<'_> {
                 system.solve(&[self.right], &mut x, &[rule], &task);
             }
             let traces = factors.traces(l_max);
-            let tilt: Vec<f64> = (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
+            let gradient_correction: Vec<f64> =
+                (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
             let before = factor;
             factor = self.noise_factor(&x[0], &r);
-            let mut right = fit.data_of(self.blocks, &x[0], self.degrees);
+            let mut right = fit.equivalent_data(self.blocks, &x[0], self.degrees);
             right.iter_mut().for_each(|b| *b /= factor);
-            let data = BlockData { blocks: self.blocks, right: &right, tilt: &tilt };
+            let data =
+                BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
             let next = fit.maximised(data)?;
-            // That of the noise is one of the power, too.
+            // A change of the noise factor also changes the power.
             let change = next.change(&fit).max((factor / before).ln().abs());
             fit = next;
-            let task = watch.start("the sky's power", settled);
-            if !task.report_wanting(change > settled && round < ROUNDS_MAX, round, change) {
+            let task = watch.start("the sky's power", tolerance);
+            if !task.report_step(change > tolerance && round < ROUNDS_MAX, round, change) {
                 let factors = Factors::new(self.blocks, &fit.regularisation());
                 let mut traces = factors.traces(l_max);
                 traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
-                let power = fit.estimate(data, &traces)?.of_data_divided_by(factor);
+                let power = fit.estimate(data, &traces)?.scaled_from_divided_data(factor);
                 let [solution] = x;
                 return Ok(FoundPower { regularisation: fit.regularisation(), solution, power, ratio });
             }
@@ -162,8 +159,8 @@ impl PowerProblem<'_> {
         Err(SolveError::NoPower)
     }
 
-    /// When a map on the way is good enough beside what the data leave open, or as good as `rule` asks.
-    pub(in crate::imaging) fn rule(
+    /// The stopping rule of an intermediate map: its solver error is a fraction of its posterior error, or as `rule` requires.
+    pub(in crate::imaging) fn intermediate_rule(
         &self,
         factors: &Factors<'_>,
         factor: f64,
@@ -171,40 +168,44 @@ impl PowerProblem<'_> {
     ) -> StoppingRule {
         let mut solved = self.right.to_vec();
         factors.solve(&mut solved);
-        // The squares of errors of (A + R)^-1 add up to one an unknown in the norm of A + R, in which residuals are measured.
-        let open = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
-        // No less than a tenth of the map, whatever the noise.
-        StoppingRule { residual_max: rule.residual_max.max(SOLVED * open.min(1.0)), ..rule }
+        // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
+        let posterior_error = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
+        // At least a tenth of the map, for any noise.
+        StoppingRule {
+            residual_max: rule.residual_max.max(INTERMEDIATE_ERROR * posterior_error.min(1.0)),
+            ..rule
+        }
     }
 
-    /// The ratio of traces by draws: few where the last ones said that the blocks are near.
-    fn drawn_ratio(
+    /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.
+    fn sampled_ratio(
         &self,
         regularisation: &Diagonal,
         factors: &Factors<'_>,
         last: &[f64],
         watch: NamedWatch<'_>,
     ) -> Vec<f64> {
-        let is_near = watch.all(last.iter().all(|ratio| ratio.ln().abs() < NEAR));
-        let which = if is_near { &TRACES[..1] } else { &TRACES };
-        let task = watch.start("draws for the sky's power", TRACE_SETTLED);
-        let drawn = Covariance { sums: self.sums, regularisation, factors }.draw(which, TRACE_SETTLED, &task);
-        self.ratio(&drawn, &factors.traces(self.l_max()))
+        let is_accurate = watch.all(last.iter().all(|ratio| ratio.ln().abs() < LN_RATIO_ACCURATE));
+        let sample_ids = if is_accurate { &TRACE_SAMPLES[..1] } else { &TRACE_SAMPLES };
+        let task = watch.start("samples for the sky's power", TRACE_TOLERANCE);
+        let precision = PosteriorPrecision { sums: self.sums, regularisation, factors };
+        let samples = precision.draw(sample_ids, TRACE_TOLERANCE, &task);
+        self.ratio(&samples, &factors.traces(self.l_max()))
     }
 
-    /// Traces of the true covariance over those of the blocks, means over neighbouring degrees: a draw has few numbers of each.
-    fn ratio(&self, drawn: &[Drawn], traces: &[f64]) -> Vec<f64> {
-        let mut more = vec![0.0; traces.len()];
-        for Drawn { whole, of_blocks } in drawn {
-            for ((l, d), of_blocks) in self.degrees.iter().zip(whole).zip(of_blocks) {
-                more[*l] += (d * d - of_blocks * of_blocks) / drawn.len() as f64;
+    /// The ratio of the traces of the true covariance and of the preconditioner, averaged over neighbouring degrees for accuracy.
+    fn ratio(&self, samples: &[PosteriorSample], traces: &[f64]) -> Vec<f64> {
+        let mut excess = vec![0.0; traces.len()];
+        for PosteriorSample { exact, preconditioner } in samples {
+            for ((l, x), y) in self.degrees.iter().zip(exact).zip(preconditioner) {
+                excess[*l] += (x * x - y * y) / samples.len() as f64;
             }
         }
         let of_degree = |l: usize| {
             let l = l.max(FREE);
             let width = (l / 4).max(2);
-            let near = l.saturating_sub(width).max(FREE)..(l + width + 1).min(traces.len());
-            let sums = near.fold([0.0, 0.0], |[a, b], l| [a + more[l], b + traces[l]]);
+            let neighbours = l.saturating_sub(width).max(FREE)..(l + width + 1).min(traces.len());
+            let sums = neighbours.fold([0.0, 0.0], |[a, b], l| [a + excess[l], b + traces[l]]);
             if sums[1] > 0.0 { (1.0 + sums[0] / sums[1]).clamp(RATIO_MAX.recip(), RATIO_MAX) } else { 1.0 }
         };
         (0..traces.len()).map(of_degree).collect()

@@ -1,5 +1,5 @@
-//! Against dense matrices by formulas other than those of the code: densities of data, not of solutions.
-#![allow(clippy::print_stderr)] // They say what they measured.
+//! Tests against dense matrices with other formulas than the code: densities of data, not of solutions.
+#![allow(clippy::print_stderr)] // Tests print what they measured.
 
 use std::borrow::Cow;
 
@@ -27,14 +27,14 @@ fn normal(seed: u64) -> impl FnMut() -> f64 {
     move || StandardNormal.sample(&mut stream)
 }
 
-/// A normal matrix of random rows, some combinations of which measure much and some nearly nothing.
+/// A normal matrix of random rows, with well and badly measured combinations.
 fn random_normal(seed: u64, rows: usize) -> Mat<f64> {
     let mut normal = normal(seed);
     let b = Mat::from_fn(rows, ORDER, |row, _| normal() * 10.0_f64.powf(-2.0 * row as f64 / rows as f64));
     b.transpose() * &b
 }
 
-/// A power that falls as `(l + 1)^-3`.
+/// A power proportional to `(l + 1)^-3`.
 fn power(level: f64) -> Vec<f64> {
     (0..=L_MAX).map(|l| level * ((l + 1) as f64).powi(-3)).collect()
 }
@@ -60,7 +60,7 @@ fn log_density(a: &Mat<f64>, power: &[f64], right: &[f64]) -> f64 {
     (0..ORDER).map(term).sum()
 }
 
-/// A right-hand side of a sky of this power, with the sky.
+/// A right-hand side for a random sky of this power, and the sky.
 fn observed(a: &Mat<f64>, power: &[f64], normal: &mut dyn FnMut() -> f64) -> (Vec<f64>, Vec<f64>) {
     let sky: Vec<f64> = degrees().iter().map(|l| power[*l].sqrt() * normal()).collect();
     let root = a.llt(Side::Lower).unwrap();
@@ -83,7 +83,7 @@ fn evidence_is_the_density_of_the_data() {
     // Logarithms of eigenvalues over twelve decades in f64.
     assert!((found - expected).abs() < 1e-6 * expected.abs().max(1.0), "{found} {expected}");
     assert_eq!(super::blocks::value(&block(&a), &one, &right), Some(of(&one).value));
-    // The gradient is that of the density by differences, whose error is of second order: 1e-6 of it.
+    // Compared with central differences of the density, whose error is of second order: 1e-6 of it.
     for l in 0..=L_MAX {
         let moved = |by: f64| {
             let mut power = one.clone();
@@ -122,7 +122,7 @@ fn information_is_fishers_of_gaussian_data() {
     }
 }
 
-/// Sums that are a matrix.
+/// Sums with a dense matrix.
 struct Dense {
     matrix: Mat<f64>,
     right: Vec<f64>,
@@ -156,7 +156,7 @@ impl NormalSums for Dense {
     }
 }
 
-/// Blocks of pairs of unknowns: an approximation.
+/// Blocks of pairs of unknowns, as an approximation.
 fn pairs(a: &Mat<f64>) -> Vec<Block<'static>> {
     let of = |first: usize| {
         let count = 2.min(ORDER - first);
@@ -171,7 +171,7 @@ fn pairs(a: &Mat<f64>) -> Vec<Block<'static>> {
 }
 
 #[test]
-fn draws_have_the_covariance_of_the_posterior() {
+fn samples_have_the_covariance_of_the_posterior() {
     const DRAWS: usize = 4000;
     let a = random_normal(5, 2 * ORDER);
     let r = power(1.0).iter().map(|power| power.recip()).collect::<Vec<f64>>();
@@ -182,24 +182,24 @@ fn draws_have_the_covariance_of_the_posterior() {
     let factors = Factors::new(&blocks, &r);
     let sums = Dense { matrix: a, right: vec![0.0; ORDER] };
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
-    let covariance = Covariance { sums: &sums, regularisation: &regularisation, factors: &factors };
-    let which: Vec<u64> = (0..DRAWS as u64).collect();
-    let drawn = covariance.draw(&which, SAMPLE_SETTLED, &watch.named("test").start("draws", 0.0));
+    let precision = PosteriorPrecision { sums: &sums, regularisation: &regularisation, factors: &factors };
+    let sample_ids: Vec<u64> = (0..DRAWS as u64).collect();
+    let drawn = precision.draw(&sample_ids, SAMPLE_TOLERANCE, &watch.named("test").start("draws", 0.0));
     for i in 0..ORDER {
-        let variance: f64 = drawn.iter().map(|d| d.whole[i].powi(2)).sum::<f64>() / DRAWS as f64;
+        let variance: f64 = drawn.iter().map(|d| d.exact[i].powi(2)).sum::<f64>() / DRAWS as f64;
         // Five standard errors of a variance.
         let tolerance = 5.0 * (2.0 / DRAWS as f64).sqrt();
         assert!((variance / expected[(i, i)] - 1.0).abs() < tolerance, "{i}: {variance}");
         let j = (i + 3) % ORDER;
-        let found: f64 = drawn.iter().map(|d| d.whole[i] * d.whole[j]).sum::<f64>() / DRAWS as f64;
+        let found: f64 = drawn.iter().map(|d| d.exact[i] * d.exact[j]).sum::<f64>() / DRAWS as f64;
         let scale = (expected[(i, i)] * expected[(j, j)]).sqrt();
         assert!((found - expected[(i, j)]).abs() < 5.0 / (DRAWS as f64).sqrt() * scale * 1.5, "{i} {j}");
     }
 }
 
-/// Skies of a power that falls, seen through a matrix that leaves some of it open: intervals hold as often as they say.
+/// Coverage of the intervals for random skies that the data do not fully determine.
 #[test]
-fn intervals_hold_as_often_as_they_say() {
+fn intervals_have_the_stated_coverage() {
     let skies: usize = std::env::var("LUNARRAY_SKIES").ok().and_then(|text| text.parse().ok()).unwrap_or(300);
     let a = random_normal(7, ORDER + 20);
     let truth = power(40.0);
@@ -209,7 +209,7 @@ fn intervals_hold_as_often_as_they_say() {
         let (right, sky) = observed(&a, &truth, &mut normal);
         let blocks = block(&a);
         let sums = Dense { matrix: a.clone(), right: right.clone() };
-        let sought = PowerProblem {
+        let problem = PowerProblem {
             sums: &sums,
             blocks: &blocks,
             degrees: &degrees,
@@ -217,12 +217,12 @@ fn intervals_hold_as_often_as_they_say() {
             power: 0.0,
             numbers: 1.0,
         };
-        let found = sought.found_in_blocks().unwrap();
+        let found = problem.solve_blocks().unwrap();
         let mut whole = a.clone();
         degrees.iter().enumerate().for_each(|(k, l)| whole[(k, k)] += found.regularisation[*l]);
         let posterior = whole.llt(Side::Lower).unwrap().inverse();
         let sum = |of: &dyn Fn(usize) -> f64| (0..ORDER).map(of).sum::<f64>();
-        // A value at one place: a sum of all unknowns with fixed factors. The monopole. The power at l = 4.
+        // Scores of a fixed linear combination of all unknowns, of the monopole, and of the power at l = 4.
         let factor = |k: usize| (0.7 * k as f64).cos();
         let off = sum(&|k| factor(k) * (found.solution[k] - sky[k]));
         let variance = sum(&|i| factor(i) * (0..ORDER).map(|j| posterior[(i, j)] * factor(j)).sum::<f64>());
@@ -239,18 +239,18 @@ fn intervals_hold_as_often_as_they_say() {
         for (held, expected) in held.into_iter().zip([0.683, 0.95]) {
             let share = held as f64 / skies as f64;
             let error = (expected * (1.0 - expected) / skies as f64).sqrt();
-            // Three standard errors; that C_l is taken as known widens nothing here, as it is known to a third.
+            // Three standard errors. Uncertainty of C_l is not included in errors, but small: C_l is known to a third.
             assert!((share - expected).abs() < 3.0 * error + 0.03, "{what}: {share} {expected}");
         }
     }
 }
 
 #[test]
-fn without_data_the_power_is_what_is_expected_and_never_rises() {
+fn without_data_the_power_is_the_prior_and_never_rises() {
     let a = Mat::from_fn(ORDER, ORDER, |i, j| if i == j { 1e-12 } else { 0.0 });
     let (right, degrees) = (vec![0.0; ORDER], degrees());
     let (blocks, sums) = (block(&a), Dense { matrix: a.clone(), right: right.clone() });
-    let sought = PowerProblem {
+    let problem = PowerProblem {
         sums: &sums,
         blocks: &blocks,
         degrees: &degrees,
@@ -258,13 +258,13 @@ fn without_data_the_power_is_what_is_expected_and_never_rises() {
         power: 0.0,
         numbers: 1.0,
     };
-    let power = sought.found_in_blocks().unwrap().power;
+    let power = problem.solve_blocks().unwrap().power;
     assert!(power.power_k2.iter().all(|power| power.is_finite() && *power > 0.0), "{power:?}");
     assert!(power.power_k2[2..].windows(2).all(|pair| pair[1] < pair[0]), "{power:?}");
-    // Mean and dipole are free, and so decided by whatever is there.
+    // Mean and dipole are free, so any data determine them.
     let decided: f64 = power.decided[FREE..].iter().sum();
     assert!(decided < 1.0, "{decided}");
-    // The same from rounds with the true products.
+    // The same in rounds with products of the true matrix.
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 200 };
     let watch = SolveWatch::default();
     let rounds = PowerProblem {
@@ -275,18 +275,18 @@ fn without_data_the_power_is_what_is_expected_and_never_rises() {
         power: 0.0,
         numbers: 1.0,
     };
-    assert!(rounds.found(None, rule, watch.named("test")).is_ok());
+    assert!(rounds.solve(None, rule, watch.named("test")).is_ok());
 }
 
-/// Blocks that are far from the matrix: rounds with true products end where the exact matrix has its maximum.
+/// With inaccurate blocks, rounds converge to the maximum for the exact matrix.
 #[test]
-fn rounds_with_products_find_what_the_matrix_itself_gives() {
+fn rounds_converge_to_the_result_of_the_exact_matrix() {
     let a = random_normal(11, 2 * ORDER);
     let (right, _) = observed(&a, &power(40.0), &mut normal(12));
     let degrees = degrees();
     let sums = Dense { matrix: a.clone(), right: right.clone() };
     let exact = block(&a);
-    let of = |blocks| PowerProblem {
+    let problem = |blocks| PowerProblem {
         sums: &sums,
         blocks,
         degrees: &degrees,
@@ -294,15 +294,15 @@ fn rounds_with_products_find_what_the_matrix_itself_gives() {
         power: 0.0,
         numbers: 1.0,
     };
-    let expected = of(&exact).found_in_blocks().unwrap();
-    let near = pairs(&a);
+    let expected = problem(&exact).solve_blocks().unwrap();
+    let approximation = pairs(&a);
     let rule = StoppingRule { residual_max: 1e-8, iterations_max: 400 };
     let watch = SolveWatch::default();
-    let found = of(&near).found(None, rule, watch.named("test")).unwrap();
+    let found = problem(&approximation).solve(None, rule, watch.named("test")).unwrap();
     for l in FREE..=L_MAX {
         let off = (found.power.power_k2[l] / expected.power.power_k2[l]).ln();
         eprintln!("{l}: {off:.3} of sigma {:.3}", expected.power.sigma_ln[l]);
-        // Rounds end within a tenth; traces are of four draws of 81 numbers, and these blocks are off by a factor of three.
+        // Rounds end within a tenth; traces are from four samples of 81 numbers, and these blocks are wrong by a factor of three.
         assert!(
             off.abs() < 0.15 + 0.3 * expected.power.sigma_ln[l],
             "{l}: {off} {:?}",
@@ -316,7 +316,7 @@ fn the_variance_beyond_is_that_of_pixels_of_a_falling_sky() {
     const NSIDE: usize = 4;
     let power_k2: Vec<f64> = (0..=10).map(|l| ((l + 1) as f64).powi(-3)).collect();
     let power = SkyPower { sigma_ln: vec![0.1; 11], decided: vec![1.0; 11], power_k2, noise_factor: 1.0 };
-    // Means over the 16 pixels of nside 16 in each pixel, of skies of the degrees beyond.
+    // Means of 16 small pixels in each pixel, for skies of the higher degrees.
     let mut normal = normal(21);
     let (mut sum, mut count) = (0.0, 0);
     for _ in 0..40 {

@@ -1,31 +1,31 @@
-//! Conjugate gradients for `(BtN^-1B + R) x = b`.
+//! Solves `(BtN^-1B + R) x = b` by preconditioned conjugate gradients.
 
 use super::vectors::{dot, subtract};
 use super::watch::SolveTask;
 use crate::imaging::NormalSums;
 use crate::imaging::regulariser::Diagonal;
 
-/// When to stop.
+/// Stopping rule of an iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StoppingRule {
-    /// Greatest residual, relative to the right-hand side, in the preconditioner's norm.
+    /// Target residual, relative to the right-hand side, in the preconditioner's norm.
     pub residual_max: f64,
-    /// Iteration limit.
+    /// Maximum number of iterations.
     pub iterations_max: usize,
 }
 
-/// How an iteration ended.
+/// The result of an iteration.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 pub struct Convergence {
-    /// Products with BtN^-1B.
+    /// Number of products with BtN^-1B.
     pub iterations: usize,
     /// `sqrt(r.Mr / b.Mb)`, M the preconditioner, r the residual, b the right-hand side.
     pub residual: f64,
-    /// Whether the residual was reached; if not, the iteration limit was, or the run was interrupted.
+    /// Whether the target residual was reached before the iteration limit or an interruption.
     pub converged: bool,
 }
 
-/// A symmetric system.
+/// A symmetric system of equations with its preconditioner.
 pub(in crate::imaging) struct System<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
     pub(in crate::imaging) regularisation: Diagonal,
@@ -33,49 +33,54 @@ pub(in crate::imaging) struct System<'a> {
     pub(in crate::imaging) precondition: &'a dyn Fn(&mut [f64]),
 }
 
-/// One right-hand side on its way.
+/// The iteration for one right-hand side.
 struct Iteration {
     x: Vec<f64>,
     residual: Vec<f64>,
     direction: Vec<f64>,
-    /// The residual's square in the preconditioner's norm.
-    energy: f64,
-    /// The right-hand side's.
-    whole: f64,
+    /// Squared norm of the residual, in the preconditioner's norm.
+    residual_square: f64,
+    /// Squared norm of the right-hand side.
+    right_square: f64,
     products: usize,
-    /// Rounding errors dominate: no further gain is possible.
+    /// Whether rounding errors prevent further progress.
     is_stuck: bool,
 }
 
 impl Iteration {
-    /// From the first guess `x`, whose product is known unless it is zero.
+    /// Starts from the initial guess `x` and its product with the matrix; `None` if the guess is zero.
     fn new(b: &[f64], x: Vec<f64>, product: Option<&[f64]>, precondition: &dyn Fn(&mut [f64])) -> Self {
         let preconditioned = |v: &[f64]| {
             let mut z = v.to_vec();
             precondition(&mut z);
             z
         };
-        let whole = dot(b, &preconditioned(b));
+        let right_square = dot(b, &preconditioned(b));
         let mut residual = b.to_vec();
         if let Some(product) = product {
             subtract(&mut residual, 1.0, product);
         }
         let direction = preconditioned(&residual);
-        let energy = dot(&residual, &direction);
+        let residual_square = dot(&residual, &direction);
         let products = usize::from(product.is_some());
-        Self { x, residual, direction, energy, whole, products, is_stuck: false }
+        Self { x, residual, direction, residual_square, right_square, products, is_stuck: false }
     }
 
-    /// The residual, relative to the right-hand side; 0 if that is zero.
-    fn relative(&self) -> f64 {
-        if self.whole <= 0.0 { 0.0 } else { (self.energy.max(0.0) / self.whole).sqrt() }
+    /// The residual relative to the right-hand side; 0 if that is zero.
+    fn relative_residual(&self) -> f64 {
+        if self.right_square <= 0.0 {
+            0.0
+        } else {
+            (self.residual_square.max(0.0) / self.right_square).sqrt()
+        }
     }
 
-    fn wants(&self, rule: StoppingRule) -> bool {
-        !self.is_stuck && self.relative() > rule.residual_max && self.products < rule.iterations_max
+    /// Whether the rule requires another iteration.
+    fn needs_step(&self, rule: StoppingRule) -> bool {
+        !self.is_stuck && self.relative_residual() > rule.residual_max && self.products < rule.iterations_max
     }
 
-    /// Takes the step along the direction, of which this is the product, and turns to the next.
+    /// Takes a step along the current direction, given its product with the matrix, and computes the next direction.
     fn step(&mut self, product: &[f64], precondition: &dyn Fn(&mut [f64])) {
         self.products += 1;
         let curvature = dot(&self.direction, product);
@@ -83,33 +88,33 @@ impl Iteration {
             self.is_stuck = true;
             return;
         }
-        let step = self.energy / curvature;
+        let step = self.residual_square / curvature;
         self.x.iter_mut().zip(&self.direction).for_each(|(x, d)| *x += step * d);
         subtract(&mut self.residual, step, product);
         let mut z = self.residual.clone();
         precondition(&mut z);
         let next = dot(&self.residual, &z);
-        let turn = next / self.energy;
-        self.energy = next;
-        self.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+        let beta = next / self.residual_square;
+        self.residual_square = next;
+        self.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + beta * *d);
     }
 
     fn convergence(&self, rule: StoppingRule) -> Convergence {
-        let residual = self.relative();
+        let residual = self.relative_residual();
         Convergence { iterations: self.products, residual, converged: residual <= rule.residual_max }
     }
 }
 
 impl System<'_> {
-    /// The products of several vectors with the system's matrix.
+    /// Multiplies several vectors by `BtN^-1B + R`.
     fn apply(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
         let mut products = self.sums.apply_all(x);
         products.iter_mut().zip(x).for_each(|(product, x)| self.regularisation.add_product(x, product));
         products
     }
 
-    /// Solves for each right-hand side `b` by its rule in place, from the first guess `x`; the best so far is left whenever it ends. Each solution has
-    /// the bits that it has alone: only products are made together.
+    /// Solves for each right-hand side `b` by its own rule, from the initial guesses in `x`, which then hold the solutions. An interrupted
+    /// iteration leaves its last solution. Products are computed together, but each solution has the bits that it would have alone.
     pub(in crate::imaging) fn solve(
         &self,
         b: &[&[f64]],
@@ -129,21 +134,22 @@ impl System<'_> {
             })
             .collect();
         loop {
-            let wants: Vec<bool> = iterations.iter().zip(rules).map(|(one, rule)| one.wants(*rule)).collect();
+            let needs_step: Vec<bool> =
+                iterations.iter().zip(rules).map(|(one, rule)| one.needs_step(*rule)).collect();
             let products = iterations.iter().map(|iteration| iteration.products).max().unwrap_or(0);
-            let residual = iterations.iter().map(Iteration::relative).fold(0.0, f64::max);
-            let goes_on = task.report_each(&wants, products, residual);
-            let mut open: Vec<&mut Iteration> = iterations
+            let residual = iterations.iter().map(Iteration::relative_residual).fold(0.0, f64::max);
+            let continues = task.report_each(&needs_step, products, residual);
+            let mut running: Vec<&mut Iteration> = iterations
                 .iter_mut()
-                .zip(goes_on)
-                .filter_map(|(one, goes_on)| goes_on.then_some(one))
+                .zip(continues)
+                .filter_map(|(one, continues)| continues.then_some(one))
                 .collect();
-            if open.is_empty() {
+            if running.is_empty() {
                 break;
             }
-            let directions: Vec<&[f64]> = open.iter().map(|one| one.direction.as_slice()).collect();
+            let directions: Vec<&[f64]> = running.iter().map(|one| one.direction.as_slice()).collect();
             let products = self.apply(&directions);
-            for (iteration, product) in open.iter_mut().zip(&products) {
+            for (iteration, product) in running.iter_mut().zip(&products) {
                 iteration.step(product, self.precondition);
             }
         }
@@ -164,13 +170,13 @@ mod tests {
 
     const ORDER: usize = 40;
 
-    /// A symmetric matrix with eigenvalues from 1 to 40, which keeps how many vectors each product had.
+    /// A symmetric matrix with eigenvalues from 1 to 40 that records the number of vectors in each product.
     #[derive(Default)]
-    struct Known {
+    struct TestMatrix {
         products: Mutex<Vec<usize>>,
     }
 
-    impl NormalSums for Known {
+    impl NormalSums for TestMatrix {
         fn unknowns(&self) -> usize {
             ORDER
         }
@@ -213,13 +219,13 @@ mod tests {
     }
 
     fn solve(
-        known: &Known,
+        matrix: &TestMatrix,
         b: &[&[f64]],
         x: &mut [Vec<f64>],
         rule: StoppingRule,
         watch: &SolveWatch,
     ) -> Vec<Convergence> {
-        let system = System { sums: known, regularisation: Diagonal::Uniform(0.5), precondition: &|_| () };
+        let system = System { sums: matrix, regularisation: Diagonal::Uniform(0.5), precondition: &|_| () };
         let rules = vec![rule; b.len()];
         system.solve(b, x, &rules, &watch.named("test").start("columns", rule.residual_max))
     }
@@ -229,13 +235,13 @@ mod tests {
     #[test]
     fn columns_of_all_kinds_have_the_bits_of_each_alone() {
         let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
-        let known = Known::default();
+        let matrix = TestMatrix::default();
         let zeros = vec![0.0; ORDER];
         let watch = SolveWatch::default();
         let mut solved = [zeros.clone()];
-        solve(&known, &[&wave(0.3)], &mut solved, RULE, &watch);
+        solve(&matrix, &[&wave(0.3)], &mut solved, RULE, &watch);
         let [solved] = solved;
-        // Nothing to solve; one that is solved already; one with a first guess of another; a plain one; and not a number.
+        // A zero right-hand side; one that is solved already; one with the solution of another as guess; a plain one; and NaN.
         let columns = [
             (zeros.clone(), zeros.clone()),
             (wave(0.3), solved.clone()),
@@ -246,10 +252,10 @@ mod tests {
         let bits = |x: &[f64]| x.iter().map(|x| x.to_bits()).collect::<Vec<u64>>();
         let b: Vec<&[f64]> = columns.iter().map(|(b, _)| b.as_slice()).collect();
         let mut together: Vec<Vec<f64>> = columns.iter().map(|(_, x)| x.clone()).collect();
-        let found = solve(&known, &b, &mut together, RULE, &watch);
+        let found = solve(&matrix, &b, &mut together, RULE, &watch);
         for (k, (b, x)) in columns.iter().enumerate() {
             let mut alone = [x.clone()];
-            let convergence = solve(&known, &[b], &mut alone, RULE, &watch)[0];
+            let convergence = solve(&matrix, &[b], &mut alone, RULE, &watch)[0];
             assert_eq!(bits(&together[k]), bits(&alone[0]), "{k}");
             assert_eq!(format!("{:?}", found[k]), format!("{convergence:?}"), "{k}");
         }
@@ -259,25 +265,25 @@ mod tests {
         assert_eq!(converged, [true, true, true, true, false]);
         // The matrix is that of the right-hand side.
         let mut again = vec![0.0; ORDER];
-        known.apply(&together[3], &mut again);
+        matrix.apply(&together[3], &mut again);
         for (k, (y, x)) in again.iter().zip(&together[3]).enumerate() {
             assert!((y + 0.5 * x - columns[3].0[k]).abs() < 1e-5, "{k}");
         }
     }
 
-    /// Processors that round in other ways find an end at other products.
+    /// Ranks whose processors round differently would stop at different iterations.
     #[test]
     fn ranks_end_a_column_together() {
         let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();
         let b = [wave(0.7), wave(1.1)];
         let found = on_threads(3, |ranks| {
-            let known = Known::default();
+            let matrix = TestMatrix::default();
             let watch = SolveWatch::default().with_ranks(ranks);
             let residual_max = [1e-3, 1e-6, 1e-9][ranks.share().rank];
             let mut x = [vec![0.0; ORDER], vec![0.0; ORDER]];
             let b: Vec<&[f64]> = b.iter().map(Vec::as_slice).collect();
-            solve(&known, &b, &mut x, StoppingRule { residual_max, ..RULE }, &watch);
-            (known.products.into_inner().unwrap(), x)
+            solve(&matrix, &b, &mut x, StoppingRule { residual_max, ..RULE }, &watch);
+            (matrix.products.into_inner().unwrap(), x)
         });
         assert!(found[0].0.len() > 3 && found.iter().all(|one| *one == found[0]), "{:?}", found[0].0);
     }

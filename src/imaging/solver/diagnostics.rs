@@ -8,16 +8,16 @@ use crate::imaging::PixelSums;
 /// Eigenvalues and eigenvectors of `BtN^-1B = Q W Qt`.
 #[derive(Clone, Debug)]
 pub struct Spectrum {
-    /// Eigenvalues W, K^-2, rising.
+    /// Eigenvalues W, K^-2, in increasing order.
     pub eigenvalues: Vec<f64>,
     /// Eigenvectors Q, one per column.
     vectors: Mat<f64>,
 }
 
-/// Decomposes the normal matrix. Costs `10 N_pix^3` operations and the memory of three matrices: for nside up to 16.
+/// Decomposes the normal matrix, with `10 N_pix^3` operations and the memory of three matrices: for nside up to 16.
 ///
 /// # Errors
-/// A matrix with numbers that are not finite.
+/// The matrix has elements that are not finite.
 pub fn spectrum(sums: &PixelSums) -> Result<Spectrum, SolveError> {
     let order = sums.normal.order();
     let matrix = Mat::from_fn(order, order, |row, column| sums.normal.get(row, column));
@@ -27,7 +27,7 @@ pub fn spectrum(sums: &PixelSums) -> Result<Spectrum, SolveError> {
 }
 
 impl Spectrum {
-    /// eps = epsilon W_max, K^-2.
+    /// The regularisation eps = epsilon W_max, K^-2.
     #[must_use]
     pub fn regularisation(&self, epsilon: f64) -> f64 {
         epsilon * self.eigenvalues.last().copied().unwrap_or(0.0)
@@ -47,7 +47,7 @@ impl Spectrum {
         self.eigenvalues.iter().map(|w| (eps / (w + eps)).powi(2)).sum()
     }
 
-    /// Standard deviation of the thermal noise of every pixel, K: the root of the diagonal of
+    /// Standard deviation of the thermal noise of every pixel, K: the square root of the diagonal of
     /// `Q W (W + eps)^-2 Qt`.
     #[must_use]
     pub fn pixel_noise_k(&self, epsilon: f64) -> Vec<f64> {
@@ -56,8 +56,8 @@ impl Spectrum {
         self.weighted_diagonal(variance).into_iter().map(f64::sqrt).collect()
     }
 
-    /// The effective beam of one pixel: that column of `B_eff = Q W (W + eps)^-1 Qt`, the map of a sky
-    /// that is 1 K in that pixel alone. Empty if there is no such pixel.
+    /// The effective beam of one pixel: a column of `B_eff = Q W (W + eps)^-1 Qt`, the map of a sky
+    /// that is 1 K in that pixel only. Empty if there is no such pixel.
     #[must_use]
     pub fn effective_beam(&self, epsilon: f64, pixel: usize) -> Vec<f64> {
         let eps = self.regularisation(epsilon);

@@ -9,28 +9,28 @@ use crate::units::ChannelId;
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum SolveError {
-    /// The run was cancelled, and there is no time for the solution.
+    /// The run was cancelled before the solution was ready.
     #[error("the run was cancelled before the map was made")]
     Interrupted,
-    /// Ranks that were to solve for different maps.
+    /// The ranks of a job hold different data.
     #[error(
         "the ranks of the job hold sums of different data; expected each to take the same downlink with the same settings: is a file \
          growing, or was one of them interrupted?"
     )]
     Ranks,
-    /// Sums on disk that could not be read.
+    /// Sums on disk could not be read.
     #[error("{0}")]
     Sums(String),
-    /// Nothing to solve.
+    /// There is no data.
     #[error("there is no data for a map")]
     NoData,
-    /// epsilon is missing for a channel.
+    /// There is no epsilon for a channel.
     #[error("map.epsilon has no value for channel {0}; expected one value, or one for each channel")]
     NoEpsilon(ChannelId),
     /// epsilon is not positive.
     #[error("epsilon = {0}: expected a number above 0")]
     Epsilon(f64),
-    /// A prior of another size.
+    /// The prior has another size than the map.
     #[error("a prior of {found} pixels was given for a map of {expected}")]
     PriorLength {
         /// Pixels of the prior.
@@ -38,7 +38,7 @@ pub enum SolveError {
         /// Pixels of the map.
         expected: usize,
     },
-    /// A table of angular power that cannot be used.
+    /// A table of angular power is invalid.
     #[error("map.regulariser.file: {}: {found}; expected a table of l and C_l in K^2, from l = 0 on, all above 0", path.display())]
     Power {
         /// Its path.
@@ -46,7 +46,7 @@ pub enum SolveError {
         /// What was found.
         found: String,
     },
-    /// A table of angular power that ends too early.
+    /// A table of angular power ends before the map's maximum degree.
     #[error("map.regulariser.file: {found} degrees; expected {expected}, up to the greatest of the map")]
     PowerLength {
         /// Degrees in it.
@@ -54,34 +54,34 @@ pub enum SolveError {
         /// Degrees of the map.
         expected: usize,
     },
-    /// No power of the sky makes the matrix positive definite.
+    /// No power of the sky makes the normal matrix positive definite.
     #[error(
         "no angular power of the sky fits the data: the normal matrix has no Cholesky factor with any; expected finite numbers in it. \
          map.regulariser = \"identity\" takes R = epsilon W_max I instead"
     )]
     NoPower,
-    /// Channels that cannot be solved for together.
+    /// There are too few channels for a joint map, or two of one frequency.
     #[error(
         "a joint map of {channels} channels at {frequencies} frequencies; expected two or more, each at its own frequency"
     )]
     FewChannels {
-        /// Channels given.
+        /// Number of channels.
         channels: usize,
-        /// Frequencies among them.
+        /// Number of different frequencies.
         frequencies: usize,
     },
-    /// A frequency that channels do not enclose.
+    /// A frequency lies outside the range of the channels.
     #[error(
         "{:.3} MHz: expected a frequency between {:.3} and {:.3} MHz, those of the channels; beyond them the sky is not known",
         frequency_hz / 1e6, ends_hz[0] / 1e6, ends_hz[1] / 1e6
     )]
     BeyondChannels {
-        /// Frequency asked for, Hz.
+        /// Requested frequency, Hz.
         frequency_hz: f64,
-        /// Lowest and highest channel, Hz.
+        /// Lowest and highest frequency of the channels, Hz.
         ends_hz: [f64; 2],
     },
-    /// Sums of which no joint map can be made.
+    /// A state does not hold harmonic sums, which joint maps need.
     #[error(
         "{:.3} MHz: a state of {found}; expected sums over harmonics (map.engine = \"harmonic\", without refinement), of which joint maps \
          are made",
@@ -90,15 +90,15 @@ pub enum SolveError {
     NotHarmonic {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// What it holds.
+        /// What the state holds.
         found: &'static str,
     },
     /// A pixel that is not on the map.
     #[error("there is no pixel {pixel} on a map of {pixels}")]
     NoPixel {
-        /// Pixel asked for.
+        /// Requested pixel.
         pixel: usize,
-        /// Pixels of the map.
+        /// Number of pixels of the map.
         pixels: usize,
     },
     /// The matrix has no Cholesky factor.
@@ -108,18 +108,18 @@ pub enum SolveError {
          below it"
     )]
     NotPositive {
-        /// First pixel of the tile in which it failed.
+        /// First pixel of the tile in which factorisation failed.
         pixel: usize,
-        /// Regularisation.
+        /// Value of epsilon.
         epsilon: f64,
     },
-    /// Visibilities that could not be summed for refinement.
+    /// Refinement failed.
     #[error("refinement: {0}")]
     Refinement(String),
     /// A transform between map and harmonics failed.
     #[error(transparent)]
     Harmonics(#[from] HarmonicsError),
-    /// An eigenvalue decomposition that did not converge.
+    /// An eigenvalue decomposition did not converge.
     #[error("the eigenvalues of the normal matrix did not converge; expected finite numbers in it")]
     Eigenvalues,
 }

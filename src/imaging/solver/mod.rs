@@ -1,4 +1,4 @@
-//! What map methods share to solve their equations: conjugate gradients, eigenvalues, traces of covariances, progress.
+//! Solvers that all map methods share: conjugate gradients, eigenvalues, traces of covariances, and progress reports.
 
 mod conjugate_gradients;
 mod diagnostics;
@@ -19,7 +19,7 @@ pub(super) use fit::FitInputs;
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 pub(super) use lanczos::{largest_eigenvalue_from, normalised, random_vector};
 pub use probing::{effective_beam, noise_variance, regularisation};
-pub use traces::{Estimate, HELD_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
+pub use traces::{Estimate, STORED_MAX, Traces, UnsupportedEpsilon, probed_traces, traces};
 pub(super) use vectors::{add, dot, subtract};
 pub(super) use watch::SolveTask;
 pub use watch::{NamedWatch, SolveWatch, Solving, SolvingPart};

@@ -1,21 +1,19 @@
-//! Vectors of unknowns.
+//! Arithmetic of vectors of unknowns.
 
-/// Scalar product.
 pub(in crate::imaging) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Euclidean norm.
 pub(in crate::imaging) fn norm(a: &[f64]) -> f64 {
     dot(a, a).sqrt()
 }
 
-/// `a -= factor b`.
+/// Computes `a -= factor b`.
 pub(in crate::imaging) fn subtract(a: &mut [f64], factor: f64, b: &[f64]) {
     a.iter_mut().zip(b).for_each(|(a, b)| *a -= factor * b);
 }
 
-/// `a += b`.
+/// Computes `a += b`.
 pub(in crate::imaging) fn add(a: &mut [f64], b: &[f64]) {
     a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
 }

@@ -1,4 +1,4 @@
-//! Progress of a long solution, and how it is interrupted.
+//! Progress reports and interruption of long solutions.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -9,62 +9,61 @@ use crate::runtime::Cancel;
 /// Progress of a solution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Solving {
-    /// Number of the task since the start, to tell a new one from the last.
+    /// Number of the task since the start.
     pub number: u64,
-    /// The task: `map at 10.000 MHz`.
+    /// Description of the task, such as `10.000 MHz: map`.
     pub what: String,
-    /// Products with BtN^-1B so far.
+    /// Number of iterations so far.
     pub iteration: usize,
-    /// Residual reached.
+    /// Current residual.
     pub residual: f64,
-    /// Residual at which it ends.
+    /// Target residual.
     pub target: f64,
-    /// The iteration within the one in progress.
+    /// Progress of the inner iteration, if one is running.
     pub part: Option<SolvingPart>,
 }
 
-/// Progress of an iteration that is a step of another.
+/// Progress of an inner iteration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SolvingPart {
-    /// What it solves.
+    /// Description of the inner iteration.
     pub what: &'static str,
-    /// Products so far.
+    /// Number of iterations so far.
     pub iteration: usize,
-    /// Residual reached.
+    /// Current residual.
     pub residual: f64,
-    /// Residual at which it ends.
+    /// Target residual.
     pub target: f64,
 }
 
-/// Shared between a solver, the progress display and the interrupt handler.
+/// The progress of a solver, which the progress display and the interrupt handler share.
 #[derive(Clone, Debug)]
 pub struct SolveWatch {
     cancel: Cancel,
-    /// Time for iterations after cancellation; `None` for no limit.
-    time: Option<Duration>,
+    /// Time limit after cancellation; `None` for no limit.
+    grace: Option<Duration>,
     state: Arc<Mutex<WatchState>>,
-    /// Those who solve together: what one of them ends, all end.
+    /// The ranks that solve together; when one stops an iteration, all stop.
     ranks: Ranks,
 }
 
 #[derive(Debug, Default)]
 struct WatchState {
-    /// Tasks started so far.
+    /// Number of tasks started so far.
     started: u64,
-    now: Option<Solving>,
+    current: Option<Solving>,
 }
 
-/// A watch, and the name under which a solution reports to it.
+/// A watch with the name under which a solution reports to it.
 #[derive(Clone, Copy, Debug)]
 pub struct NamedWatch<'a> {
     watch: &'a SolveWatch,
     name: &'a str,
-    /// Whether the solution is wanted although the run was cancelled.
-    wanted: bool,
+    /// Whether the solution continues after the run was cancelled, within the time limit.
+    has_priority: bool,
 }
 
-/// Iterations that a solution may take if the run was interrupted before it began: enough for the well-measured part of
-/// a map.
+/// Maximum number of iterations of a solution that starts after cancellation: enough for the well-measured modes of a map.
 const ITERATIONS_WHEN_CANCELLED: usize = 12;
 
 impl Default for SolveWatch {
@@ -74,44 +73,44 @@ impl Default for SolveWatch {
 }
 
 impl SolveWatch {
-    /// A watch whose solutions end early when `cancel` is triggered.
+    /// Creates a watch whose solutions end early when `cancel` is triggered.
     #[must_use]
     pub fn new(cancel: Cancel) -> Self {
-        Self { cancel, time: None, state: Arc::default(), ranks: Ranks::one() }
+        Self { cancel, grace: None, state: Arc::default(), ranks: Ranks::single() }
     }
 
-    /// The watch of one rank, whose solutions end when any of the ranks ends its own.
+    /// Makes it the watch of one rank: an iteration stops when any rank stops its own.
     #[must_use]
     pub fn with_ranks(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
     }
 
-    /// Whether all ranks are to solve the same.
-    pub(in crate::imaging) fn agrees(&self, on: &[i64]) -> bool {
-        self.ranks.agree(on)
+    /// Whether all ranks have equal values.
+    pub(in crate::imaging) fn agrees(&self, values: &[i64]) -> bool {
+        self.ranks.have_equal(values)
     }
 
-    /// Ends all iterations `time` after cancellation.
+    /// Ends all iterations `grace` after cancellation.
     #[must_use]
-    pub fn within(self, time: Duration) -> Self {
-        Self { time: Some(time), ..self }
+    pub fn with_grace(self, grace: Duration) -> Self {
+        Self { grace: Some(grace), ..self }
     }
 
-    /// Whether the time after cancellation is over.
-    fn is_over(&self) -> bool {
-        self.cancel.elapsed().zip(self.time).is_some_and(|(elapsed, time)| elapsed >= time)
+    /// Whether the time limit after cancellation has passed.
+    fn is_expired(&self) -> bool {
+        self.cancel.elapsed().zip(self.grace).is_some_and(|(elapsed, grace)| elapsed >= grace)
     }
 
-    /// The solution in progress, if any.
+    /// The progress of the current task, if any.
     #[must_use]
-    pub fn now(&self) -> Option<Solving> {
-        self.state().now.clone()
+    pub fn progress(&self) -> Option<Solving> {
+        self.state().current.clone()
     }
 
-    /// The watch for a solution of this name.
+    /// The watch with a solution's name; see [`NamedWatch::with_priority`] for its priority.
     #[must_use]
     pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
-        NamedWatch { watch: self, name, wanted: true }
+        NamedWatch { watch: self, name, has_priority: true }
     }
 
     fn state(&self) -> MutexGuard<'_, WatchState> {
@@ -120,86 +119,86 @@ impl SolveWatch {
 }
 
 impl<'a> NamedWatch<'a> {
-    /// Whether the map is one that the run leaves, not one on the way.
-    pub(in crate::imaging) fn is_wanted(self) -> bool {
-        self.wanted
+    /// Whether the solution is of a final map.
+    pub(in crate::imaging) fn has_priority(self) -> bool {
+        self.has_priority
     }
 
-    /// Whether the solution is wanted although the run was cancelled; it is unless this says otherwise.
+    /// Sets whether the solution is of a final map, which continues after cancellation (the default), or of an intermediate one.
     #[must_use]
-    pub fn wanted(self, wanted: bool) -> Self {
-        Self { wanted, ..self }
+    pub fn with_priority(self, has_priority: bool) -> Self {
+        Self { has_priority, ..self }
     }
 
-    /// Whether something holds for all ranks.
+    /// Whether `holds` is true on all ranks.
     pub(in crate::imaging) fn all(self, holds: bool) -> bool {
         self.watch.ranks.all(holds)
     }
 
-    /// Whether it is worth while to go on, for all ranks.
-    pub(in crate::imaging) fn goes_on(self) -> bool {
-        self.all(self.goes_on_here())
+    /// Whether the solution may continue on all ranks.
+    pub(in crate::imaging) fn may_continue(self) -> bool {
+        self.all(self.may_continue_here())
     }
 
-    fn goes_on_here(self) -> bool {
-        if self.wanted { !self.watch.is_over() } else { !self.watch.cancel.is_cancelled() }
+    fn may_continue_here(self) -> bool {
+        if self.has_priority { !self.watch.is_expired() } else { !self.watch.cancel.is_cancelled() }
     }
 
-    /// Starts a task that ends at the residual `target`.
+    /// Starts a task with the residual `target`.
     pub(in crate::imaging) fn start(self, what: &str, target: f64) -> SolveTask<'a> {
         let Self { watch, name, .. } = self;
         let mut state = watch.state();
         state.started += 1;
         let number = state.started;
         let what = format!("{name}: {what}");
-        state.now = Some(Solving { number, what, iteration: 0, residual: 1.0, target, part: None });
-        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), part: None }
+        state.current = Some(Solving { number, what, iteration: 0, residual: 1.0, target, part: None });
+        SolveTask { named: self, watch, was_cancelled: watch.cancel.is_cancelled(), inner: None }
     }
 
-    /// A step of the task in progress that is an iteration of its own and ends at the residual `target`.
-    pub(in crate::imaging) fn part(self, what: &'static str, target: f64) -> SolveTask<'a> {
+    /// Starts an inner iteration of the current task, with its own residual `target`.
+    pub(in crate::imaging) fn inner(self, what: &'static str, target: f64) -> SolveTask<'a> {
         let was_cancelled = self.watch.cancel.is_cancelled();
-        SolveTask { named: self, watch: self.watch, was_cancelled, part: Some((what, target)) }
+        SolveTask { named: self, watch: self.watch, was_cancelled, inner: Some((what, target)) }
     }
 }
 
-/// A task in progress.
 pub(in crate::imaging) struct SolveTask<'a> {
     named: NamedWatch<'a>,
     watch: &'a SolveWatch,
     was_cancelled: bool,
-    /// Of a step of another task: what it solves, and the residual at which it ends.
-    part: Option<(&'static str, f64)>,
+    /// Description and target residual, for an inner iteration.
+    inner: Option<(&'static str, f64)>,
 }
 
 impl SolveTask<'_> {
-    /// Reports an iteration; whether to continue, for all ranks.
+    /// Reports an iteration, and returns whether all ranks continue.
     pub(in crate::imaging) fn report(&self, iteration: usize, residual: f64) -> bool {
-        self.report_wanting(true, iteration, residual)
+        self.report_step(true, iteration, residual)
     }
 
-    /// As [`SolveTask::report`], of an iteration that is to continue if it `wants` to.
-    pub(in crate::imaging) fn report_wanting(&self, wants: bool, iteration: usize, residual: f64) -> bool {
-        // One that has come to its end says so as well: where processors round in other ways, others may not have.
-        self.watch.ranks.all(self.report_here(iteration, residual) && wants)
+    /// Reports an iteration that needs another step if `needs_step`, and returns whether all ranks continue.
+    pub(in crate::imaging) fn report_step(&self, needs_step: bool, iteration: usize, residual: f64) -> bool {
+        // A rank that has converged takes part too: on other processors rounding may differ.
+        self.watch.ranks.all(self.report_here(iteration, residual) && needs_step)
     }
 
-    /// As [`SolveTask::report_wanting`], of several iterations that are made together: which of them continue, for all ranks.
+    /// Reports several iterations that share products, and returns which of them continue on all ranks.
     pub(in crate::imaging) fn report_each(
         &self,
-        wants: &[bool],
+        needs_step: &[bool],
         iteration: usize,
         residual: f64,
     ) -> Vec<bool> {
-        let goes_on = self.report_here(iteration, residual);
-        let mut ended: Vec<i64> = wants.iter().map(|wants| i64::from(!(goes_on && *wants))).collect();
-        self.watch.ranks.greatest(&mut ended);
-        ended.into_iter().map(|ended| ended == 0).collect()
+        let continues = self.report_here(iteration, residual);
+        let mut stops: Vec<i64> =
+            needs_step.iter().map(|needs_step| i64::from(!(continues && *needs_step))).collect();
+        self.watch.ranks.max(&mut stops);
+        stops.into_iter().map(|stops| stops == 0).collect()
     }
 
     fn report_here(&self, iteration: usize, residual: f64) -> bool {
-        if let Some(solving) = &mut self.watch.state().now {
-            match self.part {
+        if let Some(solving) = &mut self.watch.state().current {
+            match self.inner {
                 Some((what, target)) => {
                     solving.part = Some(SolvingPart { what, iteration, residual, target });
                 }
@@ -207,7 +206,7 @@ impl SolveTask<'_> {
             }
         }
         if self.was_cancelled {
-            iteration < ITERATIONS_WHEN_CANCELLED && self.named.goes_on_here()
+            iteration < ITERATIONS_WHEN_CANCELLED && self.named.may_continue_here()
         } else {
             !self.watch.cancel.is_cancelled()
         }
@@ -217,9 +216,9 @@ impl SolveTask<'_> {
 impl Drop for SolveTask<'_> {
     fn drop(&mut self) {
         let mut state = self.watch.state();
-        match (self.part, &mut state.now) {
+        match (self.inner, &mut state.current) {
             (Some(_), Some(solving)) => solving.part = None,
-            _ => state.now = None,
+            _ => state.current = None,
         }
     }
 }

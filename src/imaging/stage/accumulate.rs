@@ -1,4 +1,4 @@
-//! The ground stage that sums normal equations: an engine for each channel.
+//! The ground stage that accumulates the normal equations, with one engine per channel.
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -6,8 +6,10 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentPlace, VisibilityArchive};
-use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, orbit_of};
+use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentFolder, VisibilityArchive};
+use crate::imaging::circle::{
+    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, nominal_orbit,
+};
 use crate::imaging::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
     NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
@@ -27,35 +29,37 @@ pub struct Snapshot {
     pub number: u32,
     /// Whether it holds all data.
     pub is_final: bool,
-    /// First and last mission time of the data in it, s.
+    /// Mission times of its first and last data, s.
     pub span_s: [f64; 2],
-    /// nside of the map to be made.
+    /// nside of its map.
     pub nside: usize,
-    /// The sums.
-    pub sums: SnapshotSums,
+    /// Its data.
+    pub data: SnapshotData,
 }
 
-/// Sums of either engine.
-pub enum SnapshotSums {
-    /// Over pixels.
+/// The data of a snapshot: accumulated normal equations, or individual visibilities.
+pub enum SnapshotData {
+    /// Normal equations over pixels.
     Pixel(PixelSums),
-    /// Over harmonics.
+    /// Normal equations over spherical harmonics.
     Harmonic(Box<HarmonicSums>),
-    /// Visibilities one by one, for a refined map.
+    /// Individual visibilities, for iterative refinement.
     Refined(Box<VisibilityArchive>),
-    /// Visibilities one by one, for a map of pixels.
+    /// Individual visibilities, for a pixel map solved without storing the matrix.
     MatrixFree(Box<MatrixFreeVisibilities>),
 }
 
-impl SnapshotSums {
-    fn with_noises(self, noises: Option<NoiseSums>) -> Self {
-        match (self, noises) {
-            (Self::Harmonic(sums), Some(noises)) => Self::Harmonic(Box::new(sums.with_noises(noises))),
+impl SnapshotData {
+    fn with_noise_realisations(self, realisations: Option<NoiseSums>) -> Self {
+        match (self, realisations) {
+            (Self::Harmonic(sums), Some(realisations)) => {
+                Self::Harmonic(Box::new(sums.with_noise_realisations(realisations)))
+            }
             (other, _) => other,
         }
     }
 
-    /// Number and weight of the visibilities in the sums.
+    /// Number and weight of its visibilities.
     #[must_use]
     pub fn counts(&self) -> SumCounts {
         match self {
@@ -67,7 +71,7 @@ impl SnapshotSums {
     }
 }
 
-/// Sums of either engine, or an archive of single visibilities.
+/// The engine of one channel: pixel sums, harmonic sums, or stored visibilities.
 enum Engine {
     Pixel(Box<PixelEngine>),
     Harmonic(Box<HarmonicEngine>),
@@ -75,7 +79,7 @@ enum Engine {
 }
 
 impl Engine {
-    /// The part of one rank of several. Only the harmonic engine divides its sums; others hold all on every rank.
+    /// Restricts the engine to this rank's share. Only the harmonic engine divides its sums; the others hold everything on every rank.
     fn with_ranks(self, ranks: &Ranks) -> Self {
         match self {
             Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.with_ranks(ranks))),
@@ -99,7 +103,7 @@ impl Engine {
         }
     }
 
-    /// Whether it is empty: then there is no map to make.
+    /// Whether it holds no visibility.
     fn is_empty(&self) -> bool {
         let counts = match self {
             Self::Pixel(engine) => engine.counts(),
@@ -109,37 +113,38 @@ impl Engine {
         counts.visibilities == 0
     }
 
-    /// A copy of the sums; for an archive to be refined, its sums on the nearest circle.
-    fn sums(&mut self, config: &MapConfig) -> Result<SnapshotSums, AccumulationError> {
+    /// Copies the data for a snapshot. For refinement these are the harmonic sums on the nearest circular orbit.
+    fn snapshot_data(&mut self, config: &MapConfig) -> Result<SnapshotData, AccumulationError> {
         Ok(match self {
             Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, archive.copy()),
-            Self::Pixel(engine) => SnapshotSums::Pixel(engine.sums()),
-            Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.sums())),
-            Self::Archive(archive) => SnapshotSums::Harmonic(Box::new(archive.circle_sums()?)),
+            Self::Pixel(engine) => SnapshotData::Pixel(engine.sums()),
+            Self::Harmonic(engine) => SnapshotData::Harmonic(Box::new(engine.sums())),
+            Self::Archive(archive) => SnapshotData::Harmonic(Box::new(archive.circle_sums()?)),
         })
     }
 
-    fn into_sums(self, config: &MapConfig) -> SnapshotSums {
+    fn into_final_data(self, config: &MapConfig) -> SnapshotData {
         match self {
             Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, *archive),
-            Self::Pixel(engine) => SnapshotSums::Pixel(engine.into_sums()),
-            Self::Harmonic(engine) => SnapshotSums::Harmonic(Box::new(engine.into_sums())),
-            Self::Archive(archive) => SnapshotSums::Refined(archive),
+            Self::Pixel(engine) => SnapshotData::Pixel(engine.into_sums()),
+            Self::Harmonic(engine) => SnapshotData::Harmonic(Box::new(engine.into_sums())),
+            Self::Archive(archive) => SnapshotData::Refined(archive),
         }
     }
 }
 
-/// Visibilities for a map of pixels without its matrix.
-fn matrix_free(config: &MapConfig, archive: VisibilityArchive) -> SnapshotSums {
-    SnapshotSums::MatrixFree(Box::new(MatrixFreeVisibilities {
+/// Wraps stored visibilities for the matrix-free pixel solver.
+fn matrix_free(config: &MapConfig, archive: VisibilityArchive) -> SnapshotData {
+    SnapshotData::MatrixFree(Box::new(MatrixFreeVisibilities {
         nside: config.nside,
         method: config.rows,
         archive,
     }))
 }
 
-/// State of an accumulator besides its engines, spans and ledger, from which another can resume. Snapshots are numbered
-/// from 1 again: their times depend on how the data arrived.
+/// Checkpoint state of an accumulator, except its engines, time spans and ledger, which are saved separately.
+///
+/// Snapshot numbers are not saved: they start from 1 again, because snapshot times depend on how the data arrived.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct AccumulatorState {
     instrument: Option<Instrument>,
@@ -147,40 +152,40 @@ pub struct AccumulatorState {
     channels: Vec<bool>,
 }
 
-/// The span of no data.
+/// The time span of a channel without data.
 const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
-/// The engine of one channel, and the span of its data.
-struct ChannelSums {
+/// The engine of one channel, and the time span of its data.
+struct ChannelState {
     engine: Engine,
-    /// Noises of further realisations, of the harmonic engine.
-    noises: Option<NoiseSums>,
+    /// Sums of additional noise realisations (harmonic engine only).
+    realisations: Option<NoiseSums>,
     span_s: [f64; 2],
     snapshots: u32,
 }
 
-/// Sums calibrated visibilities; emits snapshots at equal steps of mission time, and a final one.
+/// Accumulates calibrated visibilities, and emits snapshots at equal steps of mission time and a final one.
 pub struct Accumulator {
     config: MapConfig,
     ledger: Ledger<VisibilityReason>,
     instrument: Option<Arc<Instrument>>,
-    channels: Vec<Option<ChannelSums>>,
+    channels: Vec<Option<ChannelState>>,
     next_snapshot_s: Option<f64>,
     accumulated: u64,
     cancel: Cancel,
     memory_max_bytes: Option<u64>,
-    /// The channels of a group; `None` for all.
+    /// The channels to accumulate; `None` for all.
     group: Option<ChannelGroup>,
-    /// The ranks that hold the other parts of the sums.
+    /// The ranks that share the sums.
     ranks: Ranks,
-    /// The part of the sums that is made now, where they are made one after the other.
+    /// The part of the harmonic sums that this reading of the data accumulates, if memory cannot hold all of them.
     part: Option<SumPart>,
-    /// Seeds of further realisations of noise.
-    noise_seeds: Vec<u64>,
+    /// Seeds of the additional noise realisations.
+    realisation_seeds: Vec<u64>,
 }
 
 impl Accumulator {
-    /// A stage that reports to `ledger`.
+    /// Creates a stage that reports to `ledger`.
     #[must_use]
     pub fn new(config: MapConfig, ledger: Ledger<VisibilityReason>) -> Self {
         Self {
@@ -193,68 +198,68 @@ impl Accumulator {
             cancel: Cancel::new(),
             memory_max_bytes: None,
             group: None,
-            ranks: Ranks::one(),
+            ranks: Ranks::single(),
             part: None,
-            noise_seeds: Vec::new(),
+            realisation_seeds: Vec::new(),
         }
     }
 
-    /// Makes it one rank of several: it takes all visibilities and holds its part of the harmonic engine's sums.
+    /// Makes it one of several ranks: it receives all visibilities and holds its share of the harmonic sums.
     #[must_use]
     pub fn with_ranks(self, ranks: &Ranks) -> Self {
         Self { ranks: ranks.clone(), ..self }
     }
 
-    /// Makes a part of the sums of the harmonic engine, and emits them with the last part; there are no snapshots on the way. `None` makes all of
-    /// them at once.
+    /// Accumulates only this part of the harmonic sums; `None` for all of them. The complete sums are emitted after the last part, and no
+    /// snapshots before.
     #[must_use]
-    pub fn in_part(self, part: Option<SumPart>) -> Self {
+    pub fn with_part(self, part: Option<SumPart>) -> Self {
         Self { part, ..self }
     }
 
-    /// Sums noise of further realisations as well, one a seed, for the final sums of the harmonic engine.
+    /// Also accumulates additional noise realisations, one per seed, for the final harmonic sums.
     #[must_use]
-    pub fn with_noises(self, seeds: &[u64]) -> Self {
-        Self { noise_seeds: seeds.to_vec(), ..self }
+    pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
+        Self { realisation_seeds: seeds.to_vec(), ..self }
     }
 
-    /// A copy with the same settings and ledger, without data.
+    /// A copy with the same settings and ledger but without data; additional noise realisations are not copied.
     #[must_use]
-    pub fn without_sums(&self) -> Self {
+    pub fn without_data(&self) -> Self {
         let (config, ledger) = (self.config.clone(), self.ledger.clone());
         Self::new(config, ledger)
             .with_ranks(&self.ranks)
-            .of_group(self.group.clone())
-            .in_part(self.part.clone())
-            .within_memory(self.memory_max_bytes)
+            .with_group(self.group.clone())
+            .with_part(self.part.clone())
+            .with_memory_limit(self.memory_max_bytes)
             .cancelled_by(&self.cancel)
     }
 
-    /// The ranks that hold parts of the sums.
+    /// The ranks that share the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// Restricts it to the channels of a group; `None` for all.
+    /// Restricts it to the channels of a group; `None` for all channels.
     #[must_use]
-    pub fn of_group(self, group: Option<ChannelGroup>) -> Self {
+    pub fn with_group(self, group: Option<ChannelGroup>) -> Self {
         Self { group, ..self }
     }
 
-    /// Refuses instruments whose sums would take more memory, bytes.
+    /// Refuses instruments whose sums would take more than this many bytes.
     #[must_use]
-    pub fn within_memory(self, memory_max_bytes: Option<u64>) -> Self {
+    pub fn with_memory_limit(self, memory_max_bytes: Option<u64>) -> Self {
         Self { memory_max_bytes, ..self }
     }
 
-    /// Once `cancel` is triggered, only final sums are emitted.
+    /// Emits only final data once `cancel` is triggered.
     #[must_use]
     pub fn cancelled_by(self, cancel: &Cancel) -> Self {
         Self { cancel: cancel.clone(), ..self }
     }
 
-    /// Its state besides the engines and spans.
+    /// The checkpoint state, except engines and spans.
     #[must_use]
     pub fn state(&self) -> AccumulatorState {
         AccumulatorState {
@@ -263,47 +268,47 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines one after another; archives of visibilities go into files of their own at `place`.
+    /// Writes its engines one after another; archives of visibilities go into files of their own in `segments`.
     ///
     /// # Errors
     /// The writer's.
     pub fn write_engines(
         &mut self,
         out: &mut dyn Write,
-        place: SegmentPlace<'_>,
+        segments: SegmentFolder<'_>,
     ) -> Result<(), AccumulationError> {
-        for sums in self.channels.iter_mut().flatten() {
-            match &mut sums.engine {
+        for state in self.channels.iter_mut().flatten() {
+            match &mut state.engine {
                 Engine::Pixel(engine) => engine.checkpoint(out)?,
                 Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Archive(archive) => archive.checkpoint(out, place)?,
+                Engine::Archive(archive) => archive.checkpoint(out, segments)?,
             }
         }
         Ok(())
     }
 
-    /// The archive files beside the checkpoint.
+    /// The archive files that belong to the checkpoint.
     pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
-        self.channels.iter().flatten().flat_map(|sums| match &sums.engine {
+        self.channels.iter().flatten().flat_map(|state| match &state.engine {
             Engine::Archive(archive) => archive.segments(),
             Engine::Pixel(_) | Engine::Harmonic(_) => &[],
         })
     }
 
-    /// Forgets the archive files: the next checkpoint goes into another folder.
-    pub fn leave_segments(&mut self) {
-        for sums in self.channels.iter_mut().flatten() {
-            if let Engine::Archive(archive) = &mut sums.engine {
-                archive.leave_segments();
+    /// Forgets the archive files, so that the next checkpoint can go into another folder.
+    pub fn forget_segments(&mut self) {
+        for state in self.channels.iter_mut().flatten() {
+            if let Engine::Archive(archive) = &mut state.engine {
+                archive.forget_segments();
             }
         }
     }
 
-    /// Resumes from a state and its engines, as [`Accumulator::write_engines`] wrote them, with files in `folder`. The channels' spans
-    /// are not part of it: see [`Accumulator::set_spans`].
+    /// Resumes from a state and the engines that [`Accumulator::write_engines`] wrote, with archive files in `folder`. The channels' spans
+    /// are restored by [`Accumulator::retain_spans`].
     ///
     /// # Errors
-    /// Engines that are damaged, or of another kind than configured.
+    /// The engines are damaged, or of another kind than configured.
     pub fn resume(
         self,
         state: AccumulatorState,
@@ -313,11 +318,11 @@ impl Accumulator {
         self.resume_part(state, from, folder, RankShare::WHOLE)
     }
 
-    /// As [`Accumulator::resume`], from engines that were written by the rank of `part`. Only what this rank holds is kept; join the
-    /// other parts.
+    /// Resumes from engines that the rank with share `part` wrote, as [`Accumulator::resume`]. Only the share of this rank is kept; call
+    /// [`Accumulator::join`] for what other ranks wrote.
     ///
     /// # Errors
-    /// Likewise.
+    /// As [`Accumulator::resume`].
     pub fn resume_part(
         self,
         state: AccumulatorState,
@@ -334,36 +339,36 @@ impl Accumulator {
             }
             let engine = match self.config.engine {
                 _ if self.config.holds_visibilities() => {
-                    let most = refine.visibilities_max;
-                    Engine::Archive(Box::new(VisibilityArchive::restore(from, folder, most)?))
+                    let archive = VisibilityArchive::restore(from, folder, refine.visibilities_max)?;
+                    Engine::Archive(Box::new(archive))
                 }
                 EngineKind::Pixel | EngineKind::Auto => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
             };
-            channels.push(Some(ChannelSums { engine, noises: None, span_s: NO_SPAN_S, snapshots: 0 }));
+            channels.push(Some(ChannelState { engine, realisations: None, span_s: NO_SPAN_S, snapshots: 0 }));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
 
-    /// Joins another part of the same sums, channel by channel: the same visibilities at other alphas.
+    /// Adds the share of the sums that another rank wrote, channel by channel. Both must hold the same visibilities, at different alphas
+    /// (see [`crate::imaging::circle`]).
     ///
     /// # Errors
-    /// Parts of different sums.
+    /// The shares are of different sums, or of an engine that does not divide its sums.
     pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
-        let apart = AccumulationError::Mismatch { what: "channels, or sums that have no parts," };
         if self.channels.len() != other.channels.len() {
-            return Err(apart);
+            return Err(AccumulationError::Mismatch { what: "numbers of channels" });
         }
         for (slot, theirs) in self.channels.iter_mut().zip(other.channels) {
             match (slot, theirs) {
                 (None, None) => {}
                 (
-                    Some(ChannelSums { engine: Engine::Harmonic(ours), .. }),
-                    Some(ChannelSums { engine: Engine::Harmonic(theirs), .. }),
+                    Some(ChannelState { engine: Engine::Harmonic(ours), .. }),
+                    Some(ChannelState { engine: Engine::Harmonic(theirs), .. }),
                 ) => ours.join(*theirs)?,
-                _ => return Err(apart),
+                _ => return Err(AccumulationError::Undivided),
             }
         }
         Ok(())
@@ -372,7 +377,7 @@ impl Accumulator {
     /// Adds the sums of another accumulator, channel by channel.
     ///
     /// # Errors
-    /// Engines of different setups.
+    /// The engines have different setups.
     pub fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
         if self.instrument.is_none() {
             self.instrument = other.instrument;
@@ -399,44 +404,44 @@ impl Accumulator {
         Ok(())
     }
 
-    /// Subtracts visibilities from the sums of their channel; posts nothing to the ledger.
+    /// Removes visibilities from their channel without posting to the ledger.
     ///
-    /// Visibilities beyond the map's longest baseline never were in the sums: they are neither subtracted nor refused.
+    /// Visibilities beyond the map's longest baseline were never added: they are neither removed nor refused.
     ///
     /// # Errors
-    /// A channel that holds nothing, or as [`NormalEngine::remove`].
+    /// The channel holds nothing, or as [`NormalEngine::remove`].
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
-        if near.is_empty() {
+        let short = within_baseline(placed, self.config.baseline_m_max(placed.frequency_hz));
+        if short.is_empty() {
             return Ok(Added::default());
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
-        let sums = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        sums.engine.remove(&near)
+        let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        state.engine.remove(&short)
     }
 
-    /// Sets the first and last mission time, s, of the data in each channel; drops the sums of all others.
-    pub fn set_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
+    /// Sets the first and last mission time, s, of the data in each channel, and drops channels without a span.
+    pub fn retain_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
         for (slot, channel) in self.channels.iter_mut().zip(0..) {
             match (slot.as_mut(), spans_s.get(&ChannelId(channel))) {
-                (Some(sums), Some(&span_s)) => sums.span_s = span_s,
+                (Some(state), Some(&span_s)) => state.span_s = span_s,
                 _ => *slot = None,
             }
         }
     }
 
-    /// Takes the next frame, and emits snapshots that are due; returns the first and last mission time, s, of the
-    /// visibilities that were offered to an engine.
+    /// Accepts the next frame and emits the snapshots that are due. Returns the first and last mission time, s, of the visibilities that
+    /// were passed to an engine.
     ///
     /// # Errors
-    /// As [`NormalEngine::add`]; an instrument that the map's settings do not fit.
+    /// As [`NormalEngine::add`]; or the map's settings do not fit the instrument.
     pub fn accept(
         &mut self,
         frame: PlacedFrame,
         out: &mut Outlet<Snapshot>,
     ) -> Result<Option<[f64; 2]>, AccumulationError> {
         match frame {
-            PlacedFrame::Instrument(instrument) => self.open(instrument)?,
+            PlacedFrame::Instrument(instrument) => self.set_instrument(instrument)?,
             PlacedFrame::Visibilities(placed) => {
                 if let Some(&time_s) = placed.time_s.first() {
                     self.emit_if_due(time_s, out)?;
@@ -445,17 +450,18 @@ impl Accumulator {
             }
             PlacedFrame::Elsewhere(counted) => {
                 self.emit_if_due(counted.first_s, out)?;
-                self.ledger.left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
+                self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
             }
             PlacedFrame::Housekeeping(_) => {}
         }
         Ok(None)
     }
 
-    fn open(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
+    /// Checks an instrument against the map's settings, and starts anew with it.
+    fn set_instrument(&mut self, instrument: Instrument) -> Result<(), AccumulationError> {
         let channels = instrument.channels.len();
-        if let Some(misfit) = self.config.misfits(channels).into_iter().next() {
-            return Err(misfit.into());
+        if let Some(mismatch) = self.config.mismatches(channels).into_iter().next() {
+            return Err(mismatch.into());
         }
         self.config.check_priors(&instrument)?;
         self.config.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?;
@@ -464,77 +470,77 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The sums that `placed` belongs to, created with the first data; or why its positions determine no orbit.
-    fn sums(
+    /// The channel of `placed`, created by its first data.
+    fn channel_or_new(
         &mut self,
         placed: &PlacedVisibilities,
-    ) -> Result<Result<&mut ChannelSums, VisibilityReason>, AccumulationError> {
+    ) -> Result<NewOrRefused<&mut ChannelState>, AccumulationError> {
         let channel = placed.channel;
         let index = usize::from(channel.0);
         let unknown = || AccumulationError::UnknownChannel(channel);
         let instrument = self.instrument.as_ref().ok_or_else(unknown)?;
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
-        let sums = match slot {
-            Some(sums) => sums,
-            empty => match engine(&self.config, instrument, placed)? {
+        let state = match slot {
+            Some(state) => state,
+            empty => match new_engine(&self.config, instrument, placed)? {
                 Ok(engine) => {
                     let engine = match &self.part {
                         Some(part) => engine.with_ranks(&part.ranks()),
                         None => engine.with_ranks(&self.ranks),
                     };
-                    let noises = match &engine {
-                        Engine::Harmonic(engine) if !self.noise_seeds.is_empty() => {
-                            Some(NoiseSums::new(engine, &self.noise_seeds))
+                    let realisations = match &engine {
+                        Engine::Harmonic(engine) if !self.realisation_seeds.is_empty() => {
+                            Some(NoiseSums::new(engine, &self.realisation_seeds))
                         }
                         _ => None,
                     };
-                    empty.insert(ChannelSums { engine, noises, span_s: NO_SPAN_S, snapshots: 0 })
+                    empty.insert(ChannelState { engine, realisations, span_s: NO_SPAN_S, snapshots: 0 })
                 }
                 Err(reason) => return Ok(Err(reason)),
             },
         };
-        Ok(Ok(sums))
+        Ok(Ok(state))
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
-        let is_other = self.group.as_ref().is_some_and(|group| !group.contains(&placed.channel));
-        if is_other || !self.config.maps(placed.channel) {
-            self.ledger.left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
+        let is_in_group = self.group.as_ref().is_none_or(|group| group.contains(&placed.channel));
+        if !is_in_group || !self.config.is_mapped(placed.channel) {
+            self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
-        let near = within(placed, self.config.baseline_m_max(placed.frequency_hz));
-        self.ledger.left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - near.len()) as u64);
-        if near.is_empty() {
-            // A channel without usable data has no sums, and no map.
+        let short = within_baseline(placed, self.config.baseline_m_max(placed.frequency_hz));
+        self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - short.len()) as u64);
+        if short.is_empty() {
+            // A channel without usable data gets no engine and no map.
             return Ok(None);
         }
-        let sums = match self.sums(&near)? {
-            Ok(sums) => sums,
+        let state = match self.channel_or_new(&short)? {
+            Ok(state) => state,
             Err(reason) => {
-                self.ledger.left_out(reason, near.len() as u64);
+                self.ledger.add_left_out(reason, short.len() as u64);
                 return Ok(None);
             }
         };
-        let Added { visibilities, refused } = sums.engine.add(&near)?;
-        if let (Engine::Harmonic(engine), Some(noises)) = (&sums.engine, &mut sums.noises) {
-            noises.add(engine, &near);
+        let Added { visibilities, refused } = state.engine.add(&short)?;
+        if let (Engine::Harmonic(engine), Some(realisations)) = (&state.engine, &mut state.realisations) {
+            realisations.add(engine, &short);
         }
-        let offered_s = near.time_s.first().zip(near.time_s.last()).map(|(&first, &last)| [first, last]);
+        let offered_s = short.time_s.first().zip(short.time_s.last()).map(|(&first, &last)| [first, last]);
         if let Some([first, last]) = offered_s {
-            sums.span_s = [sums.span_s[0].min(first), sums.span_s[1].max(last)];
+            state.span_s = [state.span_s[0].min(first), state.span_s[1].max(last)];
         }
         self.accumulated += visibilities;
-        self.ledger.accumulated(visibilities);
+        self.ledger.add_accumulated(visibilities);
         for (reason, count) in refused {
-            self.ledger.left_out(reason.into(), count);
+            self.ledger.add_left_out(reason.into(), count);
         }
         Ok(offered_s)
     }
 
-    /// Emits a snapshot of what earlier sessions have summed, if snapshots are wanted.
+    /// Emits snapshots of the data of earlier sessions, if snapshots are wanted.
     ///
     /// # Errors
-    /// Sums that cannot be written down.
+    /// As [`NormalEngine::add`], for the harmonic sums of stored visibilities.
     pub fn emit_resumed(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         if self.config.snapshot_every_s > 0.0 { self.emit(out) } else { Ok(()) }
     }
@@ -546,23 +552,23 @@ impl Accumulator {
             if self.cancel.is_cancelled() {
                 return Ok(());
             }
-            let Some(channel) = slot.as_mut().filter(|channel| !channel.engine.is_empty()) else { continue };
-            channel.snapshots += 1;
+            let Some(state) = slot.as_mut().filter(|state| !state.engine.is_empty()) else { continue };
+            state.snapshots += 1;
             let snapshot = Snapshot {
                 instrument: Arc::clone(instrument),
                 channel: ChannelId(index as u16),
-                number: channel.snapshots,
+                number: state.snapshots,
                 is_final: false,
-                span_s: channel.span_s,
+                span_s: state.span_s,
                 nside: self.config.nside,
-                sums: channel.engine.sums(&self.config)?,
+                data: state.engine.snapshot_data(&self.config)?,
             };
             out.push_unless(snapshot, &self.cancel);
         }
         Ok(())
     }
 
-    /// Emits snapshots when data of a later step of mission time arrives.
+    /// Emits snapshots when the first data of the next step of mission time arrive.
     fn emit_if_due(&mut self, time_s: f64, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let every_s = self.config.snapshot_every_s;
         if every_s <= 0.0 || self.part.is_some() {
@@ -581,12 +587,15 @@ impl Accumulator {
     }
 }
 
-/// An engine for the channel of `placed`, which is its first data; or why its positions determine no orbit.
-fn engine(
+/// A value, or why it could not be created from the first data of its channel.
+type NewOrRefused<T> = Result<T, VisibilityReason>;
+
+/// Creates an engine for the channel of `placed`, its first data; refuses positions that determine no usable orbit.
+fn new_engine(
     config: &MapConfig,
     instrument: &Instrument,
     placed: &PlacedVisibilities,
-) -> Result<Result<Engine, VisibilityReason>, AccumulationError> {
+) -> Result<NewOrRefused<Engine>, AccumulationError> {
     let Some(&Channel { frequency_hz, width_hz }) = instrument.channels.get(usize::from(placed.channel.0))
     else {
         return Err(AccumulationError::UnknownChannel(placed.channel));
@@ -600,7 +609,7 @@ fn engine(
         _ if config.holds_visibilities() => {
             Ok(Engine::Archive(Box::new(VisibilityArchive::new(RefinedSetup {
                 channel: placed.channel,
-                // Pixels have no degrees.
+                // A pixel map has no l_max.
                 l_max: if config.is_matrix_free() { 0 } else { config.degree() },
                 frequency_hz,
                 baseline_m_max: config.baseline_m_max(frequency_hz),
@@ -621,8 +630,9 @@ fn engine(
             companion_seed: config.companion_seed,
             weight_max,
         })?))),
-        EngineKind::Harmonic => match orbit_of(placed, config.limits) {
-            // Positions come from outside: what no satellite can have is refused, and later data may have others.
+        EngineKind::Harmonic => match nominal_orbit(placed, config.limits) {
+            // Positions are untrusted: an orbit inside the Moon, or smaller than the longest baseline, is refused. Later data may still
+            // create the engine.
             Some(orbit) if orbit.radius_m <= moon_radius_m.max(config.baseline_m_max(frequency_hz)) => {
                 Err(VisibilityReason::OffAltitude)
             }
@@ -641,10 +651,10 @@ fn engine(
     })
 }
 
-/// The visibilities whose baseline is shorter than `baseline_m_max`.
-fn within(placed: &PlacedVisibilities, baseline_m_max: f64) -> PlacedVisibilities {
-    let is_near = |k: &usize| norm(sub(placed.r_i_m[*k], placed.r_j_m[*k])) < baseline_m_max;
-    let kept: Vec<usize> = (0..placed.len()).filter(is_near).collect();
+/// The visibilities whose baselines are shorter than `baseline_m_max`.
+fn within_baseline(placed: &PlacedVisibilities, baseline_m_max: f64) -> PlacedVisibilities {
+    let is_short = |k: &usize| norm(sub(placed.r_i_m[*k], placed.r_j_m[*k])) < baseline_m_max;
+    let kept: Vec<usize> = (0..placed.len()).filter(is_short).collect();
     fn pick<T: Copy>(from: &[T], kept: &[usize]) -> Vec<T> {
         kept.iter().map(|&k| from[k]).collect()
     }
@@ -677,19 +687,19 @@ impl Stage for Accumulator {
             if out.is_closed() {
                 return Ok(());
             }
-            let Some(ChannelSums { engine, noises, span_s, snapshots }) =
-                slot.filter(|sums| !sums.engine.is_empty())
+            let Some(ChannelState { engine, realisations, span_s, snapshots }) =
+                slot.filter(|state| !state.engine.is_empty())
             else {
                 continue;
             };
-            let sums = match (&self.part, engine) {
-                // Later parts would be of other data.
+            let data = match (&self.part, engine) {
+                // After cancellation the remaining parts would not see the same visibilities, so nothing is emitted.
                 (Some(_), _) if self.cancel.is_cancelled() => continue,
                 (Some(part), Engine::Harmonic(engine)) => match engine.finish_part(part)? {
-                    Some(sums) => SnapshotSums::Harmonic(Box::new(sums)),
+                    Some(sums) => SnapshotData::Harmonic(Box::new(sums)),
                     None => continue,
                 },
-                (_, engine) => engine.into_sums(&self.config).with_noises(noises),
+                (_, engine) => engine.into_final_data(&self.config).with_noise_realisations(realisations),
             };
             out.push(Snapshot {
                 instrument: Arc::clone(&instrument),
@@ -698,7 +708,7 @@ impl Stage for Accumulator {
                 is_final: true,
                 span_s,
                 nside: self.config.nside,
-                sums,
+                data,
             });
         }
         Ok(())

@@ -1,7 +1,7 @@
-//! The stages of the pipeline that make maps: one that keeps the sums of each channel, one that solves them.
+//! The two pipeline stages that make maps: one accumulates the sums of each channel, the other solves them.
 
 mod accumulate;
 mod solve;
 
-pub use accumulate::{Accumulator, AccumulatorState, Snapshot, SnapshotSums};
+pub use accumulate::{Accumulator, AccumulatorState, Snapshot, SnapshotData};
 pub use solve::{Solution, Solver, SolverSetup};

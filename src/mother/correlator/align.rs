@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::frames::{ObservingWindow, SampleBlock};
 
-/// Counters of what happened to the received blocks.
+/// Counts of received and missing blocks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct AlignerCounts {
     /// Blocks used.
@@ -39,7 +39,7 @@ impl AlignerCounts {
     }
 }
 
-/// The blocks of one number, of all channels and daughters.
+/// Blocks of one number, of all channels and daughters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BlockRow {
     /// Number of the blocks.
@@ -50,7 +50,7 @@ pub struct BlockRow {
     pub blocks: Vec<Option<SampleBlock>>,
 }
 
-/// The shape of a window's streams.
+/// Dimensions of a window's sample streams.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StreamShape {
     /// Number of daughters.
@@ -61,7 +61,7 @@ pub struct StreamShape {
     pub block_samples: usize,
     /// Width of a channel, Hz, which is the sample rate.
     pub width_hz: f64,
-    /// Number of blocks that may arrive beyond a missing one before it is given up.
+    /// Number of blocks that may arrive after a missing one before it is given up.
     pub wait_blocks: u64,
 }
 
@@ -85,7 +85,7 @@ struct PartialRow {
 }
 
 impl Aligner {
-    /// An aligner of `window`.
+    /// Creates an aligner for `window`.
     #[must_use]
     pub fn new(streams: StreamShape, window: ObservingWindow) -> Self {
         let length_s = (window.end.0 - window.start.0) as f64 * 1e-6;
@@ -100,7 +100,7 @@ impl Aligner {
         self.samples
     }
 
-    /// The counters so far.
+    /// Counts so far.
     #[must_use]
     pub fn counts(&self) -> AlignerCounts {
         self.counts
@@ -121,7 +121,7 @@ impl Aligner {
             return Vec::new();
         }
         let mut rows = Vec::new();
-        // Far ahead: give up incomplete rows before it.
+        // Rows far behind the block are released incomplete.
         while number >= self.next + self.streams.wait_blocks {
             rows.push(self.release());
         }
@@ -167,9 +167,9 @@ impl Aligner {
 
     /// Number of samples of a block; 0 beyond the window.
     fn length(&self, number: u64) -> usize {
-        let whole = self.streams.block_samples as u64;
-        let first = number.saturating_mul(whole);
-        self.samples.saturating_sub(first).min(whole) as usize
+        let block_samples = self.streams.block_samples as u64;
+        let first = number.saturating_mul(block_samples);
+        self.samples.saturating_sub(first).min(block_samples) as usize
     }
 
     fn is_well_formed(&self, block: &SampleBlock, length: usize) -> bool {
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_late_duplicate_and_malformed_blocks_are_counted_and_not_guessed() {
+    fn missing_late_duplicate_and_malformed_blocks_are_counted() {
         let mut aligner = aligner();
         assert!(aligner.put(block(0, 0)).is_empty());
         assert!(aligner.put(block(0, 0)).is_empty());

@@ -1,24 +1,24 @@
-//! Integrates auto-correlations, which carry the sky's mean.
+//! Integration of auto-correlations, which carry the sky's mean.
 
 use num_complex::Complex32;
 
 use super::integrate::COMPLETE_MIN;
 use super::kernel::LANES;
-use crate::array::EarthShadow;
+use crate::array::EarthOccultation;
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::units::{ChannelId, Pair};
 
-/// Auto-correlations per block of one daughter and channel.
+/// Maximum number of auto-correlations in a block of one daughter and channel.
 const HELD_MAX: usize = 256;
 
-/// The powers of a row of blocks.
+/// Powers of a row of blocks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowPowers {
-    /// By daughter and lane: sum of |x|^2, K sr, and number of samples.
+    /// Sum of |x|^2, K sr, and number of samples, by daughter and lane.
     pub sums: Vec<[(f64, u64); LANES]>,
     /// Expected number of samples.
     pub samples: u64,
-    /// By daughter and lane: whether too many samples were out of range.
+    /// Whether too many samples were out of range, by daughter and lane.
     pub saturated: Vec<[bool; LANES]>,
 }
 
@@ -30,8 +30,8 @@ pub struct AutoIntegrator {
     first_channel: usize,
     lanes: usize,
     window: ObservingWindow,
-    /// Present if the Earth in sight is flagged.
-    shadow: Option<EarthShadow>,
+    /// Occultation of the Earth, if auto-correlations with the Earth in sight are flagged.
+    shadow: Option<EarthOccultation>,
     duration_ticks: u32,
     from_ticks: u32,
     sums: Vec<[(f64, u64); LANES]>,
@@ -41,7 +41,8 @@ pub struct AutoIntegrator {
 }
 
 impl AutoIntegrator {
-    /// An integrator of `lanes` channels from `first_channel` on, over `duration_s` or one row, whichever is longer.
+    /// Creates an integrator of `lanes` channels from `first_channel` on, over `duration_s` or one row, whichever is
+    /// longer.
     #[must_use]
     pub fn new(
         first_channel: usize,
@@ -64,9 +65,9 @@ impl AutoIntegrator {
         }
     }
 
-    /// Flags auto-correlations for which the Earth is not hidden from their daughter.
+    /// Flags auto-correlations of daughters that see the Earth.
     #[must_use]
-    pub fn with_shadow(self, shadow: Option<EarthShadow>) -> Self {
+    pub fn with_earth_occultation(self, shadow: Option<EarthOccultation>) -> Self {
         Self { shadow, ..self }
     }
 
@@ -81,7 +82,7 @@ impl AutoIntegrator {
                 self.saturated[daughter][lane] |= saturated[lane];
             }
         }
-        // If one more such row would exceed the integration time, it begins the next integration.
+        // If one more such row would exceed the integration time, it starts the next integration.
         let elapsed = f64::from(until_ticks.saturating_sub(self.from_ticks));
         let one_more = elapsed * row.samples as f64 / self.samples.max(1) as f64;
         if elapsed + one_more > f64::from(self.duration_ticks) {
@@ -89,7 +90,7 @@ impl AutoIntegrator {
         }
     }
 
-    /// Ends all integrations and emits all blocks held.
+    /// Ends all integrations and emits all held blocks.
     pub fn finish(&mut self, until_ticks: u32, out: &mut Vec<VisibilityBlock>) {
         if self.samples > 0 {
             self.close(until_ticks, out);

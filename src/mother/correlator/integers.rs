@@ -1,9 +1,10 @@
 //! Products of quantised samples in integer arithmetic, 16 channels at a time.
 //!
-//! A code `c` represents the level `(2 c + 1)` in units of half a step. The two parts of a sample are adjacent, so that
-//! one pairwise multiply-add gives `re re' + im im'` of eight channels, and, with the parts of one daughter exchanged
-//! (`im`, `-re`), the imaginary part `im re' - re im'` of `x conj(x')`. Levels are below 2^8 and their products below
-//! 2^16, so sums of two products over `SLICE` = 2^4 samples are below 2^21 and exact, even in `f32`.
+//! A code `c` represents the level `(2 c + 1)` in units of half a step. The real and imaginary part of a sample are
+//! adjacent, so that one pairwise multiply-add gives `re re' + im im'` of eight channels, and, with the parts of one
+//! daughter exchanged (`im`, `-re`), the imaginary part `im re' - re im'` of `x conj(x')`. Levels are below 2^8 and
+//! their products below 2^16, so sums of two products over `SLICE` = 2^4 samples are below 2^21 and exact, even in
+//! `f32`.
 
 use pulp::Arch;
 
@@ -18,11 +19,11 @@ const EIGHT: usize = LANES / 2;
 #[derive(Clone, Copy, Debug)]
 struct Sample {
     plain: [Half; 2],
-    turned: [Half; 2],
+    exchanged: [Half; 2],
 }
 
 impl Sample {
-    const SILENCE: Self = Self { plain: [[0; 16]; 2], turned: [[0; 16]; 2] };
+    const SILENCE: Self = Self { plain: [[0; 16]; 2], exchanged: [[0; 16]; 2] };
 }
 
 /// A slice of levels of all daughters in the kernel's order: by sample, then by daughter.
@@ -120,11 +121,11 @@ impl Levels {
             for (k, own) in own.iter_mut().enumerate() {
                 let (a, b) = (&a[k % 2], &b[k / 2].plain[half]);
                 own[0] = machine.add(&a.plain[half], b, own[0]);
-                own[1] = machine.add(&a.turned[half], b, own[1]);
+                own[1] = machine.add(&a.exchanged[half], b, own[1]);
             }
         }
         for (k, own) in own.into_iter().enumerate() {
-            self.hand_over(machine, [i + k % 2, j + k / 2, half], own, sums);
+            self.add_scaled(machine, [i + k % 2, j + k / 2, half], own, sums);
         }
     }
 
@@ -136,17 +137,17 @@ impl Levels {
             let (a, b) = (&sample[j], &sample[j + 1]);
             own[0] = machine.add(&a.plain[half], &a.plain[half], own[0]);
             own[1] = machine.add(&a.plain[half], &b.plain[half], own[1]);
-            own[2] = machine.add(&a.turned[half], &b.plain[half], own[2]);
+            own[2] = machine.add(&a.exchanged[half], &b.plain[half], own[2]);
             own[3] = machine.add(&b.plain[half], &b.plain[half], own[3]);
         }
-        self.hand_over(machine, [j, j, half], [own[0], machine.zero()], sums);
-        self.hand_over(machine, [j, j + 1, half], [own[1], own[2]], sums);
-        self.hand_over(machine, [j + 1, j + 1, half], [own[3], machine.zero()], sums);
+        self.add_scaled(machine, [j, j, half], [own[0], machine.zero()], sums);
+        self.add_scaled(machine, [j, j + 1, half], [own[1], own[2]], sums);
+        self.add_scaled(machine, [j + 1, j + 1, half], [own[3], machine.zero()], sums);
     }
 
     /// Scales the sums of a product by the steps of both daughters and adds them.
     #[inline(always)]
-    fn hand_over<M: PairMultiply>(
+    fn add_scaled<M: PairMultiply>(
         &self,
         machine: M,
         [i, j, half]: [usize; 3],
@@ -155,7 +156,7 @@ impl Levels {
     ) {
         let steps = [i, j].map(|n| &self.half_steps[n].as_chunks::<EIGHT>().0[half]);
         for (own, sums) in own.into_iter().zip(&mut sums[product(i, j)]) {
-            machine.hand_over(own, steps, &mut sums.as_chunks_mut::<EIGHT>().0[half]);
+            machine.add_scaled(own, steps, &mut sums.as_chunks_mut::<EIGHT>().0[half]);
         }
     }
 }
@@ -168,7 +169,7 @@ trait PairMultiply: Copy {
     /// Adds the products of adjacent parts.
     fn add(self, a: &Half, b: &Half, sum: Self::Output) -> Self::Output;
     /// `out += sum x steps`.
-    fn hand_over(self, sum: Self::Output, steps: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]);
+    fn add_scaled(self, sum: Self::Output, steps: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]);
 }
 
 /// The portable version.
@@ -178,11 +179,11 @@ mod plain {
     pub(super) fn put(codes: &Codes, rows: &mut [Sample], stride: usize) {
         for (k, row) in rows.iter_mut().step_by(stride).enumerate() {
             for lane in 0..LANES {
-                let there = i16::from(codes.steps[lane] > 0.0);
-                let [re, im] = codes.parts.map(|part| 2 * i16::from(part[lane][k]) + there);
+                let is_present = i16::from(codes.steps[lane] > 0.0);
+                let [re, im] = codes.parts.map(|part| 2 * i16::from(part[lane][k]) + is_present);
                 let (half, at) = (lane / EIGHT, 2 * (lane % EIGHT));
                 row.plain[half][at..at + 2].copy_from_slice(&[re, im]);
-                row.turned[half][at..at + 2].copy_from_slice(&[im, -re]);
+                row.exchanged[half][at..at + 2].copy_from_slice(&[im, -re]);
             }
         }
     }
@@ -208,7 +209,7 @@ mod plain {
         }
 
         #[inline(always)]
-        fn hand_over(self, sum: Self::Output, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
+        fn add_scaled(self, sum: Self::Output, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
             for k in 0..EIGHT {
                 out[k] += sum[k] as f32 * (a[k] * b[k]);
             }
@@ -233,11 +234,11 @@ mod x86 {
     pub(super) fn put(simd: V3, codes: &Codes, rows: &mut [Sample], stride: usize) {
         let avx2 = simd.avx2;
         // Lower byte of a level before the shift: one half, where there are samples.
-        let mut there = [[0_i8; 2]; LANES];
-        for (there, lane) in there.iter_mut().zip(ORDER) {
-            *there = [if codes.steps[lane] > 0.0 { i8::MIN } else { 0 }; 2];
+        let mut is_present = [[0_i8; 2]; LANES];
+        for (is_present, lane) in is_present.iter_mut().zip(ORDER) {
+            *is_present = [if codes.steps[lane] > 0.0 { i8::MIN } else { 0 }; 2];
         }
-        let there: __m256i = cast(there);
+        let is_present: __m256i = cast(is_present);
         let exchange: __m256i = cast(EXCHANGE);
         let sign: __m256i = cast(SIGN);
         // Interleave the parts; each half of a register holds samples of eight channels.
@@ -254,14 +255,16 @@ mod x86 {
             let samples = transpose(simd, channels);
             for (k, sample) in samples.into_iter().enumerate() {
                 let row = &mut rows[(first + k) * stride];
-                let halves =
-                    [avx2._mm256_unpacklo_epi8(there, sample), avx2._mm256_unpackhi_epi8(there, sample)];
+                let halves = [
+                    avx2._mm256_unpacklo_epi8(is_present, sample),
+                    avx2._mm256_unpackhi_epi8(is_present, sample),
+                ];
                 for (half, levels) in halves.into_iter().enumerate() {
                     // (256 c + 128) / 128.
                     let levels = avx2._mm256_srai_epi16::<7>(levels);
-                    let turned = avx2._mm256_sign_epi16(avx2._mm256_shuffle_epi8(levels, exchange), sign);
+                    let exchanged = avx2._mm256_sign_epi16(avx2._mm256_shuffle_epi8(levels, exchange), sign);
                     row.plain[half] = cast(levels);
-                    row.turned[half] = cast(turned);
+                    row.exchanged[half] = cast(exchanged);
                 }
             }
         }
@@ -315,7 +318,7 @@ mod x86 {
         }
 
         #[inline(always)]
-        fn hand_over(self, sum: __m256i, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
+        fn add_scaled(self, sum: __m256i, [a, b]: [&[f32; EIGHT]; 2], out: &mut [f32; EIGHT]) {
             let avx = self.0.avx;
             let steps = avx._mm256_mul_ps(cast(*a), cast(*b));
             let scaled = avx._mm256_mul_ps(avx._mm256_cvtepi32_ps(sum), steps);
@@ -344,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn sums_are_those_of_a_plain_loop_to_the_last_bit() {
+    fn sums_equal_those_of_a_simple_loop_bit_by_bit() {
         for daughters in [2, 3, 8] {
             for arch in [Arch::new(), Arch::Scalar] {
                 let mut levels = Levels::new(daughters);

@@ -1,26 +1,26 @@
-//! Integrates short dumps for as long as the motion of each baseline allows.
+//! Integration of short dumps, for as long as the motion of each baseline allows.
 
 use num_complex::Complex32;
 
 use super::kernel::{LANES, ProductSums, product};
-use crate::array::{Array, EarthShadow, integration_time_s};
+use crate::array::{Array, EarthOccultation, integration_time_s};
 use crate::frames::{Flags, ObservingWindow, VisibilityBlock};
 use crate::mother::Schedule;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, scale, sub};
 use crate::units::{ChannelId, Pair, TICKS_PER_SECOND, all_pairs};
 
-/// Visibilities per block of one pair and channel, once the powers are known.
+/// Maximum number of visibilities in a block of one pair and channel, once the powers are known.
 const HELD_MAX: usize = 2048;
 
-/// Weight of a visibility without samples, which is flagged: the downlink accepts positive weights only.
+/// Weight of a flagged visibility without samples: the downlink accepts positive weights only.
 const NO_WEIGHT: f32 = f32::MIN_POSITIVE;
 
 /// An integration with a smaller fraction of its samples is flagged as incomplete: its effective middle may then be off
 /// by a twentieth of its length, 2 degrees of fringe.
 pub(super) const COMPLETE_MIN: f64 = 0.9;
 
-/// How dumps are combined into integrations.
+/// Rule that combines dumps into integrations.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DumpRule {
     /// Samples per dump; with sub-bands, per sub-band.
@@ -43,12 +43,12 @@ impl DumpRule {
     }
 }
 
-/// Which samples of a dump arrived, for one group of channels.
+/// Samples of a dump that arrived, for one group of channels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Presence {
-    /// By product and lane: number of samples that arrived from both daughters.
+    /// Number of samples that arrived from both daughters, by product and lane.
     pub common: Vec<[u32; LANES]>,
-    /// By daughter and lane: whether too many samples were out of range.
+    /// Whether too many samples were out of range, by daughter and lane.
     pub saturated: Vec<[bool; LANES]>,
 }
 
@@ -58,8 +58,8 @@ pub struct GroupIntegrator {
     schedules: Vec<Schedule>,
     rule: DumpRule,
     window: ObservingWindow,
-    /// Present if the Earth in sight is flagged.
-    shadow: Option<EarthShadow>,
+    /// Occultation of the Earth, if visibilities with the Earth in sight are flagged.
+    shadow: Option<EarthOccultation>,
     /// Number of dumps in the window.
     dumps: u64,
     now: u64,
@@ -86,7 +86,7 @@ struct PairLanes {
 }
 
 impl GroupIntegrator {
-    /// Integrators of the channels from `first_channel` on, one per schedule, over `dumps` dumps of a window.
+    /// Creates integrators of the channels from `first_channel` on, one per schedule, over `dumps` dumps of a window.
     #[must_use]
     pub fn new(
         first_channel: usize,
@@ -119,14 +119,14 @@ impl GroupIntegrator {
         own
     }
 
-    /// Flags visibilities for which the Earth is not hidden from both daughters.
+    /// Flags visibilities of pairs of which a daughter sees the Earth.
     #[must_use]
-    pub fn with_shadow(self, shadow: Option<EarthShadow>) -> Self {
+    pub fn with_earth_occultation(self, shadow: Option<EarthOccultation>) -> Self {
         Self { shadow, ..self }
     }
 
-    /// Declares that `powers` (by daughter and lane, K sr) are accurate enough for weights, and weights the visibilities
-    /// held so far.
+    /// Marks `powers` (by daughter and lane, K sr) as accurate enough for weights, and weights the visibilities held
+    /// so far.
     pub fn set_powers_known(&mut self, powers: &[[f64; LANES]]) {
         if std::mem::replace(&mut self.powers_known, true) {
             return;
@@ -173,7 +173,7 @@ impl GroupIntegrator {
         }
     }
 
-    /// Ends all integrations and emits all blocks held.
+    /// Ends all integrations and emits all held blocks.
     pub fn finish(&mut self, powers: &[[f64; LANES]], out: &mut Vec<VisibilityBlock>) {
         for lane in 0..self.schedules.len() {
             for at in 0..self.pairs.len() {
@@ -193,7 +193,7 @@ impl GroupIntegrator {
         }
     }
 
-    /// Begins an integration at the next dump.
+    /// Starts an integration at the next dump.
     fn open(&mut self, at: usize, lane: usize, array: &Array) {
         let (now, schedule) = (self.now, self.schedules[lane]);
         let t_s = self.window.start.plus_ticks(i64::from(self.rule.ticks(now))).seconds();
@@ -237,7 +237,7 @@ impl GroupIntegrator {
         block.offset_ticks.push(rule.ticks(from));
         block.duration_ticks.push(rule.ticks(self.now) - rule.ticks(from));
         block.value_k_sr.push(Complex32::new(mean(own.re[lane]), mean(own.im[lane])));
-        // Variance of the mean of products of independent samples, in one part: P_i P_j / (2 n).
+        // Variance of the real or imaginary part of a mean of products of independent samples: P_i P_j / (2 n).
         block.weight.push(weight_of(2.0 * used / power));
         block.flags.push(flags);
         if self.powers_known && block.len() >= HELD_MAX {
@@ -251,7 +251,7 @@ fn power_of(pair: Pair, powers: &[[f64; LANES]], lane: usize) -> f64 {
     powers[usize::from(pair.i)][lane] * powers[usize::from(pair.j)][lane]
 }
 
-/// A weight for the downlink: finite and positive.
+/// Weight for the downlink: finite and positive.
 fn weight_of(weight: f64) -> f32 {
     let weight = weight as f32;
     if weight.is_finite() { weight.max(NO_WEIGHT) } else { NO_WEIGHT }
@@ -275,7 +275,7 @@ impl PairLanes {
     }
 }
 
-/// The shortest integration of any correlated pair in any channel, s.
+/// Shortest integration of any correlated pair in any channel, s.
 #[must_use]
 pub fn shortest_integration_s(array: &Array, schedules: &[Schedule]) -> f64 {
     let last = array.satellites() - 1;

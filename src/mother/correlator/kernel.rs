@@ -81,7 +81,7 @@ impl Packed {
             }
         }
         if self.quantised {
-            // From now on all samples are packed as values, including those of this slice packed before.
+            // From here on all samples are packed as values, including those of this slice packed before.
             self.quantised = false;
             for other in (0..self.codes.len()).filter(|&other| other != daughter) {
                 self.put_values(other, [[0.0; SLICE * LANES]; 2]);
@@ -204,7 +204,7 @@ fn add<S: Simd, const PARTS: usize>(
 
 /// `sum + a conj(b)`.
 #[inline(always)]
-fn fold<S: Simd>(simd: S, a: [S::f32s; 2], b: [S::f32s; 2], sum: &mut [S::f32s; 2]) {
+fn multiply_add<S: Simd>(simd: S, a: [S::f32s; 2], b: [S::f32s; 2], sum: &mut [S::f32s; 2]) {
     sum[0] = simd.mul_add_f32s(a[0], b[0], sum[0]);
     sum[1] = simd.mul_add_f32s(a[1], b[0], sum[1]);
     sum[0] = simd.mul_add_f32s(a[1], b[1], sum[0]);
@@ -231,10 +231,10 @@ fn tile<S: Simd, const PARTS: usize>(
     let mut own = [[simd.splat_f32s(0.0); 2]; 4];
     for sample in data.chunks_exact(groups * PLANES * PARTS) {
         let (a, b) = (load::<S, PARTS>(sample, i, part), load::<S, PARTS>(sample, j, part));
-        fold(simd, a[0], b[0], &mut own[0]);
-        fold(simd, a[1], b[0], &mut own[1]);
-        fold(simd, a[0], b[1], &mut own[2]);
-        fold(simd, a[1], b[1], &mut own[3]);
+        multiply_add(simd, a[0], b[0], &mut own[0]);
+        multiply_add(simd, a[1], b[0], &mut own[1]);
+        multiply_add(simd, a[0], b[1], &mut own[2]);
+        multiply_add(simd, a[1], b[1], &mut own[3]);
     }
     for (k, own) in own.into_iter().enumerate() {
         add::<S, PARTS>(simd, part, own, &mut sums[product(2 * i + k % 2, 2 * j + k / 2)]);
@@ -259,7 +259,7 @@ fn diagonal<S: Simd, const PARTS: usize>(
         second = simd.mul_add_f32s(b[0], b[0], second);
         first_im = simd.mul_add_f32s(a[1], a[1], first_im);
         second_im = simd.mul_add_f32s(b[1], b[1], second_im);
-        fold(simd, a, b, &mut cross);
+        multiply_add(simd, a, b, &mut cross);
     }
     let (first, second) = (simd.add_f32s(first, first_im), simd.add_f32s(second, second_im));
     add::<S, PARTS>(simd, part, [first, zero], &mut sums[product(2 * j, 2 * j)]);
@@ -271,7 +271,7 @@ fn diagonal<S: Simd, const PARTS: usize>(
 mod tests {
     use super::*;
 
-    /// Small integers, so that sums are exact; those of one daughter may be floats.
+    /// Samples are small integers, so that sums are exact; those of one daughter may be floats.
     fn samples(daughter: usize, lane: usize, float: Option<usize>) -> Samples {
         match codes(daughter, lane) {
             Samples::Codes { step, re, im, .. } if float == Some(daughter) => {
@@ -298,14 +298,14 @@ mod tests {
     }
 
     #[test]
-    fn products_are_those_of_a_plain_loop_for_any_number_of_daughters() {
+    fn products_equal_those_of_a_simple_loop_for_any_number_of_daughters() {
         let all = [2, 3, 8].into_iter();
         for (daughters, float) in all.flat_map(|n| [None, Some(0), Some(1)].map(|float| (n, float))) {
             let mut packed = Packed::new(daughters);
             for daughter in 0..daughters {
                 let blocks: Vec<Samples> = (0..LANES).map(|lane| samples(daughter, lane, float)).collect();
-                let there = |lane: usize| (daughter != 1 || lane != 3).then(|| &blocks[lane]);
-                packed.put_all(daughter, there, SLICE);
+                let block_of = |lane: usize| (daughter != 1 || lane != 3).then(|| &blocks[lane]);
+                packed.put_all(daughter, block_of, SLICE);
             }
             for arch in [Arch::new(), Arch::Scalar] {
                 let mut sums = no_sums(daughters);

@@ -1,4 +1,4 @@
-//! Delays and sub-bands: what happens to samples before correlation.
+//! Delays and sub-bands, applied to samples before correlation.
 //!
 //! Over a channel of width W, a source whose wave reaches daughter i earlier than j by
 //! `tau = n . (r_i - r_j) / c` keeps the fraction sinc(pi W tau) of its visibility. At 100 km tau is up to 333 us,
@@ -70,10 +70,10 @@ impl Division {
         let Some(n_hat) = self.delay_centre else {
             return Delays { streams: vec![0; count], pairs: pairs(count, |i, j| [i, j]) };
         };
-        let ahead_s = |n| dot(n_hat, array.position_m(n, t_s)) / SPEED_OF_LIGHT_M_S;
-        let ahead_s: Vec<f64> = (0..count).map(ahead_s).collect();
-        let most_s = ahead_s.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        let later: Vec<f64> = ahead_s.iter().map(|own_s| (most_s - own_s) * rate_hz).collect();
+        let lead_s = |n| dot(n_hat, array.position_m(n, t_s)) / SPEED_OF_LIGHT_M_S;
+        let lead_s: Vec<f64> = (0..count).map(lead_s).collect();
+        let most_s = lead_s.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let later: Vec<f64> = lead_s.iter().map(|own_s| (most_s - own_s) * rate_hz).collect();
         let below = later.iter().map(|later| *later as usize);
         let above = below.clone().map(|below| below + 1);
         let chosen = |i: usize, j: usize| {
@@ -125,7 +125,7 @@ pub struct Spectra {
 }
 
 impl Divider {
-    /// A divider for `division`.
+    /// Creates a divider for `division`.
     #[must_use]
     pub fn new(division: Division) -> Self {
         let bands = division.sub_bands;
@@ -188,12 +188,12 @@ impl Divider {
 
     /// Phase factors that refer the spectra of samples read `delay` later to the frame's instant.
     fn phases(&self, delay: usize) -> Vec<Complex32> {
-        let turned = |offset: f64| {
+        let rotated = |offset: f64| {
             let value = Complex64::cis(std::f64::consts::TAU * (offset * delay as f64).fract());
             Complex32::new(value.re as f32, value.im as f32)
         };
         // Without sub-bands the only offset is 0.
-        self.division.offsets().map(turned).collect()
+        self.division.offsets().map(rotated).collect()
     }
 }
 
@@ -287,12 +287,12 @@ impl Spectra {
         }
         let (first, count) = (frames.start as u32, frames.len() as u32);
         let complete = &self.complete[group * self.streams()..];
-        let both = |&[i, j]: &[usize; 2]| {
+        let add_product = |&[i, j]: &[usize; 2]| {
             std::array::from_fn(|lane| {
                 complete[i][lane].min(complete[j][lane]).saturating_sub(first).min(count)
             })
         };
-        self.delays.pairs.iter().map(both).collect()
+        self.delays.pairs.iter().map(add_product).collect()
     }
 }
 

@@ -1,4 +1,4 @@
-//! The correlator stage: blocks of samples in, frames for the ground out.
+//! Correlator stage: from blocks of samples to frames for the ground.
 
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,13 +10,13 @@ use super::autos::{AutoIntegrator, RowPowers};
 use super::integrate::{COMPLETE_MIN, DumpRule, GroupIntegrator, Presence, WINDOW_S_MAX, dump_samples};
 use super::kernel::{LANES, Packed, SLICE, correlate, no_sums};
 use super::spectra::{Divider, Division, Spectra};
-use crate::array::{Array, EarthShadow};
+use crate::array::{Array, EarthOccultation};
 use crate::daughters::{InstrumentErrors, PassErrors};
 use crate::frames::{
     GroundFrame, Housekeeping, Instrument, ObservingWindow, SampleBlock, Samples, SpaceFrame, VisibilityBlock,
 };
 use crate::mother::Schedule;
-use crate::mother::integrator::positions_said;
+use crate::mother::integrator::reported_ephemeris;
 use crate::runtime::{Outlet, Stage, Units};
 use crate::units::MissionTime;
 
@@ -35,7 +35,7 @@ const POWER_SAMPLES_MIN: u64 = 1024;
 pub struct CorrelatorSetup {
     /// The array, which gives the daughters' positions.
     pub array: Arc<Array>,
-    /// The instrument description that it sends.
+    /// Instrument description to be sent.
     pub instrument: Instrument,
     /// One schedule per channel or sub-band of the instrument.
     pub schedules: Vec<Schedule>,
@@ -47,7 +47,7 @@ pub struct CorrelatorSetup {
     pub flag_earth: bool,
     /// Samples per block.
     pub block_samples: usize,
-    /// Number of blocks that may arrive beyond a missing one before it is given up.
+    /// Number of blocks that may arrive after a missing one before it is given up.
     pub wait_blocks: u64,
 }
 
@@ -60,9 +60,9 @@ pub struct CorrelatorCounts {
     pub stray: u64,
     /// Samples of the stray blocks.
     pub stray_samples: u64,
-    /// Visibilities made.
+    /// Number of visibilities emitted.
     pub visibilities: u64,
-    /// By channel or sub-band and daughter: sum of |x|^2 (K sr) and number of samples.
+    /// Sum of |x|^2 (K sr) and number of samples, by channel or sub-band and daughter.
     pub autos: Vec<Vec<(f64, u64)>>,
 }
 
@@ -75,7 +75,7 @@ pub struct CorrelatorCounts {
 pub struct Correlator {
     setup: CorrelatorSetup,
     rule: DumpRule,
-    /// Present with delays or sub-bands.
+    /// Delays and sub-bands, if there are any.
     divider: Option<Divider>,
     arch: Arch,
     running: Option<OpenWindow>,
@@ -100,7 +100,7 @@ struct OpenWindow {
 struct ChannelGroup {
     first: usize,
     integrator: GroupIntegrator,
-    /// Present if auto-correlations are configured.
+    /// Integrator of auto-correlations, if they are configured.
     autos: Option<AutoIntegrator>,
     packed: Packed,
     /// By daughter and lane: running auto-correlation, K sr; 0 before the first block.
@@ -112,7 +112,7 @@ struct ChannelGroup {
 }
 
 impl Correlator {
-    /// A correlator, which updates `counts` as it goes.
+    /// Creates a correlator that updates `counts` while it runs.
     #[must_use]
     pub fn new(setup: CorrelatorSetup, counts: Arc<Mutex<CorrelatorCounts>>) -> Self {
         let width_hz = setup.instrument.channels.first().map_or(1.0, |channel| channel.width_hz);
@@ -153,7 +153,7 @@ impl Correlator {
         let end = MissionTime::from_seconds(window.start.seconds() + WINDOW_S_MAX);
         window.end = window.end.min(end);
         out.push(GroundFrame::Instrument(setup.instrument.clone()));
-        for segment in positions_said(&setup.array, window, pass.as_ref()) {
+        for segment in reported_ephemeris(&setup.array, window, pass.as_ref()) {
             out.push(GroundFrame::Ephemeris(segment));
         }
         let streams = StreamShape {
@@ -165,15 +165,15 @@ impl Correlator {
         };
         let aligner = Aligner::new(streams, window);
         let dumps = aligner.samples() / (rule.dump_samples * setup.division.sub_bands) as u64;
-        let shadow = setup.flag_earth.then(|| EarthShadow::new(&setup.array, window));
+        let earth_occultation = setup.flag_earth.then(|| EarthOccultation::new(&setup.array, window));
         let group = |(k, schedules): (usize, &[Schedule])| ChannelGroup {
             first: k * LANES,
             integrator: GroupIntegrator::new(k * LANES, schedules, *rule, &setup.array, window, dumps)
-                .with_shadow(shadow.clone()),
+                .with_earth_occultation(earth_occultation.clone()),
             autos: (setup.auto_integration_s > 0.0).then(|| {
                 let (daughters, integration_s) = (streams.daughters, setup.auto_integration_s);
                 AutoIntegrator::new(k * LANES, schedules.len(), daughters, window, integration_s)
-                    .with_shadow(shadow.clone())
+                    .with_earth_occultation(earth_occultation.clone())
             }),
             packed: Packed::new(streams.daughters),
             powers: vec![[0.0; LANES]; streams.daughters],
@@ -202,7 +202,7 @@ impl Correlator {
         next: Option<&BlockRow>,
         out: &mut Outlet<GroundFrame>,
     ) {
-        let mut made = Vec::new();
+        let mut blocks = Vec::new();
         let rate_hz = self.rate_hz();
         let spectra = self.divider.as_ref().map(|divider| {
             let ticks = crate::daughters::sample_ticks(row.number * self.setup.block_samples as u64, rate_hz);
@@ -212,15 +212,15 @@ impl Correlator {
         });
         for (index, group) in running.groups.iter_mut().enumerate() {
             match &spectra {
-                Some(spectra) => self.process_spectra(group, row, spectra, index, &mut made),
-                None => self.process_group(group, row, &mut made),
+                Some(spectra) => self.process_spectra(group, row, spectra, index, &mut blocks),
+                None => self.process_group(group, row, &mut blocks),
             }
         }
         self.samples += row.blocks.iter().flatten().map(|block| block.samples.len() as u64).sum::<u64>();
-        self.emit(made, running.pass.as_ref(), out);
+        self.emit(blocks, running.pass.as_ref(), out);
     }
 
-    fn process_group(&self, group: &mut ChannelGroup, row: &BlockRow, made: &mut Vec<VisibilityBlock>) {
+    fn process_group(&self, group: &mut ChannelGroup, row: &BlockRow, blocks: &mut Vec<VisibilityBlock>) {
         let daughters = self.setup.array.satellites();
         let channels = LANES.min(self.setup.schedules.len() - group.first);
         let first = group.first;
@@ -236,14 +236,15 @@ impl Correlator {
                 let Some(block) = block(lane, daughter) else { continue };
                 present[daughter][lane] = dump_samples as u32;
                 saturated[daughter][lane] = is_saturated(block);
-                *sum = (square(&block.samples), row.samples as u64);
+                *sum = (power_sum(&block.samples), row.samples as u64);
             }
         }
         let samples = row.samples as u64;
         let powers = RowPowers { sums, samples, saturated: saturated.clone() };
-        self.update_powers(group, row, &powers, made);
-        let both = |i: usize, j: usize| std::array::from_fn(|lane| present[i][lane].min(present[j][lane]));
-        let common = (0..daughters).flat_map(|j| (0..=j).map(move |i| both(i, j))).collect();
+        self.update_powers(group, row, &powers, blocks);
+        let count_of_pair =
+            |i: usize, j: usize| std::array::from_fn(|lane| present[i][lane].min(present[j][lane]));
+        let common = (0..daughters).flat_map(|j| (0..=j).map(move |i| count_of_pair(i, j))).collect();
         let presence = Presence { common, saturated };
         for dump in 0..row.samples / dump_samples {
             let mut sums = no_sums(daughters);
@@ -256,18 +257,18 @@ impl Correlator {
                 }
                 correlate(self.arch, &group.packed, &mut sums);
             }
-            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, made);
+            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, blocks);
         }
     }
 
-    /// As [`Self::process_group`], for group `index` of the spectra of a row.
+    /// Processes group `index` of the spectra of a row.
     fn process_spectra(
         &self,
         group: &mut ChannelGroup,
         row: &BlockRow,
         spectra: &Spectra,
         index: usize,
-        made: &mut Vec<VisibilityBlock>,
+        blocks: &mut Vec<VisibilityBlock>,
     ) {
         let daughters = self.setup.array.satellites();
         let lanes = LANES.min(self.setup.schedules.len() - group.first);
@@ -281,13 +282,13 @@ impl Correlator {
         }
         let (sums, samples) = (spectra.powers(index), spectra.frames as u64);
         let powers = RowPowers { sums, samples, saturated: saturated.clone() };
-        self.update_powers(group, row, &powers, made);
+        self.update_powers(group, row, &powers, blocks);
         let dump = self.rule.dump_samples;
         for number in 0..spectra.frames / dump {
             let mut sums = no_sums(daughters);
             let common = spectra.correlate(index, number * dump..(number + 1) * dump, &mut sums);
             let presence = Presence { common, saturated: saturated.clone() };
-            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, made);
+            group.integrator.add(&sums, &presence, &group.powers, &self.setup.array, blocks);
         }
     }
 
@@ -297,12 +298,12 @@ impl Correlator {
         group: &mut ChannelGroup,
         row: &BlockRow,
         powers: &RowPowers,
-        made: &mut Vec<VisibilityBlock>,
+        blocks: &mut Vec<VisibilityBlock>,
     ) {
         if let Some(autos) = &mut group.autos {
             let samples = row.number * self.setup.block_samples as u64 + row.samples as u64;
             let ticks = crate::daughters::sample_ticks(samples, self.rate_hz()) as u32;
-            autos.add(powers, ticks, made);
+            autos.add(powers, ticks, blocks);
         }
         let smoothing = 1.0 - (-(row.samples as f64) / self.rate_hz() / POWER_TIME_S).exp();
         let lanes = LANES.min(self.setup.schedules.len() - group.first);
@@ -328,8 +329,13 @@ impl Correlator {
         }
     }
 
-    fn emit(&mut self, made: Vec<VisibilityBlock>, pass: Option<&PassErrors>, out: &mut Outlet<GroundFrame>) {
-        for mut block in made {
+    fn emit(
+        &mut self,
+        blocks: Vec<VisibilityBlock>,
+        pass: Option<&PassErrors>,
+        out: &mut Outlet<GroundFrame>,
+    ) {
+        for mut block in blocks {
             if let Some(pass) = pass {
                 pass.tag(&mut block);
             }
@@ -348,15 +354,15 @@ impl Correlator {
         if let Some(last) = running.held.take() {
             self.process(&mut running, &last, None, out);
         }
-        let mut made = Vec::new();
+        let mut blocks = Vec::new();
         for group in &mut running.groups {
-            group.integrator.finish(&group.powers, &mut made);
+            group.integrator.finish(&group.powers, &mut blocks);
             if let Some(autos) = &mut group.autos {
                 let ticks = (end.0 - running.window.start.0).clamp(0, i64::from(u32::MAX));
-                autos.finish(ticks as u32, &mut made);
+                autos.finish(ticks as u32, &mut blocks);
             }
         }
-        self.emit(made, running.pass.as_ref(), out);
+        self.emit(blocks, running.pass.as_ref(), out);
         let mut counts = lock(&self.counts);
         counts.blocks.add(running.aligner.counts());
         counts.visibilities = self.sampled;
@@ -376,19 +382,18 @@ fn is_saturated(block: &SampleBlock) -> bool {
 }
 
 /// Sum of |x|^2, K sr.
-fn square(samples: &Samples) -> f64 {
+fn power_sum(samples: &Samples) -> f64 {
     match samples {
         Samples::Float { re, im } => re.iter().zip(im).map(|(re, im)| f64::from(re * re + im * im)).sum(),
         Samples::Codes { step, re, im, .. } => {
             // (c + 1/2)^2 = c (c + 1) + 1/4, in integers.
-            let whole: i64 =
-                re.chunks(CODES_AT_ONCE).chain(im.chunks(CODES_AT_ONCE)).map(whole_squares).sum();
+            let whole: i64 = re.chunks(CODES_AT_ONCE).chain(im.chunks(CODES_AT_ONCE)).map(code_squares).sum();
             f64::from(*step).powi(2) * (whole as f64 + 0.25 * (re.len() + im.len()) as f64)
         }
     }
 }
 
-/// Codes whose squares, at most 2^14 each, are summed in 32 bits.
+/// Number of codes whose squares, at most 2^14 each, are summed in 32 bits.
 const CODES_AT_ONCE: usize = 1 << 16;
 
 /// Sum of c (c + 1).
@@ -397,7 +402,7 @@ const CODES_AT_ONCE: usize = 1 << 16;
     "x86_64+avx2",
     "aarch64+neon"
 ))]
-fn whole_squares(codes: &[i8]) -> i64 {
+fn code_squares(codes: &[i8]) -> i64 {
     let mut sum = 0_i32;
     for &code in codes {
         let code = i32::from(code);

@@ -78,7 +78,7 @@ impl Plan {
         };
         for (channel, &hz) in spacecraft.channels_hz.iter().enumerate() {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let read = path.and_then(|path| MapOutline::of(&path, &sky_options(sky, hz)).ok());
+            let read = path.and_then(|path| MapOutline::read(&path, &sky_options(sky, hz)).ok());
             tell("sky.file", read.map(|read| read.to_string()));
         }
         for (key, files, frame) in [
@@ -87,7 +87,7 @@ impl Plan {
         ] {
             let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
             for path in files {
-                tell(key, MapOutline::of(path, &options).ok().map(|read| read.to_string()));
+                tell(key, MapOutline::read(path, &options).ok().map(|read| read.to_string()));
             }
         }
         let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());

@@ -71,8 +71,8 @@ impl Plan {
         let channels = spacecraft.channels_hz.len();
         SkyChannel {
             frequency_hz: spacecraft.channels_hz[channel],
-            may_be_dark: spacecraft.receiver_k_sr()[channel] > 0.0,
-            shares_file: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
+            is_dark_accepted: spacecraft.receiver_k_sr()[channel] > 0.0,
+            is_file_shared: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
         }
     }
 
@@ -144,7 +144,7 @@ impl Plan {
         let map = &self.config.map;
         let bands = self.config.spacecraft.sub_bands as f64;
         let expected = |(channel, schedule): (usize, &Schedule)| {
-            let is_mapped = map.maps(ChannelId(channel as u16));
+            let is_mapped = map.is_mapped(ChannelId(channel as u16));
             let limit_m = map.baseline_m_max(schedule.frequency_hz);
             let mut expected = Expected::default();
             for &window in &self.windows {

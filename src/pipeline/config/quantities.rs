@@ -10,7 +10,7 @@ pub(in crate::pipeline) fn read_units(table: &mut Table) {
     for (key, value) in table.iter_mut() {
         if let Value::Table(table) = value {
             read_units(table);
-        } else if let Some(dimension) = Dimension::of_key(key)
+        } else if let Some(dimension) = Dimension::from_key(key)
             && let Some(number) = with_units(value, dimension)
         {
             *value = number;

@@ -261,7 +261,7 @@ fn plain(message: &str) -> String {
 /// The units that the key of a text, or of a list with texts, takes, by its name.
 fn units_of(key: &str, value: &Value) -> Option<&'static str> {
     let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
-    Dimension::of_key(key).filter(|_| is_text).map(Dimension::expected)
+    Dimension::from_key(key).filter(|_| is_text).map(Dimension::expected)
 }
 
 /// A message of the parser, with the units that the key takes.

@@ -65,7 +65,7 @@ impl Config {
         let channels = self.spacecraft.channels_hz.len();
         let mut found = Problems::default();
         found.extend(self.sky.problems(channels));
-        let mut checks = Checks::of("");
+        let mut checks = Checks::new("");
         let is_folder = is_folder_name(&self.name);
         let expected = "at most 60 bytes, without slashes and control characters";
         checks.require("name", format!("{:?}", self.name), is_folder, expected);
@@ -99,7 +99,7 @@ impl Config {
         found.extend(self.navigation.problems(self.array.satellites));
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
-        found.extend(self.map.misfits(channels));
+        found.extend(self.map.mismatches(channels));
         found.append(self.ground_values());
         found.append(self.without_effect(&[]));
         found
@@ -128,7 +128,7 @@ impl Config {
 
     /// Requires that no other epoch is given than that of orbits with dates, and that time codes hold it.
     fn misdated(&self, array: &Array) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         if let Some(dated_s) = array.epoch_tai_s() {
             let given_s = self.spacecraft.epoch_tai_s;
             let usual_s = SpacecraftConfig::default().epoch_tai_s;
@@ -150,7 +150,7 @@ impl Config {
     /// Requires that positions are known for the whole mission.
     fn unknown_positions(&self, array: &Array) -> Vec<InvalidValue> {
         let Some([from_s, until_s]) = array.known_s() else { return Vec::new() };
-        let mut checks = Checks::of("spacecraft");
+        let mut checks = Checks::new("spacecraft");
         let duration_s = self.spacecraft.duration_s;
         // Dates of files are to a microsecond.
         let good = from_s <= 1e-6 && until_s + 1e-6 >= duration_s;
@@ -407,7 +407,7 @@ mod tests {
             let (bits, ground) =
                 (format!("daughters.bits={bits}"), format!("calibration.quantiser_bits={ground}"));
             let config = with(&[&bits, &ground, &fidelity]).unwrap();
-            let mut checks = Checks::of("");
+            let mut checks = Checks::new("");
             config.check_quantiser(&mut checks);
             checks.finish().pop().map(|problem| problem.to_string())
         };

@@ -136,13 +136,17 @@ impl Plan {
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
-            let is_mapped = map.maps(ChannelId(channel as u16));
+            let is_mapped = map.is_mapped(ChannelId(channel as u16));
             let data = ChannelData {
                 frequency_hz,
                 visibilities: expected.mapped,
                 windows: self.windows.len() as f64,
             };
-            if is_mapped { EngineCost::of(map, data).with_ranks(ranks, map) } else { EngineCost::default() }
+            if is_mapped {
+                EngineCost::estimate(map, data).with_ranks(ranks, map)
+            } else {
+                EngineCost::default()
+            }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let sent: f64 = expected.iter().map(|e| e.sent).sum();
@@ -284,7 +288,7 @@ pub(in crate::pipeline) fn memory_bytes(
         copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
     };
     let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
-    let last = if engines.iter().any(|engine| engine.copies_last) { engines.len() } else { 0 };
+    let last = if engines.iter().any(|engine| engine.copies_final) { engines.len() } else { 0 };
     growing.max(sums + solving(last)) + BASE_BYTES
 }
 

@@ -135,10 +135,10 @@ pub(in crate::pipeline) fn complete_costs(
     let channels = (0..).map(ChannelId).zip(&instrument.channels);
     let cost = |frequency_hz: f64| {
         let visibilities = map.refine.visibilities_max as f64;
-        EngineCost::of(map, ChannelData { frequency_hz, visibilities, windows: f64::INFINITY })
+        EngineCost::estimate(map, ChannelData { frequency_hz, visibilities, windows: f64::INFINITY })
     };
     channels
-        .filter(|(channel, _)| map.maps(*channel))
+        .filter(|(channel, _)| map.is_mapped(*channel))
         .map(|(channel, described)| (channel, cost(described.frequency_hz)))
         .collect()
 }

@@ -8,7 +8,7 @@ use crate::calibration::solver::{CalibrationMode, known_wavelengths_max};
 use crate::frames::ObservingWindow;
 use crate::mother::{Fidelity, Schedule};
 use crate::pipeline::config::{Expected, Plan};
-use crate::response::model::{BandAverage, Load, ModelChoice, ModelPlan, degrees_seen};
+use crate::response::model::{BandAverage, ModelChoice, ModelPlan, Workload, l_max_of_fringes};
 use crate::sky::fits::{read_nside, sky_options};
 use crate::sky::healpix::pixel_count;
 use crate::sky::{GENERATED_NSIDE_MAX, SkyConfig};
@@ -41,18 +41,18 @@ impl Plan {
                 true => {
                     let width_hz = spacecraft.channel_width_hz;
                     let longest_m = longest * SPEED_OF_LIGHT_M_S / schedule.frequency_hz;
-                    let frequencies = BandAverage::frequencies(longest_m, width_hz);
+                    let frequencies = BandAverage::frequency_count(longest_m, width_hz);
                     (frequencies, BandAverage::baseline_factor(schedule.frequency_hz, width_hz))
                 }
                 false => (1, 1.0),
             };
-            let load = Load {
+            let load = Workload {
                 visibilities: expected.sent * frequencies as f64,
                 sky_nside,
                 baseline_wavelengths_max: longest * stretch,
                 l_max: self.config.sky.l_max,
-                smeared: spacecraft.smear_integrations,
-                circle: self.array.formation().is_some(),
+                is_time_averaged: spacecraft.smear_integrations,
+                is_on_circle: self.array.formation().is_some(),
             };
             if spacecraft.fidelity == Fidelity::Samples {
                 // The sampler needs auto-correlations and pairs stretched over the channel; the others are made for neither.
@@ -96,16 +96,19 @@ impl Plan {
             .map(|(schedule, nside)| {
                 let longest = longest_baseline_wavelengths(&self.array, apart_m, schedule);
                 let name = format!("{:.3} MHz ({longest:.1} wavelengths)", schedule.frequency_hz / 1e6);
-                (name, degrees_seen(longest), nside)
+                (name, l_max_of_fringes(longest), nside)
             })
-            .filter(|&(_, seen, nside)| seen > SkyConfig::l_max_held(nside))
+            .filter(|&(_, seen, nside)| seen > SkyConfig::l_max_determined(nside))
             .collect();
         let (_, seen, nside) = coarse.iter().max_by_key(|(_, seen, _)| *seen)?;
-        let (held, most) = (SkyConfig::l_max_held(*nside), SkyConfig::l_max_held(GENERATED_NSIDE_MAX));
+        let (held, most) =
+            (SkyConfig::l_max_determined(*nside), SkyConfig::l_max_determined(GENERATED_NSIDE_MAX));
         let names: Vec<&str> = coarse.iter().map(|(name, ..)| name.as_str()).take(4).collect();
         let more = if coarse.len() > names.len() { ", .." } else { "" };
-        let needed =
-            (0..).map(|k| 1 << k).find(|&nside| SkyConfig::l_max_held(nside) >= *seen).unwrap_or(nside * 2);
+        let needed = (0..)
+            .map(|k| 1 << k)
+            .find(|&nside| SkyConfig::l_max_determined(nside) >= *seen)
+            .unwrap_or(nside * 2);
         let mend = match *seen <= most {
             true => format!("a sky of nside {needed} (sky.nside, or a finer map) or shorter baselines"),
             false => "shorter baselines".to_owned(),
@@ -126,13 +129,13 @@ impl Plan {
         }
         let bytes = |nside: usize| {
             let map = DIRECTION_BYTES * pixel_count(nside.max(solver.model_nside)) as f64;
-            let load = Load {
+            let load = Workload {
                 visibilities: 0.0,
                 sky_nside: nside,
                 baseline_wavelengths_max: known_wavelengths_max(nside),
                 l_max: 5 * nside / 2,
-                smeared: false,
-                circle: true,
+                is_time_averaged: false,
+                is_on_circle: true,
             };
             map + if solver.is_harmonic(nside) {
                 ModelPlan::new(ModelChoice::Harmonic, load).bytes

@@ -55,7 +55,7 @@ impl Config {
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
             assumed: map.assumed(),
-            passes: None,
+            iteration_folder: None,
             trace_probes: map.trace_probes,
             samples: 0,
             watch,
@@ -100,8 +100,8 @@ pub(in crate::pipeline) fn add(
     let MappingContext { out, truth, watch, viewers, trouble } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
-    let passes = config.map.refine.is_on().then(|| out.to_owned());
-    let setup = SolverSetup { passes, ..config.solver(watch.with_ranks(&ranks))? };
+    let iteration_folder = config.map.refine.is_on().then(|| out.to_owned());
+    let setup = SolverSetup { iteration_folder, ..config.solver(watch.with_ranks(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
@@ -111,10 +111,10 @@ pub(in crate::pipeline) fn add(
     let provenance = Provenance { ground_hash: config.ground_hash(), map: config.map.clone() };
     let channels = Arc::clone(&outcome.channels);
     let publisher =
-        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.shown_to(viewers);
-    let publisher = trouble.iter().fold(publisher, Publisher::persisting);
+        Publisher::new(config.products.clone(), out, truth, provenance, channels)?.with_viewers(viewers);
+    let publisher = trouble.iter().fold(publisher, Publisher::with_retries);
     let mut writer = GainsWriter::new(config, out);
-    let ground = ground.observed_by(Box::new(move |gains| writer.update(gains)));
+    let ground = ground.with_observer(Box::new(move |gains| writer.update(gains)));
     // Sums are large: one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

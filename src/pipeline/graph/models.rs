@@ -12,7 +12,8 @@ use crate::pipeline::config::{PipelineError, Plan};
 use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup,
-    ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithReflection, WithSphereReflection,
+    ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithFlatReflection,
+    WithSphereReflection,
 };
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
@@ -146,13 +147,13 @@ fn with_moon(
         return Ok(sky);
     }
     if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
-        let mirror = (plan.array.moon_radius_m(), share);
-        let response = plan.instrument.response;
-        return Ok(Box::new(WithSphereReflection::new(sky, map.clone(), frequency_hz, response, mirror)));
+        let (radius_m, response) = (plan.array.moon_radius_m(), plan.instrument.response);
+        let map = map.clone();
+        return Ok(Box::new(WithSphereReflection::new(sky, map, frequency_hz, response, radius_m, share)));
     }
     // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
     let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
-    Ok(Box::new(WithReflection::new(sky, above, share)))
+    Ok(Box::new(WithFlatReflection::new(sky, above, share)))
 }
 
 /// The model, averaged over its channel if the configuration asks for it.

@@ -128,7 +128,7 @@ pub fn run(
     cancel: &Cancel,
     watch: Watcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    run_with_ranks(&Ranks::one(), plan, out, cancel, watch)
+    run_with_ranks(&Ranks::single(), plan, out, cancel, watch)
 }
 
 /// As [`run`], as one rank of several that share the sums. Each simulates and receives everything; the first alone writes into
@@ -145,7 +145,7 @@ pub fn run_with_ranks(
 ) -> Result<RunSummary, PipelineError> {
     plan.config.require_shareable(ranks.share().count)?;
     let DownlinkConfig { link, rate_bits_per_s_max, .. } = &plan.config.downlink;
-    if ranks.are_many() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
+    if ranks.is_distributed() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
         let found = "downlink.link with faults, or downlink.rate_bits_per_s_max";
         return Err(PipelineError::NotShareable {
             found,
@@ -172,9 +172,9 @@ pub fn run_with_ranks(
     let truth = Truth::new(&skies, plan.config.map_shape())?;
     drop(skies);
     let grace = Grace::of(&plan.config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.to_iterate);
     let ground =
-        Ground::new(&plan.config.ground(WAIT_BYTES))?.cancelled_by(cancel, grace.to_add).with_ranks(ranks);
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.to_add).with_ranks(ranks);
     let maps = MapWatch::default();
     let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
@@ -292,9 +292,9 @@ pub(in crate::pipeline) fn ground_alone<S: GroundSource + 'static>(
     let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
     let grace = Grace::of(&config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).within(grace.to_iterate);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.to_iterate);
     let ranks = ground.ranks().clone();
-    let ground = ground.cancelled_by(cancel, grace.to_add);
+    let ground = ground.with_cancel(cancel, grace.to_add);
     let maps = MapWatch::default();
     let trouble = is_service.then(ProductsWatch::default);
     let (viewers, products) = (maps.clone(), trouble.clone());
@@ -441,7 +441,7 @@ pub(in crate::pipeline) fn start_alone(
     watched: Watched,
     watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    start(graph, &Ranks::one(), config, cancel, (watched, watch))
+    start(graph, &Ranks::single(), config, cancel, (watched, watch))
 }
 
 fn start(
@@ -457,7 +457,7 @@ fn start(
     // These stages save data: they end in order, however long it takes.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     watch(watched);
-    Ok(graph.run(cancel, if ranks.are_many() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
+    Ok(graph.run(cancel, if ranks.is_distributed() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.
@@ -483,7 +483,7 @@ fn conclude(
     out: &Path,
     ended: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    if ranks.are_many() && ended.report.cancelled {
+    if ranks.is_distributed() && ended.report.cancelled {
         return Err(PipelineError::RankInterrupted);
     }
     if ranks.is_first() {
@@ -491,7 +491,7 @@ fn conclude(
     }
     let FinishedGraph { report, outcome, .. } = ended;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ground.ledger.close()?;
+    let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
@@ -506,7 +506,7 @@ pub(in crate::pipeline) fn summarise(
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = ground.ledger.close()?;
+    let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
     if let Some(account) = &listening {
         account.complete(&mut reception);

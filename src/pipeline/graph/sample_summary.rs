@@ -82,12 +82,12 @@ impl SampleSummary {
         let correlator = read(&counts.correlator);
         let blocks = correlator.blocks;
         let ledger = Ledger::new();
-        ledger.sampled(sampler.samples);
-        ledger.accumulated(blocks.used_samples);
-        ledger.left_out(SampleReason::LinkOverrun, link.dropped_samples);
-        ledger.left_out(SampleReason::Late, blocks.late_samples);
-        ledger.left_out(SampleReason::Malformed, blocks.malformed_samples);
-        ledger.left_out(SampleReason::OutsideWindow, correlator.stray_samples);
+        ledger.add_sampled(sampler.samples);
+        ledger.add_accumulated(blocks.used_samples);
+        ledger.add_left_out(SampleReason::LinkOverrun, link.dropped_samples);
+        ledger.add_left_out(SampleReason::Late, blocks.late_samples);
+        ledger.add_left_out(SampleReason::Malformed, blocks.malformed_samples);
+        ledger.add_left_out(SampleReason::OutsideWindow, correlator.stray_samples);
         Ok(Self {
             saturated: sampler.saturated,
             correlations: sampler.repairs.elements,
@@ -103,7 +103,7 @@ impl SampleSummary {
                 stray: correlator.stray,
             },
             visibilities: correlator.visibilities,
-            ledger: ledger.close()?,
+            ledger: ledger.balanced_report()?,
         })
     }
 }

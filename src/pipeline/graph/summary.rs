@@ -110,7 +110,7 @@ impl RunSummary {
     /// The summary of this pass and an earlier one over the same downlink, for other channels.
     pub(in crate::pipeline) fn after(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
-        let ledger = earlier.ledger.of_two_passes(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
+        let ledger = earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
         Self {
             seed: earlier.seed.or(self.seed),
             space_hash: earlier.space_hash.or(self.space_hash),

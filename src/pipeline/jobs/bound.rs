@@ -72,7 +72,7 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
         let expected = "a HEALPix map of the sky for each channel, here or in calibrate.model_files";
         return Err(invalid("--model", "(none)".to_owned(), expected.to_owned()).into());
     }
-    solver.fits(&plan.instrument, maps.len(), "--model")?;
+    solver.check_instrument(&plan.instrument, maps.len(), "--model")?;
     let Some(&window) = plan.windows.get(pass) else {
         let expected = format!("0 to {}, the passes of the mission", plan.windows.len().saturating_sub(1));
         return Err(invalid("--pass", pass.to_string(), expected).into());
@@ -119,7 +119,7 @@ fn observed(
         lengths.push(f64::from(one.duration_ticks) / TICKS_PER_SECOND as f64);
         for n in [pair.i, pair.j].map(usize::from) {
             let (r_m, normal_hat) = (plan.array.position_m(n, t_s), plan.array.normal_hat(n, t_s));
-            daughters.push(DaughterPosition { r_m, normal_hat, at: None });
+            daughters.push(DaughterPosition { r_m, normal_hat, daughter_time: None });
         }
     }
     let mut powers = vec![0.0; daughters.len()];

@@ -6,7 +6,7 @@ use std::time::Duration;
 use crate::downlink::FileSource;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::circle::{NoiseSums, memory};
-use crate::imaging::{EngineKind, Snapshot, SnapshotSums};
+use crate::imaging::{EngineKind, Snapshot, SnapshotData};
 use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError};
 use crate::pipeline::graph::ground_segment::GROUND;
@@ -97,7 +97,7 @@ impl NoiseMaps<'_> {
         let source = FileSource::open(&[self.file.to_owned()])?;
         let bytes = graph.source(READ, config.runtime.queue_capacity, source);
         let ground = Ground::new(&config.ground(WAIT_BYTES))?;
-        let ground = ground.with_noises(seeds).cancelled_by(cancel, Duration::ZERO);
+        let ground = ground.with_noise_realisations(seeds).with_cancel(cancel, Duration::ZERO);
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let solving = SolveWatch::new(cancel.clone());
         let setup = config.solver(solving.clone())?;
@@ -120,8 +120,8 @@ impl Sink for NoiseMapSolver {
     type Error = PipelineError;
 
     fn take(&mut self, snapshot: Snapshot) -> Result<(), PipelineError> {
-        let Snapshot { instrument, channel, nside, is_final, sums, .. } = snapshot;
-        let SnapshotSums::Harmonic(sums) = sums else { return Ok(()) };
+        let Snapshot { instrument, channel, nside, is_final, data, .. } = snapshot;
+        let SnapshotData::Harmonic(sums) = data else { return Ok(()) };
         if !is_final {
             return Ok(());
         }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, solve_jointly};
-use crate::imaging::{REFINED, Regulariser, RegulariserChoice, SnapshotSums, SolveError, StoppingRule};
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice, SnapshotData, SolveError, StoppingRule};
 use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
@@ -175,12 +175,12 @@ pub fn solve_states_jointly(
         for snapshot in Ground::sums_in(folder, &config.ground(WAIT_BYTES))? {
             let channel = snapshot.instrument.channels.get(usize::from(snapshot.channel.0));
             let frequency_hz = channel.map_or(0.0, |channel| channel.frequency_hz);
-            let found = match snapshot.sums {
-                SnapshotSums::Harmonic(sums) => {
+            let found = match snapshot.data {
+                SnapshotData::Harmonic(sums) => {
                     channels.push(JointChannel { frequency_hz, nside: snapshot.nside, sums });
                     continue;
                 }
-                SnapshotSums::Pixel(_) => "sums over pixels",
+                SnapshotData::Pixel(_) => "sums over pixels",
                 _ => "visibilities one by one",
             };
             return Err(SolveError::NotHarmonic { frequency_hz, found }.into());
@@ -226,7 +226,7 @@ mod tests {
         let refined = MapConfig { refine, ..harmonic.clone() };
         for map in [pixel, harmonic, refined] {
             let mut overrides: Vec<String> = map
-                .of_sums()
+                .sum_settings()
                 .iter()
                 .filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)))
                 .collect();

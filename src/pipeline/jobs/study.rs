@@ -145,7 +145,7 @@ fn downlink_key(config: &Config) -> u64 {
 fn sums_key(case: &StudyCase) -> u64 {
     let config = &case.plan.config;
     let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
-    let sums = (map.of_sums(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
+    let sums = (map.sum_settings(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
     // Alternation with the map depends on how the map is solved for.
     let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
     let text = serde_json::to_vec(&(sums, solution));
@@ -341,7 +341,7 @@ fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
     for (case, summary) in done.iter().zip(cases) {
         let key = ideal_of(case);
         if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
-            summary.figures.against_ideal(ideal);
+            summary.figures.set_power_kept(ideal);
         }
     }
 }

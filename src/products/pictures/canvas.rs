@@ -1,4 +1,4 @@
-//! A page: values in colour as pixels, and above them lines, fills and text, which are kept as such until all is drawn.
+//! A page: pixels with values in colour, and lines, fills and text above them, which are kept as shapes until flattened.
 
 use std::ops::Range;
 
@@ -32,7 +32,6 @@ impl Rect {
     }
 }
 
-/// How a line is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Stroke {
     pub colour: Colour,
@@ -50,18 +49,13 @@ impl Stroke {
     }
 }
 
-/// What is drawn above the pixels.
 #[derive(Clone, Debug)]
 pub(super) enum Shape {
-    /// A filled rectangle, as far as it is within the clip.
     Fill { rect: Rect, colour: Colour, alpha: f32, clip: Rect },
-    /// A line through points.
     Line { points: Vec<(f64, f64)>, stroke: Stroke, clip: Rect },
-    /// A line of text.
     Text { text: String, anchor: (f64, f64), align: Align, style: Style },
 }
 
-/// The page.
 pub(super) struct Canvas {
     width: usize,
     height: usize,
@@ -82,7 +76,6 @@ impl Canvas {
         self.clip = clip.unwrap_or(page);
     }
 
-    /// Fills a rectangle.
     pub fn fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
         self.shapes.push(Shape::Fill { rect, colour, alpha, clip: self.clip });
     }
@@ -97,7 +90,7 @@ impl Canvas {
         self.shapes.push(Shape::Text { text: text.to_owned(), anchor, align, style });
     }
 
-    /// What is drawn above the pixels; from here on it is part of them.
+    /// Paints all shapes into the pixels, and returns them.
     pub fn flatten(&mut self) -> Vec<Shape> {
         let shapes = std::mem::take(&mut self.shapes);
         for shape in &shapes {
@@ -124,7 +117,7 @@ impl Canvas {
         shapes
     }
 
-    /// Columns of pixels from `low` to `high`, within the page and the clip.
+    /// The columns of pixels from `low` to `high`, within the page and the clip.
     fn columns(&self, low: f64, high: f64) -> Range<usize> {
         span(low.max(self.clip.x), high.min(self.clip.right()), self.width)
     }
@@ -138,14 +131,13 @@ impl Canvas {
         self.pixels.chunks_exact_mut(self.width.max(1))
     }
 
-    /// Blends `colour` into one pixel.
     pub fn blend(&mut self, x: usize, y: usize, colour: Colour, alpha: f32) {
         if x < self.width && y < self.height {
             mix(&mut self.pixels[y * self.width + x], colour, alpha);
         }
     }
 
-    /// Edge pixels by the fraction covered.
+    /// Fills a rectangle, with edge pixels by the fraction covered.
     fn paint_fill(&mut self, rect: Rect, colour: Colour, alpha: f32) {
         for y in self.rows(rect.y, rect.bottom()) {
             let covered_y = overlap(y, rect.y, rect.bottom());
@@ -156,7 +148,6 @@ impl Canvas {
         }
     }
 
-    /// Draws the outline of a rectangle.
     pub fn outline(&mut self, rect: Rect, stroke: Stroke) {
         let (x, y, right, bottom) = (rect.x, rect.y, rect.right(), rect.bottom());
         self.polyline(&[(x, y), (right, y), (right, bottom), (x, bottom), (x, y)], stroke);
@@ -193,7 +184,7 @@ impl Canvas {
         }
     }
 
-    /// The pixels as bytes, three each; without what [`Canvas::flatten`] has not drawn yet.
+    /// The pixels as three bytes each, without shapes that are not flattened yet.
     pub fn rgb(&self) -> Vec<u8> {
         self.pixels.iter().flat_map(|pixel| pixel.map(|v| v.round().clamp(0.0, 255.0) as u8)).collect()
     }
@@ -226,8 +217,8 @@ impl StrokeCoverage {
                 let t = if length2 > 0.0 { (along / length2).clamp(0.0, 1.0) } else { 0.0 };
                 let distance = (px - x0 - t * dx).hypot(py - y0 - t * dy);
                 let covered = (0.5 + 0.5 * width - distance).clamp(0.0, 1.0) * width.min(1.0);
-                let place = (y - self.rows.start) * self.columns.len() + x - self.columns.start;
-                self.values[place] = self.values[place].max(covered as f32);
+                let index = (y - self.rows.start) * self.columns.len() + x - self.columns.start;
+                self.values[index] = self.values[index].max(covered as f32);
             }
         }
     }
@@ -235,13 +226,13 @@ impl StrokeCoverage {
 
 /// The straight segments of a line, cut into dashes if required.
 fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
-    // Beyond a million pixels a point is off any page; poles of a scale must not overflow.
-    let far = |v: f64| !v.is_finite() || v.abs() > 1e6;
+    // A point farther away than a million pixels is off any page, and could overflow.
+    let is_off_page = |v: f64| !v.is_finite() || v.abs() > 1e6;
     let mut pieces = Vec::new();
     let mut travelled = 0.0;
     for pair in points.windows(2) {
         let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
-        if [x0, y0, x1, y1].into_iter().any(far) {
+        if [x0, y0, x1, y1].into_iter().any(is_off_page) {
             continue;
         }
         let Some((dash, gap)) = dash else {
@@ -249,11 +240,11 @@ fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
             continue;
         };
         let length = (x1 - x0).hypot(y1 - y0);
-        let at = |s: f64| (x0 + s / length * (x1 - x0), y0 + s / length * (y1 - y0));
+        let point_at = |s: f64| (x0 + s / length * (x1 - x0), y0 + s / length * (y1 - y0));
         let mut start = -(travelled % (dash + gap));
         while start < length {
             if start + dash > 0.0 {
-                let ((ax, ay), (bx, by)) = (at(start.max(0.0)), at((start + dash).min(length)));
+                let ((ax, ay), (bx, by)) = (point_at(start.max(0.0)), point_at((start + dash).min(length)));
                 pieces.push([ax, ay, bx, by]);
             }
             start += dash + gap;
@@ -263,16 +254,15 @@ fn pieces(points: &[(f64, f64)], dash: Option<(f64, f64)>) -> Vec<[f64; 4]> {
     pieces
 }
 
-/// Pixels from `low` to `high` within a range.
-fn within(low: f64, high: f64, others: &Range<usize>) -> Range<usize> {
-    let whole = span(low, high, others.end);
-    let first = whole.start.max(others.start);
+fn within(low: f64, high: f64, limits: &Range<usize>) -> Range<usize> {
+    let whole = span(low, high, limits.end);
+    let first = whole.start.max(limits.start);
     first..whole.end.max(first)
 }
 
 fn mix(pixel: &mut [f32; 3], colour: Colour, alpha: f32) {
-    for (have, want) in pixel.iter_mut().zip(colour) {
-        *have += alpha * (f32::from(want) - *have);
+    for (current, target) in pixel.iter_mut().zip(colour) {
+        *current += alpha * (f32::from(target) - *current);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Colours.
+//! Colours of lines, text and background.
 
 /// Red, green, blue, 0-255.
 pub(super) type Colour = [u8; 3];

@@ -1,4 +1,4 @@
-//! Line plots.
+//! Draws line plots.
 
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::error::PictureError;
@@ -7,7 +7,7 @@ use super::png_file::Picture;
 use super::text::{Align, Style};
 use super::{labels, text};
 
-/// Colours that colour-blind readers can tell apart (Okabe & Ito 2008, and the wine of Tol 2021), one a daughter.
+/// Colours that colour-blind readers can distinguish (Okabe & Ito 2008, and wine from Tol 2021), one per daughter.
 const COLOURS: [Colour; 8] = [
     [0, 114, 178],
     [213, 94, 0],
@@ -19,25 +19,25 @@ const COLOURS: [Colour; 8] = [
     [136, 34, 85],
 ];
 
-/// A curve.
+/// A curve of a plot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Curve {
     /// Name in the legend; none if empty.
     pub label: String,
-    /// Points; one that is not finite, or not positive on a logarithmic axis, interrupts the curve.
+    /// Points. One that is not finite, or not positive on a logarithmic axis, interrupts the curve.
     pub points: Vec<(f64, f64)>,
-    /// Whether dashes are drawn.
+    /// Whether the curve is dashed.
     pub dashed: bool,
 }
 
 /// An axis of a plot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Axis {
-    /// What is shown, with its unit; `_{...}` makes a subscript, here as in every text of a picture.
+    /// Quantity and unit. `_{...}` makes a subscript, as in all texts of a picture.
     pub label: String,
     /// Whether the axis is logarithmic.
     pub log: bool,
-    /// Ends of the axis; chosen from the data if not given or not usable.
+    /// Limits of the axis, chosen from the data if `None` or unusable.
     pub limits: Option<(f64, f64)>,
 }
 
@@ -52,7 +52,7 @@ pub struct Plot {
     pub y: Axis,
     /// Curves, drawn in order.
     pub curves: Vec<Curve>,
-    /// Vertical values marked with a thin horizontal line.
+    /// Vertical values marked by a thin horizontal line.
     pub levels: Vec<f64>,
 }
 
@@ -80,19 +80,18 @@ pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture
         canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
     }
     for (number, plot) in plots.iter().enumerate() {
-        let share = Rect {
+        let area = Rect {
             x: (number % columns * PLOT_PX.0) as f64,
             y: (head + number / columns * PLOT_PX.1) as f64,
             width: PLOT_PX.0 as f64,
             height: PLOT_PX.1 as f64,
         };
-        draw_plot(&mut canvas, share, plot);
+        draw_plot(&mut canvas, area, plot);
     }
     let title = if title.is_empty() { plots[0].title.as_str() } else { title };
     Ok(Picture::from_canvas(canvas, width, height, title))
 }
 
-/// An axis with fixed limits.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Range {
     pub low: f64,
@@ -101,7 +100,7 @@ pub(super) struct Range {
 }
 
 impl Range {
-    pub fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
+    pub fn new(axis: &Axis, values: impl Iterator<Item = f64>, margin: f64) -> Self {
         let usable = |v: &f64| v.is_finite() && v.abs() < 1e300 && (!axis.log || *v > 1e-300);
         if let Some((low, high)) = axis.limits
             && usable(&low)
@@ -116,15 +115,15 @@ impl Range {
             return Self { low: if axis.log { 0.1 } else { 0.0 }, high: 1.0, log: axis.log };
         }
         if axis.log {
-            let factor = (high / low).powf(room).max(if room > 0.0 || high <= low { 1.1 } else { 1.0 });
+            let factor = (high / low).powf(margin).max(if margin > 0.0 || high <= low { 1.1 } else { 1.0 });
             return Self { low: low / factor, high: high * factor, log: true };
         }
         let span = if high > low { high - low } else { low.abs().max(1.0) };
-        let room = if high > low { room } else { 0.1 };
-        Self { low: low - room * span, high: high + room * span, log: false }
+        let margin = if high > low { margin } else { 0.1 };
+        Self { low: low - margin * span, high: high + margin * span, log: false }
     }
 
-    pub fn place(&self, value: f64) -> f64 {
+    pub fn position(&self, value: f64) -> f64 {
         if self.log {
             if value > 0.0 { (value / self.low).ln() / (self.high / self.low).ln() } else { f64::NAN }
         } else {
@@ -141,7 +140,7 @@ impl Range {
     }
 }
 
-fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
+fn draw_plot(canvas: &mut Canvas, area: Rect, plot: &Plot) {
     let points = || plot.curves.iter().flat_map(|curve| curve.points.iter().copied());
     let x_range = Range::new(&plot.x, points().map(|p| p.0), 0.0);
     let y_range = Range::new(&plot.y, points().map(|p| p.1).chain(plot.levels.iter().copied()), 0.06);
@@ -154,22 +153,22 @@ fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
     let top = if plot.title.is_empty() { 24.0 } else { 52.0 };
     let left = 3.4 * FONT + widest;
     let whole = Rect {
-        x: share.x + left,
-        y: share.y + top,
-        width: share.width - left - 36.0,
-        height: share.height - top - 78.0,
+        x: area.x + left,
+        y: area.y + top,
+        width: area.width - left - 36.0,
+        height: area.height - top - 78.0,
     };
     let on_page = |frame: Rect| {
         move |x: f64, y: f64| {
-            (frame.x + x_range.place(x) * frame.width, frame.bottom() - y_range.place(y) * frame.height)
+            (frame.x + x_range.position(x) * frame.width, frame.bottom() - y_range.position(y) * frame.height)
         }
     };
     let drawn_in = |frame: Rect| -> Vec<Vec<(f64, f64)>> {
-        let place = on_page(frame);
-        plot.curves.iter().map(|curve| curve.points.iter().map(|&(x, y)| place(x, y)).collect()).collect()
+        let to_page = on_page(frame);
+        plot.curves.iter().map(|curve| curve.points.iter().map(|&(x, y)| to_page(x, y)).collect()).collect()
     };
     let legend = Legend::new(plot);
-    // Inside where it hides nothing, else beside the frame.
+    // The legend is inside where it hides no curve, otherwise beside the frame.
     let (frame, corner) = match legend.size() {
         None => (whole, None),
         Some(size) => match free_corner(whole, size, &drawn_in(whole)) {
@@ -202,7 +201,7 @@ fn draw_plot(canvas: &mut Canvas, share: Rect, plot: &Plot) {
     }
 }
 
-/// Curves beyond the number of colours are dotted, so that no two of sixteen are alike.
+/// Style of a curve. Curves beyond the number of colours are dotted, so that sixteen curves are distinct.
 fn stroke_of(number: usize, curve: &Curve) -> Stroke {
     let dash = match (curve.dashed, number / COLOURS.len() % 2) {
         (true, _) => Some((9.0, 6.0)),
@@ -274,15 +273,17 @@ pub(super) fn write_axes(
     }
 }
 
-/// Distance of the legend from the frame, and of its rows; length of a sample.
+/// Distance of the legend from the frame, pixels.
 const LEGEND_INSET: f64 = 0.7 * FONT;
+/// Height of a row of the legend, pixels.
 const LEGEND_ROW: f64 = 1.35 * FONT;
+/// Length of the line in a row of the legend, pixels.
 const LEGEND_SAMPLE: f64 = 2.2 * FONT;
 
-/// Points of a line between two that are looked at for what hides them.
-const BETWEEN: usize = 16;
+/// Number of steps between two points of a curve at which it is tested for overlap with the legend.
+const OVERLAP_STEPS: usize = 16;
 
-/// The names of the curves that have a name and points.
+/// The legend, with the curves that have a name and visible points.
 struct Legend<'a> {
     named: Vec<(usize, &'a Curve)>,
 }
@@ -301,7 +302,7 @@ impl<'a> Legend<'a> {
         Style::new(0.92 * FONT, INK)
     }
 
-    /// Width and height; `None` if there is nothing in it.
+    /// Width and height; `None` for an empty legend.
     fn size(&self) -> Option<(f64, f64)> {
         let length = |(_, curve): &(usize, &Curve)| text::length(&curve.label, Self::style());
         let widest = self.named.iter().map(length).fold(0.0, f64::max);
@@ -311,29 +312,32 @@ impl<'a> Legend<'a> {
 
     fn draw(&self, canvas: &mut Canvas, (x, y): (f64, f64)) {
         let Some((width, height)) = self.size() else { return };
-        let place = Rect { x, y, width, height };
-        canvas.fill(place, WHITE, 0.85);
-        canvas.outline(place, Stroke::solid(FAINT, 0.5, 1.0));
+        let frame = Rect { x, y, width, height };
+        canvas.fill(frame, WHITE, 0.85);
+        canvas.outline(frame, Stroke::solid(FAINT, 0.5, 1.0));
         for (line, (number, curve)) in self.named.iter().enumerate() {
-            let y = place.y + 0.3 * FONT + LEGEND_ROW * (line as f64 + 0.5);
-            let x = place.x + 0.5 * FONT;
+            let y = frame.y + 0.3 * FONT + LEGEND_ROW * (line as f64 + 0.5);
+            let x = frame.x + 0.5 * FONT;
             canvas.polyline(&[(x, y), (x + LEGEND_SAMPLE, y)], stroke_of(*number, curve));
-            let at = (x + LEGEND_SAMPLE + 0.5 * FONT, y);
-            canvas.text(&curve.label, at, Align::Start, Self::style());
+            let anchor = (x + LEGEND_SAMPLE + 0.5 * FONT, y);
+            canvas.text(&curve.label, anchor, Align::Start, Self::style());
         }
     }
 }
 
-/// Where in a frame something of a size hides no curve: the upper left end of it.
+/// Upper left corner of a position in a frame at which a legend of this size hides no curve.
 fn free_corner(frame: Rect, (width, height): (f64, f64), drawn: &[Vec<(f64, f64)>]) -> Option<(f64, f64)> {
     let [left, right] = [frame.x + LEGEND_INSET, frame.right() - width - LEGEND_INSET];
     let [upper, lower] = [frame.y + LEGEND_INSET, frame.bottom() - height - LEGEND_INSET];
     let is_free = |&(x, y): &(f64, f64)| {
         let hides = |p: (f64, f64)| (x..x + width).contains(&p.0) && (y..y + height).contains(&p.1);
         let crosses = |two: &[(f64, f64)]| {
-            (0..=BETWEEN).any(|k| {
-                let share = k as f64 / BETWEEN as f64;
-                hides((two[0].0 + share * (two[1].0 - two[0].0), two[0].1 + share * (two[1].1 - two[0].1)))
+            (0..=OVERLAP_STEPS).any(|k| {
+                let fraction = k as f64 / OVERLAP_STEPS as f64;
+                hides((
+                    two[0].0 + fraction * (two[1].0 - two[0].0),
+                    two[0].1 + fraction * (two[1].1 - two[0].1),
+                ))
             })
         };
         !drawn.iter().any(|line| line.iter().any(|p| hides(*p)) || line.windows(2).any(crosses))
@@ -350,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn no_two_of_sixteen_curves_are_alike() {
+    fn sixteen_curves_are_distinct() {
         let plain = Curve::default();
         let strokes: Vec<Stroke> = (0..16).map(|number| stroke_of(number, &plain)).collect();
         for (k, one) in strokes.iter().enumerate() {
@@ -363,7 +367,7 @@ mod tests {
         let frame = Rect { x: 0.0, y: 0.0, width: 900.0, height: 500.0 };
         let size = (200.0, 150.0);
         assert!(free_corner(frame, size, &[vec![(0.0, 250.0), (900.0, 250.0)]]).is_some());
-        // A line through all corners, whose two ends are in none.
+        // Lines through all corners whose ends are outside the frame.
         let ends = |y: f64| vec![(-400.0, y), (1300.0, y)];
         assert_eq!(free_corner(frame, size, &[ends(80.0), ends(420.0)]), None);
         let points = vec![(0.0, 1.0), (1.0, f64::NAN)];

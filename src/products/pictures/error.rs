@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Why a picture could not be drawn or written.
+/// Errors of drawing or writing a picture.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PictureError {
-    /// The number of values is not that of a HEALPix map.
+    /// A number of values that is not that of a HEALPix map.
     #[error(
         "panel {panel}: {pixels} values are not a HEALPix map; expected 12 nside^2 of them, with nside a power of two"
     )]
@@ -21,11 +21,11 @@ pub enum PictureError {
     /// An invalid size or count.
     #[error("invalid {what} {value}; expected {expected}")]
     Size {
-        /// Which quantity is invalid.
+        /// Name of the quantity.
         what: &'static str,
         /// Value found.
         value: usize,
-        /// Range that is accepted.
+        /// Accepted range.
         expected: &'static str,
     },
     /// Invalid limits of a scale.
@@ -40,26 +40,26 @@ pub enum PictureError {
         /// Further condition.
         more: &'static str,
     },
-    /// The PNG encoder failed.
+    /// An error of the PNG encoder.
     #[error("{path}: cannot encode the picture")]
     Encode {
-        /// File that was to be written.
+        /// Path of the picture.
         path: PathBuf,
-        /// The encoder's reason.
+        /// Error of the encoder.
         source: png::EncodingError,
     },
-    /// The PNG encoder failed on a tile.
+    /// An error of the PNG encoder for a tile.
     #[error("cannot encode a tile")]
     EncodeTile {
-        /// The encoder's reason.
+        /// Error of the encoder.
         source: png::EncodingError,
     },
-    /// The file could not be written.
+    /// A file that cannot be written.
     #[error("{path}: cannot write the picture; check that the folder exists and is writable")]
     Write {
-        /// File that was to be written.
+        /// Path of the picture.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: std::io::Error,
     },
 }

@@ -1,18 +1,17 @@
-//! Ticks at round numbers, and their labels.
+//! Chooses ticks at round numbers, and their labels.
 
-/// Ticks of an axis or a colour bar.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Ticks {
     /// Values with a label.
     pub labelled: Vec<(f64, String)>,
     /// Values without a label.
     pub minor: Vec<f64>,
-    /// Labels are in units of this power of ten.
+    /// Power of ten that is the unit of the labels.
     pub exponent: i32,
 }
 
 impl Ticks {
-    /// The unit to print beside the ticks: `K` or `10⁵ K`.
+    /// The unit to print beside the ticks, such as `K` or `10⁵ K`.
     pub fn unit(&self, unit: &str) -> String {
         match (self.exponent, unit.is_empty()) {
             (0, _) => unit.to_owned(),
@@ -22,12 +21,12 @@ impl Ticks {
     }
 }
 
-/// Ticks of a linear scale, about `wanted` of them.
+/// About `wanted` ticks of a linear scale.
 pub(super) fn linear(low: f64, high: f64, wanted: usize) -> Ticks {
     let step = round_step((high - low) / wanted.max(1) as f64);
-    let greatest = low.abs().max(high.abs());
+    let magnitude = low.abs().max(high.abs());
     // Values up to 1.5e6 are labelled in units of 1e5.
-    let decade = if greatest > 0.0 { (greatest / 1.5).log10().floor() as i32 } else { 0 };
+    let decade = if magnitude > 0.0 { (magnitude / 1.5).log10().floor() as i32 } else { 0 };
     let exponent = if (-3..5).contains(&decade) { 0 } else { decade };
     let decimals = (exponent - step.log10().floor() as i32).clamp(0, 12) as usize;
     let values = multiples(low, high, step);
@@ -42,7 +41,7 @@ pub(super) fn linear(low: f64, high: f64, wanted: usize) -> Ticks {
     Ticks { labelled, minor: multiples(low, high, step / minor_parts(step)), exponent }
 }
 
-/// Ticks of a logarithmic scale; `low` > 0.
+/// About `wanted` ticks of a logarithmic scale; `low` must be positive.
 pub(super) fn logarithmic(low: f64, high: f64, wanted: usize) -> Ticks {
     let (first, last) = (low.log10().floor() as i32, high.log10().ceil() as i32);
     let decades = high.log10() - low.log10();
@@ -81,7 +80,6 @@ pub(super) fn logarithmic(low: f64, high: f64, wanted: usize) -> Ticks {
     Ticks { labelled, minor, exponent }
 }
 
-/// A power of ten with superscript digits.
 pub(super) fn power_of_ten(exponent: i32) -> String {
     const RAISED: [char; 10] = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
     let raise = |c: char| match c.to_digit(10) {
@@ -91,7 +89,7 @@ pub(super) fn power_of_ten(exponent: i32) -> String {
     format!("10{}", exponent.to_string().chars().map(raise).collect::<String>())
 }
 
-/// A few digits without trailing zeros.
+/// Formats a value without trailing zeros.
 fn plain(value: f64) -> String {
     let text = format!("{value:.4}");
     let text = text.trim_end_matches('0').trim_end_matches('.');

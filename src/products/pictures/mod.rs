@@ -1,7 +1,7 @@
-//! Pictures: sky maps in Mollweide projection, curves, values over two axes; PNG and SVG files.
+//! Draws sky maps in Mollweide projection, curves, and values over two axes, as PNG and SVG files.
 //!
-//! Everything is drawn here, antialiased, with an embedded font. The result does not depend on the machine's fonts or
-//! libraries, so equal data give equal bytes. May use [`crate::sky`] and [`crate::files`].
+//! Drawing is antialiased, with an embedded font. It does not depend on the fonts or libraries of the machine, so equal
+//! data give equal bytes. Uses [`crate::sky`] and [`crate::files`].
 
 mod canvas;
 mod colour;

@@ -1,4 +1,4 @@
-//! A HEALPix map in Mollweide projection.
+//! Draws a HEALPix map in Mollweide projection.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -12,16 +12,16 @@ use crate::sky::Frame;
 use crate::sky::healpix::{Ring, pixel_of, ring};
 use crate::units::vector::{Vec3, dot};
 
-/// Samples per pixel of the picture, along each side.
+/// Number of samples along each side of a pixel of the picture.
 const SUPERSAMPLING: usize = 3;
 
-/// How a map is sampled for its picture.
+/// Sampling of a map for its picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Sampling {
-    /// Uniform map pixels: each in its own colour.
+    /// Each map pixel has a uniform colour.
     #[default]
     Pixels,
-    /// Linear interpolation between pixel centres along and across rings: smoother for coarse maps.
+    /// Linear interpolation between pixel centres along and across rings, which is smoother for coarse maps.
     Interpolated,
 }
 
@@ -66,7 +66,7 @@ impl View {
     }
 }
 
-/// A map with its geometry: `values` in RING order.
+/// A map with its nside; `values` are in RING order.
 #[derive(Clone, Copy)]
 pub(super) struct MapField<'a> {
     pub values: &'a [f64],
@@ -95,7 +95,7 @@ impl MapField<'_> {
         let (mut sum, mut weights) = (0.0, 0.0);
         for (k, ring_weight) in [(above, 1.0 - weight), (above + 1, weight)] {
             if k == 0 || k > last {
-                // Beyond the first ring is the pole, whose value is the mean of that ring.
+                // Beyond the first and last ring is a pole, whose value is the mean of that ring.
                 let ring = ring(self.nside, k.clamp(1, last));
                 for value in &self.values[ring.first..ring.first + ring.len] {
                     add(&mut sum, &mut weights, *value, ring_weight / ring.len as f64);
@@ -120,10 +120,10 @@ fn add(sum: &mut f64, weights: &mut f64, value: f64, weight: f64) {
 
 /// The pixels of a ring west and east of a longitude, and its fractional position between them.
 fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
-    let place = ((longitude - ring.phi0_rad) / TAU).rem_euclid(1.0) * ring.len as f64;
-    let west = (place.floor() as usize).min(ring.len - 1);
+    let position = ((longitude - ring.phi0_rad) / TAU).rem_euclid(1.0) * ring.len as f64;
+    let west = (position.floor() as usize).min(ring.len - 1);
     let east = if west + 1 == ring.len { 0 } else { west + 1 };
-    ([ring.first + west, ring.first + east], (place - west as f64).clamp(0.0, 1.0))
+    ([ring.first + west, ring.first + east], (position - west as f64).clamp(0.0, 1.0))
 }
 
 /// Draws a map into the largest ellipse that fits a rectangle.
@@ -148,7 +148,6 @@ pub(super) fn draw(canvas: &mut Canvas, area: Rect, field: MapField<'_>, scale: 
     }
 }
 
-/// The map's outline on the page.
 struct Ellipse {
     x: f64,
     y: f64,
@@ -183,7 +182,7 @@ impl<'a> Painter<'a> {
         Self { field, scale, pixels }
     }
 
-    /// Whether one sample per page pixel is enough.
+    /// Whether one sample per pixel of the page is enough.
     fn is_smooth(&self) -> bool {
         self.pixels.is_none()
     }
@@ -204,8 +203,7 @@ fn paint(canvas: &mut Canvas, ellipse: &Ellipse, field: MapField<'_>, scale: &Co
     lines.par_iter_mut().for_each(|(y, line)| paint_row(line, *y, ellipse, &painter, view));
 }
 
-/// Paints one row of pixels; each takes the mean colour of its samples. Samples outside the ellipse keep the
-/// background.
+/// Paints one row of pixels with the mean colours of their samples. Samples outside the ellipse keep the background.
 fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Painter<'_>, view: &View) {
     let centre = view.centre_deg.to_radians();
     let inside = |k: usize| (k as f64 + 0.5) / SUPERSAMPLING as f64;
@@ -215,14 +213,14 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
     let mut sums = vec![([0.0_f32; 3], 0.0_f32); columns.min(line.len() - first)];
     for sub_row in 0..SUPERSAMPLING {
         let up = (ellipse.y - (y as f64 + inside(sub_row))) / ellipse.half_height;
-        let Some(parallel) = LatitudeLine::at(up) else { continue };
+        let Some(parallel) = LatitudeLine::at_height(up) else { continue };
         for (x, (sum, hits)) in sums.iter_mut().enumerate() {
             for sub_column in 0..SUPERSAMPLING {
                 let right = ((first + x) as f64 + inside(sub_column) - ellipse.x) / ellipse.half_height;
                 let Some(longitude) = parallel.longitude(right) else { continue };
                 *hits += 1.0;
                 if painter.is_smooth() && *hits > 1.0 {
-                    // Interpolated colours vary little within a page pixel.
+                    // Interpolated colours vary little within a pixel of the page.
                     continue;
                 }
                 let (sin, cos) = (longitude + centre).sin_cos();
@@ -233,14 +231,14 @@ fn paint_row(line: &mut [[f32; 3]], y: usize, ellipse: &Ellipse, painter: &Paint
         }
     }
     for (pixel, (sum, hits)) in line[first..].iter_mut().zip(sums) {
-        let share = if painter.is_smooth() { hits } else { 1.0 };
+        let weight = if painter.is_smooth() { hits } else { 1.0 };
         for (pixel, sum) in pixel.iter_mut().zip(sum) {
-            *pixel = (*pixel * (all - hits) + sum * share) / all;
+            *pixel = (*pixel * (all - hits) + sum * weight) / all;
         }
     }
 }
 
-/// Meridians every 60 degrees and parallels every 30, as lines on the ellipse.
+/// Meridians every 60 degrees and parallels every 30 degrees, as lines on the ellipse.
 fn graticule(centre: f64) -> Vec<Vec<(f64, f64)>> {
     let latitudes = (0..=180).map(|k| (f64::from(k) - 90.0).to_radians());
     let longitudes = (0..=180).map(|k| (f64::from(k) * 2.0 - 180.0).to_radians());
@@ -296,7 +294,7 @@ mod tests {
     use crate::sky::healpix::{pixel_count, pixel_directions};
 
     #[test]
-    fn interpolation_keeps_what_is_linear_in_z_and_hits_centres() {
+    fn interpolation_is_exact_at_pixel_centres() {
         for nside in [1, 2, 8, 16] {
             let directions = pixel_directions(nside);
             let values: Vec<f64> = directions.iter().map(|d| d[2] + 0.3 * d[0]).collect();

@@ -1,4 +1,4 @@
-//! Square pieces of the sky with a graticule.
+//! Draws square cutouts of the sky with a graticule.
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke, WHITE};
 use super::error::PictureError;
@@ -8,36 +8,37 @@ use super::sheet::draw_bar;
 use super::text::{Align, Style};
 use crate::sky::{Cutout, Frame};
 
-/// A piece of the sky.
+/// A cutout of the sky to draw.
 #[derive(Clone, Debug)]
 pub struct Patch<'a> {
-    /// Line above; none if empty.
+    /// Line above the cutout; none if empty.
     pub caption: String,
-    /// What is shown of the sky.
+    /// The region of the sky.
     pub cutout: Cutout,
-    /// Its values, as [`Cutout::values`] gives them.
+    /// Values of the region, as from [`Cutout::values`].
     pub values: &'a [f64],
-    /// Colours.
+    /// Colour scale.
     pub scale: ColourScale,
     /// Unit of the values.
     pub unit: String,
 }
 
-/// Side of a piece, and width and height of its share of the page, pixels.
+/// Side of a cutout, pixels.
 const SIDE_PX: f64 = 600.0;
-const SHARE_PX: (usize, usize) = (740, 840);
+/// Width and height of the area of the page for a cutout, pixels.
+const PANEL_PX: (usize, usize) = (740, 840);
 const FONT: f64 = 19.0;
-/// Distances of the lines of a graticule, degrees.
+/// Possible spacings of the lines of a graticule, degrees.
 const STEPS_DEG: [f64; 9] = [0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0, 60.0];
 
-/// Draws pieces of the sky on one page in `columns` columns, below a title (none if empty).
+/// Draws cutouts of the sky on one page in `columns` columns, below a title (none if empty).
 ///
 /// # Errors
-/// [`PictureError::Size`] without pieces, with too many for a page, or with values that are not those of their piece.
+/// [`PictureError::Size`] without cutouts, with too many for a page, or with a wrong number of values.
 pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Result<Picture, PictureError> {
     if patches.is_empty() || patches.len() > 64 {
         let value = patches.len();
-        return Err(PictureError::Size { what: "number of pieces", value, expected: "1 to 64" });
+        return Err(PictureError::Size { what: "number of cutouts", value, expected: "1 to 64" });
     }
     if let Some(bad) =
         patches.iter().find(|p| p.values.is_empty() || p.values.len() != p.cutout.pixels.pow(2))
@@ -47,7 +48,7 @@ pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Resul
     }
     let columns = columns.clamp(1, patches.len());
     let head = if title.is_empty() { 0 } else { 62 };
-    let (width, height) = (SHARE_PX.0 * columns, head + SHARE_PX.1 * patches.len().div_ceil(columns));
+    let (width, height) = (PANEL_PX.0 * columns, head + PANEL_PX.1 * patches.len().div_ceil(columns));
     Picture::check_size(width, height)?;
     let mut canvas = Canvas::new(width, height);
     if !title.is_empty() {
@@ -56,8 +57,8 @@ pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Resul
     }
     for (number, patch) in patches.iter().enumerate() {
         let frame = Rect {
-            x: (number % columns * SHARE_PX.0) as f64 + 90.0,
-            y: (head + number / columns * SHARE_PX.1) as f64 + 50.0,
+            x: (number % columns * PANEL_PX.0) as f64 + 90.0,
+            y: (head + number / columns * PANEL_PX.1) as f64 + 50.0,
             width: SIDE_PX,
             height: SIDE_PX,
         };
@@ -100,7 +101,7 @@ fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
     draw_bar(canvas, bar, (&patch.scale, &patch.unit), FONT);
 }
 
-/// The least usual distance of lines that leaves at most six of them.
+/// The smallest spacing that gives at most six lines.
 fn step_deg(span_deg: f64) -> f64 {
     STEPS_DEG.into_iter().find(|step| span_deg / step <= 6.0).unwrap_or(90.0)
 }
@@ -111,10 +112,10 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
     let to_page = |[right, up]: [f64; 2]| {
         (frame.middle_x() + right / size_deg * SIDE_PX, frame.middle_y() - up / size_deg * SIDE_PX)
     };
-    // Meridians as far as the corner reaches; all of them around a pole.
+    // Meridians up to the corner; all of them around a pole.
     let reach = 1.5 * half;
-    let most = latitude.abs() + reach;
-    let wide = if most < 89.0 { (reach / most.to_radians().cos()).min(180.0) } else { 180.0 };
+    let latitude_max = latitude.abs() + reach;
+    let wide = if latitude_max < 89.0 { (reach / latitude_max.to_radians().cos()).min(180.0) } else { 180.0 };
     let (along, up) = (step_deg(2.0 * half / latitude.to_radians().cos().max(0.05)), step_deg(size_deg));
     let (low, high) = ((latitude - reach).max(-90.0), (latitude + reach).min(90.0));
     let steps = |from: f64, to: f64, step: f64| {
@@ -136,18 +137,18 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
     let meridian =
         |l: f64| (0..=200).map(|k| patch.cutout.place_deg(l, fine(k, low, high))).collect::<Vec<_>>();
     let parallel = |b: f64| {
-        let at = |k| patch.cutout.place_deg(fine(k, longitude - wide, longitude + wide), b);
-        (0..=200).map(at).collect::<Vec<_>>()
+        let point = |k| patch.cutout.place_deg(fine(k, longitude - wide, longitude + wide), b);
+        (0..=200).map(point).collect::<Vec<_>>()
     };
     meridians.iter().for_each(|&l| line(canvas, meridian(l)));
     parallels.iter().for_each(|&b| line(canvas, parallel(b)));
     canvas.set_clip(None);
-    // Where lines leave the piece below, and to the left.
+    // Labels where lines leave the cutout at the bottom and the left.
     for &l in &meridians {
         let crossing = edge(&meridian(l), 1, -half).filter(inside);
         if let Some(place) = crossing {
             let (x, y) = to_page(place);
-            let text = format!("{}°", shown(l.rem_euclid(360.0)));
+            let text = format!("{}°", format_degrees(l.rem_euclid(360.0)));
             canvas.text(&text, (x, y + 0.9 * FONT), Align::Middle, label);
         }
     }
@@ -155,29 +156,29 @@ fn graticule(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
         if let Some(place) = edge(&parallel(b), 0, -half).filter(inside) {
             let (x, y) = to_page(place);
             let sign = if b > 0.0 { "+" } else { "" };
-            let text = format!("{sign}{}°", shown(b)).replace('-', "−");
+            let text = format!("{sign}{}°", format_degrees(b)).replace('-', "−");
             canvas.text(&text, (x - 0.4 * FONT, y), Align::End, label);
         }
     }
 }
 
-/// A number of degrees, which is whole or half.
-fn shown(degrees: f64) -> String {
+/// Formats a multiple of half a degree.
+fn format_degrees(degrees: f64) -> String {
     if degrees.fract() == 0.0 { format!("{degrees:.0}") } else { format!("{degrees:.1}") }
 }
 
-/// Where a line crosses the edge on which coordinate `axis` is `value`.
+/// The point at which a line crosses the edge on which coordinate `axis` is `value`.
 fn edge(line: &[Option<[f64; 2]>], axis: usize, value: f64) -> Option<[f64; 2]> {
     line.windows(2).find_map(|two| {
         let (a, b) = (two[0]?, two[1]?);
         let (da, db) = (a[axis] - value, b[axis] - value);
-        // A jump from one side of the plane to the other is no crossing.
+        // A jump from one side of the plane to the other is not a crossing.
         let near = (a[0] - b[0]).abs() + (a[1] - b[1]).abs() < 30.0;
         (da * db <= 0.0 && da != db && near).then(|| {
             let t = da / (da - db);
-            let mut place = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
-            place[axis] = value;
-            place
+            let mut point = [a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1])];
+            point[axis] = value;
+            point
         })
     })
 }
@@ -189,7 +190,7 @@ mod tests {
     use crate::sky::PlaneProjection;
 
     #[test]
-    fn pieces_of_any_place_are_drawn_and_wrong_ones_refused() {
+    fn cutouts_anywhere_are_drawn_and_invalid_ones_refused() {
         let values = vec![0.5; 16];
         for projection in [PlaneProjection::Gnomonic, PlaneProjection::Cartesian] {
             for centre_deg in [[0.0, 0.0], [359.0, 89.9], [120.0, -90.0], [200.0, 45.0]] {

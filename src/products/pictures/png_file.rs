@@ -1,4 +1,4 @@
-//! Finished pictures, and writing them as PNG or SVG files.
+//! Finished pictures, which are written as PNG or SVG files.
 
 use std::path::Path;
 
@@ -7,20 +7,19 @@ use super::error::PictureError;
 use super::svg::svg_of;
 use crate::files::write_atomically;
 
-/// Maximum side of a picture, pixels.
 const SIDE_MAX: usize = 16_384;
-/// Maximum number of pixels of a picture.
 const PIXELS_MAX: usize = 1 << 27;
 
-/// A finished picture and its text chunks.
+/// A finished picture.
 #[derive(Clone, Debug)]
 pub struct Picture {
     width: usize,
     height: usize,
     rgb: Vec<u8>,
-    /// Without lines, fills and texts.
-    below: Vec<u8>,
+    /// The pixels without the shapes.
+    background: Vec<u8>,
     shapes: Vec<Shape>,
+    /// Keywords and texts of the PNG text chunks.
     texts: Vec<(String, String)>,
 }
 
@@ -28,12 +27,11 @@ impl Picture {
     pub(super) fn from_canvas(mut canvas: Canvas, width: usize, height: usize, title: &str) -> Self {
         let software = concat!("lunarray ", env!("CARGO_PKG_VERSION")).to_owned();
         let texts = vec![("Software".to_owned(), software), ("Title".to_owned(), title.to_owned())];
-        let below = canvas.rgb();
+        let background = canvas.rgb();
         let shapes = canvas.flatten();
-        Self { width, height, rgb: canvas.rgb(), below, shapes, texts }
+        Self { width, height, rgb: canvas.rgb(), background, shapes, texts }
     }
 
-    /// Checks the size of a page.
     pub(super) fn check_size(width: usize, height: usize) -> Result<(), PictureError> {
         for (what, value) in [("picture width", width), ("picture height", height)] {
             if !(16..=SIDE_MAX).contains(&value) {
@@ -75,7 +73,7 @@ impl Picture {
     /// The picture as a PNG file in memory.
     ///
     /// # Errors
-    /// What the encoder says.
+    /// Errors of the encoder.
     pub fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
         self.encoded(&self.rgb)
     }
@@ -95,21 +93,21 @@ impl Picture {
         Ok(bytes)
     }
 
-    /// The picture as an SVG file in memory: lines and texts as such, values in colour as an image within.
+    /// The picture as an SVG file in memory, with shapes as vector graphics, and values in colour as an embedded image.
     ///
     /// # Errors
-    /// What the encoder of the image says.
+    /// Errors of the encoder of the image.
     pub fn to_svg(&self) -> Result<String, png::EncodingError> {
-        let is_blank = self.below.iter().all(|&value| value == 255);
-        let image = if is_blank { None } else { Some(self.encoded(&self.below)?) };
+        let is_blank = self.background.iter().all(|&value| value == 255);
+        let image = if is_blank { None } else { Some(self.encoded(&self.background)?) };
         let title = self.texts.iter().find(|(keyword, _)| keyword == "Title").map_or("", |(_, title)| title);
         Ok(svg_of(self.width, self.height, title, image.as_deref(), &self.shapes))
     }
 
-    /// Writes the picture atomically: as SVG to a name that ends so, else as PNG.
+    /// Writes the picture atomically, as SVG if the path has that extension, otherwise as PNG.
     ///
     /// # Errors
-    /// [`PictureError::Write`] with the system's reason, [`PictureError::Encode`].
+    /// [`PictureError::Write`] or [`PictureError::Encode`].
     pub fn write(&self, path: &Path) -> Result<(), PictureError> {
         let is_svg = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("svg"));
         let bytes = if is_svg { self.to_svg().map(String::into_bytes) } else { self.to_png() };

@@ -1,4 +1,4 @@
-//! Values over two axes, in colour.
+//! Draws values over two axes in colour.
 
 use super::canvas::{Canvas, INK, Rect, Stroke};
 use super::curves::{Axis, FONT, Plot, Range, write_axes};
@@ -12,29 +12,29 @@ use super::text::{Align, Style};
 /// Values in equal cells over two axes.
 #[derive(Clone, Debug)]
 pub struct Raster<'a> {
-    /// Line above; none if empty.
+    /// Line above the raster; none if empty.
     pub title: String,
     /// Horizontal axis, with its limits.
     pub x: Axis,
     /// Vertical axis, with its limits.
     pub y: Axis,
-    /// Values, row by row from the lowest; those that are no number are drawn grey.
+    /// Values, row by row from the lowest. NaN is drawn in grey.
     pub values: &'a [f64],
-    /// Values in a row.
+    /// Number of values in a row.
     pub columns: usize,
-    /// Colours.
+    /// Colour scale.
     pub scale: ColourScale,
     /// Unit of the values, printed at the colour bar.
     pub unit: String,
 }
 
-/// Width and height of one raster with its axes and its bar, pixels.
+/// Width and height of one raster with axes and colour bar, pixels.
 const RASTER_PX: (usize, usize) = (700, 760);
 
 /// Draws rasters on one page in `columns` columns, below a title (none if empty).
 ///
 /// # Errors
-/// [`PictureError::Size`] without rasters, with too many for a page, or with values that fill no whole rows.
+/// [`PictureError::Size`] without rasters, with too many for a page, or with an incomplete row.
 pub fn draw_rasters(title: &str, rasters: &[Raster<'_>], columns: usize) -> Result<Picture, PictureError> {
     if rasters.is_empty() || rasters.len() > 64 {
         let value = rasters.len();
@@ -57,33 +57,33 @@ pub fn draw_rasters(title: &str, rasters: &[Raster<'_>], columns: usize) -> Resu
         canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
     }
     for (number, raster) in rasters.iter().enumerate() {
-        let share = Rect {
+        let area = Rect {
             x: (number % columns * RASTER_PX.0) as f64,
             y: (head + number / columns * RASTER_PX.1) as f64,
             width: RASTER_PX.0 as f64,
             height: RASTER_PX.1 as f64,
         };
-        draw_raster(&mut canvas, share, raster);
+        draw_raster(&mut canvas, area, raster);
     }
     let title = if title.is_empty() { rasters[0].title.as_str() } else { title };
     Ok(Picture::from_canvas(canvas, width, height, title))
 }
 
-fn draw_raster(canvas: &mut Canvas, share: Rect, raster: &Raster<'_>) {
+fn draw_raster(canvas: &mut Canvas, area: Rect, raster: &Raster<'_>) {
     let [x_range, y_range] = [&raster.x, &raster.y].map(|axis| Range::new(axis, std::iter::empty(), 0.0));
     let (x_ticks, y_ticks) = (x_range.ticks(6), y_range.ticks(6));
     let labels = y_ticks.labelled.iter().map(|(_, label)| text::length(label, Style::new(FONT, INK)));
     let left = (3.4 * FONT + labels.fold(0.0, f64::max)).ceil();
     let top = if raster.title.is_empty() { 24.0 } else { 52.0 };
     let frame = Rect {
-        x: share.x + left,
-        y: share.y + top,
-        width: share.width - left - 50.0,
-        height: share.height - top - 160.0,
+        x: area.x + left,
+        y: area.y + top,
+        width: area.width - left - 50.0,
+        height: area.height - top - 160.0,
     };
     let rows = raster.values.len() / raster.columns;
-    // Cells are equal on the page.
-    let cell = |place: f64, count: usize| ((place * count as f64) as usize).min(count - 1);
+    // Cells have equal sizes on the page.
+    let cell = |position: f64, count: usize| ((position * count as f64) as usize).min(count - 1);
     for y in frame.y as usize..frame.bottom() as usize {
         let row = cell((frame.bottom() - y as f64 - 0.5) / frame.height, rows);
         for x in frame.x as usize..frame.right() as usize {
@@ -94,7 +94,7 @@ fn draw_raster(canvas: &mut Canvas, share: Rect, raster: &Raster<'_>) {
     }
     canvas.outline(frame, Stroke::solid(INK, 1.0, 1.2));
     let to_page = |x: f64, y: f64| {
-        (frame.x + x_range.place(x) * frame.width, frame.bottom() - y_range.place(y) * frame.height)
+        (frame.x + x_range.position(x) * frame.width, frame.bottom() - y_range.position(y) * frame.height)
     };
     let axes =
         Plot { title: raster.title.clone(), x: raster.x.clone(), y: raster.y.clone(), ..Plot::default() };
@@ -128,11 +128,11 @@ mod tests {
 
     #[test]
     fn the_first_row_is_the_lowest() {
-        // Bright below and to the right alone.
+        // Only the lower right cell is bright.
         let picture = draw_rasters("", &[raster(&[0.0, 1.0, 0.0, 0.0])], 1).unwrap();
         let brightness = |x: usize, y: usize| {
-            let place = 3 * (y * picture.width() + x);
-            picture.rgb()[place..place + 3].iter().map(|&c| u32::from(c)).sum::<u32>()
+            let start = 3 * (y * picture.width() + x);
+            picture.rgb()[start..start + 3].iter().map(|&c| u32::from(c)).sum::<u32>()
         };
         assert!(brightness(500, 450) > 500);
         for (x, y) in [(200, 450), (200, 150), (500, 150)] {

@@ -1,4 +1,4 @@
-//! Pages of maps: a single map, or several with captions.
+//! Draws pages with one or more maps.
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke};
 use super::error::PictureError;
@@ -12,11 +12,11 @@ use crate::sky::healpix::nside_of;
 /// One map of a page.
 #[derive(Clone, Debug)]
 pub struct MapPanel<'a> {
-    /// `12 nside^2` values in RING order; NaN and UNSEEN are drawn grey, values that a logarithmic scale lacks blue.
+    /// `12 nside^2` values in RING order. NaN and UNSEEN are drawn in grey, values <= 0 on a logarithmic scale in blue.
     pub values: &'a [f64],
     /// Line above the map.
     pub caption: String,
-    /// Colours.
+    /// Colour scale.
     pub scale: ColourScale,
     /// Unit of the values, printed at the colour bar.
     pub unit: String,
@@ -43,7 +43,7 @@ pub struct Sheet {
     pub columns: usize,
     /// Width of the page, pixels.
     pub width_px: usize,
-    /// Colour bars.
+    /// Placement of colour bars.
     pub bars: Bars,
     /// View of the maps.
     pub view: View,
@@ -62,10 +62,10 @@ impl Default for Sheet {
     }
 }
 
-/// Draws one map with its colour bar; the panel's caption is the title.
+/// Draws one map with its colour bar. The caption of the panel is the title.
 ///
 /// # Errors
-/// As [`draw_sheet`].
+/// Errors of [`draw_sheet`].
 pub fn draw_map(panel: &MapPanel<'_>, subtitle: &str, view: &View) -> Result<Picture, PictureError> {
     let sheet = Sheet {
         title: panel.caption.clone(),
@@ -77,7 +77,7 @@ pub fn draw_map(panel: &MapPanel<'_>, subtitle: &str, view: &View) -> Result<Pic
     draw_sheet(std::slice::from_ref(&panel), &sheet)
 }
 
-/// Draws maps in rows, with captions and colour bars: for example successive snapshots of a map.
+/// Draws maps in rows, with captions and colour bars.
 ///
 /// # Errors
 /// [`PictureError::PixelCount`] for values that are not a map, [`PictureError::Size`] for a page without
@@ -103,13 +103,13 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
     let mut canvas = Canvas::new(sheet.width_px, layout.height);
     layout.write_head(&mut canvas, sheet);
     for (number, (panel, field)) in panels.iter().zip(fields).enumerate() {
-        let place = layout.panel(number);
+        let area = layout.panel(number);
         if !panel.caption.is_empty() {
-            let anchor = (place.middle_x(), place.y + 0.5 * layout.caption);
+            let anchor = (area.middle_x(), area.y + 0.5 * layout.caption);
             let style = Style::new(layout.font, INK).medium();
             canvas.text(&panel.caption, anchor, Align::Middle, style);
         }
-        let map = Rect { y: place.y + layout.caption, height: layout.map_height, ..place };
+        let map = Rect { y: area.y + layout.caption, height: layout.map_height, ..area };
         mollweide::draw(&mut canvas, map, field, &panel.scale, &sheet.view);
         if sheet.bars == Bars::Each {
             let y = map.bottom() + layout.gap;
@@ -141,15 +141,14 @@ pub fn draw_sheet(panels: &[MapPanel<'_>], sheet: &Sheet) -> Result<Picture, Pic
     Ok(Picture::from_canvas(canvas, sheet.width_px, layout.height, &sheet.title))
 }
 
-/// What colours outside the bars mean, if there are any.
+/// Explains colours that are not in the colour bars; empty if there are none.
 fn footnote(panels: &[MapPanel<'_>]) -> String {
-    let negative = panels.iter().any(|p| p.values.iter().any(|&value| p.scale.lacks(value)));
+    let negative = panels.iter().any(|p| p.values.iter().any(|&value| p.scale.is_off_scale(value)));
     let unseen = panels.iter().any(|p| p.values.iter().any(|&value| !is_seen(value)));
     let notes = [(negative, "blue: negative"), (unseen, "grey: not measured")];
     notes.into_iter().filter(|(is_shown, _)| *is_shown).map(|(_, note)| note).collect::<Vec<_>>().join("; ")
 }
 
-/// The layout of a page, pixels.
 struct Layout {
     height: usize,
     columns: usize,
@@ -183,8 +182,8 @@ impl Layout {
         let caption = if panels.iter().all(|p| p.caption.is_empty()) { 0.0 } else { 2.0 * font };
         let (bar, gap) = (1.0 * font, 1.0 * font);
         let bar_block = gap + bar + 2.1 * font;
-        let own_bar = if sheet.bars == Bars::Each { bar_block } else { 0.0 };
-        let panel_height = caption + map_height + own_bar + if rows > 1 { 0.8 * font } else { 0.0 };
+        let panel_bar = if sheet.bars == Bars::Each { bar_block } else { 0.0 };
+        let panel_height = caption + map_height + panel_bar + if rows > 1 { 0.8 * font } else { 0.0 };
         let shared_bar = if sheet.bars == Bars::Shared { bar_block } else { 0.0 };
         let height = (head + rows as f64 * panel_height + shared_bar + 1.5 * font).ceil() as usize;
         Self {
@@ -216,7 +215,7 @@ impl Layout {
     }
 
     fn gutter(&self) -> f64 {
-        // The margins' and gutters' shares of the width stand in one proportion.
+        // Margins are 0.02 and gutters 0.018 of the width.
         if self.columns == 1 { 0.0 } else { 0.9 * self.margin }
     }
 
@@ -239,7 +238,7 @@ impl Layout {
     }
 }
 
-/// A horizontal colour bar with ticks below and the unit at its right end.
+/// Draws a horizontal colour bar with ticks below and the unit at its right end.
 pub(super) fn draw_bar(canvas: &mut Canvas, bar: Rect, (scale, unit): (&ColourScale, &str), font: f64) {
     let (first, last) = (bar.x.floor() as usize, bar.right().ceil() as usize);
     for x in first..last {
@@ -250,7 +249,7 @@ pub(super) fn draw_bar(canvas: &mut Canvas, bar: Rect, (scale, unit): (&ColourSc
     canvas.outline(bar, Stroke::solid(INK, 1.0, 1.0));
     let wanted = ((bar.width / (3.0 * font)) as usize).clamp(3, 10);
     let ticks = scale.ticks(wanted);
-    let x_of = |value: f64| bar.x + scale.place(value).clamp(0.0, 1.0) * bar.width;
+    let x_of = |value: f64| bar.x + scale.position(value).clamp(0.0, 1.0) * bar.width;
     let thin = Stroke::solid(INK, 1.0, 1.0);
     for value in &ticks.minor {
         let x = x_of(*value);

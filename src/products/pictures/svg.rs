@@ -1,17 +1,17 @@
-//! Pages as SVG: lines, fills and texts stay what they are, so that they are sharp at any size and can be edited.
+//! Writes pages as SVG. Shapes stay vector graphics, which are sharp at any size and can be edited.
 
 use std::fmt::Write;
 
 use super::canvas::{Colour, Rect, Shape, Stroke};
 use super::text::{Align, EM, HALF_CAPITAL, SUBSCRIPT_DROP, SUBSCRIPT_SIZE, Style, runs};
 
-/// Fonts that look like ours, which is the first.
+/// The font of pictures, and similar ones.
 const FONTS: &str = "Roboto, Helvetica, Arial, 'DejaVu Sans', sans-serif";
 
-/// Beyond this a coordinate is off any page.
-const FAR: f64 = 1e6;
+/// Coordinate beyond which a point is off any page, pixels.
+const OFF_PAGE: f64 = 1e6;
 
-/// The page, with an image (PNG) below all shapes if there is one.
+/// The page as SVG, with a PNG image, if given, below all shapes.
 pub(super) fn svg_of(
     width: usize,
     height: usize,
@@ -34,7 +34,6 @@ pub(super) fn svg_of(
     let page = Rect { x: 0.0, y: 0.0, width: width as f64, height: height as f64 };
     let mut clips: Vec<Rect> = Vec::new();
     for shape in shapes {
-        // Writing to a string cannot fail.
         let _ = match shape {
             Shape::Fill { rect, colour, alpha, clip } => {
                 fill(&mut out, within(*rect, *clip), *colour, *alpha)
@@ -55,7 +54,7 @@ fn within(rect: Rect, clip: Rect) -> Rect {
     Rect { x, y, width: (right - x).max(0.0), height: (bottom - y).max(0.0) }
 }
 
-/// The number of a clip, which is written when it is first needed.
+/// The number of a clip, whose definition is written at its first use.
 fn clip_number(out: &mut String, clips: &mut Vec<Rect>, clip: Rect) -> usize {
     if let Some(known) = clips.iter().position(|known| *known == clip) {
         return known;
@@ -85,14 +84,14 @@ fn fill(out: &mut String, rect: Rect, colour: Colour, alpha: f32) -> std::fmt::R
 
 fn line(out: &mut String, points: &[(f64, f64)], stroke: Stroke, clip: Option<usize>) -> std::fmt::Result {
     let mut path = String::new();
-    let mut goes_on = false;
+    let mut is_connected = false;
     for &(x, y) in points {
-        if !(x.abs() <= FAR && y.abs() <= FAR) {
-            goes_on = false;
+        if !(x.abs() <= OFF_PAGE && y.abs() <= OFF_PAGE) {
+            is_connected = false;
             continue;
         }
-        write!(path, "{}{x:.2} {y:.2}", if goes_on { "L" } else { "M" })?;
-        goes_on = true;
+        write!(path, "{}{x:.2} {y:.2}", if is_connected { "L" } else { "M" })?;
+        is_connected = true;
     }
     let Stroke { colour, alpha, width, dash } = stroke;
     let colour = colour_of(colour);
@@ -134,7 +133,7 @@ fn write_text(
     let lowered = SUBSCRIPT_DROP * style.size;
     let mut is_low = false;
     for (run, subscript) in runs(text).into_iter().filter(|(run, _)| !run.is_empty()) {
-        // A line that was lowered has to be raised again.
+        // Raises the line again after a subscript.
         let shift = match (is_low, subscript) {
             (false, true) => lowered,
             (true, false) => -lowered,
@@ -147,7 +146,6 @@ fn write_text(
     writeln!(out, "</text>")
 }
 
-/// Text within XML: what it would take for itself, and what it does not allow.
 fn escaped(text: &str) -> String {
     text.chars().filter(|c| !c.is_control()).fold(String::new(), |mut out, c| {
         match c {
@@ -216,9 +214,9 @@ mod tests {
         let svg = draw_plots("", &[plot], 1).unwrap().to_svg().unwrap();
         assert!(svg.contains(">a &lt; b &amp; c</tspan>"), "{svg}");
         assert!(svg.contains("rotate(-90)") && svg.contains(">l</tspan>"), "{svg}");
-        // Nothing in colour: no image.
+        // Without values in colour there is no image.
         assert!(!svg.contains("<image"));
-        // The number that is none interrupts the line.
+        // NaN interrupts the line.
         let dashed: Vec<&str> = svg.lines().filter(|line| line.contains("stroke-dasharray")).collect();
         assert!(dashed.iter().any(|line| line.matches('M').count() == 1 && line.contains('L')), "{dashed:?}");
         assert!(svg.matches("<clipPath").count() == 1 && svg.contains("clip-path=\"url(#c0)\""));
@@ -239,7 +237,7 @@ mod tests {
         let picture = draw_rasters("", &[raster], 1).unwrap();
         let svg = picture.to_svg().unwrap();
         assert!(svg.matches("<image").count() == 1 && svg.contains(">h</tspan>"));
-        // The image alone has no ink where the title stands.
+        // The image does not contain the title.
         assert!(picture.to_png().unwrap().len() > svg.matches("iVBOR").count());
     }
 }

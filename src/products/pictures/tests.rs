@@ -2,8 +2,8 @@ use super::*;
 use crate::sky::healpix::{pixel_count, pixel_directions};
 
 fn colour_at(picture: &Picture, x: f64, y: f64) -> [u8; 3] {
-    let place = 3 * (y as usize * picture.width() + x as usize);
-    [picture.rgb()[place], picture.rgb()[place + 1], picture.rgb()[place + 2]]
+    let start = 3 * (y as usize * picture.width() + x as usize);
+    [picture.rgb()[start], picture.rgb()[start + 1], picture.rgb()[start + 2]]
 }
 
 fn bare() -> Sheet {
@@ -20,12 +20,11 @@ fn panel(values: &[f64], scale: ColourScale) -> MapPanel<'_> {
 
 #[test]
 fn longitude_grows_to_the_left_and_latitude_upwards() {
-    // One map bright in the east, one in the north.
     for (axis, bright, dark) in [(1, (0.3, 0.5), (0.7, 0.5)), (2, (0.5, 0.3), (0.5, 0.7))] {
         let values: Vec<f64> = pixel_directions(16).iter().map(|d| d[axis]).collect();
         let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap();
         let picture = draw_sheet(&[panel(&values, scale)], &bare()).unwrap();
-        // The map fills the page's width but for the margins; its middle is near the page's.
+        // The map fills the width of the page except for the margins, and is nearly centred.
         let map_height = 0.445 * 800.0;
         let sum = |(x, y): (f64, f64)| {
             let c = colour_at(&picture, x * 800.0, 15.0 + y * map_height);
@@ -85,7 +84,7 @@ fn a_view_in_another_frame_shows_the_galaxy_where_it_is() {
     let sheet = Sheet { view: View { frame: String::new(), ..galactic }, ..bare() };
     let picture = draw_sheet(&[panel(&values, scale)], &sheet).unwrap();
     let brightness = |x: f64, y: f64| colour_at(&picture, x, y).into_iter().map(u32::from).sum::<u32>();
-    // The brightest place is the middle of the picture.
+    // The brightest position is the centre of the picture.
     let middle = brightness(400.0, 193.0);
     for (x, y) in [(330.0, 193.0), (470.0, 193.0), (400.0, 150.0), (400.0, 236.0)] {
         assert!(middle > brightness(x, y), "{x} {y}");

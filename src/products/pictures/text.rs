@@ -1,4 +1,4 @@
-//! Text in the embedded font.
+//! Measures and paints text in the embedded font.
 
 use std::sync::LazyLock;
 
@@ -16,7 +16,6 @@ fn parse(bytes: &'static [u8]) -> FontRef<'static> {
     FontRef::try_from_slice(bytes).expect("the embedded font is valid")
 }
 
-/// Position of the anchor along the text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Align {
     Start,
@@ -24,15 +23,12 @@ pub(super) enum Align {
     End,
 }
 
-/// Style of a text.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Style {
-    /// Height of the font, pixels.
     pub size: f64,
     pub colour: Colour,
     pub alpha: f32,
     pub medium: bool,
-    /// Whether the text runs upwards.
     pub upwards: bool,
 }
 
@@ -59,11 +55,12 @@ impl Style {
     }
 }
 
-/// Size of a subscript and its drop below the line, relative to the size of the text.
+/// Size of a subscript, relative to the size of the text.
 pub(super) const SUBSCRIPT_SIZE: f64 = 0.72;
+/// Drop of a subscript below the line, relative to the size of the text.
 pub(super) const SUBSCRIPT_DROP: f64 = 0.16;
 
-/// The runs of a text; `_{...}` marks subscripts.
+/// Splits a text into runs, each with whether it is a subscript, marked by `_{...}`.
 pub(super) fn runs(text: &str) -> Vec<(&str, bool)> {
     let mut runs = Vec::new();
     let mut rest = text;
@@ -76,7 +73,7 @@ pub(super) fn runs(text: &str) -> Vec<(&str, bool)> {
     runs
 }
 
-fn lowered(style: Style, subscript: bool) -> (Style, f64) {
+fn run_style(style: Style, subscript: bool) -> (Style, f64) {
     if subscript {
         (Style { size: SUBSCRIPT_SIZE * style.size, ..style }, SUBSCRIPT_DROP * style.size)
     } else {
@@ -89,19 +86,19 @@ pub(super) fn length(text: &str, style: Style) -> f64 {
     runs(text)
         .into_iter()
         .map(|(run, subscript)| {
-            let font = lowered(style, subscript).0.font();
+            let font = run_style(style, subscript).0.font();
             run.chars().map(|c| f64::from(font.h_advance(font.glyph_id(c)))).sum::<f64>()
         })
         .sum()
 }
 
-/// Height of capitals, half of it, for a size of 1: those of Roboto are 0.711 em high, and an em is 0.853 of ascent plus descent.
+/// Half the height of capitals for a size of 1. Capitals of Roboto are 0.711 em high.
 pub(super) const HALF_CAPITAL: f64 = 0.5 * 0.711 * EM;
 
-/// An em, for a size of 1.
+/// Length of an em for a size of 1, which is ascent plus descent.
 pub(super) const EM: f64 = 0.853;
 
-/// Paints it with a function that blends a colour into one pixel.
+/// Paints a line of text with a function that blends a colour into one pixel.
 pub(super) fn paint(
     blend: &mut dyn FnMut(usize, usize, Colour, f32),
     text: &str,
@@ -117,11 +114,11 @@ pub(super) fn paint(
     let half_capital = HALF_CAPITAL * style.size;
     let mut along = 0.0;
     for (run, subscript) in runs(text) {
-        let (style, drop) = lowered(style, subscript);
+        let (style, drop) = run_style(style, subscript);
         let font = style.font();
         for c in run.chars() {
             let id = font.glyph_id(c);
-            // Upwards: the text runs up the page, and its downward direction points right.
+            // In upward text, the downward direction of the glyphs points right.
             let origin = if style.upwards {
                 (along, drop)
             } else {

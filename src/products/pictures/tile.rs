@@ -1,12 +1,13 @@
-//! Tiles: values as colours and nothing else.
+//! Tiles, which are pictures of values in colours without any decoration.
 
 use super::error::PictureError;
 use super::scale::{ColourScale, is_seen};
 
-/// A PNG of `width` columns, row by row from the top, in the colours of a scale; pixels without a value are transparent.
+/// Encodes values as a PNG of `width` columns, row by row from the top, in the colours of a scale. Pixels without a value are
+/// transparent.
 ///
 /// # Errors
-/// [`PictureError::Size`] unless the values are whole rows; [`PictureError::EncodeTile`].
+/// [`PictureError::Size`] if the last row is incomplete; [`PictureError::EncodeTile`].
 pub fn tile_png(scale: &ColourScale, width: usize, values: &[f32]) -> Result<Vec<u8>, PictureError> {
     if width == 0 || !values.len().is_multiple_of(width) {
         return Err(PictureError::Size { what: "tile width", value: width, expected: "whole rows" });

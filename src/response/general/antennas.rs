@@ -1,39 +1,37 @@
 //! Responses of pairs whose antennas differ, as polynomials in the direction.
 //!
-//! Of short dipoles along d and e an unpolarised wave from n leaves `d . e - (n . d) (n . e)`; further factors are polynomials in
-//! `(n . d)^2`. With `n . n = 1` all terms have one even degree D, so that
+//! Short dipoles along d and e correlate an unpolarised wave from n by `d . e - (n . d) (n . e)`; further factors are polynomials in
+//! `(n . d)^2`. With `n . n = 1` all terms can have the same even degree D, so that
 //!
 //! ```text
 //! A_ij(n, t) = sum_k a_k(t) P_k(n),   P_k = n_x^p n_y^q n_z^r,   p + q + r = D,
 //! ```
 //!
-//! and a visibility is a sum of isotropic ones of the skies `P_k T`, which have D degrees more than T. These do not depend on time, so
-//! that antennas may turn as they like between visibilities: rows of B are interpolated for the isotropic ones alone.
+//! and a visibility is a sum of isotropic visibilities of the skies `P_k T`, which have D degrees more than T. These skies do not depend
+//! on time, so that rows of B are interpolated for isotropic antennas only, and antennas may rotate freely between visibilities.
 
 use crate::frames::AntennaResponse;
 use crate::response::pixel::SatelliteAntenna;
 use crate::sky::harmonics::{Alm, Component, times_direction, times_direction_transposed};
 use crate::units::vector::{Vec3, dot};
 
-/// Greatest degree of a response: two dipoles, each with a pattern of its own.
+/// Maximum degree of a response: two dipoles, each with an individual pattern.
 pub const DEGREE_MAX: usize = 6;
 
-/// Exponents of n_x, n_y and n_z.
 type Exponents = [usize; 3];
 
-/// Exponents of the monomials of one degree.
 fn monomials(degree: usize) -> Vec<Exponents> {
     (0..=degree).rev().flat_map(|p| (0..=degree - p).rev().map(move |q| [p, q, degree - p - q])).collect()
 }
 
-/// Place of a monomial among those of its degree.
-fn place([p, q, r]: Exponents) -> usize {
+/// Index of a monomial among those of its degree.
+fn monomial_index([p, q, r]: Exponents) -> usize {
     let rest = q + r;
     debug_assert!(p + rest <= DEGREE_MAX);
     rest * (rest + 1) / 2 + r
 }
 
-/// The response of a pair: a homogeneous polynomial of even degree in the direction, of length 1.
+/// Response of a pair, a homogeneous polynomial of even degree in the direction (a unit vector).
 #[derive(Clone, Debug, PartialEq)]
 pub struct PairResponse {
     degree: usize,
@@ -41,19 +39,19 @@ pub struct PairResponse {
 }
 
 impl PairResponse {
-    /// 1 in all directions.
+    /// The response 1 in all directions.
     #[must_use]
     pub fn isotropic() -> Self {
         Self { degree: 0, coefficients: vec![1.0] }
     }
 
-    /// `constant - (n . a) (n . b)` summed over pairs of vectors, as a polynomial of degree 2.
+    /// The polynomial `constant - sum (n . a) (n . b)` over pairs of vectors, of degree 2.
     fn quadratic(constant: f64, vectors: &[[Vec3; 2]]) -> Self {
         let mut coefficients = vec![0.0; 6];
         for axis in 0..3 {
             let mut exponents = [0; 3];
             exponents[axis] = 2;
-            coefficients[place(exponents)] = constant;
+            coefficients[monomial_index(exponents)] = constant;
         }
         for [a, b] in vectors {
             for (p, a) in a.iter().enumerate() {
@@ -61,7 +59,7 @@ impl PairResponse {
                     let mut exponents = [0; 3];
                     exponents[p] += 1;
                     exponents[q] += 1;
-                    coefficients[place(exponents)] -= a * b;
+                    coefficients[monomial_index(exponents)] -= a * b;
                 }
             }
         }
@@ -74,8 +72,8 @@ impl PairResponse {
         Self::quadratic(dot(d, e), &[[d, e]])
     }
 
-    /// The response of three crossed dipoles on each satellite, d and e being their unit vectors: the mean of the correlations of like
-    /// dipoles, times 3/2, so that satellites of one attitude have the response 1.
+    /// The response of three crossed dipoles on each satellite, along the unit vectors d and e: 3/2 of the mean correlation of
+    /// corresponding dipoles, which is 1 for equal attitudes.
     #[must_use]
     pub fn of_triads(d: [Vec3; 3], e: [Vec3; 3]) -> Self {
         let constant = 0.5 * (0..3).map(|k| dot(d[k], e[k])).sum::<f64>();
@@ -83,7 +81,7 @@ impl PairResponse {
         Self::quadratic(constant, &halves)
     }
 
-    /// Times `1 + q P_2(n . axis)`.
+    /// The response times `1 + q P_2(n . axis)`.
     #[must_use]
     pub fn distorted(&self, axis_hat: Vec3, q: f64) -> Self {
         // P_2 = 3/2 cos^2 - 1/2.
@@ -91,7 +89,7 @@ impl PairResponse {
         self.times(&Self::quadratic(1.0 - 0.5 * q, &[[scaled, axis_hat]]))
     }
 
-    /// The response of the antennas of two satellites: dipoles if both are.
+    /// The response of the antennas of two satellites; elements count as isotropic unless both satellites have the same kind.
     #[must_use]
     pub fn of_antennas([a, b]: [&SatelliteAntenna; 2]) -> Self {
         let ideal = match (a.elements, b.elements) {
@@ -103,60 +101,60 @@ impl PairResponse {
             }
             _ => Self::isotropic(),
         };
-        let whole = |of: Self, antenna: &SatelliteAntenna| match antenna.distortion {
-            0.0 => of,
-            q => of.distorted(antenna.axes_hat[0], q),
+        let distort = |response: Self, antenna: &SatelliteAntenna| match antenna.distortion {
+            0.0 => response,
+            q => response.distorted(antenna.axes_hat[0], q),
         };
-        whole(whole(ideal, a), b)
+        distort(distort(ideal, a), b)
     }
 
-    /// Their product.
+    /// The product with another response.
     #[must_use]
     pub fn times(&self, other: &Self) -> Self {
         let degree = self.degree + other.degree;
         let mut coefficients = vec![0.0; monomials(degree).len()];
         for (a, x) in monomials(self.degree).into_iter().zip(&self.coefficients) {
             for (b, y) in monomials(other.degree).into_iter().zip(&other.coefficients) {
-                coefficients[place(std::array::from_fn(|k| a[k] + b[k]))] += x * y;
+                coefficients[monomial_index(std::array::from_fn(|k| a[k] + b[k]))] += x * y;
             }
         }
         Self { degree, coefficients }
     }
 
-    /// Its degree.
+    /// Degree of the polynomial.
     #[must_use]
     pub fn degree(&self) -> usize {
         self.degree
     }
 
-    /// Its value in a direction of length 1.
+    /// Value in a direction, a unit vector.
     #[must_use]
-    pub fn at(&self, n_hat: Vec3) -> f64 {
+    pub fn value(&self, n_hat: Vec3) -> f64 {
         let power = |exponents: Exponents| -> f64 {
             n_hat.iter().zip(exponents).map(|(n, exponent)| n.powi(exponent as i32)).product()
         };
         monomials(self.degree).into_iter().map(power).zip(&self.coefficients).map(|(p, a)| a * p).sum()
     }
 
-    /// The coefficients of the same response as a polynomial of a degree that is not less.
-    pub(super) fn coefficients_of(&self, degree: usize) -> Vec<f64> {
-        let mut same = self.clone();
-        // Times n . n.
+    /// Coefficients of the same response as a polynomial of this degree, which must not be lower.
+    pub(super) fn coefficients_of_degree(&self, degree: usize) -> Vec<f64> {
+        let mut raised = self.clone();
+        // n . n = 1 raises the degree by 2.
         let one = Self::quadratic(1.0, &[]);
-        while same.degree < degree {
-            same = same.times(&one);
+        while raised.degree < degree {
+            raised = raised.times(&one);
         }
-        same.coefficients
+        raised.coefficients
     }
 }
 
-/// Skies times the monomials of one degree.
+/// Products of skies with the monomials of one degree.
 #[derive(Clone, Debug)]
-pub(super) struct Products {
+pub(super) struct SkyProducts {
     degree: usize,
 }
 
-impl Products {
+impl SkyProducts {
     pub(super) fn new(degree: usize) -> Self {
         Self { degree }
     }
@@ -165,7 +163,6 @@ impl Products {
         self.degree
     }
 
-    /// Products of each sky.
     pub(super) fn count(&self) -> usize {
         (self.degree + 1) * (self.degree + 2) / 2
     }
@@ -175,8 +172,8 @@ impl Products {
         x(p).chain(y(q)).chain(z(r))
     }
 
-    /// All products of each sky, one sky after the other.
-    pub(super) fn of(&self, skies: &[Alm]) -> Vec<Alm> {
+    /// Computes all products of each sky, sky by sky.
+    pub(super) fn multiply(&self, skies: &[Alm]) -> Vec<Alm> {
         let product = |sky: &Alm, exponents| {
             Self::factors(exponents).fold(sky.clone(), |sky, component| times_direction(&sky, component))
         };
@@ -184,8 +181,8 @@ impl Products {
         skies.iter().flat_map(all).collect()
     }
 
-    /// Gradients with respect to skies from those with respect to their products.
-    pub(super) fn back(&self, gradients: Vec<Alm>) -> Vec<Alm> {
+    /// Computes gradients with respect to skies from gradients with respect to their products.
+    pub(super) fn gradients_of_skies(&self, gradients: Vec<Alm>) -> Vec<Alm> {
         if self.degree == 0 {
             return gradients;
         }
@@ -215,9 +212,9 @@ mod tests {
     fn monomials_have_their_places() {
         for degree in 0..=DEGREE_MAX {
             let all = monomials(degree);
-            assert_eq!(all.len(), Products::new(degree).count());
+            assert_eq!(all.len(), SkyProducts::new(degree).count());
             for (k, exponents) in all.into_iter().enumerate() {
-                assert_eq!((exponents.iter().sum::<usize>(), place(exponents)), (degree, k));
+                assert_eq!((exponents.iter().sum::<usize>(), monomial_index(exponents)), (degree, k));
             }
         }
     }
@@ -232,7 +229,7 @@ mod tests {
         let p_2 = |x: f64| 1.5 * x * x - 0.5;
         for n in [[0.2, 0.3, -0.7], [1.0, 0.0, 0.0], [-0.4, 0.9, 0.1]].map(unit) {
             let dipoles = dot(across(d, n), across(e, n));
-            assert!((PairResponse::of_dipoles(d, e).at(n) - dipoles).abs() < 1e-15);
+            assert!((PairResponse::of_dipoles(d, e).value(n) - dipoles).abs() < 1e-15);
             let [a, b] = [(d, 0.2), (e, -0.1)].map(|(axis_hat, distortion)| SatelliteAntenna {
                 elements: AntennaResponse::DipoleNormal,
                 axes_hat: [axis_hat, unit(cross(axis_hat, n))],
@@ -241,24 +238,26 @@ mod tests {
             let expected = dipoles * (1.0 + 0.2 * p_2(dot(d, n))) * (1.0 - 0.1 * p_2(dot(e, n)));
             let found = PairResponse::of_antennas([&a, &b]);
             assert_eq!(found.degree(), 6);
-            assert!((found.at(n) - expected).abs() < 1e-14, "{} {expected}", found.at(n));
-            let higher =
-                PairResponse { degree: 6, coefficients: PairResponse::of_dipoles(d, e).coefficients_of(6) };
-            assert!((higher.at(n) - dipoles).abs() < 1e-14);
+            assert!((found.value(n) - expected).abs() < 1e-14, "{} {expected}", found.value(n));
+            let higher = PairResponse {
+                degree: 6,
+                coefficients: PairResponse::of_dipoles(d, e).coefficients_of_degree(6),
+            };
+            assert!((higher.value(n) - dipoles).abs() < 1e-14);
         }
     }
 
     #[test]
     fn three_dipoles_of_one_attitude_see_all_directions_alike() {
         let axes = [[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.0, -0.8, 0.6]];
-        // Turned by 10 degrees about x.
+        // Rotated by 10 degrees about x.
         let (sin, cos) = 10.0_f64.to_radians().sin_cos();
         let turned = axes.map(|[x, y, z]| [x, cos * y - sin * z, sin * y + cos * z]);
         for n in [[0.2, 0.3, -0.7], [1.0, 0.0, 0.0], [-0.4, 0.9, 0.1]].map(unit) {
-            assert!((PairResponse::of_triads(axes, axes).at(n) - 1.0).abs() < 1e-15);
+            assert!((PairResponse::of_triads(axes, axes).value(n) - 1.0).abs() < 1e-15);
             // sum_k d_k . e_k = 1 + 2 cos; sum_k (n . d_k) (n . e_k) = n . R n = nx^2 + cos (ny^2 + nz^2).
             let expected = 0.5 * (1.0 + 2.0 * cos - n[0] * n[0] - cos * (1.0 - n[0] * n[0]));
-            let found = PairResponse::of_triads(axes, turned).at(n);
+            let found = PairResponse::of_triads(axes, turned).value(n);
             assert!((found - expected).abs() < 1e-15, "{found} {expected}");
         }
     }

@@ -1,21 +1,22 @@
-//! Patterns of pairs: the view of both satellites without the Moon, less the cap that it hides.
+//! Fringe patterns of satellite pairs in spherical harmonics: the whole-sky pattern minus that of the cap occulted by the Moon.
 //!
-//! From the mean nadir of the pair as the pole the hidden cap is made of whole rings, whose Fourier coefficients are Bessel
-//! functions, but for the zone between the class's limb and the pair's (see `border.rs`):
+//! With the pair's mean nadir as the pole, the occulted cap consists of complete rings, whose Fourier coefficients are Bessel
+//! functions. The exception is the zone between the class's limb and the pair's (see `limb_zone.rs`):
 //!
 //! ```text
 //! q_{l m} = sum_rings w lambda_{l m}(theta) 2 pi (-1)^m J_m(2 pi u cos(p) sin theta) exp(2 pi i u sin(p) cos theta)
 //!         + (-i)^m sum_j a_{j l m} c_{j m},
 //! ```
 //!
-//! p being the pitch of the baseline. The pattern is mirror-symmetric in the plane of the pair, so that
+//! with p the pitch of the baseline. The pattern is mirror-symmetric in the plane of the pair, so that
 //! `q_{l,-m} = q_{l m}`, and a quarter turn takes the pole to the normal of the plane (see `turns.rs`):
 //!
 //! ```text
 //! h_{l mu} = exp(-i mu p) sum_m F_{m mu} q_{l m},    (-1)^mu h_{l,-mu} = exp(i mu p) sum_m (-1)^m F_{m mu} q_{l m}.
 //! ```
 //!
-//! Without the Moon the coefficients are `4 pi (-1)^((l + mu) / 2) lambda_{l mu}(pi / 2) j_l(2 pi u)` (Rayleigh).
+//! Without the Moon the coefficients are `w_{l mu} = 4 pi (-1)^((l + mu) / 2) lambda_{l mu}(pi / 2) j_l(2 pi u)` (Rayleigh). The
+//! pattern is `f = w - h`.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -23,52 +24,51 @@ use faer::{Accum, MatMut, MatRef, Par};
 use rayon::prelude::*;
 
 use super::RowsSetup;
-use super::border::{Border, BorderBuffers};
 use super::classes::{NodeClass, rings_for};
 use super::lanes::{LANES, VALUES, Value};
+use super::limb_zone::{LimbZone, LimbZoneBuffers};
 use super::plan::RowNode;
-use super::turns::{QuarterTurns, rows_apart_mut};
+use super::turns::{QuarterTurns, strided_rows_mut};
 use crate::frames::AntennaResponse;
 use crate::numerics::bessel::BesselOrders;
 use crate::numerics::legendre::Legendre;
 use crate::numerics::quadrature::GaussLegendre;
 use crate::numerics::trigonometry::sin_cos;
-use crate::response::harmonic::degrees;
+use crate::response::harmonic::degree_count;
 
-/// Values of [`LANES`] pairs, complex.
-const COMPLEX: usize = 2 * LANES;
+/// Number of real and imaginary parts of [`LANES`] pairs.
+const COMPLEX_LANES: usize = 2 * LANES;
 
-/// A ring of the hidden cap.
 #[derive(Clone, Copy, Debug)]
 struct Ring {
     sin: f64,
     cos: f64,
-    /// The greatest order with Legendre functions that are not negligible here.
-    reach: usize,
+    /// Maximum order m at which Legendre functions are not negligible on this ring.
+    order_max: usize,
 }
 
-/// Tables that pairs with about the same limb share.
+/// Tables shared by pairs whose limbs lie at about the same angle from the nadir.
 #[derive(Clone, Debug)]
 pub(super) struct CapClass {
     l_max: usize,
-    border: Border,
-    /// From the limb to the nadir.
+    limb_zone: LimbZone,
+    /// Quadrature rings, ordered from the limb to the nadir.
     rings: Vec<Ring>,
-    /// By m: on how many rings, from the first, Legendre functions are not negligible.
-    reached: Vec<usize>,
-    /// By m: for l = m, m + 1, .. a row of the border's series, then of the rings reached, with their weights.
+    /// Number of leading rings on which Legendre functions are not negligible, by m.
+    rings_by_order: Vec<usize>,
+    /// By m, for l = m, m + 1, .. a row: the series in the limb zone, then the weighted functions on these rings.
     legendre: Vec<Vec<Value>>,
     response: AntennaResponse,
 }
 
-/// Orders of Legendre functions of degree `l_max` that are not negligible at this sine: beyond `l sin(theta)` they decay as
-/// Airy functions, over a width of its cube root.
-fn reach(l_max: usize, sin: f64) -> usize {
+/// Maximum order at which Legendre functions of degree `l_max` are not negligible at this sine: beyond m = l sin(theta) they decay
+/// like an Airy function, with width (l sin(theta))^(1/3).
+fn order_max(l_max: usize, sin: f64) -> usize {
     let turning = l_max as f64 * sin;
     l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
 }
 
-/// Memory of a task's buffers besides patterns, bytes.
+/// Memory of a task's work buffers without patterns, bytes.
 pub(super) fn batch_bytes(l_max: usize, u_max: f64, batch: usize) -> f64 {
     let orders = (l_max + 1) as f64;
     let rings = (rings_for(l_max, FRAC_PI_2, u_max) + 16) as f64;
@@ -83,54 +83,54 @@ impl CapClass {
         let (mut rings, mut weights) = (Vec::new(), Vec::new());
         for (t, w) in rule.abscissae.iter().zip(&rule.weights).rev() {
             let (sin, cos) = (limb_rad * t).sin_cos();
-            rings.push(Ring { sin, cos, reach: reach(l_max, sin) });
+            rings.push(Ring { sin, cos, order_max: order_max(l_max, sin) });
             weights.push(TAU * limb_rad * w * sin);
         }
-        let border = Border::new(setup, limb_rad, class.width_rad, class.u_max);
+        let limb_zone = LimbZone::new(setup, limb_rad, class.width_rad, class.u_max);
         let functions = Legendre::new(l_max, rings.iter().map(|ring| (ring.cos, ring.sin)));
-        let angles = border.angles_rad();
+        let angles = limb_zone.angles_rad();
         let near = Legendre::new(l_max, angles.iter().map(|theta| (theta.cos(), theta.sin())));
         let ones = vec![1.0; angles.len()];
-        let reached: Vec<usize> =
-            (0..=l_max).map(|m| rings.partition_point(|ring| ring.reach >= m)).collect();
+        let rings_by_order: Vec<usize> =
+            (0..=l_max).map(|m| rings.partition_point(|ring| ring.order_max >= m)).collect();
         let legendre = (0..=l_max)
             .into_par_iter()
             .map(|m| {
-                let (terms, reached) = (border.terms, reached[m]);
-                let inner = functions.rows::<Value>(m, &weights[..reached]);
+                let (terms, count) = (limb_zone.terms, rings_by_order[m]);
+                let inner = functions.rows::<Value>(m, &weights[..count]);
                 let outer = near.rows::<f64>(m, &ones);
-                let mut rows = vec![0.0; (l_max + 1 - m) * (terms + reached)];
-                for (k, row) in rows.chunks_exact_mut(terms + reached).enumerate() {
-                    border.series(&outer[k * terms..(k + 1) * terms], &mut row[..terms]);
-                    row[terms..].copy_from_slice(&inner[k * reached..(k + 1) * reached]);
+                let mut rows = vec![0.0; (l_max + 1 - m) * (terms + count)];
+                for (k, row) in rows.chunks_exact_mut(terms + count).enumerate() {
+                    limb_zone.series(&outer[k * terms..(k + 1) * terms], &mut row[..terms]);
+                    row[terms..].copy_from_slice(&inner[k * count..(k + 1) * count]);
                 }
                 rows
             })
             .collect();
-        Self { l_max, border, rings, reached, legendre, response: setup.response }
+        Self { l_max, limb_zone, rings, rings_by_order, legendre, response: setup.response }
     }
 
-    /// Coefficients of the hidden parts of pairs, `q_{l m}` at `[l][m][group][real or imaginary part][lane]`.
+    /// Computes the coefficients `q_{l m}` of the occulted caps, `[l][m][group][real or imaginary part][lane]`.
     fn hidden<'a>(&self, nodes: &[RowNode], wavelength_m: f64, buffers: &'a mut CapBuffers) -> &'a [Value] {
         let groups = nodes.len().div_ceil(LANES);
-        let columns = groups * COMPLEX;
-        let (l_max, terms) = (self.l_max, self.border.terms);
+        let columns = groups * COMPLEX_LANES;
+        let (l_max, terms) = (self.l_max, self.limb_zone.terms);
         let height = terms + self.rings.len();
-        // Only written elements are read: the orders that reach a ring.
+        // Only written elements are read: the orders up to each ring's maximum.
         buffers.rings.resize((l_max + 1) * height * columns, 0.0);
         for (group, nodes) in nodes.chunks(LANES).enumerate() {
             self.ring_coefficients(nodes, wavelength_m, group, columns, buffers);
         }
-        self.border_coefficients(nodes, columns, buffers);
+        self.limb_zone_coefficients(nodes, columns, buffers);
         buffers.hidden.resize((l_max + 1) * (l_max + 1) * columns, 0.0);
         for m in 0..=l_max {
-            let inner = terms + self.reached[m];
+            let inner = terms + self.rings_by_order[m];
             let rings = &buffers.rings[m * height * columns..][..inner * columns];
             let rows = l_max + 1 - m;
             let out = &mut buffers.hidden[(m * (l_max + 1) + m) * columns..];
             let out = &mut out[..(rows - 1) * (l_max + 1) * columns + columns];
             faer::linalg::matmul::matmul(
-                rows_apart_mut(out, rows, columns, (l_max + 1) * columns),
+                strided_rows_mut(out, rows, columns, (l_max + 1) * columns),
                 Accum::Replace,
                 MatRef::from_row_major_slice(&self.legendre[m], rows, inner),
                 MatRef::from_row_major_slice(rings, inner, columns),
@@ -141,8 +141,8 @@ impl CapClass {
         &buffers.hidden
     }
 
-    /// Writes the rings' coefficients of up to [`LANES`] pairs, of which the last fills what is left, to
-    /// `[m][row][column]`.
+    /// Computes the rings' coefficients of up to [`LANES`] pairs, `[m][row][column]`; the last pair is repeated to fill the remaining
+    /// lanes.
     fn ring_coefficients(
         &self,
         nodes: &[RowNode],
@@ -151,65 +151,66 @@ impl CapClass {
         columns: usize,
         buffers: &mut CapBuffers,
     ) {
-        let (terms, height) = (self.border.terms, self.border.terms + self.rings.len());
+        let (terms, height) = (self.limb_zone.terms, self.limb_zone.terms + self.rings.len());
         let Some(last) = nodes.last() else { return };
-        let mut waves = [[0.0; LANES]; 2];
+        let (mut horizontal, mut vertical) = ([0.0; LANES], [0.0; LANES]);
         let filled = nodes.iter().chain(std::iter::repeat(last)).take(LANES);
         for (k, node) in filled.enumerate() {
             let wave = TAU * node.view.baseline_m / wavelength_m;
             let (sin, cos) = node.view.pitch_rad().sin_cos();
-            (waves[0][k], waves[1][k]) = (wave * cos, wave * sin);
+            (horizontal[k], vertical[k]) = (wave * cos, wave * sin);
         }
-        let more = match self.response {
+        // The response of dipoles couples m to m - 2 and m + 2.
+        let extra_orders = match self.response {
             AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => 0,
             AntennaResponse::DipoleNormal => 2,
         };
         for (k, ring) in self.rings.iter().enumerate() {
-            let x = waves[0].map(|wave| wave * ring.sin);
-            let orders = buffers.bessel.cylindrical(&x, ring.reach + more);
-            let first = (terms + k) * columns + group * COMPLEX;
-            let phases = phases(&waves[1], ring.cos);
+            let x = horizontal.map(|wave| wave * ring.sin);
+            let orders = buffers.bessel.cylindrical(&x, ring.order_max + extra_orders);
+            let first = (terms + k) * columns + group * COMPLEX_LANES;
+            let phases = phases(&vertical, ring.cos);
             let out = &mut buffers.rings[first..];
-            write_ring(orders, &phases, ring, more > 0, out, height * columns);
+            write_ring(orders, &phases, ring, extra_orders > 0, out, height * columns);
         }
     }
 
-    /// Writes the coefficients of the borders.
-    fn border_coefficients(&self, nodes: &[RowNode], columns: usize, buffers: &mut CapBuffers) {
-        let (terms, points) = (self.border.terms, self.border.points());
+    /// Computes the coefficients of the limb zones.
+    fn limb_zone_coefficients(&self, nodes: &[RowNode], columns: usize, buffers: &mut CapBuffers) {
+        let (terms, points) = (self.limb_zone.terms, self.limb_zone.points());
         let height = terms + self.rings.len();
         // `[term][column][psi]`.
         let width = terms * columns;
-        buffers.border.resize(points * width, 0.0);
-        for lane in 0..columns / 2 {
-            let Some(node) = nodes.get(lane).or(nodes.last()) else { return };
-            if lane < nodes.len() {
-                self.border.integrate(&node.view, &mut buffers.pair);
+        buffers.limb_zone.resize(points * width, 0.0);
+        for pair in 0..columns / 2 {
+            let Some(node) = nodes.get(pair).or(nodes.last()) else { return };
+            if pair < nodes.len() {
+                self.limb_zone.integrate(&node.view, &mut buffers.pair);
             }
-            let column = lane / LANES * COMPLEX + lane % LANES;
+            let column = pair / LANES * COMPLEX_LANES + pair % LANES;
             for (part, sums) in buffers.pair.sums.iter().enumerate() {
                 for (term, sums) in sums.chunks_exact(points).enumerate() {
                     let place = (term * columns + column + part * LANES) * points;
-                    let to = &mut buffers.border[place..place + points];
+                    let to = &mut buffers.limb_zone[place..place + points];
                     to.iter_mut().zip(sums).for_each(|(to, from)| *to = *from as Value);
                 }
             }
         }
         let orders = self.l_max + 1;
-        buffers.waves.resize(orders * width, 0.0);
+        buffers.fourier.resize(orders * width, 0.0);
         faer::linalg::matmul::matmul(
-            MatMut::from_row_major_slice_mut(&mut buffers.waves, orders, width),
+            MatMut::from_row_major_slice_mut(&mut buffers.fourier, orders, width),
             Accum::Replace,
-            MatRef::from_row_major_slice(&self.border.waves, orders, points),
-            MatRef::from_column_major_slice(&buffers.border, points, width),
+            MatRef::from_row_major_slice(&self.limb_zone.cos_weights, orders, points),
+            MatRef::from_column_major_slice(&buffers.limb_zone, points, width),
             1.0,
             Par::Seq,
         );
-        for (m, waves) in buffers.waves.chunks_exact(width).enumerate() {
+        for (m, fourier) in buffers.fourier.chunks_exact(width).enumerate() {
             let out = &mut buffers.rings[m * height * columns..][..width];
-            for (to, from) in out.chunks_exact_mut(COMPLEX).zip(waves.chunks_exact(COMPLEX)) {
+            for (to, from) in out.chunks_exact_mut(COMPLEX_LANES).zip(fourier.chunks_exact(COMPLEX_LANES)) {
                 let ((to_re, to_im), (re, im)) = (to.split_at_mut(LANES), from.split_at(LANES));
-                // (-i)^m.
+                // Times (-i)^m.
                 for k in 0..LANES {
                     (to_re[k], to_im[k]) = match m % 4 {
                         0 => (re[k], im[k]),
@@ -223,7 +224,7 @@ impl CapClass {
     }
 }
 
-/// `exp(i wave cos)`.
+/// Real and imaginary parts of `exp(i wave cos)`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn phases(waves: &[f64; LANES], cos: f64) -> [[f64; LANES]; 2] {
     let mut out = [[0.0; LANES]; 2];
@@ -233,7 +234,7 @@ fn phases(waves: &[f64; LANES], cos: f64) -> [[f64; LANES]; 2] {
     out
 }
 
-/// Writes `(-1)^m J_m` times phases, or that of a ring with the response of dipoles, at steps of `stride`.
+/// Writes `(-1)^m J_m` times the phase for each m, with a stride of `stride`; with `dipole` for a ring weighted by the dipole response.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn write_ring(
     orders: &[[f64; LANES]],
@@ -244,16 +245,16 @@ fn write_ring(
     stride: usize,
 ) {
     let quarter = 0.25 * ring.sin * ring.sin;
-    for m in 0..=ring.reach {
+    for m in 0..=ring.order_max {
         let sign = if m.is_multiple_of(2) { 1.0 } else { -1.0 };
-        let out = &mut out[m * stride..m * stride + COMPLEX];
+        let out = &mut out[m * stride..m * stride + COMPLEX_LANES];
         let (re, im) = out.split_at_mut(LANES);
         for k in 0..LANES {
             let mut value = orders[m][k];
             if dipole {
                 // 1 - sin^2(theta) sin^2(psi); J_{-m} = (-1)^m J_m.
-                let below = if m == 1 { -orders[1][k] } else { orders[m.abs_diff(2)][k] };
-                value = (1.0 - 2.0 * quarter) * value - quarter * (orders[m + 2][k] + below);
+                let j_minus_2 = if m == 1 { -orders[1][k] } else { orders[m.abs_diff(2)][k] };
+                value = (1.0 - 2.0 * quarter) * value - quarter * (orders[m + 2][k] + j_minus_2);
             }
             re[k] = (sign * value * phases[0][k]) as Value;
             im[k] = (sign * value * phases[1][k]) as Value;
@@ -261,34 +262,34 @@ fn write_ring(
     }
 }
 
-/// Room for the patterns of a batch.
+/// Work buffers for the patterns of a batch.
 #[derive(Clone, Debug, Default)]
 pub(super) struct CapBuffers {
     bessel: BesselOrders,
-    pair: BorderBuffers,
+    pair: LimbZoneBuffers,
     rings: Vec<Value>,
-    border: Vec<Value>,
-    waves: Vec<Value>,
+    limb_zone: Vec<Value>,
+    fourier: Vec<Value>,
     hidden: Vec<Value>,
-    /// Sums over even and over odd m.
-    turned: [Vec<Value>; 2],
+    /// Contributions of even and of odd m after the quarter turn.
+    rotated: [Vec<Value>; 2],
 }
 
-/// Tables of patterns that all classes share.
+/// Tables of patterns shared by all classes.
 #[derive(Clone, Debug)]
 pub(super) struct Patterns {
     setup: RowsSetup,
-    /// By mu, for l = mu, mu + 2, ..: factors of `j_l`, `j_{l+2}` and `j_{l-2}`.
-    whole: Vec<Vec<[f64; 3]>>,
+    /// Factors of `j_l`, `j_{l+2}` and `j_{l-2}` in the whole-sky pattern, by mu and for l = mu, mu + 2, ..
+    whole_sky: Vec<Vec<[f64; 3]>>,
 }
 
 impl Patterns {
     pub(super) fn new(setup: RowsSetup) -> Self {
-        Self { whole: whole_sky(&setup), setup }
+        Self { whole_sky: whole_sky_factors(&setup), setup }
     }
 
-    /// Writes patterns of pairs of one class, by mu: for [`LANES`] of them at a time rows of l = mu, mu + 2, ..
-    pub(super) fn of(
+    /// Computes the patterns of pairs of one class, by mu: rows of l = mu, mu + 2, .. for [`LANES`] pairs at a time.
+    pub(super) fn write_patterns(
         &self,
         turns: &QuarterTurns,
         class: &CapClass,
@@ -298,23 +299,23 @@ impl Patterns {
     ) {
         let l_max = self.setup.l_max;
         let groups = nodes.len().div_ceil(LANES);
-        let columns = groups * COMPLEX;
+        let columns = groups * COMPLEX_LANES;
         class.hidden(nodes, self.setup.wavelength_m, buffers);
         out.resize_with(l_max + 1, NodePatterns::default);
-        // All of it will be written.
-        out.iter_mut().enumerate().for_each(|(mu, out)| out.make_room(degrees(l_max, mu), groups));
-        let unhidden = self.unhidden(nodes, buffers);
+        // All elements are overwritten.
+        out.iter_mut().enumerate().for_each(|(mu, out)| out.resize(degree_count(l_max, mu), groups));
+        let spherical_bessel = self.spherical_bessel(nodes, buffers);
         let pitches = pitch_phases(nodes, l_max);
         for l in 0..=l_max {
             let hidden = &buffers.hidden[l * (l_max + 1) * columns..][..(l + 1) * columns];
-            turns.fold(l, hidden, columns, &mut buffers.turned);
-            let turned = buffers.turned.each_ref().map(Vec::as_slice);
-            assemble(turned, &pitches, &unhidden, &self.whole, [l, l_max, groups], out);
+            turns.rotate_symmetric(l, hidden, columns, &mut buffers.rotated);
+            let rotated = buffers.rotated.each_ref().map(Vec::as_slice);
+            assemble(rotated, &pitches, &spherical_bessel, &self.whole_sky, [l, l_max, groups], out);
         }
     }
 
-    /// `j_l(2 pi u)`, l = 0 ..= l_max + 2, by group.
-    fn unhidden(&self, nodes: &[RowNode], buffers: &mut CapBuffers) -> Vec<[f64; LANES]> {
+    /// Computes the spherical Bessel functions `j_l(2 pi u)`, l = 0 ..= l_max + 2, by group.
+    fn spherical_bessel(&self, nodes: &[RowNode], buffers: &mut CapBuffers) -> Vec<[f64; LANES]> {
         let order_max = self.setup.l_max + 2;
         let mut out = Vec::with_capacity(nodes.len().div_ceil(LANES) * (order_max + 1));
         for nodes in nodes.chunks(LANES) {
@@ -328,7 +329,7 @@ impl Patterns {
     }
 }
 
-/// `exp(-i mu p)` by group, mu and lane: real and imaginary parts.
+/// Real and imaginary parts of `exp(-i mu p)` by group, mu and lane.
 fn pitch_phases(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
     let mut out = [0, 1].map(|_| Vec::with_capacity(nodes.len().next_multiple_of(LANES) * (l_max + 1)));
     for nodes in nodes.chunks(LANES) {
@@ -344,31 +345,33 @@ fn pitch_phases(nodes: &[RowNode], l_max: usize) -> [Vec<Value>; 2] {
     out
 }
 
-/// The visible part of all pairs at one degree: writes `f_{l mu}` and `(-1)^mu f_{l,-mu}`.
+/// Computes `f_{l mu}` and `(-1)^mu f_{l,-mu}` of all pairs at one degree: whole-sky minus occulted coefficients.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn assemble(
     [even, odd]: [&[Value]; 2],
     [cos, sin]: &[Vec<Value>; 2],
-    unhidden: &[[f64; LANES]],
-    whole: &[Vec<[f64; 3]>],
+    spherical_bessel: &[[f64; LANES]],
+    whole_sky: &[Vec<[f64; 3]>],
     [l, l_max, groups]: [usize; 3],
     out: &mut [NodePatterns],
 ) {
-    let rows = even.chunks_exact(groups * COMPLEX).zip(odd.chunks_exact(groups * COMPLEX));
+    let rows = even.chunks_exact(groups * COMPLEX_LANES).zip(odd.chunks_exact(groups * COMPLEX_LANES));
     for (mu, (even, odd)) in (l % 2..=l).step_by(2).zip(rows) {
-        let (degree, out) = ((l - mu) / 2, &mut out[mu]);
-        let [of_here, of_above, of_below] = whole[mu][degree];
+        let (row, out) = ((l - mu) / 2, &mut out[mu]);
+        let [factor, factor_plus_2, factor_minus_2] = whole_sky[mu][row];
         let sign: Value = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
-        let parts = even.chunks_exact(COMPLEX).zip(odd.chunks_exact(COMPLEX));
+        let parts = even.chunks_exact(COMPLEX_LANES).zip(odd.chunks_exact(COMPLEX_LANES));
         for (group, (even, odd)) in parts.enumerate() {
             let place = (group * (l_max + 1) + mu) * LANES;
             let (cos, sin) = (&cos[place..place + LANES], &sin[place..place + LANES]);
-            let spherical = &unhidden[group * (l_max + 3)..];
-            let (below, here, above) = (&spherical[l.saturating_sub(2)], &spherical[l], &spherical[l + 2]);
+            let spherical = &spherical_bessel[group * (l_max + 3)..];
+            let (j_minus_2, j, j_plus_2) =
+                (&spherical[l.saturating_sub(2)], &spherical[l], &spherical[l + 2]);
             let ((even_re, even_im), (odd_re, odd_im)) = (even.split_at(LANES), odd.split_at(LANES));
-            let out = &mut out.of_mut(group)[degree * VALUES..(degree + 1) * VALUES];
+            let out = &mut out.rows_mut(group)[row * VALUES..(row + 1) * VALUES];
             for k in 0..LANES {
-                let whole = (of_here * here[k] + of_above * above[k] + of_below * below[k]) as Value;
+                let whole =
+                    (factor * j[k] + factor_plus_2 * j_plus_2[k] + factor_minus_2 * j_minus_2[k]) as Value;
                 let (re, im) = (even_re[k] + odd_re[k], even_im[k] + odd_im[k]);
                 out[k] = whole - (re * cos[k] - im * sin[k]);
                 out[LANES + k] = -(re * sin[k] + im * cos[k]);
@@ -380,37 +383,38 @@ fn assemble(
     }
 }
 
-/// Coefficients of a fringe over the whole sky, by mu and l: factors of `j_l`, `j_{l+2}` and `j_{l-2}`. A dipole's response
-/// is `1 - z^2`, and z takes degree l to its neighbours.
-fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
+/// Factors of `j_l`, `j_{l+2}` and `j_{l-2}` in the coefficients of a fringe over the whole sky, by mu and l. The response of dipoles is
+/// `1 - z^2`, and multiplication by z couples degree l to l - 1 and l + 1.
+fn whole_sky_factors(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
     let l_max = setup.l_max;
     let functions = Legendre::new(l_max + 2, std::iter::once((0.0, 1.0)));
     (0..=l_max)
         .map(|mu| {
             let values = functions.even_rows::<f64>(mu, &[4.0 * PI]);
-            // With (-1)^((l + mu) / 2), which alternates with l.
+            // The factor (-1)^((l + mu) / 2) alternates with l.
             let first = if mu.is_multiple_of(2) { 1.0 } else { -1.0 };
-            let value = |degree: usize| {
-                values.get(degree).map_or(0.0, |value| {
-                    if degree.is_multiple_of(2) { first * value } else { -first * value }
-                })
+            let value = |row: usize| {
+                values
+                    .get(row)
+                    .map_or(0.0, |value| if row.is_multiple_of(2) { first * value } else { -first * value })
             };
-            let step = |l: usize| {
+            // z lambda_l = coupling(l + 1) lambda_{l+1} + coupling(l) lambda_{l-1}.
+            let coupling = |l: usize| {
                 if l <= mu { 0.0 } else { (((l * l - mu * mu) as f64) / ((4 * l * l - 1) as f64)).sqrt() }
             };
-            (0..degrees(l_max, mu))
-                .map(|degree| {
-                    let l = mu + 2 * degree;
+            (0..degree_count(l_max, mu))
+                .map(|row| {
+                    let l = mu + 2 * row;
                     match setup.response {
-                        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => {
-                            [value(degree), 0.0, 0.0]
-                        }
+                        AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => [value(row), 0.0, 0.0],
                         AntennaResponse::DipoleNormal => {
-                            let same = 1.0 - step(l + 1).powi(2) - step(l).powi(2);
-                            let above = -step(l + 1) * step(l + 2) * value(degree + 1);
-                            let below =
-                                if degree == 0 { 0.0 } else { -step(l) * step(l - 1) * value(degree - 1) };
-                            [same * value(degree), above, below]
+                            let to_l = 1.0 - coupling(l + 1).powi(2) - coupling(l).powi(2);
+                            let to_l_plus_2 = -coupling(l + 1) * coupling(l + 2) * value(row + 1);
+                            let to_l_minus_2 = match row {
+                                0 => 0.0,
+                                _ => -coupling(l) * coupling(l - 1) * value(row - 1),
+                            };
+                            [to_l * value(row), to_l_plus_2, to_l_minus_2]
                         }
                     }
                 })
@@ -419,7 +423,7 @@ fn whole_sky(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
         .collect()
 }
 
-/// Coefficients of the patterns of a batch at one mu: for [`LANES`] nodes at a time rows of l = mu, mu + 2, ..; in a row real and
+/// Coefficients of the patterns of a batch at one mu: rows of l = mu, mu + 2, .. for [`LANES`] nodes at a time. A row has the real and
 /// imaginary parts of `f_{l mu}`, then of `(-1)^mu f_{l,-mu}`, each by lane.
 #[derive(Default)]
 pub(super) struct NodePatterns {
@@ -428,17 +432,16 @@ pub(super) struct NodePatterns {
 }
 
 impl NodePatterns {
-    fn make_room(&mut self, count: usize, groups: usize) {
+    fn resize(&mut self, count: usize, groups: usize) {
         self.count = count;
         self.coefficients.resize(groups * count * VALUES, 0.0);
     }
 
-    /// Rows of a group of nodes.
-    pub(super) fn of(&self, group: usize) -> &[Value] {
+    pub(super) fn rows(&self, group: usize) -> &[Value] {
         &self.coefficients[group * self.count * VALUES..][..self.count * VALUES]
     }
 
-    fn of_mut(&mut self, group: usize) -> &mut [Value] {
+    fn rows_mut(&mut self, group: usize) -> &mut [Value] {
         &mut self.coefficients[group * self.count * VALUES..][..self.count * VALUES]
     }
 }
@@ -460,11 +463,11 @@ mod tests {
     /// Two satellites in the plane of x and y.
     fn view(radii_m: [f64; 2], angles_rad: [f64; 2]) -> PairView {
         let at = |k: usize| [radii_m[k] * angles_rad[k].cos(), radii_m[k] * angles_rad[k].sin(), 0.0];
-        PairView::of(at(0), at(1), MOON_M).unwrap()
+        PairView::new(at(0), at(1), MOON_M).unwrap()
     }
 
-    /// Coefficients by quadrature in the pair's own axes: whole circles about the mean zenith, on each of which what both satellites
-    /// see is found by bisection, and Gauss-Legendre quadrature from there to the zenith.
+    /// Coefficients by quadrature on the pair's own axes. On each half circle from the mean zenith the limb is found by bisection, and
+    /// Gauss-Legendre quadrature runs from there to the zenith.
     fn expected(view: &PairView, response: AntennaResponse) -> Vec<Vec<[Complex64; 2]>> {
         const CIRCLE: usize = 500;
         let rule = GaussLegendre::new(240);
@@ -504,7 +507,7 @@ mod tests {
                         for ((n, value), lambda) in points.iter().zip(&values).zip(row) {
                             let turn = Complex64::cis(-(mu as f64) * n[1].atan2(n[0]));
                             sums[0] += lambda * value * turn;
-                            // lambda_{l,-mu} = (-1)^mu lambda_{l mu}, twice.
+                            // The sign (-1)^mu of lambda_{l,-mu} cancels that of the expected (-1)^mu f_{l,-mu}.
                             sums[1] += lambda * value * turn.conj();
                         }
                         sums
@@ -534,22 +537,24 @@ mod tests {
             let nodes = views.map(|view| RowNode { turns_rad: [0.0; 3], view, class: 0 });
             let patterns = Patterns::new(setup);
             let middle_rad = views[0].cap_rad();
-            let farthest = |view: &PairView| (view.cap_rad() - middle_rad).abs() + view.limbs_apart_rad();
+            let half_width_rad =
+                |view: &PairView| (view.cap_rad() - middle_rad).abs() + view.limb_spread_rad();
             let class = NodeClass {
                 limb_rad: middle_rad,
-                width_rad: views.iter().map(farthest).fold(0.0, f64::max),
+                width_rad: views.iter().map(half_width_rad).fold(0.0, f64::max),
                 u_max: 40.0,
             };
             let class = CapClass::new(&setup, &class);
             let (mut buffers, mut found) = (CapBuffers::default(), Vec::new());
-            patterns.of(&QuarterTurns::new(L_MAX), &class, &nodes, &mut buffers, &mut found);
+            patterns.write_patterns(&QuarterTurns::new(L_MAX), &class, &nodes, &mut buffers, &mut found);
             for (lane, view) in views.iter().enumerate() {
                 for (mu, expected) in expected(view, response).iter().enumerate() {
                     for (k, expected) in expected.iter().enumerate() {
-                        let part = |part: usize| f64::from(found[mu].of(0)[k * VALUES + part * LANES + lane]);
+                        let part =
+                            |part: usize| f64::from(found[mu].rows(0)[k * VALUES + part * LANES + lane]);
                         let found = [Complex64::new(part(0), part(1)), Complex64::new(part(2), part(3))];
                         for (found, expected) in found.iter().zip(expected) {
-                            // Sums of some 100 terms of f32 of up to 4; the circle of the expected ones has a kink.
+                            // f32 sums of about 100 terms of up to 4; the integrand of the reference quadrature has a kink in psi.
                             let error = (found - expected).norm();
                             assert!(error < 4e-6, "{lane} {mu} {k}: {found} {expected} {error:e}");
                         }

@@ -1,40 +1,40 @@
 //! Averages over integrations as sums over instants.
 //!
-//! Gauss-Legendre quadrature of n points errs in the mean of `exp(i h x)` over -1 <= x <= 1 by
-//! `2^(2n) n!^4 / ((2n + 1) (2n)!^3) h^(2n)` at most. Within an integration h is half of what phases move by: those of the fringe, and
-//! those of the limb's harmonics, in which there is little power.
+//! The error of n-point Gauss-Legendre quadrature in the mean of `exp(i h x)` over -1 <= x <= 1 is at most
+//! `2^(2n) n!^4 / ((2n + 1) (2n)!^3) h^(2n)`. Within an integration h is half of the motion of a phase: of the fringe, and of the
+//! limb's harmonics, which have little power.
 
 use crate::numerics::quadrature::GaussLegendre;
 
-/// Error of the mean of a fringe that moves as fast as any in the sky: few directions do.
+/// Maximum error of the mean of the fastest fringe in the sky, which few directions have.
 const FRINGE_ERROR: f64 = 1e-4;
 
-/// Error of the mean of the limb's highest degree: the power at one degree is about 1e-3 of the whole.
+/// Maximum error of the mean of the limb's highest degree: one degree has about 1e-3 of the power.
 const LIMB_ERROR: f64 = 1e-2;
 
-/// Most instants.
+/// Maximum number of instants.
 const INSTANTS_MAX: usize = 24;
 
-/// An instant of an integration.
+/// Instant of an integration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Instant {
-    /// After the middle, in units of half of the integration.
+    /// Time after the middle, in units of half the integration.
     pub offset: f64,
-    /// Its weight in the mean.
+    /// Weight in the mean.
     pub weight: f64,
 }
 
-/// The instants of a mean, by their number less 1.
+/// Quadrature rules with 1, 2, .. instants.
 #[derive(Clone, Debug)]
 pub struct Instants {
     rules: Vec<Vec<Instant>>,
 }
 
-/// Points that the mean of `exp(i h x)` takes.
-fn points(h: f64, error_max: f64) -> usize {
+/// Number of points that the mean of `exp(i h x)` needs.
+fn point_count(h: f64, error_max: f64) -> usize {
     let mut error = 1.0;
     for n in 1..INSTANTS_MAX {
-        // From the formula for n - 1.
+        // The bound for n from the bound for n - 1.
         let k = n as f64;
         error *= (h * h * k) / (2.0 * (2.0 * k + 1.0) * (2.0 * k - 1.0).powi(2));
         if error <= error_max {
@@ -51,7 +51,7 @@ impl Default for Instants {
 }
 
 impl Instants {
-    /// All rules.
+    /// Computes all rules.
     #[must_use]
     pub fn new() -> Self {
         let rule = |n: usize| {
@@ -62,17 +62,17 @@ impl Instants {
         Self { rules: (1..=INSTANTS_MAX).map(rule).collect() }
     }
 
-    /// The instant in the middle alone.
+    /// Returns the rule with the middle instant only.
     #[must_use]
     pub fn middle(&self) -> &[Instant] {
         &self.rules[0]
     }
 
-    /// The instants of an integration, as many as the motion of phases in half of it needs, rad: of the fringe, and of the limb's highest
-    /// degree.
+    /// Returns the rule for an integration in half of which the phases of the fringe and of the limb's highest degree move by these
+    /// angles, rad.
     #[must_use]
     pub fn for_phases(&self, [fringe_rad, limb_rad]: [f64; 2]) -> &[Instant] {
-        &self.rules[points(fringe_rad, FRINGE_ERROR).max(points(limb_rad, LIMB_ERROR)) - 1]
+        &self.rules[point_count(fringe_rad, FRINGE_ERROR).max(point_count(limb_rad, LIMB_ERROR)) - 1]
     }
 }
 
@@ -86,18 +86,18 @@ mod tests {
     fn means_err_by_what_is_allowed() {
         let all = Instants::new();
         assert_eq!(all.rules[0], [Instant { offset: 0.0, weight: 1.0 }]);
-        for (h, most) in [(0.01, 1e-4), (0.4, 1e-4), (1.3, 1e-4), (4.2, 1e-2), (9.0, 1e-2)] {
-            let count = points(h, most);
+        for (h, error_max) in [(0.01, 1e-4), (0.4, 1e-4), (1.3, 1e-4), (4.2, 1e-2), (9.0, 1e-2)] {
+            let count = point_count(h, error_max);
             let mean: Complex64 =
                 all.rules[count - 1].iter().map(|at| at.weight * Complex64::cis(h * at.offset)).sum();
             let error = (mean - f64::sin(h) / h).norm();
-            assert!(error <= most, "{h}: {error} with {count}");
-            // No more than it takes, by one: the formula is a bound.
+            assert!(error <= error_max, "{h}: {error} with {count}");
+            // At most one more than needed, as the formula is a bound.
             let fewer: Complex64 = match count {
                 0..=2 => continue,
                 _ => all.rules[count - 3].iter().map(|at| at.weight * Complex64::cis(h * at.offset)).sum(),
             };
-            assert!((fewer - f64::sin(h) / h).norm() > most, "{h}: {count}");
+            assert!((fewer - f64::sin(h) / h).norm() > error_max, "{h}: {count}");
         }
     }
 }

@@ -1,34 +1,37 @@
 //! Rows of B over spherical harmonics for satellites at any positions.
 //!
-//! Nothing is assumed of orbits: a pair's two positions give its own frame, what the Moon hides from either, and so its
-//! pattern (see `cap.rs`); the sky is turned into that frame. On a common circle the rows are those of
-//! [`crate::response::harmonic`]. Along a track the rows of a pair change slowly, so that few are computed and the others
-//! interpolated (see `plan.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`], [`GeneralRows::adjoint`]. As a reference
-//! [`GeneralRows::plan_direct`] computes each row.
+//! No orbit is assumed. The two positions of a pair define its own frame and the part of the sky that the Moon occults, and so
+//! its fringe pattern (see `cap.rs`); the sky is rotated into that frame. On a common circle the rows are those of
+//! [`crate::response::harmonic`]. Along a track the rows of a pair change slowly, so that
+//! few are computed and the others interpolated (see `plan.rs` and `planner.rs`): [`GeneralRows::plan`], [`GeneralRows::forward`],
+//! [`GeneralRows::adjoint`]. As the reference, [`GeneralRows::plan_direct`] computes each row.
 //!
-//! Antennas of a pair may have any response that is a polynomial in the direction ([`PairResponse`]), and visibilities may be averages over
-//! their integrations ([`GeneralRows::plan_of`]).
+//! The response of a pair may be any polynomial in the direction ([`PairResponse`]), and visibilities may be averages over
+//! their integrations ([`GeneralRows::plan_with`]).
 //!
 //! Results do not depend on the number of threads.
 
 mod antennas;
-mod border;
 mod cap;
 mod classes;
 mod frames;
 mod instants;
 mod lanes;
+mod limb_zone;
 mod operator;
+mod order_sums;
 mod phases;
 mod plan;
+mod planner;
 mod skies;
 mod turns;
 mod view;
+mod workspace;
 
 pub use antennas::{DEGREE_MAX, PairResponse};
 pub use instants::{Instant, Instants};
 pub use operator::{GeneralRows, row_tables_bytes};
-pub use plan::{Observed, RowPlan};
+pub use plan::{ObservationDetails, RowPlan};
 
 use thiserror::Error;
 
@@ -37,10 +40,10 @@ use crate::frames::AntennaResponse;
 use crate::units::Pair;
 use crate::units::vector::Vec3;
 
-/// Setup of rows: everything but positions.
+/// Setup of rows, independent of positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RowsSetup {
-    /// Greatest degree of the sky.
+    /// Maximum degree of the sky.
     pub l_max: usize,
     /// Wavelength, m.
     pub wavelength_m: f64,
@@ -48,13 +51,13 @@ pub struct RowsSetup {
     pub moon_radius_m: f64,
     /// Response of the antennas.
     pub response: AntennaResponse,
-    /// Greatest degree of the polynomials that multiply it, pair by pair: even, at most [`DEGREE_MAX`]; 0 if none does.
+    /// Maximum degree of the polynomials that multiply the response pair by pair: even, at most [`DEGREE_MAX`]; 0 for none.
     pub polynomial_degree: usize,
 }
 
-/// Positions of a pair at a time.
+/// Positions of a pair at one time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PairAt {
+pub struct TimedPair {
     /// Pair.
     pub pair: Pair,
     /// Mission time, s.
@@ -65,39 +68,39 @@ pub struct PairAt {
     pub r_j_m: Vec3,
 }
 
-/// A visibility that has no row.
+/// Refusal of a visibility, which has no row.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("visibility {index}: {refusal}")]
 pub struct RowsError {
-    /// Its index.
+    /// Index of the visibility.
     pub index: usize,
-    /// What is wrong with it.
+    /// Reason.
     pub refusal: RowsRefusal,
 }
 
 /// Why a visibility has no row.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum RowsRefusal {
-    /// Its positions.
+    /// Its positions are not covered.
     #[error(transparent)]
     Geometry(#[from] GeometryRefusal),
-    /// Its response is of a higher degree than the rows'.
+    /// Its response has a higher degree than the rows.
     #[error(
         "its response is a polynomial of degree {degree} in the direction; expected at most the polynomial_degree of the rows' \
-         setup, {most}"
+         setup, {degree_max}"
     )]
     Degree {
         /// Degree of the response.
         degree: usize,
-        /// Degree that the rows hold.
-        most: usize,
+        /// Maximum degree of the rows.
+        degree_max: usize,
     },
 }
 
-/// Whether a pair at these positions has a row.
+/// Checks that a pair at these positions has a row.
 ///
 /// # Errors
-/// What is wrong with the positions.
+/// [`GeometryRefusal`] if it has none.
 pub fn check_positions(r_i_m: Vec3, r_j_m: Vec3, moon_radius_m: f64) -> Result<(), GeometryRefusal> {
-    view::PairView::of(r_i_m, r_j_m, moon_radius_m).map(drop)
+    view::PairView::new(r_i_m, r_j_m, moon_radius_m).map(drop)
 }

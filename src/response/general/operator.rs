@@ -1,36 +1,37 @@
-//! Products with B and its transpose.
+//! Products of skies with B and its transpose.
 
 use std::ops::Range;
-use std::sync::{Mutex, PoisonError};
 
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::antennas::Products;
-use super::cap::{CapBuffers, CapClass, NodePatterns, Patterns, batch_bytes};
+use super::antennas::SkyProducts;
+use super::cap::{Patterns, batch_bytes};
 use super::classes::tables_bytes;
 use super::frames::Frames;
 use super::instants::Instants;
-use super::lanes::{LANES, Lanes, VALUES, Value};
-use super::phases::{PaddedShares, PhaseGrid, PhaseTable};
-use super::plan::{GROUP_NODES, Observed, RowNode, RowPlan, Track};
-use super::skies::{TurnBuffers, TurnedSkies, lanes_of, make_room};
+use super::lanes::{LANES, Value};
+use super::order_sums::{phase_sum, phase_terms, products, products_back};
+use super::phases::PhaseGrid;
+use super::plan::{GROUP_NODES, ObservationDetails, RowPlan, Track};
+use super::skies::{padded_count, resize_buffers};
 use super::turns::QuarterTurns;
-use super::{PairAt, RowsError, RowsSetup};
+use super::workspace::{Batch, Tables, Workspace, WorkspacePool};
+use super::{RowsError, RowsSetup, TimedPair};
 use crate::sky::harmonics::Alm;
 
-/// Rows of one class that a task computes together.
+/// Maximum number of rows of one class that a task computes together.
 const BATCH: usize = 32;
 
-/// Groups whose gradients are held until they are added.
+/// Number of groups whose gradients are held until they are added.
 const GROUPS_AT_ONCE: usize = 32;
 
-/// Rows of B over harmonics, for any positions.
+/// Rows of B over spherical harmonics, for any positions.
 #[derive(Clone, Debug)]
 pub struct GeneralRows {
-    /// With the degrees that products with the response have.
+    /// The setup, with `l_max` raised by the degree of the response.
     setup: RowsSetup,
-    products: Products,
+    products: SkyProducts,
     instants: Instants,
     turns: QuarterTurns,
     patterns: Patterns,
@@ -38,182 +39,193 @@ pub struct GeneralRows {
 }
 
 impl GeneralRows {
-    /// Rows for a setup.
+    /// Prepares rows for a setup.
     #[must_use]
     pub fn new(setup: RowsSetup) -> Self {
-        let products = Products::new(setup.polynomial_degree);
+        let products = SkyProducts::new(setup.polynomial_degree);
         let setup = RowsSetup { l_max: setup.l_max + products.degree(), ..setup };
         let turns = QuarterTurns::new(setup.l_max);
         let (patterns, phases) = (Patterns::new(setup), PhaseGrid::new(setup.l_max));
         Self { patterns, phases, turns, setup, products, instants: Instants::new() }
     }
 
-    /// Plans the rows of visibilities: few of them where consecutive ones are of one pair and in the order of time.
+    /// Plans the rows of visibilities. Few are computed where consecutive visibilities are of one pair and in the order of time.
     ///
     /// # Errors
-    /// The first visibility that has no row.
-    pub fn plan(&self, pairs: &[PairAt]) -> Result<RowPlan, RowsError> {
-        self.plan_of(pairs, &Observed::default())
+    /// [`RowsError`] for the first visibility that has no row.
+    pub fn plan(&self, pairs: &[TimedPair]) -> Result<RowPlan, RowsError> {
+        self.plan_with(pairs, &ObservationDetails::default())
     }
 
-    /// As [`Self::plan`], of averages over integrations and of pairs with responses of their own.
+    /// Plans rows as [`Self::plan`] for averages over integrations, and for pairs with individual responses.
     ///
     /// # Errors
     /// As [`Self::plan`].
-    pub fn plan_of(&self, pairs: &[PairAt], observed: &Observed<'_>) -> Result<RowPlan, RowsError> {
+    pub fn plan_with(
+        &self,
+        pairs: &[TimedPair],
+        observed: &ObservationDetails<'_>,
+    ) -> Result<RowPlan, RowsError> {
         RowPlan::new(&self.setup, pairs, observed, false)
     }
 
-    /// As [`Self::plan`], each row computed for itself.
+    /// Plans rows so that each is computed on its own, as a reference.
     ///
     /// # Errors
     /// As [`Self::plan`].
-    pub fn plan_direct(&self, pairs: &[PairAt]) -> Result<RowPlan, RowsError> {
-        RowPlan::new(&self.setup, pairs, &Observed::default(), true)
+    pub fn plan_direct(&self, pairs: &[TimedPair]) -> Result<RowPlan, RowsError> {
+        RowPlan::new(&self.setup, pairs, &ObservationDetails::default(), true)
     }
 
-    /// Visibilities, K sr, of skies given by coefficients up to `l_max`: `B x`, one vector a sky.
+    /// Computes the visibilities `B x`, K sr, of skies given by coefficients up to `l_max`: one vector per sky.
     #[must_use]
     pub fn forward(&self, plan: &RowPlan, skies: &[Alm]) -> Vec<Vec<Complex64>> {
-        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
-        let (count, skies) = (skies.len(), self.products.of(skies));
+        let (tables, pool) = (Tables::new(&self.setup, plan), WorkspacePool::default());
+        let (count, skies) = (skies.len(), self.products.multiply(skies));
         let skies = skies.as_slice();
         let values = plan.groups.par_iter().map(|group| {
-            memory.with_workspace(|of| {
+            pool.with_workspace(|workspace| {
                 let tracks = &plan.tracks[group.clone()];
-                self.no_amplitudes(tracks, skies.len(), &mut of.amplitudes);
+                self.clear_amplitudes(tracks, skies.len(), &mut workspace.amplitudes);
                 let frames = self.frames(plan, tracks);
-                self.turn(frames.as_ref(), skies, of);
-                for places in Self::batches(plan, tracks) {
-                    self.batch(plan, tracks, &tables, places, 0, of);
-                    self.amplitudes(0, skies, frames.as_ref(), of);
+                self.rotate_skies(frames.as_ref(), skies, workspace);
+                for indices in Self::batches(plan, tracks) {
+                    self.compute_patterns(plan, tracks, &tables, indices, 0, workspace);
+                    self.compute_amplitudes(0, skies, frames.as_ref(), workspace);
                 }
-                self.interpolate(plan, tracks, count, of)
+                self.interpolate(plan, tracks, count, workspace)
             })
         });
-        joined(plan, count, values.collect())
+        concatenate(plan, count, values.collect())
     }
 
-    /// `sum_t Re(conj(dV_t/dx) v_t)` with respect to `Re T_lm` and `Im T_lm`, as real and imaginary part: `Bt v` for each of
-    /// several vectors of one value a row.
+    /// Computes `Bt v` for each of several vectors of one value per row: `sum_t Re(conj(dV_t/dx) v_t)` with respect to `Re T_lm`
+    /// and `Im T_lm`, as real and imaginary part.
     #[must_use]
     pub fn adjoint(&self, plan: &RowPlan, values: &[&[Complex64]]) -> Vec<Alm> {
-        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
+        let (tables, pool) = (Tables::new(&self.setup, plan), WorkspacePool::default());
         let skies = values.len() * self.products.count();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies];
-        // The order of sums is that of the groups, whatever the threads.
+        // Sums are added in the order of the groups, so that results do not depend on threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                memory.with_workspace(|of| {
+                pool.with_workspace(|workspace| {
                     let tracks = &plan.tracks[group.clone()];
-                    let rows = rows_of(tracks);
+                    let rows = row_range(tracks);
                     let values: Vec<&[Complex64]> =
                         values.iter().map(|values| &values[rows.clone()]).collect();
-                    self.spread(plan, tracks, &values, of);
+                    self.interpolate_transposed(plan, tracks, &values, workspace);
                     let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
                     let frames = self.frames(plan, tracks);
-                    self.no_gradients(frames.as_ref(), skies, of);
-                    for places in Self::batches(plan, tracks) {
-                        self.batch(plan, tracks, &tables, places, 0, of);
-                        self.gradients(0, frames.as_ref(), of, &mut gradients);
+                    self.clear_gradients(frames.as_ref(), skies, workspace);
+                    for indices in Self::batches(plan, tracks) {
+                        self.compute_patterns(plan, tracks, &tables, indices, 0, workspace);
+                        self.compute_gradients(0, frames.as_ref(), workspace, &mut gradients);
                     }
-                    self.turn_back(frames.as_ref(), of, &mut gradients);
+                    self.rotate_gradients_back(frames.as_ref(), workspace, &mut gradients);
                     gradients
                 })
             });
             let parts: Vec<_> = parts.collect();
-            parts.iter().for_each(|part| add_to(&mut out, part));
+            parts.iter().for_each(|part| add_gradients(&mut out, part));
         }
-        self.products.back(out)
+        self.products.gradients_of_skies(out)
     }
 
-    /// `Bt W B x` for several x, W being the rows' weights: [`Self::forward`] and [`Self::adjoint`] with each row computed once
-    /// for both.
+    /// Computes `Bt W B x` for several x, with W the rows' weights; each row is computed once for both products.
     #[must_use]
     pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> Vec<Alm> {
-        let (tables, memory) = (Tables::new(&self.setup, plan), Memory::default());
-        let (count, skies) = (skies.len(), self.products.of(skies));
+        let (tables, pool) = (Tables::new(&self.setup, plan), WorkspacePool::default());
+        let (count, skies) = (skies.len(), self.products.multiply(skies));
         let skies = skies.as_slice();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
-                memory.with_workspace(|of| {
+                pool.with_workspace(|workspace| {
                     let tracks = &plan.tracks[group.clone()];
-                    self.no_amplitudes(tracks, skies.len(), &mut of.amplitudes);
+                    self.clear_amplitudes(tracks, skies.len(), &mut workspace.amplitudes);
                     let frames = self.frames(plan, tracks);
-                    self.turn(frames.as_ref(), skies, of);
+                    self.rotate_skies(frames.as_ref(), skies, workspace);
                     let batches = Self::batches(plan, tracks);
-                    let made = batches.len();
-                    for (number, places) in batches.into_iter().enumerate() {
-                        self.batch(plan, tracks, &tables, places, number, of);
-                        self.amplitudes(number, skies, frames.as_ref(), of);
+                    let batch_count = batches.len();
+                    for (number, indices) in batches.into_iter().enumerate() {
+                        self.compute_patterns(plan, tracks, &tables, indices, number, workspace);
+                        self.compute_amplitudes(number, skies, frames.as_ref(), workspace);
                     }
-                    let seen = self.interpolate(plan, tracks, count, of);
-                    let weight = &weight[rows_of(tracks)];
-                    let weighted = |seen: &Vec<Complex64>| -> Vec<Complex64> {
-                        seen.iter().zip(weight).map(|(v, w)| v * *w).collect()
+                    let visibilities = self.interpolate(plan, tracks, count, workspace);
+                    let weight = &weight[row_range(tracks)];
+                    let weighted = |visibilities: &Vec<Complex64>| -> Vec<Complex64> {
+                        visibilities.iter().zip(weight).map(|(v, w)| v * *w).collect()
                     };
-                    let weighted: Vec<Vec<Complex64>> = seen.iter().map(weighted).collect();
+                    let weighted: Vec<Vec<Complex64>> = visibilities.iter().map(weighted).collect();
                     let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
-                    self.spread(plan, tracks, &weighted, of);
+                    self.interpolate_transposed(plan, tracks, &weighted, workspace);
                     let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
-                    self.no_gradients(frames.as_ref(), skies.len(), of);
-                    for number in 0..made {
-                        self.gradients(number, frames.as_ref(), of, &mut gradients);
+                    self.clear_gradients(frames.as_ref(), skies.len(), workspace);
+                    for number in 0..batch_count {
+                        self.compute_gradients(number, frames.as_ref(), workspace, &mut gradients);
                     }
-                    self.turn_back(frames.as_ref(), of, &mut gradients);
+                    self.rotate_gradients_back(frames.as_ref(), workspace, &mut gradients);
                     gradients
                 })
             });
             let parts: Vec<_> = parts.collect();
-            parts.iter().for_each(|gradients| add_to(&mut out, gradients));
+            parts.iter().for_each(|gradients| add_gradients(&mut out, gradients));
         }
-        self.products.back(out)
+        self.products.gradients_of_skies(out)
     }
 
-    /// How the frames of the tracks' nodes are combined from a chosen few, if they are.
+    /// Chooses the frames from which those of the tracks' nodes are combined; `None` if each sky is rotated to all.
     fn frames(&self, plan: &RowPlan, tracks: &[Track]) -> Option<Frames> {
-        if plan.direct { None } else { Frames::new(&plan.nodes[nodes_of(tracks)], self.setup.l_max) }
+        if plan.direct { None } else { Frames::new(&plan.nodes[node_range(tracks)], self.setup.l_max) }
     }
 
-    /// Turns skies into the chosen frames, if there are any.
-    fn turn(&self, frames: Option<&Frames>, skies: &[Alm], of: &mut Workspace) {
+    fn rotate_skies(&self, frames: Option<&Frames>, skies: &[Alm], workspace: &mut Workspace) {
         if let Some(frames) = frames {
-            self.turns.turn_skies(&frames.chosen, skies, &mut of.turning, &mut of.basis);
+            self.turns.rotate_skies(&frames.chosen, skies, &mut workspace.rotation, &mut workspace.basis);
         }
     }
 
-    /// Makes room for gradients of skies in the chosen frames.
-    fn no_gradients(&self, frames: Option<&Frames>, skies: usize, of: &mut Workspace) {
+    fn clear_gradients(&self, frames: Option<&Frames>, skies: usize, workspace: &mut Workspace) {
         if let Some(frames) = frames {
-            make_room(&mut of.basis, self.setup.l_max, lanes_of(&frames.chosen) * skies);
-            of.basis.iter_mut().flatten().for_each(|part| part.fill(0.0));
+            resize_buffers(&mut workspace.basis, self.setup.l_max, padded_count(&frames.chosen) * skies);
+            workspace.basis.iter_mut().flatten().for_each(|part| part.fill(0.0));
         }
     }
 
-    /// Adds gradients in the chosen frames to those of skies.
-    fn turn_back(&self, frames: Option<&Frames>, of: &mut Workspace, gradients: &mut [Alm]) {
+    /// Adds the gradients in the chosen frames to the gradients of skies.
+    fn rotate_gradients_back(
+        &self,
+        frames: Option<&Frames>,
+        workspace: &mut Workspace,
+        gradients: &mut [Alm],
+    ) {
         if let Some(frames) = frames {
-            self.turns.turn_skies_back(&frames.chosen, &of.basis, &mut of.turning, gradients);
+            self.turns.rotate_skies_transposed(
+                &frames.chosen,
+                &workspace.basis,
+                &mut workspace.rotation,
+                gradients,
+            );
         }
     }
 
-    /// Orders of an amplitude, mu = -l_max ..= l_max, padded to whole vectors.
-    fn orders(&self) -> usize {
+    /// Number of orders mu = -l_max ..= l_max of an amplitude, padded to whole vectors.
+    fn padded_orders(&self) -> usize {
         (2 * self.setup.l_max + 1).next_multiple_of(LANES)
     }
 
-    /// Zero amplitudes g of the tracks' nodes: `[node][sky][real or imaginary part][order]`.
-    fn no_amplitudes(&self, tracks: &[Track], skies: usize, out: &mut Vec<f64>) {
+    /// Zeroes the amplitudes g of the tracks' nodes: `[node][sky][real or imaginary part][order]`.
+    fn clear_amplitudes(&self, tracks: &[Track], skies: usize, out: &mut Vec<f64>) {
         out.clear();
-        out.resize(nodes_of(tracks).len() * skies * 2 * self.orders(), 0.0);
+        out.resize(node_range(tracks).len() * skies * 2 * self.padded_orders(), 0.0);
     }
 
-    /// Nodes of tracks, in batches of one class: places among the tracks' nodes.
+    /// Divides the nodes of tracks into batches of one class: indices among the tracks' nodes.
     fn batches(plan: &RowPlan, tracks: &[Track]) -> Vec<Vec<usize>> {
-        let nodes = &plan.nodes[nodes_of(tracks)];
+        let nodes = &plan.nodes[node_range(tracks)];
         let mut order: Vec<usize> = (0..nodes.len()).collect();
-        // Pairs of one batch should need about as many quadrature points.
+        // Sorted by length, so that the pairs of a batch need similar numbers of quadrature points.
         let length = |k: usize| nodes[k].view.baseline_m;
         order.sort_by(|&a, &b| nodes[a].class.cmp(&nodes[b].class).then(length(a).total_cmp(&length(b))));
         order
@@ -223,47 +235,59 @@ impl GeneralRows {
     }
 
     /// Computes the patterns of batch `number`.
-    fn batch(
+    fn compute_patterns(
         &self,
         plan: &RowPlan,
         tracks: &[Track],
         tables: &Tables,
-        places: Vec<usize>,
+        indices: Vec<usize>,
         number: usize,
-        of: &mut Workspace,
+        workspace: &mut Workspace,
     ) {
-        let first = nodes_of(tracks).start;
-        if of.batches.len() <= number {
-            of.batches.resize_with(number + 1, Batch::default);
+        let first = node_range(tracks).start;
+        if workspace.batches.len() <= number {
+            workspace.batches.resize_with(number + 1, Batch::default);
         }
-        let batch = &mut of.batches[number];
-        batch.places = places;
+        let batch = &mut workspace.batches[number];
+        batch.indices = indices;
         batch.nodes.clear();
-        batch.nodes.extend(batch.places.iter().map(|&k| plan.nodes[first + k]));
+        batch.nodes.extend(batch.indices.iter().map(|&k| plan.nodes[first + k]));
         let class = tables.class(&batch.nodes);
-        self.patterns.of(&self.turns, class, &batch.nodes, &mut of.cap, &mut batch.patterns);
+        self.patterns.write_patterns(
+            &self.turns,
+            class,
+            &batch.nodes,
+            &mut workspace.cap,
+            &mut batch.patterns,
+        );
     }
 
-    /// Writes the amplitudes of a batch, from the skies in the chosen frames.
-    fn amplitudes(&self, number: usize, skies: &[Alm], frames: Option<&Frames>, of: &mut Workspace) {
-        let (orders, l_max) = (self.orders(), self.setup.l_max);
-        let Workspace { batches, basis, turned, weights, turning, amplitudes: out, .. } = of;
+    /// Computes the amplitudes of a batch from the skies in the chosen frames.
+    fn compute_amplitudes(
+        &self,
+        number: usize,
+        skies: &[Alm],
+        frames: Option<&Frames>,
+        workspace: &mut Workspace,
+    ) {
+        let (orders, l_max) = (self.padded_orders(), self.setup.l_max);
+        let Workspace { batches, basis, rotated, weights, rotation, amplitudes: out, .. } = workspace;
         let batch = &batches[number];
         match frames {
-            None => self.turns.turn_skies(&batch.nodes, skies, turning, turned),
+            None => self.turns.rotate_skies(&batch.nodes, skies, rotation, rotated),
             Some(frames) => {
-                frames.weights_of(&batch.places, weights);
-                frames.combined(basis, weights, [l_max, skies.len()], turned);
+                frames.weights_for(&batch.indices, weights);
+                frames.combine(basis, weights, [l_max, skies.len()], rotated);
             }
         }
-        let lanes = lanes_of(&batch.nodes);
-        for (mu, [re, im]) in turned.iter().enumerate() {
-            for (group, places) in batch.places.chunks(LANES).enumerate() {
-                let pattern = batch.patterns[mu].of(group);
+        let lanes = padded_count(&batch.nodes);
+        for (mu, [re, im]) in rotated.iter().enumerate() {
+            for (group, indices) in batch.indices.chunks(LANES).enumerate() {
+                let pattern = batch.patterns[mu].rows(group);
                 for sky in 0..skies.len() {
                     let first = sky * lanes + group * LANES;
                     let sums = products(&re[first..], &im[first..], skies.len() * lanes, pattern);
-                    for (lane, node) in places.iter().enumerate() {
+                    for (lane, node) in indices.iter().enumerate() {
                         let place = (node * skies.len() + sky) * 2 * orders + l_max;
                         (out[place + mu], out[place + orders + mu]) = (sums[0][lane], sums[1][lane]);
                         if mu > 0 {
@@ -275,20 +299,26 @@ impl GeneralRows {
         }
     }
 
-    /// The transpose of [`Self::amplitudes`], added to the gradients in the chosen frames, or to `out`.
-    fn gradients(&self, number: usize, frames: Option<&Frames>, of: &mut Workspace, out: &mut [Alm]) {
-        let (orders, l_max, skies) = (self.orders(), self.setup.l_max, out.len());
-        let Workspace { batches, basis, turned, weights, turning, amplitudes, .. } = of;
+    /// Adds the transpose of [`Self::compute_amplitudes`] to the gradients in the chosen frames, or to `out`.
+    fn compute_gradients(
+        &self,
+        number: usize,
+        frames: Option<&Frames>,
+        workspace: &mut Workspace,
+        out: &mut [Alm],
+    ) {
+        let (orders, l_max, skies) = (self.padded_orders(), self.setup.l_max, out.len());
+        let Workspace { batches, basis, rotated, weights, rotation, amplitudes, .. } = workspace;
         let batch = &batches[number];
-        let lanes = lanes_of(&batch.nodes);
+        let lanes = padded_count(&batch.nodes);
         let at = |place: usize| amplitudes[place] as Value;
-        make_room(turned, l_max, lanes * skies);
-        for (mu, [re, im]) in turned.iter_mut().enumerate() {
-            for (group, places) in batch.places.chunks(LANES).enumerate() {
-                let pattern = batch.patterns[mu].of(group);
+        resize_buffers(rotated, l_max, lanes * skies);
+        for (mu, [re, im]) in rotated.iter_mut().enumerate() {
+            for (group, indices) in batch.indices.chunks(LANES).enumerate() {
+                let pattern = batch.patterns[mu].rows(group);
                 for sky in 0..skies {
                     let mut values = [[0.0; LANES]; 4];
-                    for (lane, node) in places.iter().enumerate() {
+                    for (lane, node) in indices.iter().enumerate() {
                         let place = (node * skies + sky) * 2 * orders + l_max;
                         (values[0][lane], values[1][lane]) = (at(place + mu), at(place + orders + mu));
                         if mu > 0 {
@@ -301,27 +331,27 @@ impl GeneralRows {
             }
         }
         match frames {
-            None => self.turns.turn_skies_back(&batch.nodes, turned, turning, out),
+            None => self.turns.rotate_skies_transposed(&batch.nodes, rotated, rotation, out),
             Some(frames) => {
-                frames.weights_of(&batch.places, weights);
-                frames.shared(turned, weights, basis, [l_max, skies]);
+                frames.weights_for(&batch.indices, weights);
+                frames.combine_transposed(rotated, weights, basis, [l_max, skies]);
             }
         }
     }
 
-    /// Values at all rows of tracks, one vector a sky, from the amplitudes of the skies' products.
+    /// Interpolates the visibilities of all rows of tracks, one vector per sky, from the amplitudes of the skies' products.
     fn interpolate(
         &self,
         plan: &RowPlan,
         tracks: &[Track],
         skies: usize,
-        of: &mut Workspace,
+        workspace: &mut Workspace,
     ) -> Vec<Vec<Complex64>> {
-        let first = nodes_of(tracks).start;
+        let first = node_range(tracks).start;
         let products = skies * self.products.count();
-        let width = 2 * self.orders();
-        let mut out = vec![Vec::with_capacity(rows_of(tracks).len()); skies];
-        let Workspace { amplitudes, table, shares, padded, .. } = of;
+        let width = 2 * self.padded_orders();
+        let mut out = vec![Vec::with_capacity(row_range(tracks).len()); skies];
+        let Workspace { amplitudes, table, node_weights, padded, .. } = workspace;
         let [mut values, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; products]);
         for track in tracks {
             let amplitudes = &amplitudes[(track.nodes.start - first) * products * width..];
@@ -329,48 +359,58 @@ impl GeneralRows {
             if track.tau.is_empty() {
                 for (row, node) in track.rows.clone().zip(amplitudes.chunks_exact(products * width)) {
                     for (value, g) in values.iter_mut().zip(node.chunks_exact(width)) {
-                        *value = self.at_phase(g, plan.gamma_rad[row]);
+                        *value = self.sum_orders(g, plan.gamma_rad[row]);
                     }
-                    plan.combine(row, &values, &mut out);
+                    plan.combine_products(row, &values, &mut out);
                 }
                 continue;
             }
-            self.phases.fill(amplitudes, width / 2, [track.nodes.len(), products], table);
+            self.phases.transform(amplitudes, width / 2, [track.nodes.len(), products], table);
             for row in track.rows.clone() {
                 values.fill(Complex64::ZERO);
                 for instant in plan.instants_of(track, row, &self.instants) {
-                    let gamma_rad = plan.shares(track, row, instant, shares);
-                    padded.set(table, shares);
-                    self.phases.at(table, gamma_rad, padded, &mut at);
+                    let gamma_rad = plan.node_weights(track, row, instant, node_weights);
+                    padded.set(table, node_weights);
+                    self.phases.interpolate(table, gamma_rad, padded, &mut at);
                     values.iter_mut().zip(&at).for_each(|(value, at)| *value += instant.weight * at);
                 }
-                plan.combine(row, &values, &mut out);
+                plan.combine_products(row, &values, &mut out);
             }
         }
         out
     }
 
-    /// `sum_mu exp(-i mu gamma) g_mu`.
-    fn at_phase(&self, amplitudes: &[f64], gamma_rad: f64) -> Complex64 {
+    /// Computes `sum_mu exp(-i mu gamma) g_mu`.
+    fn sum_orders(&self, amplitudes: &[f64], gamma_rad: f64) -> Complex64 {
         let (re, im) = amplitudes.split_at(amplitudes.len() / 2);
         phase_sum(re, im, gamma_rad) * Complex64::cis(self.setup.l_max as f64 * gamma_rad)
     }
 
-    /// The transpose of [`Self::interpolate`], for several vectors over the rows of the tracks: writes amplitudes.
-    fn spread(&self, plan: &RowPlan, tracks: &[Track], values: &[&[Complex64]], of: &mut Workspace) {
-        let (first, first_row) = (nodes_of(tracks).start, rows_of(tracks).start);
-        let (width, skies) = (2 * self.orders(), values.len() * self.products.count());
-        let Workspace { amplitudes: out, table, shares, padded, .. } = of;
-        self.no_amplitudes(tracks, skies, out);
-        let [mut of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
+    /// Writes amplitudes by the transpose of [`Self::interpolate`], for several vectors over the rows of the tracks.
+    fn interpolate_transposed(
+        &self,
+        plan: &RowPlan,
+        tracks: &[Track],
+        values: &[&[Complex64]],
+        workspace: &mut Workspace,
+    ) {
+        let (first, first_row) = (node_range(tracks).start, row_range(tracks).start);
+        let (width, skies) = (2 * self.padded_orders(), values.len() * self.products.count());
+        let Workspace { amplitudes: out, table, node_weights, padded, .. } = workspace;
+        self.clear_amplitudes(tracks, skies, out);
+        let [mut products_of_row, mut at] = [0, 1].map(|_| vec![Complex64::ZERO; skies]);
         for track in tracks {
             let out = &mut out[(track.nodes.start - first) * skies * width..];
             let out = &mut out[..track.nodes.len() * skies * width];
             if track.tau.is_empty() {
                 for (row, to) in track.rows.clone().zip(out.chunks_exact_mut(skies * width)) {
                     let gamma_rad = plan.gamma_rad[row];
-                    plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
-                    for (value, to) in of_row.iter().zip(to.chunks_exact_mut(width)) {
+                    plan.distribute_to_products(
+                        row,
+                        values.iter().map(|values| values[row - first_row]),
+                        &mut products_of_row,
+                    );
+                    for (value, to) in products_of_row.iter().zip(to.chunks_exact_mut(width)) {
                         let turn = Complex64::cis(-(self.setup.l_max as f64) * gamma_rad);
                         let (re, im) = to.split_at_mut(width / 2);
                         phase_terms(value * turn, gamma_rad, re, im);
@@ -380,112 +420,34 @@ impl GeneralRows {
             }
             self.phases.clear(table, [track.nodes.len(), skies]);
             for row in track.rows.clone() {
-                plan.divide(row, values.iter().map(|values| values[row - first_row]), &mut of_row);
+                plan.distribute_to_products(
+                    row,
+                    values.iter().map(|values| values[row - first_row]),
+                    &mut products_of_row,
+                );
                 for instant in plan.instants_of(track, row, &self.instants) {
-                    let gamma_rad = plan.shares(track, row, instant, shares);
-                    padded.set(table, shares);
-                    at.iter_mut().zip(&of_row).for_each(|(at, value)| *at = instant.weight * value);
-                    self.phases.add(table, gamma_rad, padded, &at);
+                    let gamma_rad = plan.node_weights(track, row, instant, node_weights);
+                    padded.set(table, node_weights);
+                    at.iter_mut().zip(&products_of_row).for_each(|(at, value)| *at = instant.weight * value);
+                    self.phases.interpolate_transposed(table, gamma_rad, padded, &at);
                 }
             }
-            self.phases.collect(table, width / 2, out);
+            self.phases.transform_transposed(table, width / 2, out);
         }
     }
 }
 
-/// Degrees whose products are added in f32, before their sum is added to others in f64.
-const DEGREES: usize = 16;
-
-/// Sums over l of turned skies with patterns: for mu, and of the conjugate skies for -mu. Values of one l are `stride` apart.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn products(re: &[Value], im: &[Value], stride: usize, pattern: &[Value]) -> [Lanes; 4] {
-    let mut sums = [[0.0; LANES]; 4];
-    let (re, im) = (re.chunks(DEGREES * stride), im.chunks(DEGREES * stride));
-    for ((re, im), pattern) in re.zip(im).zip(pattern.chunks(DEGREES * VALUES)) {
-        let mut some = [[0.0; LANES]; 4];
-        for ((re, im), pattern) in re.chunks(stride).zip(im.chunks(stride)).zip(pattern.chunks_exact(VALUES))
-        {
-            let (re, im) = (&re[..LANES], &im[..LANES]);
-            for k in 0..LANES {
-                let [a, b, c, d] = [0, 1, 2, 3].map(|part| pattern[part * LANES + k]);
-                some[0][k] += re[k] * a - im[k] * b;
-                some[1][k] += re[k] * b + im[k] * a;
-                some[2][k] += re[k] * c + im[k] * d;
-                some[3][k] += re[k] * d - im[k] * c;
-            }
-        }
-        for (sums, some) in sums.iter_mut().zip(&some) {
-            sums.iter_mut().zip(some).for_each(|(sum, some)| *sum += f64::from(*some));
-        }
-    }
-    sums
-}
-
-/// The transpose of [`products`].
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn products_back(
-    values: &[[Value; LANES]; 4],
-    pattern: &[Value],
-    re: &mut [Value],
-    im: &mut [Value],
-    stride: usize,
-) {
-    let parts = re.chunks_mut(stride).zip(im.chunks_mut(stride));
-    for ((re, im), pattern) in parts.zip(pattern.chunks_exact(VALUES)) {
-        let (re, im) = (&mut re[..LANES], &mut im[..LANES]);
-        for k in 0..LANES {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|part| pattern[part * LANES + k]);
-            let [plus_re, plus_im, minus_re, minus_im] = [0, 1, 2, 3].map(|part| values[part][k]);
-            re[k] = a * plus_re + b * plus_im + c * minus_re + d * minus_im;
-            im[k] = a * plus_im - b * plus_re + d * minus_re - c * minus_im;
-        }
-    }
-}
-
-/// `sum_n exp(-i n angle) g_n`, n from 0; the length is a multiple of the lanes.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn phase_sum(re: &[f64], im: &[f64], angle_rad: f64) -> Complex64 {
-    // Horner's rule, each lane on its own from the last of its orders down.
-    let (sin, cos) = (-(LANES as f64) * angle_rad).sin_cos();
-    let mut sums = [[0.0; LANES]; 2];
-    for (re, im) in re.rchunks_exact(LANES).zip(im.rchunks_exact(LANES)) {
-        for k in 0..LANES {
-            let [a, b] = [sums[0][k], sums[1][k]];
-            sums[0][k] = a * cos - b * sin + re[k];
-            sums[1][k] = a * sin + b * cos + im[k];
-        }
-    }
-    (0..LANES).map(|k| Complex64::new(sums[0][k], sums[1][k]) * Complex64::cis(-(k as f64) * angle_rad)).sum()
-}
-
-/// `exp(i n angle) first`, n from 0; the length is a multiple of the lanes.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn phase_terms(first: Complex64, angle_rad: f64, re: &mut [f64], im: &mut [f64]) {
-    let (sin, cos) = (LANES as f64 * angle_rad).sin_cos();
-    let start: [Complex64; LANES] = std::array::from_fn(|k| first * Complex64::cis(k as f64 * angle_rad));
-    let mut term = [start.map(|z| z.re), start.map(|z| z.im)];
-    for (re, im) in re.chunks_exact_mut(LANES).zip(im.chunks_exact_mut(LANES)) {
-        for k in 0..LANES {
-            let [a, b] = [term[0][k], term[1][k]];
-            (re[k], im[k]) = (a, b);
-            term[0][k] = a * cos - b * sin;
-            term[1][k] = a * sin + b * cos;
-        }
-    }
-}
-
-/// Nodes of consecutive tracks.
-fn nodes_of(tracks: &[Track]) -> Range<usize> {
+/// Range of the nodes of consecutive tracks.
+fn node_range(tracks: &[Track]) -> Range<usize> {
     tracks.first().map_or(0, |track| track.nodes.start)..tracks.last().map_or(0, |track| track.nodes.end)
 }
 
-/// Rows of consecutive tracks.
-fn rows_of(tracks: &[Track]) -> Range<usize> {
+/// Range of the rows of consecutive tracks.
+fn row_range(tracks: &[Track]) -> Range<usize> {
     tracks.first().map_or(0, |track| track.rows.start)..tracks.last().map_or(0, |track| track.rows.end)
 }
 
-/// Values of groups one after the other, by sky.
-fn joined(plan: &RowPlan, skies: usize, groups: Vec<Vec<Vec<Complex64>>>) -> Vec<Vec<Complex64>> {
+fn concatenate(plan: &RowPlan, skies: usize, groups: Vec<Vec<Vec<Complex64>>>) -> Vec<Vec<Complex64>> {
     let mut out = vec![Vec::with_capacity(plan.rows()); skies];
     for group in groups {
         for (out, values) in out.iter_mut().zip(group) {
@@ -495,90 +457,22 @@ fn joined(plan: &RowPlan, skies: usize, groups: Vec<Vec<Vec<Complex64>>>) -> Vec
     out
 }
 
-fn add_to(sums: &mut [Alm], part: &[Alm]) {
+fn add_gradients(sums: &mut [Alm], part: &[Alm]) {
     for (sum, part) in sums.iter_mut().zip(part) {
         sum.values_mut().iter_mut().zip(part.values()).for_each(|(sum, x)| *sum += x);
     }
 }
 
-/// Tables that the rows of a plan share.
-struct Tables {
-    /// The classes of the nodes.
-    classes: Vec<CapClass>,
-    /// Index among `classes`, by the number of a class.
-    places: Vec<usize>,
-}
-
-impl Tables {
-    fn new(setup: &RowsSetup, plan: &RowPlan) -> Self {
-        let mut numbers: Vec<usize> = plan.nodes.iter().map(|node| node.class as usize).collect();
-        numbers.sort_unstable();
-        numbers.dedup();
-        let mut places = vec![0; plan.classes.len()];
-        numbers.iter().enumerate().for_each(|(place, number)| places[*number] = place);
-        let classes = numbers.par_iter().map(|number| CapClass::new(setup, &plan.classes[*number])).collect();
-        Self { classes, places }
-    }
-
-    /// The class of a batch, which has at least one node.
-    fn class(&self, nodes: &[RowNode]) -> &CapClass {
-        &self.classes[self.places[nodes[0].class as usize]]
-    }
-}
-
-/// Nodes of one class, and their patterns.
-#[derive(Default)]
-struct Batch {
-    /// Places among the nodes of the group's tracks.
-    places: Vec<usize>,
-    nodes: Vec<RowNode>,
-    /// By mu.
-    patterns: Vec<NodePatterns>,
-}
-
-/// Buffers of a task on one group of tracks. They are kept for the next: tens of MB that come and go with each group
-/// cost up to two fifths of a product's time in page faults, where antennas multiply the skies.
-#[derive(Default)]
-struct Workspace {
-    cap: CapBuffers,
-    batches: Vec<Batch>,
-    turning: TurnBuffers,
-    /// Skies in the chosen frames, then gradients there.
-    basis: TurnedSkies,
-    /// Skies in the frames of a batch, and its weights.
-    turned: TurnedSkies,
-    weights: Vec<Value>,
-    /// `[node][sky][real or imaginary part][order]`.
-    amplitudes: Vec<f64>,
-    table: PhaseTable,
-    shares: Vec<f64>,
-    padded: PaddedShares,
-}
-
-/// Workspaces that no task uses now.
-#[derive(Default)]
-struct Memory(Mutex<Vec<Workspace>>);
-
-impl Memory {
-    fn with_workspace<T>(&self, to: impl FnOnce(&mut Workspace) -> T) -> T {
-        let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut workspace = free().pop().unwrap_or_default();
-        let out = to(&mut workspace);
-        free().push(workspace);
-        out
-    }
-}
-
-/// Memory of rows up to `l_max` and `u_max` wavelengths besides the visibilities', bytes: Legendre functions by class, and what each thread
-/// works with. Responses that are polynomials of a degree multiply the skies by the number of its monomials.
+/// Memory of rows up to `l_max` and `u_max` wavelengths without the visibilities, bytes: Legendre functions by class, and the buffers
+/// of each thread. A response of some degree multiplies the number of skies by the number of its monomials.
 #[must_use]
 pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize, polynomial_degree: usize) -> u64 {
-    let products = Products::new(polynomial_degree).count() as f64;
+    let products = SkyProducts::new(polynomial_degree).count() as f64;
     let l_max = l_max + polynomial_degree;
     let coefficients = 0.25 * ((l_max + 2) as f64).powi(2);
     let turns = ((l_max + 2) as f64).powi(3) / 3.0;
     let gradients = (2 * GROUPS_AT_ONCE) as f64 * 16.0 * 2.0 * coefficients * products;
-    // Amplitudes of two skies before and after the weights, and the patterns.
+    // Amplitudes of two skies before and after the weights, and patterns.
     let group =
         1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 * products + 16.0 * coefficients);
     let batch = BATCH as f64 * 80.0 * coefficients + batch_bytes(l_max, u_max, BATCH);

@@ -1,8 +1,8 @@
-//! Sums over mu of interpolated amplitudes, `V = sum_k share_k sum_mu exp(-i mu gamma) g_{k mu}`, at many angles gamma.
+//! Sums over mu of interpolated amplitudes, `V = sum_k weight_k sum_mu exp(-i mu gamma) g_{k mu}`, at many angles gamma.
 //!
-//! One transform a node gives its sum at equally spaced angles, between which a kernel about gamma interpolates (see
-//! `response/harmonic/kernel.rs`): a dozen angles and as many multiply-adds each as there are nodes, where interpolated amplitudes
-//! would take one for each mu.
+//! This is a non-uniform FFT (NUFFT): one FFT per node gives its sum at equally spaced angles, between which a gridding kernel
+//! interpolates (see `response/harmonic/gridding_kernel.rs`). That costs a dozen angles with one multiply-add per node, where
+//! interpolated amplitudes would take one for each mu.
 
 use std::f64::consts::TAU;
 use std::sync::Arc;
@@ -12,25 +12,24 @@ use rustfft::{Fft, FftPlanner};
 
 use super::lanes::{LANES, Lanes};
 use crate::numerics::fft_length;
-use crate::response::harmonic::kernel::{Kernel, LANES as TAPS};
+use crate::response::harmonic::gridding_kernel::{Kernel, LANES as TAPS};
 
-/// Error of the kernel, of the largest value: below that of patterns in f32.
+/// Error of the kernel relative to the largest value: below the rounding of patterns in f32.
 const TOLERANCE: f64 = 1e-8;
 
-/// Angles about a grid of twice as many points as a sum has orders.
+/// Uniform grid of angles with twice as many points as a sum has orders.
 #[derive(Clone)]
 pub(super) struct PhaseGrid {
     l_max: usize,
-    /// Equally spaced angles.
     points: usize,
     kernel: Kernel,
-    /// By mu + `l_max`: what the kernel makes of an order, inverted.
+    /// Reciprocal of the kernel's transform at each order, by mu + `l_max`.
     factors: Vec<f64>,
     forward: Arc<dyn Fft<f64>>,
     inverse: Arc<dyn Fft<f64>>,
 }
 
-/// Values of the nodes of a track at all angles: `[angle][sky][real or imaginary part][node]`, nodes filled up to whole vectors.
+/// Values of a track's nodes at all angles: `[angle][sky][real or imaginary part][node]`, nodes padded to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PhaseTable {
     values: Vec<f64>,
@@ -50,20 +49,19 @@ impl std::fmt::Debug for PhaseGrid {
 }
 
 impl PhaseTable {
-    /// Nodes with what fills the last vector.
+    /// Number of nodes, padded to whole vectors.
     fn padded(&self) -> usize {
         self.nodes.next_multiple_of(LANES)
     }
 
-    /// Values at one angle.
     fn stride(&self) -> usize {
         2 * self.skies * self.padded()
     }
 
-    /// The shares of nodes with what fills the last vector.
-    fn fill_shares(&self, shares: &[f64], filled: &mut Vec<f64>) {
+    /// Copies the weights of nodes and pads them to whole vectors.
+    fn pad_weights(&self, weights: &[f64], filled: &mut Vec<f64>) {
         filled.clear();
-        filled.extend_from_slice(shares);
+        filled.extend_from_slice(weights);
         filled.resize(self.padded(), 0.0);
     }
 }
@@ -81,7 +79,6 @@ impl PhaseGrid {
         Self { l_max, points, kernel, factors, forward, inverse }
     }
 
-    /// Makes a table of zeros.
     pub(super) fn clear(&self, table: &mut PhaseTable, [nodes, skies]: [usize; 2]) {
         (table.nodes, table.skies) = (nodes, skies);
         table.values.clear();
@@ -91,14 +88,21 @@ impl PhaseGrid {
         table.scratch.resize(length, Complex64::ZERO);
     }
 
-    /// Place of order mu = place - `l_max` in a transform.
+    /// FFT bin of order mu = `place` - `l_max`.
     fn bin(&self, place: usize) -> usize {
         (place + self.points - self.l_max) % self.points
     }
 
-    /// Fills a table with the sums of amplitudes `[node][sky][real or imaginary part][mu + l_max]`, each part of `orders`.
-    pub(super) fn fill(&self, amplitudes: &[f64], orders: usize, of: [usize; 2], table: &mut PhaseTable) {
-        self.clear(table, of);
+    /// Transforms amplitudes `[node][sky][real or imaginary part][mu + l_max]`, each part of `orders` values, to the angles of a table;
+    /// `shape` is the number of nodes and of skies.
+    pub(super) fn transform(
+        &self,
+        amplitudes: &[f64],
+        orders: usize,
+        shape: [usize; 2],
+        table: &mut PhaseTable,
+    ) {
+        self.clear(table, shape);
         let (padded, stride, skies) = (table.padded(), table.stride(), table.skies);
         for (k, both) in amplitudes.chunks_exact(2 * orders).enumerate() {
             let (node, sky) = (k / skies, k % skies);
@@ -115,8 +119,8 @@ impl PhaseGrid {
         }
     }
 
-    /// The transpose of [`Self::fill`]: what was added to a table as gradients of amplitudes, added to `out`.
-    pub(super) fn collect(&self, table: &mut PhaseTable, orders: usize, out: &mut [f64]) {
+    /// Adds the gradients of amplitudes to `out`, by the transpose of [`Self::transform`].
+    pub(super) fn transform_transposed(&self, table: &mut PhaseTable, orders: usize, out: &mut [f64]) {
         let (padded, stride, skies) = (table.padded(), table.stride(), table.skies);
         for (k, both) in out.chunks_exact_mut(2 * orders).enumerate() {
             let (node, sky) = (k / skies, k % skies);
@@ -134,68 +138,68 @@ impl PhaseGrid {
         }
     }
 
-    /// The first angle that the kernel about gamma reaches, and its values from there on.
-    fn near(&self, gamma_rad: f64) -> (usize, [f32; TAPS]) {
+    /// Returns the first angle within the kernel's support about gamma, and the kernel at it and the following angles.
+    fn kernel_at(&self, gamma_rad: f64) -> (usize, [f32; TAPS]) {
         let x = (gamma_rad / TAU).rem_euclid(1.0) * self.points as f64;
         let (first, lanes) = self.kernel.spread(x);
         (first.rem_euclid(self.points as i64) as usize, lanes)
     }
 
-    /// Values at an angle, by sky, with these shares of the nodes.
-    pub(super) fn at(
+    /// Interpolates the value of each sky at an angle, with these weights of the nodes.
+    pub(super) fn interpolate(
         &self,
         table: &PhaseTable,
         gamma_rad: f64,
-        shares: &PaddedShares,
+        weights: &PaddedWeights,
         out: &mut [Complex64],
     ) {
-        let (first, lanes) = self.near(gamma_rad);
+        let (first, lanes) = self.kernel_at(gamma_rad);
         let (padded, stride) = (table.padded(), table.stride());
         let taps = &lanes[..self.kernel.width()];
         for (sky, out) in out.iter_mut().enumerate() {
             let [re, im] = [0, 1].map(|part| {
                 let column = (2 * sky + part) * padded;
-                gather(&table.values[column..], stride, first, self.points, taps, &shares.0)
+                gather(&table.values[column..], stride, first, self.points, taps, &weights.0)
             });
             *out = Complex64::new(re, im);
         }
     }
 
-    /// The transpose of [`Self::at`]: adds values, by sky.
-    pub(super) fn add(
+    /// Adds the values of each sky to a table, by the transpose of [`Self::interpolate`].
+    pub(super) fn interpolate_transposed(
         &self,
         table: &mut PhaseTable,
         gamma_rad: f64,
-        shares: &PaddedShares,
+        weights: &PaddedWeights,
         values: &[Complex64],
     ) {
-        let (first, lanes) = self.near(gamma_rad);
+        let (first, lanes) = self.kernel_at(gamma_rad);
         let (padded, stride) = (table.padded(), table.stride());
         let taps = &lanes[..self.kernel.width()];
         for (sky, value) in values.iter().enumerate() {
             for (part, value) in [value.re, value.im].into_iter().enumerate() {
                 let column = (2 * sky + part) * padded;
-                scatter(&mut table.values[column..], stride, first, self.points, taps, (&shares.0, value));
+                scatter(&mut table.values[column..], stride, first, self.points, taps, (&weights.0, value));
             }
         }
     }
 }
 
-/// Shares of the nodes of a track in a row, filled up to whole vectors.
+/// Weights of a track's nodes in a row, padded to whole vectors.
 #[derive(Clone, Debug, Default)]
-pub(super) struct PaddedShares(Vec<f64>);
+pub(super) struct PaddedWeights(Vec<f64>);
 
-impl PaddedShares {
-    pub(super) fn set(&mut self, table: &PhaseTable, shares: &[f64]) {
-        table.fill_shares(shares, &mut self.0);
+impl PaddedWeights {
+    pub(super) fn set(&mut self, table: &PhaseTable, weights: &[f64]) {
+        table.pad_weights(weights, &mut self.0);
     }
 }
 
-/// The sum over taps and nodes of one column.
+/// Sums over taps and nodes of one column.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f32], shares: &[f64]) -> f64 {
+fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f32], weights: &[f64]) -> f64 {
     let mut sums: Lanes = [0.0; LANES];
-    for (chunk, shares) in shares.chunks_exact(LANES).enumerate() {
+    for (chunk, weights) in weights.chunks_exact(LANES).enumerate() {
         let mut row: Lanes = [0.0; LANES];
         let mut angle = first;
         for tap in taps {
@@ -210,7 +214,7 @@ fn gather(values: &[f64], stride: usize, first: usize, points: usize, taps: &[f3
             }
         }
         for k in 0..LANES {
-            sums[k] += shares[k] * row[k];
+            sums[k] += weights[k] * row[k];
         }
     }
     sums.iter().sum()
@@ -224,15 +228,15 @@ fn scatter(
     first: usize,
     points: usize,
     taps: &[f32],
-    (shares, value): (&[f64], f64),
+    (weights, value): (&[f64], f64),
 ) {
     let mut angle = first;
     for tap in taps {
         let factor = f64::from(*tap) * value;
-        let values = &mut values[angle * stride..][..shares.len()];
-        for (values, shares) in values.chunks_exact_mut(LANES).zip(shares.chunks_exact(LANES)) {
+        let values = &mut values[angle * stride..][..weights.len()];
+        for (values, weights) in values.chunks_exact_mut(LANES).zip(weights.chunks_exact(LANES)) {
             for k in 0..LANES {
-                values[k] += factor * shares[k];
+                values[k] += factor * weights[k];
             }
         }
         angle += 1;
@@ -246,7 +250,7 @@ fn scatter(
 mod tests {
     use super::*;
 
-    /// Amplitudes of two skies at three nodes, at some angles and shares, against the sums as they are written.
+    /// Compares the result for two skies at three nodes with the sums as they are written.
     #[test]
     fn sums_are_those_of_all_orders_and_the_transpose_is_one() {
         for l_max in [3, 40, 160] {
@@ -262,37 +266,37 @@ mod tests {
                 part[..2 * l_max + 1].iter_mut().for_each(|x| *x = random());
             }
             let mut table = PhaseTable::default();
-            grid.fill(&amplitudes, orders, [nodes, skies], &mut table);
+            grid.transform(&amplitudes, orders, [nodes, skies], &mut table);
             let mut gradients = PhaseTable::default();
             grid.clear(&mut gradients, [nodes, skies]);
-            let (mut shares, mut product) = (PaddedShares::default(), 0.0);
+            let (mut weights, mut product) = (PaddedWeights::default(), 0.0);
             for k in 0..50 {
                 let gamma_rad = 0.7 * f64::from(k) - 9.0;
-                let of_nodes: Vec<f64> = (0..nodes).map(|_| random()).collect();
+                let node_weights: Vec<f64> = (0..nodes).map(|_| random()).collect();
                 let mut found = [Complex64::ZERO; 2];
-                shares.set(&table, &of_nodes);
-                grid.at(&table, gamma_rad, &shares, &mut found);
+                weights.set(&table, &node_weights);
+                grid.interpolate(&table, gamma_rad, &weights, &mut found);
                 for (sky, found) in found.iter().enumerate() {
                     let mut expected = Complex64::ZERO;
-                    for (node, share) in of_nodes.iter().enumerate() {
+                    for (node, weight) in node_weights.iter().enumerate() {
                         let g = &amplitudes[(node * skies + sky) * 2 * orders..];
                         for place in 0..=2 * l_max {
                             let turn = Complex64::cis(-(place as f64 - l_max as f64) * gamma_rad);
-                            expected += share * Complex64::new(g[place], g[orders + place]) * turn;
+                            expected += weight * Complex64::new(g[place], g[orders + place]) * turn;
                         }
                     }
-                    // A sum of 11 x 321 terms of 0.1; weights in f32 have 6e-8, the kernel 5e-8 of the largest of such sums.
+                    // A sum of 11 x 321 terms of 0.1: weights in f32 have errors of 6e-8, and the kernel 5e-8 of the largest sum.
                     let size = 0.1 * ((nodes * (2 * l_max + 1)) as f64).sqrt();
                     assert!((found - expected).norm() < 1e-6 * size, "{l_max}: {found} {expected}");
                 }
                 let values = [Complex64::new(random(), random()), Complex64::new(random(), random())];
                 product += found.iter().zip(&values).map(|(a, b)| (a * b.conj()).re).sum::<f64>();
-                grid.add(&mut gradients, gamma_rad, &shares, &values);
+                grid.interpolate_transposed(&mut gradients, gamma_rad, &weights, &values);
             }
             let mut back = vec![0.0; amplitudes.len()];
-            grid.collect(&mut gradients, orders, &mut back);
+            grid.transform_transposed(&mut gradients, orders, &mut back);
             let other: f64 = amplitudes.iter().zip(&back).map(|(a, b)| a * b).sum();
-            // Both go through the same numbers.
+            // Both use the same rounded numbers.
             assert!((product - other).abs() < 1e-10 * (1.0 + product.abs()), "{l_max}: {product} {other}");
         }
     }

@@ -1,4 +1,4 @@
-//! One batch of runs: groups that share alphas, their projection, and the visibilities.
+//! Batches of runs: groups of runs that share alphas, their projection, and their visibilities.
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
@@ -11,27 +11,26 @@ use super::blocked::{BLOCK_NODES, PATTERN_LANES};
 use super::forward::{
     ALPHAS_MAX, AlphaPart, ORDER_LANES, OrderBlock, Projection, RunGroup, RunPlan, project,
 };
-use super::kernel::LANES;
+use super::gridding_kernel::LANES;
 use super::model::{ALPHA_BLOCK, ALPHA_TOLERANCE, BLOCKS_KEPT, HarmonicModel, TERMS};
-use super::rotation::orders;
+use super::rotation::order_count;
 use super::runs::{Run, split};
 use crate::numerics::chebyshev;
 use crate::units::arithmetic::sinc;
 
-/// Most runs in a batch; bounds its memory.
-const RUNS_AT_ONCE: usize = 256;
-/// Target number of alphas in groups of several runs.
-const ALPHAS_AIMED_AT: usize = 4;
+/// Maximum number of runs in a batch, which bounds its memory.
+const RUNS_MAX: usize = 256;
+const ALPHAS_TARGET: usize = 4;
 
-/// Groups of runs and their plans. Indices of runs are those in the batch.
+/// Groups of runs and their plans; runs are indexed within the batch.
 pub(super) struct Batch {
     runs: Vec<Run>,
     groups: Vec<RunGroup>,
     plans: Vec<RunPlan>,
+    /// Blocks of alphas that the groups need.
     blocks: Vec<usize>,
 }
 
-/// The interval of alpha that a group covers.
 #[derive(Clone, Copy)]
 struct AlphaRange {
     low: f64,
@@ -39,20 +38,19 @@ struct AlphaRange {
 }
 
 impl Batch {
-    /// Takes a batch from the head of the runs `order` (sorted by alpha), and says how many it took.
+    /// Forms a batch from the first runs of `order` (sorted by alpha), and returns it with their number.
     pub(super) fn new(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (Self, usize) {
         let mut batch = Self { runs: Vec::new(), groups: Vec::new(), plans: Vec::new(), blocks: Vec::new() };
         let mut taken = 0;
-        while taken < order.len() && taken < RUNS_AT_ONCE {
-            let (range, count) = group(model, runs, &order[taken..]);
-            let (group, needs) = batch.alphas(model, range);
-            if needs.len() > BLOCKS_KEPT && taken > 0 {
+        while taken < order.len() && taken < RUNS_MAX {
+            let (range, count) = next_range(model, runs, &order[taken..]);
+            let (mut group, needed) = batch.new_group(model, range);
+            if needed.len() > BLOCKS_KEPT && taken > 0 {
                 break;
             }
-            batch.blocks = needs;
-            let mut group = group;
+            batch.blocks = needed;
             for &run in &order[taken..taken + count] {
-                let plan = plan(model, &runs[run], range, group.alphas.len());
+                let plan = plan_run(model, &runs[run], range, group.alphas.len());
                 group.runs.push(batch.runs.len());
                 group.blocks.extend(plan.first_block..plan.first_block + plan.blocks);
                 batch.plans.push(plan);
@@ -66,9 +64,9 @@ impl Batch {
         (batch, taken)
     }
 
-    /// A group with its alphas, and the blocks of alphas that the batch then needs.
-    fn alphas(&self, model: &HarmonicModel, range: AlphaRange) -> (RunGroup, Vec<usize>) {
-        let mut needs = self.blocks.clone();
+    /// Creates a group without runs, and lists the blocks of alphas that the batch then needs.
+    fn new_group(&self, model: &HarmonicModel, range: AlphaRange) -> (RunGroup, Vec<usize>) {
+        let mut needed = self.blocks.clone();
         let half = 0.5 * (range.high - range.low);
         let terms = alpha_terms(model, half);
         let per_radian = model.alpha.count as f64 / TAU;
@@ -85,36 +83,36 @@ impl Batch {
                         Some(part) => part.weights.push(weight),
                         None => parts.push(AlphaPart { block, first, weights: vec![weight] }),
                     }
-                    if !needs.contains(&block) {
-                        needs.push(block);
+                    if !needed.contains(&block) {
+                        needed.push(block);
                     }
                 }
                 parts
             })
             .collect();
-        (RunGroup { alphas, runs: Vec::new(), blocks: Vec::new() }, needs)
+        (RunGroup { alphas, runs: Vec::new(), blocks: Vec::new() }, needed)
     }
 }
 
-/// Number of alphas for an interval of this half width.
+/// Number of alphas that interpolate over an interval of this half width.
 fn alpha_terms(model: &HarmonicModel, half: f64) -> usize {
     let tolerance = ALPHA_TOLERANCE * model.settings().tolerance;
     let h = half * model.sky.l_max() as f64;
     chebyshev::terms_for(h, tolerance).unwrap_or(ALPHAS_MAX).min(ALPHAS_MAX)
 }
 
-/// Number of runs at the head of `order` that can share alphas, and the interval they cover.
-fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, usize) {
-    let reach = chebyshev::reach(ALPHAS_AIMED_AT, ALPHA_TOLERANCE * model.settings().tolerance)
+/// Finds how many of the first runs of `order` can share alphas, and the interval that they cover.
+fn next_range(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, usize) {
+    let reach = chebyshev::h_max(ALPHAS_TARGET, ALPHA_TOLERANCE * model.settings().tolerance)
         / model.sky.l_max().max(1) as f64;
     let range = |k: usize| {
         let run = &runs[k];
-        let middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
-        AlphaRange { low: middle - run.node[1].abs(), high: middle + run.node[1].abs() }
+        let middle = (run.node.centre - FRAC_PI_2).rem_euclid(TAU);
+        AlphaRange { low: middle - run.node.half.abs(), high: middle + run.node.half.abs() }
     };
     let mut whole = range(order[0]);
     let mut count = 1;
-    for &k in order[1..].iter().take(RUNS_AT_ONCE / 4) {
+    for &k in order[1..].iter().take(RUNS_MAX / 4) {
         let next = range(k);
         let joined = AlphaRange { low: whole.low.min(next.low), high: whole.high.max(next.high) };
         if joined.high - joined.low > 2.0 * reach {
@@ -126,28 +124,27 @@ fn group(model: &HarmonicModel, runs: &[Run], order: &[usize]) -> (AlphaRange, u
     (whole, count)
 }
 
-/// The weights of a run.
-fn plan(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> RunPlan {
+fn plan_run(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> RunPlan {
     let tolerance = model.settings().tolerance;
-    let drift = TAU * run.u[1].abs() + model.sky.l_max() as f64 * run.node[1].abs();
-    let terms = chebyshev::terms_for(drift, tolerance).unwrap_or(TERMS).min(TERMS);
+    let fringe_phase = TAU * run.u.half.abs() + model.sky.l_max() as f64 * run.node.half.abs();
+    let terms = chebyshev::terms_for(fringe_phase, tolerance).unwrap_or(TERMS).min(TERMS);
     let grid = model.patterns.grid;
     let node = |u: f64| (u - grid.first) / grid.step;
     let reach = 0.5 * model.u_kernel.width() as f64;
-    let first_node = (node(run.u[0] - run.u[1].abs()) - reach).ceil().max(0.0) as usize;
-    let last_node = (node(run.u[0] + run.u[1].abs()) + reach).floor().max(0.0) as usize;
+    let first_node = (node(run.u.centre - run.u.half.abs()) - reach).ceil().max(0.0) as usize;
+    let last_node = (node(run.u.centre + run.u.half.abs()) + reach).floor().max(0.0) as usize;
     let first_block = first_node / BLOCK_NODES;
     let blocks = last_node.min(grid.count - 1) / BLOCK_NODES + 1 - first_block;
     let middle = 0.5 * (range.high + range.low);
     let half = (0.5 * (range.high - range.low)).max(1e-300);
-    let run_middle = (run.node[0] - FRAC_PI_2).rem_euclid(TAU);
+    let run_middle = (run.node.centre - FRAC_PI_2).rem_euclid(TAU);
     let mut weights = vec![[0.0_f64; PATTERN_LANES]; terms * blocks * alphas];
     let analysis = chebyshev::analysis(terms);
     for (k, tau) in chebyshev::points(terms).into_iter().enumerate() {
-        let u = node(run.u[0] + run.u[1] * tau) - (first_block * BLOCK_NODES) as f64;
+        let u = node(run.u.centre + run.u.half * tau) - (first_block * BLOCK_NODES) as f64;
         let kernel: Vec<f64> =
             (0..blocks * BLOCK_NODES).map(|n| model.u_kernel.value(n as f64 - u)).collect();
-        let at = ((run_middle + run.node[1] * tau - middle) / half).clamp(-1.0, 1.0);
+        let at = ((run_middle + run.node.half * tau - middle) / half).clamp(-1.0, 1.0);
         for (a, lagrange) in chebyshev::weights_at(alphas, at).into_iter().enumerate() {
             for (n, row) in analysis.iter().enumerate() {
                 for (block, kernel) in kernel.chunks_exact(BLOCK_NODES).enumerate() {
@@ -165,12 +162,13 @@ fn plan(model: &HarmonicModel, run: &Run, range: AlphaRange, alphas: usize) -> R
 }
 
 impl HarmonicModel {
-    /// Visibilities (K sr) of `states`, in order.
+    /// Predicts the visibilities (K sr) of `states`, in order.
     ///
-    /// Any order is correct. Consecutive integrations of a pair are fast, and many pairs over several observing windows
+    /// States may be in any order. Consecutive integrations of a pair are fast, and many pairs over several observing windows
     /// in one call are fastest. At a baseline of zero the result is the auto-correlation power `Int T S A dn`.
     ///
-    /// # Errors [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline,
+    /// # Errors
+    /// [`HarmonicError::NotFinite`], [`HarmonicError::Baseline`] beyond the longest baseline,
     /// [`HarmonicError::Lengths`].
     pub fn visibilities(
         &mut self,
@@ -181,9 +179,9 @@ impl HarmonicModel {
             return Err(HarmonicError::Lengths { states: states.len(), values: values.len() });
         }
         self.check_states(states)?;
-        let runs = split(states, self.limits());
+        let runs = split(states, self.run_limits());
         let mut order: Vec<usize> = (0..runs.len()).collect();
-        let alpha = |k: &usize| (runs[*k].node[0] - FRAC_PI_2).rem_euclid(TAU);
+        let alpha = |k: &usize| (runs[*k].node.centre - FRAC_PI_2).rem_euclid(TAU);
         order.sort_by(|a, b| alpha(a).total_cmp(&alpha(b)).then(a.cmp(b)));
         let mut rest = &order[..];
         while !rest.is_empty() {
@@ -197,16 +195,16 @@ impl HarmonicModel {
         Ok(())
     }
 
-    /// The visibilities of each run of a batch.
+    /// Predicts the visibilities of each run of a batch.
     pub(super) fn evaluate(&mut self, states: &[PairState], batch: &Batch) -> Vec<Vec<Complex64>> {
         self.rotate_sky(&batch.blocks);
         let l_max = self.sky.l_max();
-        let groups: Vec<RunGroup> = batch.groups.iter().map(|group| self.located(group)).collect();
+        let groups: Vec<RunGroup> = batch.groups.iter().map(|group| self.with_sky_indices(group)).collect();
         let mut offsets = vec![0];
         for plan in &batch.plans {
             offsets.push(offsets[offsets.len() - 1] + plan.terms);
         }
-        let tasks: Vec<OrderBlock> = (0..orders(l_max))
+        let tasks: Vec<OrderBlock> = (0..order_count(l_max))
             .step_by(ORDER_LANES)
             .flat_map(|first| [0, 1].map(|parity| OrderBlock { parity, first }))
             .filter(|block| block.order(0) <= l_max)
@@ -226,14 +224,14 @@ impl HarmonicModel {
             .zip(&batch.plans)
             .enumerate()
             .map(|(k, (run, plan))| {
-                let rows = self.rows(&tasks, &projected, offsets[k], plan.terms, run.span);
-                self.sample(&rows, plan.terms, run, &states[run.first..run.first + run.len])
+                let rows = self.gamma_rows(&tasks, &projected, offsets[k], plan.terms, run.span);
+                self.interpolate(&rows, plan.terms, run, &states[run.first..run.first + run.len])
             })
             .collect()
     }
 
-    /// The group with blocks of alphas replaced by their indices among the rotated skies.
-    fn located(&self, group: &RunGroup) -> RunGroup {
+    /// Replaces the blocks of alphas of a group by their indices among the rotated skies.
+    fn with_sky_indices(&self, group: &RunGroup) -> RunGroup {
         let mut group = group.clone();
         for alpha in group.alphas.iter_mut().flatten() {
             alpha.block = self.blocks.iter().position(|b| *b == alpha.block).unwrap_or_default();
@@ -241,8 +239,8 @@ impl HarmonicModel {
         group
     }
 
-    /// Chebyshev coefficients on the grid in gamma: one row a term, its first values repeated at its end.
-    fn rows(
+    /// Transforms Chebyshev coefficients to the grid in gamma: one row per term, with its first values repeated at its end.
+    fn gamma_rows(
         &self,
         tasks: &[OrderBlock],
         projected: &[Vec<f32>],
@@ -276,8 +274,14 @@ impl HarmonicModel {
         rows
     }
 
-    /// The visibilities of a run's states from its rows.
-    fn sample(&self, rows: &[Complex32], terms: usize, run: &Run, states: &[PairState]) -> Vec<Complex64> {
+    /// Interpolates the visibilities of a run's states from its rows.
+    fn interpolate(
+        &self,
+        rows: &[Complex32],
+        terms: usize,
+        run: &Run,
+        states: &[PairState],
+    ) -> Vec<Complex64> {
         let count = self.gamma.count;
         let per_radian = count as f64 / TAU;
         states

@@ -11,9 +11,9 @@ pub enum HarmonicError {
     Parameter {
         /// Name of the parameter.
         name: &'static str,
-        /// Value found.
+        /// Value of the parameter.
         value: f64,
-        /// Range that is accepted.
+        /// Accepted range.
         expected: &'static str,
     },
     /// A state with a value that is not finite.
@@ -30,15 +30,15 @@ pub enum HarmonicError {
     Baseline {
         /// Index of the state.
         index: usize,
-        /// Its baseline in wavelengths.
+        /// Baseline of the state, wavelengths.
         u: f64,
-        /// Greatest baseline covered.
+        /// Longest baseline of the model, wavelengths.
         u_max: f64,
     },
     /// Input and output differ in length.
-    #[error("{states} states, but an output of {values} visibilities")]
+    #[error("{states} states, but an output of {values} visibilities; expected equal numbers")]
     Lengths {
-        /// States given.
+        /// Number of states.
         states: usize,
         /// Length of the output.
         values: usize,

@@ -1,23 +1,21 @@
-//! Linear filters of patterns along the nodes in u.
+//! Symmetric linear filters of patterns along the nodes in u.
 
 use faer::Mat;
 use faer::prelude::*;
 use rayon::prelude::*;
 
 use super::Real;
-use super::pattern::{NodeGrid, PatternTable, degrees};
+use super::pattern::{NodeGrid, PatternTable, degree_count};
 use crate::units::arithmetic::sinc;
 
-/// Taps on each side of a node.
-const REACH: usize = 10;
-/// Frequencies of the fit, for each tap.
+const TAPS_PER_SIDE: usize = 10;
 const SAMPLES_PER_TAP: usize = 12;
 
 /// Patterns after a symmetric filter along the nodes, with both signs of mu interleaved.
 #[derive(Clone, Debug)]
 pub(crate) struct FilteredPatterns {
     pub(crate) grid: NodeGrid,
-    /// By mu: for l = mu, mu + 2, ..: `f_{l,mu}` and `(-1)^mu f_{l,-mu}` at one node after another; padding at the end.
+    /// By mu, for l = mu, mu + 2, ..: `f_{l,mu}` and `(-1)^mu f_{l,-mu}` node by node; padding at the end.
     orders: Vec<Vec<f32>>,
 }
 
@@ -26,10 +24,10 @@ const PADDING: usize = 32;
 
 impl FilteredPatterns {
     /// Additional nodes needed at each end.
-    pub(crate) const MARGIN: usize = REACH;
+    pub(crate) const MARGIN: usize = TAPS_PER_SIDE;
 
     /// Filters every coefficient as a function of u: the component `exp(2 pi i f k)` of node k is
-    /// multiplied by `response(f) sinc(pi width(u) f)`, for f up to `band` cycles a node.
+    /// multiplied by `response(f) sinc(pi width(u) f)`, for f up to `band` cycles per node.
     pub(crate) fn new(
         mut table: PatternTable<f32>,
         band: f64,
@@ -37,9 +35,9 @@ impl FilteredPatterns {
         width: impl Fn(f64) -> f64,
     ) -> Self {
         let from = table.grid();
-        let count = from.count - 2 * REACH;
-        let grid = NodeGrid { first: from.u(REACH), step: from.step, count };
-        let taps = fit(grid, band, response, width);
+        let count = from.count - 2 * TAPS_PER_SIDE;
+        let grid = NodeGrid { first: from.u(TAPS_PER_SIDE), step: from.step, count };
+        let taps = fit_taps(grid, band, response, width);
         let l_max = table.l_max();
         let orders = table
             .orders_mut()
@@ -47,12 +45,12 @@ impl FilteredPatterns {
             .enumerate()
             .map(|(mu, rows)| {
                 let rows = std::mem::take(rows);
-                let mut out = Vec::with_capacity(2 * count * degrees(l_max, mu) + PADDING);
+                let mut out = Vec::with_capacity(2 * count * degree_count(l_max, mu) + PADDING);
                 for row in rows.chunks_exact(2 * from.count) {
                     let (plus, minus) = row.split_at(from.count);
                     for (k, taps) in taps.iter().enumerate() {
-                        out.push(tap(&plus[k..=k + 2 * REACH], taps));
-                        out.push(tap(&minus[k..=k + 2 * REACH], taps));
+                        out.push(apply_taps(&plus[k..=k + 2 * TAPS_PER_SIDE], taps));
+                        out.push(apply_taps(&minus[k..=k + 2 * TAPS_PER_SIDE], taps));
                     }
                 }
                 out.resize(out.len() + PADDING, 0.0);
@@ -62,43 +60,45 @@ impl FilteredPatterns {
         Self { grid, orders }
     }
 
-    /// The nodes, and the rows of every order mu as [`Self::order`] has them.
+    /// Returns the nodes, and the rows of each order mu as in [`Self::order`].
     pub(crate) fn into_orders(self) -> (NodeGrid, Vec<Vec<f32>>) {
         (self.grid, self.orders)
     }
 
-    /// Rows of order mu: `2 count` values for each l = mu, mu + 2, .., then padding.
+    /// Rows of order mu: `2 count` values for each l = mu, mu + 2, .., followed by padding.
     pub(crate) fn order(&self, mu: usize) -> &[f32] {
         &self.orders[mu]
     }
 }
 
 #[inline]
-fn tap(values: &[f32], taps: &[f32; 2 * REACH + 1]) -> f32 {
+fn apply_taps(values: &[f32], taps: &[f32; 2 * TAPS_PER_SIDE + 1]) -> f32 {
     let sum: f32 = values.iter().zip(taps).map(|(v, t)| v * t).sum();
-    f32::entry(f64::from(sum))
+    f32::table_entry(f64::from(sum))
 }
 
-/// Symmetric taps by least squares over the band; the rest of the spectrum is not constrained.
-fn fit(
+/// Fits symmetric taps by least squares over the band; the spectrum outside is not constrained.
+fn fit_taps(
     grid: NodeGrid,
     band: f64,
     response: impl Fn(&[f64]) -> Vec<f64>,
     width: impl Fn(f64) -> f64,
-) -> Vec<[f32; 2 * REACH + 1]> {
-    let samples = SAMPLES_PER_TAP * REACH;
-    // Chebyshev-spaced, so that the ends of the band fit as well as its middle.
+) -> Vec<[f32; 2 * TAPS_PER_SIDE + 1]> {
+    let samples = SAMPLES_PER_TAP * TAPS_PER_SIDE;
+    // Chebyshev spacing makes the fit as good at the ends of the band as in the middle.
     let frequency = |k: usize| band * (std::f64::consts::PI * (k as f64 + 0.5) / (2 * samples) as f64).cos();
-    let basis = Mat::from_fn(samples, REACH + 1, |k, j| {
+    let basis = Mat::from_fn(samples, TAPS_PER_SIDE + 1, |k, j| {
         let wave = (std::f64::consts::TAU * frequency(k) * j as f64).cos();
         if j == 0 { 1.0 } else { 2.0 * wave }
     });
     let frequencies: Vec<f64> = (0..samples).map(frequency).collect();
     let response = response(&frequencies);
-    let wanted = Mat::from_fn(samples, grid.count, |k, node| {
+    let target = Mat::from_fn(samples, grid.count, |k, node| {
         let phase = std::f64::consts::PI * width(grid.u(node)) * frequencies[k];
         response[k] * sinc(phase)
     });
-    let solution = basis.qr().solve_lstsq(&wanted);
-    (0..grid.count).map(|node| std::array::from_fn(|j| solution[(j.abs_diff(REACH), node)] as f32)).collect()
+    let solution = basis.qr().solve_lstsq(&target);
+    (0..grid.count)
+        .map(|node| std::array::from_fn(|j| solution[(j.abs_diff(TAPS_PER_SIDE), node)] as f32))
+        .collect()
 }

@@ -1,17 +1,16 @@
 //! Inner loops of the forward operator.
 //!
-//! For each order mu: interpolate the rotated sky to the alphas of a group, multiply it by the patterns at the nodes of
+//! For each order mu they interpolate the rotated sky to the alphas of a group, multiply it by the patterns at the nodes of
 //! a run, and reduce the products to the run's Chebyshev terms.
 
 use super::blocked::{BlockedPatterns, PATTERN_LANES, PatternLanes};
-use super::rotation::{RotatedSky, orders};
+use super::rotation::{RotatedSky, order_count};
 
-/// Orders mu of one task: a vector of the rotated sky.
+/// Orders mu of one task, which fill a vector of the rotated sky.
 pub(crate) const ORDER_LANES: usize = 16;
-/// Most alphas in a group.
 pub(crate) const ALPHAS_MAX: usize = 6;
 
-/// Part of the interpolation to one alpha: which rotated sky, the first of its alphas, and the kernel from there on.
+/// Part of the interpolation to one alpha: the rotated sky, the index of its first alpha, and the kernel at the following ones.
 #[derive(Clone, Debug)]
 pub(crate) struct AlphaPart {
     pub(crate) block: usize,
@@ -19,34 +18,30 @@ pub(crate) struct AlphaPart {
     pub(crate) weights: Vec<f32>,
 }
 
-/// Products at one block of nodes: real and imaginary part at each alpha.
+/// Products at one block of nodes: real and imaginary part for each alpha.
 type Products = [[f32; PATTERN_LANES]; 2 * ALPHAS_MAX];
 
 /// Runs that share alphas.
 #[derive(Clone, Debug)]
 pub(crate) struct RunGroup {
-    /// Each alpha, in one or two parts.
+    /// Interpolation to each alpha, in one or two parts.
     pub(crate) alphas: Vec<Vec<AlphaPart>>,
-    /// Indices of its runs in the batch.
     pub(crate) runs: Vec<usize>,
-    /// Blocks of nodes that its runs need, in order.
+    /// Blocks of nodes that the runs need, in order.
     pub(crate) blocks: Vec<usize>,
 }
 
 /// Weights that reduce products at alphas and nodes to the Chebyshev coefficients of a run.
 #[derive(Clone, Debug)]
 pub(crate) struct RunPlan {
-    /// First of its blocks of nodes.
     pub(crate) first_block: usize,
-    /// Number of blocks.
     pub(crate) blocks: usize,
-    /// Number of Chebyshev terms.
     pub(crate) terms: usize,
     /// `[term][block][alpha]`: a weight for each lane of the pattern vector.
     pub(crate) weights: Vec<[f32; PATTERN_LANES]>,
 }
 
-/// The orders of a task: mu = parity + 2 (first + lane).
+/// Orders of a task: mu = parity + 2 (first + lane).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct OrderBlock {
     pub(crate) parity: usize,
@@ -60,36 +55,35 @@ impl OrderBlock {
     }
 }
 
-/// The inputs of a projection, shared by all tasks.
+/// Inputs of [`project`], shared by all tasks.
 pub(crate) struct Projection<'a> {
     pub(crate) l_max: usize,
-    /// Rotated skies, as the parts of alphas number them.
+    /// Rotated skies, indexed by [`AlphaPart::block`].
     pub(crate) skies: &'a [RotatedSky<f32>],
     pub(crate) patterns: &'a BlockedPatterns,
     pub(crate) groups: &'a [RunGroup],
-    /// By run.
     pub(crate) plans: &'a [RunPlan],
-    /// First term of each run in the output, and the number of all terms.
+    /// Index of each run's first term in the output, and the total number of terms.
     pub(crate) offsets: &'a [usize],
 }
 
-/// Chebyshev coefficients of a block's orders: for each term of each run and each lane `A_mu` (re, im) and
+/// Computes the Chebyshev coefficients of a block's orders: for each term of each run and each lane `A_mu` (re, im) and
 /// `conj(A_{-mu})` (re, im).
 pub(crate) fn project(block: OrderBlock, inputs: &Projection<'_>) -> Vec<f32> {
     let Projection { l_max, skies, patterns, groups, plans, offsets } = *inputs;
     let mut out = vec![0.0; 4 * ORDER_LANES * offsets[plans.len()]];
     let rows = (l_max - block.order(0)) / 2 + 1;
-    let turned: Vec<Vec<f32>> = groups.iter().map(|group| interpolate(block, l_max, skies, group)).collect();
+    let rotated: Vec<Vec<f32>> = groups.iter().map(|group| interpolate(block, l_max, skies, group)).collect();
     let mut products: Vec<Products> = Vec::new();
-    // Order by order: its patterns stay in the cache for all runs.
+    // Order by order, so that the patterns of an order stay in the cache for all runs.
     for lane in 0..ORDER_LANES {
         let mu = block.order(lane);
         if mu > l_max {
             break;
         }
-        for (group, turned) in groups.iter().zip(&turned) {
+        for (group, rotated) in groups.iter().zip(&rotated) {
             let alphas = group.alphas.len();
-            let sky = &turned[(lane * rows + lane) * 2 * alphas..(lane + 1) * rows * 2 * alphas];
+            let sky = &rotated[(lane * rows + lane) * 2 * alphas..(lane + 1) * rows * 2 * alphas];
             products.clear();
             products.extend(group.blocks.iter().map(|&nodes| {
                 let pattern = patterns.block(mu, nodes);
@@ -113,7 +107,7 @@ pub(crate) fn project(block: OrderBlock, inputs: &Projection<'_>) -> Vec<f32> {
     out
 }
 
-/// The rotated sky at a group's alphas, `[lane][l][alpha][re, im]`, l from the block's first order in steps of 2.
+/// Interpolates the rotated sky to a group's alphas: `[lane][l][alpha][re, im]`, l from the block's first order in steps of 2.
 fn interpolate(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group: &RunGroup) -> Vec<f32> {
     let first_l = block.order(0);
     let rows = (l_max - first_l) / 2 + 1;
@@ -121,7 +115,7 @@ fn interpolate(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group
     let mut out = vec![0.0; ORDER_LANES * rows * width];
     for row in 0..rows {
         let l = first_l + 2 * row;
-        let stride = orders(l);
+        let stride = order_count(l);
         let lanes = (stride - block.first).min(ORDER_LANES);
         let parts = group.alphas.iter().enumerate().flat_map(|(a, parts)| parts.iter().map(move |p| (a, p)));
         for (a, alpha) in parts {
@@ -138,7 +132,7 @@ fn interpolate(block: OrderBlock, l_max: usize, skies: &[RotatedSky<f32>], group
     out
 }
 
-/// `sum_k weights[k] values[k stride + lane]`.
+/// Returns `sum_k weights[k] values[k stride + lane]` by lane.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn combine(values: &[f32], stride: usize, lanes: usize, weights: &[f32]) -> [f32; ORDER_LANES] {
     let mut sums = [0.0_f32; ORDER_LANES];
@@ -157,7 +151,7 @@ fn combine(values: &[f32], stride: usize, lanes: usize, weights: &[f32]) -> [f32
     sums
 }
 
-/// `sums + factor values`, lane by lane; passed by value, so that the sums stay in a register.
+/// Returns `sums + factor values`, lane by lane. Sums are passed by value so that they stay in a register.
 #[inline(always)]
 fn add_scaled(
     sums: [f32; PATTERN_LANES],
@@ -171,9 +165,9 @@ fn add_scaled(
     out
 }
 
-/// `sum_l sky[l][r] pattern[l][lane]` for r < A + B, the rest zero.
+/// Returns `sum_l sky[l][r] pattern[l][lane]` for r < A + B, and 0 for the other r.
 ///
-/// Two short arrays instead of one long one: the compiler turns loops over eight sums into gathers and scatters instead
+/// The sums are in two short arrays, because the compiler turns loops over eight sums into gathers and scatters instead
 /// of unrolling them.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[PatternLanes]) -> Products {
@@ -193,7 +187,7 @@ fn multiply<const A: usize, const B: usize>(sky: &[f32], pattern: &[PatternLanes
     out
 }
 
-/// Sums the products into the terms of the run; even lanes hold +mu, odd ones -mu.
+/// Reduces the products to the terms of the run; even lanes hold +mu, odd lanes -mu.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 fn reduce(products: &[Products], alphas: usize, plan: &RunPlan, out: &mut [f32]) {
     for (term, weights) in plan.weights.chunks_exact(alphas * products.len()).enumerate() {

@@ -1,4 +1,4 @@
-//! From two positions to the rotation and the lengths that the harmonic basis needs.
+//! Conversion of two positions to the rotation and the lengths that the harmonic basis needs.
 //!
 //! With `y = (r_i - r_j) / b`, x the direction of the mid-point, `z = x cross y`, the matrix of columns x, y, z is
 //!
@@ -7,19 +7,18 @@
 //!                                z = (sin i sin Omega, -sin i cos Omega, cos i)
 //! ```
 //!
-//! For two satellites at one distance from the Moon's centre this is exact, whatever their orbits: any two directions
-//! define a plane. The plane of a pair off the common track is not that of the orbit; it has its own node and
-//! inclination.
+//! For two satellites at the same distance from the Moon's centre this is exact, whatever their orbits, because any two
+//! directions define a plane. The plane of a pair off the common track has its own node and inclination.
 //!
-//! The engine knows one inclination i0. Of all rotations with it, the nearest to R is the one with R's own
-//! Omega and phi: in unit quaternions the scalar product of two rotations is
+//! The harmonic basis has one inclination i0. Of all rotations with this inclination, the nearest to R has the Omega and phi of R:
+//! in unit quaternions the scalar product of two rotations is
 //!
 //! ```text
 //! cos(i/2) cos(i0/2) cos((dOmega + dphi)/2) + sin(i/2) sin(i0/2) cos((dOmega - dphi)/2)
 //! ```
 //!
-//! which is greatest, `cos((i - i0)/2)`, where both differences vanish. The remaining error is a rotation by `i - i0`
-//! about the line of nodes. [`GeometryLimits`] bounds it and the altitude; pairs beyond the limits are refused.
+//! whose maximum, `cos((i - i0)/2)`, is where both differences vanish. The remaining error is a rotation by `i - i0`
+//! about the line of nodes. [`GeometryLimits`] bounds this error and the altitude; pairs beyond the limits are refused.
 
 use thiserror::Error;
 
@@ -27,27 +26,27 @@ use super::PairState;
 use crate::units::keys;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
-/// Euler angles of a pair's own frame, and its lengths.
+/// Orientation of a pair's own frame as Euler angles, and the lengths of the pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PairOrientation {
     /// Longitude Omega of the ascending node of the pair's plane, rad.
     pub node_rad: f64,
     /// Inclination of the pair's plane, rad; above pi/2 if satellite j leads on a prograde orbit.
     pub inclination_rad: f64,
-    /// Phase phi of the mid-point in that plane, rad from the node.
+    /// Phase phi of the mid-point in the pair's plane, rad from the node.
     pub phase_rad: f64,
     /// Length of the baseline, m.
     pub baseline_m: f64,
-    /// Mean distance of the two from the Moon's centre, m.
+    /// Mean distance of the satellites from the Moon's centre, m.
     pub radius_m: f64,
-    /// Distance of i minus that of j, m.
+    /// Distance of satellite i minus distance of satellite j, m.
     pub radius_difference_m: f64,
 }
 
 keys! {
-    /// Greatest departures from the orbit that an engine accepts.
+    /// Maximum departures from the nominal orbit that are accepted.
     ///
-    /// Pairs within the limits are approximated. Rms error over rms visibility, for a diffuse sky with a monopole
+    /// Pairs within the limits are approximated. The rms error over the rms visibility is, for a diffuse sky with a monopole
     /// (`tests/physics/departures.rs`):
     ///
     /// | u = b / wavelength | 0.1 deg, l <= 64 | l <= 191 | 5 km, l <= 64 | l <= 191 |
@@ -57,9 +56,9 @@ keys! {
     /// | 30 | 1.1 % | 3.1 % | 34 % | 39 % |
     /// | 120 | 0.9 % | 2.1 % | 57 % | 68 % |
     ///
-    /// A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and long
-    /// baselines see a sky without small scales at the limb only. The default limit of 150 m keeps errors below 2 % at all
-    /// of these u.
+    /// A tilt of 0.1 deg costs a few per cent. 5 km of altitude cost more: they move the Moon's limb by 0.23 deg, and on long
+    /// baselines a sky without small scales is visible only at the limb. The default limit of 150 m keeps errors below 2 % at
+    /// all of these u.
     #[derive(Copy)]
     pub struct GeometryLimits {
         /// Angle between a baseline and the orbital plane.
@@ -74,7 +73,7 @@ keys! {
 }
 
 impl GeometryLimits {
-    /// Keys and values.
+    /// Returns the keys and values of the limits.
     #[must_use]
     pub fn values(&self) -> [(&'static str, f64); 4] {
         [
@@ -86,7 +85,7 @@ impl GeometryLimits {
     }
 }
 
-/// The orbit of an engine.
+/// Circular orbit that the harmonic basis assumes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NominalOrbit {
     /// Inclination, rad.
@@ -97,12 +96,12 @@ pub struct NominalOrbit {
     pub limits: GeometryLimits,
 }
 
-/// A pair on the nominal circle.
+/// A pair projected onto the nominal orbit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NominalPair {
-    /// The state for an instant.
+    /// Instantaneous state.
     pub state: PairState,
-    /// Whether satellite j leads: V_ij is then the conjugate of the visibility of this state.
+    /// Whether satellite j leads; V_ij is then the conjugate of the visibility of `state`.
     pub reversed: bool,
 }
 
@@ -110,16 +109,16 @@ pub struct NominalPair {
 #[derive(Clone, Copy, Debug, Error, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum GeometryRefusal {
-    /// A position that is not finite, or at the Moon's centre.
+    /// A position is not finite, or is at the Moon's centre.
     #[error("a position is not finite")]
     NotFinite,
-    /// Both satellites at one position, or opposite each other.
+    /// Both satellites are at one position, or opposite each other.
     #[error("the baseline has no direction")]
     Degenerate,
-    /// The plane of the pair differs from that of the orbit.
+    /// The plane of the pair differs from the plane of the orbit.
     #[error("out of the orbit's plane")]
     Inclination,
-    /// Too high or too low.
+    /// The pair is too high or too low.
     #[error("off the orbit's altitude")]
     Altitude,
     /// One satellite is much higher than the other.
@@ -128,26 +127,26 @@ pub enum GeometryRefusal {
 }
 
 impl GeometryRefusal {
-    /// All refusals, for tables of counts.
+    /// All refusals, as tables of counts list them.
     pub const ALL: [Self; 5] =
         [Self::NotFinite, Self::Degenerate, Self::Inclination, Self::Altitude, Self::UnequalRadii];
 }
 
-/// Shortest baseline with a direction, m: rounding of positions rotates shorter ones by more than 1e-6 rad.
+/// Shortest baseline with a defined direction, m: rounding of positions rotates shorter ones by more than 1e-6 rad.
 const BASELINE_M_MIN: f64 = 1e-3;
 
 impl PairOrientation {
-    /// The orientation of a pair at these positions (m, Moon-centred, ecliptic axes).
+    /// Computes the orientation of a pair at these positions (m, Moon-centred, ecliptic axes).
     ///
     /// # Errors
     /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`].
     #[inline]
-    pub fn of(r_i_m: Vec3, r_j_m: Vec3) -> Result<Self, GeometryRefusal> {
+    pub fn of_pair(r_i_m: Vec3, r_j_m: Vec3) -> Result<Self, GeometryRefusal> {
         let (difference, sum) = (sub(r_i_m, r_j_m), add(r_i_m, r_j_m));
         let baseline_m = norm(difference);
         let (radius_i_m, radius_j_m) = (norm(r_i_m), norm(r_j_m));
         let all = baseline_m + radius_i_m + radius_j_m;
-        // Lengths are sums of squares, so any value that is not finite shows here.
+        // Lengths are sums of squares, so that any value that is not finite shows here.
         if !(all.is_finite() && radius_i_m > 0.0 && radius_j_m > 0.0) {
             return Err(GeometryRefusal::NotFinite);
         }
@@ -167,12 +166,12 @@ impl PairOrientation {
         })
     }
 
-    /// The orientation of one satellite at a position (m, Moon-centred, ecliptic axes) on an orbit with this normal: a
-    /// pair of length 0.
+    /// Computes the orientation of one satellite, a pair of length 0, at a position (m, Moon-centred, ecliptic axes) on an orbit
+    /// with this normal.
     ///
     /// # Errors
     /// [`GeometryRefusal::NotFinite`], [`GeometryRefusal::Degenerate`] for a position along the normal.
-    pub fn single(r_m: Vec3, normal_hat: Vec3) -> Result<Self, GeometryRefusal> {
+    pub fn of_satellite(r_m: Vec3, normal_hat: Vec3) -> Result<Self, GeometryRefusal> {
         let radius_m = norm(r_m);
         if !(radius_m.is_finite() && norm(normal_hat).is_finite() && radius_m > 0.0) {
             return Err(GeometryRefusal::NotFinite);
@@ -185,12 +184,12 @@ impl PairOrientation {
         Ok(Self { radius_m, ..Self::of_axes(x, scale(1.0 / along_m, along)) })
     }
 
-    /// The angles of two orthogonal axes, without lengths.
+    /// Computes the angles of two orthogonal axes; lengths are 0.
     #[inline]
     fn of_axes(x: Vec3, y: Vec3) -> Self {
         let z = cross(x, y);
         let sin_inclination = z[0].hypot(z[1]);
-        // In the ecliptic the node is undefined; any direction will do, with the phase counted from it.
+        // In the ecliptic the node is undefined: the phase counts from an arbitrary direction.
         let node = if sin_inclination > 0.0 {
             [-z[1] / sin_inclination, z[0] / sin_inclination]
         } else {
@@ -208,11 +207,11 @@ impl PairOrientation {
 }
 
 impl NominalOrbit {
-    /// The state of a pair on this orbit: the node, phase and baseline of the pair with the inclination and radius of
-    /// the orbit.
+    /// Projects a pair onto this orbit: the result has the node, phase and baseline of the pair, and the inclination and radius
+    /// of the orbit.
     ///
     /// # Errors
-    /// The departure from the orbit that exceeds the limits.
+    /// [`GeometryRefusal`] for a departure from the orbit that exceeds the limits.
     #[inline]
     pub fn pair(
         &self,
@@ -290,14 +289,14 @@ mod tests {
         for t_s in [0.0, 1234.5, 7e6] {
             let (r_m, normal_hat) = (array.position_m(2, t_s), array.orbit_normal_hat(t_s));
             let (behind, ahead) = (array.position_m(2, t_s - 1.0), array.position_m(2, t_s + 1.0));
-            let single = PairOrientation::single(r_m, normal_hat).unwrap();
-            let about = PairOrientation::of(ahead, behind).unwrap();
+            let single = PairOrientation::of_satellite(r_m, normal_hat).unwrap();
+            let about = PairOrientation::of_pair(ahead, behind).unwrap();
             for (found, expected) in [
                 (single.node_rad, about.node_rad),
                 (single.inclination_rad, about.inclination_rad),
                 (single.phase_rad, about.phase_rad),
             ] {
-                // The node moves by 1.5e-7 rad in these 2 s, 2e-4 of the way along the orbit.
+                // The node moves by 1.5e-7 rad in these 2 s, 2e-4 of the motion along the orbit.
                 assert!(wrap(found - expected).abs() < 3e-4, "{t_s}: {found} {expected}");
             }
             // The daughters are in their plane; rounding of 2e6 m.
@@ -305,13 +304,16 @@ mod tests {
             assert_eq!((single.baseline_m, single.radius_difference_m), (0.0, 0.0));
         }
         assert_eq!(
-            PairOrientation::single([0.0, 0.0, 1e6], [0.0, 0.0, 1.0]),
+            PairOrientation::of_satellite([0.0, 0.0, 1e6], [0.0, 0.0, 1.0]),
             Err(GeometryRefusal::Degenerate)
         );
-        assert_eq!(PairOrientation::single([f64::NAN; 3], [0.0, 0.0, 1.0]), Err(GeometryRefusal::NotFinite));
+        assert_eq!(
+            PairOrientation::of_satellite([f64::NAN; 3], [0.0, 0.0, 1.0]),
+            Err(GeometryRefusal::NotFinite)
+        );
     }
 
-    /// A pair at +-`half` of the body's x axis.
+    /// A pair at angles +-`half` from the body's x axis.
     fn pair(r: Matrix, half: f64) -> [Vec3; 2] {
         [half, -half].map(|at| apply(r, [RADIUS_M * at.cos(), RADIUS_M * at.sin(), 0.0]))
     }
@@ -329,9 +331,9 @@ mod tests {
             let inclination = 0.01 + (0.0173 * k).rem_euclid(3.1);
             let half = 2.5e-5 * 1.01_f64.powf(k);
             let [r_i, r_j] = pair(rotation(node, inclination, phase), half);
-            let found = PairOrientation::of(r_i, r_j).unwrap();
+            let found = PairOrientation::of_pair(r_i, r_j).unwrap();
             // Positions of 2e6 m are rounded to 5e-10 m, which turns the shortest baseline, 100 m, by 5e-12.
-            // Towards the ecliptic the node is less and less well known.
+            // Near the ecliptic the node is poorly determined.
             let bound = 1e-10 / inclination.sin();
             assert!(wrap(found.node_rad - node).abs() < bound, "{k}");
             assert!(wrap(found.phase_rad - phase).abs() < bound, "{k}");
@@ -348,7 +350,8 @@ mod tests {
         for t_s in [0.0, 1e4, 3.3e5, 8.1e6, 4.09e7] {
             for p in all_pairs(8) {
                 let [i, j] = [p.i, p.j].map(usize::from);
-                let found = PairOrientation::of(array.position_m(i, t_s), array.position_m(j, t_s)).unwrap();
+                let found =
+                    PairOrientation::of_pair(array.position_m(i, t_s), array.position_m(j, t_s)).unwrap();
                 assert!((found.inclination_rad - PI / 6.0).abs() < 1e-9, "{p} {t_s}");
                 let node = -TAU * t_s / (1.3 * 365.25 * 86_400.0);
                 assert!(wrap(found.node_rad - node).abs() < 1e-9, "{p} {t_s}");
@@ -357,27 +360,27 @@ mod tests {
                 assert!(wrap(found.phase_rad - phase).abs() < 1e-9, "{p} {t_s}");
                 let placed = orbit.pair(&found, 30.0).unwrap();
                 let u = 2.0 * RADIUS_M * (0.5 * (arcs[1] - arcs[0])).sin() / 30.0;
-                // The last bit of an orbital phase is worth 7 um after 1.3 years.
+                // The last bit of an orbital phase is 7 um after 1.3 years.
                 assert!((placed.state.baseline_wavelengths - u).abs() < 1e-6 && !placed.reversed);
             }
         }
     }
 
-    /// Exchanged satellites: the same rotation, and the flag that says to conjugate.
+    /// Exchanged satellites have the same rotation, and the flag for conjugation.
     #[test]
     fn a_pair_that_trails_is_turned_round() {
         for (node, inclination, phase) in [(0.4, 0.5, 2.0), (5.0, 2.6, -1.0), (3.0, 0.01, 4.4)] {
             let [r_i, r_j] = pair(rotation(node, inclination, phase), 0.01);
             let orbit = nominal(inclination);
-            let forth = orbit.pair(&PairOrientation::of(r_i, r_j).unwrap(), 30.0).unwrap();
-            let back = orbit.pair(&PairOrientation::of(r_j, r_i).unwrap(), 30.0).unwrap();
+            let forth = orbit.pair(&PairOrientation::of_pair(r_i, r_j).unwrap(), 30.0).unwrap();
+            let back = orbit.pair(&PairOrientation::of_pair(r_j, r_i).unwrap(), 30.0).unwrap();
             assert!(!forth.reversed && back.reversed);
             assert!(wrap(forth.state.node_rad - back.state.node_rad).abs() < 1e-9);
             assert!(wrap(forth.state.phase_rad - back.state.phase_rad).abs() < 1e-9);
         }
     }
 
-    /// The chosen rotation is the nearest of all with the nominal inclination.
+    /// The chosen rotation is the nearest one with the nominal inclination.
     #[test]
     fn the_nearest_rotation_keeps_node_and_phase() {
         let (node, inclination, phase) = (1.1, 0.55, 2.2);
@@ -394,7 +397,7 @@ mod tests {
     #[test]
     fn in_the_ecliptic_the_phase_counts_from_anywhere() {
         let [r_i, r_j] = pair(rotation(0.0, 0.0, 2.5), 0.01);
-        let found = PairOrientation::of(r_i, r_j).unwrap();
+        let found = PairOrientation::of_pair(r_i, r_j).unwrap();
         assert!(wrap(found.node_rad + found.phase_rad - 2.5).abs() < 1e-9);
         assert!(nominal(0.0).pair(&found, 30.0).is_ok());
     }
@@ -404,7 +407,7 @@ mod tests {
         let r = rotation(1.0, 0.5, 2.0);
         let [r_i, r_j] = pair(r, 0.001);
         let orbit = nominal(0.5);
-        let ask = |r_i, r_j| PairOrientation::of(r_i, r_j).and_then(|found| orbit.pair(&found, 30.0));
+        let ask = |r_i, r_j| PairOrientation::of_pair(r_i, r_j).and_then(|found| orbit.pair(&found, 30.0));
         let b = norm(sub(r_i, r_j));
         let up = |metres: f64, r: Vec3| add(r, scale(metres / RADIUS_M, r));
         assert!(ask(r_i, r_j).is_ok());
@@ -412,7 +415,7 @@ mod tests {
         assert_eq!(ask(up(5_200.0, r_i), up(5_200.0, r_j)), Err(GeometryRefusal::Altitude));
         assert!(ask(up(1e-3 * b, r_i), r_j).is_ok());
         assert_eq!(ask(up(2e-3 * b, r_i), r_j), Err(GeometryRefusal::UnequalRadii));
-        // Turned about its mid-point; at the node that is an inclination.
+        // A rotation about the mid-point, which at the node changes the inclination.
         for (tilt_deg, covered) in [(0.1, true), (-0.19, true), (0.21, false), (-1.0, false)] {
             let tilted = product(rotation(1.0, 0.5, 0.0), about_x(f64::to_radians(tilt_deg)));
             let [r_i, r_j] = pair(tilted, 0.001);

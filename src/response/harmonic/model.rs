@@ -1,4 +1,4 @@
-//! Visibilities of a band-limited sky at any states of a pair.
+//! Visibilities of a band-limited sky for any states of pairs on one orbit.
 
 use rustfft::{Fft, FftPlanner};
 use std::f64::consts::TAU;
@@ -7,7 +7,7 @@ use std::sync::Arc;
 use super::blocked::{BLOCK_NODES, BlockedPatterns};
 use super::filter::FilteredPatterns;
 use super::forward::ALPHAS_MAX;
-use super::kernel::{Kernel, LANES};
+use super::gridding_kernel::{Kernel, LANES};
 use super::rotation::{RotatedSky, RotationTable};
 use super::runs::RunLimits;
 use super::{HarmonicError, NodeGrid, PairState, PatternGeometry, PatternTable};
@@ -15,36 +15,35 @@ use crate::numerics::chebyshev;
 use crate::numerics::fft_length;
 use crate::sky::harmonics::Alm;
 
-/// Nodes a wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes
+/// Nodes per wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes
 /// suffices.
 const NODES_PER_WAVELENGTH: f64 = 4.5;
-/// Alphas of the grid for which the sky is rotated together.
+/// Number of alphas of the grid for which the sky is rotated together.
 pub(super) const ALPHA_BLOCK: usize = 64;
-/// Blocks of alphas kept, and the most that a batch may use.
+/// Maximum number of blocks of alphas that are kept and that a batch uses.
 pub(super) const BLOCKS_KEPT: usize = 4;
-/// Chebyshev terms along a run.
 pub(super) const TERMS: usize = 8;
 
-/// Factor by which the error in alpha may exceed the tolerance at the greatest order m, which few coefficients have.
+/// Factor by which the error in alpha may exceed the tolerance at the highest order m, which few coefficients have.
 pub(super) const ALPHA_TOLERANCE: f64 = 3.0;
 
 /// Parameters of a model.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ModelSettings {
-    /// Orbit, Moon, wavelength, antennas.
+    /// Orbit, Moon, wavelength and antennas.
     pub geometry: PatternGeometry,
     /// Inclination of the orbit, rad, 0 to pi.
     pub inclination_rad: f64,
     /// Longest baseline, wavelengths.
     pub u_max: f64,
-    /// Bandwidth over frequency: each visibility is a mean over the channel's width; 0 for one frequency.
+    /// Ratio of bandwidth to frequency; each visibility is a mean over the channel. 0 for one frequency.
     pub fractional_bandwidth: f64,
-    /// Error, relative to the rms visibility, at the end of the band.
+    /// Maximum error at the end of the band, relative to the rms visibility.
     pub tolerance: f64,
 }
 
 impl ModelSettings {
-    /// One frequency, and a tolerance of 1e-5.
+    /// Settings for a single frequency, with a tolerance of 1e-5.
     #[must_use]
     pub fn new(geometry: PatternGeometry, inclination_rad: f64, u_max: f64) -> Self {
         Self { geometry, inclination_rad, u_max, fractional_bandwidth: 0.0, tolerance: 1e-5 }
@@ -100,16 +99,16 @@ pub struct HarmonicModel {
     pub(super) alpha: PeriodicGrid,
     pub(super) gamma: PeriodicGrid,
     pub(super) fft: Arc<dyn Fft<f32>>,
-    /// The blocks of alphas that `skies` holds.
+    /// Blocks of alphas in `skies`.
     pub(super) blocks: Vec<usize>,
     pub(super) skies: Vec<RotatedSky<f32>>,
 }
 
-/// A grid on the circle with its interpolation kernel.
+/// Uniform grid on the circle with its gridding kernel.
 pub(super) struct PeriodicGrid {
     pub(super) count: usize,
     pub(super) kernel: Kernel,
-    /// Reciprocals of the kernel's transform at the orders 0, 1, ..
+    /// Reciprocals of the kernel's transform at orders 0, 1, ..
     pub(super) correction: Vec<f64>,
 }
 
@@ -134,8 +133,7 @@ impl HarmonicModel {
         Self::with_rotation(sky, settings, rotation)
     }
 
-    /// As [`Self::new`], with a rotation table shared between channels. The table must be for the sky's `l_max` and the
-    /// inclination of the settings.
+    /// Builds the model with a rotation table that channels share, for the sky's `l_max` and the inclination of the settings.
     ///
     /// # Errors
     /// [`HarmonicError::Parameter`].
@@ -163,7 +161,7 @@ impl HarmonicModel {
             count: (settings.u_max / step).ceil() as usize + 2 * margin + BLOCK_NODES,
         };
         let table = PatternTable::new(settings.geometry, l_max, grid);
-        // exp(-2 pi i u n_y): |f| = |n_y| / density; the kernel's transform is divided out, and the
+        // The fringe exp(-2 pi i u n_y) has |f| = |n_y| / density. The kernel's transform is divided out, and the
         // mean over the channel multiplies by a sinc.
         let patterns = FilteredPatterns::new(
             table,
@@ -186,7 +184,7 @@ impl HarmonicModel {
         })
     }
 
-    /// Parameters of the model.
+    /// Settings of the model.
     #[must_use]
     pub fn settings(&self) -> &ModelSettings {
         &self.settings
@@ -207,7 +205,7 @@ impl HarmonicModel {
         Ok(())
     }
 
-    /// Rotates the sky to the alphas of the `needed` blocks; keeps recent blocks.
+    /// Rotates the sky to the alphas of the `needed` blocks that are not kept from earlier calls.
     pub(super) fn rotate_sky(&mut self, needed: &[usize]) {
         let missing: Vec<usize> = needed.iter().copied().filter(|b| !self.blocks.contains(b)).collect();
         for block in missing {
@@ -226,14 +224,14 @@ impl HarmonicModel {
         }
     }
 
-    pub(super) fn limits(&self) -> RunLimits {
+    pub(super) fn run_limits(&self) -> RunLimits {
         let tolerance = self.settings.tolerance;
         RunLimits {
-            l_max: self.sky.l_max() as f64,
+            m_max: self.sky.l_max() as f64,
             // A wider range would read more than a block of nodes for a few visibilities.
             u_half: 0.5 * BLOCK_NODES as f64 / NODES_PER_WAVELENGTH,
-            drift_half: chebyshev::reach(TERMS, tolerance),
-            node_half: chebyshev::reach(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
+            fringe_phase_half: chebyshev::h_max(TERMS, tolerance),
+            node_half: chebyshev::h_max(ALPHAS_MAX, ALPHA_TOLERANCE * tolerance)
                 / self.sky.l_max().max(1) as f64,
             residual: 10.0 * tolerance,
         }

@@ -1,21 +1,21 @@
-//! Harmonic coefficients of the fringe pattern of a pair, at many baseline lengths.
+//! Harmonic coefficients of a pair's fringe pattern at many baseline lengths.
 //!
 //! In the body frame (x to the zenith, y along the track, z the orbit normal) the pattern of a pair with
 //! `u = b nu / c` is `f(n) = S_i S_j A exp(-2 pi i u n_y)`. A satellite at `psi = +-d/2` on the circle sees the
-//! directions with `n_x cos(d/2) +- n_y sin(d/2) >= -cos a`, `cos a = sqrt(1 - (R_moon / r)^2)`, so on the ring at
-//! colatitude theta both see `|psi| <= arccos(-cos a / sin theta) - d/2`, and everything where
-//! `sin theta < cos a`. With the rings' Fourier coefficients `I_mu` (exact edges)
+//! directions with `n_x cos(d/2) +- n_y sin(d/2) >= -cos a`, `cos a = sqrt(1 - (R_moon / r)^2)`. On the ring at
+//! colatitude theta both therefore see `|psi| <= arccos(-cos a / sin theta) - d/2`, and the whole ring where
+//! `sin theta < cos a`. With the rings' Fourier coefficients `I_mu` (see `ring.rs`)
 //!
 //! ```text
 //! f_{l mu} = Int dtheta sin theta lambda_{l mu}(theta) I_mu(theta)
 //! ```
 //!
 //! by Gauss-Legendre quadrature: in theta where rings are whole, and elsewhere in the angle chi along the Moon's limb,
-//! `cos theta = (R_moon / r) sin chi`, in which the edge is analytic. f is real, and zero where l + mu is odd
-//! (mirror symmetry in the orbit plane).
+//! `cos theta = (R_moon / r) sin chi`, in which the limb is analytic. f is real, and zero where l + mu is odd
+//! (mirror symmetry in the orbital plane).
 //!
-//! Nodes may have negative u, and then negative d. That continues f analytically, as interpolation near u = 0
-//! needs. (The sliver opposite the zenith that one satellite's hidden arc would leave, `|psi - pi| < d/2 - h`, is
+//! Nodes may have negative u, and then negative d. This continues f analytically, as interpolation near u = 0
+//! requires. (The sliver `|psi - pi| < d/2 - h` opposite the zenith, which the arc hidden from one satellite would leave, is
 //! neglected: less than d^3 / 40 sr, 1e-10 sr at d = 1.8e-3.)
 
 use faer::{Accum, MatMut, MatRef, Par};
@@ -27,7 +27,7 @@ use crate::numerics::Real;
 use crate::numerics::legendre::Legendre;
 use crate::numerics::quadrature::GaussLegendre;
 
-/// Parameters of a pattern besides the baseline.
+/// Parameters of a fringe pattern except the baseline.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PatternGeometry {
     /// Radius of the satellites' circle, m.
@@ -40,7 +40,7 @@ pub struct PatternGeometry {
     pub response: AntennaResponse,
 }
 
-/// Equally spaced values of u.
+/// Grid of equally spaced u.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NodeGrid {
     /// First value.
@@ -52,39 +52,41 @@ pub struct NodeGrid {
 }
 
 impl NodeGrid {
-    /// Node `k`.
+    /// Value of node `k`.
     #[must_use]
     pub fn u(&self, k: usize) -> f64 {
         self.first + self.step * k as f64
     }
 
-    /// Greatest |u|.
+    /// Maximum |u|.
     #[must_use]
     pub fn u_abs_max(&self) -> f64 {
         self.first.abs().max(self.u(self.count.saturating_sub(1)).abs())
     }
 }
 
-/// `f_{l,mu}` and `(-1)^mu f_{l,-mu}` for mu >= 0, l = mu, mu + 2, .. at every node.
+/// Coefficients `f_{l,mu}` and `(-1)^mu f_{l,-mu}` for mu >= 0 and l = mu, mu + 2, .. at every node.
 #[derive(Clone, Debug)]
 pub struct PatternTable<T> {
     l_max: usize,
     grid: NodeGrid,
-    /// By mu: for each l a row of `2 count`: `f_{l,mu}` at the nodes, then `(-1)^mu f_{l,-mu}`.
+    /// By mu, for each l a row of `2 count` values: `f_{l,mu}` at all nodes, then `(-1)^mu f_{l,-mu}`.
     blocks: Vec<Vec<T>>,
 }
 
-/// Greatest memory of the ring coefficients of one chunk of nodes, bytes.
+/// Maximum memory of the ring coefficients of one chunk of nodes, bytes.
 const CHUNK_BYTES: usize = 400 << 20;
 
 impl<T: Real> PatternTable<T> {
-    /// Computes the coefficients for `l <= l_max` at the nodes of `grid` in `T`.
+    /// Computes the coefficients for `l <= l_max` at the nodes of `grid`.
     #[must_use]
     pub fn new(geometry: PatternGeometry, l_max: usize, grid: NodeGrid) -> Self {
         let mut table = Self {
             l_max,
             grid,
-            blocks: (0..=l_max).map(|mu| vec![T::default(); 2 * grid.count * degrees(l_max, mu)]).collect(),
+            blocks: (0..=l_max)
+                .map(|mu| vec![T::default(); 2 * grid.count * degree_count(l_max, mu)])
+                .collect(),
         };
         let points = ring_points(geometry, l_max, grid.u_abs_max(), 1).0.len();
         let per_node = points * (2 * l_max + 1) * size_of::<T>();
@@ -95,7 +97,6 @@ impl<T: Real> PatternTable<T> {
         table
     }
 
-    /// Computes the nodes `first .. first + count`.
     fn fill(&mut self, geometry: PatternGeometry, first: usize, count: usize) {
         let (grid, l_max) = (self.grid, self.l_max);
         let u: Vec<f64> = (first..first + count).map(|k| grid.u(k)).collect();
@@ -107,42 +108,42 @@ impl<T: Real> PatternTable<T> {
         coefficients.par_chunks_mut(orders * count).zip(&rings).for_each_init(
             || (solver.clone(), vec![0.0; orders]),
             |(solver, orders_of_ring), (chunk, ring)| {
-                let reach = ring.orders(l_max);
-                let orders_of_ring = &mut orders_of_ring[..2 * reach + 1];
-                let chunk = &mut chunk[(l_max - reach) * count..];
+                let order_max = ring.order_max(l_max);
+                let orders_of_ring = &mut orders_of_ring[..2 * order_max + 1];
+                let chunk = &mut chunk[(l_max - order_max) * count..];
                 for (k, &u) in u.iter().enumerate() {
                     let half = half_separation(geometry, u);
-                    let edge = if ring.whole { ring.edge } else { ring.edge - half };
-                    solver.solve(std::f64::consts::TAU * u * ring.sin_theta, edge, orders_of_ring);
+                    let limb = if ring.is_whole { ring.limb } else { ring.limb - half };
+                    solver.solve(std::f64::consts::TAU * u * ring.sin_theta, limb, orders_of_ring);
                     for (place, value) in chunk[k..].iter_mut().step_by(count).zip(orders_of_ring.iter()) {
-                        *place = T::entry(*value);
+                        *place = T::table_entry(*value);
                     }
                 }
             },
         );
         let legendre = Legendre::new(l_max, rings.iter().map(|ring| (ring.z, ring.sin_theta)));
         self.blocks.par_iter_mut().enumerate().for_each(|(mu, block)| {
-            let reached = rings.partition_point(|ring| ring.orders(l_max) >= mu);
-            let rows = legendre.even_rows::<T>(mu, &weights[..reached]);
-            let lambda = MatRef::from_column_major_slice(&rows, reached, degrees(l_max, mu));
-            let mut out = MatMut::from_column_major_slice_mut(block, 2 * grid.count, degrees(l_max, mu));
+            let rings_used = rings.partition_point(|ring| ring.order_max(l_max) >= mu);
+            let rows = legendre.even_rows::<T>(mu, &weights[..rings_used]);
+            let lambda = MatRef::from_column_major_slice(&rows, rings_used, degree_count(l_max, mu));
+            let mut out = MatMut::from_column_major_slice_mut(block, 2 * grid.count, degree_count(l_max, mu));
             for (sign, order) in [(0, l_max + mu), (1, l_max - mu)] {
                 let ring = MatRef::from_column_major_slice_with_stride(
                     &coefficients[order * count..],
                     count,
-                    reached,
+                    rings_used,
                     orders * count,
                 );
                 let out = out.as_mut().subrows_mut(sign * grid.count + first, count);
-                // lambda_{l,-mu} = (-1)^mu lambda_{l,mu}, which is the sign in the table.
-                faer::linalg::matmul::matmul(out, Accum::Replace, ring, lambda, T::of(1.0), Par::Seq);
+                // lambda_{l,-mu} = (-1)^mu lambda_{l,mu} gives the sign in the table.
+                faer::linalg::matmul::matmul(out, Accum::Replace, ring, lambda, T::nearest(1.0), Par::Seq);
             }
         });
     }
 }
 
 impl<T> PatternTable<T> {
-    /// Greatest degree.
+    /// Maximum degree.
     #[must_use]
     pub fn l_max(&self) -> usize {
         self.l_max
@@ -154,13 +155,12 @@ impl<T> PatternTable<T> {
         self.grid
     }
 
-    /// Rows of order `mu >= 0`: for l = mu, mu + 2, ..: `f_{l,mu}` at all nodes, `(-1)^mu f_{l,-mu}` at all nodes.
+    /// Rows of order `mu >= 0` for l = mu, mu + 2, ..: `f_{l,mu}` at all nodes, then `(-1)^mu f_{l,-mu}` at all nodes.
     #[must_use]
     pub fn order(&self, mu: usize) -> &[T] {
         &self.blocks[mu]
     }
 
-    /// Mutable rows of all orders.
     pub(crate) fn orders_mut(&mut self) -> &mut [Vec<T>] {
         &mut self.blocks
     }
@@ -168,36 +168,37 @@ impl<T> PatternTable<T> {
 
 /// Number of degrees l = mu, mu + 2, .. <= l_max.
 #[must_use]
-pub fn degrees(l_max: usize, mu: usize) -> usize {
+pub fn degree_count(l_max: usize, mu: usize) -> usize {
     (l_max - mu) / 2 + 1
 }
 
-/// Half the angle between the satellites of a pair at the Moon's centre, rad, with the sign of u.
+/// Half the angle between the satellites of a pair, seen from the Moon's centre, rad, with the sign of u.
 fn half_separation(geometry: PatternGeometry, u: f64) -> f64 {
     (0.5 * u * geometry.wavelength_m / geometry.orbit_radius_m).clamp(-1.0, 1.0).asin()
 }
 
-/// A ring of the body frame: its colatitude, the |psi| up to which a satellite at psi = 0 sees it, and whether any
-/// satellite sees all of it.
+/// Ring of the body frame at one colatitude.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct RingPoint {
     pub(crate) z: f64,
     pub(crate) sin_theta: f64,
-    edge: f64,
-    whole: bool,
+    /// The |psi| up to which a satellite at psi = 0 sees the ring, rad.
+    limb: f64,
+    /// Whether any satellite sees all of the ring.
+    is_whole: bool,
 }
 
 impl RingPoint {
-    /// The greatest order with Legendre functions of degree `l_max` that are not negligible here: beyond l sin(theta)
-    /// they decay like Airy functions, over a width of its cube root.
-    pub(crate) fn orders(&self, l_max: usize) -> usize {
+    /// Maximum order at which Legendre functions of degree `l_max` are not negligible on this ring: beyond
+    /// m = l sin(theta) they decay like an Airy function, with width (l sin(theta))^(1/3).
+    pub(crate) fn order_max(&self, l_max: usize) -> usize {
         let turning = l_max as f64 * self.sin_theta;
         l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
     }
 }
 
-/// Rings of the northern hemisphere, equator first, and their weights (for both hemispheres, with the antennas'
-/// response), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of points.
+/// Returns the rings of the northern hemisphere, equator first, and their quadrature weights (for both hemispheres, with the
+/// antennas' response), for degrees up to `l_max` and |u| up to `u_max`; `refine` multiplies the number of rings.
 pub(crate) fn ring_points(
     geometry: PatternGeometry,
     l_max: usize,
@@ -219,15 +220,15 @@ pub(crate) fn ring_points(
         let (sin_chi, cos_chi) = (quarter * t).sin_cos();
         let z = sin_limb * sin_chi;
         let sin_theta = (1.0 - z * z).sqrt();
-        rings.push(RingPoint { z, sin_theta, edge: (sin_limb * cos_chi).atan2(-cos_limb), whole: false });
+        rings.push(RingPoint { z, sin_theta, limb: (sin_limb * cos_chi).atan2(-cos_limb), is_whole: false });
         weights.push(2.0 * w * quarter * sin_limb * cos_chi * response(z));
     }
-    let whole = cos_limb.asin();
-    let rule = GaussLegendre::new(refine * GaussLegendre::points_for(0.5 * whole * wave_number));
+    let theta_max = cos_limb.asin();
+    let rule = GaussLegendre::new(refine * GaussLegendre::points_for(0.5 * theta_max * wave_number));
     for (t, w) in rule.abscissae.iter().zip(&rule.weights).rev() {
-        let (sin_theta, z) = (whole * t).sin_cos();
-        rings.push(RingPoint { z, sin_theta, edge: std::f64::consts::PI, whole: true });
-        weights.push(2.0 * w * whole * sin_theta * response(z));
+        let (sin_theta, z) = (theta_max * t).sin_cos();
+        rings.push(RingPoint { z, sin_theta, limb: std::f64::consts::PI, is_whole: true });
+        weights.push(2.0 * w * theta_max * sin_theta * response(z));
     }
     (rings, weights)
 }
@@ -245,7 +246,7 @@ mod tests {
         }
     }
 
-    /// More points change nothing: the points chosen suffice.
+    /// More points do not change the result.
     #[test]
     fn quadrature_has_converged() {
         for (l_max, u) in [(8, 3.0), (60, 0.0), (12, 60.0), (50, 20.0)] {
@@ -258,7 +259,7 @@ mod tests {
                 let mut orders = vec![0.0; 2 * l_max + 1];
                 let mut sums = vec![0.0; rows.len() / rings.len()];
                 for (k, ring) in rings.iter().enumerate() {
-                    solver.solve(std::f64::consts::TAU * u * ring.sin_theta, ring.edge, &mut orders);
+                    solver.solve(std::f64::consts::TAU * u * ring.sin_theta, ring.limb, &mut orders);
                     for (sum, row) in sums.iter_mut().zip(rows.chunks_exact(rings.len())) {
                         *sum += row[k] * orders[l_max + mu];
                     }
@@ -269,15 +270,15 @@ mod tests {
                 let few = project(&rings, &weights, mu);
                 let many = project(&finer, &finer_weights, mu);
                 for (a, b) in few.iter().zip(&many) {
-                    // Rounding of phases of some hundred radians.
+                    // Phases of some hundred radians are rounded.
                     assert!((a - b).abs() < 2e-12, "{l_max} {u} {mu}: {a} {b}");
                 }
             }
         }
     }
 
-    /// Parseval: the coefficients carry the visible solid angle, all but the tail that the mask's edge
-    /// leaves beyond `l_max` (about its length over 2 pi^2 l_max).
+    /// By Parseval's theorem the power of the coefficients is the visible solid angle, except for the tail beyond `l_max` (about
+    /// the length of the limb over 2 pi^2 l_max).
     #[test]
     fn power_is_the_visible_solid_angle() {
         let grid = NodeGrid { first: 0.0, step: 7.0, count: 2 };

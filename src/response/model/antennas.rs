@@ -1,4 +1,4 @@
-//! Direct sums with antennas that differ from daughter to daughter.
+//! Direct sums over the sky with a different antenna on each daughter.
 
 use std::sync::Arc;
 
@@ -11,26 +11,26 @@ use crate::response::pixel::{SatelliteAntenna, antenna_powers, antenna_sums};
 
 /// The antenna of each daughter at any time.
 pub trait AntennaPatterns: Send + Sync {
-    /// The antenna of a daughter, from 0, at a mission time, s.
+    /// Returns the antenna of a daughter (counted from 0) at a mission time, s.
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna;
 
-    /// Greatest degree of a pair's response as a polynomial in the direction.
+    /// Maximum degree of a pair's response as a polynomial in the direction.
     fn degree(&self) -> usize {
         DEGREE_MAX
     }
 }
 
-/// A direct sum in which every daughter has its own antenna: of two dipoles along d and e an unpolarised wave from n leaves
+/// Direct sum in which every daughter has its own antenna: two dipoles along d and e correlate an unpolarised wave from n by
 /// `d . e - (n . d) (n . e)`.
 ///
-/// Positions have to say whose they are (`at`); those that do not have the response of the sum.
+/// Unless all positions of a call carry their pair (or daughter) and time, the response of the sum itself is used.
 pub struct AntennaSum {
     sum: DirectSum,
     patterns: Arc<dyn AntennaPatterns>,
 }
 
 impl AntennaSum {
-    /// A direct sum with these antennas in place of its own.
+    /// Replaces the antenna response of `sum` by `patterns`.
     #[must_use]
     pub fn new(sum: DirectSum, patterns: Arc<dyn AntennaPatterns>) -> Self {
         Self { sum, patterns }
@@ -39,9 +39,9 @@ impl AntennaSum {
 
 impl VisibilityModel for AntennaSum {
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        let at: Option<Vec<_>> = positions.iter().map(|position| position.at).collect();
-        let Some(at) = at else { return self.sum.predict(positions, out) };
-        let pairs = self.sum.pairs(positions)?.into_iter().zip(at).map(|(geometry, (pair, t_s))| {
+        let pair_times: Option<Vec<_>> = positions.iter().map(|position| position.pair_time).collect();
+        let Some(pair_times) = pair_times else { return self.sum.predict(positions, out) };
+        let pairs = self.sum.pairs(positions)?.into_iter().zip(pair_times).map(|(geometry, (pair, t_s))| {
             (geometry, [pair.i, pair.j].map(|daughter| self.patterns.antenna(daughter, t_s)))
         });
         let pairs: Vec<_> = pairs.collect();
@@ -53,21 +53,22 @@ impl VisibilityModel for AntennaSum {
     }
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
-        let at: Option<Vec<_>> = daughters.iter().map(|daughter| daughter.at).collect();
-        let Some(at) = at else { return self.sum.predict_powers(daughters, out) };
+        let daughter_times: Option<Vec<_>> =
+            daughters.iter().map(|daughter| daughter.daughter_time).collect();
+        let Some(daughter_times) = daughter_times else { return self.sum.predict_powers(daughters, out) };
         let singles = daughters
             .iter()
-            .zip(at)
+            .zip(daughter_times)
             .map(|(daughter, (number, t_s))| (self.sum.single(daughter), self.patterns.antenna(number, t_s)));
         let singles: Vec<_> = singles.collect();
         let (directions, values, area_sr) = self.sum.sky();
-        // As above.
+        // Lengths agree by construction, so the sums cannot fail.
         let powers = antenna_powers(&singles, directions, values, area_sr).unwrap_or_default();
         out.iter_mut().zip(powers).for_each(|(out, power)| *out = power);
         Ok(())
     }
 
-    fn has_own_antennas(&self) -> bool {
+    fn has_individual_antennas(&self) -> bool {
         true
     }
 }
@@ -84,7 +85,7 @@ mod tests {
 
     const NSIDE: usize = 8;
 
-    /// Antennas that turn with the daughter's number.
+    /// Antennas whose attitude depends on the daughter's number.
     struct Tilted {
         elements: AntennaResponse,
     }
@@ -98,10 +99,10 @@ mod tests {
         }
     }
 
-    /// A source in one pixel, and where it is.
+    /// A source in one pixel, and its direction.
     fn source() -> (SkyMap, Vec3) {
         let mut values = vec![0.0; 12 * NSIDE * NSIDE];
-        // High above all daughters at the epoch, who are on the x axis.
+        // Near the zenith of all daughters, which are on the x axis at the epoch.
         let directions = pixel_directions(NSIDE);
         let above = (0..values.len()).max_by(|a, b| directions[*a][0].total_cmp(&directions[*b][0])).unwrap();
         values[above] = 1e4;
@@ -121,17 +122,18 @@ mod tests {
             for (i, j) in [(0_u8, 1_u8), (2, 5), (1, 7)] {
                 let t_s = 4e5 + f64::from(j);
                 let [r_i_m, r_j_m] = [i, j].map(|n| array.position_m(n.into(), 0.0));
-                let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i, j }, t_s)) };
+                let position =
+                    PairPosition { r_i_m, r_j_m, span_rad: 0.0, pair_time: Some((Pair { i, j }, t_s)) };
                 let (mut found, mut ideal) = ([Complex64::ZERO], [Complex64::ZERO]);
                 model.predict(&[position], &mut found).unwrap();
                 plain.predict(&[position], &mut ideal).unwrap();
-                // Voltages of a wave of either polarisation: the parts of the dipoles across its direction.
+                // The voltage of a polarisation is the component of the dipole across the wave's direction.
                 let [a, b] = [i, j].map(|n| Tilted { elements }.antenna(n, t_s));
                 let across = |axis: Vec3| sub(axis, scale(dot(axis, n_hat), n_hat));
                 let dipoles = |a: &SatelliteAntenna, b: &SatelliteAntenna| match elements {
                     AntennaResponse::Isotropic => 1.0,
                     AntennaResponse::DipoleNormal => dot(across(a.axes_hat[0]), across(b.axes_hat[0])),
-                    // Those of like dipoles, whose mean is 2/3 where attitudes are the same.
+                    // Sum over corresponding dipoles, whose mean is 2/3 for equal attitudes.
                     AntennaResponse::ThreeDipoles => {
                         let third =
                             |antenna: &SatelliteAntenna| cross(antenna.axes_hat[0], antenna.axes_hat[1]);
@@ -147,11 +149,14 @@ mod tests {
                 let factor = dipoles(&a, &b)
                     * (1.0 + a.distortion * legendre(a.axes_hat[0]))
                     * (1.0 + b.distortion * legendre(b.axes_hat[0]));
-                // Single precision of the fringe.
+                // The fringe is in single precision.
                 assert!((found[0] - factor * ideal[0]).norm() < 2e-6 * ideal[0].norm(), "{i} {j}: {found:?}");
                 let mut power = [0.0];
-                let daughter =
-                    DaughterPosition { r_m: r_i_m, normal_hat: [0.0, 0.0, 1.0], at: Some((i, t_s)) };
+                let daughter = DaughterPosition {
+                    r_m: r_i_m,
+                    normal_hat: [0.0, 0.0, 1.0],
+                    daughter_time: Some((i, t_s)),
+                };
                 model.predict_powers(&[daughter], &mut power).unwrap();
                 let own = dipoles(&a, &a);
                 let expected =
@@ -178,11 +183,12 @@ mod tests {
         let mut model = AntennaSum::new(plain.clone(), Arc::new(Straight(array.clone())));
         let t_s = 3e6;
         let [r_i_m, r_j_m] = [1, 5].map(|n| array.position_m(n, t_s));
-        let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((Pair { i: 1, j: 5 }, t_s)) };
+        let position =
+            PairPosition { r_i_m, r_j_m, span_rad: 0.0, pair_time: Some((Pair { i: 1, j: 5 }, t_s)) };
         let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
         model.predict(&[position], &mut found).unwrap();
         plain.predict(&[position], &mut expected).unwrap();
-        // Single precision of a sky of 40 K sr.
+        // Single precision for a sky of 40 K sr.
         assert!((found[0] - expected[0]).norm() < 4e-5, "{found:?} {expected:?}");
     }
 }

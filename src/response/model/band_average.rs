@@ -9,15 +9,15 @@ use crate::numerics::quadrature::GaussLegendre;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
-/// Error of the average, relative to the power of the sky.
-const ERROR: f64 = 1e-6;
+/// Maximum error of the average, relative to the power of the sky.
+const TOLERANCE: f64 = 1e-6;
 
-/// A model averaged over a channel in which the sky does not depend on frequency: the integrand is multiplied by
+/// Averages a model over a channel in which the sky does not depend on frequency: this multiplies the integrand by
 /// `sinc(pi n . r_ij dnu / c)`.
 ///
-/// Averages over Gauss-Legendre frequencies, as many as the baseline needs: 2 at 1 km in 8 kHz, 12 at 100 km. A scaled
-/// baseline stands for another frequency ([`scaled_baseline`](crate::array::scaled_baseline)), which moves the Moon's
-/// limb by half of the added length: 1e-5 rad for 100 km at 10 MHz.
+/// The average is a Gauss-Legendre sum over as many frequencies as the baseline needs: 2 at 1 km in 8 kHz, 12 at 100 km.
+/// The baseline is scaled in place of the frequency ([`scaled_baseline`](crate::array::scaled_baseline)), which moves the
+/// Moon's limb by half of the added length: 1e-5 rad for 100 km at 10 MHz.
 pub struct BandAverage {
     model: Box<dyn VisibilityModel>,
     frequency_hz: f64,
@@ -25,26 +25,26 @@ pub struct BandAverage {
 }
 
 impl BandAverage {
-    /// Averages `model`, which is for one frequency, over `width_hz` about it. The model must cover baselines longer by
+    /// Averages `model`, of frequency `frequency_hz`, over a channel of `width_hz`. The model must cover baselines longer by
     /// [`BandAverage::baseline_factor`].
     #[must_use]
     pub fn new(model: Box<dyn VisibilityModel>, frequency_hz: f64, width_hz: f64) -> Self {
         Self { model, frequency_hz, width_hz }
     }
 
-    /// Factor by which baselines in wavelengths are longer at the upper end of a channel.
+    /// Ratio of baselines in wavelengths at the upper end and at the middle of a channel.
     #[must_use]
     pub fn baseline_factor(frequency_hz: f64, width_hz: f64) -> f64 {
         1.0 + 0.5 * width_hz / frequency_hz
     }
 
-    /// Number of frequencies that a baseline needs. A rule of K points errs by less than `(e x / 4 K)^(2 K)` for a
-    /// phase that goes from -x to x over the channel.
+    /// Number of frequencies that a baseline needs. The error of K points is below `(e x / 4 K)^(2 K)` for a phase that
+    /// goes from -x to x over the channel.
     #[must_use]
-    pub fn frequencies(baseline_m: f64, width_hz: f64) -> usize {
+    pub fn frequency_count(baseline_m: f64, width_hz: f64) -> usize {
         let x = PI * baseline_m * width_hz / SPEED_OF_LIGHT_M_S;
-        let is_enough = |&k: &usize| (E * x / (4 * k) as f64).powi(2 * k as i32) <= ERROR;
-        // The terms fall from there on for any baseline about the Moon.
+        let is_enough = |&k: &usize| (E * x / (4 * k) as f64).powi(2 * k as i32) <= TOLERANCE;
+        // The search ends for any baseline about the Moon, as the bound falls with K.
         (1..).find(is_enough).unwrap_or(1)
     }
 }
@@ -54,12 +54,12 @@ impl VisibilityModel for BandAverage {
         self.model.batch()
     }
 
-    fn has_own_antennas(&self) -> bool {
-        self.model.has_own_antennas()
+    fn has_individual_antennas(&self) -> bool {
+        self.model.has_individual_antennas()
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        // A batch at a time, to bound memory.
+        // In batches, to bound memory.
         let batch = self.model.batch().max(1024);
         for (positions, out) in positions.chunks(batch).zip(out.chunks_mut(batch)) {
             self.predict_batch(positions, out)?;
@@ -74,22 +74,23 @@ impl VisibilityModel for BandAverage {
 
 impl BandAverage {
     fn predict_batch(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        let count = |pair: &PairPosition| Self::frequencies(norm(sub(pair.r_i_m, pair.r_j_m)), self.width_hz);
+        let count =
+            |pair: &PairPosition| Self::frequency_count(norm(sub(pair.r_i_m, pair.r_j_m)), self.width_hz);
         let counts: Vec<usize> = positions.iter().map(count).collect();
-        let most = counts.iter().copied().max().unwrap_or(0);
-        let rules: Vec<GaussLegendre> = (0..=most).map(GaussLegendre::new).collect();
-        // Frequency by frequency, so that consecutive integrations of a pair stay together.
-        let (mut apart, mut parts) = (Vec::new(), Vec::new());
-        for node in 0..most {
-            for (place, (pair, &count)) in positions.iter().zip(&counts).enumerate() {
+        let count_max = counts.iter().copied().max().unwrap_or(0);
+        let rules: Vec<GaussLegendre> = (0..=count_max).map(GaussLegendre::new).collect();
+        // Frequency by frequency, so that consecutive integrations of a pair stay adjacent.
+        let (mut scaled, mut terms) = (Vec::new(), Vec::new());
+        for node in 0..count_max {
+            for (index, (pair, &count)) in positions.iter().zip(&counts).enumerate() {
                 if node < count {
                     let offset = (rules[count].abscissae[node] - 0.5) * self.width_hz / self.frequency_hz;
-                    apart.push(pair.scaled(1.0 + offset));
-                    parts.push((place, rules[count].weights[node]));
+                    scaled.push(pair.scaled(1.0 + offset));
+                    terms.push((index, rules[count].weights[node]));
                 }
             }
         }
-        predict_means(self.model.as_mut(), &apart, &parts, out)
+        predict_means(self.model.as_mut(), &scaled, &terms, out)
     }
 }
 
@@ -107,20 +108,23 @@ mod tests {
     #[test]
     fn rules_average_fringes_as_well_as_they_say() {
         for baseline_m in [0.0, 1.0, 100.0, 1e3, 7.5e3, 24e3, 1e5, 1e6] {
-            let count = BandAverage::frequencies(baseline_m, 8e3);
+            let count = BandAverage::frequency_count(baseline_m, 8e3);
             let rule = GaussLegendre::new(count);
             for part in [0.1, 0.5, 0.9, 1.0] {
                 let x = PI * part * baseline_m * 8e3 / SPEED_OF_LIGHT_M_S;
                 let mean: f64 =
                     (0..count).map(|k| rule.weights[k] * (x * (2.0 * rule.abscissae[k] - 1.0)).cos()).sum();
                 let sinc = if x == 0.0 { 1.0 } else { x.sin() / x };
-                assert!((mean - sinc).abs() < ERROR, "{baseline_m} m: {count} frequencies, {mean} {sinc}");
+                assert!(
+                    (mean - sinc).abs() < TOLERANCE,
+                    "{baseline_m} m: {count} frequencies, {mean} {sinc}"
+                );
             }
         }
-        assert_eq!(BandAverage::frequencies(0.0, 8e3), 1);
+        assert_eq!(BandAverage::frequency_count(0.0, 8e3), 1);
     }
 
-    /// The sum over the sky with the sinc in it, from the equations alone.
+    /// Direct sum over the sky with the sinc in the integrand, written independently from the equations.
     fn with_sinc(
         sky: &[f64],
         pair: &PairPosition,
@@ -157,7 +161,7 @@ mod tests {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         let pairs =
             [(0, 1, 100.0), (0, 4, 900.0), (0, 5, 4000.0), (2, 6, 7000.0), (0, 7, 2000.0)].map(position);
@@ -167,13 +171,13 @@ mod tests {
         direct.clone().predict(&pairs, &mut instants).unwrap();
         for (pair, found) in pairs.iter().zip(&found) {
             let expected = with_sinc(&values, pair, frequency_hz, width_hz, array.moon_radius_m());
-            // f32 phases and values of direct sums, 1e-4 of the noise of so many pixels of about 2e5 K; and one pixel
-            // that the Moon's limb, moved by 3e-5 rad, may pass at one of the frequencies.
+            // Direct sums have f32 phases and values: 1e-4 of the noise of 1e4 pixels of about 2e5 K. One pixel may also cross
+            // the Moon's limb, which moves by 3e-5 rad, at one of the frequencies.
             let tolerance = pixel_area_sr(32) * 2.7e5 * (1e-4 * 1e4_f64.sqrt() + 0.3);
             let error = (*found - expected).norm();
             assert!(error < tolerance, "{error} {tolerance}");
         }
-        // Not by chance: without the average the longest ones are far off.
+        // The test is sensitive: without the average the longest baseline is far off.
         let expected = with_sinc(&values, &pairs[4], frequency_hz, width_hz, array.moon_radius_m());
         assert!((instants[4] - expected).norm() > 20.0 * pixel_area_sr(32) * 2.7e5 * 0.3);
     }

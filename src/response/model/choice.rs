@@ -1,4 +1,4 @@
-//! The choice of the model of a channel, by the cost of each.
+//! Choice of a channel's visibility model by cost.
 
 use std::f64::consts::TAU;
 use std::fmt;
@@ -9,7 +9,7 @@ use super::{general, harmonic};
 use crate::response::general::row_tables_bytes;
 use crate::sky::SkyConfig;
 
-/// The model asked for in the configuration.
+/// Model as set in the configuration.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ModelChoice {
@@ -18,9 +18,9 @@ pub enum ModelChoice {
     Auto,
     /// Sums over the sky's pixels.
     Direct,
-    /// Spherical harmonics; satellites follow each other on one circle.
+    /// Spherical harmonics, for satellites on one circle.
     Harmonic,
-    /// Spherical harmonics for satellites anywhere.
+    /// Spherical harmonics, for satellites at any positions.
     General,
 }
 
@@ -30,14 +30,14 @@ pub enum ModelChoice {
 pub enum ModelKind {
     /// Sums over the sky's pixels.
     Direct,
-    /// Spherical harmonics on a circle.
+    /// Spherical harmonics, for satellites on one circle.
     Harmonic,
-    /// Spherical harmonics anywhere.
+    /// Spherical harmonics, for satellites at any positions.
     General,
 }
 
 impl ModelKind {
-    /// Preferred number of visibilities a call ([`VisibilityModel::batch`](super::VisibilityModel::batch)).
+    /// Preferred number of visibilities per call ([`VisibilityModel::batch`](super::VisibilityModel::batch)).
     #[must_use]
     pub fn batch(self) -> usize {
         match self {
@@ -58,21 +58,21 @@ impl fmt::Display for ModelKind {
     }
 }
 
-/// The work of a channel's model.
+/// Size of a channel's problem, from which the cost of each model follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Load {
-    /// Visibilities.
+pub struct Workload {
+    /// Number of visibilities.
     pub visibilities: f64,
     /// nside of the sky.
     pub sky_nside: usize,
     /// Longest baseline, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Greatest band limit; 0 for the limit that the baselines need, or what the map determines if that is less.
+    /// Band limit; 0 for the limit that the baselines need, or that the map determines if that is less.
     pub l_max: usize,
     /// Whether visibilities are averages over their integrations.
-    pub smeared: bool,
-    /// Whether satellites follow each other on one circle, as the harmonic model has them.
-    pub circle: bool,
+    pub is_time_averaged: bool,
+    /// Whether all satellites are on one circle, as the harmonic model requires.
+    pub is_on_circle: bool,
 }
 
 /// The chosen model, the reason, and the cost of each.
@@ -80,61 +80,60 @@ pub struct Load {
 pub struct ModelPlan {
     /// The model.
     pub kind: ModelKind,
-    /// Reason for the choice.
+    /// Reason of the choice.
     pub why: &'static str,
     /// Band limit of the harmonic and of the general model.
     pub l_max: usize,
     /// Longest baseline of the harmonic model, wavelengths.
     pub baseline_wavelengths_max: f64,
-    /// Cost of direct sums, fringes: one a pixel and visibility.
+    /// Cost of direct sums, fringes: one per pixel and visibility.
     pub direct_fringes: f64,
-    /// Cost of setting up the harmonic model, in fringes that take as long.
+    /// Cost of setting up the harmonic model, as the number of fringes that take the same time.
     pub set_up_fringes: f64,
-    /// Cost of one visibility of the harmonic model, in such fringes.
+    /// Cost of one visibility of the harmonic model, in the same unit.
     pub visibility_fringes: f64,
-    /// Cost of one visibility of the general model, in such fringes.
+    /// Cost of one visibility of the general model, in the same unit.
     pub general_fringes: f64,
     /// Memory of the chosen model, bytes.
     pub bytes: f64,
 }
 
-/// Greatest band limit that is chosen without being asked for.
-const L_MAX: usize = 1024;
-/// Direct sums up to this cost are preferred: about a minute on two cores, and they have no band limit.
-const DIRECT_FRINGES_ALLOWED: f64 = 1.2e11;
-/// Memory of a batch of the general model, bytes a position: the position, its view, its row's place.
+/// Maximum band limit unless the configuration sets one.
+const DEFAULT_L_MAX_MAX: usize = 1024;
+/// Direct sums up to this cost are preferred: they take about a minute on two cores, and have no band limit.
+const DIRECT_FRINGES_MAX: f64 = 1.2e11;
+/// Memory of a batch of the general model, bytes per position: its coordinates, its view, and the index of its row.
 const POSITION_BYTES: f64 = 600.0;
-/// Most memory of a harmonic model that was not asked for, bytes.
-const BYTES_ALLOWED: f64 = 8e9;
+/// Maximum memory of a harmonic model unless the configuration sets that model, bytes.
+const HARMONIC_BYTES_MAX: f64 = 8e9;
 
 impl ModelPlan {
-    /// Chooses the model for `load`. Does not depend on the machine, because results depend on the model.
+    /// Chooses the model for `load`. The choice does not depend on the machine, because results depend on the model.
     #[must_use]
-    pub fn new(choice: ModelChoice, load: Load) -> Self {
+    pub fn new(choice: ModelChoice, load: Workload) -> Self {
         let u_max = load.baseline_wavelengths_max;
         let l_max = match load.l_max {
-            0 => band_limit(u_max).min(SkyConfig::l_max_held(load.sky_nside)),
-            // The configuration may ask for a little more than the default; what the map does not determine is refused by those who
-            // make its coefficients.
-            asked => asked,
+            0 => default_l_max(u_max).min(SkyConfig::l_max_determined(load.sky_nside)),
+            // Coefficients that the map does not determine are refused later, where they are computed.
+            configured => configured,
         };
         let pixels = 12.0 * (load.sky_nside as f64).powi(2);
         let direct_fringes = pixels * load.visibilities;
         let (l, nodes) = (l_max as f64, 4.5 * u_max + 40.0);
-        // Measured, in fringes of 0.45 ns (two cores): patterns and rotation; rotated sky, products, sampling.
+        // Measured in fringes of 0.45 ns (two cores). Set-up: patterns and rotation; visibility: rotated sky, products, interpolation.
         let set_up_fringes = 2e8 + 40.0 * l * l * nodes + 6.0 * l * l * l;
         let visibility_fringes = 500.0 + 8.0 * l;
         let harmonic_fringes = set_up_fringes + visibility_fringes * load.visibilities;
-        // Patterns of both signs of mu; d+ and d-; rotated skies.
+        // Patterns of both signs of mu, d+ and d-, and rotated skies.
         let harmonic_bytes = 2.2 * l * l * nodes + 4.0 / 3.0 * l * l * l + 600.0 * l * l;
-        // A row for every 45 visibilities, and their interpolation (bench `general`).
+        // One row per 45 visibilities, and interpolation (bench `general`).
         let general_fringes = 7e3 + 0.7 * l * (l + TAU * u_max);
         let (kind, why) = match choice {
             ModelChoice::Direct => (ModelKind::Direct, "as configured"),
             ModelChoice::Harmonic => (ModelKind::Harmonic, "as configured"),
             ModelChoice::General => (ModelKind::General, "as configured"),
-            ModelChoice::Auto if !load.circle => {
-                if direct_fringes <= DIRECT_FRINGES_ALLOWED {
+            ModelChoice::Auto if !load.is_on_circle => {
+                if direct_fringes <= DIRECT_FRINGES_MAX {
                     (ModelKind::Direct, "takes a minute at most")
                 } else if general_fringes < pixels {
                     (ModelKind::General, "no common circle; cheaper than direct sums")
@@ -145,11 +144,11 @@ impl ModelPlan {
                     )
                 }
             }
-            ModelChoice::Auto if load.smeared => (ModelKind::Harmonic, "averages over integrations"),
-            ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_ALLOWED => {
+            ModelChoice::Auto if load.is_time_averaged => (ModelKind::Harmonic, "averages over integrations"),
+            ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_MAX => {
                 (ModelKind::Direct, "takes a minute at most")
             }
-            ModelChoice::Auto if harmonic_bytes > BYTES_ALLOWED => {
+            ModelChoice::Auto if harmonic_bytes > HARMONIC_BYTES_MAX => {
                 (ModelKind::Direct, "harmonic needs more than 8 GB")
             }
             ModelChoice::Auto if harmonic_fringes < direct_fringes => (ModelKind::Harmonic, "cheaper"),
@@ -177,14 +176,14 @@ impl ModelPlan {
     }
 }
 
-/// As [`degrees_seen`], at most 1024.
-fn band_limit(u_max: f64) -> usize {
-    degrees_seen(u_max).min(L_MAX)
+/// Band limit that baselines need, at most 1024.
+fn default_l_max(u_max: f64) -> usize {
+    l_max_of_fringes(u_max).min(DEFAULT_L_MAX_MAX)
 }
 
-/// Greatest degree that fringes of `u_max` wavelengths reach: 2 pi u plus the width of the Airy function's decay.
+/// Maximum degree to which fringes of `u_max` wavelengths respond: 2 pi u plus the width of the Airy function's decay.
 #[must_use]
-pub fn degrees_seen(u_max: f64) -> usize {
+pub fn l_max_of_fringes(u_max: f64) -> usize {
     let turning = TAU * u_max;
     (turning + 6.0 * turning.cbrt()).ceil() as usize + 8
 }
@@ -193,8 +192,15 @@ pub fn degrees_seen(u_max: f64) -> usize {
 mod tests {
     use super::*;
 
-    fn load(visibilities: f64, sky_nside: usize, u: f64) -> Load {
-        Load { visibilities, sky_nside, baseline_wavelengths_max: u, l_max: 0, smeared: false, circle: true }
+    fn load(visibilities: f64, sky_nside: usize, u: f64) -> Workload {
+        Workload {
+            visibilities,
+            sky_nside,
+            baseline_wavelengths_max: u,
+            l_max: 0,
+            is_time_averaged: false,
+            is_on_circle: true,
+        }
     }
 
     #[test]
@@ -203,24 +209,27 @@ mod tests {
         assert_eq!(plan(load(5e4, 64, 31.3)).kind, ModelKind::Direct);
         let paper = plan(load(2.6e7, 512, 125.2));
         assert_eq!(paper.kind, ModelKind::Harmonic);
-        // 2 pi 125.2 = 787, and the fall beyond.
+        // 2 pi 125.2 = 787, plus the width of the decay.
         assert!((840..860).contains(&paper.l_max), "{}", paper.l_max);
         assert_eq!(plan(load(2.6e7, 64, 125.2)).l_max, 144);
-        // What is asked for is taken, or refused where the map does not hold it.
-        assert_eq!(plan(Load { l_max: 191, ..load(2.6e7, 64, 125.2) }).l_max, 191);
-        assert_eq!(plan(Load { l_max: 1024, ..load(2.6e7, 512, 125.2) }).l_max, 1024);
-        // All pairs at 10 MHz ask for gigabytes of patterns.
+        // A configured l_max is used as it is.
+        assert_eq!(plan(Workload { l_max: 191, ..load(2.6e7, 64, 125.2) }).l_max, 191);
+        assert_eq!(plan(Workload { l_max: 1024, ..load(2.6e7, 512, 125.2) }).l_max, 1024);
+        // All pairs at 10 MHz would need gigabytes of patterns.
         assert_eq!(plan(load(1.9e9, 512, 3336.0)).kind, ModelKind::Direct);
-        assert_eq!(plan(Load { smeared: true, ..load(5e4, 64, 31.3) }).kind, ModelKind::Harmonic);
+        assert_eq!(
+            plan(Workload { is_time_averaged: true, ..load(5e4, 64, 31.3) }).kind,
+            ModelKind::Harmonic
+        );
     }
 
     #[test]
     fn without_a_circle_large_jobs_take_rows_at_true_positions() {
-        let plan = |load| ModelPlan::new(ModelChoice::Auto, Load { circle: false, ..load }).kind;
+        let plan = |load| ModelPlan::new(ModelChoice::Auto, Workload { is_on_circle: false, ..load }).kind;
         assert_eq!(plan(load(5e4, 64, 31.3)), ModelKind::Direct);
-        assert_eq!(plan(Load { l_max: 288, ..load(2.6e7, 256, 125.2) }), ModelKind::General);
-        // Few degrees cost little, and so do few pixels.
-        assert_eq!(plan(Load { l_max: 20, ..load(2.6e7, 64, 3.0) }), ModelKind::General);
+        assert_eq!(plan(Workload { l_max: 288, ..load(2.6e7, 256, 125.2) }), ModelKind::General);
+        // A low band limit makes the general model cheap, a small map the direct sum.
+        assert_eq!(plan(Workload { l_max: 20, ..load(2.6e7, 64, 3.0) }), ModelKind::General);
         assert_eq!(plan(load(2.6e7, 16, 125.2)), ModelKind::Direct);
     }
 
@@ -231,7 +240,7 @@ mod tests {
             (ModelChoice::Harmonic, ModelKind::Harmonic),
             (ModelChoice::General, ModelKind::General),
         ] {
-            let plan = ModelPlan::new(choice, Load { l_max: 200, ..load(10.0, 512, 10.0) });
+            let plan = ModelPlan::new(choice, Workload { l_max: 200, ..load(10.0, 512, 10.0) });
             assert_eq!((plan.kind, plan.l_max), (kind, 200));
         }
     }

@@ -1,4 +1,4 @@
-//! Visibilities by direct sum over the pixels of a sky.
+//! Visibilities by direct sums over the pixels of a sky.
 
 use faer::{Accum, MatMut, MatRef, Par};
 use num_complex::Complex64;
@@ -14,9 +14,9 @@ use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::vector::Vec3;
 
-/// Sums a sky over its own pixels, at their centres, without resampling.
+/// Direct sum of a sky over the centres of its own pixels, without resampling.
 ///
-/// Costs one fringe a pixel and visibility.
+/// It costs one fringe per pixel and visibility.
 #[derive(Clone, Debug)]
 pub struct DirectSum {
     frequency_hz: f64,
@@ -29,7 +29,7 @@ pub struct DirectSum {
 }
 
 impl DirectSum {
-    /// Builds the model of `sky` (K, any frame) at `frequency_hz`.
+    /// Builds the sum over `sky` (K, any frame) at `frequency_hz`.
     #[must_use]
     pub fn new(sky: &SkyMap, frequency_hz: f64, moon_radius_m: f64, response: AntennaResponse) -> Self {
         Self {
@@ -78,7 +78,7 @@ impl DirectSum {
     }
 }
 
-/// A direct sum with its moments by direction, which give its derivatives by the baseline.
+/// Direct sum with its first moments over the direction, from which its derivatives with respect to the baseline follow.
 #[derive(Clone, Debug)]
 pub struct DirectMoments {
     sum: DirectSum,
@@ -98,7 +98,7 @@ impl DirectMoments {
         Self { sum: DirectSum::new(sky, frequency_hz, moon_radius_m, response), moments }
     }
 
-    /// For each position the visibility, and the sums over the sky times the x, y and z of its direction on ecliptic axes, K sr.
+    /// Predicts the visibility of each position, and the sums weighted by the x, y and z of the direction on ecliptic axes, K sr.
     ///
     /// # Errors
     /// As [`VisibilityModel::predict`].
@@ -111,7 +111,6 @@ impl DirectMoments {
     }
 }
 
-/// Positions whose rows are multiplied at once.
 const ROWS: usize = 16;
 
 impl DirectMoments {
@@ -122,12 +121,16 @@ impl DirectMoments {
         (0..directions.len()).map(|k| directions.get(k)).collect()
     }
 
-    /// For each position the sums over the sky times some functions of the direction, K sr: real parts of all functions, then
-    /// imaginary ones. `functions` holds the values at [`Self::directions`], one after another: all functions of the first, and so on.
+    /// Sums the sky weighted by functions of the direction, K sr: for each position the real parts of all functions, then
+    /// the imaginary parts. `functions` holds their values at [`Self::directions`], direction by direction.
     ///
     /// # Errors
     /// As [`VisibilityModel::predict`].
-    pub fn sums_with(&self, positions: &[PairPosition], functions: &[f32]) -> Result<Vec<f32>, ModelError> {
+    pub fn weighted_sums(
+        &self,
+        positions: &[PairPosition],
+        functions: &[f32],
+    ) -> Result<Vec<f32>, ModelError> {
         let pairs = self.sum.pairs(positions)?;
         let directions = self.directions();
         let count = functions.len() / directions.len().max(1);
@@ -171,7 +174,7 @@ impl VisibilityModel for DirectSum {
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
         let singles: Vec<SingleGeometry> = daughters.iter().map(|daughter| self.single(daughter)).collect();
-        // As above.
+        // Lengths agree by construction, so the sums cannot fail.
         let powers = sky_powers(&singles, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, power) in out.iter_mut().zip(powers) {
             *out = power;
@@ -186,7 +189,7 @@ impl VisibilityModel for DirectSum {
         out: &mut [Complex64],
     ) -> Result<(), ModelError> {
         let pairs = self.pairs(positions)?;
-        // As above.
+        // Lengths agree by construction, so the sums cannot fail.
         let sums = comb_sums(&pairs, comb, &self.directions, &self.values, self.area_sr).unwrap_or_default();
         for (out, sum) in out.iter_mut().zip(sums) {
             *out = sum;

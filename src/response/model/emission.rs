@@ -10,14 +10,14 @@ use crate::response::pixel::Comb;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
-/// A model of the sky with a Moon whose disc has the same brightness T all over.
+/// Adds a Moon with a disc of uniform brightness temperature T to a sky model.
 ///
-/// The disc is what the sky's model takes as hidden: for a pair, from either daughter. So the disc is a uniform sky of T without
-/// a Moon, less the same with it, and with the sky's own visibility `V(sky) + T (V_whole - V(1)) = V(sky - T) + T V_whole`:
-/// one model of the sky less T, and V_whole in closed form. That depends on the length of the baseline only, so that it holds for
-/// averages over integrations, too. The disc does not reflect; [`WithReflection`](super::WithReflection) adds the image of the sky.
+/// The disc is the region that the sky model treats as occulted, for a pair from either daughter. It equals a uniform sky of T
+/// without the Moon minus the same sky with the Moon, so that the sum is `V(sky) + T (V_whole - V(1)) = V(sky - T) + T V_whole`:
+/// one model of the sky minus T, and V_whole in closed form. V_whole depends only on the length of the baseline, and so holds for
+/// averages over integrations too. Reflection is separate ([`WithFlatReflection`](super::WithFlatReflection)).
 ///
-/// At 250 K and 300 km of altitude, with the generated sky (rms of visibilities by length of the baseline, wavelengths):
+/// At 250 K and an altitude of 300 km, with the generated sky (rms visibility by baseline length in wavelengths):
 ///
 /// | | Moon, K sr | sky at 1 MHz | at 10 MHz | at 30 MHz |
 /// |---|---|---|---|---|
@@ -27,43 +27,44 @@ use crate::units::vector::{norm, sub};
 /// | 8 to 16 | 3 | 8e6 | 5.0e4 | 3.7e3 |
 /// | 16 to 32 | 1 | 4e6 | 2.9e4 | 1.8e3 |
 ///
-/// So it is 1e-6 of the sky, 1e-4 and 1e-3, and the ground does not correct for it. Direct sums alias where a baseline has more
-/// wavelengths than about half of nside, as of any sky: at nside 64 the disc then has 5 to 12 K sr, ten times too much. Harmonics do not.
+/// The emission is 1e-6, 1e-4 and 1e-3 of the sky, and the ground does not correct for it. Direct sums alias on baselines of more
+/// wavelengths than about half of nside: at nside 64 the disc then has 5 to 12 K sr, ten times too much. Harmonic sums do not alias.
 pub struct WithEmission {
-    less: Box<dyn VisibilityModel>,
+    sky_minus_moon: Box<dyn VisibilityModel>,
     frequency_hz: f64,
     response: AntennaResponse,
     temperature_k: f64,
 }
 
 impl WithEmission {
-    /// A model of the sky `less` the Moon's `temperature_k` in all directions, for daughters of this response.
+    /// Adds the disc to `sky_minus_moon`, the model of a sky from which `temperature_k` is subtracted in all directions.
     #[must_use]
     pub fn new(
-        less: Box<dyn VisibilityModel>,
+        sky_minus_moon: Box<dyn VisibilityModel>,
         frequency_hz: f64,
         response: AntennaResponse,
         temperature_k: f64,
     ) -> Self {
-        Self { less, frequency_hz, response, temperature_k }
+        Self { sky_minus_moon, frequency_hz, response, temperature_k }
     }
 
-    /// T V_whole at `factor` times the frequency, K sr.
-    fn whole_k_sr(&self, position: &PairPosition, factor: f64) -> f64 {
+    /// Visibility `T V_whole` of a uniform sky without the Moon, at `factor` times the frequency, K sr.
+    fn uniform_k_sr(&self, position: &PairPosition, factor: f64) -> f64 {
         let baseline_m = norm(sub(position.r_i_m, position.r_j_m));
         let turns = baseline_m * self.frequency_hz / SPEED_OF_LIGHT_M_S * factor;
-        self.temperature_k * uniform_sr(self.response, turns)
+        self.temperature_k * uniform_sky_sr(self.response, turns)
     }
 }
 
-/// `Int A exp(-2 pi i u . n) dn` over the whole sphere, sr, for baselines of `u` wavelengths, across which dipoles stand:
-/// `4 pi j0(x)`, and `4 pi (j0(x) - j1(x) / x)` for dipoles, with the spherical Bessel functions of `x = 2 pi u`.
-fn uniform_sr(response: AntennaResponse, u: f64) -> f64 {
+/// Visibility of a uniform sky of 1 K, `Int A exp(-2 pi i u . n) dn` over the whole sphere, sr, for a baseline of `u` wavelengths.
+///
+/// It is `4 pi j0(x)`, and `4 pi (j0(x) - j1(x) / x)` for dipoles normal to the baseline, with `x = 2 pi u`.
+fn uniform_sky_sr(response: AntennaResponse, u: f64) -> f64 {
     let x = TAU * u;
-    // Below, the next terms are 1e-18 and less, and the quotient would lose digits.
-    let series = x < 1e-2;
-    let j0 = if series { 1.0 - x * x / 6.0 * (1.0 - x * x / 20.0) } else { x.sin() / x };
-    let j1_over_x = match series {
+    // For small x the quotient would cancel, and the next terms of the series are below 1e-18.
+    let is_small = x < 1e-2;
+    let j0 = if is_small { 1.0 - x * x / 6.0 * (1.0 - x * x / 20.0) } else { x.sin() / x };
+    let j1_over_x = match is_small {
         true => (1.0 - x * x / 10.0 * (1.0 - x * x / 28.0)) / 3.0,
         false => (j0 - x.cos()) / (x * x),
     };
@@ -75,19 +76,19 @@ fn uniform_sr(response: AntennaResponse, u: f64) -> f64 {
 
 impl VisibilityModel for WithEmission {
     fn batch(&self) -> usize {
-        self.less.batch()
+        self.sky_minus_moon.batch()
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        self.less.predict(positions, out)?;
-        out.iter_mut().zip(positions).for_each(|(out, position)| *out += self.whole_k_sr(position, 1.0));
+        self.sky_minus_moon.predict(positions, out)?;
+        out.iter_mut().zip(positions).for_each(|(out, position)| *out += self.uniform_k_sr(position, 1.0));
         Ok(())
     }
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
-        self.less.predict_powers(daughters, out)?;
-        let whole_k_sr = self.temperature_k * uniform_sr(self.response, 0.0);
-        out.iter_mut().for_each(|out| *out += whole_k_sr);
+        self.sky_minus_moon.predict_powers(daughters, out)?;
+        let uniform_k_sr = self.temperature_k * uniform_sky_sr(self.response, 0.0);
+        out.iter_mut().for_each(|out| *out += uniform_k_sr);
         Ok(())
     }
 
@@ -97,10 +98,10 @@ impl VisibilityModel for WithEmission {
         comb: Comb,
         out: &mut [Complex64],
     ) -> Result<(), ModelError> {
-        self.less.predict_comb(positions, comb, out)?;
+        self.sky_minus_moon.predict_comb(positions, comb, out)?;
         for (k, out) in out.iter_mut().enumerate() {
             let factor = 1.0 + comb.first + comb.step * (k % comb.count) as f64;
-            *out += self.whole_k_sr(&positions[k / comb.count], factor);
+            *out += self.uniform_k_sr(&positions[k / comb.count], factor);
         }
         Ok(())
     }
@@ -121,12 +122,12 @@ mod tests {
 
     const MOON_K: f64 = 250.0;
     const FREQUENCY_HZ: f64 = 1e6;
-    /// Of the directions of the sums in these tests, which alias beyond some 60 wavelengths.
+    /// Resolution of the direct sums in these tests, which alias beyond some 60 wavelengths.
     const NSIDE: usize = 128;
 
     #[test]
     fn uniform_skies_are_those_of_sums() {
-        // A ring a step of the polar angle about the baseline, and the mean of A = 1 - n_z^2 along it: midpoint rule, error
+        // Midpoint rule over the polar angle from the baseline, with A = 1 - n_z^2 averaged along each ring; its error is
         // (x step)^2 / 24.
         let steps = 40_000;
         for u in [0.0, 1e-4, 0.0015, 0.0017, 0.3, 1.0, 7.25] {
@@ -141,7 +142,7 @@ mod tests {
             for (response, expected) in
                 [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal].into_iter().zip(expected)
             {
-                let found = uniform_sr(response, u);
+                let found = uniform_sky_sr(response, u);
                 assert!((found - expected).abs() < 1e-6, "{u}: {found} {expected}");
             }
         }
@@ -157,15 +158,15 @@ mod tests {
             r_i_m: array.position_m(i, t_s),
             r_j_m: array.position_m(j, t_s),
             span_rad: 0.0,
-            at: None,
+            pair_time: None,
         };
         pairs.map(at).to_vec()
     }
 
-    /// The sum over directions that the Moon hides from either daughter, K sr.
+    /// Visibility of the disc by a direct sum over the directions that the Moon hides from either daughter, K sr.
     fn disc(array: &Array, pair: &PairPosition, frequency_hz: f64, normal_hat: Option<Vec3>) -> Complex64 {
         let hides = |n: Vec3, r_m: Vec3| {
-            // The ray from the daughter comes closer to the centre than the surface is.
+            // The line of sight passes below the surface.
             let along = -dot(n, r_m);
             let closest = add(r_m, scale(along, n));
             along > 0.0 && norm(closest) < array.moon_radius_m()
@@ -181,8 +182,7 @@ mod tests {
         sum * pixel_area_sr(NSIDE)
     }
 
-    /// Pixels of the limb, sqrt(3 pi) nside times the sine of its radius about, are in or out with an error of half a pixel
-    /// at most, at random.
+    /// Random error from the pixels on the limb, about sqrt(3 pi) nside times the sine of its radius, each of at most half a pixel.
     fn limb_k_sr() -> f64 {
         let pixels = 3.07 * NSIDE as f64 * 0.85;
         MOON_K * pixel_area_sr(NSIDE) * pixels.sqrt()
@@ -192,7 +192,6 @@ mod tests {
         SkyMap::new(Frame::Ecliptic, vec![-MOON_K; 12 * nside * nside]).unwrap()
     }
 
-    /// l = 0 of -T.
     fn cold_alm() -> Alm {
         let mut alm = Alm::zeros(0);
         *alm.get_mut(0, 0) = Complex64::new(-MOON_K * (4.0 * PI).sqrt(), 0.0);
@@ -234,8 +233,8 @@ mod tests {
             harmonic(&array, AntennaResponse::DipoleNormal),
         ));
         let positions = positions(&array);
-        for (name, response, less) in models {
-            let mut model = WithEmission::new(less, FREQUENCY_HZ, response, MOON_K);
+        for (name, response, sky_minus_moon) in models {
+            let mut model = WithEmission::new(sky_minus_moon, FREQUENCY_HZ, response, MOON_K);
             let normal_hat = array.orbit_normal_hat(9e5);
             let dipole =
                 |t_s| (response == AntennaResponse::DipoleNormal).then(|| array.orbit_normal_hat(t_s));
@@ -254,13 +253,12 @@ mod tests {
                     &mut power,
                 )
                 .unwrap();
-            // The cap of half angle asin(R / r): 2 pi (1 - cos), and for dipoles across its axis less 2 pi
-            // (2/3 - cos + cos^3 / 3) / 2.
+            // A cap of half angle asin(R / r) has 2 pi (1 - cos); dipoles across its axis lose pi (2/3 - cos + cos^3 / 3).
             let cos = (1.0 - (moon_m / norm(r_m)).powi(2)).sqrt();
             let across = PI * (2.0 / 3.0 - cos + cos.powi(3) / 3.0);
             let less_sr = if response == isotropic { 0.0 } else { across };
             let expected = MOON_K * (TAU * (1.0 - cos) - less_sr);
-            // General powers are summed at nside 64.
+            // The general model sums powers at nside 64.
             assert!((power[0] - expected).abs() < 4.0 * limb_k_sr(), "{name}: {} {expected}", power[0]);
         }
     }

@@ -8,22 +8,24 @@ use super::{
     AntennaPatterns, AntennaSum, DaughterPosition, DirectSum, ModelError, PairPosition, VisibilityModel,
 };
 use crate::frames::AntennaResponse;
-use crate::response::general::{GeneralRows, Observed, PairAt, PairResponse, RowsError, RowsSetup};
+use crate::response::general::{
+    GeneralRows, ObservationDetails, PairResponse, RowsError, RowsSetup, TimedPair,
+};
 use crate::sky::harmonics::Alm;
 use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Visibilities of a batch: tables for the altitudes of an orbit take a second, whatever the batch.
+/// Visibilities per batch: tables for the altitudes of an orbit take a second, whatever the size of the batch.
 pub(super) const BATCH: usize = 250_000;
 
-/// Greatest nside at which auto-correlation powers are summed: what the pixels of the limb, some 300, are in error by at
-/// random is 1e-4 of a power.
+/// Maximum nside at which auto-correlation powers are summed: the random error from some 300 pixels on the limb is 1e-4 of a
+/// power.
 const POWERS_NSIDE: usize = 64;
 
-/// Visibilities of a sky given by harmonic coefficients, for satellites at any positions; isotropic antennas, or any that differ.
+/// Visibilities of a sky given by harmonic coefficients, for satellites at any positions with isotropic or individual antennas.
 ///
-/// Rms error below 1e-4 of the rms visibility of the same coefficients. Rows of B are computed at some times of a pair's
-/// track ([`PairPosition::at`]) and interpolated between them.
+/// The rms error is below 1e-4 of the rms visibility of the same coefficients. Rows of B are computed at some times of a pair's
+/// track ([`PairPosition::pair_time`]) and interpolated between them.
 pub struct GeneralSum {
     frequency_hz: f64,
     rows: GeneralRows,
@@ -36,7 +38,7 @@ impl GeneralSum {
     /// Builds the model of `map` (K), whose coefficients in the ecliptic frame are `alm`.
     ///
     /// # Errors
-    /// A map that cannot be averaged over larger pixels.
+    /// [`MapError`] if the map cannot be averaged over larger pixels.
     pub fn new(
         map: &SkyMap,
         alm: Alm,
@@ -73,14 +75,14 @@ impl VisibilityModel for GeneralSum {
             return Err(ModelError::Smearing { frequency_hz });
         }
         let pairs = positions.iter().enumerate().map(|(k, position)| {
-            // Positions of no track are a track each: times that run back end one.
-            let (pair, time_s) = position.at.unwrap_or_else(|| (Default::default(), -(k as f64)));
-            PairAt { pair, time_s, r_i_m: position.r_i_m, r_j_m: position.r_j_m }
+            // Positions without a time get decreasing times, so that each becomes a track of its own.
+            let (pair, time_s) = position.pair_time.unwrap_or_else(|| (Default::default(), -(k as f64)));
+            TimedPair { pair, time_s, r_i_m: position.r_i_m, r_j_m: position.r_j_m }
         });
-        let pairs: Vec<PairAt> = pairs.collect();
+        let pairs: Vec<TimedPair> = pairs.collect();
         let refused = |error: RowsError| ModelError::Geometry { frequency_hz, refusal: error.refusal };
         let response = self.antennas.as_ref().map(|antennas| {
-            move |k: usize| match positions[k].at {
+            move |k: usize| match positions[k].pair_time {
                 Some((pair, t_s)) => {
                     let [a, b] = [pair.i, pair.j].map(|daughter| antennas.antenna(daughter, t_s));
                     PairResponse::of_antennas([&a, &b])
@@ -88,11 +90,11 @@ impl VisibilityModel for GeneralSum {
                 None => PairResponse::isotropic(),
             }
         });
-        let observed = Observed {
-            response: response.as_ref().map(|of| of as &(dyn Fn(usize) -> PairResponse + Sync)),
-            ..Observed::default()
+        let observed = ObservationDetails {
+            response: response.as_ref().map(|response| response as &(dyn Fn(usize) -> PairResponse + Sync)),
+            ..ObservationDetails::default()
         };
-        let plan = self.rows.plan_of(&pairs, &observed).map_err(refused)?;
+        let plan = self.rows.plan_with(&pairs, &observed).map_err(refused)?;
         for values in self.rows.forward(&plan, &self.sky) {
             out.copy_from_slice(&values);
         }
@@ -103,7 +105,7 @@ impl VisibilityModel for GeneralSum {
         self.powers.predict_powers(daughters, out)
     }
 
-    fn has_own_antennas(&self) -> bool {
+    fn has_individual_antennas(&self) -> bool {
         self.antennas.is_some()
     }
 }
@@ -119,7 +121,7 @@ mod tests {
     use crate::units::Pair;
     use crate::units::vector::norm;
 
-    /// A smooth sky: its pixels at nside 128 hold all of it, so that direct sums err only at the limb.
+    /// A smooth sky, which nside 128 represents, so that direct sums are in error only at the limb.
     fn sky() -> (SkyMap, Alm) {
         let l_max = 8;
         let mut alm = Alm::zeros(l_max);
@@ -145,7 +147,7 @@ mod tests {
                         r_i_m: array.position_m(pair.i.into(), time_s),
                         r_j_m: array.position_m(pair.j.into(), time_s),
                         span_rad: 0.0,
-                        at: Some((pair, time_s)),
+                        pair_time: Some((pair, time_s)),
                     });
                 }
             }
@@ -172,19 +174,19 @@ mod tests {
         general.predict(&places, &mut found).unwrap();
         direct.predict(&places, &mut expected).unwrap();
         let error = rms(found.iter().zip(&expected).map(|(a, b)| (a - b).norm()));
-        // Pixels of 0.46 deg on the limb, a circle of 5.4 rad: some 900 of them, each of 6.4e-5 sr and 57 K in the rms, in error
-        // by 0.3 of themselves at random: 0.03 K sr. Twice that, as their errors go together over some pixels.
+        // The limb, a circle of 5.4 rad, crosses some 900 pixels of 0.46 deg with 6.4e-5 sr and an rms of 57 K. A random error of
+        // 0.3 of each gives 0.03 K sr; twice that, as errors of neighbours are correlated.
         assert!(error < 0.06, "{error}");
         assert!(rms(expected.iter().map(|v| v.norm())) > 3.0);
 
-        // Without a track each row is computed for itself.
+        // Without times each row is computed on its own.
         let apart: Vec<PairPosition> =
-            places.iter().step_by(40).map(|place| PairPosition { at: None, ..*place }).collect();
+            places.iter().step_by(40).map(|place| PairPosition { pair_time: None, ..*place }).collect();
         let mut alone = vec![Complex64::ZERO; apart.len()];
         general.predict(&apart, &mut alone).unwrap();
         let scale = rms(alone.iter().map(|v| v.norm()));
         let error = rms(alone.iter().zip(found.iter().step_by(40)).map(|(a, b)| (a - b).norm()));
-        // What interpolation is held to.
+        // The error that interpolation may have.
         assert!(error < 1e-4 * scale && error > 0.0, "{error} of {scale}");
     }
 
@@ -207,7 +209,7 @@ mod tests {
                 &mut power,
             )
             .unwrap();
-        // All directions but those within asin(R / r) of the nadir.
+        // All directions except those within asin(R / r) of the nadir.
         let hidden = (array.moon_radius_m() / norm(r_m)).asin();
         let expected = 50.0 * TAU * (1.0 + hidden.cos());
         assert!((power[0] / expected - 1.0).abs() < 3e-4, "{} {expected}", power[0]);

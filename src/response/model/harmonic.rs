@@ -1,4 +1,4 @@
-//! Visibilities of a band-limited sky through spherical harmonics.
+//! Visibilities of a band-limited sky by spherical harmonics, for satellites on one circle.
 
 use std::sync::Arc;
 
@@ -14,14 +14,13 @@ use crate::response::harmonic::{
 use crate::sky::harmonics::Alm;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Visibilities of a batch: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
+/// Visibilities per batch: some twenty windows of the fiducial array at 10 MHz. Twice as many are no faster.
 pub(super) const BATCH: usize = 100_000;
 
-/// Greatest degree of the sky for auto-correlation powers: the coefficients of the visibility mask fall as l^-1.5, so
-/// that the rest contributes 1e-4.
+/// Maximum degree of the sky for auto-correlation powers: the coefficients of the visibility mask fall as l^-1.5, so
+/// that higher degrees contribute 1e-4.
 const POWERS_L_MAX: usize = 96;
 
-/// Positions that one task converts to states.
 const POSITIONS_PER_TASK: usize = 1024;
 
 /// Parameters of a [`HarmonicSum`].
@@ -31,7 +30,7 @@ pub struct HarmonicSumSetup {
     pub frequency_hz: f64,
     /// Radius of the array's orbit, m.
     pub orbit_radius_m: f64,
-    /// Its inclination, rad.
+    /// Inclination of the array's orbit, rad.
     pub inclination_rad: f64,
     /// Radius of the Moon, m.
     pub moon_radius_m: f64,
@@ -39,7 +38,7 @@ pub struct HarmonicSumSetup {
     pub baseline_wavelengths_max: f64,
     /// Response of the daughters.
     pub response: AntennaResponse,
-    /// Departures from the circle that are taken as none.
+    /// Departures from the circle that are neglected.
     pub limits: GeometryLimits,
 }
 
@@ -56,7 +55,7 @@ pub struct HarmonicSum {
 impl HarmonicSum {
     /// Builds the model of `sky` (K, ecliptic frame); takes seconds at l = 1024.
     ///
-    /// Channels of one band limit can share `rotation`.
+    /// Channels with the same band limit can share `rotation`.
     ///
     /// # Errors
     /// [`ModelError::Harmonic`].
@@ -73,7 +72,7 @@ impl HarmonicSum {
             response: setup.response,
         };
         let settings = |u_max| ModelSettings::new(geometry, setup.inclination_rad, u_max);
-        let smooth = truncated(&sky, POWERS_L_MAX);
+        let smooth = truncate(&sky, POWERS_L_MAX);
         Ok(Self {
             setup,
             orbit: NominalOrbit {
@@ -87,10 +86,10 @@ impl HarmonicSum {
         })
     }
 
-    /// The state of a position, and whether satellite j leads.
+    /// Converts a position to its state on the orbit; `true` if satellite j leads.
     fn state(&self, position: &PairPosition) -> Result<(PairState, bool), GeometryRefusal> {
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
-        let found = PairOrientation::of(position.r_i_m, position.r_j_m)?;
+        let found = PairOrientation::of_pair(position.r_i_m, position.r_j_m)?;
         let pair = self.orbit.pair(&found, wavelength_m)?;
         Ok((PairState { span_rad: position.span_rad, ..pair.state }, pair.reversed))
     }
@@ -104,14 +103,13 @@ fn harmonic(setup: &HarmonicSumSetup, source: HarmonicError) -> ModelError {
     ModelError::Harmonic { frequency_hz: setup.frequency_hz, source }
 }
 
-/// The coefficients of `sky` up to `l_max`.
-fn truncated(sky: &Alm, l_max: usize) -> Alm {
-    let mut few = Alm::zeros(l_max.min(sky.l_max()));
-    for m in 0..=few.l_max() {
-        let kept = few.order(m).len();
-        few.order_mut(m).copy_from_slice(&sky.order(m)[..kept]);
+fn truncate(sky: &Alm, l_max: usize) -> Alm {
+    let mut truncated = Alm::zeros(l_max.min(sky.l_max()));
+    for m in 0..=truncated.l_max() {
+        let count = truncated.order(m).len();
+        truncated.order_mut(m).copy_from_slice(&sky.order(m)[..count]);
     }
-    few
+    truncated
 }
 
 impl VisibilityModel for HarmonicSum {
@@ -140,7 +138,7 @@ impl VisibilityModel for HarmonicSum {
             |refusal: GeometryRefusal| ModelError::Geometry { frequency_hz, refusal: refusal.into() };
         let wavelength_m = SPEED_OF_LIGHT_M_S / self.setup.frequency_hz;
         let state = |daughter: &DaughterPosition| {
-            let orientation = PairOrientation::single(daughter.r_m, daughter.normal_hat)?;
+            let orientation = PairOrientation::of_satellite(daughter.r_m, daughter.normal_hat)?;
             Ok(self.orbit.pair(&orientation, wavelength_m)?.state)
         };
         let states: Result<Vec<PairState>, GeometryRefusal> = daughters.iter().map(state).collect();
@@ -167,7 +165,7 @@ mod tests {
     fn powers_of_single_daughters_are_those_of_direct_sums() {
         const NSIDE: usize = 64;
         let array = Array::new(&ArrayConfig::default()).unwrap();
-        // T = 3 + 2 (3 z^2 - 1): far from isotropic, so that a dipole's axis matters.
+        // T = 3 + 2 (3 z^2 - 1): far from isotropic, so that the axis of a dipole matters.
         let mut alm = Alm::zeros(4);
         *alm.get_mut(0, 0) = (3.0 * (4.0 * PI).sqrt()).into();
         *alm.get_mut(2, 0) = (2.0 / (5.0 / (16.0 * PI)).sqrt()).into();
@@ -176,7 +174,7 @@ mod tests {
         let daughters = [0.0, 1500.0, 3e6].map(|t_s| DaughterPosition {
             r_m: array.position_m(4, t_s),
             normal_hat: array.orbit_normal_hat(t_s),
-            at: None,
+            daughter_time: None,
         });
         for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
             let setup = HarmonicSumSetup {
@@ -195,7 +193,7 @@ mod tests {
             harmonic.predict_powers(&daughters, &mut found).unwrap();
             direct.predict_powers(&daughters, &mut expected).unwrap();
             for (found, expected) in found.into_iter().zip(expected) {
-                // Direct sums count the 4 nside pixels on the limb whole: half a pixel each, at random.
+                // Direct sums count the 4 nside pixels on the limb fully or not at all: a random error of half a pixel each.
                 let limb = 0.5 * (4.0 * NSIDE as f64).sqrt() * 4.0 * PI / (12 * NSIDE * NSIDE) as f64;
                 assert!((found - expected).abs() < 4.0 * 7.0 * limb, "{response:?}: {found} {expected}");
             }

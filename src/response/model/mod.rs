@@ -1,30 +1,37 @@
 //! Noise-free visibilities and auto-correlation powers of a given sky.
 //!
-//! [`VisibilityModel`] is the interface, for one sky at one frequency. [`DirectSum`] sums over the sky's pixels,
-//! [`HarmonicSum`] uses spherical harmonics on a common circle, [`GeneralSum`] anywhere; [`WithReflection`] adds the image of the sky in
-//! a flat Moon, [`WithSphereReflection`] in a round one, [`AntennaSum`] antennas that differ, [`WithEmission`] the Moon's own emission, [`BandAverage`] averages over a channel,
-//! [`TimeAverage`] over integrations, and [`ModelPlan`] chooses by cost. Equal arguments give equal results, whatever the threads.
+//! [`VisibilityModel`] is the interface, for one sky at one frequency; [`ModelPlan`] chooses an implementation by cost.
+//!
+//! | model | predicts |
+//! |---|---|
+//! | [`DirectSum`] | sums over the sky's pixels |
+//! | [`AntennaSum`] | direct sums with an antenna of its own for each daughter |
+//! | [`HarmonicSum`] | sums over spherical harmonics, for satellites on one circle |
+//! | [`GeneralSum`] | sums over spherical harmonics, for satellites at any positions |
+//! | [`WithFlatReflection`], [`WithSphereReflection`] | another model plus the sky reflected by a flat or a spherical Moon |
+//! | [`WithEmission`] | another model plus the Moon's thermal emission |
+//! | [`BandAverage`], [`TimeAverage`] | means of another model over a channel or an integration |
 
 mod antennas;
 mod band_average;
 mod choice;
 mod direct;
 mod emission;
+mod flat_reflection;
 mod general;
 mod harmonic;
-mod mirror;
-mod reflection;
+mod sphere_reflection;
 mod time_average;
 
 pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
-pub use choice::{Load, ModelChoice, ModelKind, ModelPlan, degrees_seen};
+pub use choice::{ModelChoice, ModelKind, ModelPlan, Workload, l_max_of_fringes};
 pub use direct::{DirectMoments, DirectSum};
 pub use emission::WithEmission;
+pub use flat_reflection::WithFlatReflection;
 pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
-pub use mirror::WithSphereReflection;
-pub use reflection::WithReflection;
+pub use sphere_reflection::WithSphereReflection;
 pub use time_average::TimeAverage;
 
 use num_complex::Complex64;
@@ -46,8 +53,8 @@ pub struct PairPosition {
     pub r_j_m: Vec3,
     /// Orbital phase swept during the integration, rad; 0 for an instant.
     pub span_rad: f64,
-    /// Pair and mission time, s, of positions along an orbit; consecutive ones of a pair may be interpolated from each other.
-    pub at: Option<(Pair, f64)>,
+    /// Pair and mission time, s, if known; a model may then interpolate between consecutive positions of a pair.
+    pub pair_time: Option<(Pair, f64)>,
 }
 
 /// Position of one daughter, for its auto-correlation power.
@@ -57,15 +64,15 @@ pub struct DaughterPosition {
     pub r_m: Vec3,
     /// Normal of the orbit, a unit vector; dipoles point along it.
     pub normal_hat: Vec3,
-    /// Daughter, from 0, and mission time, s, where antennas differ.
-    pub at: Option<(u8, f64)>,
+    /// Daughter (counted from 0) and mission time, s; needed where antennas differ.
+    pub daughter_time: Option<(u8, f64)>,
 }
 
 /// Why a prediction failed.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// A pair departs too far from the orbit of the model.
+    /// The model does not cover the positions of a pair.
     #[error(
         "visibility model at {}: {refusal}; set spacecraft.model = \"direct\" for such an array",
         Dimension::Frequency.show(*frequency_hz)
@@ -73,7 +80,7 @@ pub enum ModelError {
     Geometry {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// The quantity that departs.
+        /// Reason of the refusal.
         refusal: RowsRefusal,
     },
     /// The harmonic model failed.
@@ -81,7 +88,7 @@ pub enum ModelError {
     Harmonic {
         /// Frequency, Hz.
         frequency_hz: f64,
-        /// Its error.
+        /// Error of the harmonic model.
         source: HarmonicError,
     },
     /// Two daughters with dipoles in the same or in opposite directions from the Moon's centre.
@@ -94,9 +101,9 @@ pub enum ModelError {
         /// Frequency, Hz.
         frequency_hz: f64,
     },
-    /// A model of instants was asked for an average over integrations.
+    /// A model of instantaneous visibilities was given an integration.
     #[error(
-        "visibility model at {}: an average over an integration of a model of instants",
+        "visibility model at {}: this model is instantaneous, but a position spans an integration; average it over time",
         Dimension::Frequency.show(*frequency_hz)
     )]
     Smearing {
@@ -109,7 +116,7 @@ pub enum ModelError {
 ///
 /// Equal arguments give equal results, whatever the threads and earlier calls.
 pub trait VisibilityModel: Send + Sync {
-    /// Preferred number of visibilities a call; smaller calls cost more a visibility.
+    /// Preferred number of visibilities per call; smaller calls cost more per visibility.
     fn batch(&self) -> usize {
         1
     }
@@ -127,14 +134,14 @@ pub trait VisibilityModel: Send + Sync {
     /// As [`Self::predict`].
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError>;
 
-    /// Whether daughters at one place have different powers.
-    fn has_own_antennas(&self) -> bool {
+    /// Whether antennas differ, so that daughters at the same position have different powers.
+    fn has_individual_antennas(&self) -> bool {
         false
     }
 
-    /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` values a position.
+    /// Predicts the visibilities (K sr) of each position at the frequencies of `comb`: `comb.count` values per position.
     ///
-    /// By default a scaled baseline stands for another frequency.
+    /// The default implementation scales the baseline in place of the frequency.
     ///
     /// # Errors
     /// As [`Self::predict`].
@@ -145,30 +152,30 @@ pub trait VisibilityModel: Send + Sync {
         out: &mut [Complex64],
     ) -> Result<(), ModelError> {
         let factors = (0..comb.count).map(|k| 1.0 + comb.first + comb.step * k as f64);
-        let apart: Vec<PairPosition> =
+        let scaled: Vec<PairPosition> =
             positions.iter().flat_map(|pair| factors.clone().map(|factor| pair.scaled(factor))).collect();
-        self.predict(&apart, out)
+        self.predict(&scaled, out)
     }
 }
 
-/// Means of a model's predictions: each of `positions` is a part of the mean at a place of `out`, with a weight.
+/// Writes weighted means of a model's predictions: `terms` gives the index in `out` and the weight of each position.
 fn predict_means(
     model: &mut dyn VisibilityModel,
     positions: &[PairPosition],
-    parts: &[(usize, f64)],
+    terms: &[(usize, f64)],
     out: &mut [Complex64],
 ) -> Result<(), ModelError> {
     let mut values = vec![Complex64::ZERO; positions.len()];
     model.predict(positions, &mut values)?;
     out.fill(Complex64::ZERO);
-    for ((place, weight), value) in parts.iter().zip(values) {
-        out[*place] += weight * value;
+    for ((index, weight), value) in terms.iter().zip(values) {
+        out[*index] += weight * value;
     }
     Ok(())
 }
 
 impl PairPosition {
-    /// The pair with its baseline scaled by `factor`, see [`scaled_baseline`].
+    /// Scales the baseline of the pair by `factor`, see [`scaled_baseline`].
     #[must_use]
     pub fn scaled(&self, factor: f64) -> Self {
         let (r_i_m, r_j_m) = scaled_baseline(self.r_i_m, self.r_j_m, factor);

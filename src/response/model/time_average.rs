@@ -10,48 +10,46 @@ use crate::array::Array;
 use crate::response::general::Instants;
 use crate::units::vector::{Vec3, norm, sub};
 
-/// A model of instants, averaged over integrations: by Gauss-Legendre quadrature over instants at the array's own positions.
+/// Averages an instantaneous model over integrations, by Gauss-Legendre quadrature in time along the array's orbits.
 ///
-/// The span of a position is that of an orbit of the array; positions have to say whose they are (`at`). Those that do not, and those
-/// without a span, are instants.
+/// Positions without a pair and time ([`PairPosition::pair_time`]) or without a span are predicted as instants.
 pub struct TimeAverage {
     model: Box<dyn VisibilityModel>,
     array: Arc<Array>,
     wavelength_m: f64,
-    /// Greatest degree of the model's sky.
     l_max: usize,
     instants: Instants,
 }
 
 impl TimeAverage {
-    /// Averages a model of a sky up to `l_max` at a wavelength, m.
+    /// Averages `model`, whose sky has degrees up to `l_max`, at a wavelength, m.
     #[must_use]
     pub fn new(model: Box<dyn VisibilityModel>, array: Arc<Array>, wavelength_m: f64, l_max: usize) -> Self {
         Self { model, array, wavelength_m, l_max, instants: Instants::new() }
     }
 
-    /// Positions of satellites i and j at a time.
-    fn positions(&self, position: &PairPosition, t_s: f64) -> Option<[Vec3; 2]> {
-        let (pair, _) = position.at?;
+    fn positions_at(&self, position: &PairPosition, t_s: f64) -> Option<[Vec3; 2]> {
+        let (pair, _) = position.pair_time?;
         Some([pair.i, pair.j].map(|n| self.array.position_m(n.into(), t_s)))
     }
 
-    /// The instants of an integration, and their weights.
-    fn apart(&self, position: &PairPosition, take: &mut dyn FnMut(PairPosition, f64)) {
+    /// Calls `take` with the positions at each instant of an integration, and their weight.
+    fn for_each_instant(&self, position: &PairPosition, take: &mut dyn FnMut(PairPosition, f64)) {
         let instant = PairPosition { span_rad: 0.0, ..*position };
         let half_s = 0.5 * position.span_rad / TAU * self.array.orbital_period_s();
-        let ends = position.at.filter(|_| half_s > 0.0).and_then(|(pair, t_s)| {
-            let [from, to] = [-half_s, half_s].map(|after_s| self.positions(position, t_s + after_s));
+        let ends = position.pair_time.filter(|_| half_s > 0.0).and_then(|(pair, t_s)| {
+            let [from, to] = [-half_s, half_s].map(|after_s| self.positions_at(position, t_s + after_s));
             Some((pair, t_s, from?, to?))
         });
         let Some((pair, t_s, from, to)) = ends else { return take(instant, 1.0) };
         let moved_m = norm(sub(sub(to[0], to[1]), sub(from[0], from[1])));
         let turned_rad = norm(sub(to[0], from[0])) / norm(position.r_i_m);
         let half_rad = [PI * moved_m / self.wavelength_m, 0.5 * self.l_max as f64 * turned_rad];
-        for at in self.instants.for_phases(half_rad) {
-            let time_s = t_s + half_s * at.offset;
-            if let Some([r_i_m, r_j_m]) = self.positions(position, time_s) {
-                take(PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: Some((pair, time_s)) }, at.weight);
+        for node in self.instants.for_phases(half_rad) {
+            let time_s = t_s + half_s * node.offset;
+            if let Some([r_i_m, r_j_m]) = self.positions_at(position, time_s) {
+                let pair_time = Some((pair, time_s));
+                take(PairPosition { r_i_m, r_j_m, span_rad: 0.0, pair_time }, node.weight);
             }
         }
     }
@@ -63,17 +61,17 @@ impl VisibilityModel for TimeAverage {
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
-        // A batch at a time, to bound memory.
+        // In batches, to bound memory.
         let batch = self.model.batch().max(1024);
         for (positions, out) in positions.chunks(batch).zip(out.chunks_mut(batch)) {
-            let (mut apart, mut parts) = (Vec::new(), Vec::new());
-            for (place, position) in positions.iter().enumerate() {
-                self.apart(position, &mut |instant, weight| {
-                    apart.push(instant);
-                    parts.push((place, weight));
+            let (mut instants, mut terms) = (Vec::new(), Vec::new());
+            for (index, position) in positions.iter().enumerate() {
+                self.for_each_instant(position, &mut |instant, weight| {
+                    instants.push(instant);
+                    terms.push((index, weight));
                 });
             }
-            predict_means(self.model.as_mut(), &apart, &parts, out)?;
+            predict_means(self.model.as_mut(), &instants, &terms, out)?;
         }
         Ok(())
     }
@@ -82,8 +80,8 @@ impl VisibilityModel for TimeAverage {
         self.model.predict_powers(daughters, out)
     }
 
-    fn has_own_antennas(&self) -> bool {
-        self.model.has_own_antennas()
+    fn has_individual_antennas(&self) -> bool {
+        self.model.has_individual_antennas()
     }
 }
 
@@ -102,7 +100,7 @@ mod tests {
     fn averages_are_those_of_many_instants() {
         let config = ArrayConfig { eccentricity: 0.01, cross_track_ratio: 0.1, ..ArrayConfig::default() };
         let array = Arc::new(Array::new(&config).unwrap());
-        // Smooth, so that pixels' centres hold it.
+        // Smooth, so that values at the pixels' centres represent it.
         let nside = 64;
         let values = pixel_directions(nside).iter().map(|n| 300.0 + 200.0 * n[0] * n[2]).collect();
         let sky = SkyMap::new(Frame::Ecliptic, values).unwrap();
@@ -116,7 +114,7 @@ mod tests {
             r_i_m: array.position_m(0, t_s),
             r_j_m: array.position_m(3, t_s),
             span_rad: TAU * length_s / array.orbital_period_s(),
-            at: Some((pair, t_s)),
+            pair_time: Some((pair, t_s)),
         };
         for (t_s, length_s) in [(1e3, 0.5), (2e3, 4.0), (3e3, 60.0)] {
             let (mut found, mut middle) = ([Complex64::ZERO], [Complex64::ZERO]);
@@ -130,7 +128,7 @@ mod tests {
             plain.predict(&instants, &mut values).unwrap();
             let expected = values.iter().sum::<Complex64>() / PARTS as f64;
             let scale = values.iter().map(|v| v.norm()).fold(0.0, f64::max);
-            // Pixels come and go at the limb: 0.08 K sr each, of some 20 K sr.
+            // Pixels rise and set at the limb: 0.08 K sr each, of some 20 K sr.
             assert!((found[0] - expected).norm() < 5e-3 * scale, "{length_s}: {found:?} {expected}");
             let left_out = (middle[0] - expected).norm();
             assert!(
@@ -138,7 +136,6 @@ mod tests {
                 "{length_s}: {left_out}"
             );
         }
-        // Instants are left as they are.
         let (mut found, mut expected) = ([Complex64::ZERO], [Complex64::ZERO]);
         averaged.predict(&[place(4e3, 0.0)], &mut found).unwrap();
         plain.predict(&[place(4e3, 0.0)], &mut expected).unwrap();

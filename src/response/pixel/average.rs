@@ -11,17 +11,15 @@ use std::f32::consts::PI;
 use multiversion::multiversion;
 
 use super::blocks::{BlockGroup, GROUP, GX, GY, HALF_PHASE_RAD_MAX, HXX, HXY, HYY};
-use super::kernel::{Prepared, dot32, dot64};
+use super::kernel::{KernelGeometry, dot32, dot64};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused, polynomial};
 
-/// Means over a group of blocks.
+/// Mean responses over a group of blocks.
 #[derive(Clone, Debug)]
 pub(super) struct Means {
-    /// Real parts.
     pub re: [f32; GROUP],
-    /// Imaginary parts.
     pub im: [f32; GROUP],
-    /// 1 where the limb of the Moon may cut the block, else 0.
+    /// 1 where the limb of the Moon may cross the block, else 0.
     pub cut: [f32; GROUP],
 }
 
@@ -31,10 +29,15 @@ impl Default for Means {
     }
 }
 
-/// Means of A S_i S_j exp(-2 pi i u . n) over blocks of `children`^2 children. Marks blocks that a limb may cut, which
-/// [`cut_mean`](super::edge::cut_mean) averages, and returns whether there are any.
+/// Computes the means of A S_i S_j exp(-2 pi i u . n) over blocks of `children`^2 children. Marks the blocks that a limb may cross, for
+/// [`limb_block_mean`](super::limb_blocks::limb_block_mean), and returns whether there are any.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn block_means(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) -> bool {
+pub(super) fn block_means(
+    pair: &KernelGeometry,
+    children: usize,
+    group: &BlockGroup,
+    means: &mut Means,
+) -> bool {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     if let Some(dipole) = pair.dipole {
@@ -46,7 +49,7 @@ pub(super) fn block_means(pair: &Prepared, children: usize, group: &BlockGroup, 
 
 #[inline(always)]
 fn means_of<const FMA: bool, const DIPOLE: bool>(
-    pair: &Prepared,
+    pair: &KernelGeometry,
     dipole: [f32; 3],
     children: usize,
     group: &BlockGroup,
@@ -70,7 +73,7 @@ fn means_of<const FMA: bool, const DIPOLE: bool>(
         let (sx, px) = sinc::<FMA>(tx);
         let (sy, py) = sinc::<FMA>(ty);
         let second = |s: f32, p: f32| fused::<FMA>(s, 1.0 / 6.0, 0.5 * p);
-        // The quadratic's coefficients include 2 pi, u only pi.
+        // The quadratic needs a factor 2 pi, but u contains only pi.
         let quadratic = 2.0 * at(HXX, k, u) * second(sx, px) * sy + 2.0 * at(HYY, k, u) * sx * second(sy, py)
             - 0.5 * at(HXY, k, u) * (tx * px) * (ty * py);
         let sampled = inverse_sinc::<FMA>(tx * per_side) * inverse_sinc::<FMA>(ty * per_side);
@@ -91,10 +94,10 @@ fn means_of<const FMA: bool, const DIPOLE: bool>(
     means.cut.iter().any(|&cut| cut != 0.0)
 }
 
-/// S(t) = sin t / t and P(t) = S'(t) / t for |t| <= [`HALF_PHASE_RAD_MAX`], to 6e-7.
+/// Computes S(t) = sin t / t and P(t) = S'(t) / t for |t| <= [`HALF_PHASE_RAD_MAX`], to 6e-7.
 ///
-/// Polynomials in t^2, interpolated at Chebyshev points. The choice of blocks keeps the argument in range; clamping it
-/// here bounds the result in any case.
+/// They are polynomials in t^2, interpolated at Chebyshev points. The choice of blocks keeps the argument in range; clamping
+/// bounds the result in any case.
 #[inline(always)]
 fn sinc<const FMA: bool>(t: f32) -> (f32, f32) {
     const S: [f32; 11] = [
@@ -127,9 +130,9 @@ fn sinc<const FMA: bool>(t: f32) -> (f32, f32) {
     (polynomial::<FMA, 11>(&S, place), polynomial::<FMA, 10>(&P, place))
 }
 
-/// 1 / S(t) by its series, to 1e-5 for |t| <= 0.8 and 2 % at 2; t is the half phase over one child.
+/// Computes 1 / S(t) by its series, to 1e-5 for |t| <= 0.8 and 2 % at 2; t is the half phase over one child.
 ///
-/// Where t is large it multiplies kernels of order (1 / CHILDREN t)^2 or less.
+/// Where t is large, the result multiplies kernels of order (1 / CHILDREN t)^2 or less.
 #[inline(always)]
 fn inverse_sinc<const FMA: bool>(t: f32) -> f32 {
     const SERIES: [f32; 5] = [1.0, 1.0 / 6.0, 7.0 / 360.0, 31.0 / 15_120.0, 127.0 / 604_800.0];
@@ -146,17 +149,17 @@ mod tests {
             let t = HALF_PHASE_RAD_MAX * f64::from(k) / 2000.0;
             let (s, p) = sinc::<false>(t as f32);
             let expected = t.sin() / t;
-            // Interpolation and f32 rounding.
+            // The error is interpolation and f32 rounding.
             assert!((f64::from(s) - expected).abs() < 1.5e-6, "{t}");
-            // The closed form of P loses bits as t^-2; the polynomial does not.
+            // The closed form of P loses bits as t^-2, unlike the polynomial.
             let derivative = (t.cos() - expected) / (t * t);
             assert!((f64::from(p) - derivative).abs() < 1e-6 + 1e-15 / (t * t), "{t}");
         }
         for k in 1..=200 {
             let t = f64::from(k) / 100.0;
-            // The terms left out of the series, from 2.1e-5 t^10 on.
-            let left_out = 4.5e-5 * t.powi(10) + 1e-6;
-            assert!((f64::from(inverse_sinc::<false>(t as f32)) - t / t.sin()).abs() < left_out, "{t}");
+            // The truncated terms of the series, from 2.1e-5 t^10 on.
+            let truncated = 4.5e-5 * t.powi(10) + 1e-6;
+            assert!((f64::from(inverse_sinc::<false>(t as f32)) - t / t.sin()).abs() < truncated, "{t}");
         }
     }
 }

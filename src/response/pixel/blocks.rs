@@ -18,32 +18,31 @@ pub(super) const GY: usize = 3;
 pub(super) const HXX: usize = 6;
 pub(super) const HXY: usize = 9;
 pub(super) const HYY: usize = 12;
-/// Number of `f32` coefficients.
 pub(super) const SLOPES: usize = 15;
 
-/// Greatest half phase (rad) over a block for which the closed form's polynomials hold.
+/// Maximum half phase (rad) over a block for which the closed form's polynomials hold.
 pub(super) const HALF_PHASE_RAD_MAX: f64 = 10.0;
 
-/// Greatest half phase (rad) over a child for which the series of the sampling factor holds.
+/// Maximum half phase (rad) over a child for which the series of the sampling factor holds.
 const HALF_PHASE_RAD_PER_CHILD_MAX: f64 = 2.0;
 
-/// Greatest accepted error of a block's closed form. Only the worst pixel, at the longest baseline of a class in the
-/// worst direction, reaches this bound, and errors of pixels are not aligned: the rms over pixels is several times
+/// Maximum error of a block's closed form. Only the worst pixel, at the longest baseline of a class in the
+/// worst direction, reaches it, and errors of pixels are independent: the rms over pixels is several times
 /// below the 1e-3 required of a row.
 const ERROR_MAX: f64 = 4e-3;
 
-/// Blocks in a [`BlockGroup`].
+/// Number of blocks in a [`BlockGroup`].
 pub(super) const GROUP: usize = 64;
 
-/// Blocks in the layout that the kernels read. Gaps and the padding of a set's last group have a radius of NaN, so that
-/// no comparison finds them visible or cut.
+/// Blocks in the layout of the kernels. Gaps and the padding of a set's last group have a radius of NaN, so that
+/// every comparison finds them hidden.
 #[derive(Clone, Debug)]
 pub(super) struct BlockGroup {
     /// Constant term of the fit.
     pub centre: [[f64; GROUP]; 3],
-    /// The other terms; see [`GX`] and the following.
+    /// The other terms, at the indices [`GX`] to [`HYY`].
     pub slopes: [[f32; GROUP]; SLOPES],
-    /// Greatest distance of a child from `centre`.
+    /// Maximum distance of a child from `centre`.
     pub radius: [f32; GROUP],
 }
 
@@ -55,15 +54,13 @@ impl BlockGroup {
 /// Blocks of one size.
 #[derive(Debug)]
 pub(super) struct BlockSet {
-    /// Children along a block's side.
     pub children: usize,
-    /// Place of each block's pixel in a row.
+    /// Index of each block's pixel in a row.
     pub pixels: Vec<u32>,
     /// The blocks.
     pub groups: Vec<BlockGroup>,
 }
 
-/// One fitted block.
 #[derive(Clone, Copy, Debug)]
 struct FittedBlock {
     children: usize,
@@ -92,15 +89,15 @@ impl BlockSet {
                 group.slopes[3 * term + axis][lane] = slope[axis] as f32;
             }
         }
-        // Rounded up, so that no child is outside in f32 either.
+        // Rounded up, so that all children are inside in f32 too.
         group.radius[lane] = (block.radius * (1.0 + 1e-6) + 1e-6) as f32;
     }
 }
 
-/// The blocks for all baselines up to a given length.
+/// Blocks for all baselines up to a given length.
 #[derive(Debug)]
 pub(super) struct BlockClass {
-    /// Blocks along a pixel's side in `whole`.
+    /// Number of blocks along a pixel's side in `whole`.
     pub per_side: usize,
     /// Blocks of all pixels in the order of a row, `per_side`^2 for each, with gaps.
     pub whole: BlockSet,
@@ -110,7 +107,7 @@ pub(super) struct BlockClass {
 }
 
 impl BlockClass {
-    /// Blocks valid for baselines up to `wavelengths_max`, at least `per_side` along a pixel's side.
+    /// Fits blocks for baselines up to `wavelengths_max`, with at least `per_side` along a pixel's side.
     pub fn new((nside, order): (usize, PixelOrder), per_side: usize, wavelengths_max: f64) -> Self {
         let cut: Vec<Vec<(usize, Option<FittedBlock>)>> = (0..healpix::pixel_count(nside))
             .into_par_iter()
@@ -143,7 +140,7 @@ impl BlockClass {
     }
 }
 
-/// Fits the block of `size` children a side at `corner`; if the fit is not good enough, records a gap (`None`) and
+/// Fits the block at `corner` with `size` children along its side. If the fit is not good enough, records a gap (`None`) and
 /// divides the block into quarters.
 fn cut(
     children: &[Vec3],
@@ -169,14 +166,13 @@ fn cut(
 }
 
 impl FittedBlock {
-    /// Whether the closed form holds for baselines up to `wavelengths_max`.
-    ///
-    /// The closed form expands the fit's quadratic phase to first order and neglects its residual.
+    /// Whether the closed form, which expands the quadratic phase to first order and neglects the residual of the fit, holds for
+    /// baselines up to `wavelengths_max`.
     fn is_good(&self, wavelengths_max: f64) -> bool {
         use std::f64::consts::PI;
         let radians = 2.0 * PI * wavelengths_max;
         let [gx, gy, hxx, hxy, hyy] = self.slopes.map(norm);
-        // Root mean squares over the unit square: x^2 - 1/12 has 1/sqrt(180), x y has 1/12.
+        // The rms over the unit square is 1/sqrt(180) for x^2 - 1/12, and 1/12 for x y.
         let quadratic = radians * ((hxx * hxx + hyy * hyy) / 180.0 + hxy * hxy / 144.0).sqrt();
         0.5 * radians * gx.max(gy) <= HALF_PHASE_RAD_MAX
             && 0.5 * radians * gx.max(gy) <= HALF_PHASE_RAD_PER_CHILD_MAX * self.children as f64
@@ -185,7 +181,6 @@ impl FittedBlock {
     }
 }
 
-/// Fits one block of m x m children.
 fn fit(children: &[Vec3], m: usize) -> FittedBlock {
     let variance = (1.0 - 1.0 / (m * m) as f64) / 12.0;
     let place = |k: usize| (k as f64 + 0.5) / m as f64 - 0.5;
@@ -204,15 +199,18 @@ fn fit(children: &[Vec3], m: usize) -> FittedBlock {
         }
     }
     for (slope, square) in slopes.iter_mut().zip(squares) {
-        // With m of 1 or 2 some functions vanish at all children, up to rounding.
+        // For m = 1 and m = 2 some functions vanish at all children, up to rounding.
         *slope = if square > 1e-12 { scale(1.0 / square, *slope) } else { [0.0; 3] };
     }
     let (mut radius, mut residual) = (0.0_f64, 0.0);
     for (k, &child) in children.iter().enumerate() {
         let off = sub(child, mean);
         radius = radius.max(norm(off));
-        let left = basis(k).iter().zip(slopes).fold(off, |left, (value, s)| sub(left, scale(*value, s)));
-        residual += dot(left, left);
+        let unexplained = basis(k)
+            .iter()
+            .zip(slopes)
+            .fold(off, |unexplained, (value, s)| sub(unexplained, scale(*value, s)));
+        residual += dot(unexplained, unexplained);
     }
     FittedBlock {
         children: m,

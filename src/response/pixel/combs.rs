@@ -1,32 +1,33 @@
-//! Visibilities of a sky at equally spaced frequencies: from one frequency to the next each pixel's fringe turns
-//! by the same angle, so a product replaces the sine.
+//! Visibilities of a sky at equally spaced frequencies.
+//!
+//! From one frequency to the next each pixel's fringe rotates by the same angle, so that a product replaces the sine.
 
 use multiversion::multiversion;
 use num_complex::Complex64;
 
-use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
+use super::kernel::{CHUNK, ChunkDirections, KernelGeometry, PaddedChunk, dot64, total};
 use super::{Directions, PairGeometry, ResponseError};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
-/// Equally spaced frequencies `nu (1 + first + k step)`, nu being that of the pair.
+/// Comb of equally spaced frequencies `nu (1 + first + k step)`, with nu the frequency of the pair.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Comb {
-    /// Offset of the first, a fraction of the pair's frequency.
+    /// Offset of the first frequency, as a fraction of the pair's frequency.
     pub first: f64,
-    /// Spacing, as such a fraction.
+    /// Spacing, as a fraction of the pair's frequency.
     pub step: f64,
     /// Number of frequencies.
     pub count: usize,
 }
 
-/// Partial sums of a chunk in `f32`; their sum is `f64`.
+/// Number of partial sums of a chunk in `f32`, which are added in `f64`.
 const LANES: usize = 16;
 
-/// Visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: `comb.count` values
-/// a pair. What the Moon hides does not depend on frequency.
+/// Computes the visibilities (K sr) of a sky (K) at `directions`, `area_sr` each, at the frequencies of `comb`: `comb.count`
+/// values per pair.
 ///
-/// Layout and accuracy as in [`sky_sums`](super::sky_sums), but a fringe loses 1e-7 with each frequency. Runs on the
-/// calling thread.
+/// Layout and accuracy are those of [`sky_sums`](super::sky_sums), except that each frequency adds an error of 1e-7 to the fringe.
+/// The sums run on the calling thread.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -45,7 +46,7 @@ pub fn comb_sums(
         return Ok(sums);
     }
     for (sums, pair) in sums.chunks_exact_mut(comb.count).zip(pairs) {
-        let pair = Prepared::pair(pair);
+        let pair = KernelGeometry::pair(pair);
         let axes = [&directions.x, &directions.y, &directions.z];
         for (k, values) in sky_k.chunks(CHUNK).enumerate() {
             let range = k * CHUNK..k * CHUNK + values.len();
@@ -58,9 +59,8 @@ pub fn comb_sums(
     Ok(sums)
 }
 
-/// Adds one chunk of the sky, without the area.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &mut [Complex64]) {
+fn add_chunk(pair: &KernelGeometry, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &mut [Complex64]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let mut fringes = Fringes::EMPTY;
@@ -72,12 +72,12 @@ fn add_chunk(pair: &Prepared, comb: Comb, n: [&[f64]; 3], sky_k: &[f32], sums: &
         }
     }
     for sum in sums {
-        let [re, im] = fringes.sum_and_turn::<FMA>();
+        let [re, im] = fringes.sum_and_advance::<FMA>();
         *sum += Complex64::new(re, im);
     }
 }
 
-/// Contributions of a chunk's pixels at one frequency, and the rotation to the next.
+/// Contributions of a chunk's pixels at one frequency, and their rotation to the next frequency.
 struct Fringes {
     re: [f32; CHUNK],
     im: [f32; CHUNK],
@@ -92,7 +92,7 @@ impl Fringes {
     #[inline(always)]
     fn begin<const FMA: bool>(
         &mut self,
-        pair: &Prepared,
+        pair: &KernelGeometry,
         comb: Comb,
         n: ChunkDirections<'_>,
         sky_k: &[f32; CHUNK],
@@ -118,7 +118,7 @@ impl Fringes {
     }
 
     #[inline(always)]
-    fn sum_and_turn<const FMA: bool>(&mut self) -> [f64; 2] {
+    fn sum_and_advance<const FMA: bool>(&mut self) -> [f64; 2] {
         let mut lanes = [[0.0_f32; LANES]; 2];
         let parts = self.re.as_chunks_mut::<LANES>().0.iter_mut().zip(self.im.as_chunks_mut::<LANES>().0);
         let turns = self.turn_re.as_chunks::<LANES>().0.iter().zip(self.turn_im.as_chunks::<LANES>().0);
@@ -169,7 +169,7 @@ mod tests {
                     let factor = 1.0 + comb.first + comb.step * k as f64;
                     let there = PairGeometry { frequency_hz: pair.frequency_hz * factor, ..*pair };
                     let exact = exact::visibility(&there, directions, &sky_k, area_sr);
-                    // 17 turns of 1e-7 each, at most, against the sum of all pixels' magnitudes.
+                    // At most 17 rotations of 1e-7 each, relative to the sum of all pixels' magnitudes.
                     let off = (found - exact.visibility_k_sr).norm() / exact.zero_spacing_k_sr;
                     assert!(off < 2e-6, "{k}: {off}");
                 }

@@ -1,8 +1,8 @@
-//! Directions in the layout that the kernels read.
+//! Directions in the layout of the kernels.
 
 use crate::units::vector::{Vec3, dot};
 
-/// Unit vectors as a structure of arrays, on the axes of any frame.
+/// List of unit vectors as a structure of arrays, on the axes of any frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Directions {
     pub(super) x: Vec<f64>,
@@ -31,7 +31,7 @@ impl Directions {
         [self.x[k], self.y[k], self.z[k]]
     }
 
-    /// The directions rotated by a matrix, given by rows.
+    /// Rotates the directions by a matrix, given by rows.
     #[must_use]
     #[doc(hidden)]
     pub fn rotated(&self, rotation: &[Vec3; 3]) -> Self {

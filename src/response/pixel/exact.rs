@@ -1,4 +1,4 @@
-//! The response in `f64`, one direction after another: the reference for the fast path.
+//! The response in `f64`, direction by direction: the reference for the fast path.
 
 use std::f64::consts::TAU;
 
@@ -24,34 +24,34 @@ pub fn envelope(pair: &PairGeometry, n_hat: Vec3) -> f64 {
     }
 }
 
-/// exp(-2 pi i u . n), from the phase reduced to a fraction of a turn.
+/// Computes exp(-2 pi i u . n) from the phase reduced to a fraction of a turn.
 fn fringe(baseline_wavelengths: Vec3, n_hat: Vec3) -> Complex64 {
     let turns = dot(baseline_wavelengths, n_hat);
     Complex64::cis(-TAU * (turns - turns.round()))
 }
 
-/// The row of B at the given directions, without the pixel area.
+/// Computes the row of B at the given directions, without the pixel area.
 #[must_use]
 pub fn centre_row(pair: &PairGeometry, directions: &[Vec3]) -> Vec<Complex64> {
     let u = pair.baseline_wavelengths();
     let at = |&n_hat: &Vec3| match envelope(pair, n_hat) {
         0.0 => Complex64::ZERO,
-        shade => shade * fringe(u, n_hat),
+        envelope_value => envelope_value * fringe(u, n_hat),
     };
     directions.iter().map(at).collect()
 }
 
-/// The row of B averaged over the centres of the `children`^2 children of each pixel of `nside`, each with
-/// its own envelope; RING order, without the pixel area. `children` need not be a power of two.
+/// Computes the row of B averaged over the centres of the `children`^2 children of each pixel of `nside`, each with
+/// its own envelope; in RING order, without the pixel area. `children` need not be a power of two.
 #[must_use]
 pub fn average_row(pair: &PairGeometry, nside: usize, children: usize) -> Vec<Complex64> {
     let u = pair.baseline_wavelengths();
     let of_pixel = |pixel| {
         let mut sum = Complex64::ZERO;
         for n_hat in child_directions(nside, children, pixel) {
-            let shade = envelope(pair, n_hat);
-            if shade != 0.0 {
-                sum += shade * fringe(u, n_hat);
+            let envelope_value = envelope(pair, n_hat);
+            if envelope_value != 0.0 {
+                sum += envelope_value * fringe(u, n_hat);
             }
         }
         sum / (children * children) as f64
@@ -68,9 +68,9 @@ pub(super) fn child_directions(nside: usize, children: usize, pixel: usize) -> i
         .map(move |k| healpix::face_direction(face, place(ix, k / children), place(iy, k % children)))
 }
 
-/// Visibility and zero-spacing sum of a sky (K) at the given directions, each of `area_sr`.
+/// Computes the visibility and the zero-spacing sum of a sky (K) at the given directions, each of `area_sr`.
 ///
-/// Sums over blocks of 1024 directions, then over blocks.
+/// The sums run over blocks of 1024 directions, then over blocks, to limit rounding.
 #[must_use]
 pub fn visibility(pair: &PairGeometry, directions: &[Vec3], sky_k: &[f64], area_sr: f64) -> SkySum {
     const BLOCK: usize = 1024;
@@ -79,10 +79,10 @@ pub fn visibility(pair: &PairGeometry, directions: &[Vec3], sky_k: &[f64], area_
     for (directions, sky_k) in directions.chunks(BLOCK).zip(sky_k.chunks(BLOCK)) {
         let mut part = SkySum::default();
         for (&n_hat, &value) in directions.iter().zip(sky_k) {
-            let shade = envelope(pair, n_hat);
-            if shade != 0.0 {
-                part.visibility_k_sr += value * shade * fringe(u, n_hat);
-                part.zero_spacing_k_sr += value * shade;
+            let envelope_value = envelope(pair, n_hat);
+            if envelope_value != 0.0 {
+                part.visibility_k_sr += value * envelope_value * fringe(u, n_hat);
+                part.zero_spacing_k_sr += value * envelope_value;
             }
         }
         total.visibility_k_sr += part.visibility_k_sr;

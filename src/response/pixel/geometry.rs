@@ -1,4 +1,4 @@
-//! Where satellites are, at which frequency they observe, and what that makes of baseline and antennas.
+//! Geometry of pairs and of single satellites: positions, baseline and antenna response.
 
 use crate::array::hidden_by_moon;
 use crate::frames::AntennaResponse;
@@ -14,7 +14,7 @@ pub struct PairGeometry {
     pub r_j_m: Vec3,
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Radius of the body that hides the sky, m.
+    /// Radius of the Moon, m; 0 if nothing hides the sky.
     pub moon_radius_m: f64,
     /// Antenna power response.
     pub response: AntennaResponse,
@@ -35,12 +35,12 @@ impl PairGeometry {
     pub fn orbit_normal(&self) -> Option<Vec3> {
         let normal = cross(self.r_i_m, self.r_j_m);
         let length = norm(normal);
-        // For parallel positions the product is rounding error only.
-        let least = 1e-12 * norm(self.r_i_m) * norm(self.r_j_m);
-        (length > least).then(|| scale(1.0 / length, normal))
+        // For parallel positions the product is only rounding error.
+        let rounding = 1e-12 * norm(self.r_i_m) * norm(self.r_j_m);
+        (length > rounding).then(|| scale(1.0 / length, normal))
     }
 
-    /// Power response A in direction `n_hat`; not a number for dipoles without an orbital plane.
+    /// Power response A in direction `n_hat`; NaN for dipoles without an orbital plane.
     #[must_use]
     #[doc(hidden)]
     pub fn antenna(&self, n_hat: Vec3) -> f64 {
@@ -54,19 +54,19 @@ impl PairGeometry {
     }
 }
 
-/// Antenna of one satellite that may be off: of the elements of a response, at an attitude of its own.
+/// Antenna of one satellite with individual attitude and pattern.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SatelliteAntenna {
-    /// What it consists of. Dipoles are along the axes below: one along the first, or one along each.
+    /// Elements of the antenna: one dipole along the first axis, three dipoles along all axes, or isotropic.
     pub elements: AntennaResponse,
-    /// Its axis, and a direction across it, unit vectors. The third axis is across both.
+    /// First and second axis, orthogonal unit vectors; the third is their cross product.
     pub axes_hat: [Vec3; 2],
-    /// q in the factor `1 + q P_2(cos)` of its voltage, with the angle from the first axis.
+    /// q in the factor `1 + q P_2(cos)` of the voltage pattern, with the angle from the first axis.
     pub distortion: f64,
 }
 
 impl SatelliteAntenna {
-    /// The axes of three dipoles.
+    /// All three axes, along which three dipoles point.
     #[must_use]
     pub fn triad(&self) -> [Vec3; 3] {
         let [a, b] = self.axes_hat;
@@ -79,9 +79,9 @@ impl SatelliteAntenna {
 pub struct SingleGeometry {
     /// Position, m, Moon-centred.
     pub r_m: Vec3,
-    /// Normal of its orbit, a unit vector along which dipoles point; the position alone does not determine it.
+    /// Normal of the orbit, a unit vector along which dipoles point; the position alone does not determine it.
     pub normal_hat: Vec3,
-    /// Radius of the body that hides the sky, m.
+    /// Radius of the Moon, m; 0 if nothing hides the sky.
     pub moon_radius_m: f64,
     /// Antenna power response.
     pub response: AntennaResponse,

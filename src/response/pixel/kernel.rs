@@ -1,4 +1,4 @@
-//! What the fast kernels share: a pair reduced to the numbers they need, and its envelope over a chunk of directions.
+//! Common parts of the fast kernels: the geometry of a pair, and its envelope over a chunk of directions.
 //!
 //! Kernels are plain loops over short buffers. `multiversion` compiles each of them for AVX-512, AVX2 and the baseline
 //! and selects one at run time.
@@ -8,16 +8,14 @@ use crate::frames::AntennaResponse;
 use crate::units::arithmetic::{fused, fused64};
 use crate::units::vector::{Vec3, dot, scale};
 
-/// Directions that a kernel handles at a time; its buffers fit the first-level cache.
+/// Number of directions that a kernel handles at a time; its buffers fit the first-level cache.
 pub(super) const CHUNK: usize = 256;
 
-/// The components of a chunk of directions.
 pub(super) type ChunkDirections<'a> = [&'a [f64; CHUNK]; 3];
 
 /// A chunk of the sky shorter than [`CHUNK`], padded with pixels of 0 K.
 pub(super) struct PaddedChunk {
     n: [[f64; CHUNK]; 3],
-    /// Temperatures, K.
     pub sky_k: [f32; CHUNK],
 }
 
@@ -33,29 +31,28 @@ impl PaddedChunk {
         chunk
     }
 
-    /// Directions.
     #[inline(always)]
     pub fn directions(&self) -> ChunkDirections<'_> {
         [&self.n[0], &self.n[1], &self.n[2]]
     }
 }
 
-/// A pair as the kernels see it.
+/// Geometry of a pair, or of a single satellite, in the form that the kernels need.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Prepared {
+pub(super) struct KernelGeometry {
     /// Baseline in wavelengths.
     pub u: Vec3,
-    /// Direction of satellite i. It sees direction n where n . i_hat + limb_i >= 0.
+    /// Direction of satellite i, which sees direction n where n . i_hat + limb_i >= 0.
     pub i_hat: Vec3,
     /// Cosine of the angle between the limb and the Moon's centre, seen from satellite i.
     pub limb_i: f64,
     /// Direction of satellite j.
     pub j_hat: Vec3,
-    /// As `limb_i`, for satellite j.
+    /// Cosine of the angle between the limb and the Moon's centre, seen from satellite j.
     pub limb_j: f64,
     /// Direction of the dipoles, if there are any.
     pub dipole: Option<Vec3>,
-    /// Antennas that differ, in place of those.
+    /// Individual antennas, in place of isotropic ones or dipoles.
     pub antennas: Option<[SatelliteAntenna; 2]>,
 }
 
@@ -66,25 +63,25 @@ fn limb(r_m: Vec3, moon_radius_m: f64) -> (Vec3, f64) {
     (scale(1.0 / length_m, r_m), (1.0 - ratio * ratio).max(0.0).sqrt())
 }
 
-impl Prepared {
+impl KernelGeometry {
     pub fn pair(pair: &PairGeometry) -> Self {
         let (i_hat, limb_i) = limb(pair.r_i_m, pair.moon_radius_m);
         let (j_hat, limb_j) = limb(pair.r_j_m, pair.moon_radius_m);
         let dipole = match pair.response {
             AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => None,
-            // Without an orbital plane the dipoles have no direction, and the result is not a number.
+            // Without an orbital plane the dipoles have no direction, and the result is NaN.
             AntennaResponse::DipoleNormal => Some(pair.orbit_normal().unwrap_or([f64::NAN; 3])),
         };
         Self { u: pair.baseline_wavelengths(), i_hat, limb_i, j_hat, limb_j, dipole, antennas: None }
     }
 
-    /// A pair whose antennas differ.
+    /// A pair with individual antennas.
     pub fn antenna_pair((pair, antennas): &(PairGeometry, [SatelliteAntenna; 2])) -> Self {
         let ideal = PairGeometry { response: AntennaResponse::Isotropic, ..*pair };
         Self { antennas: Some(*antennas), ..Self::pair(&ideal) }
     }
 
-    /// A satellite with an antenna of its own.
+    /// A satellite with an individual antenna.
     pub fn antenna_single((single, antenna): &(SingleGeometry, SatelliteAntenna)) -> Self {
         let ideal = SingleGeometry { response: AntennaResponse::Isotropic, ..*single };
         Self { antennas: Some([*antenna; 2]), ..Self::single(&ideal) }
@@ -99,7 +96,7 @@ impl Prepared {
         Self { u: [0.0; 3], i_hat, limb_i, j_hat: i_hat, limb_j: limb_i, dipole, antennas: None }
     }
 
-    /// How far direction (x, y, z) lies above the limb for satellite i and for satellite j; negative where hidden.
+    /// Depth of direction (x, y, z) above the limb for satellite i and for satellite j; negative where hidden.
     #[inline(always)]
     pub fn depths<const FMA: bool>(&self, x: f64, y: f64, z: f64) -> (f64, f64) {
         let depth_i = dot64::<FMA>(self.i_hat, x, y, z) + self.limb_i;
@@ -114,9 +111,10 @@ impl Prepared {
         (depth_i >= 0.0) & (depth_j >= 0.0)
     }
 
-    /// Multiplies a chunk of values by the antennas' power response, 1 - (n . d)^2 for dipoles along d. Of dipoles along d and e an
-    /// unpolarised wave leaves d . e - (n . d) (n . e): the product of their parts across its direction; of three on each satellite half
-    /// the sum of that of like ones.
+    /// Multiplies a chunk of values by the antennas' power response.
+    ///
+    /// It is 1 - (n . d)^2 for dipoles along d. For an unpolarised wave, dipoles along d and e have d . e - (n . d) (n . e), the scalar
+    /// product of their components across its direction; three dipoles on each satellite have half the sum over corresponding dipoles.
     #[inline(always)]
     pub fn apply_antenna<const FMA: bool, const N: usize>(
         &self,
@@ -161,13 +159,11 @@ impl Prepared {
     }
 }
 
-/// Scalar product in `f64`.
 #[inline(always)]
 pub(super) fn dot64<const FMA: bool>(a: Vec3, x: f64, y: f64, z: f64) -> f64 {
     fused64::<FMA>(a[0], x, fused64::<FMA>(a[1], y, a[2] * z))
 }
 
-/// Scalar product in `f32`.
 #[inline(always)]
 pub(super) fn dot32<const FMA: bool>(a: [f32; 3], x: f32, y: f32, z: f32) -> f32 {
     fused::<FMA>(a[0], x, fused::<FMA>(a[1], y, a[2] * z))

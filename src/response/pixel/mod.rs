@@ -1,32 +1,31 @@
 //! Rows of the beam matrix B over HEALPix pixels, and visibilities as direct sums over a sky.
 //!
 //! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i u . n) dn` with `u = (nu/c) (r_i - r_j)`, in K sr
-//! (the paper, Eq. 7). S is 0 for directions that the Moon hides from a satellite, else 1. A row of B is
+//! (the paper, Eq. 7). S is 0 for directions that the Moon hides from a satellite, and 1 otherwise. A row of B is
 //! the integrand without T, pixel by pixel, times the pixel's solid angle.
 //!
 //! | entry point | computes |
 //! |---|---|
 //! | [`RowMaker`] | rows of B: at pixel centres, or averaged over pixels |
-//! | [`RowProducts`] | products with rows that are computed for each product |
+//! | [`RowProducts`] | products with rows that are not stored |
 //! | [`sky_sums`], [`sky_powers`] | visibilities and auto-correlation powers of a sky |
-//! | [`antenna_sums`], [`antenna_powers`] | the same with antennas that differ |
+//! | [`antenna_sums`], [`antenna_powers`] | visibilities and powers with individual antennas |
 //! | [`four_sky_sums`] | visibilities of four skies together |
 //! | [`comb_sums`] | visibilities of a sky at equally spaced frequencies |
-//! | [`exact`] | the same in `f64`, for verification |
+//! | [`exact`] | rows and visibilities in `f64`, for verification |
 //!
 //! The fast path reduces phases to a fraction of a turn in `f64` and does the rest in `f32`: fringes are accurate to
-//! 1e-6 at any baseline and frequency of the mission. Results do not depend on threads. Uses [`crate::units`],
-//! [`crate::frames`], [`crate::sky::healpix`] and [`mod@crate::array`].
+//! 1e-6 at any baseline and frequency of the mission. Results do not depend on threads.
 
 mod average;
 mod blocks;
 mod combs;
 mod directions;
-mod edge;
 #[doc(hidden)]
 pub mod exact;
 mod geometry;
 mod kernel;
+mod limb_blocks;
 mod order;
 mod products;
 mod rows;
@@ -49,12 +48,12 @@ pub use sums::{SkySum, sky_sums};
 #[doc(hidden)]
 pub use sums::{antenna_powers, antenna_sums, four_sky_sums, sky_powers};
 
-/// Sample points along each side of a pixel in pixel averages: the paper evaluates at nside 1024 and averages down to
-/// nside 64.
+/// Number of sample points along each side of a pixel in pixel averages, as in the paper, which evaluates at nside 1024 and
+/// averages down to nside 64.
 #[doc(hidden)]
 pub const CHILDREN: usize = 16;
 
-/// How a row of B represents a pixel.
+/// Method by which a row of B represents a pixel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PixelMethod {
@@ -63,7 +62,7 @@ pub enum PixelMethod {
     /// The mean over the centres of the pixel's [`CHILDREN`]^2 children, in closed form.
     #[default]
     Average,
-    /// The same mean, child by child in `f64`: for verification, hundreds of times slower.
+    /// The mean over the children computed child by child in `f64`: for verification, hundreds of times slower.
     AverageExact,
 }
 

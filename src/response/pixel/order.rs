@@ -2,21 +2,21 @@
 
 use crate::sky::healpix;
 
-/// Order of the pixels in a row.
+/// Order in which a row lists the pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PixelOrder {
-    /// As maps have them.
+    /// RING order, as in maps.
     Ring,
-    /// Neighbours together, so that the Moon hides many of them at once.
+    /// NESTED order, in which neighbours are adjacent, so that the Moon hides many of them at once.
     Nested,
 }
 
 impl PixelOrder {
-    /// RING number of the pixel at a place of a row.
-    pub(super) fn ring(self, nside: usize, place: usize) -> usize {
+    /// RING number of the pixel at an index of a row.
+    pub(super) fn ring(self, nside: usize, index: usize) -> usize {
         match self {
-            Self::Ring => place,
-            Self::Nested => healpix::nested_to_ring(nside, place),
+            Self::Ring => index,
+            Self::Nested => healpix::nested_to_ring(nside, index),
         }
     }
 }

@@ -1,10 +1,10 @@
-//! Products with rows of B that are computed for each product and not kept.
+//! Products with rows of B that are computed for each product and not stored.
 //!
-//! Rows are made in blocks: the tables of a chunk of pixels are read once for all rows of a block, and the block's rows stay in the
-//! cache between `B x` and `Bt`. Pixels are in NESTED order within, so that a chunk is a patch of the sky, which the Moon mostly hides
-//! as a whole or not at all: hidden chunks cost nothing, and those in sight no comparison with the limb.
+//! Rows are computed in blocks: the tables of a chunk of pixels are read once for all rows of a block, and the rows stay in the
+//! cache between `B x` and `Bt`. Pixels are in NESTED order, so that a chunk is a compact patch of the sky, which the Moon usually hides
+//! fully or not at all: hidden chunks cost nothing, and fully visible chunks need no comparison with the limb.
 //!
-//! A product is a sum over a fixed number of parts, added in their order: its bits do not depend on threads.
+//! A product is a sum over a fixed number of parts, added in order, so that its bits do not depend on threads.
 
 use multiversion::multiversion;
 use num_complex::Complex64;
@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::average::Means;
 use super::blocks::{BlockClass, GROUP};
-use super::kernel::{Prepared, dot64};
+use super::kernel::{KernelGeometry, dot64};
 use super::order::PixelOrder;
 use super::rows::{average, means_of_group};
 use super::{PairGeometry, PixelMethod, ResponseError, RowMaker};
@@ -20,30 +20,28 @@ use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 use crate::units::vector::{Vec3, add, norm, scale, sub};
 
-/// Rows that are computed together: their elements fit a core's share of the cache, and tables are read an eighth as often.
+/// Maximum number of rows that are computed together: they fit the cache of a core, and tables are read an eighth as often.
 const ROWS: usize = 8;
 
-/// Parts of a product, each with sums of its own.
+/// Number of parts of a product, each with its own sums.
 const PARTS: usize = 32;
 
-/// Pixels of a chunk.
 const CHUNK: usize = GROUP;
 
-/// Lanes of partial sums.
 const LANES: usize = 16;
 
 /// Real and imaginary parts of a row over a chunk of pixels.
 type Piece = [[f32; CHUNK]; 2];
 
-/// A cap that holds a chunk of pixels.
+/// A spherical cap that encloses a chunk of pixels.
 #[derive(Clone, Copy, Debug)]
 struct Cap {
     centre: Vec3,
-    /// Greatest distance of anything in it from `centre`.
+    /// Maximum distance of a point of the chunk from `centre`.
     radius: f64,
 }
 
-/// How a pair sees a chunk of pixels.
+/// Visibility of a chunk of pixels to a pair: hidden, crossed by a limb, or fully visible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum ChunkView {
     Hidden,
@@ -51,29 +49,29 @@ enum ChunkView {
     Open,
 }
 
-/// Products with rows of B of any pairs; rows are not kept. Vectors are maps in RING order; rows are times the pixels' area.
+/// Products with rows of B, which are not stored. Vectors are maps in RING order; rows include the area of the pixels.
 #[derive(Debug)]
 pub struct RowProducts {
     rows: RowMaker,
-    /// RING number of the pixel at each place.
+    /// RING number of each NESTED pixel.
     ring: Vec<usize>,
     chunks: Vec<[[f64; CHUNK]; 3]>,
     caps: Vec<Cap>,
 }
 
-/// Vectors over pixels as kernels read them: chunks in NESTED order, scaled to at most 1.
-struct Scaled {
+/// Map in the layout of the kernels: chunks in NESTED order, scaled to at most 1.
+struct ScaledMap {
     chunks: Vec<[f32; CHUNK]>,
     scale: f64,
 }
 
-/// Rows of a block, chunk by chunk.
+/// Rows of a group, chunk by chunk.
 struct ChunkedRows {
     pieces: Vec<[Piece; ROWS]>,
-    sights: Vec<[ChunkView; ROWS]>,
+    views: Vec<[ChunkView; ROWS]>,
 }
 
-/// Rows that are computed together, of one class of blocks.
+/// Rows that are computed together, with one class of blocks.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct RowGroup {
     first: usize,
@@ -84,29 +82,28 @@ struct RowGroup {
 /// Factors of the real and imaginary parts of each row of a block, by column.
 type Factors = Vec<[[f32; 2]; ROWS]>;
 
-/// Sums over a map, chunk by chunk.
 type ChunkSums = Vec<[f64; CHUNK]>;
 
 impl RowProducts {
-    /// For maps of `nside`.
+    /// Prepares products for maps of `nside`.
     ///
     /// # Errors
     /// As [`RowMaker::new`].
     pub fn new(nside: usize, method: PixelMethod) -> Result<Self, ResponseError> {
         let order = PixelOrder::Nested;
-        let rows = RowMaker::in_order(nside, method, order)?;
+        let rows = RowMaker::with_order(nside, method, order)?;
         let pixels = rows.pixels();
         let ring: Vec<usize> = (0..pixels).map(|place| order.ring(nside, place)).collect();
         let n = pixel_directions(nside);
         let (mut chunks, mut caps) = (Vec::new(), Vec::new());
-        // No point of a pixel is further from its centre than the root of its area.
+        // No point of a pixel is farther from its centre than the root of its area.
         let margin = if method == PixelMethod::Centre { 1e-9 } else { rows.pixel_width_rad() };
         for places in ring.chunks(CHUNK) {
             let sum = places.iter().fold([0.0; 3], |sum, &pixel| add(sum, n[pixel]));
             let centre = scale(1.0 / places.len() as f64, sum);
             let radius = places.iter().map(|&pixel| norm(sub(n[pixel], centre))).fold(0.0, f64::max);
             caps.push(Cap { centre, radius: radius + margin });
-            // The last chunk is filled with its last pixel, which counts once.
+            // The last chunk is padded with its last pixel, which counts only once.
             let mut chunk = [[0.0; CHUNK]; 3];
             for lane in 0..CHUNK {
                 let pixel = places[lane.min(places.len() - 1)];
@@ -123,33 +120,33 @@ impl RowProducts {
         self.ring.len()
     }
 
-    /// Memory of products of `columns` vectors at once on `threads` threads, bytes: the rows of a block for each thread, and the sums of all
-    /// parts.
+    /// Memory of products of `columns` vectors together on `threads` threads, bytes: the rows of a group for each thread, and the sums
+    /// of all parts.
     #[must_use]
     pub fn memory_bytes(nside: usize, columns: usize, threads: usize) -> u64 {
         let chunks = (12 * nside * nside).div_ceil(CHUNK);
-        let made = chunks * (size_of::<[Piece; ROWS]>() + ROWS);
-        // Tables of averages: centres, slopes and radii; centres alone without.
+        let row_bytes = chunks * (size_of::<[Piece; ROWS]>() + ROWS);
+        // Tables of averages: centres, slopes and radii.
         let tables = chunks * CHUNK * (3 * 8 + 16 * 4 + 3 * 8 + 3 * 8 + 8);
-        (threads.min(PARTS) * made + PARTS * columns * chunks * CHUNK * 8 + tables) as u64
+        (threads.min(PARTS) * row_bytes + PARTS * columns * chunks * CHUNK * 8 + tables) as u64
     }
 
-    /// `Bt W B x` for several x, W the weights of the pairs.
+    /// Computes `Bt W B x` for several x, with W the weights of the pairs.
     #[must_use]
     pub fn normal(&self, pairs: &[PairGeometry], weights: &[f64], x: &[&[f64]]) -> Vec<Vec<f64>> {
-        let scaled: Vec<Scaled> = x.iter().map(|x| self.scaled(x)).collect();
+        let scaled: Vec<ScaledMap> = x.iter().map(|x| self.scale_map(x)).collect();
         let largest = weights.iter().copied().fold(0.0, f64::max);
-        let mut sums = self.sums(pairs, x.len(), &|together, made, sums| {
-            let seen = made.forward(together.count, &scaled);
-            let factors = |seen: &[[f64; 2]; ROWS]| {
+        let mut sums = self.sums(pairs, x.len(), &|group, chunked_rows, sums| {
+            let visibilities = chunked_rows.forward(group.count, &scaled);
+            let factors = |visibilities: &[[f64; 2]; ROWS]| {
                 let mut factors = [[0.0; 2]; ROWS];
-                for (row, factors) in factors.iter_mut().enumerate().take(together.count) {
-                    let weight = weights[together.first + row] / largest;
-                    *factors = seen[row].map(|seen| (weight * seen) as f32);
+                for (row, factors) in factors.iter_mut().enumerate().take(group.count) {
+                    let weight = weights[group.first + row] / largest;
+                    *factors = visibilities[row].map(|part| (weight * part) as f32);
                 }
                 factors
             };
-            made.add_to(together.count, &seen.iter().map(factors).collect(), sums);
+            chunked_rows.add_to(group.count, &visibilities.iter().map(factors).collect(), sums);
         });
         let area_sr = pixel_area_sr(self.rows.nside());
         for (sums, scaled) in sums.iter_mut().zip(&scaled) {
@@ -159,23 +156,23 @@ impl RowProducts {
         sums
     }
 
-    /// `Bt v` for several v, by pair: the sum of real parts times real rows and imaginary parts times imaginary ones.
+    /// Computes `Bt v` for several v with one value per pair: real parts times real rows plus imaginary parts times imaginary rows.
     #[must_use]
     pub fn adjoint(&self, pairs: &[PairGeometry], values: &[&[Complex64]]) -> Vec<Vec<f64>> {
         let size =
             |values: &&[Complex64]| values.iter().map(|v| v.re.abs().max(v.im.abs())).fold(0.0, f64::max);
         let scales: Vec<f64> =
             values.iter().map(size).map(|size| if size > 0.0 { size } else { 1.0 }).collect();
-        let mut sums = self.sums(pairs, values.len(), &|together, made, sums| {
+        let mut sums = self.sums(pairs, values.len(), &|group, chunked_rows, sums| {
             let factors = |(values, scale): (&&[Complex64], &f64)| {
                 let mut factors = [[0.0; 2]; ROWS];
-                for (row, factors) in factors.iter_mut().enumerate().take(together.count) {
-                    let value = values[together.first + row] / *scale;
+                for (row, factors) in factors.iter_mut().enumerate().take(group.count) {
+                    let value = values[group.first + row] / *scale;
                     *factors = [value.re as f32, value.im as f32];
                 }
                 factors
             };
-            made.add_to(together.count, &values.iter().zip(&scales).map(factors).collect(), sums);
+            chunked_rows.add_to(group.count, &values.iter().zip(&scales).map(factors).collect(), sums);
         });
         let area_sr = pixel_area_sr(self.rows.nside());
         for (sums, scale) in sums.iter_mut().zip(&scales) {
@@ -184,22 +181,28 @@ impl RowProducts {
         sums
     }
 
-    /// `B x`, by pair.
+    /// Computes `B x`: one value per pair.
     #[must_use]
     pub fn forward(&self, pairs: &[PairGeometry], x: &[f64]) -> Vec<Complex64> {
-        let scaled = [self.scaled(x)];
+        let scaled = [self.scale_map(x)];
         let unit = pixel_area_sr(self.rows.nside()) * scaled[0].scale;
-        let of_block = |made: &mut ChunkedRows, together: &RowGroup| -> Vec<Complex64> {
-            self.make(pairs, together, made);
-            let seen = made.forward(together.count, &scaled);
-            seen[0][..together.count].iter().map(|[re, im]| Complex64::new(re * unit, im * unit)).collect()
+        let values_of_group = |chunked_rows: &mut ChunkedRows, group: &RowGroup| -> Vec<Complex64> {
+            self.compute_rows(pairs, group, chunked_rows);
+            let visibilities = chunked_rows.forward(group.count, &scaled);
+            visibilities[0][..group.count]
+                .iter()
+                .map(|[re, im]| Complex64::new(re * unit, im * unit))
+                .collect()
         };
-        let blocks = self.blocks(pairs);
-        blocks.par_iter().map_init(|| ChunkedRows::new(self.chunks.len()), of_block).flatten_iter().collect()
+        let groups = self.row_groups(pairs);
+        groups
+            .par_iter()
+            .map_init(|| ChunkedRows::new(self.chunks.len()), values_of_group)
+            .flatten_iter()
+            .collect()
     }
 
-    /// Chunks of a map, scaled.
-    fn scaled(&self, x: &[f64]) -> Scaled {
+    fn scale_map(&self, x: &[f64]) -> ScaledMap {
         let largest = x.iter().map(|x| x.abs()).fold(0.0, f64::max);
         let scale = if largest > 0.0 { largest } else { 1.0 };
         let chunk = |places: &[usize]| {
@@ -209,11 +212,11 @@ impl RowProducts {
             }
             chunk
         };
-        Scaled { chunks: self.ring.chunks(CHUNK).map(chunk).collect(), scale }
+        ScaledMap { chunks: self.ring.chunks(CHUNK).map(chunk).collect(), scale }
     }
 
-    /// Divides pairs into blocks of neighbours of one class, and makes their tables.
-    fn blocks(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
+    /// Divides pairs into groups of consecutive pairs of one class, and builds the tables of these classes.
+    fn row_groups(&self, pairs: &[PairGeometry]) -> Vec<RowGroup> {
         let is_average = self.rows.method() == PixelMethod::Average;
         let mut blocks: Vec<RowGroup> = Vec::new();
         for (k, pair) in pairs.iter().enumerate() {
@@ -229,24 +232,24 @@ impl RowProducts {
         blocks
     }
 
-    /// Sums over blocks of rows, by column, in RING order; `add` gets each block.
+    /// Sums over groups of rows, by column, in RING order; `add` adds each group.
     fn sums(
         &self,
         pairs: &[PairGeometry],
         columns: usize,
         add: &(dyn Fn(&RowGroup, &ChunkedRows, &mut [ChunkSums]) + Sync),
     ) -> Vec<Vec<f64>> {
-        let blocks = self.blocks(pairs);
+        let groups = self.row_groups(pairs);
         let part = |blocks: &[RowGroup]| -> Vec<ChunkSums> {
             let mut sums = vec![vec![[0.0; CHUNK]; self.chunks.len()]; columns];
-            let mut made = ChunkedRows::new(self.chunks.len());
-            for together in blocks {
-                self.make(pairs, together, &mut made);
-                add(together, &made, &mut sums);
+            let mut chunked_rows = ChunkedRows::new(self.chunks.len());
+            for group in blocks {
+                self.compute_rows(pairs, group, &mut chunked_rows);
+                add(group, &chunked_rows, &mut sums);
             }
             sums
         };
-        let parts: Vec<_> = blocks.par_chunks(blocks.len().div_ceil(PARTS).max(1)).map(part).collect();
+        let parts: Vec<_> = groups.par_chunks(groups.len().div_ceil(PARTS).max(1)).map(part).collect();
         (0..columns)
             .map(|column| {
                 let mut sums = vec![0.0; self.pixels()];
@@ -259,35 +262,34 @@ impl RowProducts {
             .collect()
     }
 
-    /// Makes the rows of a block.
-    fn make(&self, pairs: &[PairGeometry], together: &RowGroup, made: &mut ChunkedRows) {
-        let pairs = &pairs[together.first..][..together.count];
-        let prepared: Vec<Prepared> = pairs.iter().map(Prepared::pair).collect();
-        for (cap, sights) in self.caps.iter().zip(&mut made.sights) {
-            for (pair, sight) in prepared.iter().zip(sights) {
-                *sight = cap.seen_by(pair);
+    fn compute_rows(&self, pairs: &[PairGeometry], group: &RowGroup, chunked_rows: &mut ChunkedRows) {
+        let pairs = &pairs[group.first..][..group.count];
+        let prepared: Vec<KernelGeometry> = pairs.iter().map(KernelGeometry::pair).collect();
+        for (cap, views) in self.caps.iter().zip(&mut chunked_rows.views) {
+            for (pair, view) in prepared.iter().zip(views) {
+                *view = cap.view_of(pair);
             }
         }
-        match (self.rows.method(), together.class) {
+        match (self.rows.method(), group.class) {
             (PixelMethod::Centre, _) => {
-                let chunks = self.chunks.iter().zip(&made.sights).zip(&mut made.pieces);
-                chunks.for_each(|((n, sights), pieces)| fringes(&prepared, sights, n, pieces));
+                let chunks = self.chunks.iter().zip(&chunked_rows.views).zip(&mut chunked_rows.pieces);
+                chunks.for_each(|((n, views), pieces)| fringes(&prepared, views, n, pieces));
             }
             (PixelMethod::Average, Some(class)) => {
-                averages(&prepared, self.rows.class(class), made);
+                averages(&prepared, self.rows.class(class), chunked_rows);
             }
-            // For verification, and for baselines that no map uses: one by one.
-            _ => self.fill(pairs, made),
+            // Row by row: for verification, and for baselines that no map uses.
+            _ => self.fill(pairs, chunked_rows),
         }
     }
 
-    fn fill(&self, pairs: &[PairGeometry], made: &mut ChunkedRows) {
+    fn fill(&self, pairs: &[PairGeometry], chunked_rows: &mut ChunkedRows) {
         let mut row = [vec![0.0_f32; self.pixels()], vec![0.0_f32; self.pixels()]];
         for (k, pair) in pairs.iter().enumerate() {
             let [re, im] = &mut row;
             self.rows.fill(pair, 1.0, re, im);
             for (part, values) in row.iter().enumerate() {
-                for (pieces, values) in made.pieces.iter_mut().zip(values.chunks(CHUNK)) {
+                for (pieces, values) in chunked_rows.pieces.iter_mut().zip(values.chunks(CHUNK)) {
                     pieces[k][part] = [0.0; CHUNK];
                     pieces[k][part][..values.len()].copy_from_slice(values);
                 }
@@ -297,7 +299,7 @@ impl RowProducts {
 }
 
 impl Cap {
-    fn seen_by(&self, pair: &Prepared) -> ChunkView {
+    fn view_of(&self, pair: &KernelGeometry) -> ChunkView {
         let [x, y, z] = self.centre;
         let (depth_i, depth_j) = pair.depths::<false>(x, y, z);
         match depth_i.min(depth_j) {
@@ -312,40 +314,43 @@ impl ChunkedRows {
     fn new(chunks: usize) -> Self {
         Self {
             pieces: vec![[[[0.0; CHUNK]; 2]; ROWS]; chunks],
-            sights: vec![[ChunkView::Hidden; ROWS]; chunks],
+            views: vec![[ChunkView::Hidden; ROWS]; chunks],
         }
     }
 
-    /// The first `count` rows times vectors.
-    fn forward(&self, count: usize, x: &[Scaled]) -> Vec<[[f64; 2]; ROWS]> {
-        let column = |x: &Scaled| {
+    fn forward(&self, count: usize, x: &[ScaledMap]) -> Vec<[[f64; 2]; ROWS]> {
+        let column = |x: &ScaledMap| {
             let mut lanes = [[[0.0_f64; LANES]; 2]; ROWS];
-            for ((pieces, sights), x) in self.pieces.iter().zip(&self.sights).zip(&x.chunks) {
-                multiply((&pieces[..count], sights), x, &mut lanes);
+            for ((pieces, views), x) in self.pieces.iter().zip(&self.views).zip(&x.chunks) {
+                multiply((&pieces[..count], views), x, &mut lanes);
             }
             lanes.map(|parts| parts.map(|lanes| lanes.iter().sum()))
         };
         x.iter().map(column).collect()
     }
 
-    /// Adds the first `count` rows times their factors.
     fn add_to(&self, count: usize, factors: &Factors, sums: &mut [ChunkSums]) {
-        for (k, (pieces, sights)) in self.pieces.iter().zip(&self.sights).enumerate() {
+        for (k, (pieces, views)) in self.pieces.iter().zip(&self.views).enumerate() {
             for (sums, factors) in sums.iter_mut().zip(factors) {
-                accumulate((&pieces[..count], sights), factors, &mut sums[k]);
+                accumulate((&pieces[..count], views), factors, &mut sums[k]);
             }
         }
     }
 }
 
-/// A S_i S_j exp(-2 pi i u . n) at the centres of a chunk, for each pair that sees some of it.
+/// Computes A S_i S_j exp(-2 pi i u . n) at the pixel centres of a chunk, for each pair that sees some of it.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn fringes(pairs: &[Prepared], sights: &[ChunkView; ROWS], n: &[[f64; CHUNK]; 3], out: &mut [Piece; ROWS]) {
+fn fringes(
+    pairs: &[KernelGeometry],
+    views: &[ChunkView; ROWS],
+    n: &[[f64; CHUNK]; 3],
+    out: &mut [Piece; ROWS],
+) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let [x, y, z] = n;
-    for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(out) {
-        if *sight == ChunkView::Hidden {
+    for ((pair, view), [re, im]) in pairs.iter().zip(views).zip(out) {
+        if *view == ChunkView::Hidden {
             continue;
         }
         let mut turns = [0.0_f32; CHUNK];
@@ -356,7 +361,7 @@ fn fringes(pairs: &[Prepared], sights: &[ChunkView; ROWS], n: &[[f64; CHUNK]; 3]
             let (cos, sin) = cos_sin_turns::<FMA>(turns[k]);
             (re[k], im[k]) = (cos, -sin);
         }
-        if *sight == ChunkView::Cut || pair.dipole.is_some() {
+        if *view == ChunkView::Cut || pair.dipole.is_some() {
             let mut seen = [1.0_f32; CHUNK];
             for k in 0..CHUNK {
                 seen[k] = if pair.sees::<FMA>(x[k], y[k], z[k]) { 1.0 } else { 0.0 };
@@ -369,15 +374,15 @@ fn fringes(pairs: &[Prepared], sights: &[ChunkView; ROWS], n: &[[f64; CHUNK]; 3]
     }
 }
 
-/// Averages over the pixels of all chunks that each pair sees some of.
-fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut ChunkedRows) {
+/// Averages over the pixels of all chunks, for each pair that sees some of them.
+fn averages(pairs: &[KernelGeometry], class: &BlockClass, chunked_rows: &mut ChunkedRows) {
     let mut means = Means::default();
     let per_pixel = class.per_side * class.per_side;
     let pixels = GROUP / per_pixel;
-    let chunks = class.whole.groups.chunks(per_pixel).zip(&made.sights).zip(&mut made.pieces);
-    for ((groups, sights), pieces) in chunks {
-        for ((pair, sight), [re, im]) in pairs.iter().zip(sights).zip(pieces) {
-            if *sight == ChunkView::Hidden {
+    let chunks = class.whole.groups.chunks(per_pixel).zip(&chunked_rows.views).zip(&mut chunked_rows.pieces);
+    for ((groups, views), pieces) in chunks {
+        for ((pair, view), [re, im]) in pairs.iter().zip(views).zip(pieces) {
+            if *view == ChunkView::Hidden {
                 continue;
             }
             let parts = re.chunks_exact_mut(pixels).zip(im.chunks_exact_mut(pixels));
@@ -395,7 +400,7 @@ fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut ChunkedRows) {
                 means_of_group(pair, set.children, group, &mut means);
                 for (lane, &place) in places.iter().enumerate() {
                     let (chunk, k) = (place as usize / CHUNK, place as usize % CHUNK);
-                    let [re, im] = &mut made.pieces[chunk][row];
+                    let [re, im] = &mut chunked_rows.pieces[chunk][row];
                     re[k] += share * means.re[lane];
                     im[k] += share * means.im[lane];
                 }
@@ -404,17 +409,17 @@ fn averages(pairs: &[Prepared], class: &BlockClass, made: &mut ChunkedRows) {
     }
 }
 
-/// Adds a chunk of rows times a chunk of a vector to lanes of partial sums: in f32 within a chunk, in f64 beyond.
+/// Adds a chunk of rows times a chunk of a vector to lanes of partial sums: in f32 within a chunk, in f64 between chunks.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn multiply(
-    (pieces, sights): (&[Piece], &[ChunkView; ROWS]),
+    (pieces, views): (&[Piece], &[ChunkView; ROWS]),
     x: &[f32; CHUNK],
     lanes: &mut [[[f64; LANES]; 2]; ROWS],
 ) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
-    for ((piece, sight), lanes) in pieces.iter().zip(sights).zip(lanes) {
-        if *sight == ChunkView::Hidden {
+    for ((piece, view), lanes) in pieces.iter().zip(views).zip(lanes) {
+        if *view == ChunkView::Hidden {
             continue;
         }
         for (values, lanes) in piece.iter().zip(lanes) {
@@ -431,18 +436,18 @@ fn multiply(
     }
 }
 
-/// Adds a chunk of rows times factors to sums: in f32 within a block of rows, in f64 beyond.
+/// Adds a chunk of rows times factors to sums: in f32 within a group of rows, in f64 between groups.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn accumulate(
-    (pieces, sights): (&[Piece], &[ChunkView; ROWS]),
+    (pieces, views): (&[Piece], &[ChunkView; ROWS]),
     factors: &[[f32; 2]; ROWS],
     sums: &mut [f64; CHUNK],
 ) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let mut block = [0.0_f32; CHUNK];
-    for (([re, im], sight), [a, b]) in pieces.iter().zip(sights).zip(factors) {
-        if *sight == ChunkView::Hidden {
+    for (([re, im], view), [a, b]) in pieces.iter().zip(views).zip(factors) {
+        if *view == ChunkView::Hidden {
             continue;
         }
         for k in 0..CHUNK {
@@ -464,7 +469,7 @@ mod tests {
 
     const MOON_M: f64 = 1.7371e6;
 
-    /// Pairs all around the Moon, of baselines up to `longest` wavelengths in turn.
+    /// Pairs all around the Moon, with baselines up to `longest` wavelengths.
     fn pairs(count: usize, longest: f64, response: AntennaResponse) -> Vec<PairGeometry> {
         let frequency_hz = 1e7;
         (0..count)
@@ -480,8 +485,7 @@ mod tests {
             .collect()
     }
 
-    /// Rows to compare with: in f64 by other code of this folder, and averages in closed form row by row (how good those are is the
-    /// matter of [`RowMaker`]'s tests).
+    /// Reference rows: in f64, or averages in closed form row by row, whose accuracy the tests of [`RowMaker`] check.
     fn rows(pairs: &[PairGeometry], nside: usize, method: PixelMethod) -> Vec<Vec<Complex64>> {
         let n = pixel_directions(nside);
         let area_sr = pixel_area_sr(nside);
@@ -508,13 +512,13 @@ mod tests {
         for (method, nside, longest) in [
             (PixelMethod::Centre, 4, 30.0),
             (PixelMethod::Centre, 1, 2.0),
-            // All classes of blocks, and beyond the last.
+            // All classes of blocks, and longer baselines.
             (PixelMethod::Average, 4, 1.9 / 0.256),
             (PixelMethod::Average, 8, 9.0 / 0.128),
             (PixelMethod::Average, 1, 2.0),
             (PixelMethod::AverageExact, 2, 4.0),
         ] {
-            // Fringes are good to 1e-6, sums in f32 to some 1e-7 of their greatest terms; a product has rows twice.
+            // Fringes are accurate to 1e-6, sums in f32 to some 1e-7 of their largest terms; a product contains rows twice.
             let tolerance = 3e-6;
             for response in [AntennaResponse::Isotropic, AntennaResponse::DipoleNormal] {
                 let pairs = pairs(41, longest, response);
@@ -554,7 +558,7 @@ mod tests {
                 }
                 let error = difference(&products.adjoint(&pairs, &[&values])[0], &expected);
                 assert!(error < tolerance, "{what}, adjoint: {error:e}");
-                // Each column has the same bits as alone.
+                // Columns do not affect each other.
                 assert!(products.normal(&pairs, &weights, &[&x[1]])[0] == found[1], "{what}");
             }
         }

@@ -1,4 +1,4 @@
-//! Rows of B by the fast path: at pixel centres, or averaged over blocks in closed form.
+//! Rows of B by the fast path, at pixel centres or averaged over blocks in closed form.
 
 use std::sync::OnceLock;
 
@@ -6,20 +6,20 @@ use multiversion::multiversion;
 
 use super::average::{Means, block_means};
 use super::blocks::{BlockClass, BlockGroup, BlockSet, GROUP};
-use super::edge::cut_mean;
 use super::exact::child_directions;
-use super::kernel::{CHUNK, Prepared, dot64};
+use super::kernel::{CHUNK, KernelGeometry, dot64};
+use super::limb_blocks::limb_block_mean;
 use super::order::PixelOrder;
 use super::{CHILDREN, Directions, PairGeometry, PixelMethod, ResponseError, exact};
 use crate::sky::healpix;
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn};
 use crate::units::vector::{Vec3, norm};
 
-/// Greatest nside of rows: blocks of nside 512 take some GB.
+/// Maximum nside of rows: blocks of nside 512 take some GB.
 const NSIDE_MAX: usize = 512;
 
-/// Classes of blocks: the longest baseline (wavelengths) times the pixel width, and the least number of blocks along a
-/// pixel's side. Maps use baselines up to 2.
+/// Classes of blocks: the longest baseline (wavelengths) times the pixel width, and the minimum number of blocks along a
+/// pixel's side. Maps use baselines up to 2 in this unit.
 const CLASSES: [(f64, usize); 5] = [(0.5, 1), (1.0, 1), (2.01, 1), (4.02, 2), (8.04, 4)];
 
 /// Element type of a row.
@@ -71,16 +71,16 @@ pub struct RowMaker {
 }
 
 impl RowMaker {
-    /// For maps of `nside` in RING order.
+    /// Prepares rows for maps of `nside` in RING order.
     ///
     /// # Errors
     /// [`ResponseError::Nside`] unless `nside` is a power of two up to 512.
     pub fn new(nside: usize, method: PixelMethod) -> Result<Self, ResponseError> {
-        Self::in_order(nside, method, PixelOrder::Ring)
+        Self::with_order(nside, method, PixelOrder::Ring)
     }
 
-    /// As [`RowMaker::new`], with pixels in some order.
-    pub(super) fn in_order(
+    /// Prepares rows with pixels in this order.
+    pub(super) fn with_order(
         nside: usize,
         method: PixelMethod,
         order: PixelOrder,
@@ -101,13 +101,13 @@ impl RowMaker {
         })
     }
 
-    /// Resolution.
+    /// Resolution of the maps.
     #[must_use]
     pub fn nside(&self) -> usize {
         self.nside
     }
 
-    /// Method.
+    /// Method by which rows represent pixels.
     #[must_use]
     pub fn method(&self) -> PixelMethod {
         self.method
@@ -126,7 +126,7 @@ impl RowMaker {
     }
 
     /// Builds the tables that rows of this pair need. Call it before parallel tasks fill rows: tables are built in
-    /// parallel too, and tasks waiting for them would block its workers.
+    /// parallel too, and tasks that wait for them would block the workers.
     pub fn prepare(&self, pair: &PairGeometry) {
         if self.method == PixelMethod::Average {
             let pixels_long = norm(pair.baseline_wavelengths()) * self.pixel_width_rad;
@@ -139,13 +139,13 @@ impl RowMaker {
         }
     }
 
-    /// The class of blocks for a baseline, in wavelengths; `None` beyond the longest.
+    /// Index of the class of blocks for a baseline, in wavelengths; `None` beyond the longest.
     pub(super) fn class_of(&self, u: Vec3) -> Option<usize> {
         let pixels_long = norm(u) * self.pixel_width_rad;
         CLASSES.iter().position(|&(longest, _)| pixels_long <= longest)
     }
 
-    /// The blocks of a class, which are made on first use.
+    /// Returns the blocks of a class, which are built on first use.
     pub(super) fn class(&self, class: usize) -> &BlockClass {
         self.classes[class].get_or_init(|| {
             let (longest, per_side) = CLASSES[class];
@@ -153,14 +153,14 @@ impl RowMaker {
         })
     }
 
-    /// Writes the pair's row, real and imaginary parts, times `factor` (pixel area and root of weight).
+    /// Writes the real and imaginary parts of the pair's row, times `factor` (pixel area and root of weight).
     ///
-    /// Both slices should have [`Self::pixels`] elements; elements beyond the shorter one are left unchanged.
+    /// Both slices should have [`Self::pixels`] elements; elements beyond the shorter slice are not changed.
     pub fn fill<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
         let pixels = self.pixels().min(re.len()).min(im.len());
         let (re, im) = (&mut re[..pixels], &mut im[..pixels]);
         match self.method {
-            PixelMethod::Centre => self.fill_centre(&Prepared::pair(pair), factor, re, im),
+            PixelMethod::Centre => self.fill_centre(&KernelGeometry::pair(pair), factor, re, im),
             PixelMethod::AverageExact => {
                 let row = exact::average_row(pair, self.nside, CHILDREN);
                 for (place, (re, im)) in re.iter_mut().zip(im).enumerate() {
@@ -172,7 +172,7 @@ impl RowMaker {
         }
     }
 
-    fn fill_centre<R: RowValue>(&self, pair: &Prepared, factor: f64, re: &mut [R], im: &mut [R]) {
+    fn fill_centre<R: RowValue>(&self, pair: &KernelGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
         let mut values = [[0.0_f32; CHUNK]; 2];
         let mut n = [[0.0_f64; CHUNK]; 3];
         let chunks = re.chunks_mut(CHUNK).zip(im.chunks_mut(CHUNK));
@@ -188,12 +188,12 @@ impl RowMaker {
     }
 
     fn fill_average<R: RowValue>(&self, pair: &PairGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
-        let prepared = Prepared::pair(pair);
+        let prepared = KernelGeometry::pair(pair);
         let Some(class) = self.class_of(prepared.u) else {
             return self.fill_children(&prepared, factor, re, im);
         };
         let blocks = self.class(class);
-        // Sums over blocks need zeros to start from; the output may hold anything.
+        // Sums start from zeros, but the output may hold any values.
         let mut row = vec![[0.0_f32; GROUP]; 2 * re.len().div_ceil(GROUP)];
         let (row_re, row_im) = row.as_flattened_mut().split_at_mut(re.len().next_multiple_of(GROUP));
         sum_whole(&prepared, blocks, row_re, row_im);
@@ -205,7 +205,7 @@ impl RowMaker {
     }
 
     /// Averages child by child, in the precision of the fast path.
-    fn fill_children<R: RowValue>(&self, pair: &Prepared, factor: f64, re: &mut [R], im: &mut [R]) {
+    fn fill_children<R: RowValue>(&self, pair: &KernelGeometry, factor: f64, re: &mut [R], im: &mut [R]) {
         const { assert!(CHUNK == CHILDREN * CHILDREN, "a chunk holds the children of one pixel") };
         let mut values = [[0.0_f32; CHUNK]; 2];
         let mut n = [[0.0_f64; CHUNK]; 3];
@@ -226,19 +226,18 @@ impl RowMaker {
     }
 }
 
-/// Means over a group of blocks, whether or not the limb cuts them.
-pub(super) fn means_of_group(pair: &Prepared, children: usize, group: &BlockGroup, means: &mut Means) {
+/// Computes the means over a group of blocks, including those that the limb crosses.
+pub(super) fn means_of_group(pair: &KernelGeometry, children: usize, group: &BlockGroup, means: &mut Means) {
     if block_means(pair, children, group, means) {
         for lane in 0..GROUP {
             if means.cut[lane] != 0.0 {
-                (means.re[lane], means.im[lane]) = cut_mean(pair, children, group, lane);
+                (means.re[lane], means.im[lane]) = limb_block_mean(pair, children, group, lane);
             }
         }
     }
 }
 
-/// Averages the blocks of each pixel.
-fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]) {
+fn sum_whole(pair: &KernelGeometry, class: &BlockClass, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
     let per_pixel = class.per_side * class.per_side;
     let pixels = GROUP / per_pixel;
@@ -250,26 +249,25 @@ fn sum_whole(pair: &Prepared, class: &BlockClass, re: &mut [f32], im: &mut [f32]
     }
 }
 
-/// Averages of `per_pixel` consecutive blocks.
+/// Averages `per_pixel` consecutive blocks for each pixel.
 pub(super) fn average(blocks: &[f32; GROUP], per_pixel: usize, pixels: &mut [f32]) {
     if per_pixel == 1 {
         return pixels.copy_from_slice(blocks);
     }
-    let share = 1.0 / per_pixel as f32;
+    let fraction = 1.0 / per_pixel as f32;
     for (pixel, blocks) in pixels.iter_mut().zip(blocks.chunks_exact(per_pixel)) {
-        *pixel = share * blocks.iter().sum::<f32>();
+        *pixel = fraction * blocks.iter().sum::<f32>();
     }
 }
 
-/// Adds the smaller blocks that fill gaps.
-fn add_finer(pair: &Prepared, set: &BlockSet, re: &mut [f32], im: &mut [f32]) {
+fn add_finer(pair: &KernelGeometry, set: &BlockSet, re: &mut [f32], im: &mut [f32]) {
     let mut means = Means::default();
-    let share = (set.children * set.children) as f32 / (CHILDREN * CHILDREN) as f32;
+    let fraction = (set.children * set.children) as f32 / (CHILDREN * CHILDREN) as f32;
     for (group, pixels) in set.groups.iter().zip(set.pixels.chunks(GROUP)) {
         means_of_group(pair, set.children, group, &mut means);
         for (lane, &pixel) in pixels.iter().enumerate() {
-            re[pixel as usize] += share * means.re[lane];
-            im[pixel as usize] += share * means.im[lane];
+            re[pixel as usize] += fraction * means.re[lane];
+            im[pixel as usize] += fraction * means.im[lane];
         }
     }
 }
@@ -281,9 +279,9 @@ fn scale<R: RowValue>(values: &[f32], factor: f64, out: &mut [R]) {
     }
 }
 
-/// A S_i S_j exp(-2 pi i u . n), real and imaginary parts, to 1e-6.
+/// Computes the real and imaginary parts of A S_i S_j exp(-2 pi i u . n), to 1e-6.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn fringes(pair: &Prepared, n: &[[f64; CHUNK]; 3], out: &mut [[f32; CHUNK]; 2]) {
+fn fringes(pair: &KernelGeometry, n: &[[f64; CHUNK]; 3], out: &mut [[f32; CHUNK]; 2]) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let [x, y, z] = n;

@@ -1,17 +1,16 @@
-//! Visibilities of a sky by direct sum over its pixels, many pairs at a time.
+//! Visibilities of a sky by direct sums over its pixels, many pairs at a time.
 
 use multiversion::multiversion;
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use super::kernel::{CHUNK, ChunkDirections, PaddedChunk, Prepared, dot64, total};
+use super::kernel::{CHUNK, ChunkDirections, KernelGeometry, PaddedChunk, dot64, total};
 use super::{Directions, PairGeometry, ResponseError, SatelliteAntenna, SingleGeometry};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
-/// Pairs of one task.
 const PAIRS_PER_TASK: usize = 32;
 
-/// Directions that a task sums for all its pairs before the next ones; they stay in the second-level cache.
+/// Directions that a task sums for all its pairs before the next section; they stay in the second-level cache.
 const SECTION: usize = 32 * CHUNK;
 
 /// Sums of a pair over a sky.
@@ -19,15 +18,15 @@ const SECTION: usize = 32 * CHUNK;
 pub struct SkySum {
     /// Sum of T A S_i S_j exp(-2 pi i u . n) dOmega, K sr.
     pub visibility_k_sr: Complex64,
-    /// Sum of T A S_i S_j dOmega: the sky's part of the system temperature, K sr.
+    /// Sum of T A S_i S_j dOmega: the contribution of the sky to the system temperature, K sr.
     pub zero_spacing_k_sr: f64,
 }
 
-/// Visibility and zero-spacing sum of each pair, for a sky (K) at `directions`, `area_sr` each.
+/// Computes the visibility and the zero-spacing sum of each pair, for a sky (K) at `directions`, `area_sr` each.
 ///
 /// Fringes are `f32`, accurate to 1e-6. Each of 16 partial sums adds 16 products in `f32`; the rest is summed in `f64`.
 /// The error is below 1e-6 of the zero-spacing sum for any number of pixels (1e-8 is typical, as fringe errors are not
-/// correlated between pixels). Runs on the current rayon pool; the result does not depend on it.
+/// correlated between pixels). The sums run on the current rayon pool, and do not depend on it.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -37,11 +36,11 @@ pub fn sky_sums(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<SkySum>, ResponseError> {
-    sums_of(pairs, Prepared::pair, directions, sky_k, area_sr)
+    prepare_and_sum(pairs, KernelGeometry::pair, directions, sky_k, area_sr)
 }
 
-/// Auto-correlation power `Int T A S dn` of each satellite, K sr, for a sky (K) at `directions`, `area_sr` each.
-/// Accuracy and threads as in [`sky_sums`].
+/// Computes the auto-correlation power `Int T A S dn` of each satellite, K sr, for a sky (K) at `directions`, `area_sr` each.
+/// Its accuracy is that of [`sky_sums`].
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -51,11 +50,11 @@ pub fn sky_powers(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<f64>, ResponseError> {
-    let sums = sums_of(singles, Prepared::single, directions, sky_k, area_sr)?;
+    let sums = prepare_and_sum(singles, KernelGeometry::single, directions, sky_k, area_sr)?;
     Ok(sums.into_iter().map(|sum| sum.zero_spacing_k_sr).collect())
 }
 
-/// [`sky_sums`] of pairs whose antennas differ, in place of their response.
+/// Computes [`sky_sums`] with individual antennas in place of the pairs' response.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -65,10 +64,10 @@ pub fn antenna_sums(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<SkySum>, ResponseError> {
-    sums_of(pairs, Prepared::antenna_pair, directions, sky_k, area_sr)
+    prepare_and_sum(pairs, KernelGeometry::antenna_pair, directions, sky_k, area_sr)
 }
 
-/// [`sky_powers`] of satellites with antennas of their own, in place of their response.
+/// Computes [`sky_powers`] with individual antennas in place of the satellites' response.
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless there is one sky value for each direction.
@@ -78,12 +77,12 @@ pub fn antenna_powers(
     sky_k: &[f32],
     area_sr: f64,
 ) -> Result<Vec<f64>, ResponseError> {
-    let sums = sums_of(singles, Prepared::antenna_single, directions, sky_k, area_sr)?;
+    let sums = prepare_and_sum(singles, KernelGeometry::antenna_single, directions, sky_k, area_sr)?;
     Ok(sums.into_iter().map(|sum| sum.zero_spacing_k_sr).collect())
 }
 
-/// Sums of T A S_i S_j exp(-2 pi i u . n) dOmega of each pair for four skies (K) at the same `directions`, K sr. Fringes are
-/// computed once for the four; each sum has the bits that [`sky_sums`] gives its sky.
+/// Computes the visibilities of each pair for four skies (K) at the same `directions`, K sr. Fringes are computed once for all
+/// four; each result is bit-identical to that of [`sky_sums`].
 ///
 /// # Errors
 /// [`ResponseError::SkyLength`] unless each sky has one value for each direction.
@@ -98,7 +97,7 @@ pub fn four_sky_sums(
     }
     let mut sums = vec![[Complex64::ZERO; 4]; pairs.len()];
     sums.par_chunks_mut(PAIRS_PER_TASK).zip(pairs.par_chunks(PAIRS_PER_TASK)).for_each(|(sums, pairs)| {
-        let prepared: Vec<Prepared> = pairs.iter().map(Prepared::pair).collect();
+        let prepared: Vec<KernelGeometry> = pairs.iter().map(KernelGeometry::pair).collect();
         for first in (0..directions.len()).step_by(SECTION) {
             let range = first..directions.len().min(first + SECTION);
             let n = [&directions.x, &directions.y, &directions.z].map(|axis| &axis[range.clone()]);
@@ -113,10 +112,10 @@ pub fn four_sky_sums(
     Ok(sums)
 }
 
-/// [`sky_sums`] of geometries that `prepare` reduces.
-fn sums_of<G: Sync>(
+/// Computes [`sky_sums`] of geometries that `prepare` converts.
+fn prepare_and_sum<G: Sync>(
     geometries: &[G],
-    prepare: fn(&G) -> Prepared,
+    prepare: fn(&G) -> KernelGeometry,
     directions: &Directions,
     sky_k: &[f32],
     area_sr: f64,
@@ -127,7 +126,7 @@ fn sums_of<G: Sync>(
     let mut sums = vec![SkySum::default(); geometries.len()];
     sums.par_chunks_mut(PAIRS_PER_TASK).zip(geometries.par_chunks(PAIRS_PER_TASK)).for_each(
         |(sums, geometries)| {
-            let prepared: Vec<Prepared> = geometries.iter().map(prepare).collect();
+            let prepared: Vec<KernelGeometry> = geometries.iter().map(prepare).collect();
             sum_prepared(sums, &prepared, directions, sky_k, area_sr);
         },
     );
@@ -136,7 +135,7 @@ fn sums_of<G: Sync>(
 
 fn sum_prepared(
     sums: &mut [SkySum],
-    prepared: &[Prepared],
+    prepared: &[KernelGeometry],
     directions: &Directions,
     sky_k: &[f32],
     area_sr: f64,
@@ -157,27 +156,27 @@ fn sum_prepared(
     }
 }
 
-/// Sums over one section, without the area: real part, imaginary part, zero spacing.
+/// Sums over one section, without the area: real part, imaginary part and zero spacing.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sum_section(pair: &Prepared, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
+fn sum_section(pair: &KernelGeometry, n: [&[f64]; 3], sky_k: &[f32]) -> [f64; 3] {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let ([[re, im]], zero) = section::<FMA, 1>(pair, n, [sky_k]);
     [re, im, zero]
 }
 
-/// The same of four skies, without zero spacings.
+/// Sums four skies over one section, without the area: real and imaginary part of each.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sum_four_sections(pair: &Prepared, n: [&[f64]; 3], skies_k: [&[f32]; 4]) -> [[f64; 2]; 4] {
+fn sum_four_sections(pair: &KernelGeometry, n: [&[f64]; 3], skies_k: [&[f32]; 4]) -> [[f64; 2]; 4] {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     section::<FMA, 4>(pair, n, skies_k).0
 }
 
-/// Real and imaginary part of the sum of each sky, and the zero spacing of the first.
+/// Sums skies over one section: real and imaginary part of each, and the zero spacing of the first.
 #[inline(always)]
 fn section<const FMA: bool, const SKIES: usize>(
-    pair: &Prepared,
+    pair: &KernelGeometry,
     n: [&[f64]; 3],
     skies_k: [&[f32]; SKIES],
 ) -> ([[f64; 2]; SKIES], f64) {
@@ -189,9 +188,9 @@ fn section<const FMA: bool, const SKIES: usize>(
         let whole = (n.map(<&[f64; CHUNK]>::try_from), skies_k.map(<&[f32; CHUNK]>::try_from));
         let (sums, zero_of_chunk) = match whole {
             ([Ok(x), Ok(y), Ok(z)], skies_k) if skies_k.iter().all(Result::is_ok) => {
-                // All are whole.
-                const NONE: &[f32; CHUNK] = &[0.0; CHUNK];
-                chunk::<FMA, SKIES>(pair, [x, y, z], skies_k.map(|sky_k| sky_k.unwrap_or(NONE)))
+                // The default is never used, as all are complete.
+                const ZEROS: &[f32; CHUNK] = &[0.0; CHUNK];
+                chunk::<FMA, SKIES>(pair, [x, y, z], skies_k.map(|sky_k| sky_k.unwrap_or(ZEROS)))
             }
             _ => {
                 let padded = skies_k.map(|sky_k| PaddedChunk::new(n, sky_k));
@@ -209,7 +208,7 @@ fn section<const FMA: bool, const SKIES: usize>(
 
 #[inline(always)]
 fn chunk<const FMA: bool, const SKIES: usize>(
-    pair: &Prepared,
+    pair: &KernelGeometry,
     n: ChunkDirections<'_>,
     skies_k: [&[f32; CHUNK]; SKIES],
 ) -> ([[f64; 2]; SKIES], f64) {
@@ -251,7 +250,7 @@ mod tests {
 
     const MOON_M: f64 = 1.7371e6;
 
-    /// On an orbit whose normal is nowhere near an axis.
+    /// A satellite on an orbit whose normal is not near an axis.
     fn single(response: AntennaResponse) -> SingleGeometry {
         let normal_hat = unit([0.3, -0.6, 0.5]);
         let r_m = scale(2.0371e6, unit(cross(normal_hat, [0.2, 0.1, -0.7])));
@@ -264,7 +263,7 @@ mod tests {
         let directions = pixel_directions(NSIDE);
         let sky_k = vec![3.0_f32; directions.len()];
         let cos = (1.0 - (MOON_M / 2.0371e6).powi(2)).sqrt();
-        // All but the Moon's cap; of dipoles at right angles to the Moon the integral of 1 - sin^2 t cos^2 p over it.
+        // The sphere without the Moon's cap; for dipoles at right angles to the Moon, the integral of 1 - sin^2 t cos^2 p over it.
         let whole = 2.0 * PI * (1.0 + cos);
         let dipole = PI * ((1.0 + cos) + (1.0 + cos.powi(3)) / 3.0);
         for (response, expected) in
@@ -273,11 +272,11 @@ mod tests {
             let one = single(response);
             let area_sr = pixel_area_sr(NSIDE);
             let found = sky_powers(&[one], &directions.as_slice().into(), &sky_k, area_sr).unwrap()[0];
-            // Pixels count whole: some 4 x 128 of them lie on the limb, each half too much or too little at random.
+            // Some 4 x 128 pixels lie on the limb, each counted fully or not at all: a random error of half a pixel.
             let limb = 0.5 * 512.0_f64.sqrt() * area_sr / expected;
             assert!((found / (3.0 * expected) - 1.0).abs() < 4.0 * limb, "{response:?}: {found}");
             let exact: f64 = directions.iter().map(|&n_hat| one.envelope(n_hat)).sum();
-            // As documented for sums of f32.
+            // The accuracy documented for sums of f32.
             assert!((found / (3.0 * exact * area_sr) - 1.0).abs() < 1e-6, "{response:?}");
         }
     }
@@ -330,9 +329,9 @@ mod tests {
             response: AntennaResponse::DipoleNormal,
         };
         let near = sky_sums(&[pair(0.5)], &directions, &sky_k, area_sr).unwrap()[0].zero_spacing_k_sr;
-        // Half a metre is 2.5e-7 rad; a plane through the two is known as well as their distance, to 1e-9 m.
+        // Half a metre is 2.5e-7 rad; the plane through both satellites is as exact as their distance, to 1e-9 m.
         assert!((near / expected - 1.0).abs() < 3e-6, "{near} {expected}");
-        // In one place they have no plane, and no answer instead of a wrong one.
+        // At one position they define no plane, and the result is NaN.
         assert_eq!(pair(0.0).orbit_normal(), None);
         assert!(sky_sums(&[pair(0.0)], &directions, &sky_k, area_sr).unwrap()[0].zero_spacing_k_sr.is_nan());
     }

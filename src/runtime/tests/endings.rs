@@ -1,4 +1,4 @@
-//! How runs end: errors, panics, cancellation, stuck stages.
+//! Ends of runs: errors, panics, cancellation and stuck stages.
 
 use std::error::Error;
 use std::sync::mpsc;
@@ -7,8 +7,7 @@ use std::time::Duration;
 use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
 use crate::runtime::{Cancel, Flow, Graph, Moment, Outlet, RuntimeError, Sink, Source, Stage};
 
-/// Runs numbers through `stage` into a sink that keeps them; without end unless something stops it.
-/// Returns the error, and whether the sink ran its `finish`.
+/// Runs numbers through `stage` into a sink that keeps them. Returns the error, and whether the sink ran its `finish`.
 fn fail_with<S>(stage: S) -> (RuntimeError, bool)
 where
     S: Stage<In = u64, Out = u64, Error = TestError> + 'static,
@@ -27,7 +26,7 @@ fn pass(n: u64, out: &mut Outlet<u64>) {
     out.push(n);
 }
 
-/// Numbers that a kept stage saves, and a stage that takes one of them and does not come back until `release`.
+/// Runs numbers through a kept stage, which saves them, and a stage that hangs on one of them until `release`.
 fn cut_run(grace: Duration, release: mpsc::Receiver<()>) -> (crate::runtime::Report, Vec<u64>, bool) {
     let cancel = Cancel::new();
     let saved = std::sync::Arc::new(std::sync::Mutex::new((Vec::new(), false)));
@@ -69,11 +68,11 @@ fn cut_run(grace: Duration, release: mpsc::Receiver<()>) -> (crate::runtime::Rep
 }
 
 #[test]
-fn a_cancelled_run_leaves_a_long_step_behind_but_not_what_is_kept() {
+fn a_cancelled_run_abandons_a_long_step_but_not_kept_stages() {
     let (release, held) = mpsc::channel();
     let (report, numbers, finished) = cut_run(Duration::from_millis(100), held);
     assert!(report.cancelled && finished);
-    // Everything that the source gave was saved.
+    // All items of the source were saved.
     assert_eq!(numbers, (0..report.stage("count").unwrap().items_out).collect::<Vec<_>>());
     assert!(report.cut.contains(&"long".to_owned()) && !report.cut.contains(&"save".to_owned()), "{report}");
     assert!(report.to_string().contains("cut short: long"), "{report}");
@@ -81,7 +80,7 @@ fn a_cancelled_run_leaves_a_long_step_behind_but_not_what_is_kept() {
 }
 
 #[test]
-fn a_cancelled_run_that_ends_in_time_is_whole() {
+fn a_cancelled_run_that_ends_in_time_is_complete() {
     let (release, held) = mpsc::channel();
     drop(release);
     let (report, _, finished) = cut_run(PATIENCE, held);
@@ -91,7 +90,7 @@ fn a_cancelled_run_that_ends_in_time_is_whole() {
 
 #[test]
 fn a_source_that_waits_for_something_else_does_not_hold_a_cancelled_run() {
-    /// Says nothing until it is released.
+    /// A source that hangs until it is released.
     struct Silent(mpsc::Receiver<()>);
     impl Source for Silent {
         type Out = u64;
@@ -108,14 +107,14 @@ fn a_source_that_waits_for_something_else_does_not_hold_a_cancelled_run() {
     graph.sink("keep", numbers, sink);
     graph.cut_after(Duration::ZERO, &["keep"]);
     cancel.cancel();
-    // It may see the flag before it waits.
+    // The source may notice the flag before it waits.
     let report = graph.run(&cancel, PATIENCE).unwrap();
     assert!(report.cancelled && kept.lock().unwrap().finished);
     drop(release);
 }
 
 #[test]
-fn an_error_in_the_middle_carries_stage_place_and_cause() {
+fn an_error_in_the_middle_has_stage_position_and_cause() {
     let (error, finished) = fail_with(Each::new(|n, out: &mut Outlet<u64>| {
         pass(n, out);
         if n == 41 { Err(TestError(n)) } else { Ok(()) }
@@ -127,7 +126,7 @@ fn an_error_in_the_middle_carries_stage_place_and_cause() {
 }
 
 #[test]
-fn an_error_in_finish_is_told_apart() {
+fn an_error_in_finish_is_distinguished() {
     let step = |n, out: &mut Outlet<u64>| {
         pass(n, out);
         Ok(())
@@ -181,7 +180,7 @@ fn a_panic_in_a_sink_is_an_error() {
     assert_eq!(error.to_string(), "stage `end` panicked at item 3: sink 3");
 }
 
-/// A source that gives three numbers and fails.
+/// A source that fails after three numbers.
 struct Failing(u64);
 
 impl Source for Failing {
@@ -198,7 +197,7 @@ impl Source for Failing {
     }
 }
 
-/// A sink that refuses to finish.
+/// A sink that fails in `finish`.
 struct FailingSink;
 
 impl Sink for FailingSink {
@@ -215,7 +214,7 @@ impl Sink for FailingSink {
 }
 
 #[test]
-fn errors_at_both_ends_say_where() {
+fn errors_of_sources_and_sinks_have_their_position() {
     let mut graph = Graph::new();
     let numbers = graph.source("start", 2, Failing(0));
     let (sink, kept) = Keep::new();
@@ -238,7 +237,7 @@ fn a_stage_that_stalls_ends_the_run_with_its_name() {
     let numbers = graph.source("count", 2, Count::to(u64::MAX));
     let step = move |n, out: &mut Outlet<u64>| {
         if n == 9 {
-            // Until the test lets go.
+            // Until the test drops the sender.
             held.recv().ok();
         }
         pass(n, out);
@@ -250,8 +249,8 @@ fn a_stage_that_stalls_ends_the_run_with_its_name() {
     graph.fail_after_stall(Duration::from_secs(1));
     let error = graph.run(&Cancel::new(), Duration::from_millis(10)).unwrap_err();
     drop(release);
-    let RuntimeError::Stalled { stages, laggards, .. } = &error else { panic!("{error:?}") };
-    assert!(stages.contains(&"middle".to_owned()) && laggards.stages.contains(&"middle".to_owned()));
+    let RuntimeError::Stalled { stages, unfinished, .. } = &error else { panic!("{error:?}") };
+    assert!(stages.contains(&"middle".to_owned()) && unfinished.stages.contains(&"middle".to_owned()));
     assert!(error.to_string().contains("`middle`"), "{error}");
     let kept = kept.lock().unwrap();
     assert!(!kept.finished && kept.items == (0..9).collect::<Vec<_>>());
@@ -292,7 +291,7 @@ fn cancelling_a_run_that_is_complete_changes_nothing() {
     let cancel = Cancel::new();
     let trigger = cancel.clone();
     let mut graph = Graph::new();
-    // The source ends in the call that makes its last number, before the sink sees it.
+    // The queues hold all numbers, so that the source ends without waiting.
     let numbers = graph.source("count", 16, Count::to(8));
     let (told, ended) = mpsc::channel();
     let wait = Each::with_finish(
@@ -323,7 +322,7 @@ fn a_stuck_stage_is_named() {
     let hang = Each::new(move |n: u64, out: &mut Outlet<u64>| {
         pass(n, out);
         if n == 2 {
-            // Waits until the test lets go of the other end.
+            // Until the test drops the sender.
             let _ = stuck.recv();
         }
         Ok(())
@@ -334,12 +333,12 @@ fn a_stuck_stage_is_named() {
     let metrics = graph.metrics();
     let error = graph.run(&Cancel::new(), Duration::from_millis(300)).unwrap_err();
 
-    let RuntimeError::Failed { stage, at, laggards, .. } = &error else { panic!("{error:?}") };
+    let RuntimeError::Failed { stage, at, unfinished, .. } = &error else { panic!("{error:?}") };
     assert_eq!((stage.as_str(), *at), ("fail", Moment::Item(2)));
-    assert_eq!(laggards.stages, ["hang"]);
+    assert_eq!(unfinished.stages, ["hang"]);
     assert!(error.to_string().contains("`hang`"), "{error}");
     drop(release);
-    // The stage ends by itself once it is free.
+    // The stage ends by itself once it no longer hangs.
     while !metrics.snapshot().iter().all(|stage| stage.ended) {
         std::thread::yield_now();
     }
@@ -348,7 +347,7 @@ fn a_stuck_stage_is_named() {
 #[test]
 fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     let (release, stuck) = mpsc::channel::<()>();
-    /// Gives nothing, for long.
+    /// A source that hangs until it is released.
     struct Silent(mpsc::Receiver<()>);
     impl Source for Silent {
         type Out = u64;
@@ -364,9 +363,9 @@ fn a_failure_wakes_a_chain_that_waits_for_its_source() {
     let numbers = graph.source("count", 1, Count::to(u64::MAX));
     graph.sink("fail", numbers, Into::new(|n: u64| if n == 9 { Err(TestError(n)) } else { Ok(()) }));
     let error = graph.run(&Cancel::new(), Duration::from_secs(2)).unwrap_err();
-    let RuntimeError::Failed { stage, laggards, .. } = &error else { panic!("{error:?}") };
+    let RuntimeError::Failed { stage, unfinished, .. } = &error else { panic!("{error:?}") };
     assert_eq!(stage, "fail");
-    // Not `waiting`: it was woken although its source said nothing.
-    assert_eq!(laggards.stages, ["silent"]);
+    // Not `waiting`, which was woken although its source was silent.
+    assert_eq!(unfinished.stages, ["silent"]);
     drop(release);
 }

@@ -1,4 +1,4 @@
-//! Order, back pressure, counting, and graphs that cannot run.
+//! Order, back pressure and counters, and graphs that cannot run.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::parts::{Count, Each, Into, Keep, PATIENCE, TestError};
 use crate::runtime::{Cancel, Flow, Graph, Outlet, RuntimeError, Source, Stage};
 
-/// Gives each number twice, and -1 at the end.
+/// A stage that emits each number twice, and -1 at the end.
 fn twice() -> impl Stage<In = u64, Out = i64, Error = TestError> {
     Each::with_finish(
         |n: u64, out: &mut Outlet<i64>| {
@@ -68,7 +68,7 @@ fn the_report_counts_what_passed() {
         assert_eq!(queue.capacity, capacity);
         assert!((1..=capacity).contains(&queue.depth_max), "{queue:?}");
         assert_eq!(stage.since_source.count, stage.items_in);
-        // An entry an input and one for the end.
+        // One entry per input and one for the end.
         assert_eq!(stage.waiting_in.count, stage.items_in + 1);
         assert_eq!(stage.working.count, stage.items_in + 1);
     }
@@ -84,8 +84,8 @@ fn the_report_counts_what_passed() {
 }
 
 #[test]
-fn what_was_there_before_the_source_took_it_is_as_old_as_it_is() {
-    /// Gives a number that waited, and one that did not.
+fn latency_counts_from_the_arrival_at_the_source() {
+    /// A source with one number that has waited and one that has not.
     struct Late(Option<Instant>);
     impl Source for Late {
         type Out = u64;
@@ -116,12 +116,12 @@ fn what_was_there_before_the_source_took_it_is_as_old_as_it_is() {
     for stage in &report.stages[1..] {
         let found = stage.since_source;
         assert!(found.max_s >= waited.as_secs_f64(), "{found:?}");
-        // The other one is new: together they are not twice as old.
+        // The second number is new, so the sum is below twice the maximum.
         assert!(found.count == 2 && found.total_s < 2.0 * found.max_s, "{found:?}");
     }
 }
 
-/// An item that knows how many of its kind there are.
+/// An item that counts how many of its kind exist.
 struct Tracked(Arc<AtomicUsize>);
 
 impl Drop for Tracked {
@@ -135,15 +135,15 @@ fn a_slow_sink_bounds_what_is_in_flight() {
     const CAPACITIES: [usize; 2] = [3, 5];
     const STAGES: usize = 3;
     let alive = Arc::new(AtomicUsize::new(0));
-    let most = Arc::new(AtomicUsize::new(0));
-    let (alive_there, most_there) = (Arc::clone(&alive), Arc::clone(&most));
+    let alive_max = Arc::new(AtomicUsize::new(0));
+    let (alive_in_stage, alive_max_in_stage) = (Arc::clone(&alive), Arc::clone(&alive_max));
 
     let mut graph = Graph::new();
     let numbers = graph.source("count", 1, Count::to(200));
     let make = Each::new(move |_: u64, out: &mut Outlet<Tracked>| {
-        let now = alive_there.fetch_add(1, Ordering::SeqCst) + 1;
-        most_there.fetch_max(now, Ordering::SeqCst);
-        out.push(Tracked(Arc::clone(&alive_there)));
+        let now = alive_in_stage.fetch_add(1, Ordering::SeqCst) + 1;
+        alive_max_in_stage.fetch_max(now, Ordering::SeqCst);
+        out.push(Tracked(Arc::clone(&alive_in_stage)));
         Ok(())
     });
     let made = graph.stage("make", CAPACITIES[0], numbers, make);
@@ -160,11 +160,11 @@ fn a_slow_sink_bounds_what_is_in_flight() {
     graph.run(&Cancel::new(), PATIENCE).unwrap();
 
     assert_eq!(alive.load(Ordering::SeqCst), 0);
-    let most = most.load(Ordering::SeqCst);
+    let alive_max = alive_max.load(Ordering::SeqCst);
     let bound = CAPACITIES.iter().sum::<usize>() + STAGES;
-    assert!(most <= bound, "{most} in flight, expected at most {bound}");
-    // The source is faster: the queues did fill.
-    assert!(most > CAPACITIES[1], "{most}");
+    assert!(alive_max <= bound, "{alive_max} in flight, expected at alive_max {bound}");
+    // The queues were full, as the source is faster.
+    assert!(alive_max > CAPACITIES[1], "{alive_max}");
 }
 
 #[test]
@@ -223,8 +223,8 @@ fn graphs_that_cannot_run_are_refused() {
 }
 
 #[test]
-fn a_stage_rests_after_the_last_item_that_waits() {
-    /// Gives three numbers, then nothing until the stage has shown that it rests after the third.
+fn idle_is_called_after_the_last_waiting_item() {
+    /// A source of three numbers, which then waits until the stage was idle after the third.
     struct Pausing(mpsc::Receiver<u64>, bool);
     impl Source for Pausing {
         type Out = u64;
@@ -248,7 +248,7 @@ fn a_stage_rests_after_the_last_item_that_waits() {
             out.push(n);
             Ok(())
         }
-        fn rest(&mut self) {
+        fn idle(&mut self) {
             let _ = self.0.send(self.1);
         }
     }

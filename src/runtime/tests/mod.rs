@@ -1,4 +1,4 @@
-//! The runner as a whole: order, bounds, endings.
+//! Tests of the whole runtime: order, bounds and ends of runs.
 
 mod endings;
 mod flow;

@@ -1,4 +1,4 @@
-//! Sources, stages and sinks of plain functions.
+//! Sources, stages and sinks made from functions.
 
 use std::marker::PhantomData;
 use std::sync::{Arc, Mutex};
@@ -8,14 +8,14 @@ use thiserror::Error;
 
 use crate::runtime::{Flow, Outlet, Sink, Source, Stage, Units};
 
-/// Long enough that no test comes near it, short enough that a deadlock shows.
+/// Time limit of test runs, which only a deadlock reaches.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Error, PartialEq, Eq)]
 #[error("refused {0}")]
 pub struct TestError(pub u64);
 
-/// Gives `0..count`, one a call.
+/// A source of the numbers `0..count`, one per call.
 pub struct Count {
     pub next: u64,
     pub count: u64,
@@ -45,7 +45,7 @@ impl Source for Count {
     }
 }
 
-/// A stage made of a function for steps and one for the end.
+/// A stage made from a function for steps and one for the end.
 pub struct Each<I, O, F, G> {
     step: F,
     finish: G,
@@ -91,14 +91,14 @@ where
     }
 }
 
-/// What a [`Keep`] took, and whether it finished.
+/// The items that a [`Keep`] has taken, and whether it finished.
 #[derive(Debug)]
 pub struct Kept<T> {
     pub items: Vec<T>,
     pub finished: bool,
 }
 
-/// Keeps all it takes, where the test can see it.
+/// A sink that keeps all items for the test.
 pub struct Keep<T>(Arc<Mutex<Kept<T>>>);
 
 impl<T> Keep<T> {
@@ -123,7 +123,7 @@ impl<T: Send> Sink for Keep<T> {
     }
 }
 
-/// A sink made of a function.
+/// A sink made from a function.
 pub struct Into<I, F> {
     take: F,
     kind: PhantomData<fn(I)>,

@@ -1,4 +1,4 @@
-//! Many short runs of random shape and fate; a deadlock would show as a run that does not end.
+//! Many short runs with random shapes and random events. A deadlock shows as a run that does not end.
 
 use std::sync::mpsc;
 use std::thread;
@@ -10,9 +10,9 @@ use rand_chacha::rand_core::SeedableRng;
 use super::parts::{Count, Each, Into, PATIENCE, TestError};
 use crate::runtime::{Cancel, Graph, Outlet, Report, RuntimeError};
 
-/// What befalls a run, at which stage and which item.
+/// The event of a run, at a stage and an item.
 #[derive(Clone, Copy, Debug)]
-enum Mishap {
+enum RunEvent {
     Nothing,
     Error { stage: u64, item: u64 },
     Panic { stage: u64, item: u64 },
@@ -21,20 +21,20 @@ enum Mishap {
 
 const ITEMS: u64 = 40;
 
-fn run(stages: u64, fate: Mishap, random: &mut ChaCha8Rng) -> Result<Report, RuntimeError> {
+fn run(stages: u64, event: RunEvent, random: &mut ChaCha8Rng) -> Result<Report, RuntimeError> {
     let cancel = Cancel::new();
     let mut graph = Graph::new();
     let mut link = graph.source("source", random.random_range(1..4), Count::to(ITEMS));
     for index in 0..stages {
         let trigger = cancel.clone();
         let step = move |n: u64, out: &mut Outlet<u64>| {
-            match fate {
-                Mishap::Error { stage, item } if (stage, item) == (index, n) => return Err(TestError(n)),
-                // Unwinds without the hook that would print every one of these.
-                Mishap::Panic { stage, item } if (stage, item) == (index, n) => {
+            match event {
+                RunEvent::Error { stage, item } if (stage, item) == (index, n) => return Err(TestError(n)),
+                // Unwinds without the hook, which would print every panic.
+                RunEvent::Panic { stage, item } if (stage, item) == (index, n) => {
                     std::panic::resume_unwind(Box::new("wanted"))
                 }
-                Mishap::Cancel { stage, item } if (stage, item) == (index, n) => trigger.cancel(),
+                RunEvent::Cancel { stage, item } if (stage, item) == (index, n) => trigger.cancel(),
                 _ => {}
             }
             out.push(n);
@@ -46,22 +46,22 @@ fn run(stages: u64, fate: Mishap, random: &mut ChaCha8Rng) -> Result<Report, Run
     graph.run(&cancel, PATIENCE)
 }
 
-fn check(stages: u64, fate: Mishap, result: Result<Report, RuntimeError>) {
-    match (fate, result) {
-        (Mishap::Nothing, Ok(report)) => {
+fn check(stages: u64, event: RunEvent, result: Result<Report, RuntimeError>) {
+    match (event, result) {
+        (RunEvent::Nothing, Ok(report)) => {
             assert_eq!(report.stage("sink").map(|sink| sink.items_in), Some(ITEMS));
         }
-        (Mishap::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, laggards, .. }))
-        | (Mishap::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, laggards, .. })) => {
+        (RunEvent::Error { stage, .. }, Err(RuntimeError::Failed { stage: name, unfinished, .. }))
+        | (RunEvent::Panic { stage, .. }, Err(RuntimeError::Panicked { stage: name, unfinished, .. })) => {
             assert_eq!(name, format!("stage {stage}"));
-            assert!(laggards.stages.is_empty(), "{laggards}");
+            assert!(unfinished.stages.is_empty(), "{unfinished}");
         }
-        (Mishap::Cancel { .. }, Ok(report)) => {
+        (RunEvent::Cancel { .. }, Ok(report)) => {
             let given = report.stage("source").map(|source| source.items_out);
             assert_eq!(report.stage("sink").map(|sink| sink.items_in), given);
             assert!(report.cancelled || given == Some(ITEMS));
         }
-        (fate, result) => panic!("{stages} stages, {fate:?}: {result:?}"),
+        (event, result) => panic!("{stages} stages, {event:?}: {result:?}"),
     }
 }
 
@@ -73,13 +73,13 @@ fn no_run_hangs() {
         for _ in 0..600 {
             let stages = random.random_range(1..5);
             let (stage, item) = (random.random_range(0..stages), random.random_range(0..ITEMS));
-            let fate = match random.random_range(0..4) {
-                0 => Mishap::Nothing,
-                1 => Mishap::Error { stage, item },
-                2 => Mishap::Panic { stage, item },
-                _ => Mishap::Cancel { stage, item },
+            let event = match random.random_range(0..4) {
+                0 => RunEvent::Nothing,
+                1 => RunEvent::Error { stage, item },
+                2 => RunEvent::Panic { stage, item },
+                _ => RunEvent::Cancel { stage, item },
             };
-            check(stages, fate, run(stages, fate, &mut random));
+            check(stages, event, run(stages, event, &mut random));
         }
         let _ = done.send(());
     });

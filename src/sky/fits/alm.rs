@@ -1,4 +1,4 @@
-//! Writing of harmonic coefficients, as healpy's `write_alm` does.
+//! Writing of harmonic coefficients in the format of healpy's `write_alm`.
 
 use std::io::Write;
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::header::BLOCK_BYTES;
 use super::write::{binary_table_cards, end_header, primary_cards, write_whole};
 use crate::sky::harmonics::Alm;
 
-/// Bytes of a row: an index of 32 bits and two doubles.
+/// Length of a row, bytes: an index of 32 bits and two doubles.
 const ROW_BYTES: usize = 20;
 
 /// Writes coefficients as a table INDEX = l^2 + l + m + 1, REAL, IMAG, which healpy's `read_alm` reads; replaces any file at `path`.

@@ -1,24 +1,23 @@
-//! Header cards: 80 characters, a keyword, a value, a comment (FITS Standard 4.0, Sect. 4).
+//! Header cards of 80 characters: a keyword, a value and a comment (FITS Standard 4.0, Sect. 4).
 
 use std::fmt;
 
 use super::error::FitsProblem;
 
-/// Length of a card, bytes.
 pub(super) const CARD_BYTES: usize = 80;
-/// Where fixed-format values of numbers end.
+/// Column at which fixed-format numbers end.
 const VALUE_END: usize = 30;
-/// Most characters of text between the quotes of one card.
+/// Maximum number of characters between the quotes of one card.
 const TEXT_MAX: usize = 68;
 
 /// The value of a card.
 #[derive(Clone, Debug, PartialEq)]
 pub enum CardValue {
-    /// T or F.
+    /// Logical value, T or F.
     Logical(bool),
-    /// An integer.
+    /// Integer.
     Integer(i64),
-    /// A finite number.
+    /// Finite real number.
     Real(f64),
     /// Printable ASCII text; text longer than a card is continued (CONTINUE cards).
     Text(String),
@@ -27,7 +26,7 @@ pub enum CardValue {
 /// A keyword of a header with its value and comment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Card {
-    /// Up to 8 of A-Z, 0-9, `-` and `_`.
+    /// Keyword of up to 8 characters A-Z, 0-9, `-` and `_`.
     pub key: String,
     /// Value.
     pub value: CardValue,
@@ -47,25 +46,25 @@ impl fmt::Display for CardValue {
 }
 
 impl Card {
-    /// A card with a text.
+    /// Creates a card with a text.
     #[must_use]
     pub fn text(key: &str, value: &str, comment: &str) -> Self {
         Self { key: key.into(), value: CardValue::Text(value.into()), comment: comment.into() }
     }
 
-    /// A card with an integer.
+    /// Creates a card with an integer.
     #[must_use]
     pub fn integer(key: &str, value: i64, comment: &str) -> Self {
         Self { key: key.into(), value: CardValue::Integer(value), comment: comment.into() }
     }
 
-    /// A card with a number.
+    /// Creates a card with a real number.
     #[must_use]
     pub fn real(key: &str, value: f64, comment: &str) -> Self {
         Self { key: key.into(), value: CardValue::Real(value), comment: comment.into() }
     }
 
-    /// A card with T or F.
+    /// Creates a card with a logical value.
     #[must_use]
     pub fn logical(key: &str, value: bool, comment: &str) -> Self {
         Self { key: key.into(), value: CardValue::Logical(value), comment: comment.into() }
@@ -101,7 +100,7 @@ impl Card {
             push_card(&format!("{:<8}= {quoted:<width$}", self.key), &self.comment, header);
             return Ok(());
         }
-        // A piece never ends between the two halves of a doubled quote.
+        // A piece must not end within a doubled quote.
         let mut rest = escaped.as_str();
         let mut start = format!("{:<8}= ", self.key);
         while rest.len() > TEXT_MAX {
@@ -152,7 +151,7 @@ fn push_card(field: &str, comment: &str, header: &mut Vec<u8>) {
     header.extend_from_slice(&card);
 }
 
-/// Text up to the closing quote, unescaped and without trailing blanks, and the rest.
+/// Returns the text up to the closing quote, unescaped and without trailing blanks, and the rest.
 fn unquote(quoted: &str) -> Option<(String, &str)> {
     let mut text = String::new();
     let mut rest = quoted;

@@ -9,12 +9,12 @@ use thiserror::Error;
 
 use crate::sky::MapError;
 
-/// A file and its problem.
+/// Problem with a map file, and the path of the file.
 #[derive(Debug)]
 pub struct FitsError {
-    /// The file.
+    /// Path of the file.
     pub path: PathBuf,
-    /// The problem.
+    /// Problem with the file.
     pub problem: Box<FitsProblem>,
 }
 
@@ -36,7 +36,7 @@ impl Error for FitsError {
     }
 }
 
-/// A problem with a map file.
+/// Problem with a map file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum FitsProblem {
@@ -45,7 +45,7 @@ pub enum FitsProblem {
     Io {
         /// The operation.
         action: &'static str,
-        /// The system's error.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The file is empty.
@@ -65,7 +65,7 @@ pub enum FitsProblem {
     Truncated {
         /// What was being read.
         expected: &'static str,
-        /// Where it would end.
+        /// Byte at which it would end.
         needed: u64,
         /// Length of the file, bytes.
         length: u64,
@@ -73,9 +73,9 @@ pub enum FitsProblem {
     /// A header without END.
     #[error("the header at byte {start} has no END card within {limit} cards; expected one")]
     EndlessHeader {
-        /// Where the header starts.
+        /// Byte at which the header starts.
         start: u64,
-        /// Greatest accepted number of cards.
+        /// Maximum number of cards.
         limit: usize,
     },
     /// The file holds no binary table.
@@ -84,7 +84,7 @@ pub enum FitsProblem {
              healpy writes maps"
     )]
     NoTable {
-        /// Header-data units found.
+        /// Number of header-data units found.
         units: usize,
     },
     /// A keyword is missing.
@@ -124,7 +124,7 @@ pub enum FitsProblem {
     /// No such column.
     #[error("the table has no map column {column} (counted from 0); expected one of its {columns}")]
     NoColumn {
-        /// Column asked for.
+        /// Requested column.
         column: usize,
         /// Number of map columns.
         columns: usize,
@@ -138,7 +138,7 @@ pub enum FitsProblem {
         found: u64,
         /// Pixels of the map.
         expected: u64,
-        /// Its nside.
+        /// nside of the map.
         nside: usize,
     },
     /// An explicitly numbered pixel does not exist or occurs twice.
@@ -148,10 +148,10 @@ pub enum FitsProblem {
         row: u64,
         /// The pixel number.
         pixel: i64,
-        /// Greatest allowed pixel number.
+        /// Maximum pixel number.
         last: u64,
     },
-    /// A partial map too sparse: the full map would be out of proportion to its file.
+    /// A partial map that is too sparse: the full map would be out of proportion to its file.
     #[error(
         "{found} pixels of a map of nside {nside} are too few to expand; expected nside up to {limit}, or \
              at least 1/16 of the sky"
@@ -161,13 +161,13 @@ pub enum FitsProblem {
         found: u64,
         /// Claimed nside.
         nside: usize,
-        /// Greatest nside of partial maps of any number of pixels.
+        /// Maximum nside of partial maps with any number of pixels.
         limit: usize,
     },
     /// A header card that cannot be written.
     #[error("the header card {key} cannot be written: {reason}")]
     Card {
-        /// Its keyword.
+        /// Keyword of the card.
         key: String,
         /// What was expected.
         reason: &'static str,
@@ -179,9 +179,9 @@ pub enum FitsProblem {
     Overflow {
         /// Name of the column.
         name: String,
-        /// RING pixel.
+        /// RING number of the pixel.
         pixel: usize,
-        /// Its value.
+        /// Value of the pixel.
         value: f64,
     },
     /// An image of incomplete rows.
@@ -189,7 +189,7 @@ pub enum FitsProblem {
     ImageSize {
         /// Number of values.
         found: u64,
-        /// Values of a row.
+        /// Number of values in a row.
         expected: u64,
     },
     /// The map itself is invalid.

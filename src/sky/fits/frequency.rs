@@ -1,67 +1,67 @@
-//! Maps of the sky at the frequency of a channel, and what is understood of a map's file.
+//! Maps of the sky at the frequency of a channel, and outlines of map files.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::claims::is_same_hz;
 use super::error::{FitsError, FitsProblem};
+use super::metadata::is_same_hz;
 use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map, read_whole_map_file};
 use crate::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use crate::units::Dimension;
 
-/// The channel for which a sky is read.
+/// Channel for which a sky is read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SkyChannel {
     /// Centre frequency, Hz.
     pub frequency_hz: f64,
-    /// Whether a sky without power will do, as the receivers have noise.
-    pub may_be_dark: bool,
-    /// Whether one file stands for several channels, so that it has to say its frequency.
-    pub shares_file: bool,
+    /// Whether a sky without power is accepted, because the receivers have noise.
+    pub is_dark_accepted: bool,
+    /// Whether one file serves several channels, and so has to state its frequency.
+    pub is_file_shared: bool,
 }
 
-/// Outline of a map's file.
+/// Outline of a map file.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MapOutline {
-    /// The file.
+    /// Path of the file.
     pub file: PathBuf,
-    /// Its frame.
+    /// Frame of the map.
     pub frame: Frame,
-    /// Whether the file does not say so.
+    /// Whether the frame is assumed, because the file does not state it.
     pub frame_assumed: bool,
-    /// Frequency for which it holds, Hz; `None` if it does not say so.
+    /// Frequency of the map, Hz; `None` if the file does not state it.
     pub frequency_hz: Option<f64>,
-    /// Unit (TUNIT); empty if it states none, which is K.
+    /// Unit (TUNIT); empty if not stated, which means K.
     pub unit: String,
     /// Name of the column; may be empty.
     pub column: String,
-    /// Columns of maps in the table.
+    /// Number of map columns in the table.
     pub columns: usize,
     /// HEALPix nside.
     pub nside: usize,
     /// Side of a pixel, degrees.
     pub pixel_deg: f64,
-    /// Greatest degree that the pixels determine well.
+    /// Maximum degree that the pixels determine well.
     pub l_max: usize,
-    /// Pixels without a value: NaN, infinite, UNSEEN or BAD_DATA. A map that has any is refused.
+    /// Number of pixels without a value (NaN, infinite, UNSEEN or BAD_DATA); 0, as a map with any is refused.
     pub bad_pixels: usize,
-    /// Mean, least and greatest value, K.
+    /// Mean, minimum and maximum value, K.
     pub mean_min_max_k: [f64; 3],
 }
 
 impl MapOutline {
-    /// The outline of a channel's map, or of the first map.
+    /// Reads the outline of a channel's map, or of the first map.
     ///
     /// # Errors
     /// As [`super::read_whole_map`].
-    pub fn of(path: &Path, options: &ReadOptions) -> Result<Self, FitsError> {
+    pub fn read(path: &Path, options: &ReadOptions) -> Result<Self, FitsError> {
         let file = read_whole_map_file(path, options)?;
         let (nside, values) = (file.map.nside(), file.map.values());
-        let (least, most) =
-            values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), &value| {
-                (least.min(value), most.max(value))
+        let (min_k, max_k) =
+            values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(min_k, max_k), &value| {
+                (min_k.min(value), max_k.max(value))
             });
         Ok(Self {
             file: path.to_owned(),
@@ -73,9 +73,9 @@ impl MapOutline {
             columns: file.columns,
             nside,
             pixel_deg: (41_252.961_249_419_27 / values.len() as f64).sqrt(),
-            l_max: SkyConfig::l_max_held(nside),
+            l_max: SkyConfig::l_max_determined(nside),
             bad_pixels: 0,
-            mean_min_max_k: [values.iter().sum::<f64>() / values.len() as f64, least, most],
+            mean_min_max_k: [values.iter().sum::<f64>() / values.len() as f64, min_k, max_k],
         })
     }
 }
@@ -92,11 +92,11 @@ impl fmt::Display for MapOutline {
             0 | 1 => String::new(),
             columns => format!(", column `{}` of {columns}", self.column),
         };
-        let [mean, least, most] = self.mean_min_max_k;
+        let [mean, min_k, max_k] = self.mean_min_max_k;
         write!(
             f,
             "{}: {frequency}, {} frame{frame}, {unit}{column}, nside {} (pixels of {:.2} deg, l up to {}), {} bad pixels, mean {mean:.4e} \
-             K, {least:.3e} K to {most:.3e} K",
+             K, {min_k:.3e} K to {max_k:.3e} K",
             self.file.display(),
             self.frame,
             self.nside,
@@ -107,16 +107,16 @@ impl fmt::Display for MapOutline {
     }
 }
 
-/// How the map files of a sky are read for a channel at `frequency_hz`.
+/// Returns the options for reading the map files of a sky for a channel at `frequency_hz`.
 #[must_use]
 pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
     ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), ..ReadOptions::default() }
 }
 
-/// Reads the map of a sky, in K, for a channel: temperatures in every pixel, of a mean above 0 unless it may be dark.
+/// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean above 0 unless the sky may be dark.
 ///
-/// A map says by FREQ, or by the name of its column, for which frequency it holds. One of another frequency is refused, or scaled by
-/// a power law, as `config` says. One that does not say is taken as it is if it is of this channel alone, but cannot be scaled.
+/// FREQ, or the name of the column, states the frequency of a map. A map of another frequency is refused, or scaled by
+/// a power law, as `config` says. A map that states no frequency is used unchanged if it serves only this channel, and cannot be scaled.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`FitsProblem::Keyword`] or [`FitsProblem::Missing`] for FREQ;
@@ -124,15 +124,15 @@ pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
 pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let map = read_at(path, channel, config)?;
     match mean_k(path, &map)? {
-        value if value <= 0.0 && !channel.may_be_dark => {
+        value if value <= 0.0 && !channel.is_dark_accepted => {
             Err(FitsError::new(path, MapError::Dark { value }.into()))
         }
         _ => Ok(map),
     }
 }
 
-/// Reads the map of a known sky, in K, to calibrate with: temperatures in every pixel, of a mean above 0. Its frequency is
-/// compared by [`check_frequency`] when the channel is known.
+/// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean above 0. When the channel
+/// is known, [`check_frequency`] compares the frequency.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`MapError::NoTemperature`], [`MapError::NothingKnown`].
@@ -144,7 +144,7 @@ pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
     }
 }
 
-/// Reads a prior map, in K: temperatures in every pixel.
+/// Reads a prior map, in K. Every pixel must be a temperature.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`MapError::NoTemperature`].
@@ -153,10 +153,10 @@ pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsErro
     mean_k(path, &map).map(|_| map)
 }
 
-/// Requires that a map is of a channel at `frequency_hz`, if it says of which frequency it is. Reads only headers.
+/// Requires that the frequency of a map is `frequency_hz`, if the map states one. Reads only headers.
 ///
 /// # Errors
-/// A file that cannot be read; [`FitsProblem::Keyword`] for FREQ.
+/// [`FitsError`] for a file that cannot be read; [`FitsProblem::Keyword`] for FREQ.
 pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> {
     match read_frequency(path)? {
         Some(map_hz) if !is_same_hz(map_hz, frequency_hz) => {
@@ -166,7 +166,7 @@ pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> 
     }
 }
 
-/// [`check_frequency`] of one map a channel; of another number of maps, which others refuse, of none.
+/// Checks the frequencies of maps ([`check_frequency`]) if there is one per channel; other numbers of maps are refused elsewhere.
 ///
 /// # Errors
 /// As [`check_frequency`].
@@ -177,20 +177,20 @@ pub fn check_frequencies<P: AsRef<Path>>(paths: &[P], channels_hz: &[f64]) -> Re
     }
 }
 
-/// Mean of a map of temperatures, K.
+/// Checks that a map has temperatures, and returns their mean, K.
 fn mean_k(path: &Path, map: &SkyMap) -> Result<f64, FitsError> {
     map.check_temperatures().map_err(|problem| FitsError::new(path, problem.into()))?;
     Ok(map.values().iter().sum::<f64>() / map.values().len() as f64)
 }
 
-/// A map of another frequency than the channel's; `otherwise` is what can be done besides giving another map.
+/// Problem of a map whose frequency differs from the channel's; `otherwise` is what the user can do instead of giving another map.
 fn other_frequency(map_hz: f64, frequency_hz: f64, otherwise: &str) -> FitsProblem {
     let [found, expected] = [map_hz, frequency_hz].map(|hz| Dimension::Frequency.show(hz));
     let expected = format!("{expected}, the channel's: give a map of that frequency{otherwise}");
     FitsProblem::keyword("FREQ", found, expected)
 }
 
-/// The map at the channel's frequency.
+/// Reads a map and converts it to the channel's frequency.
 fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let (rule, wanted_hz) = (config.frequency, channel.frequency_hz);
     let options = sky_options(config, wanted_hz);
@@ -201,8 +201,8 @@ fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyM
             MapFrequency::SpectralIndex(_) => {
                 "the map's frequency, Hz, for sky.frequency = { spectral_index = .. } to scale from"
             }
-            MapFrequency::MustMatch if channel.shares_file => {
-                "the map's frequency, Hz, as sky.file is one map for several channels: add the keyword, or give one map a channel"
+            MapFrequency::MustMatch if channel.is_file_shared => {
+                "the map's frequency, Hz, as sky.file is one map for several channels: add the keyword, or give one map per channel"
             }
             MapFrequency::MustMatch => return Ok(map),
         };

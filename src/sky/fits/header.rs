@@ -1,16 +1,16 @@
-//! Headers: cards up to END, in blocks of 2880 bytes.
+//! FITS headers: cards up to END, in blocks of 2880 bytes.
 
 use std::io::{Read, Seek, SeekFrom};
 
 use super::card::{CARD_BYTES, Card, CardValue};
 use super::error::FitsProblem;
 
-/// FITS files are read and written in multiples of this, bytes.
+/// Length of a FITS block, bytes: files consist of whole blocks.
 pub(super) const BLOCK_BYTES: usize = 2880;
-/// Greatest accepted number of cards in a header; map files have tens.
+/// Maximum number of cards in a header; map files have tens.
 const CARDS_MAX: usize = 36 * 1000;
 
-/// The cards of a header that carry values.
+/// Cards of a header that have values.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Header {
     cards: Vec<Card>,
@@ -50,7 +50,7 @@ impl Header {
         &self.cards
     }
 
-    /// With the cards of the file's first header after its own, where maps say what the table's leaves out.
+    /// Appends the cards of the file's primary header, which may have metadata that the table's header lacks.
     pub(super) fn with_primary(mut self, primary: Self) -> Self {
         self.cards.extend(primary.cards);
         self
@@ -61,18 +61,17 @@ impl Header {
         Self { cards }
     }
 
-    /// The first card of a keyword.
     pub(super) fn card(&self, key: &str) -> Option<&Card> {
         self.cards.iter().find(|card| card.key == key)
     }
 
-    /// The value of a keyword's first card.
+    /// Returns the value of a keyword's first card.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&CardValue> {
         self.card(key).map(|card| &card.value)
     }
 
-    /// The text of a keyword; numbers are not text.
+    /// Returns the text of a keyword; `None` for a number.
     #[must_use]
     pub fn text(&self, key: &str) -> Option<&str> {
         match self.get(key)? {
@@ -81,7 +80,7 @@ impl Header {
         }
     }
 
-    /// The number of a keyword.
+    /// Returns the number of a keyword; `None` for a text.
     #[must_use]
     pub fn real(&self, key: &str) -> Option<f64> {
         match self.get(key)? {
@@ -91,7 +90,7 @@ impl Header {
         }
     }
 
-    /// An optional keyword that must be an integer of at least 0.
+    /// Returns an optional keyword, which must be an integer of at least 0.
     pub(super) fn count(&self, key: &str) -> Result<Option<u64>, FitsProblem> {
         let wrong = |found: &CardValue| FitsProblem::keyword(key, found, "an integer of at least 0");
         match self.get(key) {
@@ -106,12 +105,12 @@ impl Header {
         }
     }
 
-    /// A required keyword that must be an integer of at least 0.
+    /// Returns a required keyword, which must be an integer of at least 0.
     pub(super) fn required_count(&self, key: &str) -> Result<u64, FitsProblem> {
         self.count(key)?.ok_or_else(|| FitsProblem::missing(key, "an integer of at least 0"))
     }
 
-    /// Length of the data that follow, bytes, without padding (FITS Standard 4.0, Eqs. 1 and 2).
+    /// Length of the data after the header, bytes, without padding (FITS Standard 4.0, Eqs. 1 and 2).
     pub(super) fn data_bytes(&self) -> Result<u64, FitsProblem> {
         let axes = self.required_count("NAXIS")?;
         if axes == 0 {
@@ -138,7 +137,7 @@ impl Header {
     }
 }
 
-/// Appends a card, or joins a CONTINUE card to the text before it.
+/// Appends a card, or joins a CONTINUE card to the previous text.
 fn push(cards: &mut Vec<Card>, card: Card) {
     if card.key != "CONTINUE" {
         cards.push(card);

@@ -1,4 +1,4 @@
-//! Images: arrays of numbers over two axes in the primary part of a file.
+//! Two-dimensional images in the primary part of a file.
 
 use std::path::Path;
 
@@ -7,11 +7,11 @@ use super::error::{FitsError, FitsProblem};
 use super::header::BLOCK_BYTES;
 use super::write::end_header;
 
-/// A file with an image of `width` columns in single precision, in memory; `rows` from the top of the image down, which FITS
-/// stores from the bottom up. NaN stands for no value.
+/// Creates in memory a file with an image of `width` columns in single precision. `rows` are from top to bottom, and FITS stores
+/// them from bottom to top; NaN means no value.
 ///
 /// # Errors
-/// Cards that FITS cannot represent, values that are no whole number of rows.
+/// [`FitsError`] for cards that FITS cannot represent, and values that do not fill whole rows.
 pub fn image_bytes(width: usize, rows: &[f32], cards: &[Card]) -> Result<Vec<u8>, FitsError> {
     let write = || {
         if width == 0 || !rows.len().is_multiple_of(width) {

@@ -1,17 +1,17 @@
 //! HEALPix maps in FITS files (FITS Standard 4.0; "HEALPix file format", Hivon 2013), compatible with healpy.
 //!
-//! A map file needs a small part of FITS: headers of 80-character cards and one binary table of fixed-width columns.
-//! Reading uses bounded memory: every size in the header is checked against the length of the file before anything is
-//! allocated. Writing produces healpy's cards in healpy's order, and whole files or none. General FITS libraries in
+//! A map file uses a small part of FITS: headers of 80-character cards and one binary table of fixed-width columns.
+//! Reading uses bounded memory: every size in the header is checked against the length of the file before memory is
+//! allocated. Writing produces healpy's cards in healpy's order, and is atomic. General FITS libraries in
 //! Rust trust the header (a forged TFIELDS aborts the process) or need a C library.
 
 mod alm;
 mod card;
-mod claims;
 mod error;
 mod frequency;
 mod header;
 mod image;
+mod metadata;
 mod read;
 mod table;
 mod write;

@@ -1,56 +1,55 @@
-//! Reading of maps: RING or NESTED, full or partial, any numeric type.
+//! Reading of maps in RING or NESTED order, full or partial, with any numeric type.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use super::card::CardValue;
-use super::claims::{MapUnit, column_hz, frequency_hz, is_same_hz};
 use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
+use super::metadata::{MapUnit, column_hz, frequency_hz, is_same_hz};
 use super::table::{CellType, ColumnLayout, TableLayout};
 use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count};
 use crate::sky::{Frame, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// Size of a read, about, bytes.
 const PIECE_BYTES: usize = 1 << 20;
-/// Most header-data units before the table.
+/// Maximum number of header-data units before the table.
 const UNITS_MAX: usize = 1000;
-/// Greatest nside of a partial map of any number of pixels: 100 MB when expanded.
+/// Maximum nside of a partial map with any number of pixels: 100 MB when expanded.
 const NSIDE_MAX_SPARSE: usize = 1024;
 
-/// How to read a map.
+/// Options for reading a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReadOptions {
-    /// Map column of the table, counted from 0 (pixel numbers of a partial map are not counted).
+    /// Map column of the table, counted from 0 without the column of pixel numbers.
     pub column: usize,
     /// Frame of files without COORDSYS; `None` makes such files an error.
     pub frame_if_missing: Option<Frame>,
-    /// Frequency, Hz, whose column is read in place of `column`, or the nearest, where columns say their frequencies.
+    /// Frequency, Hz: where columns state their frequencies, the column with the nearest one is read in place of `column`.
     pub frequency_hz: Option<f64>,
 }
 
-/// A map with the information of its file.
+/// A map with the metadata of its file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapFile {
     /// The map, in RING order; pixels missing from a partial map are UNSEEN.
     pub map: SkyMap,
     /// Name of the column (TTYPE), may be empty.
     pub name: String,
-    /// Its unit (TUNIT), may be empty.
+    /// Unit of the column (TUNIT), may be empty.
     pub unit: String,
-    /// Whether the file has no COORDSYS, so that the frame is an assumption of the reader.
+    /// Whether the frame is assumed, because the file has no COORDSYS.
     pub frame_assumed: bool,
-    /// The frequency for which it holds, Hz, as its column or either header says.
+    /// Frequency of the map, Hz, from its column or either header.
     pub frequency_hz: Option<f64>,
-    /// Columns with maps of this size in the table.
+    /// Number of columns with maps of this size in the table.
     pub columns: usize,
-    /// The header of the table, then that of the file.
+    /// Cards of the table's header, then of the primary header.
     pub header: Header,
 }
 
-/// Reads a map: RING or NESTED, full or partial, integers or floats of any precision.
+/// Reads a map in RING or NESTED order, full or partial, of integers or floats of any precision.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.
@@ -61,13 +60,13 @@ pub fn read_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError>
 /// Reads a map of temperatures with a usable value in every pixel, and converts it to K.
 ///
 /// # Errors
-/// [`FitsError`], including [`FitsProblem::Unit`] for a unit other than of temperature, and
+/// [`FitsError`], including [`FitsProblem::Unit`] for a unit that is not one of temperature, and
 /// [`crate::sky::MapError::BadPixels`] for pixels that are NaN, infinite or UNSEEN.
 pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
     read_whole_map_file(path, options).map(|file| file.map)
 }
 
-/// [`read_whole_map`] with the header.
+/// Reads a map as [`read_whole_map`], with the metadata of its file.
 ///
 /// # Errors
 /// As [`read_whole_map`].
@@ -86,7 +85,7 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
     Ok(file)
 }
 
-/// Notes on assumptions about a map: unit, frequency, column. Reads only headers.
+/// Lists the assumptions made about a map's unit, frequency and column. Reads only headers.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.
@@ -114,7 +113,7 @@ pub fn read_notes(path: &Path, options: &ReadOptions) -> Result<Vec<String>, Fit
     })
 }
 
-/// nside of a map; reads only headers.
+/// Reads the nside of a map, from headers only.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.
@@ -127,12 +126,12 @@ pub fn read_nside(path: &Path, options: &ReadOptions) -> Result<usize, FitsError
     })
 }
 
-/// The frequency of the first map in a file, Hz, if it says so; reads only headers.
+/// Reads the frequency of the first map in a file, Hz, if it is stated, from headers only.
 pub(super) fn read_frequency(path: &Path) -> Result<Option<f64>, FitsError> {
     read_headers(path, |header, _| frequency_hz(header, 1 + usize::from(is_explicit(header)?)))
 }
 
-/// What `read` takes from the headers of a file's first map.
+/// Applies `read` to the headers of a file's first map.
 fn read_headers<T>(
     path: &Path,
     read: impl FnOnce(&Header, &TableLayout) -> Result<T, FitsProblem>,
@@ -215,14 +214,14 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     Err(FitsProblem::NotFits { found })
 }
 
-/// Whether a value stands for none: UNSEEN, or what the header calls BAD_DATA.
+/// Returns a test for values that mean no value: UNSEEN, or the header's BAD_DATA.
 fn bad_values(header: &Header) -> impl Fn(f64) -> bool + use<> {
     let stated = header.real("BAD_DATA");
     // Single precision keeps seven digits.
     move |value| is_unseen(value) || stated.is_some_and(|bad| (value - bad).abs() <= 1e-6 * bad.abs())
 }
 
-/// The map column to be read, counted from 0: of those that say their frequencies the nearest to the one asked for.
+/// Index of the map column to read, from 0: of those that state their frequencies, the nearest to the requested one.
 fn chosen_column(
     header: &Header,
     table: &TableLayout,
@@ -233,15 +232,15 @@ fn chosen_column(
     let mut nearest: Option<(f64, usize)> = None;
     for column in 0..table.columns.len() - usize::from(explicit) {
         let Some(hz) = column_hz(header, column + 1 + usize::from(explicit))? else { continue };
-        let apart = if is_same_hz(hz, wanted_hz) { 0.0 } else { (hz / wanted_hz).ln().abs() };
-        if nearest.is_none_or(|(least, _)| apart < least) {
-            nearest = Some((apart, column));
+        let distance = if is_same_hz(hz, wanted_hz) { 0.0 } else { (hz / wanted_hz).ln().abs() };
+        if nearest.is_none_or(|(smallest, _)| distance < smallest) {
+            nearest = Some((distance, column));
         }
     }
     Ok(nearest.map_or(options.column, |(_, column)| column))
 }
 
-/// The header of the first binary table with that of the file after it, and the offset of the table's rows.
+/// Finds the first binary table: its header followed by the primary header, and the offset of its rows.
 fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u64), FitsProblem> {
     let mut at = 0;
     let mut units = 0;
@@ -264,7 +263,6 @@ fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u
     Err(FitsProblem::NoTable { units })
 }
 
-/// The unit of a column, counted from 1; empty without one.
 fn unit(header: &Header, column: usize) -> Result<String, FitsProblem> {
     let key = format!("TUNIT{column}");
     match header.get(&key) {
@@ -274,7 +272,7 @@ fn unit(header: &Header, column: usize) -> Result<String, FitsProblem> {
     }
 }
 
-/// Requires HEALPix pixels of the whole sphere, as far as the header says.
+/// Requires HEALPix pixels, if the header states the pixelisation.
 fn check_pixels(header: &Header) -> Result<(), FitsProblem> {
     match header.get("PIXTYPE") {
         None => Ok(()),
@@ -296,7 +294,7 @@ fn is_explicit(header: &Header) -> Result<bool, FitsProblem> {
     }
 }
 
-/// The column of pixel numbers, if there is one, and that of the map.
+/// Returns the column of pixel numbers, if there is one, and the column of the map.
 fn choose_columns(
     table: &TableLayout,
     explicit: bool,
@@ -308,7 +306,7 @@ fn choose_columns(
     };
     let no_column = || FitsProblem::NoColumn { column, columns: maps.len() };
     let map = maps.get(column).ok_or_else(no_column)?;
-    let key = |of: usize| format!("TFORM{of}");
+    let key = |number: usize| format!("TFORM{number}");
     if map.cell == CellType::Other || map.repeat == 0 {
         let found = format!("no numbers ({} cells)", map.repeat);
         let number = column + 1 + usize::from(explicit);
@@ -394,7 +392,7 @@ fn read_implicit(
         let name = column.name.clone();
         return Err(FitsProblem::ValueCount { name, found, expected: pixels as u64, nside });
     }
-    // The file has these values: the layout of the table was checked against its length.
+    // The layout of the table was checked against the file's length, so that the allocation is bounded by it.
     let mut values = Vec::with_capacity(pixels);
     for_each_row(reader, table, |_, row| {
         column.decode(column.cells(row), HEALPIX_UNSEEN, &mut values);

@@ -1,9 +1,8 @@
-//! The layout of a binary table with fixed-width columns, and its cells (FITS Standard 4.0, Sect. 7.3).
+//! Layout and cells of a binary table with fixed-width columns (FITS Standard 4.0, Sect. 7.3).
 
 use super::error::FitsProblem;
 use super::header::Header;
 
-/// Types of cells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum CellType {
     /// Unsigned byte, B.
@@ -18,18 +17,17 @@ pub(super) enum CellType {
     F32,
     /// Double precision, D.
     F64,
-    /// Any other type: can be skipped, not read.
+    /// Any other type, which is skipped.
     Other,
 }
 
-/// A column of the table.
 #[derive(Clone, Debug)]
 pub(super) struct ColumnLayout {
     pub name: String,
     pub cell: CellType,
-    /// Cells in a row.
+    /// Number of cells in a row.
     pub repeat: usize,
-    /// Where the column starts in a row, bytes.
+    /// Offset of the column in a row, bytes.
     pub offset: usize,
     /// Width in a row, bytes.
     pub width: usize,
@@ -38,7 +36,7 @@ pub(super) struct ColumnLayout {
     null: Option<i64>,
 }
 
-/// A table whose size was checked against the file.
+/// Layout of a table whose size was checked against the file.
 #[derive(Clone, Debug)]
 pub(super) struct TableLayout {
     pub rows: u64,
@@ -47,7 +45,7 @@ pub(super) struct TableLayout {
 }
 
 impl TableLayout {
-    /// The layout of a header whose data start at byte `start` of a file of `length` bytes.
+    /// Reads the layout from a header whose data start at byte `start` of a file of `length` bytes.
     pub(super) fn new(header: &Header, start: u64, length: u64) -> Result<Self, FitsProblem> {
         let row_bytes = header.required_count("NAXIS1")?;
         let rows = header.required_count("NAXIS2")?;
@@ -76,7 +74,7 @@ impl TableLayout {
         Ok(Self { rows, row_bytes, columns })
     }
 
-    /// Number of columns, besides pixel numbers, that are as long as `column`.
+    /// Number of columns, except pixel numbers, with as many cells as `column`.
     pub(super) fn maps_like(&self, column: &ColumnLayout, explicit: bool) -> usize {
         let others = self.columns.iter().skip(usize::from(explicit));
         others.filter(|other| other.cell != CellType::Other && other.repeat == column.repeat).count()
@@ -127,15 +125,14 @@ impl ColumnLayout {
         })
     }
 
-    /// The column's part of a row.
     pub(super) fn cells<'a>(&self, row: &'a [u8]) -> &'a [u8] {
         &row[self.offset..self.offset + self.width]
     }
 
     /// Appends the physical values of the column's part of a row; null integers become `null`.
     pub(super) fn decode(&self, cells: &[u8], null: f64, out: &mut Vec<f64>) {
-        let plain = self.scale == 1.0 && self.zero == 0.0;
-        let scaled = |value: f64| if plain { value } else { self.zero + self.scale * value };
+        let is_unscaled = self.scale == 1.0 && self.zero == 0.0;
+        let scaled = |value: f64| if is_unscaled { value } else { self.zero + self.scale * value };
         let integer = |value: i64| if self.null == Some(value) { null } else { scaled(value as f64) };
         match self.cell {
             CellType::U8 => out.extend(cells.iter().map(|&c| integer(i64::from(c)))),
@@ -148,7 +145,6 @@ impl ColumnLayout {
         }
     }
 
-    /// Appends the integers of the column's part of a row.
     pub(super) fn decode_integers(&self, cells: &[u8], out: &mut Vec<i64>) {
         let zero = self.zero as i64;
         match self.cell {

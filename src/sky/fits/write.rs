@@ -1,4 +1,4 @@
-//! Writing of maps: healpy's cards in healpy's order, whole files or none.
+//! Atomic writing of maps, with healpy's cards in healpy's order.
 
 use std::io::Write;
 use std::path::Path;
@@ -11,48 +11,48 @@ use crate::sky::healpix::{nested_to_ring, nside_of};
 use crate::sky::{Frame, MapError, SkyMap, is_unseen};
 use crate::units::constants::HEALPIX_UNSEEN;
 
-/// Values of a column in one row of the table, unless the map has fewer.
+/// Number of values of a column in one row of the table, unless the map has fewer.
 const ROW_VALUES: usize = 1024;
 
 /// Precision of the written values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Precision {
-    /// 32 bits.
+    /// Single precision, 32 bits.
     #[default]
     Single,
-    /// 64 bits.
+    /// Double precision, 64 bits.
     Double,
 }
 
 /// Order of the written pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Ordering {
-    /// RING.
+    /// RING order.
     #[default]
     Ring,
-    /// NESTED.
+    /// NESTED order.
     Nested,
 }
 
-/// How to write maps.
+/// Options for writing maps.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct WriteOptions {
     /// Precision.
     pub precision: Precision,
     /// Order of pixels in the file.
     pub ordering: Ordering,
-    /// Write only the pixels that are not UNSEEN in the first column, with their numbers.
+    /// Whether only pixels that are not UNSEEN in the first column are written, with their numbers.
     pub partial: bool,
-    /// Further header cards: the provenance of the map.
+    /// Additional header cards, for the provenance of the map.
     pub cards: Vec<Card>,
 }
 
 /// A column of the table.
 #[derive(Clone, Copy, Debug)]
 pub struct Column<'a> {
-    /// TTYPE.
+    /// Name (TTYPE).
     pub name: &'a str,
-    /// TUNIT; omitted if empty.
+    /// Unit (TUNIT); omitted if empty.
     pub unit: &'a str,
     /// Values in RING order.
     pub values: &'a [f64],
@@ -67,12 +67,13 @@ pub fn write_map(path: &Path, map: &SkyMap, options: &WriteOptions) -> Result<()
     write_columns(path, map.frame(), &[column], options)
 }
 
-/// Writes maps of one nside and frame as columns of one table; replaces any file at `path`.
+/// Writes maps of the same nside and frame as columns of one table; replaces any file at `path`.
 ///
 /// The file appears whole or not at all: it is written under a temporary name in the same folder, flushed to
 /// disk and renamed.
 ///
-/// # Errors [`FitsError`]: columns of unequal or invalid length, cards that FITS cannot represent, values beyond the
+/// # Errors
+/// [`FitsError`] for columns of unequal or invalid length, cards that FITS cannot represent, values beyond the
 /// range of the precision, or an error of the operating system.
 pub fn write_columns(
     path: &Path,
@@ -91,10 +92,10 @@ pub fn write_columns(
     write().map_err(|problem| FitsError::new(path, problem))
 }
 
-/// The file that [`write_map`] would write, in memory.
+/// Creates in memory the file that [`write_map`] writes.
 ///
 /// # Errors
-/// As [`write_columns`], but none of the operating system.
+/// As [`write_columns`], except errors of the operating system.
 pub fn map_bytes(map: &SkyMap, options: &WriteOptions) -> Result<Vec<u8>, FitsError> {
     let column = Column { name: "TEMPERATURE", unit: "K", values: map.values() };
     let write = || {
@@ -107,7 +108,7 @@ pub fn map_bytes(map: &SkyMap, options: &WriteOptions) -> Result<Vec<u8>, FitsEr
     write().map_err(|problem| FitsError::new(Path::new("memory"), problem))
 }
 
-/// The cards that describe a table of binary fields, given by name, format and unit.
+/// Creates the cards that describe a binary table with these fields: name, format and unit.
 pub(super) fn binary_table_cards(row_bytes: usize, rows: usize, fields: &[(&str, &str, &str)]) -> Vec<Card> {
     let mut cards = vec![
         Card::text("XTENSION", "BINTABLE", "binary table extension"),
@@ -182,7 +183,7 @@ impl<'a> Table<'a> {
         Ok(())
     }
 
-    /// Bytes of a pixel number: the least of 16, 32 and 64 bits that holds the greatest, as in healpy.
+    /// Length of a pixel number, bytes: the smallest of 16, 32 and 64 bits that fits all, as in healpy.
     fn number_bytes(&self) -> usize {
         match self.numbers.as_ref().map(|numbers| numbers.last().copied().unwrap_or(0)) {
             None => 0,

@@ -1,4 +1,4 @@
-//! Small scales and point sources on a map of one's own: the paper's input is a smooth map (ULSA) with both.
+//! Small scales and point sources added to a map file: the paper's input is a smooth map (ULSA) with both.
 
 use thiserror::Error;
 
@@ -9,10 +9,10 @@ use super::{FLUCTUATION_FLOOR, GeneratedSky, HASLAM_HZ};
 use crate::sky::healpix::{pixel_area_sr, pixel_of};
 use crate::sky::{AddedSky, MapError, SkyMap};
 
-/// Temperature index by which a map's emission is taken to 408 MHz, where the amplitude of small scales is known.
+/// Temperature index for scaling a map's emission to 408 MHz, where the amplitude of small scales is known.
 const INDEX_TO_HASLAM: f64 = 2.5;
 
-/// Why nothing could be added to a map.
+/// Why components could not be added to a map.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum AddedSkyError {
@@ -28,31 +28,30 @@ pub enum AddedSkyError {
 }
 
 impl AddedSky {
-    /// Reads the catalogue, if there is one.
+    /// Checks that the catalogue, if there is one, can be read.
     ///
     /// # Errors
-    /// One that cannot be read.
+    /// [`AddedSkyError::Catalogue`] if it cannot.
     pub fn check(&self) -> Result<(), AddedSkyError> {
         self.catalogue_understood().map(drop)
     }
 
-    /// The outline of the catalogue, if there is one.
+    /// Describes the catalogue as it was understood, if there is one.
     ///
     /// # Errors
-    /// One that cannot be read.
+    /// [`AddedSkyError::Catalogue`] if it cannot be read.
     pub fn catalogue_understood(&self) -> Result<Option<String>, AddedSkyError> {
         let understood = |path| Ok(Catalogue::read(path)?.to_string());
         self.catalogue.as_deref().map(understood).transpose()
     }
 
-    /// The map with what is to be added, on ecliptic axes, at `nside` or the map's own if that is finer.
+    /// Adds the components to a map, on ecliptic axes, at `nside` or at the nside of the map if that is finer.
     ///
-    /// A finer map is smoothed with the FWHM of a pixel of the coarse one, so that its edges do not show. Small scales are those of a
-    /// generated sky (Remazeilles et al. 2015), relative to the emission there; sources stand above the map, whose mean grows by
-    /// theirs.
+    /// If the map is refined, it is smoothed with the FWHM of one of its pixels, to hide their edges. Small scales are those of a
+    /// generated sky (Remazeilles et al. 2015), relative to the local emission. Sources add to the map, and so increase its mean.
     ///
     /// # Errors
-    /// A map that cannot be resampled; a catalogue that cannot be read.
+    /// [`AddedSkyError`] for a map that cannot be resampled, or a catalogue that cannot be read.
     pub fn add_to(
         &self,
         map: SkyMap,
@@ -72,7 +71,7 @@ impl AddedSky {
             let field = gaussian_field(&power, nside, seed, RandomField::SmallScales)?;
             let to_haslam = (HASLAM_HZ / frequency_hz).powf(-INDEX_TO_HASLAM);
             for (value, g) in map.values_mut().iter_mut().zip(field) {
-                // A pixel without emission has nothing that could fluctuate.
+                // A pixel without emission does not fluctuate.
                 let fraction = match *value > 0.0 {
                     true => generated.small_scale_amplitude * small_scale_fraction(g, *value * to_haslam),
                     false => 0.0,
@@ -83,9 +82,9 @@ impl AddedSky {
         let mut sources = Vec::new();
         if self.sources {
             let drawn = draw(generated, seed).into_iter();
-            sources.extend(drawn.map(|one| Source {
-                direction: one.direction,
-                flux_jy: one.flux_jy,
+            sources.extend(drawn.map(|source| Source {
+                direction: source.direction,
+                flux_jy: source.flux_jy,
                 at_hz: COUNTS_HZ,
                 index: None,
             }));
@@ -137,7 +136,7 @@ mod tests {
         fluxes.sort_by(f64::total_cmp);
         let expected = [20.0, 10.0 * (154e6f64 / 1e7).sqrt()];
         assert_eq!(fluxes.len(), 2);
-        // 20 and 39 Jy are differences of some 3e5 K.
+        // 20 and 39 Jy are small differences of some 3e5 K.
         assert!(
             fluxes.iter().zip(expected).all(|(found, flux)| (found / flux - 1.0).abs() < 1e-6),
             "{fluxes:?}"
@@ -168,7 +167,7 @@ mod tests {
         let expected = 0.0599 * (3e5 * (408e6f64 / 1e7).powf(-2.5)).powf(0.782 - 1.0) * variance.sqrt();
         // The sample variance of a field with some 1,000 modes at its peak.
         assert!((rms / expected - 1.0).abs() < 0.1, "{rms} {expected}");
-        // The same field whatever the map: another seed differs.
+        // The field depends only on the seed, not on the map.
         assert_eq!(map, added.add_to(flat(16), &config, 1e7, 64, 3).unwrap());
         assert_ne!(map, added.add_to(flat(16), &config, 1e7, 64, 4).unwrap());
     }
@@ -187,7 +186,7 @@ mod tests {
         let listed = AddedSky { catalogue: Some(file.path().to_owned()), ..AddedSky::default() };
         let again = listed.add_to(flat(64), &config, 1e7, 64, 99).unwrap();
         let differ = map.values().iter().zip(again.values()).filter(|(a, b)| (*a - *b).abs() > 1e-6 * *a);
-        // A source within 1e-9 degrees of a pixel's edge may change sides.
+        // A source within 1e-9 degrees of a pixel's edge may fall into the neighbouring pixel.
         assert!(differ.count() <= 2);
     }
 }

@@ -1,4 +1,4 @@
-//! Catalogues of point sources as they are published: tables of text with a line of names.
+//! Published catalogues of point sources: text tables with a line of column names.
 
 use std::fmt;
 use std::fs::File;
@@ -7,33 +7,33 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::columns::{Columns, plain};
+use super::columns::{Columns, normalise};
 use crate::sky::Frame;
 use crate::sky::frame::rotate;
 use crate::units::Dimension;
 use crate::units::vector::Vec3;
 
-/// Longest catalogue, bytes; lines of some 50.
+/// Maximum size of a catalogue, bytes; a line has some 50.
 const BYTES_MAX: u64 = 256 << 20;
 
 /// Why a catalogue cannot be used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CatalogueError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("the catalogue {}: {source}", path.display())]
     Read {
         /// Path.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// It is no catalogue.
+    /// The file is not a catalogue.
     #[error("the catalogue {}, line {line}: found {found}, expected {expected}", path.display())]
     Content {
         /// Path.
         path: PathBuf,
-        /// Line, from 1.
+        /// Line, counted from 1.
         line: usize,
         /// What was found.
         found: String,
@@ -42,19 +42,18 @@ pub enum CatalogueError {
     },
 }
 
-/// A point source of a catalogue.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Source {
-    /// On ecliptic axes.
+    /// Direction on ecliptic axes, a unit vector.
     pub direction: Vec3,
     pub flux_jy: f64,
     /// Frequency of the flux, Hz.
     pub at_hz: f64,
-    /// Its own spectral index; that of the section if the catalogue has none.
+    /// Spectral index in the catalogue; `None` for the index of the configuration.
     pub index: Option<f64>,
 }
 
-/// The sources of a catalogue, and how its columns were understood.
+/// Sources of a catalogue, and the interpretation of its columns.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Catalogue {
     pub sources: Vec<Source>,
@@ -70,9 +69,9 @@ impl fmt::Display for Catalogue {
         let mut hz: Vec<f64> = self.sources.iter().map(|source| source.at_hz).collect();
         hz.sort_by(f64::total_cmp);
         let at = match (hz.first(), hz.last()) {
-            (Some(&least), Some(&most)) if least == most => Dimension::Frequency.show(least),
-            (Some(&least), Some(&most)) => {
-                format!("{} to {}", Dimension::Frequency.show(least), Dimension::Frequency.show(most))
+            (Some(&lowest), Some(&highest)) if lowest == highest => Dimension::Frequency.show(lowest),
+            (Some(&lowest), Some(&highest)) => {
+                format!("{} to {}", Dimension::Frequency.show(lowest), Dimension::Frequency.show(highest))
             }
             _ => "no frequency".to_owned(),
         };
@@ -95,18 +94,17 @@ impl fmt::Display for Catalogue {
 }
 
 impl Catalogue {
-    /// Reads a catalogue.
     pub(super) fn read(path: &Path) -> Result<Self, CatalogueError> {
         Reader { path }.read()
     }
 }
 
-/// Lines of a table, and how they are cut into cells.
+/// Column names, units and numbered lines of a table.
 struct Table<'a> {
     names: Vec<String>,
     units: Vec<String>,
     rows: Vec<(usize, &'a str)>,
-    mark: char,
+    separator: char,
 }
 
 struct Reader<'a> {
@@ -114,7 +112,12 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    fn wrong(&self, line: usize, found: impl Into<String>, expected: impl Into<String>) -> CatalogueError {
+    fn content_error(
+        &self,
+        line: usize,
+        found: impl Into<String>,
+        expected: impl Into<String>,
+    ) -> CatalogueError {
         let (found, expected) = (found.into(), expected.into());
         CatalogueError::Content { path: self.path.to_owned(), line, found, expected }
     }
@@ -125,17 +128,19 @@ impl Reader<'_> {
         let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let is_vlssr = comments.chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
-        let columns = Columns::of(&table.names, is_vlssr).map_err(|expected| {
-            let names: Vec<String> = table.names.iter().take(40).map(|name| shown(name)).collect();
+        let columns = Columns::recognise(&table.names, is_vlssr).map_err(|expected| {
+            let names: Vec<String> = table.names.iter().take(40).map(|name| displayed(name)).collect();
             let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
-            self.wrong(first, format!("the columns {}", names.join(", ")), expected)
+            self.content_error(first, format!("the columns {}", names.join(", ")), expected)
         })?;
         let flux_unit = flux_unit(&table.names[columns.flux], &table.units[columns.flux])
-            .map_err(|found| self.wrong(1, found, "a flux density in Jy or mJy"))?;
+            .map_err(|found| self.content_error(1, found, "a flux density in Jy or mJy"))?;
         let sources = table
             .rows
             .iter()
-            .map(|&(line, text)| self.source(line, &cells(text, table.mark), &columns, &table, flux_unit.1))
+            .map(|&(line, text)| {
+                self.source(line, &cells(text, table.separator), &columns, &table, flux_unit.1)
+            })
             .collect::<Result<_, _>>()?;
         let name = |place: usize| table.names[place].clone();
         Ok(Catalogue {
@@ -147,7 +152,7 @@ impl Reader<'_> {
         })
     }
 
-    /// The file's text. Names in other encodings than UTF-8 keep their numbers.
+    /// Reads the file as text; invalid UTF-8, as in names in other encodings, is replaced.
     fn text(&self) -> Result<String, CatalogueError> {
         let failed = |source| CatalogueError::Read { path: self.path.to_owned(), source };
         let mut bytes = Vec::new();
@@ -165,10 +170,10 @@ impl Reader<'_> {
                 return Ok(text.strip_prefix('\u{feff}').unwrap_or(&text).to_owned());
             }
         };
-        Err(self.wrong(1, found, "a table as plain text (CSV, TSV), at most 268 MB"))
+        Err(self.content_error(1, found, "a table as plain text (CSV, TSV), at most 268 MB"))
     }
 
-    /// Names, units and rows: the names are the first line, or the last comment before numbers.
+    /// Divides the text into names, units and rows. The names are the first line, or the last comment before numbers.
     fn table<'a>(&self, text: &'a str) -> Result<Table<'a>, CatalogueError> {
         let mut comment = None;
         let mut lines = text.lines().zip(1..).map(|(text, line)| (line, text)).filter(|(_, text)| {
@@ -181,26 +186,26 @@ impl Reader<'_> {
         let first = lines.next();
         let mut rest: Vec<(usize, &str)> = lines.collect();
         let Some((line, first)) = first else {
-            return Err(self.wrong(1, "no columns", "a line of names, then a line a source"));
+            return Err(self.content_error(1, "no columns", "a line of names, then one line per source"));
         };
-        let mark = mark_of(first);
-        let is_data = |text: &str| cells(text, mark).iter().any(|cell| cell.parse::<f64>().is_ok());
+        let separator = separator_of(first);
+        let is_data = |text: &str| cells(text, separator).iter().any(|cell| cell.parse::<f64>().is_ok());
         let names = match (is_data(first), comment) {
             (true, Some(comment)) => {
                 rest.insert(0, (line, first));
-                cells(comment, mark)
+                cells(comment, separator)
             }
-            _ => cells(first, mark),
+            _ => cells(first, separator),
         };
         let is_rule = |text: &str| !text.is_empty() && text.chars().all(|c| "-=+| \t;,".contains(c));
         let mut units = vec![String::new(); names.len()];
-        let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text, mark)));
+        let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text, separator)));
         if has_units {
-            let found = cells(rest.remove(0).1, mark);
+            let found = cells(rest.remove(0).1, separator);
             units.iter_mut().zip(found).for_each(|(unit, found)| *unit = found);
         }
         rest.retain(|(_, text)| !is_rule(text));
-        Ok(Table { names, units, rows: rest, mark })
+        Ok(Table { names, units, rows: rest, separator })
     }
 
     fn source(
@@ -213,7 +218,7 @@ impl Reader<'_> {
     ) -> Result<Source, CatalogueError> {
         let cell = |place: usize| cells.get(place).map_or("", String::as_str);
         let joined = |places: &[usize]| places.iter().map(|&place| cell(place)).collect::<Vec<_>>().join(" ");
-        let angle = |k: usize, expected: &str, most: f64| {
+        let angle = |k: usize, expected: &str, limit: f64| {
             let text = joined(&columns.places[k]);
             let unit = &table.units[columns.places[k][0]];
             let is_hours = k == 0
@@ -222,14 +227,14 @@ impl Reader<'_> {
                     || is_sexagesimal(&text)
                     || unit.to_ascii_lowercase().starts_with('h'));
             let degrees = angle_of(&text).map(|value| if is_hours { 15.0 * value } else { value });
-            let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= most);
-            found.ok_or_else(|| self.wrong(line, format!("`{}`", shown(&text)), expected))
+            let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= limit);
+            found.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(&text)), expected))
         };
         let lon = angle(0, "a longitude: degrees, or hours, minutes and seconds", 360.0)?.to_radians();
         let lat = angle(1, "a latitude of -90 to 90 degrees", 90.0)?.to_radians();
         let number = |place: usize, expected: &str, good: fn(f64) -> bool| {
-            let value = number_of(cell(place), table.mark).filter(|value| good(*value));
-            value.ok_or_else(|| self.wrong(line, format!("`{}`", shown(cell(place))), expected))
+            let value = number_of(cell(place), table.separator).filter(|value| good(*value));
+            value.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(cell(place))), expected))
         };
         let flux = number(columns.flux, "a flux density above 0", |flux| flux > 0.0)?;
         let at_hz = match columns.frequency_place {
@@ -237,7 +242,7 @@ impl Reader<'_> {
             Some((place, unit)) => unit * number(place, "a frequency above 0", |value| value > 0.0)?,
         };
         let index = match columns.index {
-            // Sources that are not fitted have none.
+            // Sources without a fit have no index.
             Some(place) if !is_blank(cell(place)) => {
                 Some(number(place, "a spectral index of -10 to 10", |index| index.abs() <= 10.0)?)
             }
@@ -252,19 +257,19 @@ impl Reader<'_> {
     }
 }
 
-/// A cell as it is shown: short, and without control characters.
-fn shown(cell: &str) -> String {
+/// Formats a cell for messages: short, and without control characters.
+fn displayed(cell: &str) -> String {
     cell.chars().take(40).collect::<String>().escape_debug().to_string()
 }
 
-/// The separator of a line's cells: the first of these that occurs, or blanks.
-fn mark_of(line: &str) -> char {
-    ['\t', ';', '|', ','].into_iter().find(|mark| line.contains(*mark)).unwrap_or(' ')
+/// Detects the separator of a line's cells: the first of these characters that occurs, or blanks.
+fn separator_of(line: &str) -> char {
+    ['\t', ';', '|', ','].into_iter().find(|separator| line.contains(*separator)).unwrap_or(' ')
 }
 
-/// The cells of a line; one in quotes may hold the mark, and a doubled quote is one.
-fn cells(line: &str, mark: char) -> Vec<String> {
-    if mark == ' ' {
+/// Splits a line into cells. A cell in quotes may contain the separator, and a doubled quote means a quote.
+fn cells(line: &str, separator: char) -> Vec<String> {
+    if separator == ' ' {
         return line.split_whitespace().map(|cell| cell.trim_matches('"').to_owned()).collect();
     }
     let (mut cells, mut cell, mut quoted) = (Vec::new(), String::new(), false);
@@ -276,9 +281,9 @@ fn cells(line: &str, mark: char) -> Vec<String> {
                 cell.push('"');
             }
             '"' if quoted => quoted = false,
-            // A quote within a cell, as of inches and arcseconds, is one.
+            // A quote within a cell, as for arcseconds, is literal.
             '"' if cell.trim().is_empty() => quoted = true,
-            c if c == mark && !quoted => cells.push(std::mem::take(&mut cell)),
+            c if c == separator && !quoted => cells.push(std::mem::take(&mut cell)),
             c => cell.push(c),
         }
     }
@@ -286,25 +291,25 @@ fn cells(line: &str, mark: char) -> Vec<String> {
     cells.into_iter().map(|cell| cell.trim().to_owned()).collect()
 }
 
-/// Whether a row holds units: no numbers, and at least one unit of what a catalogue has.
+/// Whether a row contains units: no numbers, and at least one unit that is usual in catalogues.
 fn is_unit_row(cells: &[String]) -> bool {
     let units = ["deg", "jy", "mjy", "h:m:s", "d:m:s", "h m s", "d m s", "hms", "hourangle", "hours"];
-    let plain = |cell: &String| cell.trim_matches(['"', '\'', '(', ')', '[', ']']).to_ascii_lowercase();
+    let normalise = |cell: &String| cell.trim_matches(['"', '\'', '(', ')', '[', ']']).to_ascii_lowercase();
     cells.iter().all(|cell| cell.parse::<f64>().is_err())
-        && cells.iter().any(|cell| units.contains(&plain(cell).as_str()))
+        && cells.iter().any(|cell| units.contains(&normalise(cell).as_str()))
 }
 
-/// The unit of fluxes by the name of their column or the row of units, and how many Jy it is.
+/// Returns the unit of fluxes, from the row of units or the name of the column, and its value in Jy.
 fn flux_unit(name: &str, unit: &str) -> Result<(&'static str, f64), String> {
     let bracketed = name.split_once(['(', '[']).map_or("", |(_, unit)| unit.trim_end_matches([')', ']']));
     let unit = if unit.is_empty() { bracketed } else { unit };
-    let plain_name = plain(name);
+    let normalised_name = normalise(name);
     match unit.trim().to_ascii_lowercase().as_str() {
         "mjy" => Ok(("mJy", 1e-3)),
         "jy" => Ok(("Jy", 1.0)),
-        "" if plain_name.ends_with("mjy") => Ok(("mJy", 1e-3)),
+        "" if normalised_name.ends_with("mjy") => Ok(("mJy", 1e-3)),
         "" => Ok(("Jy", 1.0)),
-        other => Err(format!("the unit `{}` of `{}`", shown(other), shown(name))),
+        other => Err(format!("the unit `{}` of `{}`", displayed(other), displayed(name))),
     }
 }
 
@@ -313,9 +318,9 @@ fn is_blank(cell: &str) -> bool {
     ["", "nan", "--", "-", "null", "none", "n/a"].contains(&cell.as_str())
 }
 
-/// A finite number; with semicolons between cells a comma may be its point.
-fn number_of(cell: &str, mark: char) -> Option<f64> {
-    let pointed = if mark == ';' { cell.replace(',', ".") } else { cell.to_owned() };
+/// Parses a finite number; with semicolons as separators, a comma may be the decimal point.
+fn number_of(cell: &str, separator: char) -> Option<f64> {
+    let pointed = if separator == ';' { cell.replace(',', ".") } else { cell.to_owned() };
     pointed.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
@@ -323,13 +328,13 @@ fn is_sexagesimal(text: &str) -> bool {
     angle_parts(text).len() > 1
 }
 
-/// The numbers of an angle, between colons, blanks or the letters and signs of units.
+/// Splits an angle into numbers at colons, blanks, and the letters and signs of units.
 fn angle_parts(text: &str) -> Vec<&str> {
     let signs = |c: char| c.is_whitespace() || ":hdms\u{b0}'\"\u{2032}\u{2033}".contains(c);
     text.split(signs).filter(|part| !part.is_empty()).collect()
 }
 
-/// An angle of one number, or of up to three with minutes and seconds, in units of the first.
+/// Parses an angle of one number, or of up to three with minutes and seconds, in units of the first number.
 fn angle_of(text: &str) -> Option<f64> {
     let text = text.trim().replace('\u{2212}', "-").replace(',', ".");
     let (sign, rest) = match text.strip_prefix(['-', '+']) {
@@ -384,7 +389,7 @@ mod tests {
             let [source] = read.sources[..] else { panic!("{table}") };
             assert!((source.flux_jy / 17_690.0 - 1.0).abs() < 1e-12 && source.at_hz == 74e6, "{table}");
             let found = place(&source);
-            // Right ascensions in the tables have four digits of a degree.
+            // Right ascensions in the tables have four decimals of a degree.
             let apart = (found[0] - ecliptic[0]).abs().max((found[1] - ecliptic[1]).abs());
             assert!(apart < 1e-4, "{table}: {found:?}");
         }

@@ -1,13 +1,14 @@
-//! Which columns of a published catalogue hold positions, fluxes and spectral indices, by their names.
+//! Recognition of the columns of a published catalogue by name: positions, fluxes and spectral indices.
 
 use super::sources::COUNTS_HZ;
 use crate::sky::Frame;
 
-/// Frequency of GLEAM's wide-band fluxes and fits, and of VLSSr, Hz.
+/// Frequency of GLEAM's wide-band fluxes and fits, Hz.
 const GLEAM_WIDE_HZ: f64 = 200e6;
+
 const VLSSR_HZ: f64 = 73.8e6;
 
-/// Where longitudes and latitudes stand, by names without case and punctuation.
+/// Names of longitude and latitude columns in each frame, without case and punctuation.
 const POSITIONS: [(Frame, &[&str], &[&str]); 3] = [
     (
         Frame::Ecliptic,
@@ -39,50 +40,51 @@ const POSITIONS: [(Frame, &[&str], &[&str]); 3] = [
     ),
 ];
 
-/// Columns of hours, minutes and seconds, then sign, degrees, minutes and seconds, as VizieR keeps J2000 positions apart.
+/// Names of VizieR's separate columns of J2000 positions: hours, minutes and seconds; sign, degrees, minutes and seconds.
 const PARTS: [&[&str]; 2] = [&["rah", "ram", "ras"], &["de-", "ded", "dem", "des"]];
 
 const INDICES: [&str; 8] =
     ["spectralindex", "alpha", "spindex", "specindex", "spidx", "spix", "alphafit", "spectralindexfit"];
 
-/// Where the columns are that make a source.
+/// Indices of the columns that describe a source.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Columns {
     /// Frame of positions.
     pub frame: Frame,
-    /// Places of longitude and of latitude; several where hours or degrees, minutes and seconds stand apart.
+    /// Columns of longitude and of latitude; several where hours or degrees, minutes and seconds are separate.
     pub places: [Vec<usize>; 2],
-    /// Place of the flux.
+    /// Column of the flux.
     pub flux: usize,
-    /// Frequency of the flux, Hz; of each source's own in the column of `frequency_place`.
+    /// Frequency of the flux, Hz; NaN if each source has its own in `frequency_place`.
     pub flux_hz: f64,
-    /// Place of a column with each flux's frequency, and its unit, Hz.
+    /// Column with each flux's frequency, and its unit, Hz.
     pub frequency_place: Option<(usize, f64)>,
-    /// Place of spectral indices.
+    /// Column of spectral indices.
     pub index: Option<usize>,
 }
 
-/// A name in lower case without punctuation, except the point of a number.
-pub(super) fn plain(name: &str) -> String {
+/// Converts a name to lower case without punctuation, except decimal points.
+pub(super) fn normalise(name: &str) -> String {
     let name = name.split(['(', '[']).next().unwrap_or(name);
     let kept: String = name.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '.').collect();
     kept.trim_matches('.').to_ascii_lowercase()
 }
 
 impl Columns {
-    /// The columns of a catalogue by their names; else what is expected. Fluxes of the VLSSr name no frequency.
-    pub(super) fn of(names: &[String], is_vlssr: bool) -> Result<Self, String> {
-        let plain_names: Vec<String> = names.iter().map(|name| plain(name)).collect();
-        let place = |wanted: &str| plain_names.iter().position(|name| name == wanted);
-        let one_of = |wanted: &[&str]| wanted.iter().find_map(|name| place(name));
+    /// Recognises the columns of a catalogue by their names; the error is the expected columns. Flux columns of VLSSr do not contain
+    /// the frequency in their name.
+    pub(super) fn recognise(names: &[String], is_vlssr: bool) -> Result<Self, String> {
+        let normalised_names: Vec<String> = names.iter().map(|name| normalise(name)).collect();
+        let place = |accepted: &str| normalised_names.iter().position(|name| name == accepted);
+        let one_of = |accepted: &[&str]| accepted.iter().find_map(|name| place(name));
         let joined = || {
-            let part = |wanted: &[&str]| -> Vec<usize> {
+            let part = |accepted: &[&str]| -> Vec<usize> {
                 let at = |name: &&str| match *name {
-                    // Its sign alone has punctuation.
+                    // The column of the sign is the only name with punctuation.
                     "de-" => names.iter().position(|found| found.trim().eq_ignore_ascii_case("de-")),
                     name => place(name),
                 };
-                wanted.iter().filter_map(at).collect()
+                accepted.iter().filter_map(at).collect()
             };
             let [ra, dec] = PARTS.map(part);
             (ra.len() == 3 && dec.len() >= 3).then_some((Frame::Equatorial, [ra, dec]))
@@ -91,7 +93,7 @@ impl Columns {
             .iter()
             .find_map(|(frame, lon, lat)| Some((*frame, [vec![one_of(lon)?], vec![one_of(lat)?]])));
         let Some((frame, places)) = whole.or_else(joined) else {
-            let old = plain_names.iter().any(|name| name.contains("1950"));
+            let old = normalised_names.iter().any(|name| name.contains("1950"));
             let old = if old { "; positions of B1950 are to be precessed first" } else { "" };
             return Err(format!(
                 "columns of longitude and latitude: ecliptic_longitude_deg and ecliptic_latitude_deg, RAJ2000 and DEJ2000 (or ra, dec), or \
@@ -99,7 +101,7 @@ impl Columns {
             ));
         };
         let index = one_of(&INDICES);
-        let hz = plain_names.iter().enumerate().find_map(|(k, name)| {
+        let hz = normalised_names.iter().enumerate().find_map(|(k, name)| {
             let unit = match name.as_str() {
                 "frequencyhz" | "freqhz" => 1.0,
                 "frequencymhz" | "freqmhz" | "numhz" => 1e6,
@@ -107,7 +109,8 @@ impl Columns {
             };
             Some((k, unit))
         });
-        let Some((flux, flux_hz)) = flux_of(&plain_names, index.is_some(), hz.is_some(), is_vlssr) else {
+        let Some((flux, flux_hz)) = flux_of(&normalised_names, index.is_some(), hz.is_some(), is_vlssr)
+        else {
             return Err("a column of flux densities that names its frequency, such as flux_154mhz_jy, S74, int_flux_wide or Fintwide of \
                  GLEAM, Si of VLSSr, or flux_jy with a column frequency_mhz"
                 .to_owned());
@@ -118,12 +121,15 @@ impl Columns {
     }
 }
 
-/// The column of fluxes and its frequency, Hz: ours, else the one that belongs to fitted indices, else that of the lowest frequency;
-/// NaN for one whose frequencies stand in another column.
+/// Returns the column of fluxes and its frequency, Hz; NaN if the frequencies are in another column.
+///
+/// The first choice is the column that this program writes, then the one that belongs to fitted indices, then that of the lowest
+/// frequency.
 fn flux_of(names: &[String], has_index: bool, has_frequency: bool, is_vlssr: bool) -> Option<(usize, f64)> {
     let base = |name: &String| name.trim_end_matches("mjy").trim_end_matches("jy").to_owned();
     let bases: Vec<String> = names.iter().map(base).collect();
-    let at = |wanted: &[&str]| wanted.iter().find_map(|name| bases.iter().position(|found| found == name));
+    let at =
+        |accepted: &[&str]| accepted.iter().find_map(|name| bases.iter().position(|found| found == name));
     if let Some(own) = at(&["flux154mhz"]) {
         return Some((own, COUNTS_HZ));
     }
@@ -142,7 +148,7 @@ fn flux_of(names: &[String], has_index: bool, has_frequency: bool, is_vlssr: boo
         .or(vlssr.map(|k| (k, VLSSR_HZ)))
 }
 
-/// The frequency in the name of a column of fluxes, Hz, such as of `flux_74_mhz`, `S408`, `Fint076`, `int_flux_084`, `S_1.4GHz`.
+/// Parses the frequency in the name of a flux column, Hz, such as `flux_74_mhz`, `S408`, `Fint076`, `int_flux_084`, `S_1.4GHz`.
 fn flux_hz(name: &str) -> Option<f64> {
     const KINDS: [&str; 9] = ["s", "f", "si", "fint", "flux", "intflux", "sint", "totalflux", "fluxint"];
     let name = name.trim_end_matches("mjy").trim_end_matches("jy");
@@ -151,7 +157,7 @@ fn flux_hz(name: &str) -> Option<f64> {
     let (name, unit_hz) = stated.unwrap_or((name, 1e6));
     let (kind, digits) = name.split_at(name.find(|c: char| c.is_ascii_digit())?);
     let number: f64 = digits.parse().ok().filter(|_| digits.len() <= 6 && KINDS.contains(&kind))?;
-    // Small or broken numbers alone are of GHz, as of S1.4 and S5, or of something else.
+    // Small or fractional numbers without a unit are in GHz, as in S1.4 and S5, or no frequencies.
     let is_frequency = stated.is_some() || (number >= 8.0 && !digits.contains('.'));
     (is_frequency && number > 0.0).then_some(number * unit_hz)
 }
@@ -161,7 +167,7 @@ mod tests {
     use super::*;
 
     fn columns(names: &str) -> Result<Columns, String> {
-        Columns::of(&names.split(',').map(str::to_owned).collect::<Vec<_>>(), false)
+        Columns::recognise(&names.split(',').map(str::to_owned).collect::<Vec<_>>(), false)
     }
 
     #[test]
@@ -210,6 +216,9 @@ mod tests {
                 "{flux}"
             );
         }
-        assert_eq!(Columns::of(&["ra", "dec", "Si"].map(str::to_owned), true).unwrap().flux_hz, 73.8e6);
+        assert_eq!(
+            Columns::recognise(&["ra", "dec", "Si"].map(str::to_owned), true).unwrap().flux_hz,
+            73.8e6
+        );
     }
 }

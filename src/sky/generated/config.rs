@@ -6,9 +6,7 @@ use crate::sky::harmonics::HarmonicsError;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue, keys};
 
-/// Frequencies of generated skies, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=120e6;
-/// Finest map.
 const NSIDE_MAX: usize = 1024;
 
 keys! {
@@ -68,10 +66,10 @@ pub enum GeneratedSkyError {
 }
 
 impl GeneratedSky {
-    /// Everything that is wrong with the section; empty if it is good.
+    /// Lists the problems of the section; empty if it is valid.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("sky.generated");
+        let mut checks = Checks::new("sky.generated");
         let rules = [
             ("small_scale_amplitude", self.small_scale_amplitude, 0.0..=10.0, "0 to 10"),
             ("small_scale_fwhm_deg", self.small_scale_fwhm_deg, 0.1..=30.0, "0.1 to 30 degrees"),
@@ -95,8 +93,8 @@ impl GeneratedSky {
         for (key, value, range, expected) in rules {
             checks.number(key, value, range.contains(&value), expected);
         }
-        let (least_jy, most_jy) = (self.source_flux_jy_min, self.source_flux_jy_max);
-        checks.require("source_flux_jy_max", most_jy, most_jy > least_jy, "more than source_flux_jy_min");
+        let (min_jy, max_jy) = (self.source_flux_jy_min, self.source_flux_jy_max);
+        checks.require("source_flux_jy_max", max_jy, max_jy > min_jy, "more than source_flux_jy_min");
         checks.finish()
     }
 }

@@ -1,4 +1,4 @@
-//! Nearby features of the sky: radio loops in front of most of the gas, and nebulae that hide what is behind them.
+//! Nearby features of the sky: radio loops in front of most of the gas, and nebulae that absorb the emission behind them.
 
 use crate::units::vector::{Vec3, dot, unit};
 
@@ -12,35 +12,37 @@ struct Loop {
     brightness: f64,
 }
 
-/// Loops I to IV: centres and radii of Berkhuijsen, Haslam & Salter (1971), rounded brightnesses.
+/// Loops I to IV, with centres and radii of Berkhuijsen, Haslam & Salter (1971) and rounded brightnesses.
 const LOOPS: [Loop; 4] = [
     Loop { longitude_deg: 329.0, latitude_deg: 17.5, radius_deg: 58.0, brightness: 1.0 },
     Loop { longitude_deg: 100.0, latitude_deg: -32.5, radius_deg: 45.5, brightness: 1.0 },
     Loop { longitude_deg: 124.0, latitude_deg: 15.5, radius_deg: 32.5, brightness: 0.8 },
     Loop { longitude_deg: 315.0, latitude_deg: 48.5, radius_deg: 19.75, brightness: 0.3 },
 ];
-/// Inner radius of a shell over its outer one.
+/// Ratio of the inner to the outer radius of a shell.
 const SHELL_INNER: f64 = 0.9;
-/// Temperature of a path through a shell as long as the distance to its centre, K at the reference.
+/// Temperature for a path through a shell as long as the distance to its centre, K at the reference frequency.
 const LOOP_K: f64 = 8.65e5;
-/// Steeper than the diffuse emission, as the North Polar Spur is (Roger et al. 1999).
+
+/// Temperature index of the loops: steeper than the diffuse emission, like the North Polar Spur (Roger et al. 1999).
 const LOOP_INDEX: f64 = 2.9;
-/// Optical depth in front of the loops at the reference frequency: the local clouds.
+/// Optical depth of the local clouds in front of the loops at the reference frequency.
 const LOOP_DEPTH: f64 = 0.0037;
 /// Distance of the loops, kpc.
 const LOOP_KPC: f64 = 0.13;
-/// Longitude and latitude of the North Polar Spur, where the loops are brightest, degrees, and how sharply they fade
-/// away from it.
+/// Longitude and latitude of the North Polar Spur, where the loops are brightest, degrees.
 const SPUR_DEG: [f64; 2] = [25.0, 50.0];
+
+/// Rate at which the loops fade away from the spur.
 const SPUR_SHARPNESS: f64 = 4.4;
 
-/// A ball of ionised gas.
+/// Spherical nebula of ionised gas.
 struct Nebula {
     longitude_deg: f64,
     latitude_deg: f64,
     radius_deg: f64,
     distance_kpc: f64,
-    /// Emission measure through its middle, pc cm^-6.
+    /// Emission measure through the centre, pc cm^-6.
     emission_measure: f64,
 }
 
@@ -54,7 +56,7 @@ const fn nebula(place_deg: [f64; 2], radius_deg: f64, distance_kpc: f64, emissio
     }
 }
 
-/// Well-known nebulae: rounded positions, sizes and distances, and emission measures from their H-alpha brightness.
+/// Well-known nebulae with rounded positions, sizes and distances, and emission measures from their H-alpha brightness.
 const NEBULAE: [Nebula; 11] = [
     nebula([258.0, -2.0], 14.0, 0.45, 150.0), // Gum
     nebula([6.3, 23.6], 5.0, 0.12, 80.0),     // zeta Ophiuchi, Sh 2-27
@@ -69,13 +71,12 @@ const NEBULAE: [Nebula; 11] = [
     nebula([287.6, -0.8], 1.0, 2.3, 5_000.0), // eta Carinae
 ];
 
-/// Free-free optical depth of gas at [`ELECTRON_K`] for an emission measure of 1 pc cm^-6 at 1 GHz
-/// (Mezger & Henderson 1967): 3.28e-7 (T / 1e4 K)^-1.35.
+/// Free-free optical depth of gas at [`ELECTRON_K`] for an emission measure of 1 pc cm^-6 (Mezger & Henderson 1967):
+/// 3.28e-7 (T / 1e4 K)^-1.35 at 1 GHz.
 fn depth_per_measure(frequency_hz: f64) -> f64 {
     3.28e-7 * (ELECTRON_K / 1e4).powf(-1.35) * (frequency_hz / 1e9).powf(-OPACITY_INDEX)
 }
 
-/// A nebula at one frequency.
 struct Screen {
     direction: Vec3,
     sin2_radius: f64,
@@ -84,16 +85,14 @@ struct Screen {
     before_loops: bool,
 }
 
-/// Loops and nebulae at one frequency.
 pub(super) struct Features {
     loops: Vec<(Vec3, f64, f64)>,
     loop_depth: f64,
     spur: Vec3,
-    /// Ordered from the farthest to the nearest.
+    /// Nebulae from the farthest to the nearest.
     screens: Vec<Screen>,
 }
 
-/// A line of sight with loops and nebulae.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct FeatureSight {
     /// Temperature with loops and nebulae, K.
@@ -103,7 +102,7 @@ pub(super) struct FeatureSight {
 }
 
 impl Features {
-    /// The features at `frequency_hz` in front of and within `galaxy`.
+    /// Computes the features at `frequency_hz` in front of and within `galaxy`.
     pub fn new(frequency_hz: f64, galaxy: &Galaxy, loops: bool, nebulae: bool) -> Self {
         let ratio = frequency_hz / REFERENCE_HZ;
         let loop_k = LOOP_K * ratio.powf(-LOOP_INDEX);
@@ -116,16 +115,16 @@ impl Features {
             loops: shown
                 .iter()
                 .map(|shell| {
-                    let centre = place(shell.longitude_deg, shell.latitude_deg);
+                    let centre = direction_deg(shell.longitude_deg, shell.latitude_deg);
                     (centre, shell.radius_deg.to_radians().sin(), loop_k * shell.brightness)
                 })
                 .collect(),
             loop_depth: LOOP_DEPTH * ratio.powf(-OPACITY_INDEX),
-            spur: place(SPUR_DEG[0], SPUR_DEG[1]),
+            spur: direction_deg(SPUR_DEG[0], SPUR_DEG[1]),
             screens: screens
                 .into_iter()
                 .map(|nebula| {
-                    let direction = place(nebula.longitude_deg, nebula.latitude_deg);
+                    let direction = direction_deg(nebula.longitude_deg, nebula.latitude_deg);
                     Screen {
                         direction,
                         sin2_radius: nebula.radius_deg.to_radians().sin().powi(2),
@@ -140,7 +139,7 @@ impl Features {
 
     /// Adds loops and nebulae to a smooth sky of `diffuse_k` in a Galactic direction; the gas in
     /// front of the loops has `opacity_factor` times its mean opacity.
-    pub fn seen(&self, direction: Vec3, diffuse_k: f64, opacity_factor: f64) -> FeatureSight {
+    pub fn add_to(&self, direction: Vec3, diffuse_k: f64, opacity_factor: f64) -> FeatureSight {
         let mut temperature = diffuse_k;
         let mut added = 0.0;
         let mut loops_pending = true;
@@ -176,8 +175,8 @@ impl Features {
     }
 }
 
-/// Path through a shell of outer radius `radius` around a centre at distance 1, `cos` of the angle
-/// from its direction away.
+/// Path through a shell of outer radius `radius` around a centre at distance 1, at an angle with cosine `cos` from the centre's
+/// direction.
 fn shell_path(cos: f64, radius: f64) -> f64 {
     let sin2 = 1.0 - cos * cos;
     let chord = |radius: f64| {
@@ -187,7 +186,7 @@ fn shell_path(cos: f64, radius: f64) -> f64 {
     chord(radius) - chord(radius * SHELL_INNER)
 }
 
-fn place(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
+fn direction_deg(longitude_deg: f64, latitude_deg: f64) -> Vec3 {
     unit(direction_of(longitude_deg.to_radians(), latitude_deg.to_radians()))
 }
 
@@ -203,7 +202,7 @@ mod tests {
         // Twice the thickness through the middle.
         assert!((middle - 2.0 * radius * (1.0 - SHELL_INNER)).abs() < 1e-12);
         let rim = at((radius * SHELL_INNER).asin());
-        // Half a chord grazing the inner sphere is the leg of a right triangle.
+        // Half the chord that touches the inner sphere is the leg of a right triangle.
         assert!((rim - 2.0 * radius * (1.0 - SHELL_INNER * SHELL_INNER).sqrt()).abs() < 1e-7);
         assert_eq!(at(radius.asin() + 1e-3), 0.0);
         assert_eq!(at(std::f64::consts::PI), 0.0);
@@ -213,14 +212,14 @@ mod tests {
     fn an_opaque_nebula_shows_its_foreground_and_its_own_warmth() {
         let galaxy = Galaxy::new(1e6, 0.0);
         let features = Features::new(1e6, &galaxy, false, true);
-        let gum = place(258.0, -2.0);
-        let through = features.seen(gum, 3e7, 1.0);
+        let gum = direction_deg(258.0, -2.0);
+        let through = features.add_to(gum, 3e7, 1.0);
         let before = galaxy.foreground_k(gum, 0.45);
         assert!(before > 0.0 && before < 3e7);
         // 150 pc cm^-6 at 1 MHz is some 130 optical depths.
         assert!(through.depth > 100.0);
         assert!((through.temperature_k - before - ELECTRON_K).abs() < 1e-6 * before);
-        let beside = features.seen(place(230.0, 30.0), 3e7, 1.0);
+        let beside = features.add_to(direction_deg(230.0, 30.0), 3e7, 1.0);
         assert_eq!((beside.temperature_k, beside.depth), (3e7, 0.0));
     }
 }

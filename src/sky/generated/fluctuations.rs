@@ -8,22 +8,28 @@ use crate::units::{StreamKind, random_stream};
 
 /// Slope of the power of small scales (Remazeilles et al. 2015, Eq. 23 ff.).
 const SMALL_SCALE_SLOPE: f64 = -2.703;
-/// Amplitude and exponent of small scales at 408 MHz in K (the same).
+/// Amplitude of small scales at 408 MHz in K (Remazeilles et al. 2015).
 const SMALL_SCALE_ALPHA: f64 = 0.0599;
+
+/// Exponent of small scales (Remazeilles et al. 2015).
 const SMALL_SCALE_BETA: f64 = 0.782;
-/// Resolution of the 408 MHz map beyond which that paper's field has unit variance: FWHM 56'.
+
+/// Resolution of the 408 MHz map, FWHM 56', beyond which the field of Remazeilles et al. has unit variance.
 const HASLAM_FWHM_RAD: f64 = 56.0 / 60.0 * std::f64::consts::PI / 180.0;
-/// Degrees over which that variance is summed: those of nside 1024.
+
+/// Maximum degree of that variance: that of nside 1024.
 const NORMALISED_TO: usize = 3071;
 
-/// Slope and degrees of the large fields: clouds of the absorber, variations of the index.
+/// Slope of the large-scale fields: clouds of the absorber, and variations of the index.
 const LARGE_SCALE_SLOPE: f64 = -2.7;
+
+/// Range of degrees of the large-scale fields.
 const LARGE_SCALE_DEGREES: std::ops::RangeInclusive<usize> = 4..=383;
 
-/// The random fields; each has its own random stream.
+/// Random fields, each with its own random stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum RandomField {
-    /// G of Remazeilles et al.
+    /// Field G of Remazeilles et al.
     SmallScales = 0,
     /// Logarithm of the opacity of the warm gas.
     Clouds = 1,
@@ -37,11 +43,11 @@ pub(super) fn small_scale_fraction(g: f64, kelvin_408: f64) -> f64 {
     SMALL_SCALE_ALPHA * g * kelvin_408.powf(SMALL_SCALE_BETA - 1.0)
 }
 
-/// Power C_l, l = 0..=`l_max`, of G: l^gamma (1 - exp(-l^2 sigma^2)) with sigma that of `fwhm_rad`,
+/// Power spectrum C_l, l = 0..=`l_max`, of G: l^gamma (1 - exp(-l^2 sigma^2)) with the sigma of `fwhm_rad`,
 /// the resolution of the template.
 ///
 /// The scale is that of the paper, unit variance beyond 56', for any `fwhm_rad`: a coarser template
-/// gets the same small scales and the intermediate ones that it lacks.
+/// gets the same small scales plus the intermediate ones that it lacks.
 pub(super) fn small_scale_power(l_max: usize, fwhm_rad: f64) -> Vec<f64> {
     let shape = |l: usize, fwhm_rad: f64| {
         let l = l as f64;
@@ -52,7 +58,7 @@ pub(super) fn small_scale_power(l_max: usize, fwhm_rad: f64) -> Vec<f64> {
     (0..=l_max).map(|l| scale * shape(l, fwhm_rad)).collect()
 }
 
-/// Power C_l, l = 0..=`l_max`, of the large fields, of unit variance over all their degrees.
+/// Power spectrum C_l, l = 0..=`l_max`, of the large-scale fields, with unit variance over all their degrees.
 pub(super) fn large_scale_power(l_max: usize) -> Vec<f64> {
     let shape =
         |l: usize| if LARGE_SCALE_DEGREES.contains(&l) { (l as f64).powf(LARGE_SCALE_SLOPE) } else { 0.0 };
@@ -60,14 +66,14 @@ pub(super) fn large_scale_power(l_max: usize) -> Vec<f64> {
     (0..=l_max.min(*LARGE_SCALE_DEGREES.end())).map(|l| scale * shape(l)).collect()
 }
 
-/// Variance of a field of power C_l, l = 0, 1, ...
+/// Variance of a field with power spectrum C_l, l = 0, 1, ...
 fn variance(power: impl Iterator<Item = f64>) -> f64 {
     power.enumerate().map(|(l, c)| (2 * l + 1) as f64 * c).sum::<f64>() / (4.0 * std::f64::consts::PI)
 }
 
-/// A Gaussian field of power C_l = `power[l]` in RING order.
+/// Draws a Gaussian field with power spectrum C_l = `power[l]`, in RING order.
 ///
-/// Coefficients are drawn by l, then m, so that a longer `power` only adds degrees.
+/// Coefficients are drawn in the order of l, then m, so that a longer `power` only adds degrees.
 ///
 /// # Errors
 /// As [`synthesis`].

@@ -1,8 +1,8 @@
-//! The smooth Galaxy: synchrotron emission and free-free absorption along lines of sight.
+//! Smooth model of the Galaxy: synchrotron emission and free-free absorption along lines of sight.
 //!
-//! Disks of emission and of warm ionised gas, with the Sun slightly above their plane inside a cavity. The profiles
-//! are the usual ones of Galactic models (exponential in radius, sech^2 in height, a ring of dense gas at 4 kpc). The
-//! numbers reproduce the published statistics of ULSA (see [`super`]); they do not follow any map.
+//! The model has disks of emission and of warm ionised gas, with the Sun slightly above their plane inside a cavity. The profiles
+//! are usual in Galactic models (exponential in radius, sech^2 in height, a ring of dense gas at 4 kpc). The
+//! parameters reproduce the published statistics of ULSA (see [`super`]), but no particular map.
 
 use std::f64::consts::PI;
 
@@ -16,7 +16,6 @@ pub(super) const REFERENCE_HZ: f64 = 10e6;
 pub(super) const SYNCHROTRON_INDEX: f64 = 2.51;
 /// Frequency index of the free-free opacity.
 pub(super) const OPACITY_INDEX: f64 = 2.1;
-/// Temperature of the ionised gas, K.
 pub(super) const ELECTRON_K: f64 = 8_000.0;
 
 /// Galactocentric distance of the Sun, kpc (GRAVITY Collaboration 2019).
@@ -24,8 +23,10 @@ const SUN_RADIUS_KPC: f64 = 8.2;
 /// Height of the Sun above the plane, kpc (Bennett & Bovy 2019).
 const SUN_HEIGHT_KPC: f64 = 0.0208;
 
-/// Synchrotron emissivity of the disk and of the halo at the Sun, K/kpc.
+/// Synchrotron emissivity of the disk at the Sun, K/kpc.
 const DISK_K_KPC: f64 = 12.3e3;
+
+/// Synchrotron emissivity of the halo at the Sun, K/kpc.
 const HALO_K_KPC: f64 = 28.3e3;
 /// Scale lengths and heights of the emission, kpc.
 const DISK_LENGTH_KPC: f64 = 2.45;
@@ -37,31 +38,36 @@ const HALO_HEIGHT_KPC: f64 = 7.9;
 const GAS_PER_KPC: f64 = 0.0060;
 const GAS_LENGTH_KPC: f64 = 2.62;
 const GAS_HEIGHT_KPC: f64 = 1.58;
-/// Opacity in the ring of dense gas, 1/kpc; its radius, width and height, kpc.
+/// Opacity in the ring of dense gas, 1/kpc. The following constants are the ring's radius, width and height, kpc.
 const RING_PER_KPC: f64 = 1.02;
 const RING_RADIUS_KPC: f64 = 4.0;
 const RING_WIDTH_KPC: f64 = 1.8;
 const RING_HEIGHT_KPC: f64 = 0.14;
-/// The cavity around the Sun: its radius, kpc, its relative extension towards the north pole, and the opacity inside,
-/// 1/kpc.
+/// Radius of the cavity around the Sun, kpc.
 const CAVITY_KPC: f64 = 0.227;
+
+/// Relative extension of the cavity towards the north pole.
 const CAVITY_NORTH: f64 = 0.63;
+
+/// Opacity inside the cavity, 1/kpc.
 const CAVITY_PER_KPC: f64 = 0.0071;
 
-/// Steps of a line of sight: s = FIRST (exp(u) - 1), u uniform, to REACH.
+/// Number of steps along a line of sight, s = FIRST_KPC (exp(u) - 1) with uniform u, up to LENGTH_KPC.
 const STEPS: usize = 96;
 const FIRST_KPC: f64 = 0.03;
-const REACH_KPC: f64 = 40.0;
+const LENGTH_KPC: f64 = 40.0;
 
-/// Nodes of the tables in |longitude| (uniform) and in latitude (uniform in asinh(b / b0)).
+/// Number of nodes in |longitude|, which are uniform.
 const LONGITUDES: usize = 121;
+
+/// Number of nodes in latitude b, which are uniform in asinh(b / LATITUDE_SOFT_RAD).
 const LATITUDES: usize = 161;
 const LATITUDE_SOFT_RAD: f64 = 1.5 * PI / 180.0;
-/// Nodes in the cloudiness of the absorber, one standard deviation apart.
+/// Number of nodes in the cloudiness of the absorber, one standard deviation apart.
 const CLOUDS: usize = 11;
 const CLOUD_MIDDLE: f64 = 5.0;
 
-/// Emissivity, K/kpc, and opacity, 1/kpc, at distance `s_kpc`, both at [`REFERENCE_HZ`].
+/// Returns the emissivity, K/kpc, and the opacity, 1/kpc, at distance `s_kpc`, both at [`REFERENCE_HZ`].
 fn medium(direction: Vec3, s_kpc: f64) -> (f64, f64) {
     let x = SUN_RADIUS_KPC - s_kpc * direction[0];
     let y = s_kpc * direction[1];
@@ -85,9 +91,8 @@ fn sech2(x: f64) -> f64 {
     4.0 * e / ((1.0 + e) * (1.0 + e))
 }
 
-/// Edges of the steps, kpc.
 fn step_edges() -> [f64; STEPS + 1] {
-    let top = (REACH_KPC / FIRST_KPC).ln_1p();
+    let top = (LENGTH_KPC / FIRST_KPC).ln_1p();
     std::array::from_fn(|k| FIRST_KPC * (top * k as f64 / STEPS as f64).exp_m1())
 }
 
@@ -97,11 +102,11 @@ struct Ray {
     unabsorbed_k: f64,
     /// Optical depth at [`REFERENCE_HZ`].
     depth: f64,
-    /// Absorbed synchrotron temperature for each cloudiness, K at [`REFERENCE_HZ`]'s emissivity.
+    /// Absorbed synchrotron temperature for each cloudiness, K with the emissivity at [`REFERENCE_HZ`].
     absorbed_k: [f64; CLOUDS],
 }
 
-/// Radiative transfer from `reach_kpc` (or the end) to the Sun; each step is homogeneous.
+/// Solves the radiative transfer from the last of `edges` to the Sun; each step is homogeneous.
 fn transfer(direction: Vec3, edges: &[f64], opacity_scales: &[f64; CLOUDS]) -> Ray {
     let mut ray = Ray { unabsorbed_k: 0.0, depth: 0.0, absorbed_k: [0.0; CLOUDS] };
     let mut transmitted = [1.0; CLOUDS];
@@ -116,7 +121,7 @@ fn transfer(direction: Vec3, edges: &[f64], opacity_scales: &[f64; CLOUDS]) -> R
         {
             let depth = depth * scale;
             let stopped = -(-depth).exp_m1();
-            // (1 - exp(-x)) / x, whose series holds to 1e-12 there.
+            // (1 - exp(-x)) / x, by its series where that is accurate to 1e-12.
             let escaping = if depth > 1e-6 { stopped / depth } else { 1.0 - 0.5 * depth };
             *absorbed += emitted * escaping * *transmitted;
             *transmitted *= 1.0 - stopped;
@@ -125,7 +130,7 @@ fn transfer(direction: Vec3, edges: &[f64], opacity_scales: &[f64; CLOUDS]) -> R
     ray
 }
 
-/// The smooth Galaxy at one frequency, tabulated over the sky and the cloudiness of its gas.
+/// Smooth Galaxy at one frequency, tabulated over the sky and the cloudiness of its gas.
 pub(super) struct Galaxy {
     /// Factor from the emissivity at [`REFERENCE_HZ`] to this frequency.
     emission_scale: f64,
@@ -133,14 +138,14 @@ pub(super) struct Galaxy {
     opacity_scale: f64,
     /// Standard deviation of the logarithm of the gas's opacity.
     cloud_rms: f64,
-    /// Logarithms, [latitude][longitude]: optical depth at the reference, unabsorbed temperature.
+    /// Logarithm of the optical depth at the reference frequency, `[latitude][longitude]`.
     depth: Vec<f64>,
+    /// Logarithm of the unabsorbed temperature, `[latitude][longitude]`.
     unabsorbed: Vec<f64>,
-    /// Logarithm of the absorbed temperature, [latitude][longitude][cloudiness].
+    /// Logarithm of the absorbed temperature, `[latitude][longitude][cloudiness]`.
     absorbed: Vec<f64>,
 }
 
-/// The smooth Galaxy in one direction.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct GalaxySight {
     /// Absorbed synchrotron temperature, K.
@@ -177,7 +182,7 @@ impl Galaxy {
         }
     }
 
-    /// The smooth Galaxy in a Galactic direction, through gas of cloudiness `cloud` (a standard normal number).
+    /// Interpolates the line of sight in a Galactic direction, through gas of cloudiness `cloud` (a standard normal number).
     pub fn sight(&self, direction: Vec3, cloud: f64) -> GalaxySight {
         let latitude = direction[2].atan2(direction[0].hypot(direction[1]));
         let longitude = direction[1].atan2(direction[0]).abs();
@@ -212,17 +217,16 @@ impl Galaxy {
         cloudiness(self.cloud_rms, cloud.clamp(-CLOUD_MIDDLE, CLOUD_MIDDLE))
     }
 
-    /// Absorbed synchrotron temperature, K, of the first `reach_kpc` in a Galactic direction, for
+    /// Absorbed synchrotron temperature, K, of the first `distance_kpc` in a Galactic direction, for
     /// mean gas.
-    pub fn foreground_k(&self, direction: Vec3, reach_kpc: f64) -> f64 {
-        let mut edges: Vec<f64> = step_edges().into_iter().take_while(|&s| s < reach_kpc).collect();
-        edges.push(reach_kpc);
+    pub fn foreground_k(&self, direction: Vec3, distance_kpc: f64) -> f64 {
+        let mut edges: Vec<f64> = step_edges().into_iter().take_while(|&s| s < distance_kpc).collect();
+        edges.push(distance_kpc);
         let scales = [self.opacity_scale; CLOUDS];
         self.emission_scale * transfer(direction, &edges, &scales).absorbed_k[0]
     }
 }
 
-/// Unit vector of a longitude and latitude.
 pub(super) fn direction_of(longitude_rad: f64, latitude_rad: f64) -> Vec3 {
     let (sin_longitude, cos_longitude) = longitude_rad.sin_cos();
     let (sin_latitude, cos_latitude) = latitude_rad.sin_cos();
@@ -247,7 +251,7 @@ fn latitude_node(latitude: f64) -> f64 {
     (u + 1.0) * 0.5 * (LATITUDES - 1) as f64
 }
 
-/// The node before position `x` and the weights of the four nodes around it (Catmull-Rom).
+/// Returns the node before position `x` and the Catmull-Rom weights of the four nodes around it.
 fn cubic(x: f64, nodes: usize) -> (usize, [f64; 4]) {
     let x = x.clamp(0.0, (nodes - 1) as f64);
     let before = (x.floor() as usize).min(nodes - 2);
@@ -266,7 +270,7 @@ fn clamped(before: usize, k: usize, nodes: usize) -> usize {
     (before + k).saturating_sub(1).min(nodes - 1)
 }
 
-/// As [`clamped`], but the table is mirrored at its ends.
+/// Index of node k of four, as in [`clamped`], with the table mirrored at its ends.
 fn mirrored(before: usize, k: usize, nodes: usize) -> usize {
     let node = (before + k).abs_diff(1);
     if node < nodes { node } else { 2 * (nodes - 1) - node }
@@ -288,7 +292,7 @@ mod tests {
             let scales = [galaxy.opacity_scale * galaxy.opacity_factor(cloud); CLOUDS];
             let ray = transfer(direction, &edges, &scales);
             let seen = galaxy.sight(direction, cloud);
-            // Interpolation over nodes about a degree apart; far below the fluctuations put on top.
+            // The error of interpolation between nodes about a degree apart is far below the added fluctuations.
             let want = galaxy.emission_scale * ray.absorbed_k[0];
             assert!((seen.synchrotron_k / want - 1.0).abs() < 3e-3, "{k}: {} {want}", seen.synchrotron_k);
             assert!((seen.depth / (ray.depth * scales[0]) - 1.0).abs() < 3e-3, "{k}");
@@ -306,7 +310,7 @@ mod tests {
         let thick = galaxy.sight(direction, 0.0);
         assert!(thick.depth > 10.0);
         assert!(thick.synchrotron_k < 0.1 * galaxy.emission_scale * thick.unabsorbed_reference_k);
-        // Nearly all that is seen through thick gas is near.
+        // Nearly all emission seen through thick gas is nearby.
         assert!(galaxy.foreground_k(direction, 4.0) > 0.9 * thick.synchrotron_k);
     }
 }

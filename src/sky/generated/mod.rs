@@ -1,14 +1,13 @@
-//! A sky from a formula: diffuse Galactic emission, absorbing gas, fluctuations and point sources, at any frequency of
-//! 0.1-120 MHz.
+//! Model of the sky at any frequency of 0.1-120 MHz: diffuse Galactic emission, absorbing gas, fluctuations and point sources.
 //!
 //! Radiative transfer of synchrotron emission through warm ionised gas is solved along lines of sight through a smooth
-//! Galaxy, so the plane goes dark below about 10 MHz while nearby emission, from the radio loops and the local cavity,
-//! stays bright. Behind everything lies an isotropic extragalactic background (Cane 1979). Opaque nebulae hide what
-//! they cover. Gas and spectral index vary over the sky, small scales follow Remazeilles et al. (2015), and point
+//! Galaxy. The plane therefore becomes dark below about 10 MHz, while nearby emission, from the radio loops and the local cavity,
+//! stays bright. The extragalactic background is isotropic (Cane 1979), and opaque nebulae absorb the emission behind
+//! them. Gas and spectral index vary over the sky, small scales follow Remazeilles et al. (2015), and point
 //! sources the GLEAM counts of Franzen et al. (2019). The model uses Galactic coordinates; maps are on ecliptic axes.
 //!
-//! Published statistics of ULSA (Cong et al. 2021, direction-dependent index; their map at nside 64,
-//! measured in Galactic coordinates, K), to which the model's numbers were fitted:
+//! The parameters were fitted to published statistics of ULSA (Cong et al. 2021, direction-dependent index; their map at
+//! nside 64, measured in Galactic coordinates, K):
 //!
 //! | MHz | mean | 5 % | 50 % | 95 % | b > 60 deg | b < -60 deg | abs(b) < 5 deg |
 //! |---|---|---|---|---|---|---|---|
@@ -43,27 +42,28 @@ use features::Features;
 use fluctuations::{RandomField, gaussian_field, large_scale_power, small_scale_fraction, small_scale_power};
 use galaxy::{ELECTRON_K, Galaxy, REFERENCE_HZ, SYNCHROTRON_INDEX};
 
-/// Coarser maps are averages of one of this nside, which resolves the dark plane.
+/// Minimum nside of the computation, which resolves the dark plane; coarser maps are averages.
 const NSIDE_MIN: usize = 64;
 
 /// Frequency of the small-scale formula, Hz (Remazeilles et al. 2015).
 const HASLAM_HZ: f64 = 408e6;
 
-/// Extragalactic background at [`REFERENCE_HZ`], K, and its temperature index: Cane (1979),
-/// 1.06e-20 nu^-0.80 W m^-2 Hz^-1 sr^-1 with nu in MHz, through T = I c^2 / (2 k nu^2).
+/// Extragalactic background at [`REFERENCE_HZ`], K: Cane (1979), 1.06e-20 nu^-0.80 W m^-2 Hz^-1 sr^-1 with nu in MHz,
+/// by T = I c^2 / (2 k nu^2).
 const EXTRAGALACTIC_K: f64 = 5.468e4;
+
 const EXTRAGALACTIC_INDEX: f64 = 2.80;
 
-/// Least factor of the fluctuations on the diffuse emission.
+/// Minimum factor of the fluctuations on the diffuse emission.
 const FLUCTUATION_FLOOR: f64 = 0.05;
 
-/// A sky at `frequency_hz`: K in RING order on ecliptic axes, `12 nside^2` values, all positive.
+/// Generates the sky at `frequency_hz`: K in RING order on ecliptic axes, `12 nside^2` values, all positive.
 ///
 /// Equal seeds give the same sky at every frequency and nside, up to pixel averaging and the degrees above
-/// `3 nside - 1` that a map cannot represent. A point source fills the pixel that holds it.
+/// `3 nside - 1` that a map cannot represent. A point source fills the pixel that contains it.
 ///
 /// # Errors
-/// If the configuration is invalid (its first problem), the frequency lies outside 0.1-120 MHz, or `nside` is not a
+/// [`GeneratedSkyError`] for the first problem of the configuration, a frequency outside 0.1-120 MHz, or an `nside` that is not a
 /// power of two between 1 and 1024.
 pub fn generate(
     config: &GeneratedSky,
@@ -94,29 +94,28 @@ pub fn generate(
             let longitude = ring.phi0_rad + std::f64::consts::TAU * p as f64 / ring.len as f64;
             let (sin, cos) = longitude.sin_cos();
             let direction = [ring.sin_theta * cos, ring.sin_theta * sin, ring.z];
-            (kelvin[p], depth[p]) = diffuse_sky.line_of_sight(direction, fields.at(ring.first + p));
+            (kelvin[p], depth[p]) = diffuse_sky.line_of_sight(direction, fields.values_at(ring.first + p));
         }
     });
     if config.point_sources {
         let kelvin_per_jansky = sources::kelvin_sr_per_jansky(config, frequency_hz) / pixel_area_sr(fine);
         for source in sources::draw(config, seed) {
             let pixel = pixel_of(fine, source.direction);
-            let passing = if config.sources_absorbed { (-depth[pixel]).exp() } else { 1.0 };
-            kelvin[pixel] += source.flux_jy * kelvin_per_jansky * passing;
+            let transmission = if config.sources_absorbed { (-depth[pixel]).exp() } else { 1.0 };
+            kelvin[pixel] += source.flux_jy * kelvin_per_jansky * transmission;
         }
     }
     Ok(if fine == nside { kelvin } else { averaged(&kelvin, fine, nside) })
 }
 
-/// The diffuse sky at one frequency.
 struct DiffuseSky<'a> {
     config: &'a GeneratedSky,
     to_galactic: Rotation,
     galaxy: Galaxy,
     features: Features,
-    /// Background other than the sources drawn one by one, K.
+    /// Background without the sources that are drawn individually, K.
     background_k: f64,
-    /// ln(nu / reference), the factor of variations of the index.
+    /// Logarithm ln(nu / reference), by which variations of the index are multiplied.
     log_ratio: f64,
 }
 
@@ -125,7 +124,7 @@ impl<'a> DiffuseSky<'a> {
         let galaxy = Galaxy::new(frequency_hz, config.cloud_log_rms);
         let features = Features::new(frequency_hz, &galaxy, config.loops, config.nebulae);
         let background = EXTRAGALACTIC_K * (frequency_hz / REFERENCE_HZ).powf(-EXTRAGALACTIC_INDEX);
-        // The sources are part of the background: subtract those that are drawn one by one.
+        // The background includes the sources that are drawn individually.
         let drawn = if config.point_sources { sources::mean_k(config, frequency_hz) } else { 0.0 };
         Self {
             config,
@@ -137,7 +136,7 @@ impl<'a> DiffuseSky<'a> {
         }
     }
 
-    /// Temperature, K, and optical depth of the whole line of sight in an ecliptic direction.
+    /// Computes the temperature, K, and the optical depth of the whole line of sight in an ecliptic direction.
     fn line_of_sight(&self, ecliptic: Vec3, fields: FieldValues) -> (f64, f64) {
         let direction = rotate(&self.to_galactic, ecliptic);
         let sight = self.galaxy.sight(direction, fields.cloud);
@@ -149,16 +148,15 @@ impl<'a> DiffuseSky<'a> {
             let fraction = self.config.small_scale_amplitude * small_scale_fraction(fields.small, kelvin_408);
             fluctuation = (1.0 + fraction).max(FLUCTUATION_FLOOR);
         }
-        let passing = (-sight.depth).exp();
+        let transmission = (-sight.depth).exp();
         let diffuse = sight.synchrotron_k * index_factor * fluctuation
-            + self.background_k * passing
-            + ELECTRON_K * (1.0 - passing);
-        let seen = self.features.seen(direction, diffuse, self.galaxy.opacity_factor(fields.cloud));
+            + self.background_k * transmission
+            + ELECTRON_K * (1.0 - transmission);
+        let seen = self.features.add_to(direction, diffuse, self.galaxy.opacity_factor(fields.cloud));
         (seen.temperature_k, sight.depth + seen.depth)
     }
 }
 
-/// Values of the random fields in one pixel.
 #[derive(Clone, Copy, Debug)]
 struct FieldValues {
     small: f64,
@@ -166,7 +164,7 @@ struct FieldValues {
     index: f64,
 }
 
-/// The random fields of a sky; empty where disabled.
+/// Random fields of a sky; empty where disabled.
 struct RandomFields {
     small: Vec<f64>,
     cloud: Vec<f64>,
@@ -190,13 +188,13 @@ impl RandomFields {
         })
     }
 
-    fn at(&self, pixel: usize) -> FieldValues {
+    fn values_at(&self, pixel: usize) -> FieldValues {
         let value = |field: &[f64]| field.get(pixel).copied().unwrap_or(0.0);
         FieldValues { small: value(&self.small), cloud: value(&self.cloud), index: value(&self.index) }
     }
 }
 
-/// Means over the children of each pixel of a coarser map, RING to RING.
+/// Averages a RING map over the children of each pixel of a coarser RING map.
 fn averaged(kelvin: &[f64], from: usize, to: usize) -> Vec<f64> {
     let children = (from / to) * (from / to);
     let mut nested = vec![0.0; kelvin.len()];

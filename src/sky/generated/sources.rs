@@ -18,24 +18,23 @@ const COUNTS: [f64; 6] = [3.52, 0.307, -0.388, -0.0404, 0.0351, 0.006_00];
 pub(super) const COUNTS_HZ: f64 = 154e6;
 /// One jansky, W m^-2 Hz^-1.
 const JANSKY: f64 = 1e-26;
-/// Intervals of the tabulated integral of the counts, uniform in log S.
+/// Number of intervals of the tabulated integral of the counts, uniform in log S.
 const INTERVALS: usize = 4096;
 
-/// dN/dS, Jy^-1 sr^-1, at 154 MHz.
+/// Differential source counts dN/dS at 154 MHz, Jy^-1 sr^-1.
 pub(super) fn differential_counts(flux_jy: f64) -> f64 {
     let x = flux_jy.log10();
     let log = COUNTS.iter().rev().fold(0.0, |sum, a| sum * x + a);
     10.0_f64.powf(log - 2.5 * x)
 }
 
-/// The integrated counts between two fluxes.
 struct Counts {
-    /// ln S at the nodes.
+    /// ln S at the first node.
     first: f64,
     step: f64,
-    /// Sources per sr fainter than each node.
+    /// Number of sources per sr fainter than each node.
     below: Vec<f64>,
-    /// Their total flux, Jy/sr.
+    /// Total flux of all sources, Jy/sr.
     flux_jy_sr: f64,
 }
 
@@ -55,7 +54,7 @@ impl Counts {
         Self { first, step, below, flux_jy_sr }
     }
 
-    /// The flux below which a fraction `u` of the sources lies, Jy.
+    /// Flux below which a fraction `u` of the sources lies, Jy.
     fn flux_jy(&self, u: f64) -> f64 {
         let target = u * self.below[INTERVALS];
         let node = self.below.partition_point(|&n| n <= target).clamp(1, INTERVALS);
@@ -65,16 +64,14 @@ impl Counts {
     }
 }
 
-/// A point source.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct PointSource {
-    /// Direction, unit vector.
     pub direction: Vec3,
     /// Flux at 154 MHz, Jy.
     pub flux_jy: f64,
 }
 
-/// The sources of a sky: a Poisson number of them, uniform on the sphere.
+/// Draws the sources of a sky: a Poisson number, uniform on the sphere.
 pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<PointSource> {
     let counts = Counts::new(config.source_flux_jy_min, config.source_flux_jy_max);
     let mut stream = random_stream(seed, StreamKind::SkySources, [0, 0]);
@@ -91,18 +88,18 @@ pub(super) fn draw(config: &GeneratedSky, seed: u64) -> Vec<PointSource> {
         .collect()
 }
 
-/// A point source of a generated sky, as a catalogue has it.
+/// Catalogue entry of a point source of a generated sky.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CatalogueSource {
     /// Ecliptic longitude and latitude, degrees.
     pub place_deg: [f64; 2],
     /// Flux density at 154 MHz, Jy.
     pub flux_154mhz_jy: f64,
-    /// Flux density at the frequency asked for, Jy, before Galactic gas absorbs it.
+    /// Flux density at the requested frequency, Jy, before absorption by Galactic gas.
     pub flux_jy: f64,
 }
 
-/// The point sources of a generated sky at `frequency_hz`, brightest first; none without `config.point_sources`.
+/// Lists the point sources of a generated sky at `frequency_hz`, brightest first; none without `config.point_sources`.
 #[must_use]
 pub fn catalogue(config: &GeneratedSky, frequency_hz: f64, seed: u64) -> Vec<CatalogueSource> {
     if !config.point_sources {
@@ -128,7 +125,7 @@ pub(super) fn mean_k(config: &GeneratedSky, frequency_hz: f64) -> f64 {
     counts.flux_jy_sr * kelvin_sr_per_jansky(config, frequency_hz)
 }
 
-/// Temperature times solid angle, K sr, at `frequency_hz` of a source of 1 Jy at 154 MHz:
+/// Temperature times solid angle at `frequency_hz`, K sr, of a source with 1 Jy at 154 MHz:
 /// S = 2 k T nu^2 / c^2 dOmega.
 pub(super) fn kelvin_sr_per_jansky(config: &GeneratedSky, frequency_hz: f64) -> f64 {
     let wavelength = SPEED_OF_LIGHT_M_S / frequency_hz;
@@ -143,7 +140,7 @@ mod tests {
     #[test]
     fn the_number_of_sources_is_the_integral_of_the_counts() {
         let config = GeneratedSky::default();
-        // Simpson's rule on S dN/dS in ln S, on nodes of its own.
+        // Simpson's rule for S dN/dS in ln S, on independent nodes.
         let integral = |low: f64, high: f64| {
             let (intervals, a) = (1000, low.ln());
             let h = (high.ln() - a) / f64::from(intervals);
@@ -174,7 +171,7 @@ mod tests {
         assert_eq!(found.len(), drawn.len());
         assert!(found.windows(2).all(|two| two[0].flux_jy >= two[1].flux_jy));
         for source in &found {
-            // Half the frequency and a spectral index of -0.8.
+            // The ratio for half the frequency and a spectral index of -0.8.
             assert!((source.flux_jy / source.flux_154mhz_jy - 2f64.powf(0.8)).abs() < 1e-12);
             let [(sin_l, cos_l), (sin_b, cos_b)] = source.place_deg.map(|deg| deg.to_radians().sin_cos());
             let n = [cos_l * cos_b, sin_l * cos_b, sin_b];

@@ -1,7 +1,7 @@
 use super::*;
 use crate::sky::healpix::pixel_directions;
 
-/// Published ULSA statistics (see the module): MHz; mean, 5, 50, 95 %; b > 60, b < -60, |b| < 5 deg; K.
+/// Published statistics of ULSA (see the module): MHz; mean, 5, 50, 95 %; b > 60, b < -60, |b| < 5 deg; K.
 const ULSA: [(f64, [f64; 4], [f64; 3]); 3] = [
     (1.0, [3.47e7, 0.96e7, 2.69e7, 7.36e7], [6.76e7, 2.67e7, 2.13e7]),
     (3.0, [6.08e6, 3.67e6, 5.81e6, 9.40e6], [6.84e6, 4.67e6, 3.95e6]),
@@ -46,11 +46,11 @@ fn statistics_are_those_published_for_ulsa() {
             let found = points(&map);
             let zones = zones(&map, 64);
             for (found, want) in found.into_iter().zip(want) {
-                // The project's requirement.
+                // The requirement of the project.
                 assert!((found / want - 1.0).abs() < 0.25, "{mhz} MHz: {found:e} K, published {want:e} K");
             }
             for (found, want) in zones.into_iter().zip(want_zones) {
-                // One formula cannot hold every corner of the real sky: the right half-magnitude.
+                // A smooth model cannot reproduce every region of the real sky: within half an e-folding.
                 assert!((found / want).ln().abs() < 0.4, "{mhz} MHz: {found:e} K, published {want:e} K");
             }
         }
@@ -109,7 +109,7 @@ fn one_sky_at_every_nside() {
         let squares: Vec<f64> = degraded.iter().zip(map).map(|(a, b)| (b / a - 1.0).powi(2)).collect();
         mean(&squares).sqrt()
     };
-    // What a pixel averages over at its edges and at those of nebulae; another seed differs by the fluctuations.
+    // Pixels differ in their averages at edges of nebulae; another seed would differ by the fluctuations.
     assert!(rms(&coarse) < 0.02, "{}", rms(&coarse));
     assert!(rms(&other) > 2.0 * rms(&coarse), "{} {}", rms(&other), rms(&coarse));
     // Below nside 64 maps are averages.
@@ -122,11 +122,11 @@ fn sources_carry_their_flux_at_every_nside() {
     let without = GeneratedSky { point_sources: false, ..with.clone() };
     let sum = |nside: usize| {
         let (a, b) = (generate(&with, 30e6, nside, 4).unwrap(), generate(&without, 30e6, nside, 4).unwrap());
-        // Absorbed background taken away for the sources is the same at both; compare the excess.
+        // The background subtracted for the sources is the same in both; compare the excess.
         a.iter().zip(&b).map(|(a, b)| a - b).sum::<f64>() * pixel_area_sr(nside)
     };
     let (one, two) = (sum(32), sum(128));
-    // The excess of all sources over their mean; one percent of all their flux.
+    // Excess of all sources over their mean, within one per cent of their total flux.
     let all: f64 = sources::draw(&with, 4).iter().map(|s| s.flux_jy).sum::<f64>()
         * sources::kelvin_sr_per_jansky(&with, 30e6);
     assert!((one - two).abs() < 0.01 * all, "{one} {two} {all}");
@@ -137,7 +137,7 @@ fn small_scales_have_the_slope_of_the_formula() {
     let power = fluctuations::small_scale_power(191, 5f64.to_radians());
     let slope = (power[180] / power[120]).ln() / (180.0_f64 / 120.0).ln();
     assert!((slope + 2.703).abs() < 0.01, "{slope}");
-    // A realisation's variance against the sum over its power: 2 / sum (2l + 1) C_l^2 weights, a few percent.
+    // The variance of one realisation scatters about the sum over its power spectrum by a few per cent.
     let field = gaussian_field(&power, 64, 11, RandomField::SmallScales).unwrap();
     let variance = mean(&field.iter().map(|v| v * v).collect::<Vec<_>>());
     let expected = power.iter().enumerate().map(|(l, c)| (2 * l + 1) as f64 * c).sum::<f64>()

@@ -2,9 +2,9 @@
 
 use num_complex::Complex64;
 
-/// Coefficients `a_lm`, m >= 0, of a real field; `a_{l,-m} = (-1)^m conj(a_lm)`.
+/// Coefficients `a_lm`, m >= 0, of a real field, for which `a_{l,-m} = (-1)^m conj(a_lm)`.
 ///
-/// Stored as healpy stores them: all l of m = 0, then all l of m = 1, ...
+/// They are stored in healpy's order: all l of m = 0, then all l of m = 1, ...
 #[derive(Clone, Debug, PartialEq)]
 pub struct Alm {
     l_max: usize,
@@ -12,13 +12,13 @@ pub struct Alm {
 }
 
 impl Alm {
-    /// Zeros, for `l <= l_max`.
+    /// Creates zero coefficients for `l <= l_max`.
     #[must_use]
     pub fn zeros(l_max: usize) -> Self {
         Self { l_max, values: vec![Complex64::ZERO; Self::len_for(l_max)] }
     }
 
-    /// From values in healpy's order; `None` if their number does not match `l_max`.
+    /// Creates coefficients from values in healpy's order; `None` if their number does not match `l_max`.
     #[must_use]
     pub fn from_values(l_max: usize, values: Vec<Complex64>) -> Option<Self> {
         (values.len() == Self::len_for(l_max)).then_some(Self { l_max, values })
@@ -31,7 +31,7 @@ impl Alm {
         (l_max + 1) * (l_max + 2) / 2
     }
 
-    /// Greatest degree.
+    /// Maximum degree.
     #[must_use]
     pub fn l_max(&self) -> usize {
         self.l_max

@@ -1,7 +1,7 @@
-//! Products of a field with a component of the direction, n_x, n_y or n_z, in coefficients.
+//! Coefficients of the product of a field and a component n_x, n_y or n_z of the direction.
 //!
-//! From the recurrences of spherical harmonics (Varshalovich et al. 1988, Quantum Theory of Angular Momentum, 5.7), exact: a product
-//! has one degree more than the field.
+//! They follow exactly from the recurrences of spherical harmonics (Varshalovich et al. 1988, Quantum Theory of Angular Momentum, 5.7).
+//! A product has one degree more than the field.
 
 use num_complex::Complex64;
 
@@ -10,25 +10,25 @@ use super::Alm;
 /// A component of a direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Component {
-    /// n_x.
+    /// Component n_x.
     X,
-    /// n_y.
+    /// Component n_y.
     Y,
-    /// n_z.
+    /// Component n_z.
     Z,
 }
 
 impl Component {
-    /// All three, in order.
+    /// All components, in order.
     pub const ALL: [Self; 3] = [Self::X, Self::Y, Self::Z];
 }
 
-/// `sqrt(a b / ((2 l + 1) (2 l + 3)))` of the greater of two degrees, `l + 1`; zero where a or b is.
+/// Recurrence coefficient `sqrt(a b / ((2 l + 1) (2 l + 3)))` between degrees l and l + 1.
 fn root(l: usize, a: usize, b: usize) -> f64 {
     ((a * b) as f64 / ((2 * l + 1) * (2 * l + 3)) as f64).sqrt()
 }
 
-/// A term of a product: of coefficient `to` of the product from coefficient `from` of the field, or from its conjugate.
+/// Term of coefficient `to` of a product, proportional to coefficient `from` of the field or to its conjugate.
 struct Term {
     to: [usize; 2],
     from: [usize; 2],
@@ -36,7 +36,7 @@ struct Term {
     is_conjugate: bool,
 }
 
-/// Hands over all terms of the product of a field of degree `l_max`.
+/// Passes all terms of the product of a field of degree `l_max` to `take`.
 fn terms(l_max: usize, component: Component, take: &mut dyn FnMut(Term)) {
     for m in 0..=l_max + 1 {
         for l in m..=l_max + 1 {
@@ -77,7 +77,7 @@ fn terms(l_max: usize, component: Component, take: &mut dyn FnMut(Term)) {
     }
 }
 
-/// The field times a component of the direction; its degree is one more.
+/// Multiplies a field by a component of the direction; the result has one degree more.
 #[must_use]
 pub fn times_direction(field: &Alm, component: Component) -> Alm {
     let mut out = Alm::zeros(field.l_max() + 1);
@@ -88,10 +88,9 @@ pub fn times_direction(field: &Alm, component: Component) -> Alm {
     out
 }
 
-/// The transpose of [`times_direction`] with respect to real and imaginary parts: from the gradient with respect to the product to that
-/// with respect to the field, whose degree is one less.
+/// Computes the gradient with respect to a field from the gradient with respect to its product ([`times_direction`]).
 ///
-/// The gradient of degree 0 alone has none: zero of degree 0.
+/// It is the transpose with respect to real and imaginary parts, and has one degree less; for a gradient of degree 0 it is zero.
 #[must_use]
 pub fn times_direction_transposed(gradient: &Alm, component: Component) -> Alm {
     let l_max = gradient.l_max().saturating_sub(1);
@@ -132,7 +131,7 @@ mod tests {
             for (axis, component) in Component::ALL.into_iter().enumerate() {
                 let product = synthesis(&times_direction(&field, component), 8).unwrap();
                 for ((n, value), product) in pixel_directions(8).iter().zip(&map).zip(product) {
-                    // Roundings of some ten degrees.
+                    // The sums over some ten degrees are rounded.
                     assert!((n[axis] * value - product).abs() < 1e-13 * scale, "{component:?} {l_max}");
                 }
             }

@@ -19,31 +19,31 @@ pub enum HarmonicsError {
     Degree {
         /// Value found.
         l_max: usize,
-        /// Greatest allowed value.
+        /// Maximum value.
         most: usize,
     },
-    /// Coefficients of another `l_max` than the transform's.
+    /// Coefficients whose `l_max` differs from the transform's.
     #[error("the coefficients end at l = {found}; expected l_max {expected}")]
     Coefficients {
         /// Value found.
         found: usize,
-        /// The transform's.
+        /// `l_max` of the transform.
         expected: usize,
     },
-    /// A map of another nside than the transform's.
+    /// A map whose nside differs from the transform's.
     #[error("the map has {found} pixels; expected those of nside {nside}")]
     Pixels {
-        /// Number found.
+        /// Number of pixels found.
         found: usize,
-        /// The transform's nside.
+        /// nside of the transform.
         nside: usize,
     },
     /// A pixel value that is not a finite number.
     #[error("RING pixel {pixel} is {value}; expected finite values everywhere")]
     NotFinite {
-        /// RING number.
+        /// RING number of the pixel.
         pixel: usize,
-        /// Its value.
+        /// Value of the pixel.
         value: f64,
     },
     /// The iteration did not reach its tolerance.
@@ -52,11 +52,11 @@ pub enum HarmonicsError {
          iterations or lower l_max: beyond 2.5 nside the pixels hardly distinguish harmonics"
     )]
     NotConverged {
-        /// Iterations done.
+        /// Number of iterations done.
         iterations: usize,
         /// Relative residual reached.
         residual: f64,
-        /// Relative residual asked for.
+        /// Relative residual required.
         tolerance: f64,
     },
 }

@@ -1,7 +1,7 @@
-//! Sums over degrees, the inner loops of the transforms: SIMD over rings.
+//! Sums over degrees with SIMD over rings, the inner loops of the transforms.
 //!
-//! The ring pairs of a block (a ring and its mirror image south of the equator) share the recurrence. Functions start
-//! as small as (sin theta)^m, far below the least f64, so each ring carries a scale until its function has grown to
+//! The two rings of a pair (a ring and its mirror image south of the equator) share the recurrence. Functions start at
+//! (sin theta)^m, which may be far below the smallest f64. Each ring therefore carries a scale until its function has grown to
 //! 2^-100; smaller terms are neglected.
 #![expect(clippy::needless_range_loop, reason = "arrays of registers are walked in step")]
 
@@ -12,49 +12,52 @@ use pulp::{Simd, WithSimd};
 use super::lanes::{RingLanes, SCALE_EXPONENT, power_of_two};
 use super::recurrence::Order;
 
-/// Functions below this, times their scale, are neglected.
-const LEAST: f64 = power_of_two(-100);
-/// The scale of functions above this is raised: `LEAST` times 2^400.
-const GREATEST: f64 = power_of_two(300);
-/// Steps between checks of the scales. A step multiplies by less than 2^16 for any l up to 8191.
+/// Magnitude below which functions, times their scale, are neglected.
+const MAGNITUDE_MIN: f64 = power_of_two(-100);
+
+/// Magnitude above which the scale of a function is raised: `MAGNITUDE_MIN` times 2^400.
+const MAGNITUDE_MAX: f64 = power_of_two(300);
+/// Number of steps between checks of the scales. A step multiplies by less than 2^16 for any l up to 8191.
 const STEPS_BETWEEN_CHECKS: usize = 4;
 
 /// Ring pairs are passed between stages in groups of this size.
 pub(super) const GROUP: usize = 8;
 
-/// Greatest order that matters on a ring: beyond it all functions up to `l_max` are below 1e-30 or so
+/// Maximum order that is not negligible on a ring: beyond it all functions up to `l_max` are below 1e-30 or so
 /// (libsharp's rule).
-pub(super) fn greatest_order(l_max: usize, sin_theta: f64) -> usize {
+pub(super) fn order_max(l_max: usize, sin_theta: f64) -> usize {
     let l = l_max as f64;
-    let reach = l * sin_theta + (0.01 * l).max(100.0);
-    (reach as usize).min(l_max)
+    let order = l * sin_theta + (0.01 * l).max(100.0);
+    (order as usize).min(l_max)
 }
 
-/// Sums over the degrees of one order, on all rings: `out` has four planes (north real, imaginary; south real,
-/// imaginary) of `stride` values each; rings that the order does not reach are left unchanged.
+/// Sums over the degrees of one order on all rings.
+///
+/// `out` has four planes (north real, imaginary; south real, imaginary) of `stride` values each; rings on which the order is
+/// negligible are not changed.
 pub(super) struct SynthesisTask<'a> {
     pub order: &'a Order,
     pub l_max: usize,
     pub mixed: &'a [[f64; 4]],
     pub rings: &'a RingLanes,
-    /// The lanes to work on: whole blocks.
+    /// Lanes to process, in whole blocks.
     pub chunk: Range<usize>,
     pub out: &'a mut [f64],
     pub stride: usize,
 }
 
-/// The transpose: sums over rings for every function of the recurrence.
+/// Sums over rings for every function of the recurrence, the transpose of [`SynthesisTask`].
 pub(super) struct AdjointTask<'a> {
     pub order: &'a Order,
     pub l_max: usize,
     pub rings: &'a RingLanes,
-    /// The lanes to work on: whole blocks.
+    /// Lanes to process, in whole blocks.
     pub chunk: Range<usize>,
-    /// Even part (real, imaginary) and cos theta times odd part of `GROUP` rings each, for group `g` at
+    /// Even part (real, imaginary) and cos theta times odd part for groups of `GROUP` rings; group `g` is at
     /// `g * group_stride`.
     pub parts: &'a [f64],
     pub group_stride: usize,
-    /// Scratch for sums by SIMD lane.
+    /// Work buffer for sums by SIMD lane.
     pub by_lane: &'a mut Vec<f64>,
     pub sums: &'a mut Vec<[f64; 4]>,
 }
@@ -88,14 +91,14 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
         }
         let mut block = Self { simd, x2, below: [zero; U], q, scale };
         // The product is at least 2^-800.
-        block.lift(LEAST);
-        block.lift(LEAST);
+        block.scale_up(MAGNITUDE_MIN);
+        block.scale_up(MAGNITUDE_MIN);
         block
     }
 
-    /// Multiplies values below `limit` by 2^400.
+    /// Multiplies values below `limit` by 2^400 and lowers their scale.
     #[inline(always)]
-    fn lift(&mut self, limit: f64) {
+    fn scale_up(&mut self, limit: f64) {
         let simd = self.simd;
         let factor = simd.splat_f64s(power_of_two(SCALE_EXPONENT));
         let (limit, one) = (simd.splat_f64s(limit), simd.splat_f64s(1.0));
@@ -106,9 +109,9 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
         }
     }
 
-    /// Divides values above `limit`, and what comes before them, by 2^400.
+    /// Divides values above `limit`, and their predecessors in the recurrence, by 2^400 and raises their scale.
     #[inline(always)]
-    fn lower(&mut self, limit: f64) {
+    fn scale_down(&mut self, limit: f64) {
         let simd = self.simd;
         let factor = simd.splat_f64s(power_of_two(-SCALE_EXPONENT));
         let (limit, one) = (simd.splat_f64s(limit), simd.splat_f64s(1.0));
@@ -120,16 +123,15 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
         }
     }
 
-    /// Least and greatest scale.
     #[inline(always)]
     fn scales(&self) -> (f64, f64) {
         let simd = self.simd;
-        let (mut least, mut greatest) = (self.scale[0], self.scale[0]);
+        let (mut scale_min, mut scale_max) = (self.scale[0], self.scale[0]);
         for u in 1..U {
-            least = simd.min_f64s(least, self.scale[u]);
-            greatest = simd.max_f64s(greatest, self.scale[u]);
+            scale_min = simd.min_f64s(scale_min, self.scale[u]);
+            scale_max = simd.max_f64s(scale_max, self.scale[u]);
         }
-        (simd.reduce_min_f64s(least), simd.reduce_max_f64s(greatest))
+        (simd.reduce_min_f64s(scale_min), simd.reduce_max_f64s(scale_max))
     }
 
     #[inline(always)]
@@ -151,22 +153,22 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
         next
     }
 
-    /// Computes all functions and passes those that count to `sink`.
+    /// Computes all functions and passes those that are not negligible to `sink`.
     #[inline(always)]
     fn run(mut self, steps: &[[f64; 2]], sink: &mut impl FunctionSink<S, U>) {
         let simd = self.simd;
         let zero = simd.splat_f64s(0.0);
         let mut j = 0;
-        let (mut least, mut greatest) = self.scales();
-        while greatest < 0.0 && j + STEPS_BETWEEN_CHECKS <= steps.len() {
+        let (mut scale_min, mut scale_max) = self.scales();
+        while scale_max < 0.0 && j + STEPS_BETWEEN_CHECKS <= steps.len() {
             for &step in &steps[j..j + STEPS_BETWEEN_CHECKS] {
                 self.step(step);
             }
             j += STEPS_BETWEEN_CHECKS;
-            self.lower(GREATEST);
-            (least, greatest) = self.scales();
+            self.scale_down(MAGNITUDE_MAX);
+            (scale_min, scale_max) = self.scales();
         }
-        while least < 0.0 && j < steps.len() {
+        while scale_min < 0.0 && j < steps.len() {
             for _ in 0..STEPS_BETWEEN_CHECKS.min(steps.len() - j) {
                 let mut counting = self.q;
                 for u in 0..U {
@@ -177,10 +179,10 @@ impl<S: Simd, const U: usize> RingBlock<S, U> {
                 self.step(steps[j]);
                 j += 1;
             }
-            self.lower(GREATEST);
-            least = self.scales().0;
+            self.scale_down(MAGNITUDE_MAX);
+            scale_min = self.scales().0;
         }
-        // Two steps an iteration, so that nothing has to be moved.
+        // Two steps per iteration, so that no values have to be copied.
         let (mut even, mut odd) = (self.q, self.below);
         let (pairs, rest) = steps[j..].as_chunks::<2>();
         for pair in pairs {
@@ -237,7 +239,6 @@ impl<S: Simd, const U: usize> FunctionSink<S, U> for SumRings<'_, S, U> {
     }
 }
 
-/// `U` vectors from a slice.
 #[inline(always)]
 fn load<S: Simd, const U: usize>(values: &[f64]) -> [S::f64s; U] {
     let vectors = S::as_simd_f64s(values).0;
@@ -253,7 +254,7 @@ impl SynthesisTask<'_> {
         let width = U * S::F64_LANES;
         let planes = self.out;
         for at in self.chunk.clone().step_by(width) {
-            if self.order.m > greatest_order(self.l_max, self.rings.sin[at + width - 1]) {
+            if self.order.m > order_max(self.l_max, self.rings.sin[at + width - 1]) {
                 continue;
             }
             let zero = simd.splat_f64s(0.0);
@@ -283,7 +284,7 @@ impl AdjointTask<'_> {
         self.by_lane.resize(4 * S::F64_LANES * count, 0.0);
         let lanes = S::as_mut_simd_f64s(self.by_lane.as_mut_slice()).0.as_chunks_mut::<4>().0;
         for at in self.chunk.clone().step_by(width) {
-            if self.order.m > greatest_order(self.l_max, self.rings.sin[at + width - 1]) {
+            if self.order.m > order_max(self.l_max, self.rings.sin[at + width - 1]) {
                 continue;
             }
             let zero = simd.splat_f64s(0.0);
@@ -314,7 +315,7 @@ impl WithSimd for SynthesisTask<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // As many vectors as the registers hold with sums, functions and geometry (7 U).
+        // As many vectors as fit the registers with sums, functions and geometry (7 U).
         if S::REGISTER_COUNT >= 32 { self.run::<S, 4>(simd) } else { self.run::<S, 2>(simd) }
     }
 }

@@ -1,19 +1,19 @@
-//! Rings as SIMD lanes: their geometry, and the powers of sin theta that recurrences start from.
+//! Rings as SIMD lanes: their geometry, and the powers of sin theta from which recurrences start.
 
 use crate::sky::healpix::ring;
 
-/// A unit of scale stands for a factor 2^`SCALE_EXPONENT`.
+/// Exponent of the factor 2^`SCALE_EXPONENT` that one unit of scale represents.
 pub(super) const SCALE_EXPONENT: i32 = 400;
 
-/// Most ring pairs in a block; tables of rings are padded to a multiple of it.
+/// Maximum number of ring pairs in a block; tables of rings are padded to a multiple of it.
 pub(super) const BLOCK_MAX: usize = 32;
 
-/// Powers are products of one of the first `LOW` and one of every `LOW`-th.
+/// Number of low powers; each power is a product of one of the first `LOW` and one of every `LOW`-th.
 const LOW: usize = 32;
 
-/// Rings 1 .. 2 nside, from the north pole to the equator, one lane each, padded to whole blocks.
+/// Rings 1 .. 2 nside, from the north pole to the equator, one per lane, padded to whole blocks.
 pub(super) struct RingLanes {
-    /// Number of lanes with padding.
+    /// Number of lanes including padding.
     pub len: usize,
     pub cos: Vec<f64>,
     pub sin: Vec<f64>,
@@ -64,7 +64,7 @@ impl RingLanes {
         Self { len, cos, sin, low, high, high_scale }
     }
 
-    /// sin^m for `lanes` as the product of two numbers, and the scale of the second.
+    /// Returns two factors of sin^m for `lanes`, and the scale of the second.
     #[inline(always)]
     pub(super) fn powers(&self, m: usize, lanes: std::ops::Range<usize>) -> (&[f64], &[f64], &[f64]) {
         let (low, high) = (m % LOW * self.len, m / LOW * self.len);
@@ -73,7 +73,6 @@ impl RingLanes {
     }
 }
 
-/// 2^`exponent`.
 pub(super) const fn power_of_two(exponent: i32) -> f64 {
     f64::from_bits(((1023 + exponent) as u64) << 52)
 }

@@ -1,14 +1,14 @@
 //! Spherical harmonics, orthonormal with Condon-Shortley phase: coefficients, transforms, rotations.
 //!
-//! | entry point | does |
+//! | entry point | provides |
 //! |---|---|
 //! | [`Transform`] | synthesis of HEALPix maps and its transpose, after libsharp |
-//! | [`analysis`] | coefficients of a map |
-//! | [`Alm`] | coefficients of a real field; [`Alm::rotated`] takes them to another frame |
-//! | [`times_direction`] | a field times a component of the direction |
+//! | [`analysis()`] | coefficients of a map |
+//! | [`Alm`] | coefficients of a real field; [`Alm::rotated`] rotates them to another frame |
+//! | [`times_direction`] | the product of a field and a component of the direction |
 //! | [`WignerTable`] | Wigner's d-functions |
 //!
-//! Uses [`super::healpix`]. Results do not depend on the number of threads.
+//! Results do not depend on the number of threads.
 
 mod analysis;
 mod coefficients;

@@ -1,30 +1,28 @@
 //! The recurrence of normalised Legendre functions, in steps of two degrees.
 //!
 //! With eps_l = sqrt((l^2 - m^2) / (4 l^2 - 1)) the orthonormal functions p_l (Y_lm = p_l(theta) e^{i m phi})
-//! obey x p_l = eps_{l+1} p_{l+1} + eps_l p_{l-1}, x = cos theta. Used twice it links degrees l - 2, l, l + 2
-//! through x^2 alone, so that only every other function has to be computed, and those of a ring and its
-//! mirror image are the same. The functions in between follow from the same relation: a sum over them is x
-//! times a sum over the computed ones with other coefficients. This halving, and the scaling that reduces a
-//! step to two multiply-adds, are those of Reinecke & Seljebotn 2013 (libsharp) and Ishioka 2018.
+//! obey x p_l = eps_{l+1} p_{l+1} + eps_l p_{l-1}, x = cos theta. Applied twice, this links degrees l - 2, l, l + 2
+//! by x^2 only, so that only every other function has to be computed, and a ring and its mirror image have the
+//! same functions. The functions in between follow from the same relation: a sum over them is x
+//! times a sum over the computed functions with other coefficients. This halving, and the scaling that reduces a
+//! step to two multiply-adds, follow Reinecke & Seljebotn 2013 (libsharp) and Ishioka 2018.
 
 use num_complex::Complex64;
 use std::f64::consts::PI;
 
-/// Tables of one order m; computed function j is that of degree m + 2 j.
+/// Tables of one order m; computed function j has degree m + 2 j.
 pub(super) struct Order {
-    /// The order.
     pub m: usize,
-    /// p_m = `start` (sin theta)^m.
+    /// Factor of the first function, p_m = `start` (sin theta)^m.
     pub start: f64,
-    /// q_{j+1} = (A_j x^2 + B_j) q_j + q_{j-1}: `[A_j, B_j]`.
+    /// Coefficients `[A_j, B_j]` of the recurrence q_{j+1} = (A_j x^2 + B_j) q_j + q_{j-1}.
     pub steps: Vec<[f64; 2]>,
-    /// p_{m+2j} = `scale[j]` q_j.
+    /// Scale of each function, p_{m+2j} = `scale[j]` q_j.
     scale: Vec<f64>,
-    /// `[eps_{m+2j}, 1 / eps_{m+2j+1}]`.
+    /// Coefficients `[eps_{m+2j}, 1 / eps_{m+2j+1}]` for the functions in between.
     between: Vec<[f64; 2]>,
 }
 
-/// Tables of all orders up to `l_max`.
 pub(super) fn all_orders(l_max: usize) -> Vec<Order> {
     use rayon::prelude::*;
     let mut start = (0.25 / PI).sqrt();
@@ -50,8 +48,8 @@ impl Order {
         let mut steps = Vec::with_capacity(count);
         let mut scale = Vec::with_capacity(count);
         let mut between = Vec::with_capacity(count);
-        // Scales of this function and of the next; the second is free, and chosen so that the scaled functions of
-        // even and odd j are of one size. The sign makes the recurrence a sum.
+        // Scales of this function and of the next. The second is free, and is chosen so that the scaled functions of
+        // even and odd j are of similar size. The sign makes the recurrence a sum.
         let (mut this, mut next) =
             (1.0, (eps[1] * eps[2] / (eps[3.min(2 * count)] * eps[4.min(2 * count)])).sqrt());
         for j in 0..count {
@@ -68,12 +66,11 @@ impl Order {
         Self { m, start, steps, scale, between }
     }
 
-    /// Number of computed functions.
     pub(super) fn len(&self) -> usize {
         self.steps.len()
     }
 
-    /// Coefficients of the scaled functions for coefficients `alm` of l = m, m + 1, ..: real and imaginary part of
+    /// Converts coefficients `alm` of l = m, m + 1, .. to coefficients of the scaled functions: real and imaginary part of
     /// the factor of q_j, then of the factor of x q_j.
     pub(super) fn mix(&self, alm: &[Complex64], out: &mut Vec<[f64; 4]>) {
         out.clear();
@@ -90,7 +87,7 @@ impl Order {
         }
     }
 
-    /// The transpose of [`Self::mix`], added to `alm`.
+    /// Adds the transpose of [`Self::mix`] to `alm`.
     pub(super) fn unmix(&self, sums: &[[f64; 4]], alm: &mut [Complex64]) {
         let mut below = Complex64::ZERO;
         for (j, (sum, (&scale, &[eps, inverse]))) in
@@ -109,7 +106,7 @@ impl Order {
 mod tests {
     use super::*;
 
-    /// p_l for l = m .. l_max by the three-term recurrence of the degree.
+    /// Computes p_l for l = m .. l_max by the three-term recurrence in l.
     fn three_term(m: usize, l_max: usize, start: f64, x: f64) -> Vec<f64> {
         let eps = |l: usize| {
             let (l2, m2) = ((l * l) as f64, (m * m) as f64);
@@ -132,7 +129,7 @@ mod tests {
                 let (mut below, mut q) = (0.0, expected[0]);
                 for j in 0..order.len() {
                     let found = order.scale[j] * q;
-                    // Some tens of steps, each rounding numbers of the functions' size, at most a few.
+                    // Some tens of steps round numbers of at most a few.
                     assert!((found - expected[2 * j]).abs() < 1e-12, "m {} j {j} x {x}", order.m);
                     let [a, b] = order.steps[j];
                     (below, q) = (q, (a * x * x + b) * q + below);
@@ -158,7 +155,7 @@ mod tests {
                 re += q * (c[0] + x * c[2]);
                 im += q * (c[1] + x * c[3]);
             }
-            // Coefficients up to 500, tens of them, roundings of 1e-16 each.
+            // Tens of coefficients up to 500 are rounded by 1e-16 each.
             assert!((Complex64::new(re, im) - expected).norm() < 1e-11, "m {}", order.m);
             // <mix(a), s> = <a, unmix(s)>.
             let sums: Vec<[f64; 4]> = (0..order.len()).map(|j| [0.3, -0.1, 0.7 + j as f64, 0.2]).collect();

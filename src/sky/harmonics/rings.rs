@@ -1,6 +1,6 @@
-//! Between orders and pixels: a Fourier transform on every ring.
+//! Fourier transforms between orders and the pixels of every ring.
 //!
-//! On a ring of n pixels order m is the same as m modulo n; orders beyond n/2 are folded onto their aliases.
+//! On a ring of n pixels order m is equivalent to m modulo n; orders beyond n/2 are folded onto their aliases.
 
 use std::f64::consts::PI;
 use std::sync::{Arc, OnceLock};
@@ -8,13 +8,13 @@ use std::sync::{Arc, OnceLock};
 use num_complex::Complex64;
 use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
-use super::kernel::{GROUP, greatest_order};
+use super::kernel::{GROUP, order_max};
 use crate::sky::healpix::{Ring, pixel_area_sr, ring};
 
 /// Phases of orders are products of one of the first `LOW` and one of every `LOW`-th.
 const LOW: usize = 32;
 
-/// The Fourier transforms of all ring lengths of an nside.
+/// Fourier transforms for all ring lengths of an nside.
 pub(super) struct RingFourier {
     nside: usize,
     l_max: usize,
@@ -24,13 +24,12 @@ pub(super) struct RingFourier {
     forward: OnceLock<Vec<Arc<dyn RealToComplex<f64>>>>,
 }
 
-/// A ring and its mirror image (empty for the equator).
+/// A ring and its mirror image, which is empty for the equator.
 pub(super) struct RingPair<P> {
     pub north: P,
     pub south: P,
 }
 
-/// Buffers for the transform of one ring.
 pub(super) struct Scratch {
     phase: Vec<Complex64>,
     spectrum: Vec<Complex64>,
@@ -83,18 +82,18 @@ impl RingFourier {
         plans[self.length_index(pair)].as_ref()
     }
 
-    /// exp(i m phi0) for m = 0 .. top.
-    fn fill_phases(&self, pair: usize, ring: &Ring, top: usize, out: &mut Vec<Complex64>) {
+    /// Writes exp(i m phi0) for m = 0 .. m_max.
+    fn fill_phases(&self, pair: usize, ring: &Ring, m_max: usize, out: &mut Vec<Complex64>) {
         out.clear();
         if ring.phi0_rad == 0.0 {
-            out.resize(top + 1, Complex64::ONE);
+            out.resize(m_max + 1, Complex64::ONE);
             return;
         }
         let (low, high) = self.phases[self.length_index(pair)].split_at(LOW);
         for first in high {
-            let count = LOW.min(top + 1 - out.len());
+            let count = LOW.min(m_max + 1 - out.len());
             out.extend(low[..count].iter().map(|phase| first * phase));
-            if out.len() > top {
+            if out.len() > m_max {
                 return;
             }
         }
@@ -112,8 +111,8 @@ impl RingFourier {
     ) {
         let ring = self.ring(pair);
         let plan = self.inverse(pair);
-        let top = greatest_order(self.l_max, ring.sin_theta);
-        self.fill_phases(pair, &ring, top, &mut scratch.phase);
+        let m_max = order_max(self.l_max, ring.sin_theta);
+        self.fill_phases(pair, &ring, m_max, &mut scratch.phase);
         scratch.work.resize(plan.get_scratch_len(), Complex64::ZERO);
         for (plane, pixels) in [(0, &mut *pixels.north), (2, &mut *pixels.south)] {
             if pixels.is_empty() {
@@ -123,14 +122,14 @@ impl RingFourier {
                 Complex64::new(planes[(4 * m + plane) * stride], planes[(4 * m + plane + 1) * stride])
             };
             fold(&scratch.phase, value, ring.len, &mut scratch.spectrum);
-            // The lengths are those of the plan, and both ends of the spectrum are real.
+            // The transform cannot fail: lengths are those of the plan, and both ends of the spectrum are real.
             let done = plan.process_with_scratch(&mut scratch.spectrum, pixels, &mut scratch.work);
             debug_assert!(done.is_ok());
         }
     }
 
-    /// Computes the parts of a ring pair that enter sums over rings, times the pixel area: even part (real, imaginary)
-    /// and cos theta times odd part of order m at `out[(4 m + p) GROUP]`.
+    /// Computes the even part (real, imaginary) and cos theta times the odd part of a ring pair, times the pixel area: order m
+    /// is at `out[(4 m + p) GROUP]`.
     pub(super) fn analyse(
         &self,
         pair: usize,
@@ -140,20 +139,20 @@ impl RingFourier {
     ) {
         let ring = self.ring(pair);
         let plan = self.forward(pair);
-        let top = greatest_order(self.l_max, ring.sin_theta);
-        self.fill_phases(pair, &ring, top, &mut scratch.phase);
+        let m_max = order_max(self.l_max, ring.sin_theta);
+        self.fill_phases(pair, &ring, m_max, &mut scratch.phase);
         scratch.work.resize(plan.get_scratch_len(), Complex64::ZERO);
         scratch.spectrum.resize(ring.len / 2 + 1, Complex64::ZERO);
         let area = pixel_area_sr(self.nside);
         for (part, pixels) in scratch.parts.iter_mut().zip([pixels.north, pixels.south]) {
             part.clear();
             if pixels.is_empty() {
-                part.resize(top + 1, Complex64::ZERO);
+                part.resize(m_max + 1, Complex64::ZERO);
                 continue;
             }
             scratch.pixels.clear();
             scratch.pixels.extend(pixels.iter().map(|pixel| pixel * area));
-            // The lengths are those of the plan.
+            // The transform cannot fail: lengths are those of the plan.
             let done =
                 plan.process_with_scratch(&mut scratch.pixels, &mut scratch.spectrum, &mut scratch.work);
             debug_assert!(done.is_ok());
@@ -169,7 +168,7 @@ impl RingFourier {
     }
 }
 
-/// The spectrum of `len` real samples of Re sum_m (2 - [m = 0]) value(m) phase_m exp(2 pi i m k / len).
+/// Computes the spectrum of `len` real samples of Re sum_m (2 - [m = 0]) value(m) phase_m exp(2 pi i m k / len).
 fn fold(phase: &[Complex64], value: impl Fn(usize) -> Complex64, len: usize, spectrum: &mut Vec<Complex64>) {
     let half = len / 2;
     spectrum.clear();
@@ -192,7 +191,7 @@ fn fold(phase: &[Complex64], value: impl Fn(usize) -> Complex64, len: usize, spe
     }
 }
 
-/// sum_k sample_k exp(-i m phi_k) for every order, from the spectrum of `len` samples.
+/// Computes sum_k sample_k exp(-i m phi_k) for every order, from the spectrum of `len` samples.
 fn unfold(phase: &[Complex64], spectrum: &[Complex64], len: usize, out: &mut Vec<Complex64>) {
     let half = len / 2;
     let mut k = 0;

@@ -8,7 +8,7 @@
 //!       = exp(-i m alpha) sum_{mu >= 0} d^l_{m mu} b_mu + (-1)^m d^l_{-m,mu} conj(b_mu)
 //! ```
 //!
-//! (the second term from mu = 1 on) for a real field. A band-limited field stays band-limited: the only error is
+//! (the second term only for mu >= 1) for a real field. A band-limited field stays band-limited, so that the only error is
 //! rounding.
 
 use num_complex::Complex64;
@@ -17,11 +17,11 @@ use rayon::prelude::*;
 use super::{Alm, WignerTable};
 use crate::sky::frame::Rotation;
 
-/// Parts of the sum over mu; fixed, so that the result does not depend on the number of threads.
+/// Number of parts of the sum over mu, which is fixed so that the result does not depend on the number of threads.
 const PARTS: usize = 8;
 
 impl Alm {
-    /// The coefficients of the field rotated by `rotation`, which takes old directions to new ones.
+    /// Computes the coefficients of the field rotated by `rotation`, which maps old directions to new ones.
     #[must_use]
     #[doc(hidden)]
     pub fn rotated(&self, rotation: &Rotation) -> Self {
@@ -39,11 +39,11 @@ impl Alm {
             .collect();
         let mut rotated_alm = Self::zeros(self.l_max());
         for m in 0..=self.l_max() {
-            let turn = Complex64::cis(-(m as f64) * alpha);
+            let phase = Complex64::cis(-(m as f64) * alpha);
             for l in m..=self.l_max() {
                 let total: Complex64 = parts.iter().map(|part| part.get(l, m)).sum();
-                // The zeroth order of a real field is real; drop the rounding error.
-                *rotated_alm.get_mut(l, m) = if m == 0 { total.re.into() } else { total * turn };
+                // Order 0 of a real field is real; the imaginary part is rounding error.
+                *rotated_alm.get_mut(l, m) = if m == 0 { total.re.into() } else { total * phase };
             }
         }
         rotated_alm
@@ -51,10 +51,10 @@ impl Alm {
 
     /// Adds the contribution of orders mu and -mu to all orders m >= 0.
     fn add_order(&self, sum: &mut Self, table: &WignerTable, mu: usize, gamma: f64) {
-        let turn = Complex64::cis(-(mu as f64) * gamma);
+        let phase = Complex64::cis(-(mu as f64) * gamma);
         let mut rows = table.rows(mu);
         while let Some((l, row)) = rows.next_row() {
-            let b = self.get(l, mu) * turn;
+            let b = self.get(l, mu) * phase;
             *sum.get_mut(l, 0) += row[l] * if mu == 0 { b } else { (2.0 * b.re).into() };
             for m in 1..=l {
                 let mirrored = if m % 2 == 0 { row[l - m] } else { -row[l - m] };
@@ -65,12 +65,12 @@ impl Alm {
     }
 }
 
-/// Angles alpha, beta, gamma with `rotation = Rz(alpha) Ry(beta) Rz(gamma)`, rad.
+/// Returns the angles alpha, beta, gamma with `rotation = Rz(alpha) Ry(beta) Rz(gamma)`, rad.
 fn euler_angles(rotation: &Rotation) -> [f64; 3] {
     let [x, y, z] = rotation;
     let sin_beta = z[0].hypot(z[1]);
     if sin_beta < 1e-15 {
-        // About z alone, upright or upside down.
+        // A rotation about z, or z reversed.
         let beta = if z[2] > 0.0 { 0.0 } else { std::f64::consts::PI };
         return [(-x[1]).atan2(y[1]), beta, 0.0];
     }
@@ -108,7 +108,7 @@ mod tests {
             let turned = coefficients(&field).rotated(&rotation);
             let expected = coefficients(&|n| field(rotate(&back, n)));
             for (found, expected) in turned.values().iter().zip(expected.values()) {
-                // Least squares to 1e-13, coefficients of order 1.
+                // The analysis is accurate to 1e-13 for coefficients of order 1.
                 assert!((found - expected).norm() < 1e-11, "{found} {expected}");
             }
         }
@@ -124,7 +124,7 @@ mod tests {
         let rotation = Frame::Galactic.to_ecliptic();
         let again = alm.rotated(&rotation).rotated(&transpose(&rotation));
         for (found, expected) in again.values().iter().zip(alm.values()) {
-            // Errors of d, 1e-13 each, from 800 terms; the rotation itself is good to 1e-15.
+            // 800 terms with errors of d of 1e-13 each; the rotation matrix is accurate to 1e-15.
             assert!((found - expected).norm() < 1e-10, "{found} {expected}");
         }
     }

@@ -1,4 +1,4 @@
-//! Synthesis and its transpose between coefficients and RING maps.
+//! Synthesis of RING maps from coefficients, and its transpose.
 
 use num_complex::Complex64;
 use pulp::Arch;
@@ -11,16 +11,15 @@ use super::rings::{RingFourier, RingPair, Scratch};
 use super::{Alm, HarmonicsError};
 use crate::sky::healpix::{is_valid_nside, pixel_count, ring};
 
-/// Greatest degree: bounds the tables (0.7 GB) and the growth in one step of the recurrence.
+/// Maximum degree, which bounds the tables (0.7 GB) and the growth in one step of the recurrence.
 pub const L_MAX: usize = 8191;
 
-/// Ring pairs summed together: bounds memory to 130 kB an order.
+/// Number of ring pairs that are summed together, which bounds memory to 130 kB per order.
 const CHUNK: usize = 512;
 
-/// The transforms between coefficients up to `l_max` and maps of `nside`, with their tables.
+/// Transform between coefficients up to `l_max` and maps of `nside`, with its tables.
 ///
-/// Building one costs about as much as one transform; keep it for repeated use. Results do not depend on the number of
-/// threads.
+/// Building it costs about as much as one transform; keep it for repeated use.
 pub struct Transform {
     nside: usize,
     l_max: usize,
@@ -67,13 +66,13 @@ impl Transform {
         self.nside
     }
 
-    /// Greatest degree of the coefficients.
+    /// Maximum degree of the coefficients.
     #[must_use]
     pub fn l_max(&self) -> usize {
         self.l_max
     }
 
-    /// The map of a real field at pixel centres, RING order: the sum of a_lm Y_lm.
+    /// Synthesises the map of a real field at pixel centres, in RING order: the sum of a_lm Y_lm.
     ///
     /// # Errors
     /// [`HarmonicsError::Coefficients`] unless `alm` has the transform's `l_max`.
@@ -86,7 +85,7 @@ impl Transform {
         for (chunk, pairs) in pairs.chunks_mut(CHUNK).enumerate() {
             let first = chunk * CHUNK;
             let lanes = first..(first + pairs.len()).next_multiple_of(BLOCK_MAX);
-            // A row length that is not a power of two spreads rows over the sets of the cache.
+            // A stride that is not a power of two spreads rows over the sets of the cache.
             let stride = lanes.len() + GROUP;
             let mut planes = vec![0.0; 4 * stride * (self.l_max + 1)];
             let order_planes = planes.par_chunks_mut(4 * stride);
@@ -106,9 +105,9 @@ impl Transform {
         Ok(map)
     }
 
-    /// The transpose of synthesis times the pixel area: sum over pixels of map conj(Y_lm) 4 pi / N_pix.
+    /// Computes the transpose of the synthesis times the pixel area: the sum over pixels of map conj(Y_lm) 4 pi / N_pix.
     ///
-    /// This is the plain quadrature for a_lm; see [`crate::sky::harmonics::analysis`] for the coefficients themselves.
+    /// This is the quadrature for a_lm without corrections; [`crate::sky::harmonics::analysis()`] computes the coefficients.
     ///
     /// # Errors
     /// [`HarmonicsError::Pixels`] unless `map` has the transform's `nside`.
@@ -130,27 +129,30 @@ impl Transform {
                 }
             });
             let orders = self.split_orders(&mut alm);
-            let room = || (Vec::new(), Vec::new());
-            orders.into_par_iter().zip(&self.orders).for_each_init(room, |(by_lane, sums), (out, order)| {
-                let (rings, chunk) = (&self.lanes, lanes.clone());
-                let parts = &parts[4 * GROUP * order.m..];
-                self.arch.dispatch(AdjointTask {
-                    order,
-                    l_max: self.l_max,
-                    rings,
-                    chunk,
-                    parts,
-                    group_stride,
-                    by_lane,
-                    sums,
-                });
-                order.unmix(sums, out);
-            });
+            let buffers = || (Vec::new(), Vec::new());
+            orders.into_par_iter().zip(&self.orders).for_each_init(
+                buffers,
+                |(by_lane, sums), (out, order)| {
+                    let (rings, chunk) = (&self.lanes, lanes.clone());
+                    let parts = &parts[4 * GROUP * order.m..];
+                    self.arch.dispatch(AdjointTask {
+                        order,
+                        l_max: self.l_max,
+                        rings,
+                        chunk,
+                        parts,
+                        group_stride,
+                        by_lane,
+                        sums,
+                    });
+                    order.unmix(sums, out);
+                },
+            );
         }
         Ok(alm)
     }
 
-    /// The rings of a map in pairs, from the poles to the equator.
+    /// Divides a map into pairs of rings, from the poles to the equator.
     fn ring_pairs<'a>(&self, map: &'a [f64]) -> Vec<RingPair<&'a [f64]>> {
         let of = |k: usize| {
             let ring = ring(self.nside, k);
@@ -208,7 +210,7 @@ mod tests {
         let (map, back) = run(Arch::Scalar);
         let others = [Some(Arch::new()), V3::try_new().map(Arch::V3)];
         for (other_map, other_back) in others.into_iter().flatten().map(run) {
-            // Fused and separate roundings differ: 1e-16 each, over hundreds of degrees, of values up to 100.
+            // Fused and separate operations round differently: 1e-16 each, over hundreds of degrees, for values up to 100.
             assert!(map.iter().zip(&other_map).all(|(a, b)| (a - b).abs() < 1e-10));
             assert!(back.values().iter().zip(other_back.values()).all(|(a, b)| (a - b).norm() < 1e-10));
         }

@@ -29,7 +29,7 @@ impl ListenConfig {
     /// All invalid limits; empty for a valid configuration.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
-        let mut checks = Checks::of("downlink.listen");
+        let mut checks = Checks::new("downlink.listen");
         let Self { connections_max: connections, bytes_per_s_max: rate, .. } = *self;
         checks.require("connections_max", connections, (1..=1024).contains(&connections), "1 to 1024");
         for (key, value) in [

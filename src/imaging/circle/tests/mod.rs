@@ -35,7 +35,7 @@ fn setup() -> HarmonicSetup {
     }
 }
 
-/// Blocks of every pair that is short enough, at `count` times over the whole mission.
+/// Blocks of all pairs with short enough baselines, at `count` times over the mission.
 fn blocks(from: usize, count: usize) -> Vec<PlacedVisibilities> {
     let array = Array::new(&ArrayConfig::default()).unwrap();
     let mut blocks = Vec::new();
@@ -73,7 +73,7 @@ fn engine(blocks: &[PlacedVisibilities]) -> HarmonicEngine {
     engine
 }
 
-/// A vector of unknowns without pattern.
+/// A vector of pseudo-random unknowns.
 fn vector(seed: u64) -> Vec<f64> {
     vector_to(L_MAX, seed)
 }
@@ -92,7 +92,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// Visibilities of a sky by the forward operator, which is tested against sums over directions.
+/// Visibilities of a sky from the forward operator, which is tested against sums over directions.
 fn forward(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
     forward_of(&setup(), unknowns, blocks)
 }
@@ -112,7 +112,7 @@ fn forward_of(setup: &HarmonicSetup, unknowns: &[f64], blocks: &[PlacedVisibilit
         .iter()
         .flat_map(|block| block.r_i_m.iter().zip(&block.r_j_m))
         .map(|(&r_i, &r_j)| {
-            let orientation = PairOrientation::of(r_i, r_j).unwrap();
+            let orientation = PairOrientation::of_pair(r_i, r_j).unwrap();
             let pair = setup.orbit.pair(&orientation, wavelength_m).unwrap();
             assert!(!pair.reversed);
             pair.state
@@ -123,8 +123,8 @@ fn forward_of(setup: &HarmonicSetup, unknowns: &[f64], blocks: &[PlacedVisibilit
     values
 }
 
-/// Bound on the interpolation of a row between nodes: at the end of the band five nodes err by 1.8e-4 in the mean over the places
-/// between nodes (3.2e-4 at most, the kernel's own test); twice, and relative to a product of two random skies.
+/// Bound on the error of interpolating rows between nodes: at the end of the band five nodes have a mean error of 1.8e-4 (at most 3.2e-4, see
+/// the kernel's own test). It occurs twice, relative to a product of two random skies.
 const INTERPOLATION: f64 = 4e-4;
 
 #[test]
@@ -154,8 +154,7 @@ fn the_operator_is_the_sum_over_rows() {
     }
 }
 
-/// The same at a degree of maps of nside 256, from the shortest baseline over a few minutes: few nodes and alphas hold data, and
-/// take memory.
+/// Tests the degree of maps of nside 256, with the shortest baseline over a few minutes, so that few nodes and alphas take memory.
 #[test]
 fn the_operator_is_the_sum_over_rows_at_high_degrees() {
     let length_m = |block: &PlacedVisibilities| norm(sub(block.r_i_m[0], block.r_j_m[0]));
@@ -167,7 +166,7 @@ fn the_operator_is_the_sum_over_rows_at_high_degrees() {
         assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
     }
     let sums = engine.into_sums();
-    // Random coefficients that fall as those of the sky: the highest degrees count, and do not drown the rest.
+    // Random coefficients that fall as those of the sky, so that all degrees contribute.
     let falling = |seed| {
         let mut alm = coefficients(&vector_to(640, seed), 640);
         for m in 0..=640 {
@@ -187,7 +186,7 @@ fn the_operator_is_the_sum_over_rows_at_high_degrees() {
     sums.apply(&x, &mut y);
     let scale = (form(&vx, &vx) * form(&vz, &vz)).sqrt();
     let errors = [dot(&x, &y) / form(&vx, &vx) - 1.0, (dot(&z, &y) - form(&vz, &vx)) / scale];
-    // Five rows do not average: ripples of the weights' kernels, 2e-4 in alpha and in gamma, and interpolation, twice 3.2e-4 at most.
+    // Errors of five rows do not average out: ripples of the weights' kernels, 2e-4 in alpha and in gamma, and interpolation, twice 3.2e-4.
     assert!(errors.iter().all(|error| error.abs() < 1e-3), "{errors:?}");
 }
 
@@ -199,14 +198,14 @@ fn the_operator_is_symmetric() {
     sums.apply(&x, &mut ax);
     sums.apply(&z, &mut az);
     let scale = (dot(&ax, &ax) * dot(&z, &z)).sqrt();
-    // Sums of f32 products.
+    // Rounding of f32 products.
     assert!((dot(&z, &ax) - dot(&x, &az)).abs() < 1e-6 * scale);
 }
 
-/// `<B x, N^-1 V> = <x, Bt N^-1 V>`: B by the forward operator, Bt by the engine, which share no kernel.
+/// Tests `<B x, N^-1 V> = <x, Bt N^-1 V>` with B from the forward operator and Bt from the engine, which share no kernel.
 ///
-/// The bound is the engine's interpolation between nodes, 8e-5 in the mean, averaged over 600 rows, and the data's kernels, 1e-4
-/// likewise; the forward operator errs by 1e-5.
+/// The bound is the engine's error of interpolation between nodes (8e-5 in the mean over 600 rows) and of data kernels (1e-4); the forward
+/// operator has an error of 1e-5.
 #[test]
 fn data_is_projected_by_the_adjoint() {
     let blocks = blocks(0, 60);
@@ -226,8 +225,7 @@ fn data_is_projected_by_the_adjoint() {
     }
 }
 
-/// The engine's own rows: `x.A z = sum_t w_t Re(conj(v_t(x)) v_t(z))` with `v_t(x) = x.Bt e_t` from the projections of
-/// unit visibilities one by one.
+/// Tests `x.A z = sum_t w_t Re(conj(v_t(x)) v_t(z))`, with `v_t(x) = x.Bt e_t` from projections of single unit visibilities.
 #[test]
 fn the_operator_and_the_projection_are_of_one_matrix() {
     let mut blocks = blocks(0, 3);
@@ -261,11 +259,11 @@ fn the_operator_and_the_projection_are_of_one_matrix() {
     let mut y = vec![0.0; x.len()];
     sums.apply(&x, &mut y);
     let scale = (lengths[0] * lengths[1]).sqrt();
-    // Kernels: 1e-4 on the data's side, twice, and ripples of 2e-4 of the weights', twice.
+    // Kernel errors: twice 1e-4 for data, and twice ripples of 2e-4 for weights.
     assert!((dot(&z, &y) - expected).abs() < 6e-4 * scale, "{:e}", (dot(&z, &y) - expected) / scale);
 }
 
-/// The companion is projected as data is: equal when it is given as data.
+/// Noise that is passed as data gives the right-hand side of the noise.
 #[test]
 fn noise_is_projected_as_data_is() {
     let mut blocks = blocks(0, 10);
@@ -277,7 +275,7 @@ fn noise_is_projected_as_data_is() {
     }
     let second = engine(&blocks).into_sums();
     for (a, b) in first.noise_right_hand_side().iter().zip(second.right_hand_side()) {
-        // Weighted in another order before rounding to f32.
+        // The weight is applied in another order before rounding to f32.
         assert!((a - b).abs() < 1e-5 * b.abs().max(1e-2), "{a} {b}");
     }
 }
@@ -294,7 +292,7 @@ fn merging_is_adding_and_subtracting_undoes_it() {
     };
     let near = |a: &[f64], b: &[f64]| {
         let scale = dot(b, b).sqrt();
-        // f32 sums of the same terms in other orders.
+        // Sums of the same terms in other orders.
         a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6 * scale)
     };
     let whole = apply(engine(&all));
@@ -369,7 +367,7 @@ fn damage_to_a_checkpoint_is_found() {
 }
 
 #[test]
-fn what_the_basis_does_not_cover_is_refused_with_its_reason() {
+fn visibilities_off_the_circle_are_refused_with_a_reason() {
     let mut engine = HarmonicEngine::new(setup()).unwrap();
     let mut block = blocks(0, 1).into_iter().find(|block| block.len() == 5).unwrap();
     block.r_i_m[0] = block.r_i_m[0].map(|x| 1.01 * x);
@@ -391,7 +389,7 @@ fn what_the_basis_does_not_cover_is_refused_with_its_reason() {
     assert_eq!(added.refused.keys().collect::<Vec<_>>(), [&Refusal::TooLong]);
 }
 
-/// What a pair gives is the conjugate of what it gives with its satellites exchanged.
+/// Exchanging the satellites of a pair conjugates its visibility.
 #[test]
 fn exchanged_satellites_are_conjugate_data() {
     let blocks = blocks(0, 4);
@@ -408,12 +406,12 @@ fn exchanged_satellites_are_conjugate_data() {
     let (a, b) = (engine(&blocks).into_sums(), engine(&exchanged).into_sums());
     let scale = dot(a.right_hand_side(), a.right_hand_side()).sqrt();
     for (a, b) in a.right_hand_side().iter().zip(b.right_hand_side()) {
-        // Angles through other roundings, positions in f32 tables.
+        // Rounding of angles, and positions in f32 tables.
         assert!((a - b).abs() < 1e-6 * scale);
     }
 }
 
-/// Many visibilities in one place: f32 sums neither stop growing nor drift.
+/// Sums of many equal visibilities neither stop growing nor drift.
 #[test]
 fn sums_of_many_do_not_lose_weight() {
     let mut one = blocks(0, 1).swap_remove(0);
@@ -431,7 +429,7 @@ fn sums_of_many_do_not_lose_weight() {
     many.apply(&vector(9), &mut a);
     single.apply(&vector(9), &mut b);
     let ratio = dot(&a, &b) / dot(&b, &b) / f64::from(repeats);
-    // Rounding of 20,000 additions in f32, were it always the same way: 20,000 / 2^25.
+    // Rounding of 20,000 additions in f32, all in one direction: 20,000 / 2^25.
     assert!((ratio - 1.0).abs() < 6e-4, "{ratio}");
 }
 
@@ -449,25 +447,25 @@ fn blocks_of_orders_are_symmetric_and_solved() {
     let (px, pz) = (solved(&x), solved(&z));
     assert!((dot(&z, &px) - dot(&x, &pz)).abs() < 1e-9 * (dot(&px, &px) * dot(&z, &z)).sqrt());
     assert!(dot(&x, &px) > 0.0);
-    // What the blocks and R do, their factors undo.
+    // The factors invert the blocks plus R.
     let mut product = x.clone();
     sums.order_blocks().multiply(&mut product);
     product.iter_mut().zip(&x).for_each(|(product, x)| *product += 1e-3 * x);
     let undone = solved(&product);
     let apart = undone.iter().zip(&x).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
     assert!(apart < 1e-6, "R is a millionth of the greatest element: {apart:e}");
-    // The monopole of even coverage is nearly an eigenvector: the block sees it as the operator does.
+    // For even coverage the monopole is nearly an eigenvector, for which block and operator agree.
     let mut e = vec![0.0; x.len()];
     e[0] = 1.0;
     let (mut whole, block) = (vec![0.0; x.len()], sums.order_blocks());
     sums.apply(&e, &mut whole);
     let quotient = block.diagonal(0) / whole[0];
-    // What depends on the phase is not in the block; for the monopole nothing does.
+    // Blocks neglect dependence on the phase, which the monopole does not have.
     assert!((quotient - 1.0).abs() < 1e-3, "{quotient}");
 }
 
-/// Every sum against a plain one in f64 of the same kernels, at weights a thousand times below the greatest: each term
-/// is off by at most half a quantum and the roundings of its f32 product, and the errors do not add up.
+/// Compares every sum with one in f64 of the same kernels, at weights a thousand times below the maximum. The error of a term is at most half a
+/// quantum and the rounding of its f32 product, and errors do not accumulate.
 #[test]
 fn sums_are_within_their_resolution_of_plain_ones() {
     let blocks = blocks(0, 20);
@@ -485,8 +483,8 @@ fn sums_are_within_their_resolution_of_plain_ones() {
             (&grids.data, &grids.data, grids.data_points(), grids.data_stride(), quanta.right),
         ];
         for (which, (by_alpha, by_gamma, points, stride, quantum)) in circles.into_iter().enumerate() {
-            let (alpha, alphas) = Grids::on_circle(by_alpha, points, visibility.place.alpha_rad);
-            let (gamma, gammas) = Grids::on_circle(by_gamma, points, visibility.place.gamma_rad);
+            let (alpha, alphas) = Grids::kernel_at(by_alpha, points, visibility.place.alpha_rad);
+            let (gamma, gammas) = Grids::kernel_at(by_gamma, points, visibility.place.gamma_rad);
             for at in 0..grid::NODES {
                 let values: Vec<f64> = if which == 0 {
                     (at..grid::NODES).map(|above| visibility.weight * f64::from(u[at] * u[above])).collect()
@@ -524,14 +522,14 @@ fn sums_are_within_their_resolution_of_plain_ones() {
                 count += usize::from(cell.sum != 0.0);
             }
         }
-        // Rounding of 0.3 quanta, 2^-20 of a weight and 2^-14 of a standard deviation, against terms of kernels in
-        // three dimensions, whose root mean squares are some 1e-2 and 1e-1; far below the kernels' own 1e-4 and the noise.
+        // Rounding by 0.3 quanta is 2^-20 of a weight and 2^-14 of a standard deviation. Terms of three-dimensional kernels have
+        // rms values of some 1e-2 and 1e-1, so rounding is far below the kernels' errors of 1e-4 and the noise.
         let relative = (error / total).sqrt();
         assert!(count > 50_000 && relative < [5e-5, 4e-4][which], "{count} {relative:e}");
     }
 }
 
-/// A plain sum, and how far the exact one may be from it.
+/// A sum in f64, and the tolerance of the exact one.
 #[derive(Clone, Copy, Default)]
 struct Cell {
     sum: f64,
@@ -539,14 +537,14 @@ struct Cell {
 }
 
 #[test]
-fn further_realisations_have_the_bits_of_their_own_engines() {
+fn additional_realisations_have_the_bits_of_their_own_engines() {
     let blocks = blocks(0, 12);
     let of_seed = |seed: u64| {
         let mut engine = HarmonicEngine::new(HarmonicSetup { companion_seed: seed, ..setup() }).unwrap();
         blocks.iter().for_each(|block| drop(engine.add(block).unwrap()));
         engine.into_sums().noise_right_hand_side().to_vec()
     };
-    // Two share a row, and the last one has it for itself.
+    // Two realisations share a row; the last one has its own.
     let seeds = [7, 8, 1 << 40];
     let mut engine = HarmonicEngine::new(setup()).unwrap();
     let mut noises = NoiseSums::new(&engine, &seeds);
@@ -554,11 +552,11 @@ fn further_realisations_have_the_bits_of_their_own_engines() {
         noises.add(&engine, block);
         assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
     }
-    let sums = engine.into_sums().with_noises(noises);
-    assert_eq!(sums.further_noises().len(), seeds.len());
-    for (seed, found) in seeds.into_iter().zip(sums.further_noises()) {
+    let sums = engine.into_sums().with_noise_realisations(noises);
+    assert_eq!(sums.noise_realisations().len(), seeds.len());
+    for (seed, found) in seeds.into_iter().zip(sums.noise_realisations()) {
         let bits = |values: &[f64]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         assert!(bits(found) == bits(&of_seed(seed)), "seed {seed}");
     }
-    assert!(sums.further_noises()[0] == sums.noise_right_hand_side());
+    assert!(sums.noise_realisations()[0] == sums.noise_right_hand_side());
 }

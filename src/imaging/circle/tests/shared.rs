@@ -1,9 +1,9 @@
-//! Sums of which several hold parts: ranks of a job, parts on disk; and what several vectors share.
+//! Tests of sums in parts (on ranks or on disk), and of products of several vectors.
 
 use super::*;
 use crate::ranks::on_threads;
 
-/// Engines that make sums in parts, and what the last of them leaves.
+/// Accumulates sums in parts, and returns the complete sums.
 fn in_parts(
     count: usize,
     blocks: impl Fn(usize) -> Vec<PlacedVisibilities>,
@@ -16,7 +16,7 @@ fn in_parts(
             let _ = engine.add(&block).unwrap();
         }
         if let Some(sums) = engine.finish_part(&part)? {
-            // Nothing is left, whatever happens to the process.
+            // No file remains, even if the process is killed.
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
             return Ok(sums);
         }
@@ -43,12 +43,12 @@ fn sums_on_disk_have_the_bits_of_those_in_memory() {
         assert_eq!(sums.matrix_product_flops(), whole.matrix_product_flops());
         assert!(sums.failure().is_none());
     }
-    // Other data in one of the readings.
+    // One of the readings has other data.
     let other = in_parts(3, |number| blocks[..blocks.len() - usize::from(number == 1)].to_vec());
     assert!(matches!(other, Err(AccumulationError::Mismatch { .. })));
-    // A disk that loses what it was given.
+    // A disk that loses data.
     let mut sums = in_parts(2, |_| blocks.clone()).unwrap();
-    sums.tori.stored.as_ref().unwrap().cut(1000);
+    sums.tori.stored.as_ref().unwrap().truncate(1000);
     let mut y = vec![0.0; sums.unknowns()];
     sums.apply(&vector(8), &mut y);
     assert!(y.iter().all(|y| y.is_nan()));
@@ -58,7 +58,7 @@ fn sums_on_disk_have_the_bits_of_those_in_memory() {
 }
 
 #[test]
-fn products_made_together_have_the_bits_of_each_alone() {
+fn shared_products_have_the_bits_of_single_ones() {
     let blocks = blocks(0, 6);
     let vectors = [vector(8), vec![0.0; (L_MAX + 1) * (L_MAX + 1)], vector(9), vector(10)];
     let bits = |product: &[f64]| product.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
@@ -68,10 +68,10 @@ fn products_made_together_have_the_bits_of_each_alone() {
         whole.apply(x, &mut product);
         bits(&product)
     });
-    // Sums on disk are read from the first block to the last, and back.
+    // Sums on disk are read in alternating order.
     let stored = in_parts(3, |_| blocks.clone()).unwrap();
-    assert_eq!([(); 4].map(|()| stored.tori.turns_back()), [false, true, false, true]);
-    assert!(!whole.tori.turns_back() && !whole.tori.turns_back());
+    assert_eq!([(); 4].map(|()| stored.tori.next_is_reversed()), [false, true, false, true]);
+    assert!(!whole.tori.next_is_reversed() && !whole.tori.next_is_reversed());
     for sums in [&whole, &stored] {
         for count in [4, 3, 2, 1, 0] {
             let x: Vec<&[f64]> = vectors[..count].iter().map(Vec::as_slice).collect();
@@ -84,7 +84,7 @@ fn products_made_together_have_the_bits_of_each_alone() {
     }
 }
 
-/// All that a solver asks of sums, in bits.
+/// The bits of all results that a solver needs.
 fn answers(sums: &HarmonicSums) -> Vec<u64> {
     let mut product = vec![0.0; sums.unknowns()];
     sums.apply(&vector(3), &mut product);
@@ -94,18 +94,18 @@ fn answers(sums: &HarmonicSums) -> Vec<u64> {
     product.into_iter().chain(right).chain(diagonal).map(f64::to_bits).collect()
 }
 
-/// Weights that differ from zero, of all nodes.
-fn weights(sums: &HarmonicSums) -> usize {
+/// The number of non-zero weights of all nodes.
+fn weight_count(sums: &HarmonicSums) -> usize {
     sums.tori.nodes.iter().flatten().flat_map(|node| &node.weights).filter(|w| **w != 0.0).count()
 }
 
 #[test]
-fn ranks_hold_parts_and_answer_as_one() {
+fn results_do_not_depend_on_the_number_of_ranks() {
     let blocks = blocks(0, 12);
-    // Few data, so that some blocks of alphas and nodes are empty; and none.
+    // Also with so few data that some blocks and nodes are empty, and with none.
     for blocks in [&blocks[..], &blocks[..1], &[]] {
         let alone = engine(blocks).into_sums();
-        let (expected, weight_count) = (answers(&alone), weights(&alone));
+        let (expected, expected_weights) = (answers(&alone), weight_count(&alone));
         // 112 alphas in seven blocks, and 56 of data in four.
         for count in [1, 2, 3, 4, 9] {
             let found = on_threads(count, |ranks| {
@@ -113,19 +113,19 @@ fn ranks_hold_parts_and_answer_as_one() {
                 for block in blocks {
                     assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
                 }
-                // A snapshot on the way asks the same.
+                // A snapshot gives the same results.
                 assert!(answers(&engine.sums()) == expected);
                 let sums = engine.into_sums();
-                (answers(&sums) == expected, weights(&sums), sums.counts() == alone.counts())
+                (answers(&sums) == expected, weight_count(&sums), sums.counts() == alone.counts())
             });
             assert!(found.iter().all(|(is_equal, _, counts)| *is_equal && *counts), "{count} ranks");
-            assert_eq!(found.iter().map(|(_, weights, _)| weights).sum::<usize>(), weight_count);
+            assert_eq!(found.iter().map(|(_, weights, _)| weights).sum::<usize>(), expected_weights);
         }
     }
 }
 
 #[test]
-fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
+fn any_number_of_ranks_resumes_from_the_shares_of_others() {
     let blocks = blocks(0, 12);
     let (before, after) = blocks.split_at(blocks.len() / 2);
     let mut whole = Vec::new();
@@ -149,9 +149,9 @@ fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
             engines.for_each(|other| first.join(other).unwrap());
             first
         };
-        // A process alone, whose checkpoint is the one that it would have written itself.
+        // The checkpoint of a single process is the one that it would have written itself.
         let mut again = Vec::new();
-        joined(&Ranks::one()).checkpoint(&mut again).unwrap();
+        joined(&Ranks::single()).checkpoint(&mut again).unwrap();
         assert!(again == whole, "{written} parts");
         for count in [2, 3] {
             let found = on_threads(count, |ranks| {
@@ -165,7 +165,7 @@ fn any_number_of_ranks_goes_on_from_the_parts_of_others() {
 }
 
 #[test]
-fn what_are_no_parts_of_the_same_sums_is_refused() {
+fn shares_that_do_not_match_are_refused() {
     let blocks = blocks(0, 4);
     let parts: Vec<Vec<u8>> = on_threads(2, |ranks| {
         let mut engine = HarmonicEngine::new(setup()).unwrap().with_ranks(ranks);
@@ -175,11 +175,11 @@ fn what_are_no_parts_of_the_same_sums_is_refused() {
         part
     });
     let read = |at: usize, rank| {
-        HarmonicEngine::restore_part(&mut &parts[at][..], RankShare { rank, count: 2 }, &Ranks::one())
+        HarmonicEngine::restore_part(&mut &parts[at][..], RankShare { rank, count: 2 }, &Ranks::single())
     };
-    // One that has the other's name.
+    // A share that is read as the other one.
     assert!(read(0, 1).unwrap_err().to_string().contains("the rank's own blocks"));
-    // The same twice, and one of other data.
+    // The same share twice, and a share of other data.
     let same = read(0, 0).unwrap().join(read(0, 0).unwrap()).unwrap_err();
     assert!(same.to_string().contains("the same alphas"), "{same}");
     let other = read(0, 0).unwrap().join(engine(&blocks[..1])).unwrap_err();

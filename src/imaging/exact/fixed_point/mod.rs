@@ -1,8 +1,8 @@
-//! Sums as integers: the scale of their quanta, how terms are rounded, and rows that hold them.
+//! Sums as integers: the scale of their quanta, the rounding of terms, and rows of integers.
 //!
-//! Each term is rounded once, by a rule that looks at its own visibility alone, to a multiple of a quantum that was
-//! fixed before any data arrived. Integers add up to the same bits in any order, batch, number of threads or tree of
-//! merges, and what was added can be removed without a trace.
+//! Each term is rounded once, by a rule that depends only on its own visibility, to a multiple of a quantum that was
+//! fixed before any data arrived. Sums of integers have the same bits for any order, batches, threads and merges, and
+//! removal is the exact inverse of addition.
 
 pub(in crate::imaging) mod parts;
 pub(in crate::imaging) mod rounding;

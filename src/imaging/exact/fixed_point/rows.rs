@@ -1,37 +1,36 @@
-//! Rows of integers that take 32 bits each while that is enough.
+//! Rows of integers of 32 bits each, widened to 64 bits when necessary.
 //!
-//! The integers of a row take 32 bits while the greatest terms of everything that was added to it could not sum to
-//! more, else 64. That bound is a sum of integers too, so it does not depend on the order either.
+//! A row has 32-bit integers while a bound on its sums allows it: the sum of the maximum terms of all additions. The bound
+//! is a sum of integers too, so it does not depend on their order.
 
 use super::Direction;
 
-/// Bounds below this hold in 32 bits.
-const NARROW: u64 = 1 << 31;
+/// Bound below which sums fit 32 bits.
+const NARROW_BOUND: u64 = 1 << 31;
 
-/// How a row is laid out: parts behind one another, each with an overhang that folds back to its start.
+/// The layout of a row: consecutive parts, each with an overhang that is added to its start.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::imaging) struct RowLayout {
-    /// Integers of a part, its overhang included.
+    /// Number of integers of a part, including its overhang.
     pub(in crate::imaging) stride: usize,
-    /// Number of parts.
     pub(in crate::imaging) parts: usize,
-    /// Integers beyond the end of a part.
+    /// Number of integers beyond the end of a part.
     pub(in crate::imaging) overhang: usize,
 }
 
 impl RowLayout {
-    /// Integers of a row.
+    /// Number of integers of a row.
     pub(in crate::imaging) fn len(self) -> usize {
         self.stride * self.parts
     }
 
-    /// Integers of a part without its overhang.
+    /// Number of integers of a part, without its overhang.
     pub(in crate::imaging) fn points(self) -> usize {
         self.stride - self.overhang
     }
 }
 
-/// The integers of a row; none if nothing was ever added.
+/// The integers of a row; `None` before the first addition.
 #[derive(Clone, Debug, Default)]
 pub(in crate::imaging) enum Integers {
     #[default]
@@ -43,41 +42,41 @@ pub(in crate::imaging) enum Integers {
 /// A row of sums, with a bound on them.
 #[derive(Clone, Debug, Default)]
 pub(in crate::imaging) struct IntegerRow {
-    /// No sum is greater than this, in quanta.
+    /// Upper bound of the sums, in quanta.
     bound: u64,
     pub(in crate::imaging) integers: Integers,
 }
 
 impl IntegerRow {
-    /// Makes room for terms of together at most `most` quanta in each of `len` sums.
+    /// Makes room for terms that change each of `len` sums by at most `change_max` quanta.
     #[inline(always)]
-    pub(in crate::imaging) fn make_room(&mut self, most: u64, direction: Direction, len: usize) {
+    pub(in crate::imaging) fn make_room(&mut self, change_max: u64, direction: Direction, len: usize) {
         let before = self.bound;
         self.bound = match direction {
-            Direction::In => before.wrapping_add(most),
-            Direction::Out => before.wrapping_sub(most),
+            Direction::In => before.wrapping_add(change_max),
+            Direction::Out => before.wrapping_sub(change_max),
         };
-        let is_wide = self.bound.max(before) >= NARROW;
+        let is_wide = self.bound.max(before) >= NARROW_BOUND;
         match &self.integers {
             Integers::Wide(_) => {}
             Integers::Narrow(_) if !is_wide => {}
-            _ => self.hold(is_wide, len),
+            _ => self.allocate(is_wide, len),
         }
     }
 
     #[cold]
-    fn hold(&mut self, is_wide: bool, len: usize) {
+    fn allocate(&mut self, is_wide: bool, len: usize) {
         self.integers = match (std::mem::take(&mut self.integers), is_wide) {
             (Integers::None, false) => Integers::Narrow(vec![0; len].into()),
             (Integers::None, true) => Integers::Wide(vec![0; len].into()),
             (Integers::Narrow(sums), true) => {
                 Integers::Wide(sums.iter().map(|sum| i64::from(*sum)).collect())
             }
-            (held, _) => held,
+            (unchanged, _) => unchanged,
         };
     }
 
-    /// Adds another row, or removes it.
+    /// Adds another row or removes it, depending on the direction.
     pub(in crate::imaging) fn combine(&mut self, other: &Self, direction: Direction) {
         let len = match &other.integers {
             Integers::None => return,
@@ -99,7 +98,7 @@ impl IntegerRow {
                 let terms = terms.iter().map(|term| i64::from(sign).wrapping_mul(*term));
                 sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum = sum.wrapping_add(term));
             }
-            // A row that holds wide ones has a bound that is; low bits are right in any case.
+            // Does not occur, as a wide row has a large bound; the low bits would be right.
             (Integers::Narrow(sums), Integers::Wide(terms)) => {
                 sums.iter_mut()
                     .zip(terms)
@@ -117,12 +116,12 @@ impl IntegerRow {
         }
     }
 
-    /// Whether the row holds nothing.
+    /// Whether the row is empty.
     pub(in crate::imaging) fn is_empty(&self) -> bool {
         self.bound == 0
     }
 
-    /// The sums of each part, its overhang folded back to its start; `None` if the row holds nothing.
+    /// The sums of each part, with its overhang added to its start; `None` if the row is empty.
     fn folded(&self, layout: RowLayout) -> Option<impl Iterator<Item = i64>> {
         let (points, stride) = (layout.points(), layout.stride);
         (!self.is_empty()).then(|| {
@@ -139,7 +138,7 @@ impl IntegerRow {
         })
     }
 
-    /// Writes bound and sums; sums that fit 32 bits by the bound take no more.
+    /// Writes the bound and the sums, in 32 bits if the bound allows it.
     pub(in crate::imaging) fn write<E>(
         &self,
         layout: RowLayout,
@@ -147,23 +146,23 @@ impl IntegerRow {
     ) -> Result<(), E> {
         out(&self.bound.to_le_bytes())?;
         let Some(sums) = self.folded(layout) else { return Ok(()) };
-        // In place and by `for_each`: a gigabyte of these is what an interrupted run waits for.
+        // In place and by `for_each` for speed: an interrupted run waits for gigabytes of these.
         let count = layout.points() * layout.parts;
-        let bytes = if self.bound < NARROW {
+        let bytes = if self.bound < NARROW_BOUND {
             let mut bytes = vec![0; 4 * count];
-            let mut places = bytes.as_chunks_mut::<4>().0.iter_mut();
+            let mut fields = bytes.as_chunks_mut::<4>().0.iter_mut();
             sums.for_each(|sum| {
-                if let Some(place) = places.next() {
-                    *place = (sum as i32).to_le_bytes();
+                if let Some(field) = fields.next() {
+                    *field = (sum as i32).to_le_bytes();
                 }
             });
             bytes
         } else {
             let mut bytes = vec![0; 8 * count];
-            let mut places = bytes.as_chunks_mut::<8>().0.iter_mut();
+            let mut fields = bytes.as_chunks_mut::<8>().0.iter_mut();
             sums.for_each(|sum| {
-                if let Some(place) = places.next() {
-                    *place = sum.to_le_bytes();
+                if let Some(field) = fields.next() {
+                    *field = sum.to_le_bytes();
                 }
             });
             bytes
@@ -171,7 +170,7 @@ impl IntegerRow {
         out(&bytes)
     }
 
-    /// Reads what [`IntegerRow::write`] wrote.
+    /// Reads a row that [`IntegerRow::write`] wrote.
     pub(in crate::imaging) fn read<E>(
         layout: RowLayout,
         mut from: impl FnMut(&mut [u8]) -> Result<(), E>,
@@ -183,26 +182,26 @@ impl IntegerRow {
         if bound == 0 {
             return Ok(row);
         }
-        let width = if bound < NARROW { 4 } else { 8 };
+        let width = if bound < NARROW_BOUND { 4 } else { 8 };
         let mut bytes = vec![0; width * layout.points() * layout.parts];
         from(&mut bytes)?;
         row.make_room(bound, Direction::In, layout.len());
         let start = |part| part * layout.stride;
-        let places = (0..layout.parts).flat_map(|part| start(part)..start(part) + layout.points());
+        let indices = (0..layout.parts).flat_map(|part| start(part)..start(part) + layout.points());
         match &mut row.integers {
             Integers::None => {}
             Integers::Narrow(sums) => {
-                places.zip(bytes.as_chunks::<4>().0).for_each(|(at, b)| sums[at] = i32::from_le_bytes(*b));
+                indices.zip(bytes.as_chunks::<4>().0).for_each(|(at, b)| sums[at] = i32::from_le_bytes(*b));
             }
             Integers::Wide(sums) => {
-                places.zip(bytes.as_chunks::<8>().0).for_each(|(at, b)| sums[at] = i64::from_le_bytes(*b));
+                indices.zip(bytes.as_chunks::<8>().0).for_each(|(at, b)| sums[at] = i64::from_le_bytes(*b));
             }
         }
         Ok(row)
     }
 
-    /// The sums times `quantum`, into a row of the same layout.
-    pub(in crate::imaging) fn values(&self, layout: RowLayout, quantum: f64, out: &mut [f32]) {
+    /// Writes the sums times `quantum` to a row of the same layout.
+    pub(in crate::imaging) fn write_values(&self, layout: RowLayout, quantum: f64, out: &mut [f32]) {
         let Some(mut sums) = self.folded(layout) else { return };
         for out in out.chunks_exact_mut(layout.stride) {
             for (out, sum) in out[..layout.points()].iter_mut().zip(&mut sums) {

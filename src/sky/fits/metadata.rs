@@ -1,4 +1,4 @@
-//! What the headers of a map say of it: its frequency, its unit, values that stand for none.
+//! Metadata of a map in its headers: frequency and unit.
 
 use super::card::{Card, CardValue};
 use super::error::FitsProblem;
@@ -6,25 +6,23 @@ use super::header::Header;
 use crate::units::Dimension;
 use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
 
-/// Keywords of a map's frequency.
 const FREQUENCY_KEYS: [&str; 5] = ["FREQ", "FREQUENCY", "OBSFREQ", "RESTFRQ", "RESTFREQ"];
-/// Keywords of the unit of FREQ.
 const FREQUENCY_UNIT_KEYS: [&str; 3] = ["FREQUNIT", "FREQ_UNI", "UNITFREQ"];
 
-/// Relative difference up to which two frequencies are the same: a digit lost in a header.
-const SAME: f64 = 1e-6;
+/// Relative difference up to which two frequencies count as equal, as headers may lose digits.
+const FREQUENCY_TOLERANCE: f64 = 1e-6;
 
-/// What follows the kelvin in units that are temperatures: thermodynamic and Rayleigh-Jeans are the same at these frequencies (to
-/// (h nu / k T)^2 / 12 of the CMB's 2.7 K, 4e-6 at 408 MHz).
+/// Suffixes of kelvin in units of temperature. Thermodynamic and Rayleigh-Jeans temperatures agree at these frequencies, to
+/// (h nu / k T)^2 / 12 of the CMB's 2.7 K, 4e-6 at 408 MHz.
 const KINDS_OF_KELVIN: [&str; 8] = ["", "cmb", "rj", "thermo", "thermodynamic", "ant", "antenna", "b"];
 
-/// Whether two frequencies are the same, Hz.
+/// Whether two frequencies, Hz, are equal within the tolerance.
 pub(super) fn is_same_hz(one: f64, other: f64) -> bool {
-    (one - other).abs() <= SAME * other
+    (one - other).abs() <= FREQUENCY_TOLERANCE * other
 }
 
-/// The frequency for which a column holds, Hz: what its name or FREQn says, else FREQ of either header; `None` if nothing does.
-/// Columns are counted from 1, as the keywords are.
+/// Frequency of a column, Hz, from its own metadata ([`column_hz`]) or else from FREQ in either header; `None` if not stated.
+/// Columns count from 1, as in keywords.
 pub(super) fn frequency_hz(header: &Header, column: usize) -> Result<Option<f64>, FitsProblem> {
     match column_hz(header, column)? {
         None => file_hz(header),
@@ -32,7 +30,7 @@ pub(super) fn frequency_hz(header: &Header, column: usize) -> Result<Option<f64>
     }
 }
 
-/// What a column says of its own frequency, Hz, by FREQn, or its name, such as `10MHz`, or that name's comment.
+/// Frequency in the metadata of a column, Hz: FREQn, its name (such as `10MHz`), or the comment of the name.
 pub(super) fn column_hz(header: &Header, column: usize) -> Result<Option<f64>, FitsProblem> {
     if let Some(card) = header.card(&format!("FREQ{column}")) {
         return stated_hz(header, card).map(Some);
@@ -42,7 +40,7 @@ pub(super) fn column_hz(header: &Header, column: usize) -> Result<Option<f64>, F
     Ok(name.or_else(|| hz_in(&card.comment)))
 }
 
-/// FREQ of either header, which may not contradict each other.
+/// Frequency in FREQ of either header, Hz, which must not contradict each other.
 fn file_hz(header: &Header) -> Result<Option<f64>, FitsProblem> {
     let mut known: Option<f64> = None;
     for card in header.cards().iter().filter(|card| FREQUENCY_KEYS.contains(&card.key.as_str())) {
@@ -60,7 +58,7 @@ fn file_hz(header: &Header) -> Result<Option<f64>, FitsProblem> {
     Ok(known)
 }
 
-/// The frequency of a card, Hz: its unit stands in its text, its comment or FREQUNIT; without one it is Hz.
+/// Frequency of a card, Hz. Its unit is in the text, the comment or FREQUNIT; without a unit it is Hz.
 fn stated_hz(header: &Header, card: &Card) -> Result<f64, FitsProblem> {
     let wrong = || {
         let found = format!("{} / {}", card.value, card.comment);
@@ -88,19 +86,18 @@ fn stated_hz(header: &Header, card: &Card) -> Result<f64, FitsProblem> {
     if hz.is_finite() && hz > 0.0 { Ok(hz) } else { Err(wrong()) }
 }
 
-/// A unit of frequency, Hz.
 fn unit_hz(word: &str) -> Option<f64> {
     match word.to_ascii_lowercase().as_str() {
         "hz" => Some(1.0),
         "khz" => Some(1e3),
-        // Millihertz are no radio astronomer's.
+        // mHz in lower case is meant as megahertz; millihertz do not occur.
         "mhz" if word.starts_with('M') || word.chars().all(char::is_lowercase) => Some(1e6),
         "ghz" => Some(1e9),
         _ => None,
     }
 }
 
-/// The unit of frequency that a comment names, if it does; `None` if it names several and none in brackets.
+/// Unit of frequency in a comment, `Some(None)` if there is none; `None` if there are several and none in brackets.
 fn comment_unit_hz(comment: &str) -> Option<Option<f64>> {
     let bracketed = comment.split_once('[').and_then(|(_, rest)| rest.split_once(']'));
     if let Some(unit) = bracketed.and_then(|(unit, _)| unit_hz(unit.trim())) {
@@ -115,7 +112,7 @@ fn comment_unit_hz(comment: &str) -> Option<Option<f64>> {
     }
 }
 
-/// A frequency within a text, such as `T_10MHz` or `3.0 MHz`, Hz.
+/// Finds a frequency within a text, such as `T_10MHz` or `3.0 MHz`, Hz.
 fn hz_in(text: &str) -> Option<f64> {
     let at = text.to_ascii_lowercase().find("hz")?;
     let before = &text[..at];
@@ -129,17 +126,16 @@ fn hz_in(text: &str) -> Option<f64> {
     (number > 0.0 && number.is_finite()).then_some(number * unit)
 }
 
-/// A unit of maps.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum MapUnit {
-    /// So many K.
+    /// Multiple of 1 K.
     Kelvin(f64),
-    /// So many Jy/sr, which are K at a frequency: T = I c^2 / (2 k nu^2).
+    /// Multiple of 1 Jy/sr, which at a frequency is a temperature: T = I c^2 / (2 k nu^2).
     JanskyPerSr(f64),
 }
 
 impl MapUnit {
-    /// A unit by its name; `None` for one of another quantity. A map without a unit is in K.
+    /// Parses the name of a unit; `None` for a unit of another quantity. A map without a unit is in K.
     pub(super) fn parse(unit: &str) -> Option<Self> {
         let unit = unit.trim().trim_matches(['[', ']', '(', ')']).trim();
         if unit.is_empty() {
@@ -167,7 +163,7 @@ impl MapUnit {
         })
     }
 
-    /// Factor from this unit to K at a frequency; `None` if that has to be known and is not.
+    /// Factor from this unit to K at a frequency; `None` if the factor depends on the frequency and it is unknown.
     pub(super) fn kelvin(self, frequency_hz: Option<f64>) -> Option<f64> {
         match self {
             Self::Kelvin(factor) => Some(factor),

@@ -1,54 +1,57 @@
-//! The image of the sky in the Moon.
+//! Reflection of the sky by a flat Moon.
 
 use num_complex::Complex64;
 
 use super::{DaughterPosition, ModelError, PairPosition, VisibilityModel};
 use crate::response::pixel::Comb;
 
-/// A model of the sky with its image in a flat Moon, which reflects a share of the power.
+/// Adds the reflection of the sky in a flat Moon with constant power reflectivity to a sky model.
 ///
-/// A wave that the Moon reflects comes later than the direct one by at least `2 h / c`, 2 ms for 300 km: sixteen times the
-/// coherence time of a channel of 8 kHz, so that the two do not interfere (the paper, Sect. 5). What is left is a second,
-/// weaker sky. Its mirror is the horizontal plane of the pair's mid-point: it turns a direction n into the one with the
-/// opposite height, `n - 2 (n . z) z`, and since a baseline is horizontal there, the image has the fringe of the direction
-/// itself. Only what stands above the horizontal is reflected. So the image is the share times the visibility of the sky above
-/// the horizontal, that is of a Moon as large as the orbit.
-pub struct WithReflection {
+/// A reflected wave arrives at least `2 h / c` after the direct one, 2 ms for 300 km: sixteen times the coherence time of a
+/// channel of 8 kHz, so that the two do not interfere (the paper, Sect. 5). The image therefore adds as a second, weaker sky.
+/// The mirror is the horizontal plane at the pair's mid-point. It maps a direction n to `n - 2 (n . z) z`, and as the baseline is
+/// horizontal there, the image has the fringe of n itself. Only the sky above the horizontal is reflected: the image is the
+/// reflectivity times the visibility that a Moon as large as the orbit would leave.
+pub struct WithFlatReflection {
     sky: Box<dyn VisibilityModel>,
-    above: Box<dyn VisibilityModel>,
-    share: f64,
+    upper_sky: Box<dyn VisibilityModel>,
+    reflectivity: f64,
 }
 
-impl WithReflection {
-    /// A `sky`, and the same sky as seen `above` the horizontal, of whose power a `share` is reflected.
+impl WithFlatReflection {
+    /// Adds the reflection of `upper_sky`, the model of the same sky above the horizontal, to `sky`.
     #[must_use]
-    pub fn new(sky: Box<dyn VisibilityModel>, above: Box<dyn VisibilityModel>, share: f64) -> Self {
-        Self { sky, above, share }
+    pub fn new(
+        sky: Box<dyn VisibilityModel>,
+        upper_sky: Box<dyn VisibilityModel>,
+        reflectivity: f64,
+    ) -> Self {
+        Self { sky, upper_sky, reflectivity }
     }
 }
 
-impl VisibilityModel for WithReflection {
+impl VisibilityModel for WithFlatReflection {
     fn batch(&self) -> usize {
         self.sky.batch()
     }
 
-    fn has_own_antennas(&self) -> bool {
-        self.sky.has_own_antennas()
+    fn has_individual_antennas(&self) -> bool {
+        self.sky.has_individual_antennas()
     }
 
     fn predict(&mut self, positions: &[PairPosition], out: &mut [Complex64]) -> Result<(), ModelError> {
         let mut image = vec![Complex64::ZERO; out.len()];
-        self.above.predict(positions, &mut image)?;
+        self.upper_sky.predict(positions, &mut image)?;
         self.sky.predict(positions, out)?;
-        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.share * image);
+        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.reflectivity * image);
         Ok(())
     }
 
     fn predict_powers(&mut self, daughters: &[DaughterPosition], out: &mut [f64]) -> Result<(), ModelError> {
         let mut image = vec![0.0; out.len()];
-        self.above.predict_powers(daughters, &mut image)?;
+        self.upper_sky.predict_powers(daughters, &mut image)?;
         self.sky.predict_powers(daughters, out)?;
-        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.share * image);
+        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.reflectivity * image);
         Ok(())
     }
 
@@ -59,9 +62,9 @@ impl VisibilityModel for WithReflection {
         out: &mut [Complex64],
     ) -> Result<(), ModelError> {
         let mut image = vec![Complex64::ZERO; out.len()];
-        self.above.predict_comb(positions, comb, &mut image)?;
+        self.upper_sky.predict_comb(positions, comb, &mut image)?;
         self.sky.predict_comb(positions, comb, out)?;
-        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.share * image);
+        out.iter_mut().zip(image).for_each(|(out, image)| *out += self.reflectivity * image);
         Ok(())
     }
 }
@@ -88,10 +91,10 @@ mod tests {
             Box::new(DirectSum::new(&sky, frequency_hz, radius_m, AntennaResponse::Isotropic))
                 as Box<dyn VisibilityModel>
         };
-        let mut reflected = WithReflection::new(model(moon_m), model(array.orbit_radius_m()), 0.07);
+        let mut reflected = WithFlatReflection::new(model(moon_m), model(array.orbit_radius_m()), 0.07);
         for (i, j) in [(0, 1), (0, 2), (1, 3)] {
             let (r_i_m, r_j_m) = (array.position_m(i, 9e5), array.position_m(j, 9e5));
-            let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None };
+            let position = PairPosition { r_i_m, r_j_m, span_rad: 0.0, pair_time: None };
             let (mut found, mut power) = ([Complex64::ZERO], [0.0]);
             reflected.predict(&[position], &mut found).unwrap();
             let daughter = DaughterPosition {
@@ -100,7 +103,7 @@ mod tests {
                 ..DaughterPosition::default()
             };
             reflected.predict_powers(&[daughter], &mut power).unwrap();
-            // Two waves from each direction: one straight, one by the mirror, with the mirrored direction's own fringe.
+            // Each direction sends a direct wave, and a reflected one with the fringe of the mirrored direction.
             let middle = add(r_i_m, r_j_m);
             let up: Vec3 = scale(1.0 / norm(middle), middle);
             let wave = |n: Vec3| {
@@ -121,7 +124,7 @@ mod tests {
                 expected_power += if dot(n, r_i_m) >= 0.0 { 0.07 * *t } else { 0.0 };
             }
             let area_sr = pixel_area_sr(nside);
-            // Fringes in f32, sky of 40 K sr.
+            // Fringes are in f32, and the sky has 40 K sr.
             assert!((found[0] - expected * area_sr).norm() < 1e-4, "{} {}", found[0], expected * area_sr);
             assert!((power[0] - expected_power * area_sr).abs() < 1e-4);
         }

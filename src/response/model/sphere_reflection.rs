@@ -1,4 +1,4 @@
-//! The image of the sky in a round Moon.
+//! Specular reflection of the sky by a spherical Moon.
 
 use num_complex::Complex64;
 use rayon::prelude::*;
@@ -12,13 +12,12 @@ use crate::sky::healpix::{pixel_area_sr, pixel_of};
 use crate::sky::{Frame, Rotation, SkyMap, rotate};
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
-/// A model of the sky with its image in a spherical Moon that reflects a share of the power, as a mirror.
+/// Adds the specular reflection of the sky in a spherical Moon with constant power reflectivity to a sky model.
 ///
-/// The image is that which the pair's mid-point sees, a daughter's own for her power. A ray from there in direction n that
-/// hits the sphere at p goes on in direction `n - 2 (n . p) p` (p as a unit vector), from where the light comes: the image has in
-/// direction n the share times the sky's brightness there, with the fringe and antenna of n. It is summed over the directions of
-/// the sky's pixels, with the brightness of the pixel from which the light comes. As in [`WithReflection`](super::WithReflection), image and
-/// sky do not interfere.
+/// The image is computed for the pair's mid-point, or for the daughter itself for auto-correlations. A line of sight n that meets the
+/// sphere at p (a unit vector) is reflected to `n - 2 (n . p) p`. In direction n the image has the reflectivity times the sky's
+/// brightness in the reflected direction, with the fringe and the antenna response of n. It is summed over the directions of the
+/// sky's pixels. As in [`WithFlatReflection`](super::WithFlatReflection), image and sky do not interfere.
 pub struct WithSphereReflection {
     sky: Box<dyn VisibilityModel>,
     frequency_hz: f64,
@@ -26,10 +25,10 @@ pub struct WithSphereReflection {
     image: SphereImage,
 }
 
-/// The sphere and what it reflects.
+/// The reflecting sphere, and the sky that it reflects.
 struct SphereImage {
     radius_m: f64,
-    share: f64,
+    reflectivity: f64,
     /// Directions of the image, on ecliptic axes.
     directions: Vec<Vec3>,
     map: SkyMap,
@@ -38,18 +37,19 @@ struct SphereImage {
 }
 
 impl WithSphereReflection {
-    /// A model of the `sky` of a `map` (K, any frame), to which a Moon of `radius_m` adds a `share` of its power.
+    /// Adds the reflection of `map` (K, any frame) in a Moon of `radius_m` to `sky`, the model of that map.
     #[must_use]
     pub fn new(
         sky: Box<dyn VisibilityModel>,
         map: SkyMap,
         frequency_hz: f64,
         response: AntennaResponse,
-        (radius_m, share): (f64, f64),
+        radius_m: f64,
+        reflectivity: f64,
     ) -> Self {
         let image = SphereImage {
             radius_m,
-            share,
+            reflectivity,
             directions: map.directions_ecliptic(),
             from_ecliptic: Frame::Ecliptic.to_frame(map.frame()),
             area_sr: pixel_area_sr(map.nside()),
@@ -58,24 +58,24 @@ impl WithSphereReflection {
         Self { sky, frequency_hz, response, image }
     }
 
-    /// Adds `sums` of the image that each pair's mid-point sees, `each` values a pair.
+    /// Adds `sums` of the image seen from each pair's mid-point; `values_per_pair` values for each pair.
     fn add_images(
         &self,
         positions: &[PairPosition],
-        each: usize,
+        values_per_pair: usize,
         out: &mut [Complex64],
         sums: impl Fn(&PairGeometry, &MirrorImage) -> Result<Vec<Complex64>, ResponseError> + Sync,
     ) {
-        if each == 0 {
+        if values_per_pair == 0 {
             return;
         }
-        out.par_chunks_mut(each).zip(positions).for_each(|(out, position)| {
+        out.par_chunks_mut(values_per_pair).zip(positions).for_each(|(out, position)| {
             let seen = self.image.seen_from(scale(0.5, add(position.r_i_m, position.r_j_m)));
             let pair = PairGeometry {
                 r_i_m: position.r_i_m,
                 r_j_m: position.r_j_m,
                 frequency_hz: self.frequency_hz,
-                // Nothing is between the daughters and the image.
+                // Nothing hides the image from the daughters.
                 moon_radius_m: 0.0,
                 response: self.response,
             };
@@ -86,7 +86,7 @@ impl WithSphereReflection {
     }
 }
 
-/// An image: directions, and brightness with the share, K.
+/// Image of the sky: directions, and reflected brightness, K.
 struct MirrorImage {
     directions: Directions,
     values_k: Vec<f32>,
@@ -98,22 +98,22 @@ impl SphereImage {
         let (seen, values_k) = hits
             .map(|(n, from)| {
                 let pixel = pixel_of(self.map.nside(), rotate(&self.from_ecliptic, from));
-                (n, (self.share * self.map.values()[pixel]) as f32)
+                (n, (self.reflectivity * self.map.values()[pixel]) as f32)
             })
             .unzip::<Vec3, f32, Vec<Vec3>, Vec<f32>>();
         MirrorImage { directions: Directions::from(seen.as_slice()), values_k }
     }
 
-    /// Where a ray from `r_m` in direction `n` goes on after the sphere; `None` if it misses.
+    /// Direction of the line of sight `n` from `r_m` after reflection; `None` if it misses the sphere.
     fn reflected(&self, r_m: Vec3, n: Vec3) -> Option<Vec3> {
-        let along_m = -dot(n, r_m);
+        let closest_m = -dot(n, r_m);
         let height_m = norm(r_m) - self.radius_m;
-        // (R - d) (R + d) = R^2 - d^2 with d^2 = r^2 - along^2, written so that large spheres keep their digits.
-        let depth_m2 = along_m * along_m - height_m * (norm(r_m) + self.radius_m);
-        if along_m <= 0.0 || depth_m2 < 0.0 {
+        // radius^2 - distance^2 with distance^2 = |r|^2 - closest^2, written to avoid cancellation for large radii.
+        let half_chord_m2 = closest_m * closest_m - height_m * (norm(r_m) + self.radius_m);
+        if closest_m <= 0.0 || half_chord_m2 < 0.0 {
             return None;
         }
-        let p = scale(1.0 / self.radius_m, add(r_m, scale(along_m - depth_m2.sqrt(), n)));
+        let p = scale(1.0 / self.radius_m, add(r_m, scale(closest_m - half_chord_m2.sqrt(), n)));
         Some(sub(n, scale(2.0 * dot(n, p), p)))
     }
 }
@@ -140,7 +140,7 @@ impl VisibilityModel for WithSphereReflection {
             let DaughterPosition { r_m, normal_hat, .. } = *daughter;
             let seen = image.seen_from(r_m);
             let single = SingleGeometry { r_m, normal_hat, moon_radius_m: 0.0, response };
-            // As above.
+            // Lengths agree by construction, so the sums cannot fail.
             let found = sky_powers(&[single], &seen.directions, &seen.values_k, image.area_sr);
             *out += found.unwrap_or_default().iter().sum::<f64>();
         });
@@ -173,7 +173,7 @@ mod tests {
 
     const FREQUENCY_HZ: f64 = 1e6;
     const NSIDE: usize = 128;
-    const SHARE: f64 = 0.07;
+    const REFLECTIVITY: f64 = 0.07;
 
     fn brightness_k(n: Vec3) -> f64 {
         30.0 + 10.0 * n[0] - 5.0 * n[2] + 8.0 * (2.0 * n[1] + n[2]).sin()
@@ -190,22 +190,22 @@ mod tests {
         let dark = SkyMap::constant(1, Frame::Ecliptic, 0.0).unwrap();
         let response = AntennaResponse::Isotropic;
         let sky = Box::new(DirectSum::new(&dark, FREQUENCY_HZ, radius_m, response));
-        WithSphereReflection::new(sky, map(frame), FREQUENCY_HZ, response, (radius_m, SHARE))
+        WithSphereReflection::new(sky, map(frame), FREQUENCY_HZ, response, radius_m, REFLECTIVITY)
     }
 
     fn pair(r_i_m: Vec3, r_j_m: Vec3) -> PairPosition {
-        PairPosition { r_i_m, r_j_m, span_rad: 0.0, at: None }
+        PairPosition { r_i_m, r_j_m, span_rad: 0.0, pair_time: None }
     }
 
-    /// Light comes from within a pixel, rms 0.3 of 8e-3 rad along some 20 K a radian, at random over the 47,000 pixels of the disc:
-    /// five times that.
-    fn pixels_k_sr() -> f64 {
-        5.0 * SHARE * pixel_area_sr(NSIDE) * 0.05 * 47_000.0_f64.sqrt()
+    /// Five standard deviations of the error from rounding reflected directions to pixels: an rms offset of 0.3 times 8e-3 rad in
+    /// a gradient of some 20 K/rad, independent over the 47,000 pixels of the disc.
+    fn pixelisation_error_k_sr() -> f64 {
+        5.0 * REFLECTIVITY * pixel_area_sr(NSIDE) * 0.05 * 47_000.0_f64.sqrt()
     }
 
-    /// Pixels of the limb, of 30 K, are in or out at random.
-    fn limb_k_sr() -> f64 {
-        SHARE * pixel_area_sr(NSIDE) * 30.0 * (3.07 * NSIDE as f64).sqrt()
+    /// Error from pixels on the limb (30 K), values_per_pair counted or not at random.
+    fn limb_error_k_sr() -> f64 {
+        REFLECTIVITY * pixel_area_sr(NSIDE) * 30.0 * (3.07 * NSIDE as f64).sqrt()
     }
 
     #[test]
@@ -227,7 +227,7 @@ mod tests {
             let angle = 2.0 * sine.asin() - theta;
             let from = add(scale(angle.cos(), up), scale(angle.sin(), away));
             let turns = dot(n, sub(r_i_m, r_j_m)) * FREQUENCY_HZ / SPEED_OF_LIGHT_M_S;
-            expected += SHARE * brightness_k(from) * Complex64::cis(-std::f64::consts::TAU * turns);
+            expected += REFLECTIVITY * brightness_k(from) * Complex64::cis(-std::f64::consts::TAU * turns);
             sphere_sr += pixel_area_sr(NSIDE);
         }
         expected *= pixel_area_sr(NSIDE);
@@ -237,20 +237,19 @@ mod tests {
             let mut model = image(frame, moon_m);
             model.predict(&[pair(r_i_m, r_j_m)], &mut found).unwrap();
             let off = (found[0] - expected).norm();
-            // Pixels in another frame are others, also at the limb.
+            // In another frame the pixel centres differ, also along the limb.
             let same = frame == Frame::Ecliptic;
-            let tolerance = pixels_k_sr() + if same { 0.0 } else { limb_k_sr() };
+            let tolerance = pixelisation_error_k_sr() + if same { 0.0 } else { limb_error_k_sr() };
             assert!(
                 off < tolerance && expected.norm() > 100.0 * tolerance,
                 "{frame:?}: {} {expected}",
                 found[0]
             );
-            // A comb has the same at its own frequencies.
             let comb = Comb { first: -0.5, step: 0.5, count: 2 };
             let mut at = [Complex64::ZERO; 2];
             model.predict_comb(&[pair(r_i_m, r_j_m)], comb, &mut at).unwrap();
             assert!((at[1] - found[0]).norm() < 1e-5 && (at[0] - found[0]).norm() > 0.01, "{at:?}");
-            // And its power is that of no baseline.
+            // The auto-power equals the visibility at zero baseline.
             let mut power = [0.0];
             let daughter = DaughterPosition {
                 r_m: r_i_m,
@@ -273,20 +272,23 @@ mod tests {
             let position = pair(at(400.0), at(-500.0));
             let mut found = [Complex64::ZERO];
             image(Frame::Ecliptic, radius_m).predict(&[position], &mut found).unwrap();
-            // As `WithReflection`: the sky above the horizontal.
+            // A flat mirror reflects the sky above the horizontal (`WithFlatReflection`).
             let above = scale(1.0 / (radius_m + 3e5), position.r_i_m);
             let mut flat = Complex64::ZERO;
             for n in pixel_directions(NSIDE) {
                 if dot(n, above) > 0.0 {
                     let turns =
                         dot(n, sub(position.r_i_m, position.r_j_m)) * FREQUENCY_HZ / SPEED_OF_LIGHT_M_S;
-                    flat += SHARE * brightness_k(n) * Complex64::cis(-std::f64::consts::TAU * turns);
+                    flat += REFLECTIVITY * brightness_k(n) * Complex64::cis(-std::f64::consts::TAU * turns);
                 }
             }
             flat *= pixel_area_sr(NSIDE);
             off.push((found[0] - flat).norm());
         }
-        // The band between horizontal and limb, sqrt(2 h / R) wide, is 8 % and 0.8 % of the sphere's half.
-        assert!(off[0] > 10.0 * limb_k_sr() && off[1] < 0.3 * off[0] && off[2] < limb_k_sr(), "{off:?}");
+        // The band between horizontal and limb, sqrt(2 h / R) wide, is 8 % and 0.8 % of a hemisphere.
+        assert!(
+            off[0] > 10.0 * limb_error_k_sr() && off[1] < 0.3 * off[0] && off[2] < limb_error_k_sr(),
+            "{off:?}"
+        );
     }
 }

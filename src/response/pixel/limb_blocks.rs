@@ -1,15 +1,15 @@
-//! Averages over blocks that the limb of the Moon cuts: child by child, but without a sine for each.
+//! Averages over blocks that the limb of the Moon crosses, child by child, but without a sine for each child.
 //!
-//! Lanes hold columns of children (several pieces of a column when the block is small) and step through their children
-//! together. The phase along a column is quadratic, so one rotation takes the fringe from child to child, and a second
-//! one updates the first.
+//! Lanes hold columns of children (several pieces of a column if the block is small) and step through their children
+//! together. The phase along a column is quadratic, so that one rotation advances the fringe from child to child, and a second
+//! rotation updates the first.
 
 use std::f32::consts::TAU;
 
 use multiversion::multiversion;
 
 use super::blocks::{BlockGroup, GX, GY, HXX, HXY, HYY};
-use super::kernel::{Prepared, dot64};
+use super::kernel::{KernelGeometry, dot64};
 use crate::units::arithmetic::{cos_sin_turns, fraction_of_turn, fused};
 
 const LANES: usize = 16;
@@ -17,9 +17,14 @@ const LANES: usize = 16;
 /// Coefficients of a scalar field over a block: constant, x, y, x^2 - v, x y, y^2 - v.
 type BlockField = [f32; 6];
 
-/// Mean of A S_i S_j exp(-2 pi i u . n) over block `lane` of `group`, of `children`^2 children.
+/// Computes the mean of A S_i S_j exp(-2 pi i u . n) over block `lane` of `group`, which has `children`^2 children.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &BlockGroup, lane: usize) -> (f32, f32) {
+pub(super) fn limb_block_mean(
+    pair: &KernelGeometry,
+    children: usize,
+    group: &BlockGroup,
+    lane: usize,
+) -> (f32, f32) {
     const FMA: bool =
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
     let field = |v: [f64; 3]| -> BlockField {
@@ -44,19 +49,18 @@ pub(super) fn cut_mean(pair: &Prepared, children: usize, group: &BlockGroup, lan
         },
     };
     let columns = children.min(LANES);
-    // Children are a power of two: pieces of columns fill the lanes, or several passes cover the columns.
+    // `children` is a power of two: pieces of columns fill the lanes, or several slices cover the columns.
     let pieces = (LANES / columns).min(children);
     let mut sum = [0.0_f32; 2];
     for first_column in (0..children).step_by(columns) {
-        let pass = ColumnPass { children, columns, pieces, first_column };
-        let part = fields.sum::<FMA>(pass);
+        let part = fields.sum::<FMA>(ColumnSlice { children, columns, pieces, first_column });
         sum = [sum[0] + part[0], sum[1] + part[1]];
     }
     let per_child = 1.0 / (children * children) as f32;
     (sum[0] * per_child, sum[1] * per_child)
 }
 
-/// Phase, depths above the limbs and dipole direction of a pair over one block.
+/// Phase, depths above the limbs and dipole projection of a pair over one block.
 struct BlockFields {
     turns: BlockField,
     depth_i: BlockField,
@@ -64,9 +68,9 @@ struct BlockFields {
     along: BlockField,
 }
 
-/// Some columns of a block, cut into pieces so that columns times pieces fit the lanes.
+/// Some columns of a block, divided into pieces so that columns times pieces fit the lanes.
 #[derive(Clone, Copy)]
-struct ColumnPass {
+struct ColumnSlice {
     children: usize,
     columns: usize,
     pieces: usize,
@@ -74,19 +78,18 @@ struct ColumnPass {
 }
 
 impl BlockFields {
-    /// Sum over the children of a pass.
     #[inline(always)]
-    fn sum<const FMA: bool>(&self, pass: ColumnPass) -> [f32; 2] {
-        let per_side = 1.0 / pass.children as f32;
+    fn sum<const FMA: bool>(&self, slice: ColumnSlice) -> [f32; 2] {
+        let per_side = 1.0 / slice.children as f32;
         let variance = (1.0 - per_side * per_side) / 12.0;
-        let steps = pass.children / pass.pieces;
+        let steps = slice.children / slice.pieces;
         let (mut x, mut y, mut active) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
         for lane in 0..LANES {
-            let column = pass.first_column + lane % pass.columns;
-            let piece = lane / pass.columns;
+            let column = slice.first_column + lane % slice.columns;
+            let piece = lane / slice.columns;
             x[lane] = (column as f32 + 0.5) * per_side - 0.5;
             y[lane] = ((piece * steps) as f32 + 0.5) * per_side - 0.5;
-            active[lane] = if piece < pass.pieces { 1.0 } else { 0.0 };
+            active[lane] = if piece < slice.pieces { 1.0 } else { 0.0 };
         }
         let on = |field: &BlockField| ColumnField::new::<FMA>(field, &x, variance);
         let (turns, depth_i, depth_j, along) =
@@ -94,13 +97,14 @@ impl BlockFields {
         let (mut re, mut im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
         let (mut step_re, mut step_im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
         for lane in 0..LANES {
-            (re[lane], im[lane]) = turn_back::<FMA>(turns.at::<FMA>(lane, y[lane]));
+            (re[lane], im[lane]) = conjugate_fringe::<FMA>(turns.at::<FMA>(lane, y[lane]));
             let step = turns.at::<FMA>(lane, y[lane] + per_side) - turns.at::<FMA>(lane, y[lane]);
-            (step_re[lane], step_im[lane]) = turn_back::<FMA>(step);
+            (step_re[lane], step_im[lane]) = conjugate_fringe::<FMA>(step);
         }
-        // Second difference of the phase: small, the same in all lanes.
-        let bend = TAU * 2.0 * turns.square * per_side * per_side;
-        let (bend_re, bend_im) = (fused::<FMA>(-0.5 * bend, bend, 1.0), -bend);
+        // Second difference of the phase, which is small and the same in all lanes.
+        let second_difference = TAU * 2.0 * turns.square * per_side * per_side;
+        let (second_difference_re, second_difference_im) =
+            (fused::<FMA>(-0.5 * second_difference, second_difference, 1.0), -second_difference);
         let (mut sum_re, mut sum_im) = ([0.0_f32; LANES], [0.0_f32; LANES]);
         for _ in 0..steps {
             for lane in 0..LANES {
@@ -110,8 +114,10 @@ impl BlockFields {
                 sum_re[lane] = fused::<FMA>(seen, re[lane], sum_re[lane]);
                 sum_im[lane] = fused::<FMA>(seen, im[lane], sum_im[lane]);
                 (re[lane], im[lane]) = product::<FMA>((re[lane], im[lane]), (step_re[lane], step_im[lane]));
-                (step_re[lane], step_im[lane]) =
-                    product::<FMA>((step_re[lane], step_im[lane]), (bend_re, bend_im));
+                (step_re[lane], step_im[lane]) = product::<FMA>(
+                    (step_re[lane], step_im[lane]),
+                    (second_difference_re, second_difference_im),
+                );
                 y[lane] += per_side;
             }
         }
@@ -124,7 +130,7 @@ impl BlockFields {
     }
 }
 
-/// A field along the lanes' columns: a quadratic in y for each.
+/// A field along the columns of the lanes: a quadratic in y for each lane.
 struct ColumnField {
     constant: [f32; LANES],
     linear: [f32; LANES],
@@ -149,10 +155,10 @@ impl ColumnField {
     }
 }
 
-/// exp(-2 pi i turns) for a few turns.
+/// Computes exp(-2 pi i turns) for a few turns.
 #[inline(always)]
-fn turn_back<const FMA: bool>(turns: f32) -> (f32, f32) {
-    // As in `fraction_of_turn`: exact for |turns| < 2^21, and a block spans a few.
+fn conjugate_fringe<const FMA: bool>(turns: f32) -> (f32, f32) {
+    // Rounds as in `fraction_of_turn`: exact for |turns| < 2^21, and a block spans a few turns.
     const MAGIC: f32 = 12_582_912.0;
     let (cos, sin) = cos_sin_turns::<FMA>(turns - ((turns + MAGIC) - MAGIC));
     (cos, -sin)

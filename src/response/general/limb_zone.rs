@@ -1,15 +1,15 @@
-//! What the Moon hides between the limb of a class and that of a pair.
+//! The part of the occulted sky between the limb of a class and the limb of a pair.
 //!
-//! Seen from the mean nadir of a pair, its two satellites' limbs lie at angles `theta_b(psi)` that differ little from the
-//! class's `theta_c`. In between, Legendre functions are series of Chebyshev polynomials of
+//! Measured from the mean nadir of a pair, the limbs of its two satellites lie at angles `theta_b(psi)` that differ little from the
+//! class's `theta_c`. In between, Legendre functions are expanded in Chebyshev polynomials of
 //! `tau = (theta - theta_c) / width`, so that the coefficients
 //!
 //! ```text
 //! c_{j m} = Int dpsi exp(-i m psi) Int_{theta_c}^{theta_b(psi)} dtheta sin(theta) A T_j(tau) exp(-2 pi i u n_y)
 //! ```
 //!
-//! are all that a pair needs: the inner integral by Gauss-Legendre quadrature at points in psi, the outer as sums over these
-//! (the integrand is even in psi and but for two slight kinks smooth).
+//! are all that a pair needs. The inner integral is a Gauss-Legendre quadrature at points in psi, the outer one a sum over these
+//! points (the integrand is even in psi, and smooth except for two slight kinks).
 
 use std::f64::consts::{PI, TAU};
 
@@ -20,98 +20,106 @@ use crate::frames::AntennaResponse;
 use crate::numerics::quadrature::GaussLegendre;
 use crate::numerics::trigonometry::sin_cos;
 
-/// Relative error of Legendre functions as series.
+/// Maximum relative error of the series of Legendre functions.
 const SERIES_ERROR: f64 = 1e-7;
 
-/// Steps of Newton's iteration for the limb's angle, whose error is squared in each: the first is (half the separation)^2.
-const NEWTON: usize = 4;
+/// Newton steps for the angle of the limb. Each squares the error, which begins as (half the separation)^2.
+const NEWTON_STEPS: usize = 4;
 
-/// Points in psi beyond those that the fringe's and the harmonics' orders take.
-const MARGIN: f64 = 24.0;
+/// Additional points in psi beyond the orders of the fringe and of the harmonics.
+const POINTS_MARGIN: f64 = 24.0;
 
-/// The zone around a class's limb.
+/// The zone around the limb of a class.
 #[derive(Clone, Debug)]
-pub(super) struct Border {
+pub(super) struct LimbZone {
     limb_rad: f64,
     width_rad: f64,
-    /// Terms of the series.
+    /// Number of terms of the series.
     pub(super) terms: usize,
-    /// `[term][point]`: from values at the series' points to its coefficients.
+    /// Matrix `[term][point]` from values at the Chebyshev points to the series' coefficients.
     to_series: Vec<f64>,
     /// Cosines and sines of the points psi, 0 ..= pi.
     cos_psi: Vec<f64>,
     sin_psi: Vec<f64>,
     rule: GaussLegendre,
-    /// `[m][psi]`: `cos(m psi)` times the weight of the point, over the whole circle.
-    pub(super) waves: Vec<Value>,
+    /// `cos(m psi)` times the quadrature weight over the whole circle, `[m][psi]`.
+    pub(super) cos_weights: Vec<Value>,
     response: AntennaResponse,
     wavelength_m: f64,
 }
 
-/// Room for one pair.
+/// Work buffers for one pair.
 #[derive(Clone, Debug, Default)]
-pub(super) struct BorderBuffers {
+pub(super) struct LimbZoneBuffers {
     /// `theta_b - theta_c` by psi.
     depth: Vec<f64>,
-    /// `[part][term][psi]`.
+    /// Inner integrals, `[part][term][psi]`.
     pub(super) sums: [Vec<f64>; 2],
 }
 
-impl Border {
-    /// For pairs of up to `u_max` wavelengths whose limbs lie within `width_rad` of `limb_rad`.
+impl LimbZone {
+    /// Prepares the zone for pairs of up to `u_max` wavelengths whose limbs lie within `width_rad` of `limb_rad`.
     pub(super) fn new(setup: &RowsSetup, limb_rad: f64, width_rad: f64, u_max: f64) -> Self {
         let fringe = TAU * u_max;
         let orders = fringe * (limb_rad + width_rad).sin().min(1.0);
-        let count = (0.5 * (orders + setup.l_max as f64) + 4.0 * orders.cbrt() + MARGIN).ceil() as usize;
+        let count =
+            (0.5 * (orders + setup.l_max as f64) + 4.0 * orders.cbrt() + POINTS_MARGIN).ceil() as usize;
         let psi: Vec<f64> = (0..=count).map(|k| PI * k as f64 / count as f64).collect();
         let weight = |k: usize| if k == 0 || k == count { PI / count as f64 } else { TAU / count as f64 };
-        // Multiples of psi are points of the circle too.
+        // Multiples of a point psi are points of the same circle.
         let circle: Vec<f64> = (0..2 * count).map(|k| (PI * k as f64 / count as f64).cos()).collect();
-        let waves = (0..=setup.l_max)
+        let cos_weights = (0..=setup.l_max)
             .flat_map(|m| (0..=count).map(move |k| (m * k, k)))
             .map(|(mk, k)| (weight(k) * circle[mk % (2 * count)]) as Value)
             .collect();
-        let terms = terms(setup.l_max as f64 * width_rad);
+        let terms = series_terms(setup.l_max as f64 * width_rad);
         Self {
             limb_rad,
             width_rad,
             terms,
-            to_series: (0..terms).flat_map(|j| (0..terms).map(move |k| to_series(terms, j, k))).collect(),
+            to_series: (0..terms).flat_map(|j| (0..terms).map(move |k| series_weight(terms, j, k))).collect(),
             cos_psi: psi.iter().map(|psi| psi.cos()).collect(),
             sin_psi: psi.iter().map(|psi| psi.sin()).collect(),
-            rule: GaussLegendre::new(points(0.5 * width_rad * (setup.l_max as f64 + fringe))),
-            waves,
+            rule: GaussLegendre::new(gauss_points(0.5 * width_rad * (setup.l_max as f64 + fringe))),
+            cos_weights,
             response: setup.response,
             wavelength_m: setup.wavelength_m,
         }
     }
 
-    /// Points in psi.
     pub(super) fn points(&self) -> usize {
         self.cos_psi.len()
     }
 
-    /// Angles from the nadir, rad, at which the series interpolates: Chebyshev's points.
+    /// Chebyshev points of the series, as angles from the nadir, rad.
     pub(super) fn angles_rad(&self) -> Vec<f64> {
-        (0..self.terms).map(|k| self.limb_rad + self.width_rad * node(self.terms, k).cos()).collect()
+        (0..self.terms)
+            .map(|k| self.limb_rad + self.width_rad * chebyshev_angle(self.terms, k).cos())
+            .collect()
     }
 
-    /// The series' coefficients of a function from its values at [`Self::angles_rad`].
+    /// Computes the series' coefficients of a function from its values at [`Self::angles_rad`].
     pub(super) fn series(&self, values: &[f64], out: &mut [Value]) {
-        for (out, shares) in out.iter_mut().zip(self.to_series.chunks_exact(self.terms)) {
-            *out = shares.iter().zip(values).map(|(share, value)| share * value).sum::<f64>() as Value;
+        for (out, row) in out.iter_mut().zip(self.to_series.chunks_exact(self.terms)) {
+            *out = row.iter().zip(values).map(|(element, value)| element * value).sum::<f64>() as Value;
         }
     }
 
-    /// Fills `buffers.sums` with the inner integrals of a pair.
-    pub(super) fn integrate(&self, view: &PairView, buffers: &mut BorderBuffers) {
+    /// Computes the inner integrals of a pair into `buffers.sums`.
+    pub(super) fn integrate(&self, view: &PairView, buffers: &mut LimbZoneBuffers) {
         let points = self.points();
         buffers.depth.clear();
         buffers.depth.resize(points, f64::NEG_INFINITY);
         let pitch = view.pitch_rad();
         for (angle, cos_limb) in view.angle_rad.into_iter().zip(view.cos_limb) {
             let (sin_away, cos_away) = (angle - pitch).sin_cos();
-            limb(self.limb_rad, cos_limb.acos(), [cos_away, -sin_away], &self.cos_psi, &mut buffers.depth);
+            raise_to_limb(
+                self.limb_rad,
+                cos_limb.acos(),
+                [cos_away, -sin_away],
+                &self.cos_psi,
+                &mut buffers.depth,
+            );
         }
         let wave = TAU * view.baseline_m / self.wavelength_m;
         let (sin_pitch, cos_pitch) = pitch.sin_cos();
@@ -139,18 +147,18 @@ impl Border {
     }
 }
 
-/// Chebyshev's points, as angles.
-fn node(terms: usize, k: usize) -> f64 {
+/// Angle whose cosine is the k-th Chebyshev point.
+fn chebyshev_angle(terms: usize, k: usize) -> f64 {
     PI * (k as f64 + 0.5) / terms as f64
 }
 
-/// The share of the value at point k in the coefficient of `T_j`.
-fn to_series(terms: usize, j: usize, k: usize) -> f64 {
-    (if j == 0 { 1.0 } else { 2.0 }) / terms as f64 * (j as f64 * node(terms, k)).cos()
+/// Weight of the value at point k in the coefficient of `T_j`.
+fn series_weight(terms: usize, j: usize, k: usize) -> f64 {
+    (if j == 0 { 1.0 } else { 2.0 }) / terms as f64 * (j as f64 * chebyshev_angle(terms, k)).cos()
 }
 
-/// Terms of a Chebyshev series of `exp(i h tau)`: its coefficients fall as `J_j(h)`.
-fn terms(h: f64) -> usize {
+/// Number of terms of the Chebyshev series of `exp(i h tau)`, whose coefficients fall as `J_j(h)`.
+fn series_terms(h: f64) -> usize {
     let mut term = 1.0;
     let mut j = 0;
     while term > SERIES_ERROR || (j as f64) < h {
@@ -160,8 +168,8 @@ fn terms(h: f64) -> usize {
     j.max(2)
 }
 
-/// Points of a Gauss-Legendre rule for `exp(i h t)`, |t| <= 1, to some 1e-9: the remainder falls as `(h / 2)^(2 n) / (2 n)!`.
-fn points(h: f64) -> usize {
+/// Number of Gauss-Legendre points for `exp(i h t)`, |t| <= 1, to some 1e-9: the remainder falls as `(h / 2)^(2 n) / (2 n)!`.
+fn gauss_points(h: f64) -> usize {
     let mut remainder = 1.0;
     let mut n = 0;
     while remainder > 1e-10 || (2 * n) as f64 <= h {
@@ -171,15 +179,15 @@ fn points(h: f64) -> usize {
     n.max(2)
 }
 
-/// Raises `depth` to where this satellite's limb lies beyond the class's, by psi: the limb obeys
-/// `cos(theta) a + sin(theta) b cos(psi) = cos(limb)` where the satellite's nadir is at `(a, b)`.
+/// Raises `depth` by psi to the distance of this satellite's limb beyond the class's: the limb obeys
+/// `cos(theta) a + sin(theta) b cos(psi) = cos(limb)` for a satellite with its nadir at `(a, b)`.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
-fn limb(class_rad: f64, limb_rad: f64, nadir: [f64; 2], cos_psi: &[f64], depth: &mut [f64]) {
+fn raise_to_limb(class_rad: f64, limb_rad: f64, nadir: [f64; 2], cos_psi: &[f64], depth: &mut [f64]) {
     let cos_limb = sin_cos(limb_rad).1;
     for (cos_psi, depth) in cos_psi.iter().zip(depth) {
         let across = nadir[1] * cos_psi;
         let mut theta = limb_rad;
-        for _ in 0..NEWTON {
+        for _ in 0..NEWTON_STEPS {
             let (sin, cos) = sin_cos(theta);
             let value = cos * nadir[0] + sin * across - cos_limb;
             let slope = cos * across - sin * nadir[0];
@@ -189,20 +197,20 @@ fn limb(class_rad: f64, limb_rad: f64, nadir: [f64; 2], cos_psi: &[f64], depth: 
     }
 }
 
-/// A point of the inner quadrature.
 struct InnerPoint {
     limb_rad: f64,
     inverse_width: f64,
     t: f64,
     weight: f64,
-    /// `2 pi u` times cosine and sine of the pitch.
+    /// `2 pi u` times the cosine of the pitch.
     along: f64,
+    /// `2 pi u` times the sine of the pitch.
     down: f64,
     /// 1 for a dipole along the normal, 0 for isotropic antennas.
     dipole: f64,
 }
 
-/// Adds a point of the inner quadrature to all terms at all psi.
+/// Adds a point of the inner quadrature to all terms and psi.
 #[multiversion::multiversion(targets("x86_64+avx512f+avx512dq+avx512vl", "x86_64+avx2+fma"))]
 fn add_point(
     at: &InnerPoint,

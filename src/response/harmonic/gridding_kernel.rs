@@ -1,61 +1,63 @@
-//! Compact kernels for interpolation between equally spaced nodes.
+//! Gridding kernels: windows of the non-uniform FFT (NUFFT) that interpolate between equally spaced nodes.
 //!
-//! Two kinds:
-//! - the window of *Kaiser and Bessel*, `phi(x) = I_0(beta sqrt(1 - (2x/w)^2)) / I_0(beta)`, |x| <= w/2 (Jackson et al. 1991;
+//! There are two kinds:
+//! - the *Kaiser-Bessel* window `phi(x) = I_0(beta sqrt(1 - (2x/w)^2)) / I_0(beta)`, |x| <= w/2 (Jackson et al. 1991;
 //!   Fessler & Sutton 2003). Its transform is divided out of the data. With oversampling sigma its error is about
-//!   `exp(-pi w sqrt(1 - 1/sigma))`, at five nodes half of that of the exponential of semicircle (Barnett, Magland & af Klinteberg
-//!   2019) and at the end of the band a fourth; both cost the same, as polynomials;
-//! - the *windowed sinc* `sinc(x) K(2x/w)`, K the Kaiser window: longer, but with a transform of 1 over the band,
-//!   so nothing has to be divided out. The weights need that: they multiply products of two patterns, whose
-//!   transforms cannot be divided out of one.
+//!   `exp(-pi w sqrt(1 - 1/sigma))`. With five nodes that is half the error of the exponential of semicircle (Barnett, Magland &
+//!   af Klinteberg 2019), and a fourth at the end of the band; evaluated as polynomials, both cost the same;
+//! - the *windowed sinc* `sinc(x) K(2x/w)`, K the Kaiser window: it is longer, but its transform is 1 over the band, so that
+//!   nothing has to be divided out. Interpolated weights need this kind: they multiply products of two patterns, out of which
+//!   no transform can be divided.
 
 use std::f64::consts::PI;
 
 use crate::numerics::quadrature::GaussLegendre;
 use crate::units::arithmetic::sinc;
 
-/// Greatest width of a kernel, nodes.
+/// Maximum width of a kernel, nodes.
 pub(crate) const LANES: usize = 16;
 
-/// A compact kernel on a grid.
+/// Gridding kernel of compact support.
 #[derive(Clone, Debug)]
 pub(crate) struct Kernel {
     width: usize,
     shape: Shape,
-    /// Coefficients of the polynomials in the distance from the centre, highest power first; one lane a node.
+    /// Coefficients of the polynomials in the distance from the centre, highest power first; one lane per node.
     polynomial: Vec<[f32; LANES]>,
 }
 
-/// The kind of kernel and its shape parameter.
+/// Kind of a kernel, with its shape parameter beta and `I_0(beta)`.
 #[derive(Clone, Copy, Debug)]
 enum Shape {
-    KaiserBessel { beta: f64, middle: f64 },
-    WindowedSinc { beta: f64, middle: f64 },
+    KaiserBessel { beta: f64, i0_beta: f64 },
+    WindowedSinc { beta: f64, i0_beta: f64 },
 }
 
 impl Kernel {
-    /// The narrowest window of Kaiser and Bessel with an error below `tolerance` on a grid with `oversampling` > 1.
+    /// The narrowest Kaiser-Bessel window with an error below `tolerance` on a grid with `oversampling` > 1.
     pub(crate) fn new(tolerance: f64, oversampling: f64) -> Self {
         let rate = PI * (1.0 - 1.0 / oversampling).sqrt();
         let width = ((1.0 / tolerance).ln() / rate + 0.7).ceil().clamp(3.0, LANES as f64) as usize;
         Self::kaiser_bessel(width, oversampling)
     }
 
-    /// The window of Kaiser and Bessel of `width` <= 16 nodes for a grid with `oversampling` > 1. Somewhat below the `beta` that puts the transform's
-    /// first zero at the first alias of the band's end, errors over the band are least: these shares of it were found by trial.
+    /// The Kaiser-Bessel window of `width` <= 16 nodes for a grid with `oversampling` > 1.
+    ///
+    /// The error over the band is smallest for a `beta` slightly below the one that puts the transform's first zero at the first
+    /// alias of the end of the band. The factors were found by trial.
     pub(crate) fn kaiser_bessel(width: usize, oversampling: f64) -> Self {
-        let share = if width <= 6 { 0.97 } else { 0.98 };
-        let beta = share * PI * width as f64 * (1.0 - 0.5 / oversampling);
-        Self::of(width, Shape::KaiserBessel { beta, middle: bessel_i0(beta) })
+        let factor = if width <= 6 { 0.97 } else { 0.98 };
+        let beta = factor * PI * width as f64 * (1.0 - 0.5 / oversampling);
+        Self::with_shape(width, Shape::KaiserBessel { beta, i0_beta: bessel_i0(beta) })
     }
 
-    /// A sinc of `width` <= 16 nodes under a Kaiser window of parameter `beta`; a greater `beta` gives a flatter band
-    /// and a wider edge at half a cycle a node.
+    /// A sinc of `width` <= 16 nodes under a Kaiser window of parameter `beta`; a larger `beta` gives a flatter band
+    /// and a wider transition at half a cycle per node.
     pub(crate) fn windowed_sinc(width: usize, beta: f64) -> Self {
-        Self::of(width, Shape::WindowedSinc { beta, middle: bessel_i0(beta) })
+        Self::with_shape(width, Shape::WindowedSinc { beta, i0_beta: bessel_i0(beta) })
     }
 
-    fn of(width: usize, shape: Shape) -> Self {
+    fn with_shape(width: usize, shape: Shape) -> Self {
         let mut kernel = Self { width, shape, polynomial: Vec::new() };
         kernel.polynomial = kernel.fit(width + 3);
         kernel
@@ -74,12 +76,12 @@ impl Kernel {
             return 0.0;
         }
         match self.shape {
-            Shape::KaiserBessel { beta, middle } => bessel_i0(beta * inside.sqrt()) / middle,
-            Shape::WindowedSinc { beta, middle } => sinc(PI * x) * bessel_i0(beta * inside.sqrt()) / middle,
+            Shape::KaiserBessel { beta, i0_beta } => bessel_i0(beta * inside.sqrt()) / i0_beta,
+            Shape::WindowedSinc { beta, i0_beta } => sinc(PI * x) * bessel_i0(beta * inside.sqrt()) / i0_beta,
         }
     }
 
-    /// `Int phi(x) cos(2 pi f x) dx` at each of `frequencies`, cycles a step.
+    /// The kernel's transform `Int phi(x) cos(2 pi f x) dx` at each of `frequencies`, cycles per step.
     pub(crate) fn transforms(&self, frequencies: &[f64]) -> Vec<f64> {
         let rule = GaussLegendre::new(64 + 8 * self.width);
         let half = 0.5 * self.width as f64;
@@ -91,11 +93,11 @@ impl Kernel {
         frequencies.iter().map(|&f| at(f)).collect()
     }
 
-    /// The first node within reach of `x` (in grid steps), and the kernel at the nodes from there on.
+    /// The first node within the kernel's support about `x` (in grid steps), and the kernel at it and the following nodes.
     #[inline(always)]
     pub(crate) fn spread(&self, x: f64) -> (i64, [f32; LANES]) {
         let first = (x - 0.5 * self.width as f64).ceil();
-        // Goes from -1 to 1 as x goes from one node to the next.
+        // t falls from 1 to -1 as x moves from one node to the next.
         let t = (2.0 * (first - (x - 0.5 * self.width as f64)) - 1.0) as f32;
         let mut lanes = [0.0; LANES];
         for row in &self.polynomial {
@@ -106,14 +108,14 @@ impl Kernel {
         (first as i64, lanes)
     }
 
-    /// Polynomials of `degree` in t that reproduce the kernel at each node, through Chebyshev points.
+    /// Fits polynomials of `degree` in t to the kernel at each node, through Chebyshev points.
     fn fit(&self, degree: usize) -> Vec<[f32; LANES]> {
         let n = degree + 1;
         let points: Vec<f64> = (0..n).map(|k| (PI * (k as f64 + 0.5) / n as f64).cos()).collect();
         let mut rows = vec![[0.0_f32; LANES]; n];
         for node in 0..self.width {
             let half = 0.5 * self.width as f64;
-            // The node lies at (t + 1) / 2 + node - w / 2 steps from x.
+            // The node is (t + 1) / 2 + node - w / 2 steps from x.
             let values: Vec<f64> =
                 points.iter().map(|t| self.value(0.5 * (t + 1.0) + node as f64 - half)).collect();
             for (row, c) in rows.iter_mut().zip(monomials(&points, &values).iter().rev()) {
@@ -180,7 +182,7 @@ mod tests {
                         im += f64::from(*lane) / transform * phase(node).sin();
                     }
                     let error = (re - phase(x).cos()).hypot(im - phase(x).sin());
-                    // The design rule is asymptotic, and worst at the end of the band; f32 adds 1e-6.
+                    // The design rule is asymptotic, and least accurate at the end of the band; f32 adds 1e-6.
                     assert!(
                         error < 5.0 * tolerance + 1e-6,
                         "{tolerance} {oversampling} {frequency}: {error:e}"
@@ -190,11 +192,11 @@ mod tests {
         }
     }
 
-    /// The kernel between nodes in u: over all frequencies of the band and places between nodes, the error in the mean and at most.
+    /// Mean and maximum error of the kernel in u, over all frequencies of the band and positions between nodes.
     #[test]
     fn five_nodes_at_three_and_a_half_a_wavelength_follow_a_fringe() {
         let kernel = Kernel::kaiser_bessel(5, 1.75);
-        let (mut sum, mut most, mut count) = (0.0, 0.0_f64, 0.0);
+        let (mut sum, mut error_max, mut count) = (0.0, 0.0_f64, 0.0);
         for frequency in (0..=100).map(|k| f64::from(k) / 350.0) {
             let transform = kernel.transforms(&[frequency])[0];
             for k in 0..64 {
@@ -207,15 +209,18 @@ mod tests {
                     im += f64::from(*lane) / transform * phase.sin();
                 }
                 let square: f64 = (re - 1.0).powi(2) + im * im;
-                (sum, most, count) = (sum + square, most.max(square.sqrt()), count + 1.0);
+                (sum, error_max, count) = (sum + square, error_max.max(square.sqrt()), count + 1.0);
             }
         }
         let mean = f64::sqrt(sum / count);
-        // The same over the kernel's formula with numpy, in f64, gives 8.32e-5 and 3.177e-4; polynomials in f32 add some 1e-6.
-        assert!((mean - 8.32e-5).abs() < 2e-6 && (most - 3.177e-4).abs() < 5e-6, "{mean:e} {most:e}");
+        // The kernel's formula evaluated with numpy in f64 gives 8.32e-5 and 3.177e-4; polynomials in f32 add some 1e-6.
+        assert!(
+            (mean - 8.32e-5).abs() < 2e-6 && (error_max - 3.177e-4).abs() < 5e-6,
+            "{mean:e} {error_max:e}"
+        );
     }
 
-    /// In the middle of the band nothing has to be divided out, and the fall at its edge is where it should be.
+    /// The transform is 1 in the middle of the band, and falls where it should at the end.
     #[test]
     fn a_windowed_sinc_interpolates_as_it_is() {
         let kernel = Kernel::windowed_sinc(16, 7.0);
@@ -231,8 +236,8 @@ mod tests {
                     im += f64::from(*lane) * phase(node).sin();
                 }
                 let error = (re - phase(x).cos()).hypot(im - phase(x).sin());
-                // Kaiser's rule for beta = 7: ripples of 72 dB up to 0.36 cycles a node; the last is on the edge, where
-                // half of the fall, from 1 to 0 over 0.14 either side of 0.5, has not yet come.
+                // Kaiser's rule for beta = 7: ripples of -72 dB up to 0.36 cycles per node. The last frequency is in the transition,
+                // which falls from 1 to 0 within 0.14 of 0.5.
                 assert!(error < tolerance, "{frequency}: {error:e}");
             }
         }

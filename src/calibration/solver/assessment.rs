@@ -1,0 +1,214 @@
+//! Reported uncertainty and quality state of each gain, from noise, excess scatter of residuals and model errors.
+
+use super::config::{AmplitudeScale, SolverConfig};
+use super::detect::SignalPresence;
+use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
+use super::robust_fit::RobustFit;
+use super::stability::Excess;
+
+/// Coverage: errors must stay within this many stated standard deviations. Angles wrap, and at low signal-to-noise
+/// the phase error of a gain exceeds the Cramer-Rao bound.
+const COVERAGE_SIGMAS: f64 = 4.0;
+
+/// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too. It keeps
+/// fewer than one error in ten thousand beyond [`COVERAGE_SIGMAS`] of them (Gaussian errors exceed 4 deviations 0.6 times in
+/// ten thousand, 4.4 deviations 0.1 times).
+const SIGMA_MARGIN: f64 = 1.1;
+
+/// Signal-to-noise ratio at which a daughter counts as detected in several channels together, none of which suffices
+/// alone.
+const COMBINED_SNR_MIN: f64 = 5.0;
+
+/// Assessment of the gains of a fit.
+pub(super) struct GainAssessment<'a> {
+    pub(super) config: &'a SolverConfig,
+    pub(super) fitted: &'a RobustFit,
+    pub(super) counts: &'a Counts,
+    /// Unexplained fraction of the signal; by channel, then daughter.
+    pub(super) unexplained: &'a [f64],
+    pub(super) excess: &'a [Excess],
+}
+
+/// Enlarges a standard deviation (rad) so that it covers the non-Gaussian phase error of a weak gain.
+fn phase_safe_sigma(sigma: f64) -> f64 {
+    (SIGMA_MARGIN * sigma).max((COVERAGE_SIGMAS * sigma).min(1.0).asin() / COVERAGE_SIGMAS)
+}
+
+impl GainAssessment<'_> {
+    /// Estimates of all daughters, with the states of their gains.
+    pub(super) fn estimates(&self) -> Vec<DaughterEstimate> {
+        let mut estimates: Vec<DaughterEstimate> =
+            (0..self.fitted.layout.satellites).map(|n| self.daughter_estimate(n)).collect();
+        for c in 0..self.fitted.layout.channels() {
+            let good = estimates.iter().filter(|one| one.gains[c].state == GainState::Good).count();
+            let detectable: Vec<usize> =
+                (0..estimates.len()).filter(|n| self.is_detectable(c, *n, &estimates)).collect();
+            if !self.fitted.layout.solves_positions() && detectable.len() > 2 * good {
+                // If most daughters fit poorly, the model is wrong for the channel.
+                detectable.into_iter().for_each(|n| estimates[n].gains[c].state = GainState::PoorFit);
+            }
+            let mut all: Vec<&mut GainState> =
+                estimates.iter_mut().map(|one| &mut one.gains[c].state).collect();
+            all.retain(|state| **state == GainState::Good);
+            if let [alone] = &mut all[..] {
+                // A single good gain is meaningless: phases are relative.
+                **alone = GainState::Uncertain;
+            }
+        }
+        estimates
+    }
+
+    /// Whether a working, stable daughter would be detected in a channel.
+    fn is_detectable(&self, c: usize, n: usize, estimates: &[DaughterEstimate]) -> bool {
+        let own_gain = &self.fitted.own_gains[c * self.fitted.layout.satellites + n];
+        let state = estimates[n].gains[c].state;
+        own_gain.is_detectable(self.config)
+            && !matches!(state, GainState::NoData | GainState::Dead | GainState::Unstable)
+    }
+
+    /// Variance of the log amplitude common to all daughters of a channel: the flux scale of a model is assumed as
+    /// uncertain as its shape. The factor is 1/4 as an amplitude is the square root of a visibility's.
+    fn common_amplitude_variance(&self, c: usize) -> f64 {
+        let n = self.fitted.layout.satellites;
+        if self.config.amplitude_scale == AmplitudeScale::UnitMean {
+            return 0.0;
+        }
+        let mut parts = self.unexplained[c * n..(c + 1) * n].to_vec();
+        parts.sort_unstable_by(f64::total_cmp);
+        0.25 * parts.get(n / 2).copied().unwrap_or(0.0)
+    }
+
+    fn daughter_estimate(&self, n: usize) -> DaughterEstimate {
+        let (layout, values) = (&self.fitted.layout, &self.fitted.newton.values);
+        let sigma = |place: Option<usize>| self.covariance(place, place).sqrt();
+        DaughterEstimate {
+            daughter: n as u32 + 1,
+            clock_ns: values.clock_ns[n],
+            clock_sigma_ns: sigma(layout.clock(n)),
+            position_m: values.position_m[n],
+            position_sigma_m: [0, 1, 2].map(|axis| sigma(layout.position(n, axis))),
+            gains: (0..layout.channels()).map(|c| self.gain(c, n)).collect(),
+        }
+    }
+
+    fn covariance(&self, a: Option<usize>, b: Option<usize>) -> f64 {
+        let order = self.fitted.layout.order();
+        match (a, b) {
+            (Some(a), Some(b)) => self.fitted.newton.covariance[a * order + b],
+            _ => 0.0,
+        }
+    }
+
+    /// Standard deviation, due to noise, of a phase with the contribution of the clock, rad.
+    fn phase_sigma(&self, c: usize, n: usize) -> f64 {
+        let layout = &self.fitted.layout;
+        let (phase, clock, rad_per_ns) = (layout.phase(c, n), layout.clock(n), layout.rad_per_ns(c));
+        let variance = self.covariance(phase, phase)
+            + 2.0 * rad_per_ns * self.covariance(phase, clock)
+            + rad_per_ns * rad_per_ns * self.covariance(clock, clock);
+        variance.max(0.0).sqrt()
+    }
+
+    fn gain(&self, c: usize, n: usize) -> GainEstimate {
+        let (layout, newton) = (&self.fitted.layout, &self.fitted.newton);
+        let k = c * layout.satellites + n;
+        let (own_gain, excess) = (&self.fitted.own_gains[k], &self.excess[k]);
+        let is_reference = n == layout.reference;
+        let reference_excess = if is_reference {
+            Excess::default()
+        } else {
+            self.excess[c * layout.satellites + layout.reference]
+        };
+        // A daughter left out of the joint solution is assessed from its own data.
+        let is_from_own_data = self.fitted.dropped_gains[k] && own_gain.presence != SignalPresence::NoData;
+        let (gain, noise) = if is_from_own_data {
+            let sigma = own_gain.snr_squared().sqrt().recip().min(layout.phase_sigma.max(1.0));
+            (own_gain.gain, [sigma, if is_reference { 0.0 } else { sigma }])
+        } else {
+            let amplitude = layout.amplitude(c, n);
+            let sigma = self.covariance(amplitude, amplitude).sqrt();
+            (layout.gain(&newton.values, c, n), [sigma, self.phase_sigma(c, n)])
+        };
+        let relative = if is_reference { 0.0 } else { 1.0 };
+        let scatter = [excess.scatter[0], excess.scatter[1] + reference_excess.scatter[1]];
+        let model = [
+            excess.model + self.common_amplitude_variance(c),
+            relative * (excess.model + reference_excess.model),
+        ];
+        let noise = noise.map(phase_safe_sigma);
+        let total = |axis: usize| (noise[axis].powi(2) + scatter[axis] + model[axis]).sqrt();
+        let [visibilities, outliers] = self.counts.by_gain[k];
+        GainEstimate {
+            frequency_hz: layout.frequencies_hz[c],
+            amplitude: gain.norm(),
+            amplitude_sigma: total(0),
+            phase_deg: gain.arg().to_degrees(),
+            phase_sigma_deg: if is_reference { 0.0 } else { total(1).to_degrees() },
+            phase_scatter_deg: excess.scatter[1].sqrt().to_degrees(),
+            unexplained: self.unexplained[k],
+            visibilities,
+            outliers,
+            state: self.state(
+                (c, n),
+                gain.norm(),
+                [noise[0].max(noise[1]), scatter[0].max(scatter[1]), model[1]],
+            ),
+        }
+    }
+
+    /// State of a gain; `noise` is a standard deviation, `scatter` and `model` are variances.
+    fn state(&self, (c, n): (usize, usize), amplitude: f64, [noise, scatter, model]: [f64; 3]) -> GainState {
+        let Self { config, fitted, .. } = self;
+        let k = c * fitted.layout.satellites + n;
+        let phase_variance_max = config.phase_sigma_deg_max.to_radians().powi(2);
+        let is_dropped = fitted.dropped_gains[k];
+        match fitted.own_gains[k].presence {
+            SignalPresence::NoData => GainState::NoData,
+            SignalPresence::Dead => GainState::Dead,
+            SignalPresence::Unmodelled if is_dropped => GainState::PoorFit,
+            SignalPresence::Undetermined | SignalPresence::Detected if is_dropped => GainState::Uncertain,
+            _ if !fitted.newton.converged => GainState::NotConverged,
+            SignalPresence::Undetermined | SignalPresence::Unmodelled if !self.is_detected_together(n) => {
+                GainState::Uncertain
+            }
+            _ if amplitude < config.dead_amplitude => GainState::Dead,
+            _ if noise * noise > phase_variance_max => GainState::Uncertain,
+            _ if noise * noise + scatter > phase_variance_max => GainState::Unstable,
+            _ if noise * noise + scatter + model > phase_variance_max => GainState::PoorFit,
+            _ if self.unexplained[k] > config.unexplained_max => GainState::PoorFit,
+            _ => GainState::Good,
+        }
+    }
+
+    /// Whether a daughter's signal, summed coherently over the channels without a detection, is significant.
+    fn is_detected_together(&self, n: usize) -> bool {
+        let fitted = self.fitted;
+        let (mut signal, mut expected) = (0.0, 0.0);
+        for c in 0..fitted.layout.channels() {
+            let own_gain = &fitted.own_gains[c * fitted.layout.satellites + n];
+            if !matches!(own_gain.presence, SignalPresence::Detected | SignalPresence::NoData) {
+                let gain = fitted.layout.gain(&fitted.newton.values, c, n);
+                signal += (gain.conj() * own_gain.gain).re * own_gain.information;
+                expected += gain.norm_sqr() * own_gain.information;
+            }
+        }
+        signal >= COMBINED_SNR_MIN * f64::sqrt(expected)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stated_sigmas_cover_the_phase_error_of_a_noisy_vector() {
+        // In unit noise the phase of a vector of length a is beyond an angle p with a probability of at most erfc(a
+        // sin p / sqrt 2), the Gaussian one of four deviations if a sin p is 4.
+        for a in [5.0_f64, 7.0, 10.0, 30.0] {
+            let p = 4.0 * phase_safe_sigma(a.recip());
+            assert!(a * p.sin() >= 4.0 - 1e-9, "{a}: {p}");
+            // It is at most a fifth above the bound.
+            assert!(p * a / 4.0 < 1.2, "{a}: {p}");
+        }
+    }
+}
