@@ -1,36 +1,36 @@
-//! Whether the amplitude of each channel follows the law of the others.
+//! Test of each channel's amplitude against the spectrum of the other channels.
 //!
-//! Each channel has a C_l of its own, so a joint map takes a channel whose scale is wrong at its word. Its amplitude gives it away: over a
-//! decade of frequency the logarithm of the sky's amplitude is close to a parabola in the logarithm of frequency (a power law with
-//! curvature, or one that turns over by absorption).
+//! A joint map estimates a C_l for each channel, so it does not detect a channel with a wrong scale. Amplitudes do: over a decade of frequency
+//! the logarithm of the sky's amplitude is close to a parabola in the logarithm of frequency (a power law with curvature, or a spectrum
+//! that turns over by absorption).
 
 use serde::Serialize;
 
 /// Coefficients of the parabola.
 const COEFFICIENTS: usize = 3;
-/// Fewest channels: with two more than a parabola has coefficients, the channel that disagrees can be told from the others.
+/// Minimum number of channels: the others must outnumber the coefficients, or every channel disagrees alike.
 const CHANNELS_MIN: usize = COEFFICIENTS + 2;
-/// A channel disagrees beyond these: standard errors, and a relative difference that no curvature of higher order makes.
+/// Limits beyond which a channel disagrees: standard errors, and a relative difference larger than terms of higher order.
 const DISAGREES_SIGMAS: f64 = 10.0;
 const DISAGREES: f64 = 0.04;
 
-/// A channel's amplitude over what the other channels' parabola gives for it.
+/// Amplitude of a channel relative to the parabola through the other channels.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct RelativeAmplitude {
-    /// The ratio: 1 where the channel follows the others.
+    /// Ratio of the amplitudes: 1 if the channel agrees.
     pub ratio: f64,
-    /// Its standard error, from the scatter of the other channels about their parabola.
+    /// Standard error of the ratio, from the scatter of the other channels about the parabola.
     pub sigma: f64,
 }
 
 impl RelativeAmplitude {
-    /// Whether the channel's scale disagrees with the others'.
+    /// Whether the scale of the channel disagrees with the other channels.
     pub fn disagrees(self) -> bool {
         (self.ratio - 1.0).abs() > DISAGREES.max(DISAGREES_SIGMAS * self.sigma)
     }
 }
 
-/// The relative amplitude of each channel; none where there are too few channels, or one has no structure.
+/// Relative amplitude of each channel; `None` for all if there are too few channels or one of them has no structure.
 ///
 /// Arguments: frequency (Hz) and amplitude (K sr^(1/2)) of each channel.
 pub(super) fn relative_amplitudes(channels: &[(f64, f64)]) -> Vec<Option<RelativeAmplitude>> {
@@ -50,7 +50,7 @@ pub(super) fn relative_amplitudes(channels: &[(f64, f64)]) -> Vec<Option<Relativ
     (0..points.len()).map(relative).collect()
 }
 
-/// The value at `x` of the parabola through points by least squares, and the variance of a further point about it.
+/// Value at `x` of the least-squares parabola, and the variance of a new point about it.
 fn parabola_at(points: &[[f64; 2]], x: f64) -> Option<(f64, f64)> {
     // About `x` and over the widest distance, so that the value is the first coefficient and the equations are well conditioned.
     let width = points.iter().map(|point| (point[0] - x).abs()).fold(0.0, f64::max);
@@ -58,8 +58,9 @@ fn parabola_at(points: &[[f64; 2]], x: f64) -> Option<(f64, f64)> {
     let normal = faer::Mat::from_fn(COEFFICIENTS, COEFFICIENTS, |i, j| {
         points.iter().map(|point| row(point)[i] * row(point)[j]).sum::<f64>()
     });
-    let right =
-        faer::Mat::from_fn(COEFFICIENTS, 1, |i, _| points.iter().map(|point| row(point)[i] * point[1]).sum::<f64>());
+    let right = faer::Mat::from_fn(COEFFICIENTS, 1, |i, _| {
+        points.iter().map(|point| row(point)[i] * point[1]).sum::<f64>()
+    });
     let factor = normal.llt(faer::Side::Lower).ok()?;
     let fitted = faer::linalg::solvers::Solve::solve(&factor, &right);
     let leverage = faer::linalg::solvers::DenseSolveCore::inverse(&factor)[(0, 0)];

@@ -150,7 +150,8 @@ pub fn solve_jointly(
     }
     let noise_factors: Vec<f64> = singles.iter().map(|single| single.power.noise_factor).collect();
     let scale = singles.iter().map(SingleChannel::scale).collect();
-    let initial = Prior::new(all_hz.clone(), scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
+    let initial =
+        Prior::new(all_hz.clone(), scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let scaled = scaled_blocks(&initial, &blocks, &noise_factors);
     let watch = watch.named("all channels").with_priority(true);
     let rights: Vec<Vec<f64>> = singles.iter().map(|single| single.right.clone()).collect();
