@@ -380,7 +380,7 @@ fn resynchronise(bytes: usize) {
     black_box(receive(&noise));
     println!("{:<38} {:>7.2} GB/s", "noise", bytes as f64 / start.elapsed().as_secs_f64() / 1e9);
     let header = lunarray::downlink::PacketHeader {
-        kind: lunarray::downlink::Kind::Visibilities,
+        kind: lunarray::downlink::PacketKind::Visibilities,
         segment: lunarray::downlink::PacketSegment::Whole,
         count: 0,
         time: lunarray::downlink::CucTime(0),

@@ -26,7 +26,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use lunarray::downlink::{Kind, PacketHeader};
+use lunarray::downlink::{PacketHeader, PacketKind};
 use lunarray::pipeline::{ConfigSource, Plan};
 use serde_json::Value;
 
@@ -68,7 +68,7 @@ fn plan(more: &[String]) -> Result<Plan, Failure> {
 
 /// What is sent: packets one by one, and whether each is the first with visibilities of its window.
 struct Stream {
-    packets: Vec<(Vec<u8>, Kind)>,
+    packets: Vec<(Vec<u8>, PacketKind)>,
     /// Visibilities in a packet of them, on average.
     visibilities_per_packet: f64,
 }
@@ -79,7 +79,7 @@ fn at(sorted: &[f64], quantile: f64) -> f64 {
     sorted.get(rank - 1).copied().unwrap_or(f64::NAN)
 }
 
-fn split(mut bytes: &[u8]) -> Result<Vec<(Vec<u8>, Kind)>, Failure> {
+fn split(mut bytes: &[u8]) -> Result<Vec<(Vec<u8>, PacketKind)>, Failure> {
     let mut packets = Vec::new();
     while !bytes.is_empty() {
         let header = PacketHeader::parse(bytes).ok_or("not a packet")?;
@@ -157,7 +157,7 @@ fn send(
     let (mut began, mut is_first) = (Vec::new(), true);
     let (since, mut sent) = (Instant::now(), 0_u64);
     for (packet, kind) in &stream.packets {
-        if *kind == Kind::Visibilities {
+        if *kind == PacketKind::Visibilities {
             let due_s = sent as f64 / packets_per_s;
             if due_s > length_s {
                 break;
@@ -168,7 +168,7 @@ fn send(
             }
             sent += 1;
         }
-        is_first |= *kind == Kind::Ephemeris;
+        is_first |= *kind == PacketKind::Ephemeris;
         socket.write_all(packet)?;
     }
     if (sent as f64 / packets_per_s) < length_s {
@@ -271,7 +271,7 @@ fn main() -> Result<(), Failure> {
         return Err(String::from_utf8_lossy(&simulated.stderr).into());
     }
     let packets = split(&std::fs::read(&file)?)?;
-    let count = packets.iter().filter(|(_, kind)| *kind == Kind::Visibilities).count();
+    let count = packets.iter().filter(|(_, kind)| *kind == PacketKind::Visibilities).count();
     let sent = total / (EVERY_NTH_WINDOW * EVERY_NTH_INTEGRATION);
     let stream = Stream { packets, visibilities_per_packet: sent / count as f64 };
     println!(

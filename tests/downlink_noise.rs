@@ -7,7 +7,7 @@ mod common;
 use std::io::Read;
 
 use common::downlink::{mission, packets_of, transmit};
-use lunarray::downlink::{Decoder, DownlinkConfig, Format, Intake};
+use lunarray::downlink::{Decoder, DownlinkConfig, DownlinkReceiver, Format};
 use lunarray::units::{StreamKind, random_stream};
 use rand::Rng;
 
@@ -39,21 +39,21 @@ fn receive(sound: &[u8], seed: u64) -> (u64, Option<Format>) {
     let bytes = if sound.is_empty() { NOISE_BYTES } else { NOISE_BYTES_BEHIND };
     let noise = Noise(random_stream(seed, StreamKind::Probe, [0, 0])).take(bytes);
     let mut stream = sound.chain(noise);
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     loop {
-        let read = intake.fill_from(&mut stream).unwrap();
+        let read = receiver.fill_from(&mut stream).unwrap();
         if read == 0 {
-            intake.finish();
+            receiver.finish();
         }
-        while let Some(event) = intake.next_event() {
+        while let Some(event) = receiver.next_event() {
             decoder.accept(&event);
         }
         if read == 0 {
             break;
         }
     }
-    assert_eq!(intake.bytes(), sound.len() as u64 + bytes);
-    (decoder.counters().packets(), intake.format())
+    assert_eq!(receiver.bytes(), sound.len() as u64 + bytes);
+    (decoder.counters().packets(), receiver.format())
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 
 use libfuzzer_sys::fuzz_target;
 use lunarray::downlink::wire::cadu::{CaduEncoder, ReedSolomon};
-use lunarray::downlink::{Decoder, Event, Intake};
+use lunarray::downlink::{Decoder, DownlinkReceiver, Event};
 
 static PASS: LazyLock<Vec<u8>> = LazyLock::new(|| {
     let mut encoder = CaduEncoder::new(ReedSolomon::new(1).expect("depth 1"), 1, 2);
@@ -20,12 +20,12 @@ static PASS: LazyLock<Vec<u8>> = LazyLock::new(|| {
 
 fuzz_target!(|data: &[u8]| {
     let Some((&how, data)) = data.split_first() else { return };
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     let sound: &[u8] = if how & 1 == 0 { &PASS } else { &[] };
     let chunk = 1 + usize::from(how >> 1) * 40;
     let mut bytes = 0;
-    let mut drain = |intake: &mut Intake| {
-        while let Some(event) = intake.next_event() {
+    let mut drain = |receiver: &mut DownlinkReceiver| {
+        while let Some(event) = receiver.next_event() {
             bytes += match &event {
                 Event::Packet(packet) => packet.header.bytes as u64,
                 Event::Duplicate { header, .. } => header.bytes as u64,
@@ -38,15 +38,15 @@ fuzz_target!(|data: &[u8]| {
         }
     };
     for part in [sound, data, sound].concat().chunks(chunk) {
-        intake.push(part);
-        drain(&mut intake);
+        receiver.push(part);
+        drain(&mut receiver);
     }
-    intake.finish();
-    drain(&mut intake);
+    receiver.finish();
+    drain(&mut receiver);
     let counters = decoder.counters();
     assert_eq!(counters.bytes, bytes);
-    if let Some(frames) = intake.frames() {
-        assert_eq!(frames.bytes, intake.bytes());
-        assert!(frames.frames + frames.frames_uncorrectable <= intake.bytes() / 255 + 1);
+    if let Some(frames) = receiver.frames() {
+        assert_eq!(frames.bytes, receiver.bytes());
+        assert!(frames.frames + frames.frames_uncorrectable <= receiver.bytes() / 255 + 1);
     }
 });

@@ -3,7 +3,7 @@
 
 use crc_fast::{CrcAlgorithm, checksum};
 use libfuzzer_sys::fuzz_target;
-use lunarray::downlink::{Decoder, HEADER_BYTES, Kind, PacketHeader, PacketReceiver};
+use lunarray::downlink::{Decoder, HEADER_BYTES, PacketHeader, PacketKind, PacketReceiver};
 
 fuzz_target!(|data: &[u8]| {
     let mut stream = data.to_vec();
@@ -33,7 +33,7 @@ fuzz_target!(|data: &[u8]| {
     }
     decoder.finish();
     let counters = decoder.counters();
-    let packets: u64 = Kind::ALL.iter().map(|kind| counters.kind(*kind).bytes).sum();
+    let packets: u64 = PacketKind::ALL.iter().map(|kind| counters.kind(*kind).bytes).sum();
     let others =
         counters.bytes_garbage + counters.bytes_truncated + counters.bytes_damaged + counters.bytes_duplicate;
     assert_eq!((counters.bytes, packets + others), (stream.len() as u64, stream.len() as u64));

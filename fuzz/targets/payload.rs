@@ -3,12 +3,12 @@
 
 use libfuzzer_sys::fuzz_target;
 use lunarray::downlink::{
-    CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, PacketReceiver, PacketSegment,
+    CucTime, Decoder, FORMAT_VERSION, HEADER_BYTES, PacketKind, PacketHeader, PacketReceiver, PacketSegment,
     Packetizer, TRAILER_BYTES,
 };
 use lunarray::frames::{AntennaResponse, Channel, GroundFrame, Instrument};
 
-fn packet(kind: Kind, count: u64, payload: &[u8]) -> Vec<u8> {
+fn packet(kind: PacketKind, count: u64, payload: &[u8]) -> Vec<u8> {
     let bytes = HEADER_BYTES + payload.len() + TRAILER_BYTES;
     let header = PacketHeader {
         kind,
@@ -42,7 +42,7 @@ fuzz_target!(|data: &[u8]| {
     let mut packetizer = Packetizer::new(&Default::default()).expect("default");
     packetizer.encode(&instrument, &mut stream).expect("sound");
     let Some((&which, payload)) = data.split_first() else { return };
-    let kind = Kind::ALL[usize::from(which) % Kind::ALL.len()];
+    let kind = PacketKind::ALL[usize::from(which) % PacketKind::ALL.len()];
     stream.extend(packet(kind, 1, &payload[..payload.len().min(60_000)]));
     let (mut receiver, mut decoder) = (PacketReceiver::new(), Decoder::new());
     receiver.push(&stream);

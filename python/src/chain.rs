@@ -10,7 +10,7 @@ use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
 use lunarray::imaging::SolveWatch;
 use lunarray::pipeline::{
-    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, Segment, Watched, use_threads,
+    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunHandles, Segment, use_threads,
 };
 use lunarray::runtime::{Cancel, Metrics};
 use pyo3::exceptions::PyUserWarning;
@@ -37,10 +37,10 @@ pub(crate) fn ground_config(
 ) -> Result<Config, Failure> {
     let source = ConfigSource { file, overrides, seed: None };
     let source = match state {
-        Some(folder) => source.of_state(folder)?,
+        Some(folder) => source.with_state_settings(folder)?,
         None => source,
     };
-    let (source, _) = source.of_downlink(files);
+    let (source, _) = source.with_downlink_settings(files);
     Ok(source.load_ground()?)
 }
 
@@ -49,7 +49,7 @@ pub(crate) fn ground_config(
 struct Watch(Arc<OnceLock<(Arc<Metrics>, u64)>>);
 
 impl Watch {
-    fn begin(&self, watched: &Watched, windows: u64) {
+    fn begin(&self, watched: &RunHandles, windows: u64) {
         let _ = self.0.set((Arc::clone(&watched.metrics), windows));
     }
 
@@ -101,7 +101,7 @@ pub(crate) fn run<'py>(
         let plan = Plan::new(config)?;
         use_threads(&plan.config.runtime)?;
         plan.cost().require_memory(Segment::Whole, MemoryLimit::of_machine())?;
-        let windows = plan.windows_watched();
+        let windows = plan.progress_windows();
         let summary = pipeline::run(&plan, &products, &ended, &mut |watched| {
             begun.begin(&watched, windows);
             let found = found.clone();

@@ -1,4 +1,4 @@
-//! Runs the chain, and its packets through the ground segment, as graphs whose queues are sampled.
+//! Runs the chain, and the ground segment on its packets, as graphs whose queue depths are sampled.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -20,15 +20,13 @@ use crate::pipeline::{SampleCounts, sample_stages};
 use crate::runtime::{Cancel, Flow, Graph, Metrics, Outlet, Report, Sink, Source, StageProgress, Units};
 use crate::sky::SkyMap;
 
-/// Interval at which queue depths are sampled.
-const LOOK_EVERY: Duration = Duration::from_millis(5);
-/// Maximum number of samples kept.
-const LOOKS_MAX: usize = 512;
+const SAMPLE_INTERVAL: Duration = Duration::from_millis(5);
+const SAMPLES_MAX: usize = 512;
 
 /// One run of a chain of stages.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ChainRun {
-    /// Shares of time, latencies since the source, rates.
+    /// Fractions of time, latencies since the source, rates.
     pub report: Report,
     /// Times at which queue depths were sampled, s since the start.
     pub times_s: Vec<f64>,
@@ -47,7 +45,7 @@ pub struct QueueDepths {
     pub p50: u64,
     /// 90 % quantile.
     pub p90: u64,
-    /// All samples.
+    /// The samples in order of time.
     pub series: Vec<u64>,
 }
 
@@ -64,59 +62,59 @@ pub(super) fn run(plan: &Plan, skies: &[SkyMap]) -> Result<ChainRun, PipelineErr
     let packets = graph.stage("transmit", capacity, passes, Transmitter::new(&plan.config.downlink)?);
     let received = graph.stage("receive", capacity, packets, reception());
     graph.sink("drop", received, FrameSink(0));
-    watched(graph)
+    run_sampled(graph)
 }
 
-/// Segments of positions that a stage alone knows.
+/// Maximum number of ephemeris segments that the receiving stage keeps.
 const SEGMENTS_MAX: usize = 8192;
 
-/// The ground's receiving alone.
 pub(super) fn reception() -> Reception {
     Reception::new(WAIT_BYTES, SEGMENTS_MAX, Arc::default())
 }
 
-/// Runs packets through the ground segment, up to the sums.
+/// Runs the ground segment on packets, up to the sums.
 pub(super) fn run_ground(config: &Config, packets: &[Vec<u8>]) -> Result<ChainRun, PipelineError> {
     let mut graph = Graph::new();
-    // The source pops from the end.
+    // The source takes packets from the end.
     let packets = Packets(packets.iter().rev().cloned().collect());
     let bytes = graph.source("packets", config.runtime.queue_capacity, packets);
     let sums = graph.stage("ground", 1, bytes, Ground::new(&config.ground(WAIT_BYTES))?);
     graph.sink("drop", sums, SumsSink);
-    watched(graph)
+    run_sampled(graph)
 }
 
-/// Runs a graph, and samples its queue depths while it runs.
-fn watched(graph: Graph) -> Result<ChainRun, PipelineError> {
+fn run_sampled(graph: Graph) -> Result<ChainRun, PipelineError> {
     let (metrics, done) = (graph.metrics(), AtomicBool::new(false));
     let since = Instant::now();
-    let (report, mut looks) = std::thread::scope(|scope| {
-        let watcher = scope.spawn(|| {
-            let mut looks = QueueSamples { step: 1, times_s: Vec::new(), depths: Vec::new() };
+    let (report, mut samples) = std::thread::scope(|scope| {
+        let sampler = scope.spawn(|| {
+            let mut samples = QueueSamples { step: 1, times_s: Vec::new(), depths: Vec::new() };
             let mut tick = 0_usize;
             while !done.load(Ordering::Relaxed) {
-                if tick.is_multiple_of(looks.step) {
-                    looks.add(since.elapsed().as_secs_f64(), &metrics);
+                if tick.is_multiple_of(samples.step) {
+                    samples.add(since.elapsed().as_secs_f64(), &metrics);
                 }
                 tick += 1;
-                std::thread::sleep(LOOK_EVERY);
+                std::thread::sleep(SAMPLE_INTERVAL);
             }
-            looks
+            samples
         });
         let report = graph.run(&Cancel::new(), SHUTDOWN);
         done.store(true, Ordering::Relaxed);
-        (report, watcher.join().unwrap_or_default())
+        (report, sampler.join().unwrap_or_default())
     });
     let report = report?;
     let queued = report.stages.iter().filter(|stage| stage.queue.is_some());
     let queues = queued.enumerate().map(|(k, stage)| {
-        let series: Vec<u64> = looks.depths.iter_mut().map(|depths| std::mem::take(&mut depths[k])).collect();
+        let series: Vec<u64> =
+            samples.depths.iter_mut().map(|depths| std::mem::take(&mut depths[k])).collect();
         let mut sorted = series.clone();
         sorted.sort_unstable();
-        let at = |part: f64| sorted.get(((sorted.len() as f64 - 1.0) * part) as usize).copied().unwrap_or(0);
-        QueueDepths { stage: stage.name.clone(), p10: at(0.1), p50: at(0.5), p90: at(0.9), series }
+        let quantile = |q: f64| sorted.get(((sorted.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(0);
+        let [p10, p50, p90] = [0.1, 0.5, 0.9].map(quantile);
+        QueueDepths { stage: stage.name.clone(), p10, p50, p90, series }
     });
-    Ok(ChainRun { queues: queues.collect(), times_s: looks.times_s, report })
+    Ok(ChainRun { queues: queues.collect(), times_s: samples.times_s, report })
 }
 
 /// Samples of all queue depths.
@@ -125,30 +123,29 @@ struct QueueSamples {
     /// Number of intervals from one sample to the next.
     step: usize,
     times_s: Vec<f64>,
-    /// By sample, then by stage except the source.
+    /// Depths by sample, then by stage without the source.
     depths: Vec<Vec<u64>>,
 }
 
 impl QueueSamples {
     fn add(&mut self, time_s: f64, metrics: &Metrics) {
         let stages = metrics.snapshot();
-        // Stages are in chain order, so a queue holds what one stage has emitted and the next has not received. The counters
-        // change while they are read.
+        // Stages are in chain order, so a queue has the items that one stage has emitted and the next has not received. The
+        // difference may be negative, as the counters change while they are read.
         let depth = |pair: &[StageProgress]| pair[0].items_out.saturating_sub(pair[1].items_in);
         self.times_s.push(time_s);
         self.depths.push(stages.windows(2).map(depth).collect());
-        if self.times_s.len() >= LOOKS_MAX {
+        if self.times_s.len() >= SAMPLES_MAX {
             // Keep every other sample, so that a long run fits.
-            let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
+            let mut keep = (0..SAMPLES_MAX).map(|k| k % 2 == 0);
             self.times_s.retain(|_| keep.next().unwrap_or(false));
-            let mut keep = (0..LOOKS_MAX).map(|k| k % 2 == 0);
+            let mut keep = (0..SAMPLES_MAX).map(|k| k % 2 == 0);
             self.depths.retain(|_| keep.next().unwrap_or(false));
             self.step *= 2;
         }
     }
 }
 
-/// A source of packets from memory.
 struct Packets(Vec<Vec<u8>>);
 
 impl Source for Packets {
@@ -162,7 +159,6 @@ impl Source for Packets {
     }
 }
 
-/// A sink that drops sums.
 struct SumsSink;
 
 impl Sink for SumsSink {

@@ -1,9 +1,9 @@
-//! A benchmark beside an earlier one.
+//! Comparison of a benchmark with an earlier one.
 
 use serde::Serialize;
 use serde_json::Value;
 
-/// A stage beside its earlier figures.
+/// Comparison of a stage with its earlier results.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageComparison {
     /// Name of the stage.
@@ -12,18 +12,18 @@ pub struct StageComparison {
     pub before_s: f64,
     /// Median time now, s.
     pub now_s: f64,
-    /// How many times as fast it is now.
+    /// Speed relative to the earlier benchmark.
     pub times_as_fast: f64,
-    /// Whether the quartiles of both lie apart.
+    /// Whether the ranges between the quartiles do not overlap.
     pub differs: bool,
 }
 
-/// A benchmark beside an earlier one of the same size.
+/// Comparison of a benchmark with an earlier one of the same size.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// Version, processor and date of the earlier one.
+    /// Version, processor and date of the earlier benchmark.
     pub before: [String; 3],
-    /// Stages that are in both.
+    /// The stages that both benchmarks have.
     pub stages: Vec<StageComparison>,
 }
 
@@ -31,16 +31,16 @@ impl Comparison {
     /// Compares the JSON output of a benchmark with that of an earlier one.
     ///
     /// # Errors
-    /// The earlier one is none, or of another size.
+    /// `before` is not the output of a benchmark, or has another size.
     #[doc(hidden)]
     pub fn of(now: &Value, before: &Value) -> Result<Self, String> {
         for key in ["channels", "daughters", "bits", "block_samples", "sky_pixels", "mission_s"] {
             match (&now[key], &before[key]) {
                 (now, found) if now == found => {}
                 (_, Value::Null) => {
-                    return Err(format!("no number {key}; expected what `lunarray bench --json` prints"));
+                    return Err(format!("no number {key}; expected the output of `lunarray bench --json`"));
                 }
-                (now, found) => return Err(format!("{key} = {found}; expected {now}, as of this benchmark")),
+                (now, found) => return Err(format!("{key} = {found}; expected {now}, as in this benchmark")),
             }
         }
         let rates = now["rates"].as_array().into_iter().flatten();
@@ -51,7 +51,7 @@ impl Comparison {
     }
 }
 
-/// A stage beside its earlier figures, if both benchmarks have it.
+/// Compares a stage with its earlier results; `None` if the earlier benchmark does not have it.
 fn compare(now: &Value, before: &Value) -> Option<StageComparison> {
     let before = before.as_array()?.iter().find(|rate| rate["stage"] == now["stage"])?;
     let times = |rate: &Value| {

@@ -1,4 +1,4 @@
-//! The results of a benchmark as text.
+//! Text output of a benchmark.
 
 use std::fmt;
 
@@ -17,7 +17,7 @@ impl fmt::Display for Bench {
             let percent = 100.0 * share;
             writeln!(
                 f,
-                "warning: others used {percent:.0} % of the processors meanwhile; repeat it on a machine at rest"
+                "warning: other processes used {percent:.0} % of the processors; repeat the benchmark on an idle machine"
             )?;
         }
         writeln!(
@@ -27,13 +27,16 @@ impl fmt::Display for Bench {
         )?;
         self.write_rates(f)?;
         if let Some(chain) = &self.chain {
-            writeln!(f, "\nLast run of the chain; \"since source\" is from sample to the stage's output")?;
+            writeln!(
+                f,
+                "\nLast run of the chain; \"since source\" is the time from a sample to the stage's output"
+            )?;
             write_run(f, chain)?;
         }
         if let Some(ground) = &self.ground {
             writeln!(
                 f,
-                "\nIts packets through the ground segment; \"since source\" is from packet to the stage's output"
+                "\nThe ground segment on its packets; \"since source\" is the time from a packet to the stage's output"
             )?;
             write_run(f, ground)?;
         }
@@ -44,7 +47,7 @@ impl fmt::Display for Bench {
             write!(f, "\nsaturates first: {stage}")?;
         }
         if let Some(Comparison { before: [version, processor, date], stages }) = &self.comparison {
-            write!(f, "\n\nbeside lunarray {version} of {date} on {processor}:")?;
+            write!(f, "\n\ncompared with lunarray {version} of {date} on {processor}:")?;
             for StageComparison { stage, before_s, now_s, times_as_fast, differs } in stages {
                 let verdict = if *differs { "" } else { ", within the spread" };
                 write!(
@@ -85,7 +88,7 @@ impl Bench {
     }
 
     fn write_growth(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "\nThe chain at other sizes; real time is that of the size")?;
+        writeln!(f, "\nThe chain at other sizes; real time depends on the size")?;
         let columns = [
             ("channels", 8),
             ("daughters", 9),

@@ -1,13 +1,13 @@
-//! The chain at other sizes.
+//! Benchmarks of the chain at other sizes.
 
 use serde::Serialize;
 
 use super::chain;
-use super::timing::{median, samples_per_s as samples_in_a_second, seconds_of, timed};
+use super::timing::{median, mission_s, samples_per_mission_s, timed};
 use crate::pipeline::{Config, PipelineError, Plan};
 use crate::sky::SkyMap;
 
-/// The chain at one size.
+/// The speed of the chain at one size.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GrowthRow {
     /// Number of channels.
@@ -18,17 +18,15 @@ pub struct GrowthRow {
     pub block_samples: usize,
     /// Complex samples per second, median over runs.
     pub samples_per_s: f64,
-    /// Rates of the slowest and of the fastest run.
+    /// Rates of the slowest and the fastest run.
     pub samples_per_s_range: [f64; 2],
-    /// Mission time over median time.
+    /// Mission time divided by median time.
     pub times_real_time: f64,
     /// Processor time per second of mission time at this size, s, median over runs.
     pub core_s_per_mission_s: Option<f64>,
 }
 
-/// Numbers of daughters to run with.
 const DAUGHTERS: [usize; 3] = [4, 8, 16];
-/// Block sizes to run with, samples.
 const BLOCKS: [usize; 4] = [256, 1024, 4096, 16_384];
 
 /// Runs the chain with a third, two thirds and all of the channels, and with other numbers of daughters and block sizes.
@@ -38,7 +36,7 @@ pub(super) fn rows(plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Vec<Gro
     for channels in [all.div_ceil(3), (2 * all).div_ceil(3), all] {
         let mut config = plan.config.clone();
         config.spacecraft.channels_hz.truncate(channels);
-        // Lists of files and priors may now be longer than the channels; the chain uses neither.
+        // Lists of files and priors may now have more entries than channels; the chain does not use them.
         rows.push(row(config, plan, &skies[..channels], runs)?);
     }
     for daughters in DAUGHTERS {
@@ -58,7 +56,7 @@ fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Gro
     let sized = Plan::new(config)?;
     let windows = sized.windows.iter().take(plan.windows.len()).copied().collect();
     let sized = Plan { windows, ..sized };
-    let mission_s = seconds_of(&sized);
+    let mission_s = mission_s(&sized);
     let (mut rates, mut core_seconds) = (Vec::new(), Vec::new());
     for _ in 0..runs.max(1) {
         let (spent, run) = timed(|| chain::run(&sized, skies));
@@ -74,7 +72,7 @@ fn row(config: Config, plan: &Plan, skies: &[SkyMap], runs: usize) -> Result<Gro
         block_samples: sized.config.daughters.block_samples,
         samples_per_s,
         samples_per_s_range: [rates[0], rates[rates.len() - 1]],
-        times_real_time: samples_per_s / samples_in_a_second(&sized),
+        times_real_time: samples_per_s / samples_per_mission_s(&sized),
         core_s_per_mission_s: (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s),
     })
 }

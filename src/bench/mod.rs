@@ -1,7 +1,7 @@
-//! Speed of the stages of sample fidelity, each alone and all in a chain: the library behind `lunarray bench`.
+//! Speed of the stages of sample fidelity, each alone and all in a chain, for `lunarray bench`.
 //!
-//! Every stage is fed from memory with the output of the stage before it, so that each is measured alone; `chain` runs
-//! them all with their queues, `growth` repeats that at other sizes. May use every folder but [`crate::cli`].
+//! Each stage is measured alone: its input, the output of the stage before it, is in memory. `chain` runs all stages with
+//! their queues, and `growth` repeats this at other sizes. May use every folder except [`crate::cli`].
 
 mod chain;
 mod compare;
@@ -16,7 +16,9 @@ use std::time::Instant;
 use serde::Serialize;
 
 use self::machine::{machine_seconds, share_of_others};
-use self::timing::{TimeSpent, core_seconds_used, median, quartiles, samples_per_s, seconds_of, timed};
+use self::timing::{
+    TimeSpent, core_seconds_used, median, mission_s, quartiles, samples_per_mission_s, timed,
+};
 use crate::downlink::Transmitter;
 use crate::frames::{GroundFrame, Samples, SpaceFrame};
 use crate::mother::Fidelity;
@@ -43,7 +45,7 @@ pub struct BenchSettings {
     pub stage: Option<String>,
     /// Number of runs of each stage.
     pub runs: usize,
-    /// Whether to run the chain also with other numbers of channels and daughters, and other block sizes.
+    /// Whether to run the chain also with other numbers of channels and daughters and other block sizes.
     pub growth: bool,
 }
 
@@ -54,21 +56,21 @@ pub struct Rate {
     pub stage: &'static str,
     /// Time of every run, s.
     pub runs_s: Vec<f64>,
-    /// Their median, s.
+    /// Median time, s.
     pub median_s: f64,
-    /// Their quartiles, s.
+    /// Quartiles of the time, s.
     pub quartiles_s: [f64; 2],
     /// Complex samples per second, median over runs.
     pub samples_per_s: f64,
-    /// Rates of the slowest and of the fastest run.
+    /// Rates of the slowest and the fastest run.
     pub samples_per_s_range: [f64; 2],
-    /// Visibilities per second that the stage makes or passes; 0 if none.
+    /// Visibilities per second that the stage processes; 0 if none.
     pub visibilities_per_s: f64,
-    /// Bytes per second that the stage passes: samples on the links, packets on the downlink.
+    /// Bytes per second that the stage processes: samples on the links, packets on the downlink.
     pub bytes_per_s: f64,
-    /// Mission time over median time: how much faster than the daughters it would have to be.
+    /// Mission time divided by median time.
     pub times_real_time: f64,
-    /// Processor time per second of mission time, s, median over runs; it hardly depends on the other load of the machine.
+    /// Processor time per second of mission time, s, median over runs. It hardly depends on the load by other processes.
     /// `None` where the system does not report it.
     pub core_s_per_mission_s: Option<f64>,
 }
@@ -76,9 +78,9 @@ pub struct Rate {
 /// The results of a benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct Bench {
-    /// The machine, and the program.
+    /// The machine and the program.
     pub machine: Machine,
-    /// Share of the processors that others used meanwhile; `None` where the system does not report it.
+    /// Fraction of the processors that other processes used; `None` where the system does not report it.
     pub others: Option<f64>,
     /// Mission time of one run, s.
     pub mission_s: f64,
@@ -90,24 +92,24 @@ pub struct Bench {
     pub bits: u32,
     /// Samples per block.
     pub block_samples: usize,
-    /// Pixels of the sky; each prediction sums over all of them.
+    /// Number of sky pixels, all of which each prediction sums.
     pub sky_pixels: usize,
     /// Rates by stage.
     pub rates: Vec<Rate>,
-    /// The last run of the chain: shares of time, latencies since sampling, queue depths.
+    /// The last run of the chain: fractions of time, latencies since sampling, queue depths.
     pub chain: Option<ChainRun>,
-    /// Its packets through the ground segment, up to the sums: latencies since the packet.
+    /// The run of the ground segment on its packets, up to the sums, with latencies since the packet.
     pub ground: Option<ChainRun>,
     /// The stage with the longest working time in the chain.
     pub saturates_first: Option<String>,
     /// The chain at other sizes; empty unless requested.
     pub growth: Vec<GrowthRow>,
-    /// The stages beside an earlier benchmark, if one was given.
+    /// Comparison with an earlier benchmark, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub comparison: Option<Comparison>,
 }
 
-/// The default pipeline: the design's 30 channels, 8 bits, a small sky.
+/// The default pipeline of a benchmark: the design's 30 channels, 8 bits, and a small sky.
 #[must_use]
 pub fn bench_config() -> Config {
     let mut config = Config { name: "bench".to_owned(), ..Config::default() };
@@ -116,13 +118,13 @@ pub fn bench_config() -> Config {
     config.spacecraft.channels_hz = (1..=30).map(|k| 1e6 * f64::from(k)).collect();
     config.spacecraft.duration_s = 3e4;
     config.spacecraft.window_s_max = 16.0;
-    // The last daughters see the Earth for 64 s of a window, and would count as flagged.
+    // The last daughters see the Earth for 64 s of a window, and their visibilities would be flagged.
     config.spacecraft.flag_earth = false;
     config
 }
 
-/// The outputs of all stages for one window, from which each stage is fed alone.
-struct Material {
+/// The outputs of all stages for one window: the inputs for the measurements.
+struct StageData {
     samples: Vec<SpaceFrame>,
     visibilities: Vec<GroundFrame>,
     packets: Vec<Vec<u8>>,
@@ -141,13 +143,13 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     let skies = space_segment::skies(&plan)?;
     let sky_pixels = skies.first().map_or(0, |sky| sky.values().len());
     let config = &plan.config;
-    let material = material(&plan, &skies)?;
-    let wanted = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
-    let mission_s = seconds_of(&plan);
+    let data = stage_data(&plan, &skies)?;
+    let is_selected = |stage: &str| settings.stage.as_deref().is_none_or(|only| only == stage);
+    let mission_s = mission_s(&plan);
     let (since, before_s) = (Instant::now(), machine_seconds().zip(core_seconds_used()));
     let mut rates = Vec::new();
     let (mut chain, mut ground) = (None, None);
-    for stage in BENCH_STAGES.into_iter().filter(|stage| wanted(stage)) {
+    for stage in BENCH_STAGES.into_iter().filter(|stage| is_selected(stage)) {
         let (mut seconds, mut core_seconds) = (Vec::new(), Vec::new());
         for _ in 0..settings.runs.max(1) {
             let spent = if stage == "chain" {
@@ -155,15 +157,15 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
                 chain = Some(run?);
                 spent
             } else {
-                time_stage(&plan, &skies, &material, stage)?
+                time_stage(&plan, &skies, &data, stage)?
             };
             seconds.push(spent.seconds);
             core_seconds.extend(spent.core_seconds);
         }
-        let spent_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
-        rates.push(material.rate(stage, seconds, spent_s, samples_per_s(&plan)));
+        let core_s = (!core_seconds.is_empty()).then(|| median(&mut core_seconds) / mission_s);
+        rates.push(data.rate(stage, seconds, core_s, samples_per_mission_s(&plan)));
         if stage == "chain" {
-            ground = Some(chain::run_ground(config, &material.packets)?);
+            ground = Some(chain::run_ground(config, &data.packets)?);
         }
     }
     let growth = if settings.growth { growth::rows(&plan, &skies, settings.runs)? } else { Vec::new() };
@@ -193,13 +195,13 @@ pub fn bench(plan: &Plan, settings: &BenchSettings) -> Result<Bench, PipelineErr
     })
 }
 
-fn source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
+fn run_source<S: Source>(mut source: S) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     while source.next(&mut out)? == Flow::Continue {}
     Ok(out.into_vec())
 }
 
-fn stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Error> {
+fn run_stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Error> {
     let mut out = Outlet::collect();
     for item in input {
         stage.step(item, &mut out)?;
@@ -208,24 +210,25 @@ fn stage<S: Stage>(mut stage: S, input: Vec<S::In>) -> Result<Vec<S::Out>, S::Er
     Ok(out.into_vec())
 }
 
-fn never<T>(result: Result<T, Infallible>) -> T {
+/// The value of a result that cannot be an error.
+fn infallible<T>(result: Result<T, Infallible>) -> T {
     match result {
         Ok(value) => value,
         Err(never) => match never {},
     }
 }
 
-fn material(plan: &Plan, skies: &[SkyMap]) -> Result<Material, PipelineError> {
+fn stage_data(plan: &Plan, skies: &[SkyMap]) -> Result<StageData, PipelineError> {
     let (sampler, _, correlator) =
         sample_stages(plan, models::build_all(plan, skies)?, &SampleCounts::default());
-    let samples = source(sampler)?;
-    let visibilities = never(stage(correlator, samples.clone()));
-    let packets = stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
+    let samples = run_source(sampler)?;
+    let visibilities = infallible(run_stage(correlator, samples.clone()));
+    let packets = run_stage(Transmitter::new(&plan.config.downlink)?, visibilities.clone())?;
     let count = |frame: &GroundFrame| match frame {
         GroundFrame::Visibilities(block) => block.len() as f64,
         _ => 0.0,
     };
-    Ok(Material {
+    Ok(StageData {
         sample_count: samples_of(&samples).map(|samples| samples.len() as f64).sum(),
         sample_bytes: samples_of(&samples).map(|samples| samples.bits() as f64 / 8.0).sum(),
         visibility_count: visibilities.iter().map(count).sum(),
@@ -244,11 +247,10 @@ fn samples_of(frames: &[SpaceFrame]) -> impl Iterator<Item = &Samples> {
     blocks.map(|block| &block.samples)
 }
 
-/// Runs one stage alone and measures the time.
 fn time_stage(
     plan: &Plan,
     skies: &[SkyMap],
-    material: &Material,
+    data: &StageData,
     name: &str,
 ) -> Result<TimeSpent, PipelineError> {
     let (sampler, link, correlator) =
@@ -256,35 +258,34 @@ fn time_stage(
     // Input is copied before the clock starts, and output is dropped after it stops.
     Ok(match name {
         "sample" => {
-            let (spent, sampled) = timed(|| source(sampler));
+            let (spent, sampled) = timed(|| run_source(sampler));
             sampled?;
             spent
         }
         "link" => {
-            let input = material.samples.clone();
-            timed(|| never(stage(link, input))).0
+            let input = data.samples.clone();
+            timed(|| infallible(run_stage(link, input))).0
         }
         "correlate" => {
-            let input = material.samples.clone();
-            timed(|| never(stage(correlator, input))).0
+            let input = data.samples.clone();
+            timed(|| infallible(run_stage(correlator, input))).0
         }
         "transmit" => {
-            let (input, transmitter) =
-                (material.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
-            let (spent, sent) = timed(|| stage(transmitter, input));
+            let (input, transmitter) = (data.visibilities.clone(), Transmitter::new(&plan.config.downlink)?);
+            let (spent, sent) = timed(|| run_stage(transmitter, input));
             sent?;
             spent
         }
         _ => {
-            let (input, reception) = (material.packets.clone(), chain::reception());
-            let (spent, received) = timed(|| stage(reception, input));
+            let (input, reception) = (data.packets.clone(), chain::reception());
+            let (spent, received) = timed(|| run_stage(reception, input));
             received?;
             spent
         }
     })
 }
 
-impl Material {
+impl StageData {
     fn rate(
         &self,
         stage: &'static str,
@@ -294,7 +295,7 @@ impl Material {
     ) -> Rate {
         let mut seconds = runs_s.clone();
         let median_s = median(&mut seconds);
-        let (least_s, most_s) = (seconds[0], seconds[seconds.len() - 1]);
+        let (min_s, max_s) = (seconds[0], seconds[seconds.len() - 1]);
         let bytes = match stage {
             "transmit" | "receive" => self.packet_bytes,
             _ => self.sample_bytes,
@@ -307,7 +308,7 @@ impl Material {
             median_s,
             quartiles_s: quartiles(&seconds),
             samples_per_s,
-            samples_per_s_range: [self.sample_count / most_s, self.sample_count / least_s],
+            samples_per_s_range: [self.sample_count / max_s, self.sample_count / min_s],
             visibilities_per_s: visibilities / median_s,
             bytes_per_s: bytes / median_s,
             times_real_time: samples_per_s / real_time,

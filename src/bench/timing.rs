@@ -1,10 +1,9 @@
-//! What a piece of work takes.
+//! Measurement of time.
 
 use std::time::Instant;
 
 use crate::pipeline::Plan;
 
-/// Time spent on a piece of work.
 pub(super) struct TimeSpent {
     pub(super) seconds: f64,
     /// Processor time of the whole process, s; `None` where the system does not report it.
@@ -12,23 +11,24 @@ pub(super) struct TimeSpent {
 }
 
 /// Mission time of a plan's windows, s.
-pub(super) fn seconds_of(plan: &Plan) -> f64 {
+pub(super) fn mission_s(plan: &Plan) -> f64 {
     plan.windows.iter().map(|window| (window.end.0 - window.start.0) as f64 * 1e-6).sum()
 }
 
-/// Samples per second of mission time.
-pub(super) fn samples_per_s(plan: &Plan) -> f64 {
+/// Number of samples per second of mission time.
+pub(super) fn samples_per_mission_s(plan: &Plan) -> f64 {
     let channels = &plan.instrument.channels;
     let width_hz = channels.first().map_or(1.0, |channel| channel.width_hz);
     (channels.len() * plan.array.satellites()) as f64 * width_hz
 }
 
+/// The median of values, which it sorts.
 pub(super) fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
 }
 
-/// The quartiles of sorted values, nearest ranks.
+/// The quartiles of sorted values, by nearest rank.
 pub(super) fn quartiles(sorted: &[f64]) -> [f64; 2] {
     let last = sorted.len() - 1;
     [last / 4, last - last / 4].map(|at| sorted[at])
@@ -44,9 +44,10 @@ pub(super) fn core_seconds_used() -> Option<f64> {
     Some((ticks()? + ticks()?) / 100.0)
 }
 
-pub(super) fn timed<T>(work: impl FnOnce() -> T) -> (TimeSpent, T) {
+/// Runs a task; returns the time spent and its result.
+pub(super) fn timed<T>(task: impl FnOnce() -> T) -> (TimeSpent, T) {
     let (before_s, since) = (core_seconds_used(), Instant::now());
-    let value = work();
+    let value = task();
     let seconds = since.elapsed().as_secs_f64();
     let core_seconds = core_seconds_used().zip(before_s).map(|(after_s, before_s)| after_s - before_s);
     (TimeSpent { seconds, core_seconds }, value)

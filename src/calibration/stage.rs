@@ -230,7 +230,7 @@ impl Calibrator {
         self.blocks.count(block.start, count);
         if block.pair.i != block.pair.j {
             if self.is_not_imaged(&block) {
-                return Ok(self.count_not_imaged(&block).map(PlacedFrame::Elsewhere));
+                return Ok(self.count_not_imaged(&block).map(PlacedFrame::NotMapped));
             }
             let placed = self.place(block)?.filter(|placed| !placed.is_empty());
             return Ok(placed.map(PlacedFrame::Visibilities));

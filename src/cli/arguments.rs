@@ -15,7 +15,7 @@ use crate::sky::fits::ReadOptions;
 use crate::units::Dimension;
 use crate::units::time_scales::{Tai, TimeScale};
 
-/// A pipeline file, and settings that replace some of its own.
+/// A pipeline file, and settings that replace some in the file.
 #[derive(Debug, Args)]
 pub(super) struct PipelineArgs {
     /// Pipeline file (TOML); the embedded quicklook if none is given.
@@ -38,7 +38,7 @@ pub(super) struct PipelineArgs {
     memory_max: Option<u64>,
 }
 
-/// An array, for commands that need nothing else of a pipeline.
+/// A pipeline file, for commands that use only its array.
 #[derive(Debug, Args)]
 pub(super) struct ArrayArgs {
     /// Pipeline file (TOML) that describes the array; the paper's fiducial array if none is given.
@@ -49,7 +49,7 @@ pub(super) struct ArrayArgs {
     overrides: Vec<String>,
 }
 
-/// What is to be known of map files that do not say it themselves.
+/// Properties of map files that lack the keyword for them.
 #[derive(Clone, Copy, Debug, Args)]
 pub(super) struct MapFileArgs {
     /// Frame of map files without COORDSYS: ecliptic, galactic or equatorial; without it they are refused.
@@ -63,15 +63,15 @@ impl MapFileArgs {
     }
 }
 
-/// Standard input and output, as commands of a shell name them.
+/// Name of standard input and output.
 const STANDARD: &str = "-";
 
-/// A file to be read; `-` is standard input.
+/// Parser of an input file; `-` is standard input.
 pub(super) fn input_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().map(|path| if is_standard(&path) { PathBuf::from("/dev/stdin") } else { path })
 }
 
-/// Refuses inputs that cannot be read twice: a pipe, or standard input. A missing file is reported where it is opened.
+/// Refuses pipes and standard input, which cannot be read twice. A missing file is reported when it is opened.
 pub(super) fn require_repeatable(path: &Path, reason: &str) -> Result<(), String> {
     match std::fs::metadata(path) {
         Ok(found) if !found.is_file() => {
@@ -81,7 +81,7 @@ pub(super) fn require_repeatable(path: &Path, reason: &str) -> Result<(), String
     }
 }
 
-/// A file or folder to be written, which must have a name.
+/// Parser of an output file or folder; `-` is refused.
 pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| match is_standard(&path) {
         true => Err("expected a name, as this is not written to standard output; ./- is a file of that name"),
@@ -89,12 +89,10 @@ pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     })
 }
 
-/// Whether a path stands for standard input or output.
 pub(super) fn is_standard(path: &Path) -> bool {
     path.as_os_str() == STANDARD
 }
 
-/// A frame by its name or letter.
 pub(super) fn frame(text: &str) -> Result<Frame, String> {
     Frame::from_coordsys(text).ok_or_else(|| "expected ecliptic, galactic or equatorial".to_owned())
 }
@@ -111,7 +109,6 @@ pub(super) struct StateMapArgs {
 }
 
 impl ArrayArgs {
-    /// The pipeline file, if there is one.
     pub(super) fn inputs(&self) -> Vec<PathBuf> {
         self.pipeline.iter().cloned().collect()
     }
@@ -122,19 +119,19 @@ impl ArrayArgs {
 }
 
 impl StateMapArgs {
-    /// The settings of the state in this folder, unless a file names them.
+    /// The settings of the state in a folder, or of the map file if there is one.
     pub(super) fn source(&self, state: &Path) -> Result<ConfigSource, GroundError> {
         self.source_with(state, [])
     }
 
-    /// As [`StateMapArgs::source`], with more settings.
+    /// The settings of the state or the map file, with additional overrides.
     pub(super) fn source_with(
         &self,
         state: &Path,
-        more: impl IntoIterator<Item = String>,
+        extra_overrides: impl IntoIterator<Item = String>,
     ) -> Result<ConfigSource, GroundError> {
-        let overrides = self.overrides.iter().cloned().chain(more).collect();
-        ConfigSource { file: self.map.clone(), overrides, seed: None }.of_state(state)
+        let overrides = self.overrides.iter().cloned().chain(extra_overrides).collect();
+        ConfigSource { file: self.map.clone(), overrides, seed: None }.with_state_settings(state)
     }
 }
 
@@ -147,44 +144,44 @@ impl PipelineArgs {
         ConfigSource { file: pipeline.clone(), overrides, seed: *seed }
     }
 
-    /// The configuration; what follows from it without being said is noted on standard error.
+    /// Loads the configuration, and prints notes about adapted settings.
     pub(super) fn load(&self) -> Result<Config, ConfigError> {
         self.load_noting(true)
     }
 
-    /// As [`PipelineArgs::load`]; silent unless it `says` so.
-    pub(super) fn load_noting(&self, says: bool) -> Result<Config, ConfigError> {
+    /// Loads the configuration; prints notes about adapted settings if `prints_notes`.
+    pub(super) fn load_noting(&self, prints_notes: bool) -> Result<Config, ConfigError> {
         let mut notes = Vec::new();
         let config = self.source().load_noting(&mut notes)?;
-        if says {
+        if prints_notes {
             print_notes(notes);
         }
         Ok(config)
     }
 
-    /// Keeps the files that are read from being replaced by what is written, while the result lives.
+    /// Protects the input files from being overwritten, until the result is dropped.
     pub(super) fn protect(&self, config: &Config) -> ProtectedInputs {
         ProtectedInputs::of(self.pipeline.iter().cloned().chain(config.input_files()))
     }
 
-    /// The memory that the run may take.
+    /// The memory limit: the given one, or that of the machine.
     pub(super) fn memory_limit(&self) -> Option<MemoryLimit> {
         self.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine)
     }
 }
 
-/// Channels to map.
+/// Numbers of the channels to map.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct ChannelList(Vec<u16>);
 
 impl ChannelList {
-    /// As an override of a setting.
+    /// The list as an override of `map.channels`.
     pub(super) fn setting(&self) -> String {
         format!("map.channels={:?}", self.0)
     }
 }
 
-/// A number of channels that are taken at a time, or `auto`.
+/// Parses a number of channels per group, or `auto`.
 pub(super) fn group_size(text: &str) -> Result<GroupSize, String> {
     match (text.trim(), text.trim().parse()) {
         ("auto", _) => Ok(GroupSize::Automatic),
@@ -193,13 +190,13 @@ pub(super) fn group_size(text: &str) -> Result<GroupSize, String> {
     }
 }
 
-/// Channels from a list of numbers and ranges such as `0-4,7`.
+/// Parses a list of channel numbers and ranges such as `0-4,7`.
 pub(super) fn channel_list(text: &str) -> Result<ChannelList, String> {
-    const MOST: u16 = 4096;
-    let number = |text: &str| text.trim().parse::<u16>().ok().filter(|&number| number < MOST);
+    const NUMBERS: u16 = 4096;
+    let number = |text: &str| text.trim().parse::<u16>().ok().filter(|&number| number < NUMBERS);
     let range = |part: &str| match part.split_once('-') {
         Some((first, last)) => Some(number(first)?..=number(last)?).filter(|range| !range.is_empty()),
-        None => number(part).map(|one| one..=one),
+        None => number(part).map(|number| number..=number),
     };
     let ranges: Option<Vec<_>> = text.split(',').map(range).collect();
     let ranges = ranges.ok_or("expected numbers from 0 and ranges of them, such as 0-4,7")?;
@@ -207,7 +204,7 @@ pub(super) fn channel_list(text: &str) -> Result<ChannelList, String> {
     Ok(ChannelList(channels.into_iter().collect()))
 }
 
-/// Bytes from a size such as `8GB`, `16GiB` or `500 MB`; a number alone is of bytes.
+/// Parses a size such as `8GB`, `16GiB` or `500 MB`, to bytes; a number without a unit is in bytes.
 pub(super) fn size_bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, f64); 9] = [
         ("KIB", 1024.0),
@@ -229,7 +226,7 @@ pub(super) fn size_bytes(text: &str) -> Result<u64, String> {
     }
 }
 
-/// Seconds from a time such as `7d`, `12h`, `90s` or `90`; at most 1e9 s either way.
+/// Parses a time such as `7d`, `12h`, `90s` or `90`, to seconds; at most 1e9 s of either sign.
 pub(super) fn time_s(text: &str) -> Result<f64, String> {
     match Dimension::Time.parse(text)? {
         value if value.abs() <= 1e9 => Ok(value),
@@ -237,17 +234,17 @@ pub(super) fn time_s(text: &str) -> Result<f64, String> {
     }
 }
 
-/// A time of the mission: since its epoch, or a date.
+/// A mission time, given relative to the epoch or as a date.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum TimeOfMission {
-    /// Since the epoch, s.
+    /// Time since the epoch, s.
     Since(f64),
-    /// TAI since 1958, s.
+    /// TAI since 1958-01-01, s.
     Tai(f64),
 }
 
 impl TimeOfMission {
-    /// Seconds since an epoch, which is TAI since 1958, s.
+    /// The time since an epoch, s; the epoch is TAI since 1958-01-01, s.
     pub(super) fn since_s(self, epoch_tai_s: f64) -> f64 {
         match self {
             Self::Since(time_s) => time_s,
@@ -256,7 +253,7 @@ impl TimeOfMission {
     }
 }
 
-/// A time such as `7d`, or a date such as `2027-01-08T12:00:00` (TAI) or `2027-01-08T12:00:00Z` (UTC).
+/// Parses a time such as `7d`, or a date such as `2027-01-08T12:00:00` (TAI) or `2027-01-08T12:00:00Z` (UTC).
 pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
     let scale = if text.ends_with('Z') { TimeScale::Utc } else { TimeScale::Tai };
     match Tai::parse(text, scale) {
@@ -269,17 +266,16 @@ pub(super) fn time_of_mission(text: &str) -> Result<TimeOfMission, String> {
     }
 }
 
-/// A band in Hz, for messages.
 pub(super) fn band_text([low_hz, high_hz]: [f64; 2]) -> String {
     format!("{} to {}", Dimension::Frequency.show(low_hz), Dimension::Frequency.show(high_hz))
 }
 
-/// Hz from a frequency such as `3MHz` or `3e6`.
+/// Parses a frequency such as `3MHz` or `3e6`, to Hz.
 pub(super) fn frequency_hz(text: &str) -> Result<f64, String> {
     Dimension::Frequency.parse(text)
 }
 
-/// As [`time_s`], but not negative.
+/// Parses a time that is not negative, to seconds; see [`time_s`].
 pub(super) fn not_negative_s(text: &str) -> Result<f64, String> {
     match time_s(text)? {
         value if value >= 0.0 => Ok(value),
@@ -293,7 +289,7 @@ mod tests {
 
     #[test]
     fn times_are_numbers_or_dates() {
-        // 2027-01-01T00:00:00 is 69 years and 17 leap days after 1958.
+        // 2027-01-01T00:00:00 is 69 years and 17 leap days after 1958-01-01.
         let epoch_tai_s = (69.0 * 365.0 + 17.0) * 86_400.0;
         let since = |text| time_of_mission(text).map(|time| time.since_s(epoch_tai_s));
         assert_eq!(since("1.5h"), Ok(5400.0));

@@ -1,4 +1,4 @@
-//! `lunarray bound`: what a pass can tell of gains at best.
+//! `lunarray bound`: Cramer-Rao bounds of the gains in one pass.
 
 use std::path::PathBuf;
 

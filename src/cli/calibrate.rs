@@ -72,7 +72,7 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
         models,
         model_files,
         out: &args.out,
-        watch: &mut |at| lines.show(&at),
+        watch: &mut |progress| lines.show(&progress),
     };
     let summary = calibrate(job, interrupt.cancel())?;
     print_notes(&summary.conventions);

@@ -34,18 +34,17 @@ pub(super) struct CheckArgs {
     json: bool,
 }
 
-/// What is printed as JSON.
+/// The JSON output.
 #[derive(Serialize)]
-struct Checked<'a> {
+struct CheckReport<'a> {
     #[serde(flatten)]
     cost: &'a Cost,
-    /// Epoch of the mission, UTC.
     epoch_utc: &'a str,
-    /// Which Earth hides the array.
+    /// Description of the model of the Earth.
     earth: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     groups: Option<&'a RunGroups>,
-    /// What was understood of each map and catalogue.
+    /// Description of each map and catalogue.
     #[serde(skip_serializing_if = "<[String]>::is_empty")]
     files: &'a [String],
 }
@@ -66,14 +65,14 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     print_notes(sky_notes(&plan)?);
     let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;
-    let files = plan.files_understood();
+    let files = plan.file_descriptions();
     let limit = args.pipeline.memory_limit();
     let groups = args.groups.map(|size| plan.run_groups(size, limit)).transpose();
     let found = groups.as_ref().ok().and_then(Option::as_ref);
     let epoch_utc = &utc_text(plan.instrument.epoch_tai_s);
     let earth = EarthModel::of(&plan.config.array).to_string();
     if args.json {
-        print_json_line(&Checked { cost: &cost, epoch_utc, earth, groups: found, files: &files })?;
+        print_json_line(&CheckReport { cost: &cost, epoch_utc, earth, groups: found, files: &files })?;
     } else {
         let files: String = files.iter().map(|line| format!("{line}\n")).collect();
         let mission = format!("epoch {epoch_utc} UTC; the Earth is {earth}");

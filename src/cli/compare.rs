@@ -78,8 +78,8 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
         print_text(&table(&comparison))?;
     }
     // With --json, pictures are drawn only on request.
-    let wanted = !args.no_plot && (args.plot.is_some() || !args.json);
-    let pictures = if wanted { draw(args, [map_path, truth_path], &comparison)? } else { Vec::new() };
+    let draws = !args.no_plot && (args.plot.is_some() || !args.json);
+    let pictures = if draws { draw(args, [map_path, truth_path], &comparison)? } else { Vec::new() };
     if args.json {
         return Ok(Completion::Done);
     }
@@ -89,19 +89,20 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// Reads a map in K, and its frequency, Hz, if the file has one.
+/// Reads a map in K, and its frequency, Hz, if the file states it.
 fn read(path: &Path, maps: MapFileArgs) -> Result<(SkyMap, Option<f64>), CommandError> {
     let file = read_whole_map_file(path, &maps.options())?;
     let frequency_hz = file.frequency_hz;
     Ok((file.map, frequency_hz))
 }
 
-/// Runs side by side.
 fn compare_runs(args: &CompareArgs) -> CommandResult {
-    let of_maps = [("--noise", args.noise.is_some()), ("--band-limit", args.band_limit.is_some())];
-    if let Some((option, _)) =
-        of_maps.into_iter().chain([("--l-max", args.l_max.is_some())]).find(|(_, on)| *on)
-    {
+    let map_options = [
+        ("--noise", args.noise.is_some()),
+        ("--band-limit", args.band_limit.is_some()),
+        ("--l-max", args.l_max.is_some()),
+    ];
+    if let Some((option, _)) = map_options.into_iter().find(|(_, is_given)| *is_given) {
         return Err(format!("{option} is for two maps; expected none with output folders of runs").into());
     }
     let runs: Vec<RunFigures> = args
@@ -143,7 +144,7 @@ fn draw(
     Ok(vec![plot, error])
 }
 
-/// `folder/name` + `suffix` + `.png`.
+/// A path beside `path`: its stem, `suffix` and `.png`.
 fn beside(path: &Path, suffix: &str) -> PathBuf {
     let stem = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().into_owned());
     path.with_file_name(format!("{stem}{suffix}.png"))

@@ -51,7 +51,7 @@ pub(super) struct CutoutArgs {
     json: bool,
 }
 
-/// Frames of the command line.
+/// Frames as command-line values.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum FrameName {
     Galactic,
@@ -74,9 +74,9 @@ struct CutoutReport {
 struct PieceReport {
     map: String,
     mean_k: f64,
-    /// About the mean.
+    /// Standard deviation about the mean, K.
     rms_k: f64,
-    /// Of the values about their means with those of the first piece.
+    /// Correlation with the first piece, about the means.
     correlation: f64,
 }
 
@@ -173,7 +173,7 @@ fn compare(map: String, piece: &[f64], first: &[f64]) -> PieceReport {
     PieceReport { map, mean_k, rms_k, correlation }
 }
 
-/// Values by their place on the plane, degrees to the right and up.
+/// A table (CSV) of the values by position on the plane, degrees to the right and up.
 fn table(cutout: &Cutout, pieces: &[Vec<f64>]) -> String {
     let mut text = "right_deg,up_deg".to_owned();
     for number in 1..=pieces.len() {
@@ -182,9 +182,9 @@ fn table(cutout: &Cutout, pieces: &[Vec<f64>]) -> String {
     }
     text.push('\n');
     let step = cutout.size_deg / cutout.pixels as f64;
-    let at = |k: usize| (k as f64 - 0.5 * (cutout.pixels as f64 - 1.0)) * step;
+    let offset_deg = |k: usize| (k as f64 - 0.5 * (cutout.pixels as f64 - 1.0)) * step;
     for k in 0..cutout.pixels * cutout.pixels {
-        let _ = write!(text, "{:.5},{:.5}", at(k % cutout.pixels), at(k / cutout.pixels));
+        let _ = write!(text, "{:.5},{:.5}", offset_deg(k % cutout.pixels), offset_deg(k / cutout.pixels));
         for piece in pieces {
             let _ = write!(text, ",{:.8e}", piece[k]);
         }

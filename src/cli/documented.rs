@@ -1,4 +1,4 @@
-//! Every command that a page shows is one that the program takes.
+//! Tests that the command lines in the documentation are valid.
 
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ fn pages(folder: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// A command line with 3, which is a number, a frequency and a name, for each of the shell's variables.
+/// Replaces the shell variables of a command line by 3, which is valid as a number, a frequency and a name.
 fn without_variables(command: &str) -> String {
     let mut parts = command.split('$');
     let mut found = parts.next().unwrap_or_default().to_owned();
@@ -32,7 +32,7 @@ fn without_variables(command: &str) -> String {
     found
 }
 
-/// Words of a command line: up to what belongs to the shell, with quotes taken off.
+/// Words of a command line without quotes, up to the first pipe, redirection or comment.
 fn words(command: &str) -> Vec<String> {
     let command = without_variables(command);
     let mut words = vec![String::new()];
@@ -43,7 +43,7 @@ fn words(command: &str) -> Vec<String> {
             Some(open) if c == open => quote = None,
             None if is_quote => quote = Some(c),
             None if matches!(c, '|' | ';' | '&' | '<' | '>') || (c == '#' && before == ' ') => {
-                // `2> file` is the shell's.
+                // `2> file` is a redirection.
                 if c == '>' && before == '2' {
                     words.pop();
                 }
@@ -58,7 +58,7 @@ fn words(command: &str) -> Vec<String> {
     words
 }
 
-/// Command lines of a page: lines of its blocks of code, and words between backticks that name a file.
+/// Command lines of a page: lines of code blocks, and code spans that name a file.
 fn commands(page: &str) -> Vec<String> {
     let mut found = Vec::new();
     let mut is_block = false;
@@ -67,23 +67,24 @@ fn commands(page: &str) -> Vec<String> {
             is_block = !is_block;
         } else if is_block || line.starts_with("    ") {
             let line = line.replace("cargo run --release --", "lunarray");
-            // Behind `mpirun -n 4`, `until` and the like.
+            // The command may follow `mpirun -n 4` or `until`.
             let is_command =
                 ["lunarray ", "mpirun ", "until "].iter().any(|word| line.trim().starts_with(word));
             let start = line.find("lunarray ").filter(|_| is_command);
             found.extend(start.map(|start| line[start..].to_owned()));
         } else {
             let code = line.split('`').skip(1).step_by(2);
-            let whole =
+            let is_complete =
                 |code: &&str| !code.contains(['[', '|']) && !code.contains("...") && code.contains('.');
-            found.extend(code.filter(|code| code.starts_with("lunarray ")).filter(whole).map(str::to_owned));
+            let commands = code.filter(|code| code.starts_with("lunarray ")).filter(is_complete);
+            found.extend(commands.map(str::to_owned));
         }
     }
     found
 }
 
 #[test]
-fn every_command_of_a_page_is_one_that_the_program_takes() {
+fn every_documented_command_is_valid() {
     let mut files = vec![Path::new(ROOT).join("README.md"), Path::new(ROOT).join("CONTRIBUTING.md")];
     pages(&Path::new(ROOT).join("docs"), &mut files);
     let keys = std::fs::read_to_string(Path::new(ROOT).join("pipelines/reference.toml")).unwrap();
@@ -111,7 +112,7 @@ fn every_command_of_a_page_is_one_that_the_program_takes() {
         }
     }
     assert!(problems.is_empty(), "{}", problems.join("\n"));
-    // Without commands the rule would hold of nothing.
+    // The test must not pass because no command was found.
     assert!(count > 40, "{count}");
 }
 

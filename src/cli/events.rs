@@ -1,6 +1,6 @@
-//! `--events`: progress and events of a run, one JSON object a line.
+//! `--events`: progress and events of a run, one JSON object per line.
 //!
-//! A thread of its own writes; the run never waits for it. Maps wait for it in a queue, and those that find it full are counted.
+//! A separate thread writes them, and the run never waits for it. Maps are dropped and counted if the queue to the thread is full.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -20,35 +20,34 @@ use crate::downlink::ReceptionCounters;
 use crate::files::growing_file;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
-use crate::pipeline::{Config, Watched};
+use crate::pipeline::{Config, RunHandles};
 use crate::products::{MapViewer, PublishedMap, SnapshotSummary};
 use crate::runtime::{LedgerReport, StageProgress};
 
-/// Interval between two lines of progress.
 const PROGRESS_EVERY: Duration = Duration::from_secs(1);
 
-/// Maps that may wait to be written.
-const WAITING_MAX: usize = 256;
+/// Capacity of the queue to the writing thread.
+const QUEUED_MAX: usize = 256;
 
-/// Longest wait for a reader of the last line.
-const LAST_WAIT: Duration = Duration::from_secs(5);
+/// Time limit for the writing thread to take a message and to end.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Whether and where a command writes its events.
+/// Arguments for the output of events.
 #[derive(Debug, Args)]
 pub(super) struct EventsArgs {
-    /// Write progress and events to this file, one JSON object a line; the file is replaced. With - they go to standard output,
+    /// Write progress and events to this file, one JSON object per line; the file is replaced. With - they go to standard output,
     /// which then holds nothing else. The last line has the summary.
     #[arg(long, value_name = "FILE|-")]
     events: Option<PathBuf>,
 }
 
 impl EventsArgs {
-    /// Whether the events take standard output.
+    /// Whether the events go to standard output.
     pub(super) fn take_stdout(&self) -> bool {
         self.events.as_deref() == Some(Path::new("-"))
     }
 
-    /// Opens the file, if one is wanted, and writes the first line, of the `segment` of a chain with this configuration.
+    /// Opens the output, if it is requested, and writes the first line.
     pub(super) fn start(&self, config: &Config, segment: &'static str) -> Result<Events, CommandError> {
         let Some(path) = &self.events else { return Ok(Events { writer: None }) };
         let out: Box<dyn Write + Send> = match self.take_stdout() {
@@ -62,20 +61,20 @@ impl EventsArgs {
     }
 }
 
-/// The events of a command, if they are wanted.
+/// The output of events of a command, if it is requested.
 pub(super) struct Events {
     writer: Option<EventWriter>,
 }
 
 impl Events {
-    /// The run begins, or a further pass of it.
-    pub(super) fn watch(&self, watched: &Watched) {
+    /// Starts to report a graph: the run, or a further reading of it.
+    pub(super) fn watch(&self, handles: &RunHandles) {
         let Some(writer) = &self.writer else { return };
-        watched.maps.add_viewer(Box::new(writer.viewer()));
-        writer.send(Message::Watch(Box::new(watched.clone())));
+        handles.maps.add_viewer(Box::new(writer.viewer()));
+        writer.send(Message::Watch(Box::new(handles.clone())));
     }
 
-    /// Writes the last line, with the summary or the error; `cancelled` reads whether the run was ended early.
+    /// Writes the last line, with the summary or the error; `cancelled` tells whether a summary is of a cancelled run.
     pub(super) fn conclude<T: Serialize>(
         self,
         result: &Result<T, CommandError>,
@@ -86,7 +85,7 @@ impl Events {
             Ok(summary) => End {
                 status: if cancelled(summary) { "cancelled" } else { "complete" },
                 error: None,
-                // A summary that can be written once can be written twice.
+                // A summary always has a JSON form.
                 summary: serde_json::to_value(summary).unwrap_or_default(),
             },
             Err(error) => {
@@ -97,7 +96,7 @@ impl Events {
     }
 }
 
-/// What a line tells, besides when.
+/// Content of a line, without its time.
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "kebab-case")]
 enum Entry<'a> {
@@ -116,7 +115,7 @@ enum Entry<'a> {
         senders: Option<usize>,
         #[serde(skip_serializing_if = "Option::is_none")]
         solving: Option<SolveCount>,
-        /// Maps that were not told of, as nobody read.
+        /// Number of maps that were dropped because the queue was full.
         #[serde(skip_serializing_if = "is_zero")]
         untold: u64,
     },
@@ -128,14 +127,14 @@ enum Entry<'a> {
     StageEnded {
         stage: &'a str,
     },
-    /// Something happened to the instrument.
+    /// An event of the instrument, found by calibration.
     Instrument {
         what: InstrumentEvent,
     },
     End(&'a End),
 }
 
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde asks so")]
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde requires a reference")]
 fn is_zero(count: &u64) -> bool {
     *count == 0
 }
@@ -176,7 +175,7 @@ struct MapEntry {
 }
 
 impl MapEntry {
-    fn of(map: PublishedMap<'_>) -> Self {
+    fn new(map: PublishedMap<'_>) -> Self {
         let PublishedMap { solution, figures, .. } = map;
         let index = usize::from(solution.channel.0);
         Self {
@@ -194,14 +193,13 @@ struct End {
     status: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
-    /// As `summary.json` has it; of a simulation, its report. Null if it failed.
+    /// Content of `summary.json`, or the report of a simulation; null after a failure.
     summary: serde_json::Value,
 }
 
-/// A line: when, and what.
+/// A line of the output.
 #[derive(Serialize)]
 struct EventLine<'a> {
-    /// Seconds since 1970, UTC.
     unix_s: f64,
     elapsed_s: f64,
     #[serde(flatten)]
@@ -209,80 +207,78 @@ struct EventLine<'a> {
 }
 
 enum Message {
-    Watch(Box<Watched>),
+    Watch(Box<RunHandles>),
     Map(MapEntry),
     End(Box<End>),
 }
 
-/// The thread that writes, and the way to it.
+/// Handle of the writing thread.
 struct EventWriter {
     messages: Sender<Message>,
-    untold: Arc<AtomicU64>,
-    /// Closes with the thread.
-    over: Receiver<()>,
+    dropped: Arc<AtomicU64>,
+    /// Disconnects when the thread ends.
+    thread_end: Receiver<()>,
 }
 
 impl EventWriter {
     fn start(out: Box<dyn Write + Send>, name: String, segment: &'static str) -> Self {
-        let (messages, received) = bounded(WAITING_MAX);
-        let (is_alive, over) = bounded(0);
-        let untold = Arc::new(AtomicU64::new(0));
-        let lines = Lines { out, since: Instant::now(), failed: 0 };
-        let counted = Arc::clone(&untold);
+        let (messages, received) = bounded(QUEUED_MAX);
+        let (end_sender, thread_end) = bounded(0);
+        let dropped = Arc::new(AtomicU64::new(0));
+        let lines = EventLines { out, since: Instant::now(), failed: 0 };
+        let dropped_count = Arc::clone(&dropped);
         std::thread::spawn(move || {
-            write_events(lines, &name, segment, &received, &counted);
-            drop(is_alive);
+            write_events(lines, &name, segment, &received, &dropped_count);
+            drop(end_sender);
         });
-        Self { messages, untold, over }
+        Self { messages, dropped, thread_end }
     }
 
     fn viewer(&self) -> EventViewer {
-        EventViewer { messages: self.messages.clone(), untold: Arc::clone(&self.untold) }
+        EventViewer { messages: self.messages.clone(), dropped: Arc::clone(&self.dropped) }
     }
 
     fn send(&self, message: Message) {
-        // Nobody takes it if the reader has gone, and the run goes on; a reader that is late is given a moment.
-        let _ = self.messages.send_timeout(message, LAST_WAIT);
+        // An error is ignored: the run continues without a reader. A slow reader gets some time.
+        let _ = self.messages.send_timeout(message, WRITE_TIMEOUT);
     }
 
     fn end(self, end: End) {
         self.send(Message::End(Box::new(end)));
-        if matches!(self.over.recv_timeout(LAST_WAIT), Err(RecvTimeoutError::Timeout)) {
+        if matches!(self.thread_end.recv_timeout(WRITE_TIMEOUT), Err(RecvTimeoutError::Timeout)) {
             print_notes(["nobody reads the events; their last lines are not written"]);
         }
     }
 }
 
-/// Sees maps for the events.
+/// Receives maps for the events.
 struct EventViewer {
     messages: Sender<Message>,
-    untold: Arc<AtomicU64>,
+    dropped: Arc<AtomicU64>,
 }
 
 impl MapViewer for EventViewer {
     fn view(&self, map: PublishedMap<'_>) {
-        let entry = MapEntry::of(map);
+        let entry = MapEntry::new(map);
         if self.messages.try_send(Message::Map(entry)).is_err() {
-            self.untold.fetch_add(1, Ordering::Relaxed);
+            self.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
 
-/// The file, line by line.
-struct Lines {
+struct EventLines {
     out: Box<dyn Write + Send>,
     since: Instant,
-    /// Lines that could not be written since the last one that could.
+    /// Number of lines that could not be written since the last success.
     failed: u64,
 }
 
-impl Lines {
-    /// Writes a line at once.
+impl EventLines {
     fn write(&mut self, entry: Entry<'_>) -> std::io::Result<()> {
         let unix_s = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
         let line = EventLine { unix_s, elapsed_s: self.since.elapsed().as_secs_f64(), entry };
         let text = json_text(&line).map_err(std::io::Error::other)?;
-        // After a line that was cut off another begins.
+        // The last failed line may be incomplete.
         let before = if self.failed > 0 { "\n" } else { "" };
         let written =
             self.out.write_all(format!("{before}{text}\n").as_bytes()).and_then(|()| self.out.flush());
@@ -313,40 +309,40 @@ impl Lines {
     }
 }
 
-/// What has been told of a run.
+/// State of a run that has been reported.
 #[derive(Default)]
-struct EventsReported {
+struct ReportedState {
     ended: Vec<bool>,
     saving: SavingReport,
     instrument: usize,
 }
 
-/// Writes until the end, or until nobody reads.
+/// Writes events until the end of the run, or until the reader is gone.
 fn write_events(
-    mut lines: Lines,
+    mut lines: EventLines,
     name: &str,
     segment: &'static str,
     messages: &Receiver<Message>,
-    untold: &AtomicU64,
+    dropped: &AtomicU64,
 ) {
-    let mut watched: Option<Watched> = None;
-    let mut told = EventsReported::default();
+    let mut handles: Option<RunHandles> = None;
+    let mut reported = ReportedState::default();
     let mut write = || -> std::io::Result<()> {
         lines.write(Entry::Begin { version: env!("CARGO_PKG_VERSION"), name, segment })?;
         let mut next = Instant::now() + PROGRESS_EVERY;
         loop {
             match messages.recv_deadline(next) {
-                Ok(Message::Watch(new)) => (watched, told) = (Some(*new), EventsReported::default()),
+                Ok(Message::Watch(new)) => (handles, reported) = (Some(*new), ReportedState::default()),
                 Ok(Message::Map(map)) => lines.write(Entry::Map(map))?,
                 Ok(Message::End(end)) => {
-                    if let Some(watched) = &watched {
-                        progress(&mut lines, watched, &mut told, untold)?;
+                    if let Some(handles) = &handles {
+                        write_progress(&mut lines, handles, &mut reported, dropped)?;
                     }
                     return lines.write(Entry::End(&end));
                 }
                 Err(RecvTimeoutError::Timeout) => {
-                    if let Some(watched) = &watched {
-                        progress(&mut lines, watched, &mut told, untold)?;
+                    if let Some(handles) = &handles {
+                        write_progress(&mut lines, handles, &mut reported, dropped)?;
                     }
                     next = Instant::now() + PROGRESS_EVERY;
                 }
@@ -359,43 +355,43 @@ fn write_events(
     }
 }
 
-/// Writes what has happened since the last time, and the counts.
-fn progress(
-    lines: &mut Lines,
-    watched: &Watched,
-    told: &mut EventsReported,
-    untold: &AtomicU64,
+/// Writes the events since the last call, and the counts.
+fn write_progress(
+    lines: &mut EventLines,
+    handles: &RunHandles,
+    reported: &mut ReportedState,
+    dropped: &AtomicU64,
 ) -> std::io::Result<()> {
-    let stages = watched.metrics.snapshot();
-    told.ended.resize(stages.len(), false);
-    for (was, stage) in told.ended.iter_mut().zip(&stages) {
-        if stage.ended && !std::mem::replace(was, stage.ended) {
+    let stages = handles.metrics.snapshot();
+    reported.ended.resize(stages.len(), false);
+    for (had_ended, stage) in reported.ended.iter_mut().zip(&stages) {
+        if stage.ended && !std::mem::replace(had_ended, stage.ended) {
             lines.write(Entry::StageEnded { stage: &stage.name })?;
         }
     }
-    let ground = watched.ground.as_ref();
+    let ground = handles.ground.as_ref();
     if let Some(saving) = ground.and_then(|ground| ground.saving.report()) {
-        if (saving.written, saving.failed) != (told.saving.written, told.saving.failed) {
+        if (saving.written, saving.failed) != (reported.saving.written, reported.saving.failed) {
             lines.write(Entry::Checkpoint { saving: saving.clone() })?;
         }
-        told.saving = saving;
+        reported.saving = saving;
     }
     let gains = ground.and_then(|ground| ground.gains.as_ref());
-    for what in gains.map(|gains| gains.events_since(told.instrument)).unwrap_or_default() {
+    for what in gains.map(|gains| gains.events_since(reported.instrument)).unwrap_or_default() {
         lines.write(Entry::Instrument { what })?;
-        told.instrument += 1;
+        reported.instrument += 1;
     }
-    lines.write(counts_of(watched, &stages, untold.load(Ordering::Relaxed)))
+    lines.write(progress_entry(handles, &stages, dropped.load(Ordering::Relaxed)))
 }
 
-/// What a line of progress tells.
-fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<'static> {
-    let ground = watched.ground.as_ref();
+/// Content of a progress line; `untold` is the number of dropped maps.
+fn progress_entry(handles: &RunHandles, stages: &[StageProgress], untold: u64) -> Entry<'static> {
+    let ground = handles.ground.as_ref();
     let reception = ground.map(|ground| {
         let counters = ground.reception.lock();
         Box::new(counters.unwrap_or_else(std::sync::PoisonError::into_inner).clone())
     });
-    let solving = watched.solving.progress().map(|solving| SolveCount {
+    let solving = handles.solving.progress().map(|solving| SolveCount {
         what: solving.what,
         iteration: solving.iteration,
         residual: solving.residual,
@@ -405,47 +401,48 @@ fn counts_of(watched: &Watched, stages: &[StageProgress], untold: u64) -> Entry<
         stages: stages.iter().map(StageCount::from).collect(),
         ledger: ground.map(|ground| ground.ledger.report()),
         reception,
-        senders: watched.listening.as_ref().map(|listening| listening.status.open()),
+        senders: handles.listening.as_ref().map(|listening| listening.status.open()),
         solving,
         untold,
     }
 }
 
-/// What the log has been told of a run.
+/// State of a run that has been logged.
 #[derive(Default)]
 pub(super) struct LogState {
-    told: EventsReported,
+    reported: ReportedState,
     products: Option<String>,
     archive: Option<String>,
 }
 
 impl LogState {
-    /// Says what has happened since the last time: troubles and their ends; for programs everything that `--events` has.
-    pub(super) fn tell(&mut self, watched: &Watched) {
-        let stages = watched.metrics.snapshot();
-        self.told.ended.resize(stages.len(), false);
-        for (was, stage) in self.told.ended.iter_mut().zip(&stages) {
-            if stage.ended && !std::mem::replace(was, true) && is_json() {
+    /// Logs the changes since the last call: failures to write and their ends; as JSON, all events of `--events`.
+    pub(super) fn log_changes(&mut self, handles: &RunHandles) {
+        let stages = handles.metrics.snapshot();
+        self.reported.ended.resize(stages.len(), false);
+        for (had_ended, stage) in self.reported.ended.iter_mut().zip(&stages) {
+            if stage.ended && !std::mem::replace(had_ended, true) && is_json() {
                 say_entry(Level::Info, &Entry::StageEnded { stage: &stage.name }, None);
             }
         }
-        if let Some(saving) = watched.ground.as_ref().and_then(|ground| ground.saving.report()) {
-            self.tell_saving(saving);
+        if let Some(saving) = handles.ground.as_ref().and_then(|ground| ground.saving.report()) {
+            self.log_saving(saving);
         }
-        if let Some(products) = &watched.products {
+        if let Some(products) = &handles.products {
             let now = products.report().unwritten;
-            tell_trouble("products", "maps", &mut self.products, now);
+            log_failure_change("products", "maps", &mut self.products, now);
         }
-        let archive = watched.listening.as_ref().and_then(|listening| listening.archive.as_ref());
+        let archive = handles.listening.as_ref().and_then(|listening| listening.archive.as_ref());
         if let Some(archive) = archive {
             let now = archive.report().unwritten;
-            tell_trouble("archive", "the raw archive, and nothing is taken: packets", &mut self.archive, now);
+            let what = "the raw archive, and nothing is taken: packets";
+            log_failure_change("archive", what, &mut self.archive, now);
         }
     }
 
-    fn tell_saving(&mut self, saving: SavingReport) {
-        let before = std::mem::replace(&mut self.told.saving, saving);
-        let now = &self.told.saving;
+    fn log_saving(&mut self, saving: SavingReport) {
+        let before = std::mem::replace(&mut self.reported.saving, saving);
+        let now = &self.reported.saving;
         if (before.written, before.failed) == (now.written, now.failed) {
             return;
         }
@@ -460,8 +457,8 @@ impl LogState {
     }
 }
 
-/// Says that something cannot be written, and when it can be again.
-fn tell_trouble(event: &str, what: &str, before: &mut Option<String>, now: Option<String>) {
+/// Logs when writing `what` begins to fail, and when it works again.
+fn log_failure_change(event: &str, what: &str, before: &mut Option<String>, now: Option<String>) {
     match (&before, &now) {
         (None, Some(reason)) => {
             note(event, &json!({ "unwritten": reason }), format_args!("{what} cannot be written: {reason}"));
@@ -474,16 +471,16 @@ fn tell_trouble(event: &str, what: &str, before: &mut Option<String>, now: Optio
     *before = now;
 }
 
-/// Sees maps for the log of programs.
+/// Receives maps for the log in JSON.
 pub(super) struct LogViewer;
 
 impl MapViewer for LogViewer {
     fn view(&self, map: PublishedMap<'_>) {
-        say_entry(Level::Info, &Entry::Map(MapEntry::of(map)), None);
+        say_entry(Level::Info, &Entry::Map(MapEntry::new(map)), None);
     }
 }
 
-/// A line of progress for the log.
+/// A progress line of the log.
 #[derive(Serialize)]
 pub(super) struct ProgressLine {
     elapsed_s: f64,
@@ -491,8 +488,8 @@ pub(super) struct ProgressLine {
     entry: Entry<'static>,
 }
 
-/// The progress of a run that has lasted so long.
-pub(super) fn progress_of(watched: &Watched, elapsed: Duration) -> ProgressLine {
-    let entry = counts_of(watched, &watched.metrics.snapshot(), 0);
+/// The progress line of a run that has lasted `elapsed`.
+pub(super) fn progress_line(handles: &RunHandles, elapsed: Duration) -> ProgressLine {
+    let entry = progress_entry(handles, &handles.metrics.snapshot(), 0);
     ProgressLine { elapsed_s: elapsed.as_secs_f64(), entry }
 }

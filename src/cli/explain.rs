@@ -1,4 +1,4 @@
-//! `lunarray explain` and `lunarray config`: settings explain themselves.
+//! `lunarray explain` and `lunarray config`: explanations of settings, and files to start from.
 
 use clap::{Args, ValueEnum};
 
@@ -40,7 +40,7 @@ pub(super) fn explain(args: &ExplainArgs) -> CommandResult {
     for key in &args.keys {
         let found = matches_of(&all, key);
         if found.is_empty() {
-            let expected = "expected a key such as map.epsilon, a section such as map, or a part of a name or of what is said of it";
+            let expected = "expected a key such as map.epsilon, a section such as map, or a part of a name or an explanation";
             return Err(format!("{}: no such key; {expected}", echo(key)).into());
         }
         shown.extend(found);
@@ -70,7 +70,7 @@ fn is_section(all: &[KeyDescription], key: &str) -> bool {
     all.iter().any(|described| described.key.starts_with(&inside))
 }
 
-/// The page `docs/keys.md`: a table of the keys for every day, and the reference with all of them, which mdBook includes.
+/// The page `docs/keys.md`: a table of the everyday keys, and the reference with all keys, which mdBook includes.
 fn page_of(all: &[KeyDescription]) -> String {
     let mut page = "# All keys\n\n\
         A pipeline file names only the keys that it changes. Units stand at the end of names. `lunarray explain KEY` explains keys, \
@@ -80,7 +80,7 @@ fn page_of(all: &[KeyDescription]) -> String {
     for described in all.iter().filter(|described| described.everyday && !is_section(all, &described.key)) {
         let KeyDescription { key, default, about, only_with, .. } = described;
         let default = default.as_ref().map_or_else(String::new, |text| format!(" = {text}"));
-        // Its own condition is the last of the list.
+        // The last condition is that of the key; the others are of its sections.
         let condition = only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."));
         page.push_str(&format!("| `{key}{default}` | {}{condition} |\n", in_a_cell(about)));
     }
@@ -92,17 +92,17 @@ fn page_of(all: &[KeyDescription]) -> String {
     page
 }
 
-/// A text with what would end a cell, or begin a tag, escaped.
+/// Escapes a text for a table cell of Markdown.
 fn in_a_cell(text: &str) -> String {
     text.replace('|', "\\|").replace('<', "&lt;")
 }
 
-/// The key itself; else the keys of the section; else those whose names contain it; else those whose meaning does.
+/// Finds keys: the key or section itself, or else keys whose names contain the word, or else keys whose explanations do.
 fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescription> {
     let inside = format!("{wanted}.");
-    let of_section: Vec<_> = all.iter().filter(|d| d.key == wanted || d.key.starts_with(&inside)).collect();
-    if !of_section.is_empty() || wanted.is_empty() {
-        return of_section;
+    let exact: Vec<_> = all.iter().filter(|d| d.key == wanted || d.key.starts_with(&inside)).collect();
+    if !exact.is_empty() || wanted.is_empty() {
+        return exact;
     }
     let named: Vec<_> = all.iter().filter(|described| described.key.contains(wanted)).collect();
     if !named.is_empty() {
@@ -112,7 +112,7 @@ fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescrip
     all.iter().filter(|described| described.about.to_lowercase().contains(&word)).collect()
 }
 
-/// The JSON schema of `summary.json`; every summary that a test reads is held to it.
+/// The JSON schema of `summary.json`, which tests check.
 const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
 
 /// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.

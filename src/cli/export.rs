@@ -8,8 +8,8 @@ use clap::{Args, Subcommand, ValueEnum};
 use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
 use super::log::system_utc_text;
 use super::output::{
-    CommandError, CommandResult, Completion, of_stdout, print_config_notes, print_json_line, print_notes,
-    print_text,
+    CommandError, CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
+    stdout_error,
 };
 use crate::array::{Array, OemExport};
 use crate::files::{ProtectedInputs, write_atomically};
@@ -129,7 +129,7 @@ struct OrbitArgs {
     /// How long, with an optional unit s, h or d; the mission's `spacecraft.duration_s` if not given.
     #[arg(long, value_name = "TIME", value_parser = time_s)]
     duration: Option<f64>,
-    /// Most time between states, with an optional unit s, h or d.
+    /// Maximum time between states, with an optional unit s, h or d.
     #[arg(long, value_name = "TIME", value_parser = time_s, default_value = "120s")]
     step: f64,
     /// First epoch, UTC, such as 2030-01-31T12:00:00; spacecraft.epoch_tai_s if not given. Orbits of array.oem have their own dates.
@@ -160,7 +160,6 @@ struct Destination {
 }
 
 impl ExportArgs {
-    /// The files that are read.
     fn inputs(&self) -> Vec<PathBuf> {
         match &self.what {
             ExportKind::Visibilities(args) => vec![args.file.clone()],
@@ -171,7 +170,8 @@ impl ExportArgs {
         }
     }
 
-    fn refuse_misuse_of_standard_output(&self) -> Result<(), CommandError> {
+    /// Refuses binary files and JSON reports on a standard output that holds the table.
+    fn check_standard_output(&self) -> Result<(), CommandError> {
         let (to, is_table) = match &self.what {
             ExportKind::Visibilities(args) => (&args.to, true),
             ExportKind::Spectra(args) => (&args.to, true),
@@ -189,9 +189,9 @@ impl ExportArgs {
 }
 
 pub(super) fn execute(args: &ExportArgs) -> CommandResult {
-    args.refuse_misuse_of_standard_output()?;
+    args.check_standard_output()?;
     let _inputs = ProtectedInputs::of(args.inputs());
-    let (to, rows, of) = match &args.what {
+    let (to, rows, unit) = match &args.what {
         ExportKind::Hips(args) => return hips(args),
         ExportKind::Orbits(args) => return orbits(args),
         ExportKind::Visibilities(args) => (&args.to, visibilities(args)?, "visibilities"),
@@ -199,17 +199,17 @@ pub(super) fn execute(args: &ExportArgs) -> CommandResult {
         ExportKind::Alm(args) => (&args.to, alm(args)?, "coefficients"),
     };
     if is_standard(&to.out) {
-        // What is printed is the table.
+        // Standard output holds the table.
     } else if to.json {
         print_json_line(&serde_json::json!({ "file": to.out, "rows": rows }))?;
     } else {
-        print_text(&format!("{rows} {of} are in {}", to.out.display()))?;
+        print_text(&format!("{rows} {unit} are in {}", to.out.display()))?;
     }
     Ok(Completion::Done)
 }
 
 fn visibilities(args: &VisibilityArgs) -> Result<usize, CommandError> {
-    // A name that promises another format is a mistake that shows only where the file is read.
+    // CSV under the extension of another format would only fail later, in the program that reads it.
     for other in ["parquet", "uvh5"] {
         if args.to.out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(other)) {
             return Err(format!(
@@ -231,7 +231,7 @@ fn visibilities(args: &VisibilityArgs) -> Result<usize, CommandError> {
     }
     let channel = ChannelId(args.channel);
     let rows = match is_standard(&args.to.out) {
-        true => table.write_csv_to(channel, &mut std::io::stdout().lock()).map_err(of_stdout)?,
+        true => table.write_csv_to(channel, &mut std::io::stdout().lock()).map_err(stdout_error)?,
         false => table.write_csv(channel, &args.to.out)?,
     };
     if rows == 0 {
@@ -311,9 +311,9 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
     let epoch_tai_s = match (&args.epoch, array.epoch_tai_s()) {
         (None, _) => config.epoch_tai_s(&array),
         (Some(_), Some(tai_s)) => {
-            let own = utc_text(tai_s);
+            let first_date = utc_text(tai_s);
             return Err(format!(
-                "--epoch: the orbits have dates of their own, from {own} UTC on; expected none"
+                "--epoch: the orbits have dates of their own, from {first_date} UTC on; expected none"
             )
             .into());
         }
@@ -342,7 +342,7 @@ fn orbits(args: &OrbitArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// When a file was written, UTC to the minute: an export of the same file is the same at any time.
+/// Modification time of a file, UTC to the minute. It dates the export, so that repeated exports of a file are identical.
 fn written_at(path: &Path) -> String {
     let modified = std::fs::metadata(path).and_then(|found| found.modified());
     let text = system_utc_text(modified.unwrap_or(SystemTime::UNIX_EPOCH));

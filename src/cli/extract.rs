@@ -8,7 +8,7 @@ use clap::Args;
 use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::receive::EventReader;
-use crate::downlink::{DownlinkError, Event, Kind};
+use crate::downlink::{DownlinkError, Event, PacketKind};
 use crate::files::{AtomicFile, IfUnfinished};
 
 /// Cut the packets of given counts out of downlink files.
@@ -34,10 +34,10 @@ pub(super) struct ExtractArgs {
     json: bool,
 }
 
-/// Packets of consecutive counts of a kind.
+/// Packets of one kind with consecutive counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct PacketRange {
-    kind: Kind,
+    kind: PacketKind,
     from: u64,
     to: u64,
 }
@@ -91,17 +91,18 @@ pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// Ranges, one a line; empty lines and what follows `#` are left out.
+/// Parses ranges, one per line; empty lines and comments (`#`) are skipped.
 fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
-    let lines =
-        text.lines().enumerate().map(|(at, line)| (at, line.split('#').next().unwrap_or_default().trim()));
+    let lines = text
+        .lines()
+        .zip(1..)
+        .map(|(line, number)| (number, line.split('#').next().unwrap_or_default().trim()));
     let ranges: Vec<PacketRange> = lines
         .filter(|(_, line)| !line.is_empty())
-        .map(|(at, line)| {
-            range_of(line).ok_or_else(|| {
+        .map(|(number, line)| {
+            parse_range(line).ok_or_else(|| {
                 format!(
-                    "line {}: found `{line}`; expected APID, first and last count, such as 0x103 61 62",
-                    at + 1
+                    "line {number}: found `{line}`; expected APID, first and last count, such as 0x103 61 62"
                 )
             })
         })
@@ -109,7 +110,7 @@ fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
     if ranges.is_empty() { Err("no range; expected lines such as 0x103 61 62".into()) } else { Ok(ranges) }
 }
 
-fn range_of(line: &str) -> Option<PacketRange> {
+fn parse_range(line: &str) -> Option<PacketRange> {
     let mut words = line.split(|c: char| c.is_whitespace() || c == ',').filter(|word| !word.is_empty());
     let apid = words.next()?;
     let apid = match apid.strip_prefix("0x") {
@@ -118,7 +119,7 @@ fn range_of(line: &str) -> Option<PacketRange> {
     };
     let (from, to) =
         (words.next()?.parse().ok()?, words.next().map_or(Some(None), |word| word.parse().ok().map(Some))?);
-    let range = PacketRange { kind: Kind::of_apid(apid)?, from, to: to.unwrap_or(from) };
+    let range = PacketRange { kind: PacketKind::of_apid(apid)?, from, to: to.unwrap_or(from) };
     (range.from <= range.to && words.next().is_none()).then_some(range)
 }
 
@@ -130,7 +131,7 @@ mod tests {
     fn ranges_are_lines_of_apid_and_counts() {
         let found = parse("0x103 61 62\n\n258, 14 # positions\n").unwrap();
         let range = |kind, from, to| PacketRange { kind, from, to };
-        assert_eq!(found, [range(Kind::Visibilities, 61, 62), range(Kind::Ephemeris, 14, 14)]);
+        assert_eq!(found, [range(PacketKind::Visibilities, 61, 62), range(PacketKind::Ephemeris, 14, 14)]);
         for text in
             ["", "# nothing", "0x103", "0x103 5 4", "0x103 1 2 3", "0x999 1 2", "0x103 a b", "0x103 -1 2"]
         {

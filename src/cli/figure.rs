@@ -57,11 +57,11 @@ pub(super) fn execute(args: &FigureArgs) -> CommandResult {
     use_threads(&plan.config.runtime)?;
     let at_s = args.at.map(|time| time.since_s(plan.instrument.epoch_tai_s));
     let request = FigureRequest { name: args.name.clone(), pair: args.pair, at_s };
-    let made = make_figure(&request, &plan, &args.out)?;
+    let figure = make_figure(&request, &plan, &args.out)?;
     if args.json {
-        print_json_line(&made)?;
+        print_json_line(&figure)?;
     } else {
-        let files: Vec<String> = made.files.iter().map(|path| path.display().to_string()).collect();
+        let files: Vec<String> = figure.files.iter().map(|path| path.display().to_string()).collect();
         print_text(&files.join("\n"))?;
     }
     Ok(Completion::Done)

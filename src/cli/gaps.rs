@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::arguments::input_path;
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::files::ProtectedInputs;
 use crate::ground::archive::{CoverageSurvey, GapReport, Gaps, RestartReport};
 use crate::products::draw_coverage;
@@ -29,8 +29,8 @@ pub(super) struct GapsArgs {
     /// Maximum number of gaps shown; --json lists all.
     #[arg(long, default_value_t = 20)]
     most: usize,
-    /// For scripts: fail (exit code 1) if anything is missing (any), or if all gaps together would add more than this many
-    /// percent; 0 for any visibilities or positions.
+    /// For scripts: fail (exit code 1) if anything is missing (any), or if the estimated gain of all gaps exceeds this percentage;
+    /// with 0, also if any visibilities or positions are missing.
     #[arg(long, value_name = "any|PERCENT", value_parser = fail_if)]
     fail_if: Option<FailIf>,
     /// Write a picture (PNG) of integration time over mission time, channel by channel.
@@ -56,26 +56,27 @@ pub(super) fn execute(args: &GapsArgs) -> CommandResult {
     }
     let packets: u64 = gaps.gaps.iter().map(|gap| gap.to - gap.from + 1).sum();
     let adds = 100.0 * gaps.gaps.iter().map(|gap| gap.gain).sum::<f64>();
-    let lacks_data = gaps.gaps.iter().any(|gap| matches!(gap.kind, Kind::Visibilities | Kind::Ephemeris));
+    let lacks_data =
+        gaps.gaps.iter().any(|gap| matches!(gap.kind, PacketKind::Visibilities | PacketKind::Ephemeris));
     match args.fail_if {
         Some(FailIf::Any) if packets > 0 => {
             Err(format!("{packets} packets are missing; expected none").into())
         }
-        // Nothing is only estimated to be added.
-        Some(FailIf::Above(most)) if adds > most || (most == 0.0 && lacks_data) => {
-            Err(format!("the {packets} missing packets would add {adds:.4} %; expected at most {most} %")
+        // The gain is an estimate: with a limit of 0, any missing data fail even if their gain is 0.
+        Some(FailIf::Above(limit)) if adds > limit || (limit == 0.0 && lacks_data) => {
+            Err(format!("the {packets} missing packets would add {adds:.4} %; expected at most {limit} %")
                 .into())
         }
         _ => Ok(Completion::Done),
     }
 }
 
-/// What is too much.
+/// Condition under which the command fails.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum FailIf {
-    /// Anything.
+    /// Any packet is missing.
     Any,
-    /// More than so many percent.
+    /// The estimated gain of all gaps exceeds this percentage.
     Above(f64),
 }
 
@@ -87,20 +88,20 @@ fn fail_if(text: &str) -> Result<FailIf, String> {
     }
 }
 
-fn table(gaps: &Gaps, most: usize) -> String {
+fn table(gaps: &Gaps, gaps_max: usize) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
     let _ = writeln!(text, "channel        MHz     packets  received, h  missing, h  missing weight");
     for channel in &gaps.channels {
         let all = channel.weight + channel.missing_weight;
-        let share = if all > 0.0 { 100.0 * channel.missing_weight / all } else { 0.0 };
+        let missing_percent = if all > 0.0 { 100.0 * channel.missing_weight / all } else { 0.0 };
         let (received_h, missing_h) =
             (channel.integration_s / 3600.0, channel.missing_integration_s / 3600.0);
         let (number, packets) = (channel.channel, channel.packets);
         let mhz = channel.frequency_hz.map_or("?".to_owned(), |hz| format!("{:.4}", hz / 1e6));
         let _ = writeln!(
             text,
-            "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {share:>13.3} %"
+            "{number:<7} {mhz:>10} {packets:>11} {received_h:>12.2} {missing_h:>11.2} {missing_percent:>13.3} %"
         );
     }
     if !gaps.restarts.is_empty() {
@@ -116,26 +117,25 @@ fn table(gaps: &Gaps, most: usize) -> String {
         text.push_str("\nNo packets are missing between those received.");
         return text;
     }
-    let _ = writeln!(text, "\n APID        from          to  lost, h   adds %  lost by channel and pair");
-    for gap in gaps.gaps.iter().take(most) {
+    let _ = writeln!(text, "\n APID        from          to  lost, h  gain, %  lost by channel and pair");
+    for gap in gaps.gaps.iter().take(gaps_max) {
         let GapReport { apid, from, to, integration_s, gain, .. } = gap;
-        let (lost_h, adds) = (integration_s / 3600.0, 100.0 * gain);
-        let _ = write!(text, "{apid:#05x} {from:>11} {to:>11} {lost_h:>8.3} {adds:>8.4}  ");
-        text.push_str(&streams(gap));
+        let (lost_h, gain_percent) = (integration_s / 3600.0, 100.0 * gain);
+        let _ = write!(text, "{apid:#05x} {from:>11} {to:>11} {lost_h:>8.3} {gain_percent:>8.4}  ");
+        text.push_str(&largest_losses(gap));
         text.push('\n');
     }
-    if gaps.gaps.len() > most {
-        let _ = writeln!(text, "and {} more (see --most and --json)", gaps.gaps.len() - most);
+    if gaps.gaps.len() > gaps_max {
+        let _ = writeln!(text, "and {} more (see --most and --json)", gaps.gaps.len() - gaps_max);
     }
     text
 }
 
-/// The largest losses of a gap.
-fn streams(gap: &GapReport) -> String {
+fn largest_losses(gap: &GapReport) -> String {
     const SHOWN: usize = 3;
     let kind = match gap.kind {
-        Kind::Visibilities => String::new(),
-        Kind::Ephemeris if !gap.lost.is_empty() => format!("{}, needed by ", gap.kind),
+        PacketKind::Visibilities => String::new(),
+        PacketKind::Ephemeris if !gap.lost.is_empty() => format!("{}, needed by ", gap.kind),
         kind => return kind.to_string(),
     };
     let mut lost: Vec<_> = gap.lost.iter().collect();

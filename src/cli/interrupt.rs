@@ -1,4 +1,4 @@
-//! Ctrl-C and other signals: the first asks a run to end in order, the second ends the process.
+//! Ctrl-C and other signals: the first cancels a run, the second ends the process.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -9,14 +9,14 @@ use signal_hook::flag;
 use super::output::{Completion, print_notes};
 use crate::runtime::Cancel;
 
-/// Signals that end a run in order.
+/// Signals that cancel a run.
 #[cfg(unix)]
 const SIGNALS: [i32; 3] = [SIGINT, SIGTERM, signal_hook::consts::SIGHUP];
-/// Signals that end a run in order.
+/// Signals that cancel a run.
 #[cfg(not(unix))]
 const SIGNALS: [i32; 2] = [SIGINT, SIGTERM];
 
-/// What a shell adds to the number of the signal by which a command ended.
+/// Exit code of a command that a signal ended, minus the number of the signal; a convention of shells.
 const SHELL_BASE: i32 = 128;
 
 /// Cancels a run on the first signal.
@@ -34,14 +34,14 @@ impl Interrupt {
         &self.cancel
     }
 
-    /// From now on the first signal cancels and the second ends the process at once. Before, any signal ends it: there is
-    /// nothing to save. Signals that the process was told to ignore when it was started, as `nohup` does, stay ignored.
+    /// Installs the handlers: the first signal cancels the run, the second ends the process immediately. Before this call, any signal
+    /// ends the process, as there is nothing to save. Signals that are ignored at the start, as by `nohup`, stay ignored.
     ///
-    /// All is done within the signal handler: nothing that a thread waits for can delay it.
+    /// Everything happens in the signal handler, so that a blocked thread cannot delay it.
     fn arm(&self) -> std::io::Result<()> {
         let ignored = ignored_signals();
         for signal in SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0) {
-            // In this order: the first signal finds the flag unset.
+            // The order matters: at the first signal, the shutdown must find the flag unset.
             flag::register_conditional_shutdown(signal, SHELL_BASE + signal, self.cancel.flag())?;
             flag::register_usize(signal, Arc::clone(&self.signal), signal.unsigned_abs() as usize)?;
             flag::register(signal, self.cancel.flag())?;
@@ -49,8 +49,8 @@ impl Interrupt {
         Ok(())
     }
 
-    /// As [`Interrupt::arm`], once for all runs of a command: armed twice, it would take the first signal for the second. If that fails,
-    /// says so: signals then end the process as they do by default.
+    /// Installs the handlers once for all runs of a command, as a second installation would take the first signal for the second.
+    /// Prints a note on failure; signals then end the process, as is the default.
     pub(super) fn arm_or_note(&self) {
         if self.armed.swap(true, Ordering::Relaxed) {
             return;
@@ -62,7 +62,7 @@ impl Interrupt {
         }
     }
 
-    /// How a command ended whose run says whether it was `cancelled`.
+    /// The completion of a command whose run was `cancelled` or not.
     pub(super) fn completion(&self, cancelled: bool) -> Completion {
         match self.signal.load(Ordering::Relaxed) {
             _ if !cancelled => Completion::Done,
@@ -70,15 +70,15 @@ impl Interrupt {
         }
     }
 
-    /// As [`Interrupt::completion`], for a command that runs until it is told to end: SIGTERM is its regular end, unless
-    /// received data was neither saved nor made into maps.
+    /// The completion of a service, which runs until it is interrupted: SIGTERM is its regular end, unless received data were neither
+    /// saved nor mapped.
     pub(super) fn completion_of_service(&self, cancelled: bool, is_saved: bool) -> Completion {
-        let is_told = self.signal.load(Ordering::Relaxed) == SIGTERM.unsigned_abs() as usize;
-        if is_told && is_saved { Completion::Done } else { self.completion(cancelled) }
+        let is_terminated = self.signal.load(Ordering::Relaxed) == SIGTERM.unsigned_abs() as usize;
+        if is_terminated && is_saved { Completion::Done } else { self.completion(cancelled) }
     }
 }
 
-/// The signals that this process ignores, one bit each, SIGHUP (1) in the lowest. 0 where the system does not tell.
+/// Bit mask of the signals that this process ignores, SIGHUP (1) in the lowest bit; 0 if the system does not report it.
 fn ignored_signals() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

@@ -10,19 +10,18 @@ use super::output::{CommandResult, Completion, is_broken_pipe, print_error};
 use crate::pipeline::MemoryLimit;
 use crate::ranks::{RankJob, Ranks, RanksError};
 
-/// Exit code of a rank that failed.
 const FAILED: u8 = 1;
-/// How long the others let the first rank speak of what is amiss on all of them.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// Delay of other ranks before they print an error, so that one on all ranks is printed by the first.
+const ERROR_DELAY: Duration = Duration::from_millis(500);
 
-/// The job of a command; without `--mpi` it is alone.
+/// The MPI job of a command; without `--mpi`, a single process.
 pub(super) struct Job {
     job: Option<RankJob>,
     ranks: Ranks,
 }
 
 impl Job {
-    /// Joins the job that the process was started in, if that is wanted.
+    /// Joins the MPI job in which the process was started, if `is_wanted`.
     pub(super) fn join(is_wanted: bool) -> Result<Self, RanksError> {
         if !is_wanted {
             return Ok(Self { job: None, ranks: Ranks::single() });
@@ -31,29 +30,29 @@ impl Job {
         Ok(Self { job: Some(job), ranks })
     }
 
-    /// Those that share the sums.
+    /// The ranks that share the normal equations.
     pub(super) fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
-    /// Whether this is the process that talks and writes.
+    /// Whether this is the rank that prints and writes.
     pub(super) fn is_first(&self) -> bool {
         self.ranks.is_first()
     }
 
-    /// The part of this machine's memory that is this rank's.
+    /// Divides a memory limit among the ranks on this machine.
     pub(super) fn memory_limit(&self, limit: Option<MemoryLimit>) -> Option<MemoryLimit> {
-        let here = self.job.as_ref().map_or(1, RankJob::ranks_here).max(1) as u64;
-        limit.map(|limit| MemoryLimit { bytes: limit.bytes / here, ..limit })
+        let local_ranks = self.job.as_ref().map_or(1, RankJob::ranks_here).max(1) as u64;
+        limit.map(|limit| MemoryLimit { bytes: limit.bytes / local_ranks, ..limit })
     }
 
-    /// How a command ended that failed because a signal ended its rank of several, or one of the others.
-    pub(super) fn interrupted<T>(
+    /// The completion of one of several ranks that failed because a signal ended it or another rank; prints the error.
+    pub(super) fn completion_if_interrupted<T>(
         &self,
-        ended: &Result<T, impl std::fmt::Display>,
+        result: &Result<T, impl std::fmt::Display>,
         interrupt: &Interrupt,
     ) -> Option<Completion> {
-        let error = ended
+        let error = result
             .as_ref()
             .err()
             .filter(|_| self.ranks.is_distributed() && interrupt.cancel().is_cancelled())?;
@@ -64,7 +63,7 @@ impl Job {
         Some(interrupt.completion(true))
     }
 
-    /// Ends what `work` has begun: in order once all ranks have done theirs, else all of them at once.
+    /// Ends the job: normally if this rank succeeded, otherwise by aborting all ranks.
     pub(super) fn conclude(self, result: CommandResult) -> CommandResult {
         let Some(job) = self.job.filter(|_| self.ranks.is_distributed()) else { return result };
         let code = match result {
@@ -73,7 +72,7 @@ impl Job {
             Err(error) if is_broken_pipe(error.as_ref()) => return Err(error),
             Err(error) => {
                 if !self.ranks.is_first() {
-                    std::thread::sleep(PATIENCE);
+                    std::thread::sleep(ERROR_DELAY);
                 }
                 print_error(error.as_ref());
                 FAILED

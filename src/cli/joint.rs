@@ -1,4 +1,4 @@
-//! `lunarray joint`: maps of several channels' sums together.
+//! `lunarray joint`: joint maps of several channels.
 
 use std::path::{Path, PathBuf};
 
@@ -17,7 +17,7 @@ use crate::sky::Frame;
 use crate::sky::fits::{Card, Column, WriteOptions, write_columns};
 use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
 
-/// Most samples: each is in memory for every channel.
+/// Maximum number of posterior samples, which are in memory for every channel.
 const COUNT_MAX: u64 = 1_000;
 
 /// Make maps of several channels together, each with what its neighbours see.
@@ -54,9 +54,8 @@ pub(super) struct JointArgs {
 
 #[derive(Serialize)]
 struct Report {
-    /// How alike the channels are.
+    /// Correlation of the channels.
     likeness: Correlation,
-    /// Products of the iteration, and its residual.
     iterations: usize,
     residual: f64,
     converged: bool,
@@ -84,7 +83,7 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     if let Some((_, config)) = states.first() {
         use_threads(&config.runtime)?;
     }
-    // What cannot be written is told before the work of minutes.
+    // An unwritable folder is reported before minutes of work.
     std::fs::create_dir_all(&args.out).map_err(|error| format!("{}: {error}", args.out.display()))?;
     let request = |rule| JointRequest { rule, samples: args.count as usize, at_hz: args.at.clone() };
     let watch = SolveWatch::default();
@@ -156,7 +155,7 @@ fn write_map(folder: &Path, map: &JointMap, converged: bool) -> Result<MapReport
 }
 
 fn write_spectra(path: &Path, found: &SpectralMaps) -> Result<(), CommandError> {
-    let seen = |values: &[f64]| -> Vec<f64> {
+    let with_unseen = |values: &[f64]| -> Vec<f64> {
         values.iter().map(|value| if value.is_finite() { *value } else { UNSEEN }).collect()
     };
     let named: Vec<(&str, Vec<f64>)> = [
@@ -167,7 +166,7 @@ fn write_spectra(path: &Path, found: &SpectralMaps) -> Result<(), CommandError> 
     ]
     .into_iter()
     .filter(|(_, values)| !values.is_empty())
-    .map(|(name, values)| (name, seen(values)))
+    .map(|(name, values)| (name, with_unseen(values)))
     .collect();
     let columns: Vec<Column<'_>> =
         named.iter().map(|(name, values)| Column { name, unit: "", values }).collect();

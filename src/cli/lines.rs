@@ -4,7 +4,7 @@ use std::io::{BufRead, Read};
 
 use super::output::CommandError;
 
-/// Longest line, bytes: many times that of any row that a command reads.
+/// Maximum length of a line, bytes; many times that of a valid row.
 const LINE_BYTES_MAX: usize = 4096;
 
 /// Reads the next line without its end; `None` at the end of the input. `number` counts lines from 1, for messages.
@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_are_read_one_by_one_and_long_ones_refused_before_they_are_read() {
+    fn lines_are_read_and_long_ones_refused_early() {
         let mut input: &[u8] = b"one\r\n\nthree";
         let mut lines = Vec::new();
         while let Some(line) = next_line(&mut input, lines.len() + 1).unwrap() {
@@ -42,8 +42,8 @@ mod tests {
         let mut endless = std::io::BufReader::new(std::io::repeat(b'7'));
         let refused = next_line(&mut endless, 9).unwrap_err().to_string();
         assert!(refused.contains("line 9") && refused.contains("4096") && refused.len() < 200, "{refused}");
-        let mut most: &[u8] = &[&[b'x'; LINE_BYTES_MAX - 1], &b"\ny"[..]].concat();
-        assert_eq!(next_line(&mut most, 1).unwrap().unwrap().len(), LINE_BYTES_MAX - 1);
+        let mut longest: &[u8] = &[&[b'x'; LINE_BYTES_MAX - 1], &b"\ny"[..]].concat();
+        assert_eq!(next_line(&mut longest, 1).unwrap().unwrap().len(), LINE_BYTES_MAX - 1);
         assert!(next_line(&mut &b"\xff\n"[..], 1).is_err());
     }
 }

@@ -1,6 +1,4 @@
-//! The log: what commands say on standard error, as text for people or as one JSON object a line for programs.
-//!
-//! Standard error is one for the process, and so is the form in which it is written.
+//! The log on standard error: text for people, or one JSON object per line for programs. The format is global, as standard error is.
 
 use std::fmt::Display;
 use std::io::Write;
@@ -15,29 +13,28 @@ use serde_json::Value;
 use super::printable_text::{json_text, printable_text};
 use crate::units::calendar::{TAI_1970_S, tai_text};
 
-/// Form of the log.
+/// Format of the log.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub(super) enum LogFormat {
     /// Lines for people.
     #[default]
     Text,
-    /// One JSON object a line: time (UTC), level, event, message and fields.
+    /// One JSON object per line: time (UTC), level, event, message and fields.
     Json,
 }
 
-/// Whether the log is JSON.
 static IS_JSON: AtomicBool = AtomicBool::new(false);
 
-/// Lets panics be lines of the log.
+/// Installs the panic hook once.
 static HOOK: Once = Once::new();
 
-/// How much a message matters.
+/// Severity of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Level {
-    /// All is well.
+    /// Information.
     Info,
-    /// It should be looked at.
+    /// A problem that needs attention.
     Warn,
     /// The command failed.
     Error,
@@ -55,11 +52,10 @@ struct LogLine<'a> {
     fields: &'a Value,
 }
 
-/// From now on the log has this form.
 pub(super) fn use_format(format: LogFormat) {
     IS_JSON.store(format == LogFormat::Json, Ordering::Relaxed);
     if format == LogFormat::Json {
-        // A panic is a line like others.
+        // Panics are logged as JSON, too.
         HOOK.call_once(|| {
             let as_text = std::panic::take_hook();
             std::panic::set_hook(Box::new(move |panic| match is_json() {
@@ -70,12 +66,11 @@ pub(super) fn use_format(format: LogFormat) {
     }
 }
 
-/// Whether the log is for programs.
 pub(super) fn is_json() -> bool {
     IS_JSON.load(Ordering::Relaxed)
 }
 
-/// Says what happens: as text the message, as JSON the event with its fields as well.
+/// Logs information: the message as text, or the event, fields and message as JSON.
 pub(super) fn say(event: &str, fields: &Value, message: impl Display) {
     match is_json() {
         true => log_json(Level::Info, event, fields, Some(&message.to_string())),
@@ -83,16 +78,15 @@ pub(super) fn say(event: &str, fields: &Value, message: impl Display) {
     }
 }
 
-/// As [`say`], of an event that names itself in its field `event`, as those of `--events` do.
+/// Logs, as JSON, an entry that names its event in the field `event`, as entries of `--events` do.
 pub(super) fn say_entry(level: Level, entry: &impl Serialize, message: Option<&str>) {
-    // What can be written as a line can be written as a value.
     let mut fields = serde_json::to_value(entry).unwrap_or_default();
     let event = fields.as_object_mut().and_then(|fields| fields.remove("event"));
     let event = event.as_ref().and_then(Value::as_str).unwrap_or_default();
     log_json(level, event, &fields, message);
 }
 
-/// Notes what should be looked at.
+/// Logs a warning: the message as text, or the event, fields and message as JSON.
 pub(super) fn note(event: &str, fields: &Value, message: impl Display) {
     match is_json() {
         true => log_json(Level::Warn, event, fields, Some(&message.to_string())),
@@ -100,7 +94,6 @@ pub(super) fn note(event: &str, fields: &Value, message: impl Display) {
     }
 }
 
-/// Writes a line as JSON.
 pub(super) fn log_json(level: Level, event: &str, fields: &Value, message: Option<&str>) {
     let message = message.map(|message| message.trim().to_owned());
     let time = format!("{}Z", system_utc_text(SystemTime::now()));
@@ -109,14 +102,14 @@ pub(super) fn log_json(level: Level, event: &str, fields: &Value, message: Optio
     }
 }
 
-/// A time as a date, UTC to the millisecond; that of 1970 for times before, as of a clock that was never set.
+/// Formats a time as a date, UTC to the millisecond; times before 1970, as of a clock that was never set, as 1970.
 pub(super) fn system_utc_text(time: SystemTime) -> String {
     let unix_s = time.duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64());
     tai_text(unix_s + TAI_1970_S)
 }
 
-/// Prints a line to standard error. If that is not possible, there is nobody to tell.
+/// Prints a line to standard error, ignoring errors.
 pub(super) fn print_line(line: impl Display) {
-    // In one piece, so that lines of several threads stay apart.
+    // A single write keeps lines of several threads apart.
     let _ = std::io::stderr().lock().write_all(format!("{line}\n").as_bytes());
 }

@@ -33,18 +33,18 @@ pub(super) struct MergeArgs {
 }
 
 pub(super) fn execute(args: &MergeArgs) -> CommandResult {
-    // All have to agree, which merging requires.
+    // Merging requires that all states have the same settings.
     let first = args.states.first().map_or(args.out.as_path(), PathBuf::as_path);
     let config = args.map.source(first)?.load_ground()?;
     use_threads(&config.runtime)?;
-    let whole = Ground::merge(&args.out, &args.states, &config.ground(WAIT_BYTES))?;
-    print_notes(whole.notes());
+    let merged = Ground::merge(&args.out, &args.states, &config.ground(WAIT_BYTES))?;
+    print_notes(merged.notes());
     if args.json {
-        let (states, packets) = (args.states.len(), whole.packets());
+        let (states, packets) = (args.states.len(), merged.packets());
         print_json_line(&serde_json::json!({ "states": states, "packets": packets, "out": args.out }))?;
         return Ok(Completion::Done);
     }
-    let (packets, out) = (whole.packets(), args.out.display());
+    let (packets, out) = (merged.packets(), args.out.display());
     let states = match args.states.len() {
         1 => "1 state".to_owned(),
         number => format!("{number} states"),

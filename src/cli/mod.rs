@@ -1,7 +1,7 @@
-//! The command line: one file per command, plus what commands share (`arguments`, `interrupt`, `output`, `progress`, `serving`).
+//! The command line: one file per command, and shared files (`arguments`, `interrupt`, `output`, `progress`, `serving`).
 //!
-//! A command parses its arguments, calls [`crate::pipeline`] (or another library function) and prints the result for
-//! people or, with `--json`, for programs. It holds no physics and no state of its own. May use every other folder.
+//! A command parses its arguments, calls [`crate::pipeline`] or another library function, and prints the result for people or, with
+//! `--json`, for programs. It contains no physics. May use every other folder.
 
 mod arguments;
 mod bench;
@@ -129,35 +129,34 @@ enum Command {
     Man(shell::ManArgs),
 }
 
-/// Whether words that are no command line ask for messages as JSON.
+/// Whether an invalid command line requests messages as JSON.
 fn asks_for_json(words: &[OsString]) -> bool {
     let is_option = |pair: &[OsString]| pair[0] == "--log" && pair[1] == "json";
     words.windows(2).any(is_option) || words.iter().any(|word| word == "--log=json")
 }
 
-/// Exit code of a failure: of the data, or any other.
+/// Exit code of a failure of the data, or of any other failure.
 const FAILED: u8 = 1;
 
-/// Exit code of a configuration that cannot be used, as of wrong usage: to start again is of no use.
+/// Exit code of wrong usage or an unusable configuration: a restart would fail again.
 const MISCONFIGURED: u8 = 2;
 
-/// Exit code of what the system refused: a disk, a socket, a lock, memory.
+/// Exit code of a failure of the system: a disk, a socket, a lock, memory.
 const SYSTEM: u8 = 3;
 
-/// The code that says of which sort a failure is.
 fn exit_code(error: &(dyn std::error::Error + 'static)) -> u8 {
     let causes = || std::iter::successors(Some(error), |error| error.source());
-    if causes().any(is_configuration) {
+    if causes().any(is_configuration_error) {
         return MISCONFIGURED;
     }
-    match causes().any(is_of_system) {
+    match causes().any(is_system_error) {
         true => SYSTEM,
         false => FAILED,
     }
 }
 
-fn is_configuration(error: &(dyn std::error::Error + 'static)) -> bool {
-    let is_of_ground = |error: &GroundError| {
+fn is_configuration_error(error: &(dyn std::error::Error + 'static)) -> bool {
+    let is_ground_configuration = |error: &GroundError| {
         use GroundError::{FilesOfState, GivenTwice, MergeIntoPart, Occupied, Settings};
         matches!(
             error,
@@ -168,47 +167,47 @@ fn is_configuration(error: &(dyn std::error::Error + 'static)) -> bool {
                 | MergeIntoPart { .. }
         )
     };
-    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+    let is_pipeline_configuration = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
         PipelineError::Config(_) | PipelineError::Invalid(_) => true,
-        PipelineError::Ground(error) => is_of_ground(error),
+        PipelineError::Ground(error) => is_ground_configuration(error),
         _ => false,
     });
-    of_pipeline
+    is_pipeline_configuration
         || error.is::<ConfigError>()
         || error.is::<InvalidValue>()
-        || error.downcast_ref::<GroundError>().is_some_and(is_of_ground)
+        || error.downcast_ref::<GroundError>().is_some_and(is_ground_configuration)
 }
 
-fn is_of_system(error: &(dyn std::error::Error + 'static)) -> bool {
+fn is_system_error(error: &(dyn std::error::Error + 'static)) -> bool {
     let is_locked =
         |error: &GroundError| matches!(error, GroundError::Locked { .. } | GroundError::FolderLost { .. });
-    let of_pipeline = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
+    let is_pipeline_failure = error.downcast_ref::<PipelineError>().is_some_and(|error| match error {
         PipelineError::Unsaved { .. } | PipelineError::Memory { .. } => true,
         PipelineError::Ground(error) => is_locked(error),
         _ => false,
     });
-    // A file that is not there, or is not what it should be, is not the system's fault.
-    let is_of_system = |error: &std::io::Error| {
+    // A missing or invalid file is not a failure of the system.
+    let is_system_failure = |error: &std::io::Error| {
         use std::io::ErrorKind::{InvalidData, NotFound, UnexpectedEof};
         ![InvalidData, NotFound, UnexpectedEof].contains(&error.kind())
     };
-    of_pipeline
-        || error.downcast_ref::<std::io::Error>().is_some_and(is_of_system)
+    is_pipeline_failure
+        || error.downcast_ref::<std::io::Error>().is_some_and(is_system_failure)
         || error.downcast_ref::<GroundError>().is_some_and(is_locked)
 }
 
 /// Runs the command on the process's command line and returns the exit code.
 ///
-/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage, or a
-/// configuration that cannot be used. 3: the system refused: a disk, a socket, a lock, memory.
-/// 128 and the number of the signal: ended early, by Ctrl-C with 130, by SIGTERM with 143, by SIGHUP with 129; a second
-/// signal ends the process at once with the same code. For a ground that listens or follows, SIGTERM is the regular end: 0.
+/// 0: done, also if the reader of standard output has gone. 1: failed, with the reason on standard error. 2: wrong usage, or an
+/// unusable configuration. 3: a failure of the system: a disk, a socket, a lock, memory. 128 plus the number of a signal:
+/// interrupted, by Ctrl-C (130), SIGTERM (143) or SIGHUP (129); a second signal ends the process immediately with the same code.
+/// SIGTERM is the regular end of a ground segment that listens or follows: 0.
 #[must_use]
 pub fn main() -> ExitCode {
     ExitCode::from(run_command(std::env::args_os()))
 }
 
-/// As [`main`], for a command line of which the first word is the program's name; returns the exit code.
+/// Runs a command line, whose first word is the program's name, and returns the exit code; see [`main`].
 pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
     let words: Vec<OsString> = words.into_iter().collect();
     log::use_format(LogFormat::Text);
@@ -219,7 +218,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
             command
         }
         Err(error) => {
-            // Help and version are such errors too. Nobody may be there to read it.
+            // Help and version are errors of clap, too. A failure to print them is ignored.
             match error.use_stderr() && asks_for_json(&words) {
                 true => log::log_json(Level::Error, "usage", &Value::Null, Some(&error.to_string())),
                 false => drop(error.print()),

@@ -1,4 +1,4 @@
-//! In place of `serving` in a program that was built without the feature `serve`.
+//! Replacement of `serving` for builds without the feature `serve`.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::interrupt::Interrupt;
 use super::output::CommandError;
-use crate::pipeline::{Config, Watched};
+use crate::pipeline::{Config, RunHandles};
 
 /// No arguments.
 #[derive(Debug, Args)]
@@ -24,11 +24,10 @@ impl ServeArgs {
     }
 }
 
-/// No page.
 pub(super) struct Page;
 
 impl Page {
-    pub(super) fn watch(&self, _watched: &Watched) {}
+    pub(super) fn watch(&self, _watched: &RunHandles) {}
 
     pub(super) fn conclude<T, E: Into<CommandError>>(
         &self,
@@ -38,7 +37,7 @@ impl Page {
         result.map_err(Into::into)
     }
 
-    pub(super) fn tell_failure(&self, _interrupt: &Interrupt) {}
+    pub(super) fn serve_failure(&self, _interrupt: &Interrupt) {}
 
-    pub(super) fn stay(self, _interrupt: &Interrupt) {}
+    pub(super) fn serve_until_interrupt(self, _interrupt: &Interrupt) {}
 }

@@ -1,56 +1,55 @@
-//! Tells systemd how a ground is that runs as its service (`Type=notify`): ready, at work, alive, ending.
+//! Notifies systemd of the state of a ground segment that runs as a service (`Type=notify`): ready, status, watchdog, stopping.
 //!
 //! A message is a datagram of lines `KEY=VALUE` to the socket that `NOTIFY_SOCKET` names (sd_notify(3)). Without the variable nothing
-//! is sent; a message that cannot be sent is of no consequence.
+//! is sent; failures to send are ignored.
 
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::pipeline::Watched;
+use crate::pipeline::RunHandles;
 use crate::runtime::Cancel;
 
-/// Interval of looking for an interrupt.
+/// Interval of checks for cancellation.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Least time between two texts of how it goes.
 const STATUS_EVERY: Duration = Duration::from_secs(2);
 
 const STOPPING: &str = "STOPPING=1\nSTATUS=saving what was received";
 
-/// Tells until dropped.
+/// Sends notifications until dropped.
 pub(super) struct Notifier {
     stop: Sender<()>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Notifier {
-    /// Says that the ground is ready, and goes on telling how it goes; `None` if nobody asked for it.
-    pub(super) fn start(watched: &Watched, cancel: &Cancel) -> Option<Self> {
-        let supervisor = Supervisor::of_environment()?;
-        supervisor.tell(&format!("READY=1\nSTATUS={}", status_of(watched)));
+    /// Reports that the ground segment is ready, and starts to send its status; `None` without a supervisor.
+    pub(super) fn start(handles: &RunHandles, cancel: &Cancel) -> Option<Self> {
+        let supervisor = Supervisor::from_environment()?;
+        supervisor.send(&format!("READY=1\nSTATUS={}", status_line(handles)));
         let (stop, stopped) = channel();
-        let (watched, cancel) = (watched.clone(), cancel.clone());
+        let (handles, cancel) = (handles.clone(), cancel.clone());
         let thread = std::thread::spawn(move || {
             let (mut alive, mut shown, mut is_ending) = (Instant::now(), Instant::now(), false);
             while matches!(stopped.recv_timeout(POLL), Err(RecvTimeoutError::Timeout)) {
                 if !is_ending && cancel.is_cancelled() {
-                    supervisor.tell(STOPPING);
+                    supervisor.send(STOPPING);
                     is_ending = true;
                 }
-                if supervisor.alive_every.is_some_and(|every| alive.elapsed() >= every) {
-                    supervisor.tell("WATCHDOG=1");
+                if supervisor.watchdog_every.is_some_and(|every| alive.elapsed() >= every) {
+                    supervisor.send("WATCHDOG=1");
                     alive = Instant::now();
                 }
                 if !is_ending && shown.elapsed() >= STATUS_EVERY {
-                    supervisor.tell(&format!("STATUS={}", status_of(&watched)));
+                    supervisor.send(&format!("STATUS={}", status_line(&handles)));
                     shown = Instant::now();
                 }
             }
-            // It may have ended between two looks.
+            // The run may have ended between two checks.
             if !is_ending {
-                supervisor.tell(STOPPING);
+                supervisor.send(STOPPING);
             }
         });
         Some(Self { stop, thread: Some(thread) })
@@ -66,32 +65,32 @@ impl Drop for Notifier {
     }
 }
 
-/// Where to tell.
 struct Supervisor {
     socket: UnixDatagram,
     address: SocketAddr,
-    /// Interval of signs of life: half of what the supervisor waits.
-    alive_every: Option<Duration>,
+    /// Interval of watchdog messages: half of the supervisor's timeout.
+    watchdog_every: Option<Duration>,
 }
 
 impl Supervisor {
-    fn of_environment() -> Option<Self> {
+    fn from_environment() -> Option<Self> {
         let name = std::env::var("NOTIFY_SOCKET").ok()?;
         let number = |name: &str| std::env::var(name).ok()?.parse::<u64>().ok();
         let is_ours = number("WATCHDOG_PID").is_none_or(|process| process == u64::from(std::process::id()));
-        let wait = number("WATCHDOG_USEC").filter(|&wait| is_ours && wait > 0).map(Duration::from_micros);
-        let (socket, address) = (UnixDatagram::unbound().ok()?, address_of(&name)?);
+        let timeout =
+            number("WATCHDOG_USEC").filter(|&timeout| is_ours && timeout > 0).map(Duration::from_micros);
+        let (socket, address) = (UnixDatagram::unbound().ok()?, socket_address(&name)?);
         socket.set_nonblocking(true).ok()?;
-        Some(Self { socket, address, alive_every: wait.map(|wait| wait / 2) })
+        Some(Self { socket, address, watchdog_every: timeout.map(|timeout| timeout / 2) })
     }
 
-    fn tell(&self, message: &str) {
+    fn send(&self, message: &str) {
         let _ = self.socket.send_to_addr(message.as_bytes(), &self.address);
     }
 }
 
-/// A path, or a name after `@` in the namespace of Linux that has no files.
-fn address_of(name: &str) -> Option<SocketAddr> {
+/// Address of a socket: a path, or `@` and a name in Linux's abstract namespace.
+fn socket_address(name: &str) -> Option<SocketAddr> {
     match name.strip_prefix('@') {
         #[cfg(target_os = "linux")]
         Some(name) => {
@@ -104,19 +103,18 @@ fn address_of(name: &str) -> Option<SocketAddr> {
     }
 }
 
-/// One line on how it goes.
-fn status_of(watched: &Watched) -> String {
+fn status_line(handles: &RunHandles) -> String {
     let mut parts = Vec::new();
-    if let Some(listening) = &watched.listening {
+    if let Some(listening) = &handles.listening {
         parts.push(format!("{} senders connected", listening.status.open()));
     }
-    for stage in watched.metrics.snapshot() {
-        let wanted = [("ground", "received"), ("publish", "published")];
-        if let Some((_, done)) = wanted.iter().find(|(name, _)| *name == stage.name) {
-            parts.push(format!("{} {} {done}", stage.units.count, stage.units.name));
+    for stage in handles.metrics.snapshot() {
+        let verbs = [("ground", "received"), ("publish", "published")];
+        if let Some((_, verb)) = verbs.iter().find(|(name, _)| *name == stage.name) {
+            parts.push(format!("{} {} {verb}", stage.units.count, stage.units.name));
         }
     }
-    if let Some(saving) = watched.ground.as_ref().and_then(|ground| ground.saving.report()) {
+    if let Some(saving) = handles.ground.as_ref().and_then(|ground| ground.saving.report()) {
         parts.push(match saving.unsaved {
             Some(_) => saving.to_string(),
             None => format!("{} checkpoints", saving.written),

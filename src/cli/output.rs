@@ -1,4 +1,4 @@
-//! What commands print, and how they end.
+//! Output and completion of commands.
 
 use std::io::Write;
 
@@ -8,22 +8,20 @@ use super::log::{self, Level};
 pub(super) use super::printable_text::{json_text, printable_text};
 use crate::pipeline::{Config, RunSummary};
 
-/// Why a command failed; the message says where and what was expected.
+/// Error of a command; its message says where it occurred and what was expected.
 pub(super) type CommandError = Box<dyn std::error::Error + Send + Sync>;
-/// What a command returns.
 pub(super) type CommandResult = Result<Completion, CommandError>;
 
-/// How a command ended that did not fail.
+/// Completion of a command that did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Completion {
-    /// It did all of its work.
     Done,
-    /// A signal ended it early; what it leaves is valid. The code to exit with.
+    /// A signal interrupted the command; its output is valid. Contains the exit code.
     Interrupted(u8),
 }
 
 impl Completion {
-    /// Ends a command after it has `printed` its result. That nobody reads it is not a failure.
+    /// Ends a command after it has `printed` its result. A closed standard output is not a failure.
     pub(super) fn after(self, printed: Result<(), CommandError>) -> CommandResult {
         match printed {
             Err(error) if !is_broken_pipe(error.as_ref()) => Err(error),
@@ -32,7 +30,7 @@ impl Completion {
     }
 }
 
-/// Whether the reader of our output has closed it, as `head` does: not a failure.
+/// Whether the reader of standard output has closed it, as `head` does.
 pub(super) fn is_broken_pipe(error: &(dyn std::error::Error + 'static)) -> bool {
     error.downcast_ref::<std::io::Error>().is_some_and(|error| error.kind() == std::io::ErrorKind::BrokenPipe)
 }
@@ -42,27 +40,25 @@ pub(super) fn print_json_line(value: &impl serde::Serialize) -> Result<(), Comma
     print(&json_text(value)?)
 }
 
-/// Prints text for people.
 pub(super) fn print_text(text: &str) -> Result<(), CommandError> {
     print(&printable_text(text))
 }
 
-/// Prints text and a line feed as they are.
+/// Prints text and a line feed, without escaping.
 fn print(text: &str) -> Result<(), CommandError> {
     let mut out = std::io::stdout().lock();
     let printed = out.write_all(text.as_bytes()).and_then(|()| out.write_all(b"\n"));
-    printed.map_err(of_stdout)
+    printed.map_err(stdout_error)
 }
 
-/// An error of standard output, which names it unless it is only that nobody reads.
-pub(super) fn of_stdout(error: std::io::Error) -> CommandError {
+/// Adds the name of standard output to an error, unless the reader has closed it.
+pub(super) fn stdout_error(error: std::io::Error) -> CommandError {
     match error.kind() {
         std::io::ErrorKind::BrokenPipe => error.into(),
         _ => format!("standard output: cannot write: {error}").into(),
     }
 }
 
-/// Prints notes to standard error.
 pub(super) fn print_notes<T: std::fmt::Display>(notes: impl IntoIterator<Item = T>) {
     for note in notes {
         log::note("note", &Value::Null, note);
@@ -74,7 +70,7 @@ pub(super) fn print_config_notes(config: &Config) {
     print_notes(config.notes());
 }
 
-/// Says on standard error that more may be missing than the ledger tells, unless it is known to be complete.
+/// Warns if more data may be missing than the ledger shows.
 pub(super) fn print_incompleteness(summary: &RunSummary) {
     if !summary.completeness.complete {
         let fields = serde_json::to_value(&summary.completeness).unwrap_or_default();
@@ -85,13 +81,13 @@ pub(super) fn print_incompleteness(summary: &RunSummary) {
 /// Prints an error and its causes; causes that the message already quotes are left out.
 pub(super) fn print_error(error: &(dyn std::error::Error + 'static)) {
     let message = error.to_string();
-    let (mut said, mut causes, mut cause) = (message.clone(), Vec::new(), error.source());
+    let (mut outer, mut causes, mut cause) = (message.clone(), Vec::new(), error.source());
     while let Some(error) = cause {
         let text = error.to_string();
-        if !said.contains(&text) {
+        if !outer.contains(&text) {
             causes.push(text.clone());
         }
-        said = text;
+        outer = text;
         cause = error.source();
     }
     if log::is_json() {
@@ -113,7 +109,7 @@ mod tests {
         assert_eq!(printable_text(&format!("{name}\nnext")), "a\\u{1b}[2J\\u{9b}31m\\u{202e}b\nnext");
         let text = json_text(&[name, "plain \u{e9}"]).unwrap();
         assert!(text.is_ascii() || !text.contains(|c: char| c.is_control() || c == '\u{202e}'), "{text}");
-        // What it says is the same.
+        // The content is unchanged.
         assert_eq!(serde_json::from_str::<Vec<String>>(&text).unwrap(), [name, "plain \u{e9}"]);
     }
 }

@@ -56,7 +56,7 @@ struct VisibilityQuery {
 }
 
 #[derive(Serialize)]
-struct Answer {
+struct Prediction {
     t_s: f64,
     i: u32,
     j: u32,
@@ -71,7 +71,7 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let map = read_whole_map(&args.sky, &args.maps.options())?;
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
-    let answer = |query: VisibilityQuery| -> Result<(), CommandError> {
+    let print_prediction = |query: VisibilityQuery| -> Result<(), CommandError> {
         check(&array, query)?;
         let VisibilityQuery { t_s, pair, freq_hz } = query;
         let geometry = PairGeometry {
@@ -83,20 +83,19 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         };
         let value = exact::visibility(&geometry, &directions, map.values(), area_sr).visibility_k_sr;
         let (i, j) = (u32::from(pair.i) + 1, u32::from(pair.j) + 1);
-        let answer = Answer { t_s, i, j, freq_hz, re: value.re, im: value.im };
         if args.json {
-            return print_json_line(&answer);
+            return print_json_line(&Prediction { t_s, i, j, freq_hz, re: value.re, im: value.im });
         }
         print_text(&format!(
             "t = {t_s} s, pair {pair}, {}: {:+.9e} {:+.9e} i K sr",
             Dimension::Frequency.show(freq_hz),
-            answer.re,
-            answer.im
+            value.re,
+            value.im
         ))
     };
     if let (Some(time), Some(pair), Some(freq_hz)) = (args.at, args.pair, args.freq_hz) {
         let t_s = time.since_s(config.epoch_tai_s(&array));
-        answer(VisibilityQuery { t_s, pair, freq_hz })?;
+        print_prediction(VisibilityQuery { t_s, pair, freq_hz })?;
         return Ok(Completion::Done);
     }
     let mut input = std::io::stdin().lock();
@@ -109,7 +108,7 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         let Some(line) = next_line(&mut input, number)? else { break };
         if !line.trim().is_empty() {
             let query = parse(&line).and_then(|query| check(&array, query).map(|()| query));
-            answer(query.map_err(|error| format!("standard input, line {number}: {error}"))?)?;
+            print_prediction(query.map_err(|error| format!("standard input, line {number}: {error}"))?)?;
         }
     }
     Ok(Completion::Done)

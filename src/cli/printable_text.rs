@@ -1,8 +1,8 @@
-//! Text without characters that a terminal would obey.
+//! Text without control characters for terminals.
 
 use crate::units::printable;
 
-/// A JSON object whose strings hold no character that a terminal would obey. JSON itself allows some of them.
+/// Serialises a value to JSON, and escapes control characters that JSON permits but a terminal would interpret.
 pub(super) fn json_text(value: &impl serde::Serialize) -> Result<String, serde_json::Error> {
     let text = serde_json::to_string(value)?;
     let escaped = |c: char| match printable(c.encode_utf8(&mut [0; 4])) {
@@ -15,7 +15,7 @@ pub(super) fn json_text(value: &impl serde::Serialize) -> Result<String, serde_j
     }
 }
 
-/// Text for a terminal, with its line breaks: names and replies of others in it are shown, not obeyed.
+/// Escapes control characters, except line breaks: the text may contain foreign names and replies.
 pub(super) fn printable_text(text: &str) -> String {
     text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
 }

@@ -1,4 +1,4 @@
-//! `lunarray rebuild`: make a state of a raw archive.
+//! `lunarray rebuild`: make a state from a raw archive.
 
 use std::path::PathBuf;
 

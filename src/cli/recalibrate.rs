@@ -1,4 +1,4 @@
-//! `lunarray recalibrate`: better gains for the data of a state.
+//! `lunarray recalibrate`: replace the gains of the data in a state.
 
 use std::path::PathBuf;
 

@@ -123,8 +123,8 @@ pub(super) struct ReplayArgs {
     /// Channels to map, from 0 in the order of the instrument, such as 0-4,7; by default all. The others are counted as left out.
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
-    /// Map the channels in groups and read the files once a group: as many channels at a time as memory allows (auto), or this
-    /// many. Maps and ledger are those of all channels at once. When interrupted, repeat the command to go on with the next group.
+    /// Map the channels in groups and read the files once per group: as many channels at a time as memory allows (auto), or this
+    /// many. The result is identical to mapping all channels together. To resume after an interruption, repeat the command.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["live", "pace", "state"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     groups: Option<GroupSize>,
@@ -149,7 +149,7 @@ pub(super) struct ReplayArgs {
     serve: ServeArgs,
 }
 
-/// Speed relative to real time; `None` for as fast as possible.
+/// Speed of a replay relative to real time; `None` for as fast as possible.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Speed(Option<f64>);
 
@@ -201,12 +201,12 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
         return in_groups(args, &config, size);
     }
     let wait_bytes = match (&args.state, args.listens()) {
-        // A pass waits until its gains are known.
+        // Solving holds all visibilities of a pass until its gains are known, which needs the large buffer.
         _ if config.calibration.hook == CalibrationHook::Solve => WAIT_BYTES,
         (None, true) => WAIT_BYTES_LIVE,
         _ => WAIT_BYTES,
     };
-    let settings = args.limited(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
+    let settings = args.with_memory_limit(config.ground(args.wait_bytes.unwrap_or(wait_bytes)));
     let ground = match &args.state {
         Some(folder) => Ground::open_with_ranks(folder, &settings, args.checkpoint_every, job.ranks())?,
         None => Ground::new(&settings)?.with_ranks(job.ranks()),
@@ -219,22 +219,23 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
     let events = args.events.start(&config, "ground")?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
-    let ended = match args.listens() {
-        true => session.hear_senders(ground),
+    let result = match args.listens() {
+        true => session.receive_from_senders(ground),
         false => session.read_files(ground),
     };
-    if let Some(completion) = job.interrupted(&ended, &interrupt) {
+    if let Some(completion) = job.completion_if_interrupted(&result, &interrupt) {
         return Ok(completion);
     }
-    let ended = page.conclude(ended, |summary| summary.cancelled);
-    events.conclude(&ended, |summary| summary.cancelled);
-    if ended.is_err() && (args.listens() || args.follow) {
-        page.tell_failure(&interrupt);
+    let result = page.conclude(result, |summary| summary.cancelled);
+    events.conclude(&result, |summary| summary.cancelled);
+    if result.is_err() && (args.listens() || args.follow) {
+        page.serve_failure(&interrupt);
     }
-    let summary = ended.inspect_err(|error| {
-        let told = matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
-        // Another failure must not hide that nothing was saved.
-        if let Some(saving) = saving.report().filter(|saving| saving.unsaved.is_some() && !told) {
+    let summary = result.inspect_err(|error| {
+        let is_reported =
+            matches!(error.downcast_ref::<PipelineError>(), Some(PipelineError::Unsaved { .. }));
+        // Another failure must not hide that the state was not saved.
+        if let Some(saving) = saving.report().filter(|saving| saving.unsaved.is_some() && !is_reported) {
             note("checkpoint", &serde_json::to_value(&saving).unwrap_or_default(), saving);
         }
     })?;
@@ -250,30 +251,30 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     }
     let printed = args.print(&summary);
     print_incompleteness(&summary);
-    page.stay(&interrupt);
+    page.serve_until_interrupt(&interrupt);
     completion.after(printed)
 }
 
 impl ReplayArgs {
-    /// Without a map file: with the settings that belong to the state and the downlink.
+    /// Adds the settings of the state, or else of the downlink, if there is no map file.
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
-        let of_state = self.state.as_deref().map(|folder| {
+        let with_state = self.state.as_deref().map(|folder| {
             let source = source.clone();
             match job.ranks().is_distributed() {
-                true => source.of_state_for_ranks(folder),
-                false => source.of_state(folder),
+                true => source.with_state_settings_for_ranks(folder),
+                false => source.with_state_settings(folder),
             }
         });
-        let of_state = match of_state {
+        let source = match with_state {
             Some(Err(error @ GroundError::FilesOfState { .. })) => return Err(error),
-            // A state that cannot be read is told when it is opened.
+            // A state that cannot be read is reported when it is opened.
             Some(Err(_)) | None => source,
             Some(Ok(source)) => source,
         };
-        let (source, from) = of_state.of_downlink(&self.files);
-        if let Some(from) = from.filter(|_| job.is_first()) {
-            let fields = json!({ "from": from });
-            say("settings", &fields, format_args!("settings of the maps: those of {from}"));
+        let (source, origin) = source.with_downlink_settings(&self.files);
+        if let Some(origin) = origin.filter(|_| job.is_first()) {
+            let fields = json!({ "from": origin });
+            say("settings", &fields, format_args!("settings of the maps: those of {origin}"));
         }
         Ok(source)
     }
@@ -287,44 +288,40 @@ impl ReplayArgs {
         }
     }
 
-    /// With the limit of memory that was given, or the machine's.
-    fn limited(&self, config: GroundConfig) -> GroundConfig {
-        GroundConfig { memory_max_bytes: self.limit().map(|limit| limit.bytes), ..config }
+    fn with_memory_limit(&self, config: GroundConfig) -> GroundConfig {
+        GroundConfig { memory_max_bytes: self.memory_limit().map(|limit| limit.bytes), ..config }
     }
 
-    fn limit(&self) -> Option<MemoryLimit> {
+    /// The memory limit: the given one, or that of the machine.
+    fn memory_limit(&self) -> Option<MemoryLimit> {
         self.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine)
     }
 }
 
-/// Says so if the sums of an instrument will outgrow memory.
-fn advise(config: &Config, instrument: &Instrument, limit: Option<MemoryLimit>) {
-    if let Some(advice) = limit.and_then(|limit| MemoryAdvice::of(config, instrument, limit)) {
+/// Warns if the normal equations of an instrument's channels will outgrow memory.
+fn warn_about_memory(config: &Config, instrument: &Instrument, limit: Option<MemoryLimit>) {
+    if let Some(advice) = limit.and_then(|limit| MemoryAdvice::new(config, instrument, limit)) {
         print_notes([advice]);
     }
 }
 
 /// Maps the channels of files in groups.
 fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResult {
-    let groups = channel_groups(&args.files, config, size, args.limit())?;
+    let groups = channel_groups(&args.files, config, size, args.memory_limit())?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
     let events = args.events.start(config, "ground")?;
     let mut parts = Parts::new(groups.iter().map(|group| group.channels.len() as f64));
     let mut progress = None;
-    let ended = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |step, watched| {
+    let result = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |step, handles| {
         let number = step.group;
         if number == 0 {
             interrupt.arm_or_note();
         }
-        // The bar of the group before ends first.
+        // The bar of the previous group ends first.
         progress = None;
-        let channels: Vec<String> = groups[number..]
-            .iter()
-            .take(1)
-            .flat_map(|group| &group.channels)
-            .map(|c| c.to_string())
-            .collect();
+        let channels: Vec<String> =
+            groups.get(number).into_iter().flat_map(|group| &group.channels).map(|c| c.to_string()).collect();
         let (of, listed) = (groups.len(), channels.join(", "));
         let left_s = parts.begin(number);
         let fields = json!({
@@ -332,19 +329,19 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
         });
         let left = time_left(left_s);
         say("group", &fields, format_args!("group {} of {of}: channels {listed}{step}{left}", number + 1));
-        events.watch(&watched);
-        progress = Some(Progress::watch(watched, READ, 0, cancel));
+        events.watch(&handles);
+        progress = Some(Progress::watch(handles, READ, 0, cancel));
     });
     drop(progress);
-    let ended = ended.map_err(CommandError::from);
-    events.conclude(&ended, |summary| summary.cancelled);
-    let summary = ended?;
+    let result = result.map_err(CommandError::from);
+    events.conclude(&result, |summary| summary.cancelled);
+    let summary = result?;
     let printed = args.print(&summary);
     print_incompleteness(&summary);
     interrupt.completion(summary.cancelled).after(printed)
 }
 
-/// What a replay is to do, and what may end it.
+/// Arguments, settings and outputs of a replay.
 struct Session<'a> {
     args: &'a ReplayArgs,
     config: &'a Config,
@@ -355,16 +352,16 @@ struct Session<'a> {
 }
 
 impl ReplayArgs {
-    /// Whether packets come from sockets.
+    /// Whether the packets are received from sockets.
     fn listens(&self) -> bool {
         !self.listen.is_empty()
     }
 
-    /// Where it listens for connections, and where for datagrams.
+    /// Addresses for connections and for datagrams.
     fn listening_addresses(&self) -> Result<[Vec<SocketAddr>; 2], CommandError> {
         let mut found = [Vec::new(), Vec::new()];
         for url in &self.listen {
-            let (at, url) = match url {
+            let (kind, url) = match url {
                 ListenUrl::Tcp(url) => (0, url),
                 ListenUrl::Udp(_) if self.stations.is_some() => {
                     return Err(
@@ -374,57 +371,61 @@ impl ReplayArgs {
                 }
                 ListenUrl::Udp(url) => (1, url),
             };
-            if !found[at].is_empty() {
+            if !found[kind].is_empty() {
                 return Err("--listen is given twice; expected at most one tcp:// and one udp://".into());
             }
-            found[at] = if self.allow_remote { url.addresses()? } else { url.own_addresses()? };
+            found[kind] = if self.allow_remote { url.addresses()? } else { url.loopback_addresses()? };
         }
         Ok(found)
     }
 }
 
 impl Session<'_> {
-    fn hear_senders(&self, mut ground: Ground) -> Result<RunSummary, CommandError> {
+    /// Receives the downlink from senders, until a limit or a signal.
+    fn receive_from_senders(&self, mut ground: Ground) -> Result<RunSummary, CommandError> {
         let Self { args, config, .. } = self;
         let [connections, datagrams] = args.listening_addresses()?;
-        let settings = args.limited(config.ground(0));
-        let (advised, own_config, limit) = (AtomicBool::new(false), (*config).clone(), args.limit());
-        let until = ListenLimits { idle_s: args.idle_s, connections: args.connections };
+        // These settings only decide which instruments fit, so the size of the hold buffer does not matter.
+        let acceptance = args.with_memory_limit(config.ground(0));
+        let (is_warned, warning_config, limit) =
+            (AtomicBool::new(false), (*config).clone(), args.memory_limit());
+        let limits = ListenLimits { idle_s: args.idle_s, connections: args.connections };
         let listen = &config.downlink.listen;
-        let mut source = SocketSource::bind(&connections, listen, until)?
-            .knowing(ground.instrument().cloned())
-            .accepting(Arc::new(move |instrument| {
-                let fits = settings.fits(instrument).is_ok();
-                if fits && !advised.swap(true, Ordering::Relaxed) {
-                    advise(&own_config, instrument, limit);
+        let mut source = SocketSource::bind(&connections, listen, limits)?
+            .with_instrument(ground.instrument().cloned())
+            .with_instrument_check(Arc::new(move |instrument| {
+                let fits = acceptance.fits(instrument).is_ok();
+                if fits && !is_warned.swap(true, Ordering::Relaxed) {
+                    warn_about_memory(&warning_config, instrument, limit);
                 }
                 fits
             }))
-            .telling(Box::new(print_listen_note));
+            .with_note_handler(Box::new(print_listen_note));
         if !datagrams.is_empty() {
             source = source.with_datagrams(&datagrams)?;
         }
         if let Some(path) = &args.stations {
-            source = source.of_stations(Stations::read(path)?);
+            source = source.with_stations(Stations::read(path)?);
         }
         if args.state.is_some() {
             let answers = HeldAnswers::new(Duration::from_secs_f64(listen.held_every_s));
             (source, ground) =
-                (source.answering(&answers), ground.with_answers(&answers).with_initial_snapshot());
+                (source.with_held_answers(&answers), ground.with_answers(&answers).with_initial_snapshot());
             if !args.no_archive {
                 let bytes_max = args.archive_max.unwrap_or(ARCHIVE_BYTES_MAX);
                 let kept = ground.keep_packets(args.archive.as_deref(), bytes_max)?;
-                source = kept.iter().fold(source, |source, archive| source.keeping(archive));
+                source = kept.iter().fold(source, |source, archive| source.with_archive(archive));
             }
         }
         let addresses = source.addresses().to_vec();
-        Ok(self.watched(source, ground, &|| {
+        Ok(self.run(source, ground, &|| {
             for address in &addresses {
                 say("listening", &json!({ "url": address }), format_args!("listening on {address}"));
             }
         })?)
     }
 
+    /// Replays downlink files.
     fn read_files(&self, ground: Ground) -> Result<RunSummary, CommandError> {
         let args = self.args;
         let files = match args.follow {
@@ -435,67 +436,67 @@ impl Session<'_> {
         if let Some(first) = args.files.first().filter(|path| path.is_file())
             && let Ok(Some(instrument)) = Collector::instrument_of(first)
         {
-            advise(self.config, &instrument, args.limit());
+            warn_about_memory(self.config, &instrument, args.memory_limit());
         }
         let pace = match (args.step, args.speed) {
             (Some(StepLength(every_s)), _) => {
-                let tell = Box::new(|note: &str| say("step", &Value::Null, note));
-                Pace::Steps(Steps { every_s, go: lines_of_input(), tell })
+                let prompt = Box::new(|note: &str| say("step", &Value::Null, note));
+                Pace::Steps(Steps { every_s, requests: lines_of_input(), prompt })
             }
             (None, Speed(Some(times))) => Pace::Speed(times),
-            (None, Speed(None)) => return Ok(self.watched(files, ground, &|| {})?),
+            (None, Speed(None)) => return Ok(self.run(files, ground, &|| {})?),
         };
-        Ok(self.watched(PacedSource::new(files, pace), ground, &|| {})?)
+        Ok(self.run(PacedSource::new(files, pace), ground, &|| {})?)
     }
 
-    /// Runs the ground; `begun` is called once signals end it in order.
-    fn watched<S: GroundSource + 'static>(
+    /// Runs the ground segment; `on_started` is called after the signal handlers are installed.
+    fn run<S: GroundSource + 'static>(
         &self,
         source: S,
         ground: Ground,
-        begun: &dyn Fn(),
+        on_started: &dyn Fn(),
     ) -> Result<RunSummary, PipelineError> {
         let Self { args, config, job, interrupt, page, events } = self;
         let cancel = interrupt.cancel();
         let mut progress = None;
         #[cfg(unix)]
         let mut notifier = None;
-        replay(source, config, ground, &args.out, cancel, &mut |watched| {
+        replay(source, config, ground, &args.out, cancel, &mut |handles| {
             interrupt.arm_or_note();
-            begun();
+            on_started();
             #[cfg(unix)]
             if args.follow || args.listens() {
-                notifier = super::notify::Notifier::start(&watched, cancel);
+                notifier = super::notify::Notifier::start(&handles, cancel);
             }
-            page.watch(&watched);
-            events.watch(&watched);
+            page.watch(&handles);
+            events.watch(&handles);
             if job.is_first() {
-                progress = Some(Progress::watch(watched, READ, 0, cancel));
+                progress = Some(Progress::watch(handles, READ, 0, cancel));
             }
         })
     }
 }
 
-/// Prints what happened to a connection.
-fn print_listen_note(told: &ListenNote<'_>) {
+/// Logs an event of a connection.
+fn print_listen_note(event: &ListenNote<'_>) {
     match is_json() {
         true => say_entry(
-            if told.is_regular() { Level::Info } else { Level::Warn },
-            told,
-            Some(&told.to_string()),
+            if event.is_regular() { Level::Info } else { Level::Warn },
+            event,
+            Some(&event.to_string()),
         ),
-        false => print_notes([told]),
+        false => print_notes([event]),
     }
 }
 
 /// A channel with one message for each line of standard input, until its end.
 fn lines_of_input() -> Receiver<()> {
-    let (say, go) = bounded(0);
-    // The thread ends with the input or the process; nothing else can interrupt its read.
+    let (lines, go) = bounded(0);
+    // The thread ends with the input or the process, as its read cannot be interrupted.
     std::thread::spawn(move || {
         let mut input = std::io::stdin().lock();
         while let Ok(Some(_)) = next_line(&mut input, 1) {
-            if say.send(()).is_err() {
+            if lines.send(()).is_err() {
                 return;
             }
         }

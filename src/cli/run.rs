@@ -37,8 +37,8 @@ pub(super) struct RunArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
-    /// Simulate and map the channels in groups: as many at a time as memory allows (auto), or this many. Products are those of all
-    /// channels at once. When interrupted, repeat the command to go on with the next group.
+    /// Simulate and map the channels in groups: as many at a time as memory allows (auto), or this many. The products are identical to
+    /// those of all channels together. To resume after an interruption, repeat the command.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["mpi", "events"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     groups: Option<GroupSize>,
@@ -81,22 +81,22 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     let page = args.serve.start(&plan.config, "whole", None, None)?;
     let events = args.events.start(&plan.config, "whole")?;
     let mut progress = None;
-    let windows = plan.windows_watched();
-    let ended = run_with_ranks(job.ranks(), &plan, &out, interrupt.cancel(), &mut |watched| {
+    let windows = plan.progress_windows();
+    let result = run_with_ranks(job.ranks(), &plan, &out, interrupt.cancel(), &mut |handles| {
         interrupt.arm_or_note();
-        page.watch(&watched);
-        events.watch(&watched);
+        page.watch(&handles);
+        events.watch(&handles);
         if job.is_first() {
-            progress = Some(Progress::watch(watched, INTEGRATE, windows, interrupt.cancel()));
+            progress = Some(Progress::watch(handles, INTEGRATE, windows, interrupt.cancel()));
         }
     });
     drop(progress);
-    if let Some(completion) = job.interrupted(&ended, &interrupt) {
+    if let Some(completion) = job.completion_if_interrupted(&result, &interrupt) {
         return Ok(completion);
     }
-    let ended = page.conclude(ended, |summary| summary.cancelled);
-    events.conclude(&ended, |summary| summary.cancelled);
-    let summary = ended?;
+    let result = page.conclude(result, |summary| summary.cancelled);
+    events.conclude(&result, |summary| summary.cancelled);
+    let summary = result?;
     if !job.is_first() {
         return Ok(interrupt.completion(summary.cancelled));
     }
@@ -105,7 +105,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
         false => args.print(&summary, &out),
     };
     print_incompleteness(&summary);
-    page.stay(&interrupt);
+    page.serve_until_interrupt(&interrupt);
     interrupt.completion(summary.cancelled).after(printed)
 }
 
@@ -124,22 +124,22 @@ fn in_groups(args: &RunArgs, plan: &Plan, size: GroupSize, out: &Path) -> Comman
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
     let mut progress = None;
-    let windows = plan.windows_watched();
-    let ended = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |group, watched| {
-        // The bar of the group before ends first.
+    let windows = plan.progress_windows();
+    let result = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |step, handles| {
+        // The bar of the previous step ends first.
         progress = None;
-        steps.begin(group);
-        let Some(watched) = watched else { return };
+        steps.begin(step);
+        let Some(handles) = handles else { return };
         interrupt.arm_or_note();
-        let (stage, total) = match group {
-            GroupStep::Simulated(_) => (INTEGRATE, windows),
-            GroupStep::Merged => (MERGE, 0),
-            GroupStep::Mapped(_) | GroupStep::Sky(_) => (READ, 0),
+        let (stage, total) = match step {
+            GroupStep::Simulate(_) => (INTEGRATE, windows),
+            GroupStep::Merge => (MERGE, 0),
+            GroupStep::Map(_) | GroupStep::Sky(_) => (READ, 0),
         };
-        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+        progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
     });
     drop(progress);
-    let Some(summary) = ended? else {
+    let Some(summary) = result? else {
         return Ok(interrupt.completion(true));
     };
     let printed = args.print(&summary, out);

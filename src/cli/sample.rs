@@ -41,7 +41,7 @@ pub(super) struct SampleArgs {
     json: bool,
 }
 
-/// What was drawn of a channel.
+/// Statistics of the posterior samples of a channel.
 #[derive(Debug, Serialize)]
 struct SampledChannel {
     frequency_hz: f64,

@@ -9,20 +9,20 @@ use serde_json::json;
 use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::CommandError;
-use crate::pipeline::{Config, Watched};
+use crate::pipeline::{Config, RunHandles};
 use crate::serve::{ServeAddress, ServeError, Server, Subject};
 
-/// Longest time for which a failure is served: some intervals at which metrics are read.
+/// Time for which a failure is served: several typical scrape intervals.
 const FAILURE_SERVED: Duration = Duration::from_secs(20);
 
-/// Interval of looking for a signal.
+/// Interval of checks for a signal.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Whether and where a command shows itself.
+/// Arguments for the page of a command.
 #[derive(Debug, Args)]
 pub(super) struct ServeArgs {
     /// Show the run in a browser: a port of this machine, or HOST:PORT. Port 0 chooses a free one; standard error prints
-    /// `serving on http://HOST:PORT/`. Visitors can only look.
+    /// `serving on http://HOST:PORT/`. The page is read-only.
     #[arg(long, value_name = "PORT|HOST:PORT")]
     serve: Option<ServeAddress>,
     /// Allow an address that other machines can reach. Anyone who connects can read all that is shown.
@@ -34,7 +34,7 @@ pub(super) struct ServeArgs {
 }
 
 impl ServeArgs {
-    /// Starts the server, if one is wanted, to tell of the `segment` of a chain with this configuration.
+    /// Starts the server, if it is requested.
     pub(super) fn start(
         &self,
         config: &Config,
@@ -42,32 +42,32 @@ impl ServeArgs {
         state: Option<&Path>,
         out: Option<&Path>,
     ) -> Result<Page, ServeError> {
-        let Some(address) = &self.serve else { return Ok(Page { server: None, stays: false }) };
+        let Some(address) = &self.serve else { return Ok(Page { server: None, stays_after_end: false }) };
         let subject = Subject::new(config, segment, state);
         let subject = out.into_iter().fold(subject, Subject::with_maps_in);
         let server = Server::start(address, self.serve_remote, subject)?;
         let url = server.url().to_string();
         say("serving", &json!({ "url": url }), format_args!("serving on {url}"));
-        Ok(Page { server: Some(server), stays: self.serve_after })
+        Ok(Page { server: Some(server), stays_after_end: self.serve_after })
     }
 }
 
-/// The page of a command, if one is wanted; it ends when dropped.
+/// The page of a command, if it is requested; dropping it stops the server.
 pub(super) struct Page {
     server: Option<Server>,
-    /// Whether it stays after the end of the run.
-    stays: bool,
+    /// Whether to serve after the end of the run.
+    stays_after_end: bool,
 }
 
 impl Page {
-    /// The run begins.
-    pub(super) fn watch(&self, watched: &Watched) {
+    /// Starts to show a run.
+    pub(super) fn watch(&self, handles: &RunHandles) {
         if let Some(server) = &self.server {
-            server.watch(watched);
+            server.watch(handles);
         }
     }
 
-    /// Tells how a run ended that yielded a result; `cancelled` reads from it whether it was ended early.
+    /// Shows the end of a run; `cancelled` tells whether a result is of a cancelled run.
     pub(super) fn conclude<T, E: Into<CommandError>>(
         &self,
         result: Result<T, E>,
@@ -81,21 +81,22 @@ impl Page {
         result
     }
 
-    /// After a failure, serves the failed status for a while, so that monitoring sees it; a signal ends that.
-    pub(super) fn tell_failure(&self, interrupt: &Interrupt) {
+    /// After a failure, serves the failed status until monitoring has read it, a time limit or a signal.
+    pub(super) fn serve_failure(&self, interrupt: &Interrupt) {
         let Some(server) = &self.server else { return };
         let since = Instant::now();
         while since.elapsed() < FAILURE_SERVED
             && !interrupt.cancel().is_cancelled()
-            && !server.is_failure_told()
+            && !server.is_failure_scraped()
         {
             std::thread::sleep(POLL);
         }
     }
 
-    /// After a run that was not ended early: goes on serving until a signal, if that is wanted.
-    pub(super) fn stay(self, interrupt: &Interrupt) {
-        let Some(server) = self.server.filter(|_| self.stays && !interrupt.cancel().is_cancelled()) else {
+    /// After a run that was not interrupted, serves until a signal, if that is requested.
+    pub(super) fn serve_until_interrupt(self, interrupt: &Interrupt) {
+        let Some(server) = self.server.filter(|_| self.stays_after_end && !interrupt.cancel().is_cancelled())
+        else {
             return;
         };
         let url = server.url().to_string();

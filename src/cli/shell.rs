@@ -1,4 +1,4 @@
-//! `lunarray completions` and `lunarray man`: for shells and manuals.
+//! `lunarray completions` and `lunarray man`: shell completions and manual pages.
 
 use std::path::PathBuf;
 
@@ -39,7 +39,7 @@ pub(super) fn completions(args: &CompletionsArgs, mut command: Command) -> Comma
     Ok(Completion::Done)
 }
 
-/// Write manual pages, one a command.
+/// Write manual pages, one per command.
 ///
 /// `man -l FOLDER/lunarray.1` shows the first of them; packages put them into section 1 of the manual.
 ///
@@ -77,6 +77,6 @@ pub(super) fn man(args: &ManArgs, mut command: Command) -> CommandResult {
 fn page(command: &Command) -> Result<(String, Vec<u8>), CommandError> {
     let mut text = Vec::new();
     clap_mangen::Man::new(command.clone()).render(&mut text)?;
-    // A built command knows its whole name: lunarray-run.
+    // The display name includes the program, as in lunarray-run.
     Ok((format!("{}.1", command.get_display_name().unwrap_or(NAME)), text))
 }

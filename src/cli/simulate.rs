@@ -100,21 +100,21 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
     let events = args.events.start(&plan.config, "space")?;
     let mut progress = None;
-    let windows = plan.windows_watched();
+    let windows = plan.progress_windows();
     let file = args.out.clone().filter(|_| !to_standard_output);
-    let to = Destination { file, standard_output: to_standard_output, socket };
-    let ended = simulate(&plan, to, cancel, &mut |watched| {
+    let destination = Destination { file, standard_output: to_standard_output, socket };
+    let result = simulate(&plan, destination, cancel, &mut |handles| {
         interrupt.arm_or_note();
-        page.watch(&watched);
-        events.watch(&watched);
-        progress = Some(Progress::watch(watched, INTEGRATE, windows, cancel));
+        page.watch(&handles);
+        events.watch(&handles);
+        progress = Some(Progress::watch(handles, INTEGRATE, windows, cancel));
     });
     drop(progress);
-    let ended = page.conclude(ended, |report| report.cancelled);
-    events.conclude(&ended, |report| report.cancelled);
-    let report = ended?;
+    let result = page.conclude(result, |report| report.cancelled);
+    events.conclude(&result, |report| report.cancelled);
+    let report = result?;
     let is_written = report.stage("record").is_some_and(|record| record.units > 0);
-    let mut places: Vec<String> = args
+    let mut messages: Vec<String> = args
         .out
         .iter()
         .filter(|_| !to_standard_output)
@@ -124,7 +124,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
         })
         .collect();
     if let (Some(url), Some(confirmed)) = (&args.send, confirmed) {
-        places.push(match confirmed.load(Ordering::Relaxed) {
+        messages.push(match confirmed.load(Ordering::Relaxed) {
             0 => format!("Sent the downlink to {url}, which confirmed no bytes"),
             bytes if args.held => format!("A checkpoint of {url} holds all {bytes} bytes"),
             bytes => format!("{url} confirmed all {bytes} bytes"),
@@ -133,18 +133,18 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     let printed = match args.json {
         _ if args.events.take_stdout() => Ok(()),
         _ if to_standard_output => {
-            print_notes(places);
+            print_notes(messages);
             Ok(())
         }
         true => print_json_line(&report),
-        false => print_text(&format!("{report}\n{}", places.join("\n"))),
+        false => print_text(&format!("{report}\n{}", messages.join("\n"))),
     };
-    page.stay(&interrupt);
+    page.serve_until_interrupt(&interrupt);
     interrupt.completion(report.cancelled).after(printed)
 }
 
 impl SimulateArgs {
-    /// Requires that standard output is for the downlink alone.
+    /// Requires that standard output is used for the downlink only, and is not a terminal.
     fn require_standard_output(&self) -> Result<(), CommandError> {
         if self.json || self.groups.is_some() || self.events.take_stdout() {
             return Err("--out - writes the downlink to standard output; expected none of --json, --groups and --events -".into());
@@ -163,28 +163,29 @@ fn in_groups(args: &SimulateArgs, plan: &Plan, size: GroupSize, out: &Path) -> C
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
     let mut progress = None;
-    let windows = plan.windows_watched();
-    let ended = simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, watched| {
-        // The bar of the group before ends first.
-        progress = None;
-        steps.begin(step);
-        let Some(watched) = watched else { return };
-        interrupt.arm_or_note();
-        let (stage, total) = if step == GroupStep::Merged { (MERGE, 0) } else { (INTEGRATE, windows) };
-        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
-    });
+    let windows = plan.progress_windows();
+    let result =
+        simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, handles| {
+            // The bar of the previous step ends first.
+            progress = None;
+            steps.begin(step);
+            let Some(handles) = handles else { return };
+            interrupt.arm_or_note();
+            let (stage, total) = if step == GroupStep::Merge { (MERGE, 0) } else { (INTEGRATE, windows) };
+            progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
+        });
     drop(progress);
-    let reports = ended?;
+    let reports = result?;
     let is_cancelled = reports.last().is_some_and(|report| report.cancelled);
-    let place = match is_cancelled {
+    let message = match is_cancelled {
         true => "No downlink yet: repeat the command to go on".to_owned(),
         false => format!("Wrote the downlink to {}", out.display()),
     };
     let printed = match args.json {
         true => print_json_line(&reports),
         false => {
-            let each: Vec<String> = reports.iter().map(ToString::to_string).collect();
-            print_text(&format!("{}\n{place}", each.join("\n\n")))
+            let reports: Vec<String> = reports.iter().map(ToString::to_string).collect();
+            print_text(&format!("{}\n{message}", reports.join("\n\n")))
         }
     };
     interrupt.completion(is_cancelled).after(printed)

@@ -106,17 +106,17 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
     let factor = (freq_hz / made_hz).powf(args.index);
     let values = generate(&sky.generated, made_hz, nside, seed)?.into_iter().map(|value| factor * value);
     let map = SkyMap::new(Frame::Ecliptic, values.collect())?;
-    let mut made = SkyReport::write(args, &map, Some(freq_hz), &Dimension::Frequency.show(freq_hz))?;
+    let mut report = SkyReport::write(args, &map, Some(freq_hz), &Dimension::Frequency.show(freq_hz))?;
     if let Some(path) = &args.sources {
         let count = write_sources(path, &sky.generated, freq_hz, seed)?;
-        made.lines.push(format!("{}: {count} sources", path.display()));
+        report.lines.push(format!("{}: {count} sources", path.display()));
     }
     let title = format!("Generated sky, {} MHz", freq_hz / 1e6);
-    made.draw(args, &map, title, &format!("seed {seed}, nside {nside}"))?;
-    made.print(args)
+    report.draw(args, &map, title, &format!("seed {seed}, nside {nside}"))?;
+    report.print(args)
 }
 
-/// Writes a sky that resembles another.
+/// Writes a sky that is correlated with another map.
 fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     if !(0.0..=1.0).contains(&correlation) {
         return Err(format!("--correlation {correlation}: expected 0 to 1").into());
@@ -124,15 +124,14 @@ fn resemble(args: &SkyArgs, path: &Path, correlation: f64) -> CommandResult {
     let MapFile { map: other, frequency_hz, .. } = read_whole_map_file(path, &args.maps.options())?;
     let seed = args.seed.unwrap_or(0);
     let map = other.correlated(correlation, seed)?;
-    // It is of the frequency of what it resembles.
-    let what = format!("correlation {correlation} with {}", path.display());
-    let mut made = SkyReport::write(args, &map, frequency_hz, &what)?;
+    let description = format!("correlation {correlation} with {}", path.display());
+    let mut report = SkyReport::write(args, &map, frequency_hz, &description)?;
     let title = format!("A sky of correlation {correlation} with another");
-    made.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
-    made.print(args)
+    report.draw(args, &map, title, &format!("seed {seed}, nside {}", map.nside()))?;
+    report.print(args)
 }
 
-/// What was written, for programs and in words.
+/// Report on the files that were written.
 struct SkyReport {
     nside: usize,
     mean_k: f64,
@@ -141,17 +140,23 @@ struct SkyReport {
 }
 
 impl SkyReport {
-    /// Writes the sky, with its frequency if that is known.
-    fn write(args: &SkyArgs, map: &SkyMap, freq_hz: Option<f64>, what: &str) -> Result<Self, CommandError> {
+    /// Writes the map, with its frequency if that is known.
+    fn write(
+        args: &SkyArgs,
+        map: &SkyMap,
+        freq_hz: Option<f64>,
+        description: &str,
+    ) -> Result<Self, CommandError> {
         let (nside, mean_k) = (map.nside(), map.values().iter().sum::<f64>() / map.values().len() as f64);
         let freq = freq_hz.map(|hz| Card::real("FREQ", hz, "[Hz] centre frequency"));
         let options = WriteOptions { cards: freq.into_iter().collect(), ..WriteOptions::default() };
         write_map(&args.out, map, &options)?;
-        let lines = vec![format!("{}: nside {nside}, {what}, mean {mean_k:.4e} K", args.out.display())];
+        let lines =
+            vec![format!("{}: nside {nside}, {description}, mean {mean_k:.4e} K", args.out.display())];
         Ok(Self { nside, mean_k, picture: None, lines })
     }
 
-    /// Draws it beside its file.
+    /// Draws the map, unless that is switched off.
     fn draw(
         &mut self,
         args: &SkyArgs,
@@ -188,7 +193,7 @@ impl SkyReport {
     }
 }
 
-/// Writes the point sources, brightest first; how many there are.
+/// Writes a table of the point sources, brightest first; returns their number.
 fn write_sources(path: &Path, config: &GeneratedSky, freq_hz: f64, seed: u64) -> Result<usize, CommandError> {
     let sources = catalogue(config, freq_hz, seed);
     let mut csv = "ecliptic_longitude_deg,ecliptic_latitude_deg,flux_154mhz_jy,flux_jy\n".to_owned();

@@ -77,26 +77,26 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
             let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
             say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
         };
-        let (watched, what, stage, total) = match step {
-            StudyStep::Calibrate(at) => {
+        let (handles, what, stage, total) = match step {
+            StudyStep::Calibrate(calibration) => {
                 drop(progress.take());
-                if gains.as_ref().is_none_or(|(of, _)| *of != number) {
+                if gains.as_ref().is_none_or(|(case, _)| *case != number) {
                     begin("calibrating");
                     gains = Some((number, CalibrateLines::new()));
                 }
-                gains.iter_mut().for_each(|(_, lines)| lines.show(&at));
+                gains.iter_mut().for_each(|(_, lines)| lines.show(&calibration));
                 return;
             }
-            StudyStep::Simulate(watched) => {
-                (watched, "simulating for", INTEGRATE, case.plan.windows_watched())
+            StudyStep::Simulate(handles) => {
+                (handles, "simulating for", INTEGRATE, case.plan.progress_windows())
             }
-            StudyStep::Map(watched) => (watched, "mapping", READ, 0),
-            StudyStep::Realise(watched) => (watched, "noise of", READ, 0),
+            StudyStep::Map(handles) => (handles, "mapping", READ, 0),
+            StudyStep::Realise(handles) => (handles, "noise of", READ, 0),
         };
-        // The last one ends before the next begins.
+        // The bar of the previous step ends first.
         drop(progress.take());
         begin(what);
-        progress = Some(Progress::watch(watched, stage, total, interrupt.cancel()));
+        progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
     })?;
     drop(progress);
     if summary.cancelled {
@@ -113,8 +113,8 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     })
 }
 
-/// What imperfect instruments leave of the power, a line a case.
-fn told_power_kept(summary: &StudySummary) -> Vec<String> {
+/// Lines on the power that imperfect instruments preserve, one per case and channel.
+fn power_lines(summary: &StudySummary) -> Vec<String> {
     let channels = summary
         .cases
         .iter()
@@ -123,14 +123,14 @@ fn told_power_kept(summary: &StudySummary) -> Vec<String> {
     channels
         .filter(|(_, channel)| channel.power_kept.is_some())
         .map(|(label, channel)| {
-            let of = format!("{label}, {:.3} MHz", channel.frequency_hz / 1e6);
+            let name = format!("{label}, {:.3} MHz", channel.frequency_hz / 1e6);
             let last = 120.min(2 * channel.nside);
             if last < 20 {
-                return format!("{of}: the map ends at l = {last}, before l = 20: spectra.csv has C_l and rho_l by degree");
+                return format!("{name}: the map ends at l = {last}, before l = 20: spectra.csv has C_l and rho_l by degree");
             }
             let [ratio, coherent] = channel.power_kept_means();
             format!(
-                "{of}: C_l {} of the ideal instrument's, coherent with the sky {}, rho_l {} (means, l = 20 to {last})",
+                "{name}: C_l {} of the ideal instrument's, coherent with the sky {}, rho_l {} (means, l = 20 to {last})",
                 number(ratio),
                 number(coherent),
                 number(channel.rho_mean()),
@@ -174,31 +174,31 @@ fn table(summary: &StudySummary) -> String {
             100.0 * spread.sigma_scatter
         ));
     }
-    lines.extend(told_power_kept(summary));
+    lines.extend(power_lines(summary));
     for crossing in &summary.crossings {
-        let of =
+        let value =
             |epsilon: Option<f64>| epsilon.map_or_else(|| "not within".to_owned(), |e| format!("{e:.2e}"));
         lines.push(format!(
             "traces at {:.3} MHz cross at epsilon {} (Tr Sigma_n = T² Tr Sigma_s, T the mean of the input; {} with T)",
             crossing.frequency_hz / 1e6,
-            of(crossing.epsilon),
-            of(crossing.epsilon_first_power)
+            value(crossing.epsilon),
+            value(crossing.epsilon_first_power)
         ));
     }
-    lines.extend(summary.epsilons.iter().flat_map(told_epsilons));
+    lines.extend(summary.epsilons.iter().flat_map(epsilon_lines));
     lines.join("\n")
 }
 
-/// epsilon as each rule chooses it, a line a rule.
-fn told_epsilons(choices: &EpsilonChoices) -> Vec<String> {
-    let at = format!("{}, {:.3} MHz", choices.run_label, choices.frequency_hz / 1e6);
+/// Lines on the choice of epsilon, one for each rule.
+fn epsilon_lines(choices: &EpsilonChoices) -> Vec<String> {
+    let name = format!("{}, {:.3} MHz", choices.run_label, choices.frequency_hz / 1e6);
     let rules = [
         ("crossing of the traces", &choices.crossing),
         ("generalised cross-validation", &choices.cross_validation),
         ("predictive risk", &choices.risk),
         ("L-curve", &choices.l_curve),
     ];
-    let told = |(rule, choice): (&str, &EpsilonChoice)| {
+    let line = |(rule, choice): (&str, &EpsilonChoice)| {
         let chosen = choice.epsilon.map_or_else(|| "none".to_owned(), |epsilon| format!("{epsilon:.2e}"));
         let open = choice.range.filter(|[low, high]| low < high);
         let open =
@@ -206,7 +206,7 @@ fn told_epsilons(choices: &EpsilonChoices) -> Vec<String> {
         let note = choice.note.as_ref().map_or_else(String::new, |note| format!(" ({note})"));
         format!("epsilon by {rule}: {chosen}{open}{note}")
     };
-    std::iter::once(format!("{at}: V'N^-1V is {:.3e} per datum", choices.power_per_datum))
-        .chain(rules.map(told))
+    std::iter::once(format!("{name}: V'N^-1V is {:.3e} per datum", choices.power_per_datum))
+        .chain(rules.map(line))
         .collect()
 }

@@ -14,26 +14,27 @@ use super::interrupt::Interrupt;
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::serve::{Client, ClientError, Screen, ServeAddress};
 
-/// Where `--serve 8080` serves.
+/// Default address, that of `--serve 8080`.
 const ADDRESS: &str = "127.0.0.1:8080";
 
-/// Interval between two looks at the server.
-const LOOK_EVERY: Duration = Duration::from_millis(500);
+/// Interval between two requests of the status.
+const STATUS_EVERY: Duration = Duration::from_millis(500);
 
-/// Longest wait for a key.
-const POLL: Duration = Duration::from_millis(100);
+/// Time limit of a wait for a key, and interval of checks for the terminal.
+const KEY_WAIT: Duration = Duration::from_millis(100);
 
-/// How long the end may take after a signal, or after the terminal has gone; and the code to exit with then, as after SIGHUP.
+/// Time limit for the end of the process after a signal, or after the terminal is gone.
 const END_WITHIN: Duration = Duration::from_secs(1);
-const HUNG_UP: i32 = 129;
+/// Exit code after that limit, as after SIGHUP.
+const HANGUP_CODE: i32 = 129;
 
-/// Width and height of a frame that is printed, characters; empty lines at its end are left out.
+/// Width and height of a printed frame, characters; trailing empty lines are left out.
 const PRINTED: (u16, u16) = (120, 50);
 
 /// Show a running command in this terminal.
 ///
 /// Shows what `run`, `replay` or `simulate` serves with `--serve`: stages with their queues, the ledger, reception, maps and
-/// their correlation with the input. It only looks. q or Ctrl-C ends it, and the run goes on.
+/// their correlation with the input. It is read-only. q or Ctrl-C ends it, and the run continues.
 ///
 /// Example: lunarray top 8080
 #[derive(Debug, Args)]
@@ -49,7 +50,7 @@ pub(super) struct TopArgs {
     json: bool,
 }
 
-/// An address as `--serve` takes it, or as it prints it.
+/// Parses an address in the form that `--serve` accepts or prints.
 fn address(text: &str) -> Result<ServeAddress, String> {
     let bare = text.strip_prefix("http://").unwrap_or(text);
     bare.trim_end_matches('/').parse().map_err(|error: crate::serve::ServeError| error.to_string())
@@ -61,11 +62,11 @@ pub(super) fn execute(args: &TopArgs) -> CommandResult {
         print_json_line(&client.json("/api/status")?)?;
         return Ok(Completion::Done);
     }
-    let first = ServerSnapshot::of(&client, 0)?;
+    let first = ServerSnapshot::request(&client, 0)?;
     let mut screen = Screen { address: client.address(), ..Screen::default() };
     first.show(&mut screen);
     if args.once {
-        print_text(&printed(&screen))?;
+        print_text(&frame_text(&screen))?;
         return Ok(Completion::Done);
     }
     if !std::io::stdout().is_terminal() {
@@ -75,52 +76,52 @@ pub(super) fn execute(args: &TopArgs) -> CommandResult {
     }
     let interrupt = Interrupt::default();
     interrupt.arm_or_note();
-    let (ask, asked) = channel();
-    let (answer, answers) = channel();
-    // It ends with the channels, or with the process: a server that does not answer holds up nothing.
-    std::thread::spawn(move || poll(&client, &asked, &answer));
+    let (request_sender, requests) = channel();
+    let (reply_sender, replies) = channel();
+    // The thread ends with the channels or the process, so that a server that does not respond delays nothing.
+    std::thread::spawn(move || poll_server(&client, &requests, &reply_sender));
     end_with_terminal(&interrupt);
-    let watched = {
-        let mut terminal = Restored(ratatui::try_init()?);
-        watch(&mut terminal.0, &mut screen, &interrupt, &ask, &answers)
+    let result = {
+        let mut terminal = TerminalGuard(ratatui::try_init()?);
+        show_until_quit(&mut terminal.0, &mut screen, &interrupt, &request_sender, &replies)
     };
-    watched?;
+    result?;
     Ok(interrupt.completion(interrupt.cancel().is_cancelled()))
 }
 
-/// Ends the process once its terminal is gone, or a signal has come and nothing has followed of it: waiting for a key may never end then.
+/// Exits the process soon after the terminal is gone or a signal has arrived, as waiting for a key may block forever.
 fn end_with_terminal(interrupt: &Interrupt) {
     let cancel = interrupt.cancel().clone();
     std::thread::spawn(move || {
         while !cancel.is_cancelled() && std::io::stdout().is_terminal() {
-            std::thread::sleep(POLL);
+            std::thread::sleep(KEY_WAIT);
         }
         std::thread::sleep(END_WITHIN);
-        std::process::exit(HUNG_UP);
+        std::process::exit(HANGUP_CODE);
     });
 }
 
-/// A terminal that is as it was before, once dropped.
-struct Restored(ratatui::DefaultTerminal);
+/// Restores the terminal when dropped.
+struct TerminalGuard(ratatui::DefaultTerminal);
 
-impl Drop for Restored {
+impl Drop for TerminalGuard {
     fn drop(&mut self) {
-        // There is nobody to tell.
         let _ = ratatui::try_restore();
     }
 }
 
-/// The state of a run, as its server tells it at one time.
+/// Replies of a server.
 struct ServerSnapshot {
     status: Value,
-    /// Of the channel at this place in the list.
+    /// `/api/figures` of the selected channel; null without channels.
     figures: Value,
 }
 
 impl ServerSnapshot {
-    fn of(client: &Client, place: usize) -> Result<Self, ClientError> {
+    /// Requests the status, and the figures of the channel at `channel_index` in it.
+    fn request(client: &Client, channel_index: usize) -> Result<Self, ClientError> {
         let status = client.json("/api/status")?;
-        let channel = &status["channels"][place]["channel"];
+        let channel = &status["channels"][channel_index]["channel"];
         let figures = match channel.as_u64() {
             Some(channel) => client.json(&format!("/api/figures/{channel}"))?,
             None => Value::Null,
@@ -130,71 +131,76 @@ impl ServerSnapshot {
 
     fn show(self, screen: &mut Screen) {
         let Self { status, figures } = self;
-        *screen = Screen { status, figures, lost: None, ..std::mem::take(screen) };
+        *screen = Screen { status, figures, disconnected_because: None, ..std::mem::take(screen) };
     }
 }
 
-/// Looks at the server again and again, at the channel that was asked for last.
-fn poll(client: &Client, asked: &Receiver<usize>, answer: &Sender<Result<ServerSnapshot, ClientError>>) {
-    let mut place = 0;
+/// Polls the server with the channel index that was requested last.
+fn poll_server(
+    client: &Client,
+    requests: &Receiver<usize>,
+    replies: &Sender<Result<ServerSnapshot, ClientError>>,
+) {
+    let mut channel_index = 0;
     loop {
-        match asked.recv_timeout(LOOK_EVERY) {
-            Ok(wanted) => place = wanted,
+        match requests.recv_timeout(STATUS_EVERY) {
+            Ok(requested) => channel_index = requested,
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => return,
         }
-        if answer.send(ServerSnapshot::of(client, place)).is_err() {
+        if replies.send(ServerSnapshot::request(client, channel_index)).is_err() {
             return;
         }
     }
 }
 
-/// Draws until a key or a signal ends it.
-fn watch(
+/// Draws the screen until a key or a signal ends it.
+fn show_until_quit(
     terminal: &mut ratatui::DefaultTerminal,
     screen: &mut Screen,
     interrupt: &Interrupt,
-    ask: &Sender<usize>,
-    answers: &Receiver<Result<ServerSnapshot, ClientError>>,
+    requests: &Sender<usize>,
+    replies: &Receiver<Result<ServerSnapshot, ClientError>>,
 ) -> std::io::Result<()> {
     terminal.draw(|frame| screen.draw(frame))?;
     while !interrupt.cancel().is_cancelled() {
-        let mut is_new = false;
-        for answer in answers.try_iter() {
-            is_new = true;
-            match answer {
-                Ok(look) => look.show(screen),
-                Err(ClientError::Connection { source, .. }) => screen.lost = Some(source.to_string()),
-                Err(error) => screen.lost = Some(error.to_string()),
+        let mut is_changed = false;
+        for reply in replies.try_iter() {
+            is_changed = true;
+            match reply {
+                Ok(snapshot) => snapshot.show(screen),
+                Err(ClientError::Connection { source, .. }) => {
+                    screen.disconnected_because = Some(source.to_string());
+                }
+                Err(error) => screen.disconnected_because = Some(error.to_string()),
             }
         }
-        if event::poll(POLL)? {
-            is_new = true;
+        if event::poll(KEY_WAIT)? {
+            is_changed = true;
             if let Event::Key(key) = event::read()? {
                 match action(key) {
                     Action::Quit => return Ok(()),
-                    Action::Channel(by) => {
-                        let channels = screen.status["channels"].as_array().map_or(0, Vec::len);
-                        screen.place = screen.place.saturating_add_signed(by).min(channels.saturating_sub(1));
-                        // The thread has gone only if it panicked, which it has said.
-                        let _ = ask.send(screen.place);
+                    Action::Channel(step) => {
+                        let last = screen.status["channels"].as_array().map_or(0, Vec::len).saturating_sub(1);
+                        screen.channel_index = screen.channel_index.saturating_add_signed(step).min(last);
+                        // This fails only if the thread has panicked, which has been reported.
+                        let _ = requests.send(screen.channel_index);
                     }
                     Action::Nothing => {}
                 }
             }
         }
-        if is_new {
+        if is_changed {
             terminal.draw(|frame| screen.draw(frame))?;
         }
     }
     Ok(())
 }
 
-/// What a key does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Action {
     Quit,
-    /// So many channels on.
+    /// Move the selection by this many channels.
     Channel(isize),
     Nothing,
 }
@@ -205,7 +211,7 @@ fn action(key: KeyEvent) -> Action {
     }
     match key.code {
         KeyCode::Char('q') | KeyCode::Esc => Action::Quit,
-        // A terminal that passes on all keys makes no signal of it.
+        // In raw mode, Ctrl-C arrives as a key and not as SIGINT.
         KeyCode::Char('c') if key.modifiers.contains(KeyModifiers::CONTROL) => Action::Quit,
         KeyCode::Left | KeyCode::Up => Action::Channel(-1),
         KeyCode::Right | KeyCode::Down => Action::Channel(1),
@@ -214,13 +220,14 @@ fn action(key: KeyEvent) -> Action {
 }
 
 /// A frame as lines of text.
-fn printed(screen: &Screen) -> String {
+fn frame_text(screen: &Screen) -> String {
     let (width, height) = PRINTED;
+    // A `TestBackend` draws into memory; its errors are `Infallible`.
     let Ok(mut terminal) = Terminal::new(TestBackend::new(width, height));
     let Ok(_) = terminal.draw(|frame| screen.draw(frame));
     let buffer = terminal.backend().buffer();
     let line = |y| (0..width).filter_map(|x| Some(buffer.cell((x, y))?.symbol())).collect::<String>();
-    // The last line names keys.
+    // The last line lists the keys, which have no effect here.
     let lines: Vec<String> = (0..height - 1).map(|y| line(y).trim_end().to_owned()).collect();
     lines.join("\n").trim_end().to_owned()
 }

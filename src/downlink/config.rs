@@ -11,7 +11,7 @@ use crate::units::{Checks, InvalidValue, keys};
 /// Smallest packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
 
-/// Maximum number of idle frames before a pass: a megabyte.
+/// Maximum number of idle frames before a pass: about a megabyte.
 const IDLE_FRAMES_MAX: u32 = 1_000;
 
 keys! {
@@ -40,23 +40,23 @@ keys! {
 }
 
 impl DownlinkConfig {
-    /// All invalid values; empty for a valid configuration.
+    /// The invalid values; empty for a valid configuration.
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::new("downlink");
         let bytes = self.packet_bytes_max;
-        let good = (PACKET_BYTES_MIN..=PACKET_BYTES_MAX).contains(&bytes);
-        checks.require("packet_bytes_max", bytes, good, "256 to 65542");
+        let is_valid = (PACKET_BYTES_MIN..=PACKET_BYTES_MAX).contains(&bytes);
+        checks.require("packet_bytes_max", bytes, is_valid, "256 to 65542");
         checks.require("repeat_bytes", self.repeat_bytes, self.repeat_bytes >= 1 << 16, "at least 65536");
         let interleave = self.interleave;
         checks.require("interleave", interleave, INTERLEAVES.contains(&interleave), "1, 2, 3, 4, 5 or 8");
         checks.require("idle_frames", self.idle_frames, self.idle_frames <= IDLE_FRAMES_MAX, "at most 1000");
         let rate = self.rate_bits_per_s_max;
-        checks.number("rate_bits_per_s_max", rate, rate >= 0.0, "bits a second, or 0 for no limit");
-        let mut found = checks.finish();
-        found.extend(self.link.problems(self.format));
-        found
+        checks.number("rate_bits_per_s_max", rate, rate >= 0.0, "bits per second, or 0 for no limit");
+        let mut problems = checks.finish();
+        problems.extend(self.link.problems(self.format));
+        problems
     }
 
     /// The Reed-Solomon code of the frames; `None` for plain packets.
@@ -76,7 +76,7 @@ impl DownlinkConfig {
         }
     }
 
-    /// Rate available to visibilities, without headers and coding, bytes/s; `None` for no limit.
+    /// Rate available to visibilities, without headers and coding, bytes per second; `None` for no limit.
     #[must_use]
     #[doc(hidden)]
     pub fn payload_bytes_per_s(&self) -> Option<f64> {

@@ -43,26 +43,26 @@ pub enum DownlinkError {
         source: io::Error,
     },
     /// The file is empty.
-    #[error("{}: the file is empty; expected CCSDS space packets as `lunarray simulate` writes them", path.display())]
-    Empty {
+    #[error("{}: the file is empty; expected CCSDS space packets, as `lunarray simulate` writes them", path.display())]
+    EmptyFile {
         /// The file.
         path: PathBuf,
     },
     /// The stream describes a second instrument.
     #[error(
-        "at byte {offset} of the packets: the description of another instrument than that of the packets before it; \
-        expected one mission per replay and state"
+        "at byte {offset} of the packets: the description of another instrument than before; expected packets of one \
+        instrument in a replay and in a state"
     )]
     OtherInstrument {
         /// Offset in the stream, bytes.
         offset: u64,
     },
-    /// Two states hold the same visibilities.
+    /// Two states contain the same packet.
     #[error(
-        "the packet of APID {apid:#x} and count {count} is in the sums of both; expected states of different packets: \
-         replay the files of one into the other"
+        "the packet with APID {apid:#x} and count {count} is in the sums of both; expected states without common packets: \
+         replay the files of one into the other instead"
     )]
-    TakenTwice {
+    DuplicatePacket {
         /// Application process identifier.
         apid: u16,
         /// Packet count.
@@ -73,9 +73,9 @@ pub enum DownlinkError {
     Socket(#[from] crate::downlink::transport::socket::SocketError),
     /// The input of the link simulator is damaged already.
     #[error(
-        "at byte {offset}: no sound frame or packet; expected an undamaged downlink, as `lunarray simulate` writes it"
+        "at byte {offset}: no valid frame or packet; expected an undamaged downlink, as `lunarray simulate` writes it"
     )]
-    Unsound {
+    DamagedInput {
         /// Offset in the downlink, bytes.
         offset: u64,
     },
@@ -87,13 +87,13 @@ pub enum DownlinkError {
         /// The error.
         source: Box<DownlinkError>,
     },
-    /// The files differ in format.
+    /// The inputs differ in format, and one of them cannot be read twice.
     #[error(
-        "{} and {} are of different formats (packets, and coded frames of packets), and one is no file that can be read twice; expected \
-         files, or one format",
+        "{} and {} have different formats (packets and coded frames), and one of them, such as a pipe, can be read only once; expected \
+         regular files, or a single format",
         other.display(), path.display()
     )]
-    Mixed {
+    MixedFormats {
         /// The file.
         path: PathBuf,
         /// An earlier file, of the other format.
@@ -101,8 +101,8 @@ pub enum DownlinkError {
     },
     /// A followed file was removed, truncated or replaced.
     #[error(
-        "{}: after {read} bytes of it were read, the file was removed, cut short or replaced by another; expected it to \
-         grow. Replay what is there now beside what was there, with --state",
+        "{}: the file was removed, truncated or replaced after {read} bytes had been read; expected it to grow. Replay \
+         the new content into the same --state",
         path.display()
     )]
     Replaced {
@@ -111,9 +111,9 @@ pub enum DownlinkError {
         /// Bytes that had been read.
         read: u64,
     },
-    /// A followed file is packed.
-    #[error("{}: a packed file (gzip, zstd) cannot be followed as it grows; expected one that is complete, without --follow", path.display())]
-    Packed {
+    /// A followed file is compressed.
+    #[error("{}: a compressed file (gzip, zstd) cannot be followed as it grows; expected a complete file without --follow", path.display())]
+    Compressed {
         /// The file.
         path: PathBuf,
     },
@@ -123,39 +123,38 @@ pub enum DownlinkError {
         /// The file.
         path: PathBuf,
     },
-    /// The file holds no downlink packet.
+    /// The file contains no downlink packet.
     #[error(
         "{}: no downlink in {bytes} bytes: {}; expected CCSDS space packets with APIDs 0x101 to \
          0x105 and CUC times (P-field 0x1F), plain or in CADUs of AOS frames, as `lunarray simulate` writes them",
-        path.display(), name.as_deref().unwrap_or("no packet that could be one of it")
+        path.display(), format.as_deref().unwrap_or("no packet was found")
     )]
-    Foreign {
+    NotADownlink {
         /// The file.
         path: PathBuf,
-        /// Bytes read of it.
+        /// Bytes read.
         bytes: u64,
-        /// What it is, if that is known.
-        name: Option<String>,
+        /// The detected format, if it is known.
+        format: Option<String>,
     },
 }
 
 impl DownlinkError {
-    /// Adds the file that the error concerns.
     pub(crate) fn at(self, path: &std::path::Path) -> Self {
         Self::At { path: path.to_owned(), source: Box::new(self) }
     }
 }
 
-/// Requires that a file of `bytes` bytes held a packet; otherwise `name` gives its kind.
+/// Requires a packet in a file of `bytes` bytes; `detect_format` gives the format for the error.
 pub(crate) fn require_packets(
     path: &std::path::Path,
     bytes: u64,
     packets: u64,
-    name: impl FnOnce() -> Option<String>,
+    detect_format: impl FnOnce() -> Option<String>,
 ) -> Result<(), DownlinkError> {
     match (bytes, packets) {
-        (0, _) => Err(DownlinkError::Empty { path: path.to_owned() }),
-        (_, 0) => Err(DownlinkError::Foreign { path: path.to_owned(), bytes, name: name() }),
+        (0, _) => Err(DownlinkError::EmptyFile { path: path.to_owned() }),
+        (_, 0) => Err(DownlinkError::NotADownlink { path: path.to_owned(), bytes, format: detect_format() }),
         _ => Ok(()),
     }
 }

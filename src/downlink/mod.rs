@@ -10,30 +10,29 @@
 //! Nothing but these bytes passes from the spacecraft to the ground. Bad data is counted; it is never an error.
 //!
 //! # Layers
-//! From the payload down. Each layer exchanges bytes with its neighbours and knows nothing else about them.
+//! From the payload down; neighbouring layers exchange only bytes.
 //!
 //! | layer | standard | here |
 //! |---|---|---|
-//! | payload: records and arrays | own, versioned | `wire::payload` |
+//! | payload: records and arrays | none: our own, versioned | `wire::payload` |
 //! | space packet, time code | CCSDS 133.0-B, 301.0-B | [`Packetizer`], [`PacketReceiver`] |
 //! | transfer frame, Reed-Solomon, randomizer, sync marker | CCSDS 732.0-B, 131.0-B | [`wire::cadu`], [`receive::cadu`] |
-//! | either format | | [`Transmission`], [`Intake`] |
+//! | either format | | [`Transmission`], [`DownlinkReceiver`] |
 //! | every packet once, across files and sessions | | [`crate::ground::Collector`] |
 //! | file | | [`DownlinkWriter`], [`DownlinkReader`], [`Contents`] |
 //! | socket | | [`transport::socket`] |
 //!
 //! The frame layer takes the bytes that [`Packetizer::encode`] appends and passes recovered packets to
-//! [`PacketReceiver::push`]. It adds and removes idle packets by itself.
+//! [`PacketReceiver::push`]. It adds and removes idle packets itself.
 //!
 //! # A packet
 //! `docs/packets.md` specifies packets and their payloads to the byte. Each packet of visibilities can be decoded alone; other
-//! payloads are segmented if they exceed a packet. The count of packets has 46 bits and never wraps, so a gap is never ambiguous.
+//! payloads are segmented if they exceed a packet. The packet count has 46 bits and never wraps, so a gap is never ambiguous.
+//! The header has its own checksum, so the kind, time and count of a damaged packet are known.
 //!
-//! A pass begins, after the instrument description, and ends with a report of the spacecraft's counts (housekeeping) at its end,
-//! so that a pass that is cut short still tells how much it held. The reports of the last pass hold until 2^32 s, the end of the
-//! range of times: a ledger is complete only with one of them.
-//!
-//! The header has a checksum of its own, so that the loss of a damaged packet has a kind, a time and a count.
+//! A pass begins, after the instrument description, and ends with a report of the spacecraft's counts (housekeeping). Both
+//! reports are equal, so a truncated pass still tells how much it held. The reports of the last pass are valid until 2^32 s,
+//! the end of the time range: a ledger is complete only with one of them.
 
 mod config;
 pub(crate) mod error;
@@ -50,12 +49,12 @@ pub use error::DownlinkError;
 pub use receive::ReceptionCounters;
 pub use receive::inspect::Contents;
 #[doc(hidden)]
-pub use receive::{Decoder, Era, Event, Intake, PacketReceiver, ReceivedSet};
+pub use receive::{Decoder, DownlinkReceiver, Era, Event, PacketReceiver, ReceivedSet};
 pub use transport::{DownlinkReader, DownlinkWriter, FileSource};
 #[doc(hidden)]
 pub use transport::{Pace, PacedSource, Recorder, Steps, Transmitter};
 #[doc(hidden)]
 pub use wire::{
-    CucTime, FORMAT_VERSION, Format, HEADER_BYTES, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,
+    CucTime, FORMAT_VERSION, Format, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment,
     Packetizer, TRAILER_BYTES, Transmission,
 };

@@ -3,18 +3,18 @@
 use crate::units::MissionTime;
 use crate::units::vector::Vec3;
 
-/// Positions of all satellites at equal steps over an interval without manoeuvres.
+/// Positions of all satellites at equal time steps over an interval without manoeuvres.
 ///
-/// The motion is smooth within a segment; interpolation never crosses its ends.
+/// The motion is smooth within a segment, and interpolation never crosses its ends.
 #[derive(Clone, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct EphemerisSegment {
     /// Time of the first node.
     pub start: MissionTime,
-    /// Distance of the nodes, us; positive.
+    /// Time between nodes, us; positive.
     pub step_ticks: u32,
     /// Number of satellites.
     pub satellites: u8,
-    /// Positions, m, Moon-centred ecliptic axes: node after node, `satellites` each.
+    /// Positions, m, Moon-centred with ecliptic axes: `satellites` positions for each node.
     pub positions_m: Vec<Vec3>,
 }
 

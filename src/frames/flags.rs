@@ -1,15 +1,15 @@
-//! Flags of a visibility.
+//! Flags of visibilities.
 
 use super::VisibilityReason;
 
-/// Why a visibility should not be used; a set of bits, 0 for a good one.
+/// The flags of a visibility: why it should not be used. A set of bits, 0 for a good visibility.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Flags(pub u8);
 
 impl Flags {
     /// No flag.
     pub const GOOD: Self = Self(0);
-    /// Radio interference.
+    /// Radio-frequency interference.
     #[doc(hidden)]
     pub const INTERFERENCE: Self = Self(1);
     /// Samples are missing for part of the integration.
@@ -18,10 +18,10 @@ impl Flags {
     /// A receiver was saturated.
     #[doc(hidden)]
     pub const SATURATED: Self = Self(4);
-    /// Calibration rejected it.
+    /// Calibration rejected the visibility.
     #[doc(hidden)]
     pub const UNCALIBRATED: Self = Self(8);
-    /// The Earth was in sight of one of the two daughters during part of the integration.
+    /// The Earth was visible from one of the two daughters during part of the integration.
     #[doc(hidden)]
     pub const EARTH: Self = Self(16);
     /// The artificial signal for calibration was on.
@@ -34,7 +34,7 @@ impl Flags {
         self.0 == 0
     }
 
-    /// The reason that the lowest bit stands for; `None` for a good visibility.
+    /// The reason for the lowest bit that is set; `None` for a good visibility.
     #[must_use]
     pub fn reason(self) -> Option<VisibilityReason> {
         match Self(self.0 & self.0.wrapping_neg()) {

@@ -9,17 +9,17 @@ pub enum PlacedFrame {
     Instrument(Instrument),
     /// Calibrated visibilities with the positions of their satellites.
     Visibilities(PlacedVisibilities),
-    /// Visibilities of a channel that is not summed, which are counted instead.
-    Elsewhere(CountedVisibilities),
-    /// The spacecraft's own counts up to a time.
+    /// Number of visibilities of a channel that is not mapped.
+    NotMapped(CountedVisibilities),
+    /// The spacecraft's counts up to a time.
     Housekeeping(Housekeeping),
 }
 
-/// Visibilities of which only their number matters.
+/// A number of visibilities, in place of the visibilities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CountedVisibilities {
-    /// Mission time of the middle of the first, s.
+    /// Mission time of the middle of the first visibility, s.
     pub first_s: f64,
-    /// How many.
+    /// Number of visibilities.
     pub visibilities: u64,
 }

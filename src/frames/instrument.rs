@@ -1,4 +1,4 @@
-//! The instrument description: all that the ground knows of the array, except its ephemeris.
+//! The instrument description: everything that the ground knows about the array except its ephemeris.
 
 use bincode::de::Decoder;
 use bincode::enc::Encoder;
@@ -25,13 +25,13 @@ pub enum AntennaResponse {
     Isotropic,
     /// A short dipole along the orbit normal: A = 1 - (n . w)^2, fixed in the body frame.
     DipoleNormal,
-    /// Three short dipoles across each other, the first along the orbit normal, each with a receiver: the mean of the correlations of
-    /// like dipoles, times 3/2. A = 1 for satellites of one attitude.
+    /// Three orthogonal short dipoles, the first along the orbit normal, each with a receiver: the mean of the correlations of
+    /// equal dipoles, times 3/2. A = 1 for satellites of one attitude.
     ThreeDipoles,
 }
 
 impl AntennaResponse {
-    /// Receivers whose correlations are averaged.
+    /// Number of receivers whose correlations are averaged.
     #[must_use]
     #[doc(hidden)]
     pub fn receivers(self) -> u8 {
@@ -41,7 +41,7 @@ impl AntennaResponse {
         }
     }
 
-    /// Degree of the response of two such antennas as a polynomial in the direction, whatever their attitudes.
+    /// Degree of the response of two such antennas as a polynomial in the direction, for any attitudes.
     #[must_use]
     #[doc(hidden)]
     pub fn degree(self) -> usize {
@@ -52,7 +52,7 @@ impl AntennaResponse {
     }
 }
 
-/// A spectrometer: one more satellite, which measures the total power of the sky in adjacent channels.
+/// A spectrometer: an additional satellite that measures the total power of the sky in adjacent channels.
 #[derive(Clone, Copy, Debug, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct Spectrometer {
     /// Lowest frequency of the first channel, Hz.
@@ -64,13 +64,13 @@ pub struct Spectrometer {
 }
 
 impl Spectrometer {
-    /// Channel `k`.
+    /// The channel with index `k`.
     #[must_use]
     pub fn channel(&self, k: u16) -> Channel {
         Channel { frequency_hz: self.low_hz + (f64::from(k) + 0.5) * self.width_hz, width_hz: self.width_hz }
     }
 
-    /// All of them.
+    /// All channels.
     pub fn channels(&self) -> impl Iterator<Item = Channel> {
         (0..self.channels).map(|k| self.channel(k))
     }
@@ -95,18 +95,18 @@ pub struct Instrument {
     pub seed: u64,
     /// Hash of the space segment's configuration; 0 for real data.
     pub configuration_hash: u64,
-    /// Spectrometer, if any: the satellite after those that are correlated, with the channels after theirs.
+    /// The spectrometer, if there is one. It has the satellite number and the channel numbers that follow the last ones.
     pub spectrometer: Option<Spectrometer>,
-    /// Whether a simulation left thermal noise out.
+    /// Whether the data are simulated without thermal noise.
     pub noiseless: bool,
 }
 
-/// Added to the code of an antenna response by a simulation without thermal noise.
+/// Bit of the code of an antenna response that means a simulation without thermal noise.
 const NOISELESS: u8 = 128;
 
 impl Instrument {
-    /// Antenna response and whether there is thermal noise, in one byte of packets and of states: 0 (isotropic), 1 (dipole) or 2
-    /// (three dipoles), plus 128 without noise.
+    /// Code of the antenna response in packets and states: 0 (isotropic), 1 (dipole) or 2 (three dipoles), plus 128 for a
+    /// simulation without thermal noise.
     #[must_use]
     #[doc(hidden)]
     pub fn response_code(&self) -> u8 {
@@ -118,10 +118,11 @@ impl Instrument {
         response | if self.noiseless { NOISELESS } else { 0 }
     }
 
-    /// What [`Instrument::response_code`] stands for; `None` if nothing has that code.
+    /// Decodes [`Instrument::response_code`]: the antenna response, and whether there is no thermal noise. `None` for an unknown
+    /// code.
     #[must_use]
     #[doc(hidden)]
-    pub fn response_of_code(code: u8) -> Option<(AntennaResponse, bool)> {
+    pub fn decode_response(code: u8) -> Option<(AntennaResponse, bool)> {
         let response = match code & !NOISELESS {
             0 => AntennaResponse::Isotropic,
             1 => AntennaResponse::DipoleNormal,
@@ -137,14 +138,14 @@ impl Instrument {
         self.channels.iter().map(|channel| channel.frequency_hz).collect()
     }
 
-    /// The channel in which `pair` measures; `None` if it has no such channel.
+    /// The channel of a pair; `None` if the pair has no such channel.
     #[must_use]
     #[doc(hidden)]
     pub fn channel_of(&self, channel: ChannelId, pair: Pair) -> Option<Channel> {
         let index = usize::from(channel.0);
         if !self.is_spectrum(pair) {
-            let daughters = pair.i.max(pair.j) < self.satellites;
-            return self.channels.get(index).copied().filter(|_| daughters);
+            let is_of_daughters = pair.i.max(pair.j) < self.satellites;
+            return self.channels.get(index).copied().filter(|_| is_of_daughters);
         }
         let spectrometer = self.spectrometer.as_ref()?;
         let k = u16::try_from(index.checked_sub(self.channels.len())?).ok()?;
@@ -172,7 +173,7 @@ impl<C> Decode<C> for Instrument {
         let (name, epoch_tai_s, moon_radius_m, satellites, channels) = Decode::decode(from)?;
         let (code, seed, configuration_hash, spectrometer) = Decode::decode(from)?;
         let (response, noiseless) =
-            Self::response_of_code(code).ok_or(DecodeError::Other("an unknown antenna response"))?;
+            Self::decode_response(code).ok_or(DecodeError::Other("an unknown antenna response"))?;
         Ok(Self {
             name,
             epoch_tai_s,

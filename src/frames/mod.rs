@@ -1,7 +1,7 @@
-//! Data that travels between stages, and the reasons for which it does not reach the result.
+//! The data that pass between stages, and the reasons why some do not reach the result.
 //!
-//! Uses [`crate::units`] only. These are plain data. Their invariants are checked where the data enters: by the
-//! configuration on the spacecraft, by the decoder on the ground.
+//! Uses [`crate::units`] only. These are plain data. Their invariants are checked where they enter: by the configuration on
+//! the spacecraft, by the decoder on the ground.
 
 mod ephemeris;
 mod flags;
@@ -30,7 +30,7 @@ pub use samples::{SampleBlock, Samples, SpaceFrame};
 pub use visibility::AutoPower;
 pub use visibility::{PlacedVisibilities, UnequalLengths, VisibilityBlock};
 
-/// Frames that the ground reads from a downlink, in the order in which they were sent.
+/// A frame that the ground reads from a downlink.
 #[derive(Clone, Debug, PartialEq)]
 pub enum GroundFrame {
     /// The instrument description; the first frame of every downlink.
@@ -47,7 +47,7 @@ pub enum GroundFrame {
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[doc(hidden)]
 pub struct ObservingWindow {
-    /// Number of the window since the mission epoch; one an orbit.
+    /// Number of the window since the mission epoch, with one window per orbit.
     pub index: u64,
     /// First instant.
     pub start: crate::units::MissionTime,

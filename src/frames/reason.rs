@@ -1,25 +1,25 @@
-//! Why samples and visibilities do not reach the result: the entries of the two ledgers.
+//! The reasons why samples and visibilities do not reach the result: the entries of the two ledgers.
 
 use crate::units::Reason;
 
-/// Why a visibility is not in the sums.
+/// Why a visibility is not in the map.
 ///
-/// Checkpoints store a reason as its place in this list: append new ones at the end, and change the version of
-/// checkpoints when one goes.
+/// Checkpoints store the index of a reason in this list: append new reasons at the end, and change the version of checkpoints
+/// when one is removed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, bincode::Encode, bincode::Decode)]
 #[non_exhaustive]
 pub enum VisibilityReason {
-    /// Its flags name radio interference.
+    /// It is flagged: radio-frequency interference.
     Interference,
-    /// Its flags say that samples are missing for part of the integration.
+    /// It is flagged: samples are missing for part of the integration.
     Incomplete,
-    /// Its flags say that a receiver was saturated.
+    /// It is flagged: a receiver was saturated.
     Saturated,
-    /// Its flags say that calibration rejected it.
+    /// It is flagged: calibration rejected it.
     Uncalibrated,
     /// It has a flag that this version does not know.
     UnknownFlag,
-    /// Its block has been used already.
+    /// Its block was used before.
     Duplicate,
     /// No instrument description has its channel.
     NoInstrument,
@@ -27,17 +27,17 @@ pub enum VisibilityReason {
     NoEphemeris,
     /// A gain is zero, not finite, or out of range.
     UnusableGain,
-    /// An auto-correlation, where none are kept.
+    /// It is an auto-correlation, and none are kept.
     Auto,
-    /// An auto-correlation, and the table of them is full.
+    /// It is an auto-correlation, and the table of auto-correlations is full.
     AutoTableFull,
-    /// An auto-correlation of an integration that has one already.
+    /// It is a second auto-correlation of an integration.
     AutoRepeated,
     /// Its baseline is longer than the configuration of the map allows.
     BaselineBeyondMap,
     /// The engine refused it: a position is not finite.
     PositionNotFinite,
-    /// The engine refused it: its satellites are in one place, or opposite each other.
+    /// The engine refused it: its satellites are at the same position, or opposite each other.
     NoDirection,
     /// The engine refused it: the plane of its satellites is not that of the orbit.
     OutOfPlane,
@@ -45,37 +45,37 @@ pub enum VisibilityReason {
     OffAltitude,
     /// The engine refused it: one satellite is much higher than the other.
     UnequalAltitudes,
-    /// The engine refused it: its baseline is longer than the engine was made for.
+    /// The engine refused it: its baseline is longer than the engine supports.
     BaselineBeyondEngine,
     /// The engine refused it: its value or weight cannot be summed.
     ValueNotFinite,
-    /// The engine refused it: its weight (too great, or so small that it vanishes in the sums), or its value in units of its noise, is out of the range of the sums.
+    /// The engine refused it: its weight, or its value in units of its noise, is outside the range of the sums.
     WeightOutOfRange,
-    /// The engine refused it: the sums have no room for more weight, or no more visibilities are held for refinement.
+    /// The engine refused it: the sums have reached their maximum weight, or refinement its maximum number of visibilities.
     SumsFull,
     /// The onboard store dropped it.
     StoreFull,
     /// It was sent and did not arrive.
     NotReceived,
-    /// Its packet is missing, and no report says how many visibilities it held: at least one.
+    /// Its packet is missing, and no report has the number of visibilities in it: at least one.
     NotReceivedAtLeast,
-    /// It was received, but its value, weight or duration cannot be used.
+    /// It was received with an invalid value, weight or duration.
     BadValue,
-    /// It arrived after the session was interrupted, which keeps it for the next one.
+    /// It arrived after the session was interrupted, and is kept for the next session.
     NextSession,
-    /// Its flags say that the Earth was in sight of one of its daughters.
+    /// It is flagged: the Earth was visible from one of its daughters.
     EarthInSight,
-    /// Its channel is not among those that are mapped.
+    /// Its channel is not mapped.
     ChannelNotMapped,
-    /// Its flags say that the artificial signal for calibration was on.
+    /// It is flagged: the artificial signal for calibration was on.
     Beacon,
 }
 
 impl VisibilityReason {
-    /// Whether the sums leave visibilities out for it; calibration and reception do for the others.
+    /// Whether the accumulation of the map leaves visibilities out for this reason, not calibration or reception.
     #[must_use]
     #[doc(hidden)]
-    pub fn is_of_sums(self) -> bool {
+    pub fn is_of_accumulation(self) -> bool {
         matches!(
             self,
             Self::BaselineBeyondMap
@@ -148,7 +148,7 @@ impl Reason for VisibilityReason {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum SampleReason {
-    /// The link to the mother had no room, or no time left in the window.
+    /// The link to the mother had no capacity, or no time left in the window.
     LinkOverrun,
     /// Its block arrived after the others had been correlated.
     Late,
@@ -183,15 +183,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_reason_has_its_own_text_and_place_in_checkpoints() {
-        let stored = |place: u8| {
-            let decoded = bincode::decode_from_slice(&[place], bincode::config::standard());
+    fn every_reason_has_a_unique_text_and_a_fixed_index_in_checkpoints() {
+        let stored = |index: u8| {
+            let decoded = bincode::decode_from_slice(&[index], bincode::config::standard());
             decoded.ok().map(|(reason, _): (VisibilityReason, usize)| reason)
         };
         let all: Vec<VisibilityReason> = (0..=250).map_while(stored).collect();
         let texts: BTreeSet<_> = all.iter().map(|reason| (reason.lost_in(), reason.text())).collect();
         assert_eq!(texts.len(), all.len());
-        // Some of the places, so that none moves unseen.
+        // Some fixed indices, so that a change of the order is detected.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
         assert_eq!((all.len(), all[23]), (30, VisibilityReason::NotReceived));
         assert_eq!(all.last(), Some(&VisibilityReason::Beacon));

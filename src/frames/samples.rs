@@ -1,23 +1,23 @@
-//! Samples of the daughters, between them and the mother.
+//! Samples that the daughters send to the mother.
 
 use super::ObservingWindow;
 use crate::units::{ChannelId, MissionTime};
 
-/// Complex baseband samples as planes of real and imaginary parts of equal length.
+/// Complex baseband samples, as separate arrays of real and imaginary parts of equal length.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Samples {
-    /// Floats, sqrt(K sr).
+    /// Floating-point values, sqrt(K sr).
     Float {
         /// Real parts.
         re: Vec<f32>,
         /// Imaginary parts.
         im: Vec<f32>,
     },
-    /// Levels of a quantiser: a code `c` stands for `(c + 1/2) step`.
+    /// Codes of a quantiser: code `c` means `(c + 1/2) step`.
     Codes {
-        /// Bits of a code, 1 to 8, of each of the two parts.
+        /// Bits of a code for each of the two parts, 1 to 8.
         bits: u8,
-        /// Gain state: distance of two levels, sqrt(K sr).
+        /// Quantiser step, which is set by the gain, sqrt(K sr).
         step: f32,
         /// Real parts.
         re: Vec<i8>,
@@ -36,7 +36,7 @@ impl Samples {
         }
     }
 
-    /// Whether there are none.
+    /// Whether there are no samples.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -45,11 +45,11 @@ impl Samples {
     /// Size of the samples on a link, bits.
     #[must_use]
     pub fn bits(&self) -> u64 {
-        let each = match self {
+        let bits_per_part = match self {
             Self::Float { .. } => 32,
             Self::Codes { bits, .. } => u64::from(*bits),
         };
-        2 * each * self.len() as u64
+        2 * bits_per_part * self.len() as u64
     }
 }
 
@@ -60,23 +60,23 @@ pub struct SampleBlock {
     pub channel: ChannelId,
     /// Daughter, from 0.
     pub daughter: u8,
-    /// Number of the block since the start of the window; all blocks but the last of a window are equally long.
+    /// Number of the block since the start of the window. All blocks of a window except the last have the same length.
     pub number: u64,
-    /// Time tag of the first sample, by the mission's time.
+    /// Time tag of the first sample, mission time.
     pub time: MissionTime,
-    /// Real and imaginary parts beyond the quantiser's range.
+    /// Number of real and imaginary parts beyond the quantiser's range.
     pub saturated: u32,
     /// The samples.
     pub samples: Samples,
 }
 
-/// Frames from the daughters to the mother, in order except for what the link drops or delays.
+/// A frame from the daughters to the mother. Frames come in order, unless the link drops or delays them.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SpaceFrame {
-    /// A window begins; before its first block.
+    /// The start of a window, before its first block.
     WindowStart(ObservingWindow),
-    /// Samples of the window: blocks that travel together, any number of them and from any daughter.
+    /// Any number of sample blocks of the window, from any daughters.
     Samples(Vec<SampleBlock>),
-    /// The window has ended; after its last block.
+    /// The end of a window, after its last block.
     WindowEnd(ObservingWindow),
 }

@@ -1,4 +1,4 @@
-//! Integrated visibilities, before and after the ground has assigned positions to them.
+//! Integrated visibilities, with and without the positions of their satellites.
 
 use num_complex::{Complex32, Complex64};
 use thiserror::Error;
@@ -7,21 +7,21 @@ use super::Flags;
 use crate::units::vector::Vec3;
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Arrays of a block of visibilities that are not of one length.
+/// The error of a block of visibilities whose arrays differ in length.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-#[error("a block of {expected} visibilities of satellites {} and {} has {found} values of {name}: expected as many", pair.i + 1, pair.j + 1)]
+#[error("a block of visibilities of satellites {} and {} has {found} values of {name}: expected {expected}, one per visibility", pair.i + 1, pair.j + 1)]
 pub struct UnequalLengths {
     /// Pair of the block.
     pub pair: Pair,
-    /// The array of another length.
+    /// Name of the array with another length.
     pub name: &'static str,
-    /// Its length.
+    /// Length of this array.
     pub found: usize,
     /// The number of visibilities.
     pub expected: usize,
 }
 
-/// Requires arrays, by their names, of the expected length.
+/// Requires that all named arrays have the expected length.
 fn require_lengths<const N: usize>(
     pair: Pair,
     expected: usize,
@@ -35,16 +35,16 @@ fn require_lengths<const N: usize>(
 
 /// Consecutive integrations of one pair in one channel, as the mother produces them.
 ///
-/// Structure of arrays; all arrays have the same length ([`VisibilityBlock::check_lengths`]).
+/// A structure of arrays of equal length ([`VisibilityBlock::check_lengths`]).
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct VisibilityBlock {
     /// Channel.
     pub channel: ChannelId,
     /// Pair.
     pub pair: Pair,
-    /// Time that `offset_ticks` counts from.
+    /// Origin of `offset_ticks`.
     pub start: MissionTime,
-    /// Start of each integration after `start`, us.
+    /// Start of each integration, us after `start`.
     pub offset_ticks: Vec<u32>,
     /// Length of each integration, us.
     pub duration_ticks: Vec<u32>,
@@ -69,10 +69,10 @@ impl VisibilityBlock {
         self.value_k_sr.is_empty()
     }
 
-    /// Requires that all arrays have the same length, as everything that takes blocks does.
+    /// Requires that all arrays have the same length, as all code that uses blocks assumes.
     ///
     /// # Errors
-    /// The array that has not.
+    /// The first array with another length.
     pub fn check_lengths(&self) -> Result<(), UnequalLengths> {
         let Self { pair, offset_ticks, duration_ticks, weight, flags, .. } = self;
         let arrays = [
@@ -84,10 +84,10 @@ impl VisibilityBlock {
         require_lengths(*pair, self.len(), arrays)
     }
 
-    /// Splits the integrations from `at` on off into a block of their own.
+    /// Moves the integrations from index `at` on into a new block.
     ///
     /// # Panics
-    /// If the block is shorter than that.
+    /// If `at` exceeds the length of the block.
     #[must_use]
     #[doc(hidden)]
     pub fn split_off(&mut self, at: usize) -> Self {
@@ -119,24 +119,24 @@ pub struct AutoPower {
     pub daughter: u8,
     /// Centre frequency of the channel or sub-band, Hz.
     pub frequency_hz: f64,
-    /// Its width, Hz.
+    /// Width of the channel or sub-band, Hz.
     pub width_hz: f64,
     /// Middle of the integration, s since the mission epoch.
     pub time_s: f64,
-    /// Mean of |x|^2, K sr: sky and receiver.
+    /// Mean of |x|^2 of sky and receiver, K sr.
     pub power_k_sr: f64,
-    /// Standard deviation of its noise, K sr.
+    /// Standard deviation of the power, K sr.
     pub sigma_k_sr: f64,
 }
 
 /// Calibrated visibilities with the positions of their two satellites, ready for accumulation.
 ///
-/// Structure of arrays; all arrays have the same length ([`PlacedVisibilities::check_lengths`]). Times increase.
+/// A structure of arrays of equal length ([`PlacedVisibilities::check_lengths`]), with increasing times.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlacedVisibilities {
     /// Channel.
     pub channel: ChannelId,
-    /// Sub-band of the channel, from 0, where several make one channel; else 0.
+    /// Index of the sub-band, from 0; 0 for a channel without sub-bands.
     pub band: u16,
     /// Centre frequency of the channel, Hz.
     pub frequency_hz: f64,
@@ -152,7 +152,7 @@ pub struct PlacedVisibilities {
     pub value_k_sr: Vec<Complex64>,
     /// Inverse variance of the real part, (K sr)^-2; positive.
     pub weight: Vec<f64>,
-    /// Length of each integration, s; empty if they are instants.
+    /// Length of each integration, s; empty if integration times are neglected.
     pub duration_s: Vec<f32>,
 }
 
@@ -169,10 +169,10 @@ impl PlacedVisibilities {
         self.time_s.is_empty()
     }
 
-    /// Requires that all arrays have the same length, as everything that takes blocks does; `duration_s` may be empty.
+    /// Requires that all arrays have the same length, as all code that uses blocks assumes; `duration_s` may be empty.
     ///
     /// # Errors
-    /// The array that has not.
+    /// The first array with another length.
     pub fn check_lengths(&self) -> Result<(), UnequalLengths> {
         let Self { pair, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
         let durations = if duration_s.is_empty() { self.len() } else { duration_s.len() };
@@ -186,7 +186,7 @@ impl PlacedVisibilities {
         require_lengths(*pair, self.len(), arrays)
     }
 
-    /// The same channel and pair, with no visibilities.
+    /// A block of the same channel and pair without visibilities.
     #[must_use]
     #[doc(hidden)]
     pub fn without_visibilities(&self) -> Self {
@@ -194,9 +194,9 @@ impl PlacedVisibilities {
         Self { channel, band, frequency_hz, pair, ..Self::default() }
     }
 
-    /// Adds visibility `k` of `other`, which has one.
+    /// Appends visibility `k` of `other`.
     #[doc(hidden)]
-    pub fn push_of(&mut self, other: &Self, k: usize) {
+    pub fn push_from(&mut self, other: &Self, k: usize) {
         self.time_s.push(other.time_s[k]);
         self.r_i_m.push(other.r_i_m[k]);
         self.r_j_m.push(other.r_j_m[k]);
@@ -223,7 +223,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arrays_of_other_lengths_are_named() {
+    fn unequal_lengths_are_reported_with_the_arrays_name() {
         let block = VisibilityBlock {
             pair: Pair { i: 0, j: 4 },
             offset_ticks: vec![0, 5],
@@ -235,10 +235,10 @@ mod tests {
         };
         assert_eq!(block.check_lengths(), Ok(()));
         let wrong = VisibilityBlock { flags: vec![Flags::default()], ..block };
-        let told = wrong.check_lengths().unwrap_err().to_string();
+        let error = wrong.check_lengths().unwrap_err().to_string();
         assert_eq!(
-            told,
-            "a block of 2 visibilities of satellites 1 and 5 has 1 values of flags: expected as many"
+            error,
+            "a block of visibilities of satellites 1 and 5 has 1 values of flags: expected 2, one per visibility"
         );
     }
 }

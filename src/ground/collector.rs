@@ -7,10 +7,11 @@ use super::collector_state::{CollectorState, CollectorView, headers};
 use super::hold_buffer::{HeldPacket, HoldBuffer, IsDue, SendingKey};
 use crate::downlink::error::{DownlinkError, require_packets};
 use crate::downlink::receive::{
-    ByteFeed, Decoder, Event, Intake, PacketInsertion, PacketReading, ReceivedSet, ReceptionCounters,
+    ByteFeed, Decoder, DownlinkReceiver, Event, PacketInsertion, PacketOutcome, ReceivedSet,
+    ReceptionCounters,
 };
 use crate::downlink::wire::payload::visibilities_outline;
-use crate::downlink::wire::{Kind, PacketHeader, PacketSegment};
+use crate::downlink::wire::{PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument, VisibilityBlock};
 
 /// A packet that was delivered.
@@ -21,7 +22,7 @@ pub struct DeliveredPacket {
     /// The checksum of the packet.
     pub checksum: u32,
     /// The contribution of the packet to the counters.
-    pub counts: PacketReading,
+    pub counts: PacketOutcome,
 }
 
 /// Maximum number of intervals in the received set of a kind, some 100 MB. An interval is a run of consecutive counts with the
@@ -61,8 +62,8 @@ pub enum CollectorStep {
 /// once. Until the description of the instrument arrives, no packet can be decoded, and all are held.
 #[derive(Debug)]
 pub struct Collector {
-    intake: Intake,
-    received: [ReceivedSet; Kind::ALL.len()],
+    receiver: DownlinkReceiver,
+    received: [ReceivedSet; PacketKind::ALL.len()],
     held: HoldBuffer,
     decoder: Decoder,
     /// Counts duplicates, damaged bytes and bytes outside packets in this session.
@@ -90,7 +91,7 @@ impl Collector {
     #[must_use]
     pub fn new(wait_bytes: u64) -> Self {
         Self {
-            intake: Intake::unfiltered(),
+            receiver: DownlinkReceiver::unfiltered(),
             received: Default::default(),
             held: HoldBuffer::new(wait_bytes),
             decoder: Decoder::new(),
@@ -123,7 +124,7 @@ impl Collector {
     #[must_use]
     pub fn resume(
         state: CollectorState,
-        delivered: impl Iterator<Item = (Kind, SendingKey)>,
+        delivered: impl Iterator<Item = (PacketKind, SendingKey)>,
         counters: ReceptionCounters,
     ) -> Self {
         let CollectorState { held, decoder } = state;
@@ -150,18 +151,18 @@ impl Collector {
 
     /// Appends the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
-        self.intake.push(bytes);
+        self.receiver.push(bytes);
     }
 
     /// Ends the stream.
     pub fn finish(&mut self) {
-        self.intake.finish();
+        self.receiver.finish();
     }
 
     /// Bytes received in this session.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.intake.bytes()
+        self.receiver.bytes()
     }
 
     /// The next delivery; `None` until more bytes arrive.
@@ -231,7 +232,7 @@ impl Collector {
     /// A file that cannot be read, is empty, or holds no packet of this format.
     pub fn read_file(&mut self, path: &Path, take: &mut dyn FnMut(Delivery)) -> Result<(), DownlinkError> {
         let mut file = ByteFeed::open(path)?;
-        while file.feed(&mut self.intake)? {
+        while file.feed(&mut self.receiver)? {
             while let Some(found) = self.next_delivery(&|_| true)? {
                 take(found);
             }
@@ -248,7 +249,7 @@ impl Collector {
     /// A file that cannot be read.
     pub fn instrument_of(path: &Path) -> Result<Option<Instrument>, DownlinkError> {
         let (mut file, mut collector) = (ByteFeed::open(path)?, Self::new(0));
-        while file.feed(&mut collector.intake)? {
+        while file.feed(&mut collector.receiver)? {
             while collector.next_delivery(&|_| true)?.is_some() {}
             if let Some(instrument) = collector.instrument() {
                 return Ok(Some(instrument.clone()));
@@ -258,8 +259,8 @@ impl Collector {
     }
 
     /// The set of packets received of each kind.
-    pub fn received(&self) -> impl Iterator<Item = (Kind, &ReceivedSet)> {
-        Kind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
+    pub fn received(&self) -> impl Iterator<Item = (PacketKind, &ReceivedSet)> {
+        PacketKind::ALL.into_iter().map(|kind| (kind, &self.received[kind.index()]))
     }
 
     /// Number of packets of all kinds received so far, without duplicates.
@@ -297,7 +298,7 @@ impl Collector {
     pub fn counters(&self) -> ReceptionCounters {
         let mut counters = self.decoder.counters().clone();
         let session = self.session_counts.counters();
-        counters.frames = self.intake.frames();
+        counters.frames = self.receiver.frames();
         counters.bytes += session.bytes + self.refused.bytes;
         (counters.packets_beyond, counters.bytes_beyond) = (self.refused.packets, self.refused.bytes);
         counters.bytes_garbage = session.bytes_garbage;
@@ -305,7 +306,7 @@ impl Collector {
         counters.bytes_truncated = session.bytes_truncated;
         counters.bytes_damaged = session.bytes_damaged;
         counters.bytes_duplicate = session.bytes_duplicate;
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let counts = counters.kind_mut(kind);
             counts.duplicates = session.kind(kind).duplicates;
             counts.damaged = session.kind(kind).damaged;
@@ -334,8 +335,8 @@ impl Collector {
             while let Some(header) = self.candidates.pop_front() {
                 let found = match header.kind {
                     // The next session checks all of them.
-                    Kind::Visibilities if self.holds_for_next_session => None,
-                    Kind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
+                    PacketKind::Visibilities if self.holds_for_next_session => None,
+                    PacketKind::Visibilities => self.held.release(&header, is_due).map(|packet| vec![packet]),
                     _ => self.held.take_payload(&header),
                 };
                 if let Some(packets) = found {
@@ -401,13 +402,13 @@ impl Collector {
     }
 
     fn take_event(&mut self, is_due: IsDue<'_>) -> Result<EventOutcome, DownlinkError> {
-        let Some(event) = self.intake.next_event() else { return Ok(EventOutcome::NeedsBytes) };
+        let Some(event) = self.receiver.next_event() else { return Ok(EventOutcome::NeedsBytes) };
         let Event::Packet(packet) = event else {
             self.session_counts.accept(&event);
             return Ok(EventOutcome::Consumed);
         };
         let (offset, header) = (packet.offset, packet.header);
-        let is_instrument = header.kind == Kind::Instrument;
+        let is_instrument = header.kind == PacketKind::Instrument;
         if is_instrument && header.segment == PacketSegment::Whole && self.decoder.contradicts(packet.payload)
         {
             return Err(DownlinkError::OtherInstrument { offset });
@@ -415,7 +416,7 @@ impl Collector {
         let received = &mut self.received[header.kind.index()];
         let insertion = match self.packets < self.packets_max || received.contains(header.count, header.time)
         {
-            true => received.insert_within(header.count, header.time, self.intervals_max),
+            true => received.insert_bounded(header.count, header.time, self.intervals_max),
             false => PacketInsertion::Full,
         };
         match insertion {
@@ -431,7 +432,7 @@ impl Collector {
             }
         }
         // The common case: delivered without a copy into the hold buffer.
-        if header.kind == Kind::Visibilities
+        if header.kind == PacketKind::Visibilities
             && !(self.holds_for_next_session && self.held.has_room(&header))
             && self.decoder.instrument().is_some()
             && visibilities_outline(packet.payload).as_ref().is_none_or(is_due)
@@ -444,7 +445,7 @@ impl Collector {
         if !is_instrument && !self.knows_instrument() {
             return Ok(EventOutcome::Consumed);
         }
-        if header.kind == Kind::Visibilities {
+        if header.kind == PacketKind::Visibilities {
             self.candidates.push_back(header);
             return Ok(EventOutcome::Held(header));
         }

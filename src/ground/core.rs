@@ -12,7 +12,7 @@ use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, G
 use crate::calibration::{Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
-use crate::downlink::{CucTime, Kind, PacketHeader};
+use crate::downlink::{CucTime, PacketHeader, PacketKind};
 use crate::frames::{GroundFrame, Instrument, PlacedFrame};
 use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
@@ -213,7 +213,7 @@ impl Ground {
         gate.must_note_held = false;
         let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
         held.iter()
-            .filter(|header| header.kind == Kind::Visibilities)
+            .filter(|header| header.kind == PacketKind::Visibilities)
             .for_each(|header| self.note(header, false));
         self.collector.recheck_held();
     }
@@ -226,7 +226,8 @@ impl Ground {
     /// Solves for the gains of a pass with the packets held, in the order of sending.
     fn close_pass(&mut self, which: usize) {
         let Self { collector, calibrator, gate: Some(gate), .. } = self else { return };
-        let waiting = collector.held().packets().filter(|packet| packet.header.kind == Kind::Visibilities);
+        let waiting =
+            collector.held().packets().filter(|packet| packet.header.kind == PacketKind::Visibilities);
         let blocks = waiting.filter_map(|packet| collector.decoded(packet));
         let blocks = blocks.filter(|block| gate.holds(which, block)).collect();
         gate.close(which, blocks, calibrator.ephemeris());
@@ -322,7 +323,7 @@ impl Ground {
             CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
         });
         let mut missing = MissingPackets::default();
-        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == Kind::Visibilities) {
+        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == PacketKind::Visibilities) {
             let [all, since] = received.missing_since(reported.unwrap_or_default());
             missing = MissingPackets { all, unreported: if reported.is_some() { since } else { all } };
         }

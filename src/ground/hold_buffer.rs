@@ -7,7 +7,7 @@ use bincode::{Decode, Encode};
 use crate::downlink::receive::Packet;
 use crate::downlink::wire::payload::visibilities_outline;
 use crate::downlink::wire::{
-    COUNT_MAX, CucTime, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment, VisibilitiesOutline,
+    COUNT_MAX, CucTime, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment, VisibilitiesOutline,
 };
 use crate::units::MissionTime;
 
@@ -62,7 +62,7 @@ impl HeldPacket {
     /// Outline of the visibilities that the packet claims to hold; `None` if it has no outline.
     #[must_use]
     pub fn outline(&self) -> Option<VisibilitiesOutline> {
-        visibilities_outline(&self.payload).filter(|_| self.header.kind == Kind::Visibilities)
+        visibilities_outline(&self.payload).filter(|_| self.header.kind == PacketKind::Visibilities)
     }
 
     fn cost(&self) -> u64 {
@@ -83,7 +83,7 @@ pub struct HoldBuffer {
     visibilities: BTreeMap<SendingKey, HeldPacket>,
     /// Memory of `visibilities`. Saturates, as checkpoints are untrusted.
     bytes: u64,
-    others: BTreeMap<(Kind, SendingKey), HeldPacket>,
+    others: BTreeMap<(PacketKind, SendingKey), HeldPacket>,
     others_bytes: u64,
     bytes_max: u64,
 }
@@ -112,7 +112,7 @@ impl HoldBuffer {
         let PacketHeader { kind, time, count, .. } = packet.header;
         let cost = packet.cost();
         let (replaced, bytes) = match kind {
-            Kind::Visibilities => (self.visibilities.insert((time, count), packet), &mut self.bytes),
+            PacketKind::Visibilities => (self.visibilities.insert((time, count), packet), &mut self.bytes),
             _ => (self.others.insert((kind, (time, count)), packet), &mut self.others_bytes),
         };
         *bytes = bytes.saturating_add(cost).saturating_sub(replaced.map_or(0, |packet| packet.cost()));
@@ -129,7 +129,7 @@ impl HoldBuffer {
             && self
                 .visibilities
                 .iter()
-                .all(|(key, packet)| (*key, Kind::Visibilities) == (key_of(packet), packet.header.kind))
+                .all(|(key, packet)| (*key, PacketKind::Visibilities) == (key_of(packet), packet.header.kind))
             && self.others.iter().all(|(key, packet)| *key == (packet.header.kind, key_of(packet)))
             && self.bytes == cost(&mut self.visibilities.values())
             && self.others_bytes == cost(&mut self.others.values())
@@ -145,7 +145,7 @@ impl HoldBuffer {
     pub fn get(&self, header: &PacketHeader) -> Option<&HeldPacket> {
         let key_of = (header.time, header.count);
         match header.kind {
-            Kind::Visibilities => self.visibilities.get(&key_of),
+            PacketKind::Visibilities => self.visibilities.get(&key_of),
             kind => self.others.get(&(kind, key_of)),
         }
     }
@@ -154,7 +154,7 @@ impl HoldBuffer {
     pub fn remove(&mut self, header: &PacketHeader) -> Option<HeldPacket> {
         let key_of = (header.time, header.count);
         let (found, bytes) = match header.kind {
-            Kind::Visibilities => (self.visibilities.remove(&key_of), &mut self.bytes),
+            PacketKind::Visibilities => (self.visibilities.remove(&key_of), &mut self.bytes),
             kind => (self.others.remove(&(kind, key_of)), &mut self.others_bytes),
         };
         *bytes = bytes.saturating_sub(found.as_ref().map_or(0, HeldPacket::cost));
@@ -248,7 +248,7 @@ mod tests {
 
     fn packet(count: u64) -> HeldPacket {
         let header = PacketHeader {
-            kind: Kind::Visibilities,
+            kind: PacketKind::Visibilities,
             segment: PacketSegment::Whole,
             count,
             time: CucTime(count / 3),
@@ -316,8 +316,12 @@ mod tests {
     #[test]
     fn payloads_are_put_together_whatever_the_order() {
         let segment = |count: u64, segment: PacketSegment| {
-            let header =
-                PacketHeader { kind: Kind::Ephemeris, segment, time: CucTime(7), ..packet(count).header };
+            let header = PacketHeader {
+                kind: PacketKind::Ephemeris,
+                segment,
+                time: CucTime(7),
+                ..packet(count).header
+            };
             HeldPacket { header, payload: vec![count as u8], checksum: 0 }
         };
         let all = [

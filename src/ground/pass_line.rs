@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use serde::Serialize;
 
-use crate::downlink::{CucTime, Kind, ReceivedSet};
+use crate::downlink::{CucTime, PacketKind, ReceivedSet};
 
 const BINS_MAX: usize = 480;
 
@@ -18,7 +18,7 @@ const RANGES_MAX: usize = 1000;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindLine {
     /// Kind of the packets.
-    pub kind: Kind,
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Packets received, held ones included.
@@ -31,7 +31,7 @@ pub struct KindLine {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MissingRange {
     /// Kind of the packets.
-    pub kind: Kind,
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the first packet.
@@ -62,9 +62,9 @@ pub struct PassLine {
 impl PassLine {
     /// The time line of the received sets of each kind.
     #[must_use]
-    pub fn new<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (Kind, &'a ReceivedSet)>) -> Self {
+    pub fn new<'a>(epoch_tai_s: f64, received: impl Iterator<Item = (PacketKind, &'a ReceivedSet)>) -> Self {
         let time_s = |made: CucTime| made.tai_s() - epoch_tai_s;
-        let sets: Vec<(Kind, &ReceivedSet)> = received.filter(|(_, set)| !set.is_empty()).collect();
+        let sets: Vec<(PacketKind, &ReceivedSet)> = received.filter(|(_, set)| !set.is_empty()).collect();
         let ends = sets.iter().filter_map(|(_, set)| set.span());
         let Some(span) = ends.reduce(|[a, b], [c, d]| [a.min(c), b.max(d)]) else { return Self::default() };
         let [first_s, last_s] = span.map(time_s);
@@ -136,7 +136,7 @@ mod tests {
         CucTime(((EPOCH_S + time_s) * f64::from(1 << 24)) as u64)
     }
 
-    fn line_of(sets: &[(Kind, ReceivedSet)]) -> PassLine {
+    fn line_of(sets: &[(PacketKind, ReceivedSet)]) -> PassLine {
         PassLine::new(EPOCH_S, sets.iter().map(|(kind, set)| (*kind, set)))
     }
 
@@ -154,7 +154,10 @@ mod tests {
         // Within pass 1; all of pass 3; the end of pass 5 and the beginning of pass 6.
         let is_lost = |packet| matches!(packet, 12..15 | 30..40 | 58..61);
         let set = passes(8, 9000.0, is_lost);
-        let line = line_of(&[(Kind::Visibilities, set.clone()), (Kind::Calibration, ReceivedSet::default())]);
+        let line = line_of(&[
+            (PacketKind::Visibilities, set.clone()),
+            (PacketKind::Calibration, ReceivedSet::default()),
+        ]);
         assert_eq!((line.start_s, line.bin_s, line.kinds.len()), (0.0, 900.0, 1));
         let KindLine { received, missing, .. } = &line.kinds[0];
         assert_eq!((received.len(), missing.len()), (71, 71));
@@ -180,7 +183,7 @@ mod tests {
     fn a_restart_of_the_counts_begins_at_nothing() {
         let mut set = passes(2, 9000.0, |packet| packet == 0);
         set.insert(2, made(30_000.0));
-        let line = line_of(&[(Kind::Visibilities, set)]);
+        let line = line_of(&[(PacketKind::Visibilities, set)]);
         let ranges: Vec<_> =
             line.ranges.iter().map(|range| (range.from, range.to, range.between_s)).collect();
         assert_eq!(ranges, [(0, 1, [30_000.0, 30_000.0]), (0, 0, [0.0, 0.0])]);
@@ -190,7 +193,7 @@ mod tests {
     fn years_and_forged_packets_need_no_more_than_the_bins() {
         // Every second packet of 1.3 years of orbits is lost.
         let set = passes(5000, 8249.0, |packet| packet % 2 == 1);
-        let line = line_of(&[(Kind::Visibilities, set.clone())]);
+        let line = line_of(&[(PacketKind::Visibilities, set.clone())]);
         let KindLine { received, missing, .. } = &line.kinds[0];
         assert!(received.len() <= BINS_MAX && received.len() > BINS_MAX / 3, "{}", received.len());
         assert_eq!(received.iter().sum::<u64>(), set.len());
@@ -201,7 +204,7 @@ mod tests {
         for (count, time) in [(0, 0), ((1 << 46) - 1, (1 << 56) - 1), (5, (1 << 56) - 1)] {
             forged.insert(count, CucTime(time));
         }
-        let line = line_of(&[(Kind::Housekeeping, forged)]);
+        let line = line_of(&[(PacketKind::Housekeeping, forged)]);
         assert!(line.kinds[0].received.len() <= BINS_MAX);
         assert_eq!(line.kinds[0].missing.iter().sum::<u64>(), (1 << 46) - 3);
         assert_eq!(line_of(&[]), PassLine::default());

@@ -42,12 +42,13 @@ impl SenderPromises {
     /// Whether a checkpoint has to be written because senders wait for it. If the newest one already has all `packets`, the senders get
     /// their answer.
     pub(super) fn are_due(&self, packets: u64) -> bool {
-        let Some(answers) = self.answers.as_ref().filter(|answers| answers.begin(self.bytes)) else {
+        let Some(answers) = self.answers.as_ref().filter(|answers| answers.start_checkpoint(self.bytes))
+        else {
             return false;
         };
         let has_new = self.has_new(packets);
         if !has_new {
-            answers.hold(self.bytes);
+            answers.record_checkpoint(self.bytes);
         }
         has_new
     }
@@ -58,8 +59,8 @@ impl SenderPromises {
             self.packets = packets;
         }
         match &self.answers {
-            Some(answers) if is_written => answers.hold(self.bytes),
-            Some(answers) => answers.fail(),
+            Some(answers) if is_written => answers.record_checkpoint(self.bytes),
+            Some(answers) => answers.record_failure(),
             None => {}
         }
     }

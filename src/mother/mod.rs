@@ -15,6 +15,7 @@ pub mod correlator;
 mod integrator;
 mod merger;
 mod ninth;
+mod noise;
 mod observer;
 mod pair_errors;
 mod powers;
@@ -28,9 +29,10 @@ mod thinning;
 pub use config::{
     Antenna, BAND_HZ, CHANNELS_MAX, Fidelity, IntegrationTooShort, MoonMirror, SpacecraftConfig, StoreDrop,
 };
-pub use integrator::{ChannelModel, Integrator, MeasurementOptions, NoiseModel};
+pub use integrator::{ChannelModel, Integrator, MeasurementOptions};
 pub use merger::Merger;
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
+pub use noise::NoiseModel;
 pub use observer::Observer;
 pub use receiver::ReceiverNoise;
 pub use schedule::{Integration, Schedule};

@@ -1,7 +1,7 @@
 //! From a configuration to a running graph: parse, validate, build, run.
 //!
-//! The only place where space and ground meet, and where concrete stages are connected. Uses every folder before it. Its folders
-//! `config`, `cost`, `graph` and `jobs` each use only those before them.
+//! Space and ground segment meet only here, where concrete stages are connected. Of the folders `config`, `cost`, `graph` and `jobs`,
+//! each uses only those before it.
 
 mod config;
 mod cost;
@@ -22,7 +22,7 @@ pub use graph::{
     run_with_ranks, sample_stages, sky_notes, use_threads,
 };
 pub use graph::{
-    CalibrateSummary, Destination, GroundSource, RunSummary, Watched, Watcher, replay, run, simulate,
+    CalibrateSummary, Destination, GroundSource, OnStart, RunHandles, RunSummary, replay, run, simulate,
 };
 #[doc(hidden)]
 pub use jobs::{

@@ -16,7 +16,7 @@ use super::sheet_maps::SheetMaps;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
-use crate::files::{disk_room, write_atomically};
+use crate::files::{disk_space, write_atomically};
 use crate::imaging::Solution;
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
@@ -82,7 +82,7 @@ impl ChannelFolder {
     /// Returns an error if less than 1 / [`FREE_DIVISOR`] of the disk is free. Final maps are exempt, as no data follow them.
     fn require_free_disk(&self, solution: &Solution) -> Result<(), ProductsError> {
         let is_limited = self.needs_free_disk && !solution.is_final;
-        match disk_room(&self.root).filter(|_| is_limited) {
+        match disk_space(&self.root).filter(|_| is_limited) {
             Some([free, size]) if free < size / FREE_DIVISOR => {
                 let reason = "less than a twentieth of the disk is free, which is reserved for the state and the raw archive";
                 let source = std::io::Error::new(std::io::ErrorKind::StorageFull, reason);

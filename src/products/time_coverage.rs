@@ -1,7 +1,7 @@
 //! Draws the integration time received and missing over mission time.
 
 use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::ground::archive::{ChannelCoverage, CoverageSurvey, Gaps, JournalEntry};
 use crate::units::constants::DAY_S;
 
@@ -78,7 +78,7 @@ fn plot(survey: &CoverageSurvey, gaps: &Gaps, coverage: &ChannelCoverage, bins: 
 
 /// Adds the missing integration time of a channel, distributed over the observed parts of its gaps.
 fn add_missing(survey: &CoverageSurvey, gaps: &Gaps, channel: u16, bins: &TimeBins, sums_s: &mut [f64]) {
-    for gap in gaps.gaps.iter().filter(|gap| gap.kind == Kind::Visibilities) {
+    for gap in gaps.gaps.iter().filter(|gap| gap.kind == PacketKind::Visibilities) {
         let of_channel = gap.lost.iter().filter(|lost| lost.channel == channel);
         let lost_s: f64 = of_channel.map(|lost| lost.integration_s).sum();
         let [from, to] = gap.between_s;

@@ -1,4 +1,4 @@
-//! Connections: how many, how large, how slow.
+//! HTTP connections, with limits on their number, size and time.
 
 use std::io;
 use std::net::TcpListener as StdListener;
@@ -19,28 +19,28 @@ use tokio::time::{Sleep, sleep};
 
 use super::console::Console;
 
-/// Open connections. A browser keeps one for events, and a few for maps.
+/// Maximum number of open connections. A browser keeps one for events, and a few for maps.
 const CONNECTIONS_MAX: usize = 128;
 
-/// Longest wait for the header of a request, also between two requests on one connection.
-const HEADER_TIME: Duration = Duration::from_secs(10);
+/// Time limit for the header of a request, also between two requests on one connection.
+const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Longest time in which a reader takes nothing at all.
-const STALL_TIME: Duration = Duration::from_secs(10);
+/// Time limit for a client that reads nothing.
+const STALL_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// Largest header of a request, and the buffer of an answer, bytes.
+/// Maximum size of a request header, and size of the buffer of a response, bytes.
 const BUFFER_BYTES: usize = 16 << 10;
 
-/// Most header fields of a request.
+/// Maximum number of header fields of a request.
 const HEADERS_MAX: usize = 64;
 
-/// Wait after a connection could not be accepted, for example because too many files are open.
-const ACCEPT_WAIT: Duration = Duration::from_millis(50);
+/// Delay after a connection could not be accepted, for example because too many files are open.
+const ACCEPT_DELAY: Duration = Duration::from_millis(50);
 
-/// Answer to visitors when all places are taken.
+/// Response to a client above the limit of connections.
 const FULL: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 21\r\n\r\ntoo many connections\n";
 
-/// Accepts connections until `stop`.
+/// Accepts and serves connections until `stop` changes.
 pub(super) async fn accept(
     listener: StdListener,
     router: Router,
@@ -48,38 +48,38 @@ pub(super) async fn accept(
     mut stop: watch::Receiver<bool>,
 ) -> io::Result<()> {
     let listener = TcpListener::from_std(listener)?;
-    let places = Arc::new(Semaphore::new(CONNECTIONS_MAX));
+    let permits = Arc::new(Semaphore::new(CONNECTIONS_MAX));
     loop {
         let accepted = tokio::select! {
             _ = stop.changed() => return Ok(()),
             accepted = listener.accept() => accepted,
         };
         let Ok((stream, _)) = accepted else {
-            sleep(ACCEPT_WAIT).await;
+            sleep(ACCEPT_DELAY).await;
             continue;
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            console.visitors.refused.fetch_add(1, Ordering::Relaxed);
-            // Nobody waits for them to read it.
+        let Ok(permit) = Arc::clone(&permits).try_acquire_owned() else {
+            console.clients.refused.fetch_add(1, Ordering::Relaxed);
+            // The server does not wait until the client has read it.
             let _ = stream.try_write(FULL);
             continue;
         };
         let (router, console) = (router.clone(), Arc::clone(&console));
         tokio::spawn(async move {
-            let _place = place;
-            console.visitors.open.fetch_add(1, Ordering::Relaxed);
+            let _permit = permit;
+            console.clients.open.fetch_add(1, Ordering::Relaxed);
             let served = http1::Builder::new()
                 .timer(TokioTimer::new())
-                .header_read_timeout(HEADER_TIME)
+                .header_read_timeout(HEADER_TIMEOUT)
                 .max_headers(HEADERS_MAX)
                 .max_buf_size(BUFFER_BYTES)
-                .serve_connection(TokioIo::new(PatientStream::new(stream)), TowerToHyperService::new(router))
+                .serve_connection(TokioIo::new(TimeoutStream::new(stream)), TowerToHyperService::new(router))
                 .await;
-            // A reader that goes away is none of these.
+            // A client that closes its connection does not count.
             if served.is_err_and(|error| error.is_parse() || error.is_timeout() || is_stalled(&error)) {
-                console.visitors.cut.fetch_add(1, Ordering::Relaxed);
+                console.clients.cut.fetch_add(1, Ordering::Relaxed);
             }
-            console.visitors.open.fetch_sub(1, Ordering::Relaxed);
+            console.clients.open.fetch_sub(1, Ordering::Relaxed);
         });
     }
 }
@@ -89,32 +89,37 @@ fn is_stalled(error: &hyper::Error) -> bool {
     source.is_some_and(|source| source.kind() == io::ErrorKind::TimedOut)
 }
 
-/// A stream whose writes fail if its reader takes nothing for [`STALL_TIME`].
-struct PatientStream {
+/// A stream whose writes fail if its client reads nothing for [`STALL_TIMEOUT`].
+struct TimeoutStream {
     stream: TcpStream,
-    /// Runs while a write waits.
-    patience: Option<Pin<Box<Sleep>>>,
+    /// Timer of a write that waits.
+    timer: Option<Pin<Box<Sleep>>>,
 }
 
-impl PatientStream {
+impl TimeoutStream {
     fn new(stream: TcpStream) -> Self {
-        Self { stream, patience: None }
+        Self { stream, timer: None }
     }
 
-    fn judge<T>(&mut self, context: &mut Context<'_>, result: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
+    /// Turns a pending write into an error after the timeout.
+    fn with_timeout<T>(
+        &mut self,
+        context: &mut Context<'_>,
+        result: Poll<io::Result<T>>,
+    ) -> Poll<io::Result<T>> {
         if result.is_ready() {
-            self.patience = None;
+            self.timer = None;
             return result;
         }
-        let patience = self.patience.get_or_insert_with(|| Box::pin(sleep(STALL_TIME)));
-        match patience.as_mut().poll(context) {
+        let timer = self.timer.get_or_insert_with(|| Box::pin(sleep(STALL_TIMEOUT)));
+        match timer.as_mut().poll(context) {
             Poll::Ready(()) => Poll::Ready(Err(io::ErrorKind::TimedOut.into())),
             Poll::Pending => Poll::Pending,
         }
     }
 }
 
-impl AsyncRead for PatientStream {
+impl AsyncRead for TimeoutStream {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -124,14 +129,14 @@ impl AsyncRead for PatientStream {
     }
 }
 
-impl AsyncWrite for PatientStream {
+impl AsyncWrite for TimeoutStream {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
         let result = Pin::new(&mut self.stream).poll_write(context, bytes);
-        self.judge(context, result)
+        self.with_timeout(context, result)
     }
 
     fn poll_write_vectored(
@@ -140,7 +145,7 @@ impl AsyncWrite for PatientStream {
         parts: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         let result = Pin::new(&mut self.stream).poll_write_vectored(context, parts);
-        self.judge(context, result)
+        self.with_timeout(context, result)
     }
 
     fn is_write_vectored(&self) -> bool {

@@ -1,4 +1,4 @@
-//! What all connections read: the run, its maps and its log.
+//! The state that all connections read: the run, its maps and its log.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -9,32 +9,32 @@ use axum::body::Bytes;
 
 use super::event_log::EventLog;
 use super::geometry::Geometry;
-use super::pulse::{Pulse, whole_run};
-use super::shelf::Shelf;
+use super::map_cache::MapCache;
+use super::stage_rates::{RateMeter, whole_run_rates};
 use super::status::{LedgerStatus, ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
 use super::subject::Subject;
 use crate::array::EarthModel;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::imaging::Solving;
-use crate::pipeline::Watched;
+use crate::pipeline::RunHandles;
 use crate::products::{MapViewer, ProductsReport, ProductsWatch, PublishedMap};
 use crate::runtime::{Metrics, StageProgress};
 use crate::units::ChannelId;
 
-/// Most senders in a status; it goes out twice a second.
+/// Maximum number of senders in a status, which is sent twice a second.
 const SENDERS_SHOWN: usize = 20;
 
-/// Numbers of connections and requests.
+/// Counters of HTTP connections and requests.
 #[derive(Debug, Default)]
-pub(super) struct VisitorCounts {
+pub(super) struct ClientCounts {
     pub(super) open: AtomicU64,
     pub(super) refused: AtomicU64,
     pub(super) cut: AtomicU64,
     pub(super) requests: AtomicU64,
 }
 
-impl VisitorCounts {
+impl ClientCounts {
     fn status(&self) -> VisitorStatus {
         VisitorStatus {
             open: self.open.load(Ordering::Relaxed),
@@ -50,15 +50,15 @@ impl VisitorCounts {
 struct RunEnd {
     error: Option<String>,
     cancelled: bool,
-    /// When, since the server's start, s.
+    /// Time of the end since the server's start, s.
     up_s: f64,
 }
 
-/// State of the last update, to tell what has changed.
+/// State of the last update, to find what has changed.
 #[derive(Debug, Default)]
-struct Memory {
-    pulse: Pulse,
-    /// The solution being shown: its number, when it was first seen, and its residual then.
+struct LastUpdate {
+    rates: RateMeter,
+    /// The solution in progress: its number, when it was first seen, and its residual at that time.
     solution: Option<(u64, Instant, f64)>,
     ended: Vec<bool>,
     senders: u64,
@@ -68,7 +68,7 @@ struct Memory {
     status: Option<Status>,
 }
 
-/// The run as its visitors see it.
+/// The run as it is served.
 #[derive(Debug)]
 pub(super) struct Console {
     pub(super) name: String,
@@ -77,19 +77,19 @@ pub(super) struct Console {
     pub(super) config: Bytes,
     /// Folder of the state, if there is one.
     pub(super) state: Option<PathBuf>,
-    /// Says where the Earth is.
+    /// Motion of the Earth.
     earth: EarthModel,
-    /// Folders on whose disks there has to be room, by what they hold.
+    /// Folders whose free disk space is reported, by content.
     pub(super) folders: Vec<(&'static str, PathBuf)>,
     pub(super) started: Instant,
-    pub(super) shelf: Arc<Shelf>,
+    pub(super) maps: Arc<MapCache>,
     pub(super) log: Arc<EventLog>,
-    pub(super) visitors: VisitorCounts,
-    pub(super) watched: OnceLock<Watched>,
-    ending: Mutex<Option<RunEnd>>,
-    /// Metrics were read since the run failed.
-    pub(super) failure_told: AtomicBool,
-    memory: Mutex<Memory>,
+    pub(super) clients: ClientCounts,
+    pub(super) handles: OnceLock<RunHandles>,
+    end: Mutex<Option<RunEnd>>,
+    /// Whether metrics were read since the run failed.
+    pub(super) is_failure_scraped: AtomicBool,
+    last_update: Mutex<LastUpdate>,
 }
 
 impl Console {
@@ -103,52 +103,49 @@ impl Console {
             earth,
             folders,
             started: Instant::now(),
-            shelf: Arc::default(),
+            maps: Arc::default(),
             log: Arc::default(),
-            visitors: VisitorCounts::default(),
-            watched: OnceLock::new(),
-            ending: Mutex::default(),
-            failure_told: AtomicBool::new(false),
-            memory: Mutex::default(),
+            clients: ClientCounts::default(),
+            handles: OnceLock::new(),
+            end: Mutex::default(),
+            is_failure_scraped: AtomicBool::new(false),
+            last_update: Mutex::default(),
         }
     }
 
-    /// Since the server's start, s.
     fn up_s(&self) -> f64 {
         self.started.elapsed().as_secs_f64()
     }
 
-    fn note(&self, is_bad: bool, text: impl Into<String>) {
+    fn log_event(&self, is_bad: bool, text: impl Into<String>) {
         self.log.push(self.up_s(), is_bad, text.into());
     }
 
-    /// The run begins.
-    pub(super) fn begin(&self, watched: &Watched) {
+    pub(super) fn set_run(&self, handles: &RunHandles) {
         let viewer =
-            PageViewer { shelf: Arc::clone(&self.shelf), log: Arc::clone(&self.log), started: self.started };
-        watched.maps.add_viewer(Box::new(viewer));
-        if let Some(ground) = &watched.ground {
+            PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log), started: self.started };
+        handles.maps.add_viewer(Box::new(viewer));
+        if let Some(ground) = &handles.ground {
             ground.live_view.open();
         }
-        if self.watched.set(watched.clone()).is_ok() {
-            self.note(false, "the run begins");
+        if self.handles.set(handles.clone()).is_ok() {
+            self.log_event(false, "the run begins");
         }
     }
 
-    /// The run has ended.
-    pub(super) fn end(&self, error: Option<String>, cancelled: bool) {
-        let ending = RunEnd { error, cancelled, up_s: self.up_s() };
-        match &ending {
-            RunEnd { error: Some(error), .. } => self.note(true, format!("the run failed: {error}")),
-            RunEnd { cancelled: true, .. } => self.note(true, "the run was ended early"),
-            RunEnd { .. } => self.note(false, "the run is complete"),
+    pub(super) fn set_end(&self, error: Option<String>, cancelled: bool) {
+        let end = RunEnd { error, cancelled, up_s: self.up_s() };
+        match &end {
+            RunEnd { error: Some(error), .. } => self.log_event(true, format!("the run failed: {error}")),
+            RunEnd { cancelled: true, .. } => self.log_event(true, "the run was ended early"),
+            RunEnd { .. } => self.log_event(false, "the run is complete"),
         }
-        *self.ending.lock().unwrap_or_else(PoisonError::into_inner) = Some(ending);
+        *self.end.lock().unwrap_or_else(PoisonError::into_inner) = Some(end);
     }
 
     pub(super) fn phase(&self) -> Phase {
-        let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner);
-        match (&*ending, self.watched.get()) {
+        let end = self.end.lock().unwrap_or_else(PoisonError::into_inner);
+        match (&*end, self.handles.get()) {
             (Some(RunEnd { error: Some(_), .. }), _) => Phase::Failed,
             (Some(_), _) => Phase::Ended,
             (None, Some(_)) => Phase::Running,
@@ -156,71 +153,70 @@ impl Console {
         }
     }
 
-    fn memory(&self) -> MutexGuard<'_, Memory> {
-        self.memory.lock().unwrap_or_else(PoisonError::into_inner)
+    fn last_update(&self) -> MutexGuard<'_, LastUpdate> {
+        self.last_update.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The newest status, at most one look old.
     pub(super) fn status(&self) -> Status {
-        let known = self.memory().status.clone();
-        known.unwrap_or_else(|| self.look())
+        let last = self.last_update().status.clone();
+        last.unwrap_or_else(|| self.update())
     }
 
     /// The stages' counters; empty before the run.
     pub(super) fn progress(&self) -> Vec<StageProgress> {
-        self.watched.get().map(|watched| Metrics::snapshot(&watched.metrics)).unwrap_or_default()
+        self.handles.get().map(|handles| Metrics::snapshot(&handles.metrics)).unwrap_or_default()
     }
 
     fn ground(&self) -> Option<&GroundOutcome> {
-        self.watched.get().and_then(|watched| watched.ground.as_ref())
+        self.handles.get().and_then(|handles| handles.ground.as_ref())
     }
 
-    /// Packets over the mission's time; `None` before the instrument is known.
+    /// Packets over mission time; `None` before the instrument is known.
     pub(super) fn passes(&self) -> Option<Arc<PassLine>> {
         self.ground().and_then(|ground| ground.live_view.passes())
     }
 
-    /// Where everything is; `None` before there are data with positions.
+    /// Positions of satellites, Moon and Earth; `None` before there are data with positions.
     pub(super) fn geometry(&self) -> Option<Geometry> {
-        let now = self.ground()?.live_view.array()?;
-        Some(Geometry::of(&now, self.earth))
+        let array = self.ground()?.live_view.array()?;
+        Some(Geometry::new(&array, self.earth))
     }
 
-    /// Baselines of a channel; `None` if it has none.
+    /// Density of a channel's baselines in uvw; `None` if it has none.
     pub(super) fn uvw(&self, channel: ChannelId) -> Option<UvwDensity> {
         self.ground()?.live_view.density(channel)
     }
 
-    /// Visibilities of a channel by direction; `None` if it has none. Takes a while.
+    /// Map of a channel's visibilities by direction; `None` if it has none. It is computed on each call.
     pub(super) fn hits(&self, channel: ChannelId) -> Option<HitsMap> {
         let live_view = &self.ground()?.live_view;
         Some(live_view.hits(channel)?.map(live_view.array()?.moon_radius_m))
     }
 
-    /// Powers of the daughters in a channel; `None` if none came.
+    /// Auto-correlation powers of a channel over time; `None` if it has none.
     pub(super) fn powers(&self, channel: ChannelId) -> Option<PowerWaterfall> {
         self.ground()?.live_view.powers(channel)
     }
 
-    /// Looks at the run, notes what has changed, and keeps the status.
-    pub(super) fn look(&self) -> Status {
+    /// Collects and keeps the status of the run, and logs what has changed.
+    pub(super) fn update(&self) -> Status {
         let phase = self.phase();
         let progress = self.progress();
-        let ending = self.ending.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let watched = self.watched.get();
+        let end = self.end.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let handles = self.handles.get();
         let ground = self.ground();
         if let Some(ground) = ground {
             ground.live_view.refresh();
         }
         let now = Instant::now();
-        let mut memory = self.memory();
+        let mut last_update = self.last_update();
         let up_s = self.up_s();
-        let elapsed_s = ending.as_ref().map_or(up_s, |ending| ending.up_s);
-        let rates = match ending {
-            Some(_) => whole_run(&progress, elapsed_s),
-            None => memory.pulse.look(&progress, now),
+        let elapsed_s = end.as_ref().map_or(up_s, |end| end.up_s);
+        let rates = match end {
+            Some(_) => whole_run_rates(&progress, elapsed_s),
+            None => last_update.rates.sample(&progress, now),
         };
-        let listening = watched.and_then(|watched| watched.listening.as_ref()).map(|listening| {
+        let listening = handles.and_then(|handles| handles.listening.as_ref()).map(|listening| {
             let mut report = listening.report();
             report.senders.listed.truncate(SENDERS_SHOWN);
             ListenerStatus {
@@ -232,7 +228,7 @@ impl Console {
                 report,
             }
         });
-        let solving = watched.and_then(|watched| watched.solving.progress());
+        let solving = handles.and_then(|handles| handles.solving.progress());
         let saving = ground.and_then(|ground| ground.saving.report());
         let read = |ground: &GroundOutcome| {
             let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -248,43 +244,43 @@ impl Console {
             name: self.name.clone(),
             segment: self.segment,
             phase,
-            error: ending.as_ref().and_then(|ending| ending.error.clone()),
-            cancelled: ending.is_some_and(|ending| ending.cancelled),
+            error: end.as_ref().and_then(|end| end.error.clone()),
+            cancelled: end.is_some_and(|end| end.cancelled),
             up_s,
             elapsed_s,
             stages: stages_of(&progress, &rates),
-            solving: solving.map(|solving| memory.solver(solving, now)),
-            ledger: ground.map(|ground| LedgerStatus::of(ground.ledger.report(), phase == Phase::Ended)),
+            solving: solving.map(|solving| last_update.solver(solving, now)),
+            ledger: ground.map(|ground| LedgerStatus::new(ground.ledger.report(), phase == Phase::Ended)),
             completeness,
             reception,
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving,
-            products: watched.and_then(|watched| watched.products.as_ref()).map(ProductsWatch::report),
-            channels: self.shelf.status(),
+            products: handles.and_then(|handles| handles.products.as_ref()).map(ProductsWatch::report),
+            channels: self.maps.status(),
             has_state: self.state.is_some(),
-            visitors: self.visitors.status(),
+            visitors: self.clients.status(),
         };
-        for (is_bad, text) in memory.changes(&status) {
-            self.note(is_bad, text);
+        for (is_bad, text) in last_update.changes(&status) {
+            self.log_event(is_bad, text);
         }
-        memory.status = Some(status.clone());
+        last_update.status = Some(status.clone());
         status
     }
 }
 
-impl Memory {
-    /// The state of the solver, with the time left.
+impl LastUpdate {
+    /// The status of the solver, with an estimate of the time left.
     fn solver(&mut self, solving: Solving, now: Instant) -> SolverStatus {
         let Solving { number, what, iteration, residual, target, .. } = solving;
         let (_, since, first) = match self.solution {
             Some(seen) if seen.0 == number => seen,
             _ => *self.solution.insert((number, now, residual)),
         };
-        let (done, whole) = ((first / residual).ln(), (first / target).ln());
+        let (done, total) = ((first / residual).ln(), (first / target).ln());
         let elapsed_s = now.duration_since(since).as_secs_f64();
-        let is_known = done > 0.05 * whole && elapsed_s > 1.0;
-        let left_s = is_known.then(|| elapsed_s * (whole / done - 1.0).max(0.0));
+        let is_known = done > 0.05 * total && elapsed_s > 1.0;
+        let left_s = is_known.then(|| elapsed_s * (total / done - 1.0).max(0.0));
         SolverStatus { what, iteration, residual, target, left_s }
     }
 
@@ -292,21 +288,21 @@ impl Memory {
     fn changes(&mut self, status: &Status) -> Vec<(bool, String)> {
         let mut found = Vec::new();
         self.ended.resize(status.stages.len(), false);
-        for (was, stage) in self.ended.iter_mut().zip(&status.stages) {
-            if stage.ended && !*was {
+        for (had_ended, stage) in self.ended.iter_mut().zip(&status.stages) {
+            if stage.ended && !*had_ended {
                 found.push((false, format!("stage {} has ended", stage.name)));
             }
-            *was = stage.ended;
+            *had_ended = stage.ended;
         }
         if let Some(listening) = &status.listening {
-            let closed = listening.report.connections;
-            if closed > self.senders {
+            let accepted = listening.report.connections;
+            if accepted > self.senders {
                 found.push((
                     false,
-                    format!("senders: {closed} connections accepted, {} open", listening.open),
+                    format!("senders: {accepted} connections accepted, {} open", listening.open),
                 ));
             }
-            self.senders = closed;
+            self.senders = accepted;
         }
         if let Some(saving) = &status.saving {
             if saving.written > self.saving.written {
@@ -318,36 +314,35 @@ impl Memory {
             self.saving = saving.clone();
         }
         if let Some(products) = &status.products {
-            found.extend(change("maps", "written", &self.products.unwritten, &products.unwritten));
+            found.extend(failure_change("maps", &self.products.unwritten, &products.unwritten));
             self.products = products.clone();
         }
         if let Some(archive) = status.listening.as_ref().and_then(|listening| listening.archive.as_ref()) {
-            found.extend(change("the raw archive", "written", &self.archive.unwritten, &archive.unwritten));
+            found.extend(failure_change("the raw archive", &self.archive.unwritten, &archive.unwritten));
             self.archive = archive.clone();
         }
         found
     }
 }
 
-/// The event when something begins to fail, or works again.
-fn change(what: &str, done: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
+/// The event when writing `what` begins to fail, or works again.
+fn failure_change(what: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
     match (before, now) {
-        (None, Some(reason)) => Some((true, format!("{what} cannot be {done}: {reason}"))),
-        (Some(_), None) => Some((false, format!("{what}: {done} again"))),
+        (None, Some(reason)) => Some((true, format!("{what} cannot be written: {reason}"))),
+        (Some(_), None) => Some((false, format!("{what}: written again"))),
         _ => None,
     }
 }
 
-/// Sees maps for the console.
 struct PageViewer {
-    shelf: Arc<Shelf>,
+    maps: Arc<MapCache>,
     log: Arc<EventLog>,
     started: Instant,
 }
 
 impl MapViewer for PageViewer {
     fn view(&self, map: PublishedMap<'_>) {
-        let said = self.shelf.put(map);
-        self.log.push(self.started.elapsed().as_secs_f64(), false, said);
+        let description = self.maps.put(map);
+        self.log.push(self.started.elapsed().as_secs_f64(), false, description);
     }
 }

@@ -1,26 +1,26 @@
-//! What may go wrong with the server.
+//! Errors of the server.
 
 use thiserror::Error;
 
-/// The server cannot start.
+/// Errors that prevent the server from starting.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// An address that cannot be read.
+    /// An address that cannot be parsed.
     #[error("address `{text}`; expected PORT or HOST:PORT, such as 8080 or 127.0.0.1:8080")]
     Address {
-        /// What was given.
+        /// The given text.
         text: String,
     },
-    /// An address that has no numbers.
+    /// A host name that cannot be resolved.
     #[error("cannot find the address of {address}")]
     Resolve {
         /// The address.
         address: String,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// Other machines could reach it.
+    /// Other machines could reach the address.
     #[error(
         "{address} can be reached by other machines; expected an address of this machine, such as 127.0.0.1, or --serve-remote to allow it"
     )]
@@ -28,18 +28,18 @@ pub enum ServeError {
         /// The address.
         address: String,
     },
-    /// The address cannot be had.
+    /// The server cannot listen on the address.
     #[error("cannot serve on {address}; is its port in use? Port 0 chooses a free one")]
     Bind {
         /// The address.
         address: String,
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// No thread or event loop.
+    /// The thread or the event loop cannot be started.
     #[error("cannot start the server's thread")]
     Start {
-        /// What the system says.
+        /// The system's error.
         source: std::io::Error,
     },
 }

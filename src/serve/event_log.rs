@@ -5,23 +5,19 @@ use std::sync::{Mutex, PoisonError};
 
 use serde::Serialize;
 
-/// Events kept.
 const EVENTS_MAX: usize = 256;
 
-/// Something that happened.
+/// An event of a run.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Event {
-    /// Number, from 1.
     pub(super) id: u64,
-    /// Time since the server's start, s.
     elapsed_s: f64,
     /// Whether it needs attention.
     is_bad: bool,
-    /// What happened.
     text: String,
 }
 
-/// The last events.
+/// Log of the last events.
 #[derive(Debug, Default)]
 pub(super) struct EventLog(Mutex<EventQueue>);
 
@@ -42,7 +38,7 @@ impl EventLog {
         queue.events.push_back(Event { id, elapsed_s, is_bad, text });
     }
 
-    /// Kept events after number `id`.
+    /// The kept events with numbers above `id`.
     pub(super) fn after(&self, id: u64) -> Vec<Event> {
         let queue = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         queue.events.iter().filter(|event| event.id > id).cloned().collect()

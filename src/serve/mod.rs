@@ -1,28 +1,29 @@
-//! The page of a running chain, and the same for programs: a small HTTP server that only reads.
+//! A small read-only HTTP server for a running chain: a page for browsers, and JSON and metrics for programs.
 //!
 //! `docs/live.md` describes the routes: the page, `/events`, `/api/...`, `/metrics`, `/healthz` and `/readyz`.
 //!
-//! It reads what a running graph shows anyway ([`crate::pipeline::Watched`]) and sees maps through one hook of the
-//! publisher. Nothing in the chain waits for it: a browser that is late sees the newest state and misses what was between.
-//! All memory is bounded: maps held, connections, what one request may hold. No request can name a file.
+//! The server reads the handles of a running graph ([`crate::pipeline::RunHandles`]) and receives maps through a hook of the
+//! publisher. Nothing in the chain waits for it: a slow browser skips to the newest state. Memory is bounded: maps held, connections,
+//! and the size of a request. No request can name a file.
 //!
-//! [`Client`] and [`Screen`] show the same in a terminal (`lunarray top`).
+//! [`Client`] and [`Screen`] show the state in a terminal (`lunarray top`).
 //!
-//! One thread with an event loop serves all connections, a second one draws pictures. May use every folder before it.
+//! One thread with an event loop serves all connections; a second one draws pictures. May use every folder before it.
 
 mod address;
 mod client;
-mod collector;
 mod connection;
 mod console;
 mod error;
 mod event_log;
 mod geometry;
-mod pulse;
+mod map_cache;
+mod prometheus;
 mod routes;
 mod screen;
+mod screen_text;
 mod server;
-mod shelf;
+mod stage_rates;
 mod status;
 mod subject;
 

@@ -1,4 +1,4 @@
-//! What is answered to which request.
+//! Routes and their handlers.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
@@ -21,10 +21,10 @@ use futures_util::stream::{Stream, unfold};
 use serde::Serialize;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
-use super::address::is_own_host;
-use super::collector;
+use super::address::is_loopback_host;
 use super::console::Console;
-use super::shelf::{MapChoice, ShownMap};
+use super::map_cache::{MapChoice, ShownMap};
+use super::prometheus;
 use super::status::Phase;
 use crate::downlink::transport::socket::Listening;
 use crate::ground::archive::CoverageSurvey;
@@ -32,34 +32,31 @@ use crate::sky::{Frame, Rotation};
 use crate::units::ChannelId;
 use crate::units::time_scales::leap_seconds;
 
-/// The page may load what this server has, and nothing else from anywhere.
+/// Content security policy: the page may load resources from this server only.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; \
     img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// Colours of a palette.
 const PALETTE_STEPS: u32 = 256;
 
-/// What all request handlers share.
+/// State that all request handlers share.
 #[derive(Clone)]
 pub(super) struct PageState {
     pub(super) console: Arc<Console>,
     /// The newest status in JSON; empty before the first.
-    pub(super) news: watch::Receiver<Arc<str>>,
-    /// Where the server listens.
-    pub(super) own: SocketAddr,
-    /// Whether it may be called by any name.
+    pub(super) newest_status: watch::Receiver<Arc<str>>,
+    /// Address on which the server listens.
+    pub(super) address: SocketAddr,
+    /// Whether any `Host` header is accepted.
     pub(super) any_host: bool,
-    /// One slow answer is made at a time: the sums need the processors.
+    /// Permit for slow responses: one at a time, as the run needs the processors.
     pub(super) slow: Arc<Semaphore>,
-    /// Places of those who read events: fewer than all connections, so that health, metrics and status are answered.
+    /// Permits for readers of events: fewer than connections, so that health, metrics and status always respond.
     pub(super) readers: Arc<Semaphore>,
 }
 
-/// Most readers of `/events` at a time.
 pub(super) const READERS_MAX: usize = 96;
 
-/// All routes.
-pub(super) fn router(desk: PageState) -> Router {
+pub(super) fn router(page: PageState) -> Router {
     Router::new()
         .route("/", get(|| asset("text/html; charset=utf-8", include_str!("page/index.html"))))
         .route("/page.css", get(|| asset("text/css; charset=utf-8", include_str!("page/page.css"))))
@@ -87,14 +84,14 @@ pub(super) fn router(desk: PageState) -> Router {
         .fallback(|| async {
             refusal(StatusCode::NOT_FOUND, "no such page; / has the page, /api/status the state")
         })
-        .layer(from_fn_with_state(desk.clone(), guard))
-        .with_state(desk)
+        .layer(from_fn_with_state(page.clone(), guard))
+        .with_state(page)
 }
 
-/// Refuses what is not meant for this server, and adds the headers that every answer has.
-async fn guard(State(desk): State<PageState>, request: Request, next: Next) -> Response {
-    desk.console.visitors.requests.fetch_add(1, Ordering::Relaxed);
-    let mut response = match refused(&desk, request.method(), request.uri(), request.headers()) {
+/// Refuses requests with another method or host, and adds the headers of every response.
+async fn guard(State(page): State<PageState>, request: Request, next: Next) -> Response {
+    page.console.clients.requests.fetch_add(1, Ordering::Relaxed);
+    let mut response = match refused(&page, request.method(), request.uri(), request.headers()) {
         Some(refusal) => refusal,
         None => next.run(request).await,
     };
@@ -113,20 +110,20 @@ async fn guard(State(desk): State<PageState>, request: Request, next: Next) -> R
     response
 }
 
-fn refused(desk: &PageState, method: &Method, uri: &Uri, headers: &HeaderMap) -> Option<Response> {
+fn refused(page: &PageState, method: &Method, uri: &Uri, headers: &HeaderMap) -> Option<Response> {
     if method != Method::GET && method != Method::HEAD {
-        let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, "this server only tells; expected GET");
+        let mut response = refusal(StatusCode::METHOD_NOT_ALLOWED, "this server is read-only; expected GET");
         response.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
         return Some(response);
     }
     let mut hosts = headers.get_all(HOST).iter();
-    let (host, more) = (hosts.next().and_then(|host| host.to_str().ok()), hosts.next());
-    let named = [host, uri.authority().map(|authority| authority.as_str())];
-    let (Some(_), None) = (host, more) else {
+    let (host, second_host) = (hosts.next().and_then(|host| host.to_str().ok()), hosts.next());
+    let named_hosts = [host, uri.authority().map(|authority| authority.as_str())];
+    let (Some(_), None) = (host, second_host) else {
         return Some(refusal(StatusCode::BAD_REQUEST, "expected one Host header"));
     };
-    if !desk.any_host && !named.into_iter().flatten().all(|host| is_own_host(host, desk.own)) {
-        let text = "this server answers to its own address and to localhost alone, not to the name in Host";
+    if !page.any_host && !named_hosts.into_iter().flatten().all(|host| is_loopback_host(host, page.address)) {
+        let text = "the Host header names another server; expected localhost or the address of this server";
         return Some(refusal(StatusCode::MISDIRECTED_REQUEST, text));
     }
     None
@@ -151,22 +148,22 @@ async fn asset(kind: &'static str, text: &'static str) -> Response {
     answer(kind, text)
 }
 
-/// Palettes as hexadecimal digits, and rotations from ecliptic axes: the page computes with the program's own numbers.
+/// Constants of the program that the page needs: palettes as hexadecimal digits, rotations from ecliptic axes, leap seconds.
 async fn page_constants() -> Response {
     #[derive(Serialize)]
     struct Constants {
         version: &'static str,
         palettes: [(&'static str, String); 4],
-        /// Row k is the frame's axis k on ecliptic axes.
+        /// Rotations; row k is the frame's axis k in ecliptic axes.
         frames: [(&'static str, Rotation); 3],
-        /// From when on (TAI since 1970-01-01, s) UTC is how many seconds behind.
+        /// Start of each interval (TAI since 1970-01-01, s), and TAI minus UTC in it, s.
         leap_seconds: Vec<[i64; 2]>,
     }
-    let colours = |gradient: colorous::Gradient, place: fn(f64) -> f64| {
-        let colour = |k| gradient.eval_continuous(place(f64::from(k) / f64::from(PALETTE_STEPS - 1)));
+    let colours = |gradient: colorous::Gradient, position: fn(f64) -> f64| {
+        let colour = |k| gradient.eval_continuous(position(f64::from(k) / f64::from(PALETTE_STEPS - 1)));
         (0..PALETTE_STEPS).map(|k| format!("{:x}", colour(k))).collect()
     };
-    let hex = |gradient| colours(gradient, |place| place);
+    let hex = |gradient| colours(gradient, |position| position);
     let frame = |frame: Frame| Frame::Ecliptic.to_frame(frame);
     json(&Constants {
         version: env!("CARGO_PKG_VERSION"),
@@ -174,7 +171,7 @@ async fn page_constants() -> Response {
             ("inferno", hex(colorous::INFERNO)),
             ("cividis", hex(colorous::CIVIDIS)),
             ("viridis", hex(colorous::VIRIDIS)),
-            ("difference", colours(colorous::RED_BLUE, |place| 1.0 - place)),
+            ("difference", colours(colorous::RED_BLUE, |position| 1.0 - position)),
         ],
         frames: [
             ("galactic", frame(Frame::Galactic)),
@@ -185,28 +182,27 @@ async fn page_constants() -> Response {
     })
 }
 
-async fn status(State(desk): State<PageState>) -> Response {
-    json(&desk.console.status())
+async fn status(State(page): State<PageState>) -> Response {
+    json(&page.console.status())
 }
 
-async fn config(State(desk): State<PageState>) -> Response {
-    answer("application/json", desk.console.config.clone())
+async fn config(State(page): State<PageState>) -> Response {
+    answer("application/json", page.console.config.clone())
 }
 
-/// Makes an answer that takes a while, away from the event loop and one at a time.
-async fn slowly<T: Send + 'static>(
-    desk: &PageState,
-    make: impl FnOnce() -> T + Send + 'static,
+/// Runs a slow computation outside of the event loop, one at a time.
+async fn run_slow<T: Send + 'static>(
+    page: &PageState,
+    compute: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T, Response> {
-    let closed = |_| refusal(StatusCode::SERVICE_UNAVAILABLE, "the server is ending");
-    let _turn = desk.slow.acquire().await.map_err(closed)?;
-    let made = tokio::task::spawn_blocking(make).await;
-    made.map_err(|_| {
-        refusal(StatusCode::INTERNAL_SERVER_ERROR, "the answer could not be made: a bug in the program")
+    let closed = |_| refusal(StatusCode::SERVICE_UNAVAILABLE, "the server is shutting down");
+    let _permit = page.slow.acquire().await.map_err(closed)?;
+    tokio::task::spawn_blocking(compute).await.map_err(|_| {
+        refusal(StatusCode::INTERNAL_SERVER_ERROR, "the response could not be computed: a bug in the program")
     })
 }
 
-fn channel_of(text: &str) -> Option<ChannelId> {
+fn parse_channel(text: &str) -> Option<ChannelId> {
     let is_number =
         text.bytes().all(|digit| digit.is_ascii_digit()) && (text == "0" || !text.starts_with('0'));
     is_number.then(|| text.parse().ok().map(ChannelId))?
@@ -215,8 +211,8 @@ fn channel_of(text: &str) -> Option<ChannelId> {
 fn no_map() -> Response {
     refusal(
         StatusCode::NOT_FOUND,
-        "no such map is held; expected /api/maps/CHANNEL/N.f32, .fits or .png with N a number that `held` of /api/status \
-         names, latest, noise or input",
+        "no such map is held; expected /api/maps/CHANNEL/N.f32, .fits or .png with N latest, noise, input, or a number from \
+         `held` of /api/status",
     )
 }
 
@@ -224,148 +220,153 @@ fn no_channel() -> Response {
     refusal(StatusCode::NOT_FOUND, "no such channel; expected the number of one, from 0")
 }
 
-async fn figures(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
-    let Some(channel) = channel_of(&channel) else { return no_map() };
-    let shelf = Arc::clone(&desk.console.shelf);
-    match slowly(&desk, move || shelf.figures(channel)).await {
+async fn figures(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
+    let Some(channel) = parse_channel(&channel) else { return no_map() };
+    let maps = Arc::clone(&page.console.maps);
+    match run_slow(&page, move || maps.figures(channel)).await {
         Ok(Some(figures)) => json(&figures),
         Ok(None) => no_map(),
         Err(refusal) => refusal,
     }
 }
 
-async fn map(State(desk): State<PageState>, Path((channel, file)): Path<(String, String)>) -> Response {
+async fn map(State(page): State<PageState>, Path((channel, file)): Path<(String, String)>) -> Response {
     let found = || {
         let (name, kind) = file.split_once('.')?;
-        Some((desk.console.shelf.map(channel_of(&channel)?, MapChoice::read(name)?)?, kind))
+        Some((page.console.maps.map(parse_channel(&channel)?, MapChoice::parse(name)?)?, kind))
     };
     let Some((map, kind)) = found() else { return no_map() };
-    let make: fn(&ShownMap) -> Result<Option<Bytes>, String> = match kind {
+    let encode: fn(&ShownMap) -> Result<Option<Bytes>, String> = match kind {
         "f32" => return answer("application/octet-stream", map.pixels.clone()),
         "fits" => ShownMap::fits,
         "png" => |map| map.png().map(Some),
         _ => return no_map(),
     };
-    let content = if kind == "fits" { "application/fits" } else { "image/png" };
-    match slowly(&desk, move || make(&map)).await {
-        Ok(Ok(Some(bytes))) => answer(content, bytes),
+    let content_type = if kind == "fits" { "application/fits" } else { "image/png" };
+    match run_slow(&page, move || encode(&map)).await {
+        Ok(Ok(Some(bytes))) => answer(content_type, bytes),
         Ok(Ok(None)) => refusal(StatusCode::NOT_FOUND, "noise and input are served as .f32 and .png"),
         Ok(Err(error)) => refusal(StatusCode::INTERNAL_SERVER_ERROR, &error),
         Err(refusal) => refusal,
     }
 }
 
-/// `null` before anything is known.
-async fn passes(State(desk): State<PageState>) -> Response {
-    json(&desk.console.passes().as_deref())
+/// Packets over mission time; `null` before the instrument is known.
+async fn passes(State(page): State<PageState>) -> Response {
+    json(&page.console.passes().as_deref())
 }
 
-/// `null` before anything is known.
-async fn geometry(State(desk): State<PageState>) -> Response {
-    json(&desk.console.geometry())
+/// Positions of satellites, Moon and Earth; `null` before there are data with positions.
+async fn geometry(State(page): State<PageState>) -> Response {
+    json(&page.console.geometry())
 }
 
-/// `null` before anything is known.
-async fn uvw(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
-    channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.uvw(channel)))
+/// Density of a channel's baselines; `null` if it has none.
+async fn uvw(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
+    parse_channel(&channel).map_or_else(no_channel, |channel| json(&page.console.uvw(channel)))
 }
 
-/// `null` before anything is known.
-async fn hits(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
-    let Some(channel) = channel_of(&channel) else { return no_channel() };
-    let console = Arc::clone(&desk.console);
-    match slowly(&desk, move || console.hits(channel)).await {
+/// Map of a channel's visibilities by direction; `null` if it has none.
+async fn hits(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
+    let Some(channel) = parse_channel(&channel) else { return no_channel() };
+    let console = Arc::clone(&page.console);
+    match run_slow(&page, move || console.hits(channel)).await {
         Ok(hits) => json(&hits),
         Err(refusal) => refusal,
     }
 }
 
-/// `null` before anything is known.
-async fn powers(State(desk): State<PageState>, Path(channel): Path<String>) -> Response {
-    channel_of(&channel).map_or_else(no_channel, |channel| json(&desk.console.powers(channel)))
+/// Auto-correlation powers of a channel over time; `null` if it has none.
+async fn powers(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
+    parse_channel(&channel).map_or_else(no_channel, |channel| json(&page.console.powers(channel)))
 }
 
-async fn gaps(State(desk): State<PageState>) -> Response {
-    let Some(folder) = desk.console.state.clone() else {
-        return refusal(StatusCode::NOT_FOUND, "gaps are known to a ground with a state: replay --state DIR");
+async fn gaps(State(page): State<PageState>) -> Response {
+    let Some(folder) = page.console.state.clone() else {
+        return refusal(
+            StatusCode::NOT_FOUND,
+            "gaps need a ground segment with a state; expected replay --state DIR",
+        );
     };
-    match slowly(&desk, move || CoverageSurvey::read(&folder).map(|survey| survey.gaps())).await {
+    match run_slow(&page, move || CoverageSurvey::read(&folder).map(|survey| survey.gaps())).await {
         Ok(Ok(gaps)) => json(&gaps),
-        // No checkpoint yet.
+        // There is no checkpoint yet.
         Ok(Err(error)) => refusal(StatusCode::SERVICE_UNAVAILABLE, &error.to_string()),
         Err(refusal) => refusal,
     }
 }
 
-async fn metrics(State(desk): State<PageState>) -> Response {
-    match collector::scrape(&desk.console) {
+async fn metrics(State(page): State<PageState>) -> Response {
+    match prometheus::scrape(&page.console) {
         Ok(text) => {
-            if desk.console.phase() == Phase::Failed {
-                desk.console.failure_told.store(true, Ordering::Relaxed);
+            if page.console.phase() == Phase::Failed {
+                page.console.is_failure_scraped.store(true, Ordering::Relaxed);
             }
-            answer(collector::CONTENT_TYPE, text)
+            answer(prometheus::CONTENT_TYPE, text)
         }
         Err(error) => refusal(StatusCode::INTERNAL_SERVER_ERROR, &error.to_string()),
     }
 }
 
-async fn healthz(State(desk): State<PageState>) -> Response {
-    match desk.console.phase() {
+async fn healthz(State(page): State<PageState>) -> Response {
+    match page.console.phase() {
         Phase::Failed => refusal(StatusCode::SERVICE_UNAVAILABLE, "failed"),
         phase => answer("text/plain; charset=utf-8", format!("{}\n", phase.name())),
     }
 }
 
-async fn readyz(State(desk): State<PageState>) -> Response {
+async fn readyz(State(page): State<PageState>) -> Response {
     let is_unwritten = |listening: &Listening| {
         listening.archive.as_ref().is_some_and(|archive| archive.report().unwritten.is_some())
     };
-    let listening = desk.console.watched.get().and_then(|watched| watched.listening.as_ref());
-    match desk.console.phase() {
-        Phase::Running if listening.is_some_and(is_unwritten) => {
-            refusal(StatusCode::SERVICE_UNAVAILABLE, "the raw archive cannot be written: nothing is taken")
-        }
+    let listening = page.console.handles.get().and_then(|handles| handles.listening.as_ref());
+    match page.console.phase() {
+        Phase::Running if listening.is_some_and(is_unwritten) => refusal(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "the raw archive cannot be written: no data are accepted",
+        ),
         Phase::Running => answer("text/plain; charset=utf-8", "running\n"),
         phase => refusal(StatusCode::SERVICE_UNAVAILABLE, phase.name()),
     }
 }
 
-/// State of one reader of events.
-struct Reader {
-    desk: PageState,
-    seen: u64,
+struct EventReader {
+    page: PageState,
+    /// Number of the last event that was sent.
+    last_id: u64,
+    /// Events to send, the next one last.
     queue: Vec<Event>,
-    _place: OwnedSemaphorePermit,
+    _permit: OwnedSemaphorePermit,
 }
 
-async fn events(State(desk): State<PageState>) -> Response {
-    match Arc::clone(&desk.readers).try_acquire_owned() {
-        Ok(place) => events_for(desk, place).into_response(),
+async fn events(State(page): State<PageState>) -> Response {
+    match Arc::clone(&page.readers).try_acquire_owned() {
+        Ok(permit) => event_stream(page, permit).into_response(),
         Err(_) => {
             refusal(StatusCode::SERVICE_UNAVAILABLE, "too many readers of events; /api/status has the same")
         }
     }
 }
 
-fn events_for(
-    desk: PageState,
-    place: OwnedSemaphorePermit,
+fn event_stream(
+    page: PageState,
+    permit: OwnedSemaphorePermit,
 ) -> Sse<impl Stream<Item = Result<Event, Infallible>>> {
-    let mut reader = Reader { desk, seen: 0, queue: Vec::new(), _place: place };
-    reader.desk.news.mark_changed();
-    let next = |mut reader: Reader| async move {
+    let mut reader = EventReader { page, last_id: 0, queue: Vec::new(), _permit: permit };
+    reader.page.newest_status.mark_changed();
+    let next = |mut reader: EventReader| async move {
         loop {
             if let Some(event) = reader.queue.pop() {
                 return Some((Ok(event), reader));
             }
-            // Whoever is late sees the newest status only.
-            reader.desk.news.changed().await.ok()?;
-            let status = Arc::clone(&reader.desk.news.borrow_and_update());
+            // A slow reader gets the newest status only.
+            reader.page.newest_status.changed().await.ok()?;
+            let status = Arc::clone(&reader.page.newest_status.borrow_and_update());
             if status.is_empty() {
                 continue;
             }
-            for entry in reader.desk.console.log.after(reader.seen) {
-                reader.seen = entry.id;
+            for entry in reader.page.console.log.after(reader.last_id) {
+                reader.last_id = entry.id;
                 let text = serde_json::to_string(&entry).unwrap_or_default();
                 reader.queue.push(Event::default().event("log").id(entry.id.to_string()).data(text));
             }

@@ -1,4 +1,4 @@
-//! The page in a terminal: draws `/api/status` and `/api/figures` with characters.
+//! The status of a run in a terminal: draws `/api/status` and `/api/figures`.
 
 use ratatui::Frame;
 use ratatui::layout::{Alignment, Constraint, Layout, Rect};
@@ -8,20 +8,26 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Axis, Block, Cell, Chart, Dataset, GraphType, Paragraph, Row, Table};
 use serde_json::Value;
 
+use super::screen_text::{
+    as_number, as_text, bar, clock, duration, format_integer, format_short, format_within, group_digits,
+    list, percent, with_prefix,
+};
 use crate::units::constants::DAY_S;
 use crate::units::printable;
 
-/// Kinds of packets that are shown.
 const KINDS: [&str; 4] = ["instrument", "ephemeris", "visibilities", "housekeeping"];
 
-/// Characters of a queue's bar.
-const QUEUE_WIDTH: usize = 10;
+const BAR_WIDTH: usize = 10;
 
-/// Greatest and least width of the packets panel, characters; at the least, counts have five characters.
+/// Preferred width of the packets panel, characters.
 const RECEPTION_WIDTH: u16 = 58;
+/// Minimum width of the packets panel, characters, with five for each count.
 const RECEPTION_WIDTH_MIN: u16 = 40;
 
-/// Width below which a terminal counts as narrow: columns are left out and numbers get prefixes; no number is cut off.
+/// A stage below this fraction of the time is never highlighted as the busiest.
+const BUSY_MIN: f64 = 0.02;
+
+/// Width below which columns are left out and numbers get prefixes, characters.
 const NARROW: u16 = 72;
 
 const QUIET: Style = Style::new().fg(Color::DarkGray);
@@ -30,19 +36,19 @@ const BAD: Style = Style::new().fg(Color::Red).add_modifier(Modifier::BOLD);
 const BUSY: Style = Style::new().fg(Color::Yellow);
 const HEAD: Style = Style::new().add_modifier(Modifier::BOLD);
 
-/// What is drawn.
+/// Content of the terminal.
 #[derive(Clone, Debug, Default)]
 pub struct Screen {
-    /// Where it comes from.
+    /// Address of the server.
     pub address: String,
     /// The last `/api/status`.
     pub status: Value,
-    /// The last `/api/figures` of the channel shown; null before the first.
+    /// The last `/api/figures` of the selected channel; null before the first.
     pub figures: Value,
-    /// Index of the channel whose curve is shown, in the list of channels.
-    pub place: usize,
-    /// Why the state shown is not the newest.
-    pub lost: Option<String>,
+    /// Index of the selected channel in the list of channels.
+    pub channel_index: usize,
+    /// Reason of a lost connection; the status is then the last one received.
+    pub disconnected_because: Option<String>,
 }
 
 impl Screen {
@@ -80,15 +86,15 @@ impl Screen {
         frame.render_widget(Line::styled("q quit   \u{2190} \u{2192} channel of the curve", QUIET), keys);
     }
 
-    /// The title, as far as it fits: the address and the segment may be left out.
+    /// The title line. Without enough width, the address and the segment are left out.
     fn title(&self, width: usize) -> Line<'_> {
         let status = &self.status;
-        let segment = match text(&status["segment"]).as_str() {
+        let segment = match as_text(&status["segment"]).as_str() {
             "whole" => "whole chain".to_owned(),
             "space" => "space segment".to_owned(),
             other => other.to_owned(),
         };
-        let phase = text(&status["phase"]);
+        let phase = as_text(&status["phase"]);
         let (shown, style) = match phase.as_str() {
             "failed" => (phase, BAD),
             "ended" if status["cancelled"] == true => ("ended early".to_owned(), BUSY),
@@ -97,9 +103,9 @@ impl Screen {
         };
         let mut spans = vec![
             Span::styled("lunarray ", HEAD),
-            Span::raw(format!("{} \u{b7} {segment} \u{b7} ", text(&status["name"]))),
+            Span::raw(format!("{} \u{b7} {segment} \u{b7} ", as_text(&status["name"]))),
             Span::styled(shown, style),
-            Span::raw(format!(" \u{b7} {}", clock(number(&status["elapsed_s"])))),
+            Span::raw(format!(" \u{b7} {}", clock(as_number(&status["elapsed_s"])))),
         ];
         let address = format!(" \u{b7} {}", self.address);
         let has_room =
@@ -110,10 +116,11 @@ impl Screen {
         if !has_room(&spans, 0) {
             spans[1] = Span::raw("");
         }
-        if let Some(lost) = &self.lost {
-            spans.push(Span::styled(format!("  not connected, last state: {}", printable(lost)), BAD));
+        if let Some(reason) = &self.disconnected_because {
+            let text = format!("  not connected ({}); showing the last state", printable(reason));
+            spans.push(Span::styled(text, BAD));
         } else if !status["error"].is_null() {
-            spans.push(Span::styled(format!("  {}", text(&status["error"])), BAD));
+            spans.push(Span::styled(format!("  {}", as_text(&status["error"])), BAD));
         }
         Line::from(spans)
     }
@@ -121,34 +128,32 @@ impl Screen {
     fn draw_stages(&self, frame: &mut Frame<'_>, area: Rect) {
         let stages = list(&self.status["stages"]);
         let running = stages.iter().filter(|stage| stage["ended"] != true);
-        let most = running.map(|stage| number(&stage["busy"])).fold(0.02, f64::max);
+        let busiest = running.map(|stage| as_number(&stage["busy"])).fold(BUSY_MIN, f64::max);
         let rows = stages.iter().map(|stage| {
             let queue = &stage["queue"];
-            let (depth, capacity) = (number(&queue["depth"]), number(&queue["capacity"]).max(1.0));
+            let (depth, capacity) = (as_number(&queue["depth"]), as_number(&queue["capacity"]).max(1.0));
             let bar = match queue.is_null() {
                 true => Cell::from(""),
-                false => {
-                    Cell::from(format!("{} {depth:.0}/{capacity:.0}", bar(depth / capacity, QUEUE_WIDTH)))
-                        .style(if depth >= capacity { BUSY } else { GOOD })
-                }
+                false => Cell::from(format!("{} {depth:.0}/{capacity:.0}", bar(depth / capacity, BAR_WIDTH)))
+                    .style(if depth >= capacity { BUSY } else { GOOD }),
             };
-            let unit = text(&stage["unit"]);
+            let unit = as_text(&stage["unit"]);
             let rate = match unit.is_empty() {
-                true => format!("{} items", whole(&stage["items_out"])),
-                false => format!("{}{unit}/s", prefixed(number(&stage["units_per_s"]))),
+                true => format!("{} items", format_integer(&stage["items_out"])),
+                false => format!("{}{unit}/s", with_prefix(as_number(&stage["units_per_s"]))),
             };
-            let p99 = |timing: &Value| match number(&timing["count"]) > 0.0 {
-                true => duration(number(&timing["p99_s"])),
+            let p99 = |timing: &Value| match as_number(&timing["count"]) > 0.0 {
+                true => duration(as_number(&timing["p99_s"])),
                 false => "\u{2013}".to_owned(),
             };
-            let busy = number(&stage["busy"]);
+            let busy = as_number(&stage["busy"]);
             let style = match stage["ended"] == true {
                 true => QUIET,
-                false if busy >= most => BUSY,
+                false if busy >= busiest => BUSY,
                 false => Style::new(),
             };
             let cells = [
-                Cell::from(text(&stage["name"])),
+                Cell::from(as_text(&stage["name"])),
                 bar,
                 Cell::from(rate),
                 Cell::from(p99(&stage["working"])),
@@ -157,11 +162,11 @@ impl Screen {
             ];
             (cells.to_vec(), style)
         });
-        let widths = [12, QUEUE_WIDTH as u16 + 12, 0, 10, 10, 6].map(|width| match width {
+        let widths = [12, BAR_WIDTH as u16 + 12, 0, 10, 10, 6].map(|width| match width {
             0 => Constraint::Fill(1),
             width => Constraint::Length(width),
         });
-        let head = ["stage", "queue before it", "rate", "step p99", "age p99", "busy"];
+        let head = ["stage", "input queue", "rate", "step p99", "latency p99", "busy"];
         let block = Block::bordered().title(" Stages ");
         let inner = block.inner(area);
         let is_shown = |column: &usize| inner.width >= NARROW || ![3, 4].contains(column);
@@ -181,37 +186,37 @@ impl Screen {
         if solving.is_null() {
             return Line::default();
         }
-        let (residual, target) = (number(&solving["residual"]), number(&solving["target"]));
+        let (residual, target) = (as_number(&solving["residual"]), as_number(&solving["target"]));
         let left = match solving["left_s"].as_f64() {
             Some(left_s) => format!(", about {} left", clock(left_s)),
             None => String::new(),
         };
         let done = (residual.ln() / target.ln()).clamp(0.0, 1.0);
-        let iteration = whole(&solving["iteration"]);
+        let iteration = format_integer(&solving["iteration"]);
         let short = format!("iteration {iteration}, residual {residual:.1e} of {target:.0e}");
-        let long = format!("{} {}: {short}{left}", bar(done, QUEUE_WIDTH), text(&solving["what"]));
+        let long = format!("{} {}: {short}{left}", bar(done, BAR_WIDTH), as_text(&solving["what"]));
         Line::styled(if long.chars().count() <= width { long } else { short }, BUSY)
     }
 
     fn ledger_lines(&self, width: usize) -> Vec<Line<'static>> {
-        // Numbers first: names may be cut.
+        // Numbers come first, as names may be truncated.
         let digits = 15.min((width / 2).max(7));
         let ledger = &self.status["ledger"];
-        let phase = text(&self.status["phase"]);
+        let phase = as_text(&self.status["phase"]);
         let is_over = phase == "ended" || phase == "failed";
-        // Null while it is not known.
-        let rest = ledger["unaccounted"].as_f64().unwrap_or(0.0);
-        let (verdict, style) = match (is_over, rest == 0.0) {
-            (true, true) => ("closed".to_owned(), GOOD),
-            (true, false) => (format!("does not close: {} unaccounted", count(rest)), BAD),
-            (false, _) => ("open while data flow".to_owned(), QUIET),
+        // Null until the end of the run.
+        let unaccounted = ledger["unaccounted"].as_f64().unwrap_or(0.0);
+        let (balance, style) = match (is_over, unaccounted == 0.0) {
+            (true, true) => ("balanced".to_owned(), GOOD),
+            (true, false) => (format!("imbalance: {} unaccounted", group_digits(unaccounted)), BAD),
+            (false, _) => ("not final while running".to_owned(), QUIET),
         };
         let entry = |name: String, value: &Value| {
-            Line::from(format!("{:>digits$}  {name}", fit(number(value), digits)))
+            Line::from(format!("{:>digits$}  {name}", format_within(as_number(value), digits)))
         };
-        let mut lines = vec![Line::styled(verdict, style)];
+        let mut lines = vec![Line::styled(balance, style)];
         lines.push(match ledger["sampled"].is_null() {
-            true => Line::from(format!("{:>digits$}  sampled: told at the end", "\u{2013}")),
+            true => Line::from(format!("{:>digits$}  sampled: known at the end", "\u{2013}")),
             false => entry("sampled".into(), &ledger["sampled"]),
         });
         lines.push(entry("accumulated".into(), &ledger["accumulated"]));
@@ -221,30 +226,33 @@ impl Screen {
             );
         }
         lines.extend(list(&ledger["lost"]).iter().map(|lost| {
-            entry(format!("lost in {}: {}", text(&lost["stage"]), text(&lost["reason"])), &lost["count"])
+            entry(
+                format!("lost in {}: {}", as_text(&lost["stage"]), as_text(&lost["reason"])),
+                &lost["count"],
+            )
         }));
         lines
     }
 
     fn draw_reception(&self, frame: &mut Frame<'_>, area: Rect) {
         let reception = &self.status["reception"];
-        // Four columns beside the names, a space before each.
+        // Four columns after the names, with a space before each.
         let digits = usize::from(area.width.saturating_sub(2 + 12 + 4) / 4);
         let cell = |value: &Value, is_bad: bool| {
-            let style = if is_bad && number(value) > 0.0 { BAD } else { Style::new() };
-            Cell::from(Line::from(fit(number(value), digits)).right_aligned()).style(style)
+            let style = if is_bad && as_number(value) > 0.0 { BAD } else { Style::new() };
+            Cell::from(Line::from(format_within(as_number(value), digits)).right_aligned()).style(style)
         };
         let rows = KINDS.map(|kind| {
-            let of = &reception[kind];
+            let counts = &reception[kind];
             Row::new([
                 Cell::from(kind),
-                cell(&of["packets"], false),
-                cell(&of["missing"], true),
-                cell(&of["damaged"], true),
-                cell(&of["duplicates"], false),
+                cell(&counts["packets"], false),
+                cell(&counts["missing"], true),
+                cell(&counts["damaged"], true),
+                cell(&counts["duplicates"], false),
             ])
         });
-        let head = ["packets", "received", "missing", "damaged", "again"];
+        let head = ["packets", "received", "missing", "damaged", "duplicates"];
         let head = head.map(|name| {
             Line::from(name).alignment(if name == "packets" { Alignment::Left } else { Alignment::Right })
         });
@@ -257,16 +265,17 @@ impl Screen {
         ];
         let listening = &self.status["listening"];
         let from = match listening.is_null() {
-            true => format!("{}B received", prefixed(number(&reception["bytes"]))),
+            true => format!("{}B received", with_prefix(as_number(&reception["bytes"]))),
             false => format!(
-                "{} senders, {}B read, {}B wait",
-                whole(&listening["open"]),
-                prefixed(number(&listening["bytes"])),
-                prefixed(number(&listening["backlog_bytes"]))
+                "{} senders, {}B read, {}B queued",
+                format_integer(&listening["open"]),
+                with_prefix(as_number(&listening["bytes"])),
+                with_prefix(as_number(&listening["backlog_bytes"]))
             ),
         };
         let has_room = from.chars().count() + 4 <= usize::from(area.width);
-        let from = if has_room { from } else { format!("{}B read", prefixed(number(&listening["bytes"]))) };
+        let from =
+            if has_room { from } else { format!("{}B read", with_prefix(as_number(&listening["bytes"]))) };
         let mut block = Block::bordered().title(" Reception ").title_bottom(format!(" {from} "));
         if !self.status["saving"]["unsaved"].is_null() {
             block = block.title(Line::styled(" state not saved ", BAD));
@@ -277,31 +286,31 @@ impl Screen {
 
     fn draw_maps(&self, frame: &mut Frame<'_>, area: Rect) {
         let channels = list(&self.status["channels"]);
-        let first = self.place.saturating_sub(7).min(channels.len().saturating_sub(1));
-        let rows = channels.iter().enumerate().skip(first).map(|(place, channel)| {
+        let first = self.channel_index.saturating_sub(7).min(channels.len().saturating_sub(1));
+        let rows = channels.iter().enumerate().skip(first).map(|(index, channel)| {
             let figures = &channel["figures"];
             let name = match channel["is_final"] == true {
                 true => "final".to_owned(),
-                false => format!("snapshot {}", whole(&figures["number"])),
+                false => format!("snapshot {}", format_integer(&figures["number"])),
             };
             let span = &channel["span_s"];
-            let days = (number(&span[1]) - number(&span[0])) / DAY_S;
+            let days = (as_number(&span[1]) - as_number(&span[0])) / DAY_S;
             let cells = [
-                if place == self.place { "\u{25b8}".to_owned() } else { String::new() },
-                whole(&channel["channel"]),
-                format!("{:.3}", number(&channel["frequency_hz"]) / 1e6),
+                if index == self.channel_index { "\u{25b8}".to_owned() } else { String::new() },
+                format_integer(&channel["channel"]),
+                format!("{:.3}", as_number(&channel["frequency_hz"]) / 1e6),
                 name,
                 format!("{days:.1}"),
-                fit(number(&figures["visibilities"]), 15),
-                short(&channel["noise_rms_k"]),
-                short(&figures["rms_error_over_rms_truth"]),
-                short(&figures["rho_mean"]),
+                format_within(as_number(&figures["visibilities"]), 15),
+                format_short(&channel["noise_rms_k"]),
+                format_short(&figures["rms_error_over_rms_truth"]),
+                format_short(&figures["rho_mean"]),
             ];
-            (cells.map(Cell::from).to_vec(), if place == self.place { HEAD } else { Style::new() })
+            (cells.map(Cell::from).to_vec(), if index == self.channel_index { HEAD } else { Style::new() })
         });
         let head = ["", "ch", "MHz", "map", "days", "visibilities", "noise, K", "error", "rho"];
         let lengths = [1_u16, 4, 8, 13, 8, 15, 10, 9, 9];
-        // These are left out first where there is no room.
+        // Columns 8, 7, 3 and 4 are left out, in this order, if the width is too small.
         let mut left_out = Vec::new();
         let mut needed = lengths.iter().map(|length| length + 1).sum::<u16>() + 1;
         for column in [8, 7, 3, 4] {
@@ -317,10 +326,10 @@ impl Screen {
 
     fn draw_curve(&self, frame: &mut Frame<'_>, area: Rect) {
         let spectra = &self.figures["spectra"];
-        let by_degree = |values: &Value, of: fn(f64) -> f64| -> Vec<(f64, f64)> {
+        let by_degree = |values: &Value, transform: fn(f64) -> f64| -> Vec<(f64, f64)> {
             let values = list(values).iter().enumerate().skip(1);
             values
-                .filter_map(|(l, v)| Some((l as f64, of(v.as_f64()?))))
+                .filter_map(|(l, v)| Some((l as f64, transform(v.as_f64()?))))
                 .filter(|(_, v)| v.is_finite())
                 .collect()
         };
@@ -330,7 +339,7 @@ impl Screen {
                 " rho_l: correlation of the map with the input, by degree ",
                 by_degree(&spectra["rho"], |v| v),
             ),
-            // The ground does not know the truth.
+            // Without an input sky there is no correlation.
             false => {
                 (" C_l of the map, log10 of K\u{b2}, by degree ", by_degree(&spectra["cl_map"], f64::log10))
             }
@@ -344,9 +353,9 @@ impl Screen {
         let y = match is_rho {
             true => [0.0, 1.0],
             false => {
-                let least = points.iter().fold(f64::INFINITY, |least, p| least.min(p.1)).floor();
-                let most = points.iter().fold(f64::NEG_INFINITY, |most, p| most.max(p.1)).ceil();
-                [least, most.max(least + 1.0)]
+                let min = points.iter().fold(f64::INFINITY, |min, p| min.min(p.1)).floor();
+                let max = points.iter().fold(f64::NEG_INFINITY, |max, p| max.max(p.1)).ceil();
+                [min, max.max(min + 1.0)]
             }
         };
         let labels =
@@ -361,53 +370,7 @@ impl Screen {
     }
 }
 
-/// The entries of a list; none if it is not there.
-fn list(value: &Value) -> &[Value] {
-    value.as_array().map_or(&[], Vec::as_slice)
-}
-
-/// A number; 0 if it is not there.
-fn number(value: &Value) -> f64 {
-    value.as_f64().unwrap_or(0.0)
-}
-
-/// A text without control characters; empty if it is absent.
-fn text(value: &Value) -> String {
-    printable(value.as_str().unwrap_or_default()).into_owned()
-}
-
-/// A whole number in groups of three digits.
-fn whole(value: &Value) -> String {
-    count(number(value))
-}
-
-fn count(number: f64) -> String {
-    let digits = format!("{:.0}", number.abs());
-    let mut grouped = String::from(if number < 0.0 { "-" } else { "" });
-    for (k, digit) in digits.chars().enumerate() {
-        if k > 0 && (digits.len() - k).is_multiple_of(3) {
-            grouped.push(',');
-        }
-        grouped.push(digit);
-    }
-    grouped
-}
-
-/// A whole number in at most `width` characters: with a prefix if its digits do not fit.
-fn fit(number: f64, characters: usize) -> String {
-    let all = count(number);
-    if all.chars().count() <= characters {
-        return all;
-    }
-    let scales = [(1e15, 'P'), (1e12, 'T'), (1e9, 'G'), (1e6, 'M'), (1e3, 'k')];
-    let scaled = scales.into_iter().find(|(size, _)| number.abs() >= *size);
-    let Some((size, prefix)) = scaled else { return "#".repeat(characters) };
-    let texts = [1, 0].map(|digits| format!("{:.digits$}{prefix}", number / size));
-    let fitting = texts.into_iter().find(|text| text.chars().count() <= characters);
-    fitting.unwrap_or_else(|| "#".repeat(characters))
-}
-
-/// A table of the columns that are shown.
+/// Makes a table of the columns for which `is_shown` is true.
 fn table_of<'a>(
     head: &[&'static str],
     rows: Vec<(Vec<Cell<'a>>, Style)>,
@@ -421,49 +384,6 @@ fn table_of<'a>(
     });
     let head: Vec<&'static str> = shown.iter().map(|&column| head[column]).collect();
     Table::new(rows, shown.iter().map(|&column| widths[column])).header(Row::new(head).style(QUIET))
-}
-
-/// A number with a few digits; a dash if it is not there.
-fn short(value: &Value) -> String {
-    match value.as_f64() {
-        None => "\u{2013}".to_owned(),
-        Some(v) if v != 0.0 && !(1e-2..1e5).contains(&v.abs()) => format!("{v:.2e}"),
-        Some(v) => format!("{v:.3}"),
-    }
-}
-
-/// A rate: three digits and the prefix of its unit.
-fn prefixed(value: f64) -> String {
-    let scales = [(1e9, " G"), (1e6, " M"), (1e3, " k")];
-    match scales.into_iter().find(|(size, _)| value >= *size) {
-        Some((size, prefix)) => format!("{:.1}{prefix}", value / size),
-        None => format!("{value:.0} "),
-    }
-}
-
-fn percent(share: f64) -> String {
-    format!("{:.0} %", 100.0 * share)
-}
-
-fn duration(seconds: f64) -> String {
-    match seconds {
-        s if s >= 1.0 => format!("{s:.2} s"),
-        s if s >= 1e-3 => format!("{:.1} ms", 1e3 * s),
-        s => format!("{:.0} \u{b5}s", 1e6 * s),
-    }
-}
-
-fn clock(seconds: f64) -> String {
-    let s = seconds.max(0.0) as u64;
-    match s / 3600 {
-        0 => format!("{}:{:02}", s / 60, s % 60),
-        hours => format!("{hours}:{:02}:{:02}", s / 60 % 60, s % 60),
-    }
-}
-
-fn bar(share: f64, width: usize) -> String {
-    let full = (share.clamp(0.0, 1.0) * width as f64).round() as usize;
-    format!("{}{}", "\u{2588}".repeat(full), "\u{2591}".repeat(width - full))
 }
 
 #[cfg(test)]
@@ -516,7 +436,7 @@ mod tests {
             "2.5 Mbytes/s",
             "2.5 ms",
             "90 %",
-            // Half of the way from 1 to 1e-6, in the logarithm.
+            // A residual of 1e-3 is half of the way from 1 to 1e-6, in the logarithm.
             "\u{2588}\u{2588}\u{2588}\u{2588}\u{2588}\u{2591}\u{2591}\u{2591}\u{2591}\u{2591} map at 3 MHz: iteration 12, residual 1.0e-3 of 1e-6, about 1:01 left",
             "1,234,567  accumulated",
             "89  flagged: occulted",
@@ -536,14 +456,14 @@ mod tests {
         let words: Vec<&str> =
             reception.trim_end_matches('\u{2502}').split_whitespace().rev().take(4).collect();
         assert_eq!(words, ["6", "0", "5", "1,234"], "{text}");
-        // Only the curve has dots.
+        // The curve is drawn with Braille dots.
         assert!(text.chars().filter(|c| ('\u{2801}'..='\u{28ff}').contains(c)).count() > 20, "{text}");
         assert!(!text.contains('\u{1b}'));
     }
 
     #[test]
-    fn what_is_not_there_or_does_not_fit_is_left_out() {
-        // Any size, and before anything is known.
+    fn absent_panels_are_left_out() {
+        // Any size and an empty status can be drawn.
         for (width, height) in [(1, 1), (20, 5), (80, 24), (300, 100)] {
             drawn(&running(), width, height);
             drawn(&Screen::default(), width, height);
@@ -555,15 +475,15 @@ mod tests {
         space.status["channels"] = json!([]);
         let text = drawn(&space, 100, 30);
         assert!(!text.contains("Ledger") && !text.contains("Maps") && text.contains("Stages"), "{text}");
-        let mut lost = running();
-        lost.lost = Some("refused".into());
-        assert!(drawn(&lost, 120, 30).contains("not connected, last state: refused"));
-        let mut open = running();
-        open.status["phase"] = json!("ended");
-        open.status["ledger"]["unaccounted"] = json!(17);
-        open.figures = json!({"spectra": {"cl_map": [0.0, 1e4, 1e5, 1e3]}});
-        let text = drawn(&open, 100, 46);
-        assert!(text.contains("does not close: 17 unaccounted") && text.contains("C_l of the map"), "{text}");
+        let mut disconnected = running();
+        disconnected.disconnected_because = Some("refused".into());
+        assert!(drawn(&disconnected, 120, 30).contains("not connected (refused); showing the last state"));
+        let mut unbalanced = running();
+        unbalanced.status["phase"] = json!("ended");
+        unbalanced.status["ledger"]["unaccounted"] = json!(17);
+        unbalanced.figures = json!({"spectra": {"cl_map": [0.0, 1e4, 1e5, 1e3]}});
+        let text = drawn(&unbalanced, 100, 46);
+        assert!(text.contains("imbalance: 17 unaccounted") && text.contains("C_l of the map"), "{text}");
     }
 
     #[test]
@@ -581,7 +501,7 @@ mod tests {
             let row = text.lines().find(|line| line.contains("\u{2502}ephemeris ")).unwrap();
             let words: Vec<&str> =
                 row.trim_end_matches('\u{2502}').split_whitespace().rev().take(4).collect();
-            // All digits, or fewer with a prefix.
+            // All digits, or a rounded number with a prefix.
             let expected = [
                 &["12,345", "12.3k", "12k"][..],
                 &["0"],
@@ -600,20 +520,5 @@ mod tests {
             assert!(text.contains("running \u{b7} 1:02:05"), "{width}:\n{text}");
             assert!(text.contains("residual 1.0e-3 of 1e-6"), "{width}:\n{text}");
         }
-    }
-
-    #[test]
-    fn numbers_are_readable() {
-        assert_eq!(
-            [0.0, 999.0, 1000.0, 1234567.0, -1234.0].map(count),
-            ["0", "999", "1,000", "1,234,567", "-1,234"]
-        );
-        assert_eq!([0.0, 61.0, 36_061.0].map(clock), ["0:00", "1:01", "10:01:01"]);
-        assert_eq!([2e-6, 0.0025, 3.0].map(duration), ["2 \u{b5}s", "2.5 ms", "3.00 s"]);
-        assert_eq!([12.0, 1.5e3, 2e6, 3e9].map(prefixed), ["12 ", "1.5 k", "2.0 M", "3.0 G"]);
-        assert_eq!(
-            [-1.0, 0.0, 0.5, 2.0].map(|share| bar(share, 2)),
-            ["\u{2591}\u{2591}", "\u{2591}\u{2591}", "\u{2588}\u{2591}", "\u{2588}\u{2588}"]
-        );
     }
 }

@@ -15,80 +15,79 @@ use super::console::Console;
 use super::error::ServeError;
 use super::routes::{PageState, READERS_MAX, router};
 use super::subject::Subject;
-use crate::pipeline::Watched;
+use crate::pipeline::RunHandles;
 
-/// Interval between two looks at the run.
-const TICK: Duration = Duration::from_millis(500);
+const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Time for the last status to reach those who are connected.
-const LAST_WORDS: Duration = Duration::from_millis(150);
+/// Delay before the shutdown, in which the last status reaches the connected clients.
+const SHUTDOWN_DELAY: Duration = Duration::from_millis(150);
 
-/// A server at work; it ends when dropped.
+/// A running server; dropping it stops the server.
 #[derive(Debug)]
 pub struct Server {
     console: Arc<Console>,
     address: SocketAddr,
-    news: watch::Sender<Arc<str>>,
+    newest_status: watch::Sender<Arc<str>>,
     stop: watch::Sender<bool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Server {
-    /// Starts to serve; on addresses that other machines can reach only if `allow_remote`, and then under any name.
+    /// Starts a server. With `allow_remote` the address may be reachable by other machines, and any `Host` header is accepted.
     ///
     /// # Errors
-    /// [`ServeError`]: an address that cannot be had, or no thread.
+    /// [`ServeError`]: an address on which it cannot listen; a thread that cannot be started.
     pub fn start(address: &ServeAddress, allow_remote: bool, subject: Subject) -> Result<Self, ServeError> {
         let start = |source| ServeError::Start { source };
         let listener = address.bind(allow_remote)?;
         listener.set_nonblocking(true).map_err(start)?;
-        let own = listener.local_addr().map_err(start)?;
+        let address = listener.local_addr().map_err(start)?;
         let console = Arc::new(Console::new(subject));
-        let (news, reader) = watch::channel(Arc::<str>::default());
+        let (newest_status, status_receiver) = watch::channel(Arc::<str>::default());
         let (stop, stopped) = watch::channel(false);
         let (slow, readers) = (Arc::new(Semaphore::new(1)), Arc::new(Semaphore::new(READERS_MAX)));
-        let desk = PageState {
+        let page = PageState {
             console: Arc::clone(&console),
-            news: reader,
-            own,
+            newest_status: status_receiver,
+            address,
             any_host: allow_remote,
             slow,
             readers,
         };
         let runtime =
             Builder::new_current_thread().enable_all().max_blocking_threads(1).build().map_err(start)?;
-        let teller = news.clone();
+        let status_sender = newest_status.clone();
         let thread = std::thread::Builder::new()
             .name("serve".into())
-            .spawn(move || work(runtime, listener, desk, &teller, stopped))
+            .spawn(move || serve(runtime, listener, page, &status_sender, stopped))
             .map_err(start)?;
-        Ok(Self { console, address: own, news, stop, thread: Some(thread) })
+        Ok(Self { console, address, newest_status, stop, thread: Some(thread) })
     }
 
-    /// Where it can be seen.
+    /// URL of the page.
     #[must_use]
     pub fn url(&self) -> String {
         format!("http://{}/", self.address)
     }
 
-    /// The run that it shows begins.
-    pub fn watch(&self, watched: &Watched) {
-        self.console.begin(watched);
-        tell(&self.console, &self.news);
+    /// Starts to show a run.
+    pub fn watch(&self, handles: &RunHandles) {
+        self.console.set_run(handles);
+        update(&self.console, &self.newest_status);
     }
 
     /// Whether metrics were read since the run failed.
     #[must_use]
-    pub fn is_failure_told(&self) -> bool {
-        self.console.failure_told.load(std::sync::atomic::Ordering::Relaxed)
+    pub fn is_failure_scraped(&self) -> bool {
+        self.console.is_failure_scraped.load(std::sync::atomic::Ordering::Relaxed)
     }
 
-    /// The run has ended: `cancelled` early, or with an `error`.
+    /// Shows the end of the run, which was `cancelled` or failed with an `error`.
     pub fn conclude(&self, error: Option<String>, cancelled: bool) {
-        // What happened before the end stands before it in the log.
-        tell(&self.console, &self.news);
-        self.console.end(error, cancelled);
-        tell(&self.console, &self.news);
+        // Earlier events have to precede the end in the log.
+        update(&self.console, &self.newest_status);
+        self.console.set_end(error, cancelled);
+        update(&self.console, &self.newest_status);
     }
 }
 
@@ -96,43 +95,43 @@ impl Drop for Server {
     fn drop(&mut self) {
         self.stop.send_replace(true);
         if let Some(thread) = self.thread.take() {
-            // It panics only through a bug, which has been reported.
+            // A panic of the thread has already been reported.
             let _ = thread.join();
         }
     }
 }
 
-/// Looks at the run, and passes the status on to those who are connected.
-fn tell(console: &Console, news: &watch::Sender<Arc<str>>) {
-    let status = console.look();
-    // A status of plain numbers and texts can always be written.
-    let text = serde_json::to_string(&status).unwrap_or_default();
-    news.send_replace(text.into());
+/// Updates the status, and sends it to the connected clients.
+fn update(console: &Console, newest_status: &watch::Sender<Arc<str>>) {
+    // A status of plain numbers and texts always has a JSON form.
+    let text = serde_json::to_string(&console.update()).unwrap_or_default();
+    newest_status.send_replace(text.into());
 }
 
-fn work(
+/// Serves connections and updates the status until `stopped`.
+fn serve(
     runtime: Runtime,
     listener: TcpListener,
-    desk: PageState,
-    news: &watch::Sender<Arc<str>>,
+    page: PageState,
+    newest_status: &watch::Sender<Arc<str>>,
     mut stopped: watch::Receiver<bool>,
 ) {
-    let console = Arc::clone(&desk.console);
+    let console = Arc::clone(&page.console);
     runtime.block_on(async {
-        let accepting = tokio::spawn(accept(listener, router(desk), Arc::clone(&console), stopped.clone()));
-        let mut ticks = interval(TICK);
+        let accepting = tokio::spawn(accept(listener, router(page), Arc::clone(&console), stopped.clone()));
+        let mut ticks = interval(UPDATE_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 _ = stopped.changed() => break,
-                _ = ticks.tick() => tell(&console, news),
+                _ = ticks.tick() => update(&console, newest_status),
             }
         }
         accepting.abort();
-        if console.visitors.open.load(std::sync::atomic::Ordering::Relaxed) > 0 {
-            sleep(LAST_WORDS).await;
+        if console.clients.open.load(std::sync::atomic::Ordering::Relaxed) > 0 {
+            sleep(SHUTDOWN_DELAY).await;
         }
     });
-    // A picture that is being drawn is not waited for.
+    // This does not wait for a picture that is being drawn.
     runtime.shutdown_background();
 }

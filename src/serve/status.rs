@@ -1,9 +1,9 @@
-//! The state of a run, as `/api/status` tells it: the terms of `summary.json` where they exist.
+//! The status of a run for `/api/status`. It uses the terms of `summary.json` where they exist.
 
 use serde::Serialize;
 
-use super::pulse::StageRate;
-use super::shelf::ChannelStatus;
+use super::map_cache::ChannelStatus;
+use super::stage_rates::StageRate;
 use crate::calibration::Completeness;
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::packet_archive::ArchiveReport;
@@ -13,18 +13,16 @@ use crate::ground::SavingReport;
 use crate::products::ProductsReport;
 use crate::runtime::{LedgerReport, StageProgress, TimingSummary};
 
-/// Where a run is.
+/// Phase of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(super) enum Phase {
-    /// It is being prepared.
+    /// The run is being prepared.
     #[default]
     Starting,
-    /// Data flow.
     Running,
-    /// It has ended well, or was ended.
+    /// The run is complete or was cancelled.
     Ended,
-    /// It has failed.
     Failed,
 }
 
@@ -41,18 +39,15 @@ impl Phase {
     }
 }
 
-/// The queue before a stage.
+/// Status of the input queue of a stage.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(super) struct QueueStatus {
-    /// Items that it can hold.
     pub(super) capacity: usize,
-    /// Items in it.
     pub(super) depth: usize,
-    /// Greatest number of items found in it.
     depth_max: usize,
 }
 
-/// A stage.
+/// Status of a stage.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct StageStatus {
     pub(super) name: String,
@@ -60,9 +55,9 @@ pub(super) struct StageStatus {
     pub(super) items_out: u64,
     pub(super) units: u64,
     pub(super) unit: &'static str,
-    /// Units per second, over the last seconds; after the run over all of it.
+    /// Units per second over the last seconds, or over the whole run after its end.
     units_per_s: f64,
-    /// Share of that time in which it worked.
+    /// Fraction of that time in which the stage worked.
     pub(super) busy: f64,
     pub(super) ended: bool,
     pub(super) queue: Option<QueueStatus>,
@@ -70,9 +65,9 @@ pub(super) struct StageStatus {
     since_source: TimingSummary,
 }
 
-/// The stages with their queues. A stage reads what the one before it in the list writes.
+/// Status of the stages. The input of a stage is the output of the one before it in the list.
 pub(super) fn stages_of(progress: &[StageProgress], rates: &[StageRate]) -> Vec<StageStatus> {
-    let before = |k: usize| k.checked_sub(1).map_or(0, |before| progress[before].items_out);
+    let items_before = |k: usize| k.checked_sub(1).map_or(0, |before| progress[before].items_out);
     let stage = |(k, (stage, rate)): (usize, (&StageProgress, &StageRate))| StageStatus {
         name: stage.name.clone(),
         items_in: stage.items_in,
@@ -84,8 +79,8 @@ pub(super) fn stages_of(progress: &[StageProgress], rates: &[StageRate]) -> Vec<
         ended: stage.ended,
         queue: stage.queue_capacity.map(|capacity| QueueStatus {
             capacity,
-            // Counters of two threads, read one after the other.
-            depth: (before(k).saturating_sub(stage.items_in) as usize).min(capacity),
+            // The counters of two threads are not read at the same instant, hence the limits.
+            depth: (items_before(k).saturating_sub(stage.items_in) as usize).min(capacity),
             depth_max: stage.queue_depth_max,
         }),
         working: stage.working.summary(),
@@ -94,28 +89,28 @@ pub(super) fn stages_of(progress: &[StageProgress], rates: &[StageRate]) -> Vec<
     progress.iter().zip(rates).enumerate().map(stage).collect()
 }
 
-/// The solution in progress.
+/// Status of the solution in progress.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct SolverStatus {
     pub(super) what: String,
     pub(super) iteration: usize,
     pub(super) residual: f64,
     pub(super) target: f64,
-    /// Time left if the residual keeps falling at the same rate, s.
+    /// Estimated time left, s, if the residual keeps falling at the same rate.
     pub(super) left_s: Option<f64>,
 }
 
-/// The ledger of visibilities so far. How many were sampled is known at the end of a run: until then that and the rest are null.
+/// The ledger of visibilities so far. `sampled` and `unaccounted` are null until the end of a run.
 #[derive(Clone, Debug)]
 pub(super) struct LedgerStatus {
     pub(super) report: LedgerReport<VisibilityReason>,
-    /// Visibilities that were sampled, and those without an entry, zero unless the ledger does not close.
+    /// Number of sampled visibilities, and of those without an entry, which is zero if the ledger balances.
     pub(super) sampled: Option<(u64, i128)>,
 }
 
 impl LedgerStatus {
-    /// The status of a run that has ended, or goes on.
-    pub(super) fn of(report: LedgerReport<VisibilityReason>, is_over: bool) -> Self {
+    /// The status of a ledger; `is_over`: the run has ended.
+    pub(super) fn new(report: LedgerReport<VisibilityReason>, is_over: bool) -> Self {
         let sampled = is_over.then(|| (report.sampled, report.unaccounted()));
         Self { report, sampled }
     }
@@ -125,59 +120,55 @@ impl Serialize for LedgerStatus {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut fields = serde_json::to_value(&self.report).map_err(serde::ser::Error::custom)?;
         fields["sampled"] = self.sampled.map(|(sampled, _)| sampled).into();
-        fields["unaccounted"] = self.sampled.and_then(|(_, rest)| i64::try_from(rest).ok()).into();
+        fields["unaccounted"] =
+            self.sampled.and_then(|(_, unaccounted)| i64::try_from(unaccounted).ok()).into();
         fields.serialize(serializer)
     }
 }
 
-/// Senders and their backlog.
+/// Status of the senders.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ListenerStatus {
-    /// Open connections.
     pub(super) open: usize,
-    /// Bytes read from all.
+    /// Bytes read from all senders.
     pub(super) bytes: u64,
-    /// Bytes read that the ground has not taken yet.
+    /// Bytes read that the ground segment has not processed yet.
     pub(super) backlog_bytes: u64,
-    /// Time since the last sound packet from anyone, s; null before the first of this session.
+    /// Time since the last valid packet from any sender, s; null before the first of this session.
     pub(super) silence_s: Option<f64>,
-    /// The raw archive, if there is one.
     pub(super) archive: Option<ArchiveReport>,
-    /// Connections that have ended.
+    /// Counters of connections, datagrams and stations.
     pub(super) report: ListenReport,
 }
 
-/// Connections of browsers and programs.
+/// Counters of HTTP connections and requests.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub(super) struct VisitorStatus {
     pub(super) open: u64,
     pub(super) refused: u64,
-    /// Closed by the server: silent, slow, or not HTTP.
+    /// Connections closed by the server because they were silent, slow or not HTTP.
     pub(super) cut: u64,
     pub(super) requests: u64,
 }
 
-/// All of it.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Status {
     pub(super) version: &'static str,
     pub(super) name: String,
-    /// Which part of the chain runs: `whole`, `ground` or `space`.
+    /// Part of the chain that runs: `whole`, `ground` or `space`.
     pub(super) segment: &'static str,
     pub(super) phase: Phase,
-    /// Why it failed.
+    /// Why the run failed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) error: Option<String>,
-    /// Whether it was told to end early.
     pub(super) cancelled: bool,
-    /// Since the server's start, s.
     pub(super) up_s: f64,
-    /// Since the server's start, to the end of the run if it has ended, s.
+    /// Time from the server's start to the end of the run, or until now, s.
     pub(super) elapsed_s: f64,
     pub(super) stages: Vec<StageStatus>,
     pub(super) solving: Option<SolverStatus>,
     pub(super) ledger: Option<LedgerStatus>,
-    /// Known at the end.
+    /// Whether the ledger is complete; null until the end of a run.
     pub(super) completeness: Option<Completeness>,
     pub(super) reception: Option<ReceptionCounters>,
     /// Bytes of visibilities that wait for their positions.
@@ -187,11 +178,10 @@ pub(super) struct Status {
     pub(super) listening: Option<ListenerStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) saving: Option<SavingReport>,
-    /// How the files of maps go, of a ground that goes on without them.
+    /// State of the product files, if a failure to write them does not end the run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) products: Option<ProductsReport>,
     pub(super) channels: Vec<ChannelStatus>,
-    /// Whether `/api/gaps` answers.
     pub(super) has_state: bool,
     pub(super) visitors: VisitorStatus,
 }

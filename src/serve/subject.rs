@@ -1,32 +1,32 @@
-//! What the server tells about.
+//! Description of the run that the server shows.
 
 use std::path::{Path, PathBuf};
 
 use crate::array::EarthModel;
 use crate::pipeline::Config;
 
-/// The run that the server shows.
+/// Description of the run that a server shows.
 #[derive(Clone, Debug)]
 pub struct Subject {
     /// Name of the pipeline.
     pub name: String,
-    /// Which part of the chain runs: `whole`, `ground` or `space`.
+    /// Part of the chain that runs: `whole`, `ground` or `space`.
     pub segment: &'static str,
     /// The configuration in JSON.
     pub config: Vec<u8>,
     /// Folder of the state, if there is one.
     pub state: Option<PathBuf>,
-    /// Says where the Earth is.
+    /// Motion of the Earth.
     pub earth: EarthModel,
-    /// Folders on whose disks there has to be room, by what they hold.
+    /// Folders whose free disk space is reported, by content.
     pub folders: Vec<(&'static str, PathBuf)>,
 }
 
 impl Subject {
-    /// A run of this configuration, which is shown as it is.
+    /// Describes a run of a configuration.
     #[must_use]
     pub fn new(config: &Config, segment: &'static str, state: Option<&Path>) -> Self {
-        // A configuration that was read can be written.
+        // A configuration always has a JSON form.
         let text = serde_json::to_vec(config).unwrap_or_default();
         let earth = EarthModel::of(&config.array);
         let (name, state) = (config.name.clone(), state.map(Path::to_owned));
@@ -40,7 +40,7 @@ impl Subject {
         }
     }
 
-    /// As [`Subject::new`], and tells of the disk on which maps are written.
+    /// Adds the folder of the maps, whose free disk space is reported.
     #[must_use]
     pub fn with_maps_in(mut self, out: &Path) -> Self {
         self.folders.push(("maps", out.to_owned()));

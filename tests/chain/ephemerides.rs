@@ -185,5 +185,8 @@ fn odd_segments_leave_out_what_they_spoil_and_count_it() {
     assert_eq!(summary["ephemeris"]["contradictory"], 0);
     assert_eq!(inspected("contradictory")["ephemeris"]["contradictory"], 1);
     let said = succeed(&["inspect", &mission.place.path("pixel-contradictory.ccsds")]);
-    assert!(said.contains("positions between nodes to ") && said.contains("1 segment contradicts"), "{said}");
+    assert!(
+        said.contains("positions between nodes within ") && said.contains("1 segment contradicts"),
+        "{said}"
+    );
 }

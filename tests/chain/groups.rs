@@ -198,7 +198,7 @@ fn a_ground_is_told_when_its_sums_will_outgrow_memory() {
 
 /// The only reading of a group.
 fn mapped(group: usize) -> GroupStep {
-    GroupStep::Mapped(MapStep { group, part: 0, parts: 1 })
+    GroupStep::Map(MapStep { group, part: 0, parts: 1 })
 }
 
 /// All files but `summary.json`, which has times.
@@ -235,10 +235,10 @@ fn a_run_in_groups_goes_on_where_it_was_cancelled() {
     assert!(expected.len() > 6, "{:?}", expected.keys());
     let groups = plan.run_groups(GroupSize::Channels(1), None).unwrap();
     let steps = [
-        GroupStep::Simulated(0),
-        GroupStep::Simulated(1),
-        GroupStep::Simulated(2),
-        GroupStep::Merged,
+        GroupStep::Simulate(0),
+        GroupStep::Simulate(1),
+        GroupStep::Simulate(2),
+        GroupStep::Merge,
         mapped(0),
         mapped(1),
         mapped(2),

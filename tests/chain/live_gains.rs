@@ -10,7 +10,7 @@ use std::time::Duration;
 use common::downlink::packets_of;
 use common::process::{end, listening, signal, start, wait_until};
 use common::workplace::{Workplace, fail, json, succeed};
-use lunarray::downlink::{DownlinkReader, Kind, PacketHeader};
+use lunarray::downlink::{DownlinkReader, PacketHeader, PacketKind};
 use lunarray::frames::GroundFrame;
 use lunarray::sky::fits::{ReadOptions, read_whole_map};
 use serde_json::Value;
@@ -445,7 +445,7 @@ fn interference_in_a_channel_is_told() {
 /// The channel of a packet of visibilities: the first field of its payload.
 fn channel_of(packet: &[u8]) -> Option<u16> {
     let header = PacketHeader::parse(packet)?;
-    (header.kind == Kind::Visibilities).then(|| u16::from_le_bytes([packet[22], packet[23]]))
+    (header.kind == PacketKind::Visibilities).then(|| u16::from_le_bytes([packet[22], packet[23]]))
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! A small mission and its downlink.
 
-use lunarray::downlink::{DownlinkConfig, Kind, PacketHeader, Transmission};
+use lunarray::downlink::{DownlinkConfig, PacketHeader, PacketKind, Transmission};
 use lunarray::frames::{
     AntennaResponse, Channel, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
@@ -80,12 +80,12 @@ pub fn packets_of(mut bytes: &[u8]) -> Vec<Vec<u8>> {
 pub fn pass_ends(packets: &[Vec<u8>]) -> Vec<bool> {
     let mut in_pass = false;
     let mut ends = |packet: &Vec<u8>| match PacketHeader::parse(packet).unwrap().kind {
-        Kind::Housekeeping => std::mem::take(&mut in_pass),
-        Kind::Ephemeris | Kind::Visibilities => {
+        PacketKind::Housekeeping => std::mem::take(&mut in_pass),
+        PacketKind::Ephemeris | PacketKind::Visibilities => {
             in_pass = true;
             false
         }
-        Kind::Instrument | Kind::Calibration => false,
+        PacketKind::Instrument | PacketKind::Calibration => false,
     };
     packets.iter().map(&mut ends).collect()
 }

@@ -53,7 +53,7 @@ fn packets_return_at_every_depth_in_any_chunks() {
             let (recovered, account) = receive(&coded, chunk);
             assert!(recovered == sent, "{interleave}, {chunk}");
             assert_eq!((account.interleave, account.frames), (interleave, (coded.len() / cadu) as u64));
-            assert!(account.is_sound(), "{account:?}");
+            assert!(account.is_undamaged(), "{account:?}");
             // Two idle frames for each of three passes.
             assert_eq!(account.frames_idle, 6);
             let channels: Vec<u8> = account.channels.iter().map(|counts| counts.channel).collect();
@@ -219,7 +219,11 @@ fn noise_holds_no_frame_and_takes_bounded_memory() {
         random.fill_bytes(&mut noise);
         noise.chunks(1 << 16).for_each(|chunk| receiver.push(chunk, &mut recovered));
         // A chunk, the spent bytes, and two of the longest frames, twice for growth.
-        assert!(receiver.held_bytes() < 2 * ((1 << 16) + (1 << 18) + 2 * 2_044), "{}", receiver.held_bytes());
+        assert!(
+            receiver.memory_bytes() < 2 * ((1 << 16) + (1 << 18) + 2 * 2_044),
+            "{}",
+            receiver.memory_bytes()
+        );
     }
     receiver.finish(&mut recovered);
     let account = receiver.counters();

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use lunarray::downlink::{
-    Decoder, DownlinkConfig, DownlinkError, HEADER_BYTES, Kind, PacketHeader, PacketReceiver, Packetizer,
-    ReceptionCounters, TRAILER_BYTES,
+    Decoder, DownlinkConfig, DownlinkError, HEADER_BYTES, PacketHeader, PacketKind, PacketReceiver,
+    Packetizer, ReceptionCounters, TRAILER_BYTES,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
@@ -109,7 +109,7 @@ fn receive(bytes: &[u8], chunk: usize) -> (Vec<GroundFrame>, ReceptionCounters) 
     drain(&mut receiver);
     decoder.finish();
     let counters = decoder.counters().clone();
-    let in_packets: u64 = Kind::ALL.iter().map(|kind| counters.kind(*kind).bytes).sum();
+    let in_packets: u64 = PacketKind::ALL.iter().map(|kind| counters.kind(*kind).bytes).sum();
     let others =
         counters.bytes_garbage + counters.bytes_truncated + counters.bytes_damaged + counters.bytes_duplicate;
     assert_eq!(counters.bytes, bytes.len() as u64);
@@ -163,7 +163,7 @@ fn each_lost_packet_costs_its_own_visibilities_only() {
         let gap = u64::from(!is_last && !is_first);
         assert_eq!((counters.kind(header.kind).gaps, counters.kind(header.kind).missing), (gap, gap));
         let missing = all.visibilities_decoded - counters.visibilities_decoded;
-        if header.kind == Kind::Visibilities {
+        if header.kind == PacketKind::Visibilities {
             assert!(missing <= 389, "{missing}");
         } else {
             assert_eq!(missing, 0);
@@ -199,7 +199,7 @@ fn forge(packet: &[u8], change: impl FnOnce(&mut Vec<u8>)) -> Vec<u8> {
 }
 
 /// The packets of [`frames`], and the index of the first of each kind.
-fn packets_and_first(kind: Kind) -> (Vec<Vec<u8>>, usize) {
+fn packets_and_first(kind: PacketKind) -> (Vec<Vec<u8>>, usize) {
     let packets = packets(&encode(&frames()));
     let first = packets.iter().position(|p| PacketHeader::parse(p).unwrap().kind == kind).unwrap();
     (packets, first)
@@ -210,16 +210,16 @@ fn length_fields_beyond_all_bounds_are_refused_and_counted() {
     // Offset of the length in each record: see the payload modules.
     let huge = (1_u64 << 60).to_le_bytes();
     for (kind, at, length) in [
-        (Kind::Instrument, 0, &huge[..]),
-        (Kind::Ephemeris, 13, &[0xFF; 4]),
-        (Kind::Visibilities, 12, &[0xFF; 4]),
+        (PacketKind::Instrument, 0, &huge[..]),
+        (PacketKind::Ephemeris, 13, &[0xFF; 4]),
+        (PacketKind::Visibilities, 12, &[0xFF; 4]),
     ] {
         let (mut packets, first) = packets_and_first(kind);
         packets[first] =
             forge(&packets[first], |payload| payload[at..at + length.len()].copy_from_slice(length));
         let (received, counters) = receive(&packets.concat(), 4096);
         assert_eq!(counters.faults.total(), 1, "{kind}");
-        if kind == Kind::Instrument {
+        if kind == PacketKind::Instrument {
             assert!(received.is_empty());
             assert_eq!(counters.visibilities_before_instrument, 3 * 2 * 1007);
         } else {
@@ -300,7 +300,7 @@ fn what_follows_a_contradictory_instrument_is_refused() {
 fn reserved_kinds_and_other_versions_are_counted_and_skipped() {
     let mut packets = packets(&encode(&frames()));
     let mut header = PacketHeader::parse(&packets[0]).unwrap();
-    header.kind = Kind::Calibration;
+    header.kind = PacketKind::Calibration;
     let mut reserved = header.to_bytes().to_vec();
     reserved.extend(&packets[0][HEADER_BYTES..]);
     packets.insert(1, forge(&reserved, |_| ()));
@@ -431,7 +431,7 @@ proptest! {
             bytes.extend(&packets[*k]);
         }
         let counters = survives(&bytes, 0)?;
-        let duplicates: u64 = Kind::ALL.iter().map(|kind| counters.kind(*kind).duplicates).sum();
+        let duplicates: u64 = PacketKind::ALL.iter().map(|kind| counters.kind(*kind).duplicates).sum();
         prop_assert_eq!(duplicates as usize, order.len() + 1 - packets.len());
         prop_assert_eq!(counters.visibilities.missing, counters.visibilities.late);
     }

@@ -211,9 +211,9 @@ fn empty_foreign_and_missing_files_are_named() {
     };
     assert!(matches!(said(&path), DownlinkError::Io { .. }));
     fs::write(&path, "").unwrap();
-    assert!(matches!(said(&path), DownlinkError::Empty { .. }));
+    assert!(matches!(said(&path), DownlinkError::EmptyFile { .. }));
     fs::write(&path, "SIMPLE  =                    T".repeat(96)).unwrap();
-    assert!(matches!(said(&path), DownlinkError::Foreign { bytes: 2880, .. }));
+    assert!(matches!(said(&path), DownlinkError::NotADownlink { bytes: 2880, .. }));
     assert!(said(&path).to_string().contains("expected CCSDS space packets"));
     for (bytes, name) in [
         (&b"SIMPLE  =                    T"[..], "a FITS file"),
@@ -227,7 +227,7 @@ fn empty_foreign_and_missing_files_are_named() {
     for bytes in [&b"\x1f\x8b\x08\x00\x00\x00"[..], b"\x28\xb5\x2f\xfd\x24\x01"] {
         fs::write(&path, bytes).unwrap();
         assert!(
-            said(&path).to_string().contains("file is damaged behind 0 unpacked bytes"),
+            said(&path).to_string().contains("file is damaged after 0 decompressed bytes"),
             "{}",
             said(&path)
         );
@@ -299,7 +299,7 @@ fn a_file_that_lacks_visibilities_is_not_sound() {
     let contents = Contents::read(&path).unwrap();
     let lost = 8_000 - contents.visibilities.count;
     assert!(lost > 0 && contents.gaps.count == 0 && contents.is_undamaged() && !contents.is_sound());
-    assert_eq!(contents.found_less_reported(), Some(-(lost as i64)));
+    assert_eq!(contents.found_minus_reported(), Some(-(lost as i64)));
     let text = contents.to_string();
     assert!(text.contains(&format!("not sound: {lost} of 8000 visibilities")), "{text}");
     assert!(!text.contains("\nsound"), "{text}");

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use lunarray::downlink::{
-    Contents, DownlinkConfig, DownlinkReader, HEADER_BYTES, Kind, Packetizer, TRAILER_BYTES,
+    Contents, DownlinkConfig, DownlinkReader, HEADER_BYTES, PacketKind, Packetizer, TRAILER_BYTES,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, EphemerisSegment, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
@@ -63,7 +63,7 @@ fn version_1_is_read() {
     let contents = Contents::read(path).unwrap();
     assert!(contents.is_sound());
     // The file begins in the middle of a mission: counts do not start at 0.
-    let visibilities = contents.packets.iter().find(|row| row.kind == Kind::Visibilities).unwrap();
+    let visibilities = contents.packets.iter().find(|row| row.kind == PacketKind::Visibilities).unwrap();
     assert_eq!(visibilities.first_count, Some(3 << 14));
 }
 

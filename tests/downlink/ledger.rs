@@ -11,8 +11,8 @@ use lunarray::calibration::{CalibrationConfig, Calibrator, Completeness, Missing
 use lunarray::downlink::link::{LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::wire::cadu::INTERLEAVES;
 use lunarray::downlink::{
-    CucTime, Decoder, DownlinkConfig, Event, FORMAT_VERSION, Format, HEADER_BYTES, Intake, Kind,
-    PacketHeader, PacketSegment, ReceptionCounters, Transmission,
+    CucTime, Decoder, DownlinkConfig, DownlinkReceiver, Event, FORMAT_VERSION, Format, HEADER_BYTES,
+    PacketHeader, PacketKind, PacketSegment, ReceptionCounters, Transmission,
 };
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, ObservingWindow, PlacedFrame,
@@ -133,10 +133,10 @@ fn numbers(block: &VisibilityBlock) -> Vec<u64> {
 
 /// The numbers of the visibilities in each packet, by its count.
 fn visibilities_by_packet(sound: &[u8]) -> BTreeMap<u64, Vec<u64>> {
-    let (mut intake, mut decoder, mut found) = (Intake::new(), Decoder::new(), BTreeMap::new());
-    intake.push(sound);
-    intake.finish();
-    while let Some(event) = intake.next_event() {
+    let (mut receiver, mut decoder, mut found) = (DownlinkReceiver::new(), Decoder::new(), BTreeMap::new());
+    receiver.push(sound);
+    receiver.finish();
+    while let Some(event) = receiver.next_event() {
         let header = if let Event::Packet(packet) = &event { Some(packet.header) } else { None };
         if let Some(GroundFrame::Visibilities(block)) = decoder.accept(&event) {
             found.insert(header.unwrap().count, numbers(&block));
@@ -187,7 +187,7 @@ fn receive(arrived: &[u8]) -> Received {
     Received { ledger, reception, completeness, summed }
 }
 
-fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
+fn counts_of(ranges: &[PacketRange], kind: PacketKind) -> BTreeSet<u64> {
     ranges.iter().filter(|range| range.apid == kind.apid()).flat_map(PacketRange::counts).collect()
 }
 
@@ -195,7 +195,7 @@ fn counts_of(ranges: &[PacketRange], kind: Kind) -> BTreeSet<u64> {
 fn hold_to_the_truth(sent: &Sent) {
     let Sent { sound, arrived, truth } = sent;
     let by_packet = visibilities_by_packet(sound);
-    let packets_lost = counts_of(&truth.packets_lost, Kind::Visibilities);
+    let packets_lost = counts_of(&truth.packets_lost, PacketKind::Visibilities);
     let all_sent: BTreeSet<u64> = by_packet.values().flatten().copied().collect();
     let of_lost = |count: &u64| by_packet[count].iter().copied();
     let lost_on_link: BTreeSet<u64> = packets_lost.iter().flat_map(of_lost).collect();
@@ -227,7 +227,7 @@ fn hold_to_the_truth(sent: &Sent) {
     }
     // Losses by the ground's count, as far as the last housekeeping received reports them.
     // Two in each pass, and the last pass may have both.
-    let reports_lost = counts_of(&truth.packets_lost, Kind::Housekeeping);
+    let reports_lost = counts_of(&truth.packets_lost, PacketKind::Housekeeping);
     let last_reports = [2 * WINDOWS as u64 - 2, 2 * WINDOWS as u64 - 1];
     let last_report_came = !last_reports.iter().all(|report| reports_lost.contains(report));
     assert_eq!(received.completeness.complete, last_report_came && reception.instrument.packets > 0);
@@ -476,7 +476,7 @@ fn a_mission_of_which_every_pass_is_cut_short_still_tells_what_is_missing() {
 
 /// A sound packet of visibilities with no payload.
 fn forged(count: u64, s: u64) -> Vec<u8> {
-    let (kind, segment, version) = (Kind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
+    let (kind, segment, version) = (PacketKind::Visibilities, PacketSegment::Whole, FORMAT_VERSION);
     let header =
         PacketHeader { kind, segment, count, time: CucTime(s << 24), version, bytes: HEADER_BYTES + 4 };
     let mut packet = header.to_bytes().to_vec();

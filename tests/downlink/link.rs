@@ -7,7 +7,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use common::downlink::{mission, packets_of, transmit};
 use lunarray::downlink::link::{FrameFate, LinkConfig, LinkSimulator, LinkTruth, PacketRange};
 use lunarray::downlink::receive::cadu::FrameCounters;
-use lunarray::downlink::{Decoder, DownlinkConfig, Event, Format, Intake, PacketHeader, ReceptionCounters};
+use lunarray::downlink::{
+    Decoder, DownlinkConfig, DownlinkReceiver, Event, Format, PacketHeader, ReceptionCounters,
+};
 use lunarray::frames::GroundFrame;
 use proptest::prelude::*;
 
@@ -22,10 +24,10 @@ struct Received {
 }
 
 fn receive(stream: &[u8]) -> Received {
-    let (mut intake, mut decoder) = (Intake::new(), Decoder::new());
+    let (mut receiver, mut decoder) = (DownlinkReceiver::new(), Decoder::new());
     let (mut packets, mut bodies) = (Vec::new(), BTreeMap::new());
-    let mut drain = |intake: &mut Intake| {
-        while let Some(event) = intake.next_event() {
+    let mut drain = |receiver: &mut DownlinkReceiver| {
+        while let Some(event) = receiver.next_event() {
             if let Event::Packet(packet) = &event {
                 let name = (packet.header.kind.apid(), packet.header.count);
                 packets.push(name);
@@ -35,12 +37,12 @@ fn receive(stream: &[u8]) -> Received {
         }
     };
     for chunk in stream.chunks(7_000) {
-        intake.push(chunk);
-        drain(&mut intake);
+        receiver.push(chunk);
+        drain(&mut receiver);
     }
-    intake.finish();
-    drain(&mut intake);
-    Received { packets, bodies, account: decoder.counters().clone(), frames: intake.frames() }
+    receiver.finish();
+    drain(&mut receiver);
+    Received { packets, bodies, account: decoder.counters().clone(), frames: receiver.frames() }
 }
 
 fn config(format: Format) -> DownlinkConfig {

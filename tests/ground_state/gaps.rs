@@ -325,5 +325,5 @@ fn packed_downlinks_are_read_by_every_command() {
     let output = lunarray(&["inspect", &cut]);
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert!(said.contains("the gzip file is damaged behind") && said.contains("it ends early"), "{said}");
+    assert!(said.contains("the gzip file is damaged after") && said.contains("it ends early"), "{said}");
 }

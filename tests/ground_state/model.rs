@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use lunarray::array::{Array, ArrayConfig, segments_for};
 use lunarray::calibration::CalibrationConfig;
 use lunarray::downlink::transport::socket::{ListenConfig, ListenLimits, SocketSource};
-use lunarray::downlink::{DownlinkConfig, DownlinkError, FileSource, Kind, PacketHeader};
+use lunarray::downlink::{DownlinkConfig, DownlinkError, FileSource, PacketHeader, PacketKind};
 use lunarray::frames::{
     AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
 };
@@ -95,8 +95,8 @@ impl Mission {
         let windows: Vec<Option<i64>> = headers
             .iter()
             .map(|header| {
-                let of = (header.kind != Kind::Instrument).then_some(window);
-                window += i64::from(header.kind == Kind::Housekeeping);
+                let of = (header.kind != PacketKind::Instrument).then_some(window);
+                window += i64::from(header.kind == PacketKind::Housekeeping);
                 of
             })
             .collect();
@@ -124,7 +124,7 @@ impl Mission {
         (0..self.packets.len()).filter(|&k| is_meant(k)).map(|k| 1 << k).sum()
     }
 
-    fn of_kind(&self, kind: Kind) -> Packets {
+    fn of_kind(&self, kind: PacketKind) -> Packets {
         self.having(|k| self.headers[k].kind == kind)
     }
 
@@ -132,9 +132,11 @@ impl Mission {
     fn waiting(&self, held: Packets) -> Packets {
         self.having(|k| {
             let positions =
-                self.of_kind(Kind::Ephemeris) & self.having(|p| self.windows[p] == self.windows[k]);
-            let needed = positions | self.of_kind(Kind::Instrument);
-            self.headers[k].kind == Kind::Visibilities && held & (1 << k) != 0 && held & needed != needed
+                self.of_kind(PacketKind::Ephemeris) & self.having(|p| self.windows[p] == self.windows[k]);
+            let needed = positions | self.of_kind(PacketKind::Instrument);
+            self.headers[k].kind == PacketKind::Visibilities
+                && held & (1 << k) != 0
+                && held & needed != needed
         })
     }
 
@@ -425,7 +427,7 @@ impl Sequence<'_> {
         let until = ListenLimits { idle_s: 0.0, connections: 1 };
         let any = SocketAddr::from(([127, 0, 0, 1], 0));
         let source = SocketSource::bind(&[any], &ListenConfig::default(), until).unwrap();
-        let source = source.knowing(ground.instrument().cloned());
+        let source = source.with_instrument(ground.instrument().cloned());
         let address = source.addresses()[0].strip_prefix("tcp://").unwrap().to_owned();
         std::thread::scope(|scope| {
             scope.spawn(|| {
@@ -451,13 +453,14 @@ impl Sequence<'_> {
         let mission = &self.bench.mission;
         let parts = [self.states[a].folder.clone(), self.states[b].folder.clone()];
         let into = self.states[at].folder.clone();
-        let read =
-            |packets: Packets| packets & mission.of_kind(Kind::Visibilities) & !mission.waiting(packets);
+        let read = |packets: Packets| {
+            packets & mission.of_kind(PacketKind::Visibilities) & !mission.waiting(packets)
+        };
         let are_apart = read(ours) & read(theirs) == 0;
         let is_new = self.states[at].received.is_empty();
         let are_settled = self.states[a].is_settled && self.states[b].is_settled;
         match Ground::merge(&into, &parts, &mission.config) {
-            Err(GroundError::Downlink(DownlinkError::TakenTwice { .. })) => assert!(!are_apart),
+            Err(GroundError::Downlink(DownlinkError::DuplicatePacket { .. })) => assert!(!are_apart),
             Err(GroundError::Occupied { .. }) => assert!(!is_new),
             Err(error) => panic!("{error}"),
             Ok(ground) => {
@@ -485,7 +488,9 @@ impl Sequence<'_> {
                 let window = Some(self.random.random_range(0..WINDOWS));
                 given = mission.having(|k| mission.windows[k] == window);
             }
-            _ => given &= mission.of_kind(Kind::Visibilities) | mission.of_kind(Kind::Housekeeping),
+            _ => {
+                given &= mission.of_kind(PacketKind::Visibilities) | mission.of_kind(PacketKind::Housekeeping)
+            }
         }
         if given == 0 {
             return;

@@ -102,7 +102,7 @@ fn a_plain_replay_waits_as_a_state_does() {
     // What comes before the description is no sound file to look at, and is told.
     let contents = succeed(&["inspect", &turned]);
     assert!(
-        contents.contains("precede any instrument description") && !contents.contains("\nsound"),
+        contents.contains("precede the first instrument description") && !contents.contains("\nsound"),
         "{contents}"
     );
     assert!(succeed(&["inspect", &file]).contains("\nsound"));

@@ -39,7 +39,7 @@ use common::schema::check_summary;
 use common::workplace::{SMALL, Workplace, fail, succeed};
 use lunarray::downlink::transport::socket::{ListenConfig, ListenLimits, SocketSource};
 use lunarray::downlink::{
-    CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PACKET_BYTES_MAX, PacketHeader, PacketSegment,
+    CucTime, DownlinkConfig, FORMAT_VERSION, PACKET_BYTES_MAX, PacketHeader, PacketKind, PacketSegment,
 };
 use lunarray::runtime::{Flow, Outlet, Source};
 use serde_json::Value;

@@ -33,14 +33,14 @@ fn the_time_line_adds_up_to_the_status_and_names_the_missing_packets() {
     let mut packets = packets_of(&all);
     let of_kind =
         |packets: &[Vec<u8>], kind| packets.iter().filter(|p| header(p).kind == kind).count() as u64;
-    let whole = of_kind(&packets, Kind::Visibilities);
+    let whole = of_kind(&packets, PacketKind::Visibilities);
     // Within a pass, over a long time, and one by itself; and two packets of positions: what waits for those comes at the end.
     let lost = [whole / 10..whole / 10 + 3, whole / 3..whole / 2, whole - 4..whole - 3];
     packets.retain(|packet| match header(packet) {
-        PacketHeader { kind: Kind::Visibilities, count, .. } => {
+        PacketHeader { kind: PacketKind::Visibilities, count, .. } => {
             !lost.iter().any(|range| range.contains(&count))
         }
-        PacketHeader { kind: Kind::Ephemeris, count, .. } => !(4..6).contains(&count),
+        PacketHeader { kind: PacketKind::Ephemeris, count, .. } => !(4..6).contains(&count),
         _ => true,
     });
     let file = place.workplace.file("cut.packets", &packets.concat());
@@ -69,8 +69,8 @@ fn the_time_line_adds_up_to_the_status_and_names_the_missing_packets() {
     // The ranges, and when the packets on either side were made.
     let mut expected: Vec<(u64, u64, u64, [f64; 2])> = lost
         .iter()
-        .map(|range| (Kind::Visibilities, range.clone()))
-        .chain([(Kind::Ephemeris, 4..6)])
+        .map(|range| (PacketKind::Visibilities, range.clone()))
+        .chain([(PacketKind::Ephemeris, 4..6)])
         .map(|(kind, range)| {
             let side = |count| {
                 packets.iter().find(|p| header(p).kind == kind && header(p).count == count).map(made_s)

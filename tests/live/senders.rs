@@ -5,7 +5,7 @@ use super::*;
 /// Headers that announce the longest packet, without one.
 fn claims(count: u64) -> Vec<u8> {
     let header = |count| PacketHeader {
-        kind: Kind::Visibilities,
+        kind: PacketKind::Visibilities,
         segment: PacketSegment::Whole,
         count: 2 * count,
         time: CucTime(1),
@@ -248,7 +248,7 @@ fn the_first_description_shuts_nobody_out() {
     let good = std::fs::read(&file).unwrap();
     let other = transmit(&mission(1, 10), &DownlinkConfig::default());
     let others = packets_of(&other);
-    let is_data = |packet: &&Vec<u8>| PacketHeader::parse(packet).unwrap().kind == Kind::Visibilities;
+    let is_data = |packet: &&Vec<u8>| PacketHeader::parse(packet).unwrap().kind == PacketKind::Visibilities;
     let without_data: Vec<u8> = others.iter().filter(|packet| !is_data(packet)).flatten().copied().collect();
     let ground = place.ground("heard", &["--state", &place.path("state"), "--connections", "3"]);
     for bytes in [&others[0], &without_data] {

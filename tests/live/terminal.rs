@@ -56,7 +56,7 @@ fn a_terminal_shows_what_the_interface_says() {
     for (name, count) in entries {
         assert!(text.contains(&format!(" {}  {name}", grouped(count))), "{name} in\n{text}");
     }
-    assert!(text.contains("closed"), "{text}");
+    assert!(text.contains("balanced"), "{text}");
     for kind in ["instrument", "ephemeris", "visibilities", "housekeeping"] {
         let line = text.lines().find(|line| line.contains(&format!("\u{2502}{kind} ")));
         let words: Vec<&str> =

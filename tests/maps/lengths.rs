@@ -56,7 +56,7 @@ fn engines_refuse_blocks_of_unequal_lengths() {
     for (name, block) in odd() {
         for told in [engine.add(&block).unwrap_err(), engine.remove(&block).unwrap_err()] {
             let told = told.to_string();
-            assert!(told.contains(&format!("values of {name}: expected as many")), "{told}");
+            assert!(told.contains(&format!("values of {name}: expected ")), "{told}");
         }
     }
     assert_eq!(engine.counts().visibilities, 0);
@@ -101,7 +101,7 @@ fn calibration_refuses_blocks_of_unequal_lengths_and_hooks_that_leave_such() {
     };
     let odd = VisibilityBlock { flags: vec![Flags::GOOD], ..block.clone() };
     let told = calibrator(Identity).accept(GroundFrame::Visibilities(odd)).unwrap_err().to_string();
-    assert!(told.contains("a block of 2 visibilities of satellites 1 and 2 has 1 values of flags"), "{told}");
+    assert!(told.contains("a block of visibilities of satellites 1 and 2 has 1 values of flags"), "{told}");
     assert!(calibrator(Identity).accept(GroundFrame::Visibilities(block.clone())).unwrap().is_some());
     let told = calibrator(Forgetful).accept(GroundFrame::Visibilities(block)).unwrap_err().to_string();
     assert!(told.contains("has 1 values of weight"), "{told}");

@@ -389,7 +389,7 @@ def shows_a_run(page, served, out, pictures):
     browser, palettes = page.browser, page.palettes
     page.wait_for_text("#link", "live")
     page.wait_for_text("#phase", "ended")
-    page.wait_for_text("#verdict", "closed")
+    page.wait_for_text("#verdict", "✔ balanced")
     page.assert_counts(served.status)
     status = served.status()
     held = status["channels"][0]["held"]
@@ -596,7 +596,7 @@ def follows_a_replay(page, replay, out, lost, pictures):
     replay.process.stdin.close()
     replay.wait_for_phase("ended")
     page.wait_for_text("#phase", "ended")
-    page.wait_for_text("#verdict", "closed")
+    page.wait_for_text("#verdict", "✔ balanced")
     page.assert_counts(replay.status)
     page.wait_for_text("#which", "final map")
     final = read(out / "3.000MHz/map.fits")

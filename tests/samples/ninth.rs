@@ -275,7 +275,7 @@ fn spectra_are_sent_with_the_visibilities_of_either_fidelity() {
         }
         let inspected = lunarray(&["inspect", out.join("downlink.ccsds").to_str().unwrap()], &[]);
         assert!(
-            inspected.contains("satellite 9 a spectrometer: 30.000 to 120.000 MHz in 90 channels"),
+            inspected.contains("satellite 9 is a spectrometer: 30.000 to 120.000 MHz in 90 channels"),
             "{inspected}"
         );
         assert!(!inspected.contains("9-9"), "{inspected}");

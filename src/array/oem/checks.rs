@@ -1,21 +1,21 @@
-//! What states have to be: above the surface, bound to the Moon, and near enough to each other for their interpolation.
+//! Checks of states: above the surface, bound to the Moon, and close enough to each other for their interpolation.
 
 use super::interpolate::interpolated;
 use super::message::{Fault, OemSegment, Reading, TableMethod};
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{norm, sub};
 
-/// Most that a position between states may be off, m: a fifth of the shortest wavelength that is observed, 10 m at 30 MHz.
-/// States that are rounded to a metre pass.
+/// Tolerance of a position between states, m: a fifth of the shortest observed wavelength, 10 m at 30 MHz.
 const ERROR_M_MAX: f64 = 2.0;
 
-/// States through which a velocity is compared with the positions around it.
+/// Number of states with which a velocity is compared.
 const VELOCITY_POINTS: usize = 9;
 
-/// A step so many times as long as the one before and the one after is a gap.
+/// Ratio of a step to its neighbours from which it is a gap.
 const GAP_STEPS: f64 = 3.0;
 
-/// Requires orbits above the surface that the Moon holds, states that agree with each other, and segments that follow each other.
+/// Checks that orbits are above the surface and bound to the Moon, that states agree with each other, and that
+/// segments follow each other.
 pub(super) fn check(reading: &Reading, moon_radius_m: f64) -> Result<(), Fault> {
     for (segment, lines) in reading.message.segments.iter().zip(&reading.lines) {
         let line = |k: usize| lines.get(k).map_or(0, |line| *line as usize);
@@ -31,7 +31,7 @@ pub(super) fn check(reading: &Reading, moon_radius_m: f64) -> Result<(), Fault> 
     require_order(reading)
 }
 
-/// Requires states above the surface that the Moon holds.
+/// Checks that states are above the surface and bound to the Moon.
 fn require_orbits(
     segment: &OemSegment,
     line: &dyn Fn(usize) -> usize,
@@ -54,7 +54,7 @@ fn require_orbits(
     Ok(())
 }
 
-/// Requires segments that do not hold at the same time. Between them there may be gaps.
+/// Checks that segments do not overlap. There may be gaps between them.
 fn require_order(reading: &Reading) -> Result<(), Fault> {
     let segments = &reading.message.segments;
     for (k, (before, after)) in segments.iter().zip(segments.iter().skip(1)).enumerate() {
@@ -70,7 +70,7 @@ fn require_order(reading: &Reading) -> Result<(), Fault> {
     Ok(())
 }
 
-/// States of a segment beside each other.
+/// Neighbouring states of a segment.
 struct SegmentCheck<'a> {
     reading: &'a Reading,
     segment: &'a OemSegment,
@@ -82,13 +82,13 @@ impl SegmentCheck<'_> {
         format!("{} {scale}", self.reading.message.zero.plus_s(self.segment.time_s[k]).text(scale, 3))
     }
 
-    /// Whether something between two times is to be used.
+    /// Whether any time between two times is to be used.
     fn is_used(&self, from_s: f64, until_s: f64) -> bool {
         let [first_s, last_s] = self.segment.useable_s;
         from_s < last_s && until_s > first_s
     }
 
-    /// Requires that the interpolation after state `k` is good: one through a state more gives the same in the middle.
+    /// Checks the interpolation after state `k`: one with another state must give the same in the middle.
     fn interval(&self, k: usize, line: usize) -> Result<(), Fault> {
         let segment = self.segment;
         let [from_s, until_s] = [segment.time_s[k], segment.time_s[k + 1]];
@@ -100,7 +100,8 @@ impl SegmentCheck<'_> {
         let middle_s = 0.5 * (from_s + until_s);
         let at = |points| interpolated(segment, segment.method, points, middle_s).position_m;
         let error_m = norm(sub(at(points), at(other)));
-        // With no state more it is one less, which errs some ten times as much or more.
+        // If there is no other state, the comparison is with one state fewer, which errs some ten times as much or
+        // more.
         let allowed_m = if points < states { ERROR_M_MAX } else { 10.0 * ERROR_M_MAX };
         if error_m <= allowed_m {
             return Ok(());
@@ -128,7 +129,7 @@ impl SegmentCheck<'_> {
         Err(Fault::new(line, found, expected))
     }
 
-    /// Requires that the velocity of state `k` is that of the positions around it.
+    /// Checks that the velocity of state `k` is the derivative of the positions around it.
     fn velocity(&self, k: usize, line: usize) -> Result<(), Fault> {
         let segment = self.segment;
         let time_s = segment.time_s[k];
@@ -145,7 +146,8 @@ impl SegmentCheck<'_> {
         if off_m_s * step_s <= ERROR_M_MAX {
             return Ok(());
         }
-        // Positions alone may be too far apart to say; how much they leave open is what other numbers of them give.
+        // Positions alone may be too far apart to decide; interpolations with other numbers of them show the
+        // uncertainty.
         let open_m_s = [points - 1, points - 2].map(|points| norm(sub(by_positions, at(points))));
         if off_m_s <= 10.0 * open_m_s[0].max(open_m_s[1]) {
             return Ok(());

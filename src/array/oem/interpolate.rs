@@ -1,4 +1,4 @@
-//! Interpolation of states through some of those around a time.
+//! Interpolation through some of the states around a time.
 
 use super::message::{DEGREE_MAX, OemSegment, TableMethod};
 use crate::array::state::SatelliteState;
@@ -14,7 +14,7 @@ pub(super) fn interpolated(
     let repeats = if method == TableMethod::Hermite { 2 } else { 1 };
     let after = segment.time_s.partition_point(|t_s| *t_s <= at_s);
     let first = after.saturating_sub(points.div_ceil(2)).min(segment.time_s.len() - points);
-    // Times from the middle, so that differences keep their digits.
+    // Times count from the middle, so that differences keep their digits.
     let zero_s = segment.time_s[first];
     let count = points * repeats;
     let mut times = [0.0; 2 * DEGREE_MAX + 2];

@@ -23,7 +23,8 @@
 //! | `expansion` | expansion of a plane wave in spherical harmonics |
 //! | `passes` | a pass, from packets to solutions |
 //! | `bound` | Cramer-Rao bounds of a pass |
-//! | `monitor` | instrument events, detected from solutions |
+//! | `events` | events of the instrument |
+//! | `monitor` | detection of events from solutions |
 //! | `table` | solutions as a table and as a gains file |
 
 mod agree;
@@ -36,6 +37,7 @@ mod cramer_rao;
 mod dense;
 mod detect;
 mod estimates;
+mod events;
 mod expansion;
 mod fit;
 mod global;
@@ -65,8 +67,9 @@ pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
 pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierFractions};
+pub use events::InstrumentEvent;
 pub use model::{KnownSignal, Offsets};
-pub use monitor::{InstrumentEvent, instrument_events};
+pub use monitor::instrument_events;
 pub use passes::{PassBlocks, PassSolver, SolvedPass};
 pub use solution::{PassData, PassSolution, solve_pass, solve_pass_in_parts};
 pub use sums::{MODEL_TERMS, ModelTerms, ModelledBlock};

@@ -141,7 +141,7 @@ impl Search<'_> {
             let stride = parts.iter().map(|part| part.len()).sum::<usize>().div_ceil(count_max);
             let mut thinned = parts.first()?.without_visibilities();
             let visibilities = parts.iter().flat_map(|part| (0..part.len()).map(move |k| (part, k)));
-            visibilities.step_by(stride.max(1)).for_each(|(part, k)| thinned.push_of(part, k));
+            visibilities.step_by(stride.max(1)).for_each(|(part, k)| thinned.push_from(part, k));
             Some((thinned, beacon_is_on, index))
         };
         all.into_iter().filter_map(thin).collect()

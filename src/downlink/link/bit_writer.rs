@@ -1,16 +1,16 @@
-//! Appends bytes at any bit.
+//! A writer of bits, for streams that lose or gain single bits.
 
-/// Appends bytes to a bit stream. After a lost or added bit they are no longer aligned to bytes.
+/// Appends bytes to a bit stream, which need not be aligned to bytes.
 #[derive(Debug, Default)]
 pub(super) struct BitWriter {
     bytes: Vec<u8>,
-    /// Used bits of the last byte, 0 for all.
-    taken: u32,
+    /// Number of used bits of the last byte; 0 if all are used.
+    used_bits: u32,
 }
 
 impl BitWriter {
     pub(super) fn push(&mut self, bytes: &[u8]) {
-        if self.taken == 0 {
+        if self.used_bits == 0 {
             self.bytes.extend_from_slice(bytes);
             return;
         }
@@ -19,7 +19,7 @@ impl BitWriter {
         }
     }
 
-    /// Appends bytes without one of their bits (`None`), or with another bit added before it.
+    /// Appends bytes without their bit number `bit`, or with `added` inserted before it.
     pub(super) fn slip(&mut self, bytes: &[u8], bit: usize, added: Option<bool>) {
         let (before, rest) = bytes.split_at(bit / 8);
         self.push(before);
@@ -41,29 +41,28 @@ impl BitWriter {
         self.push(after);
     }
 
-    /// Bits written so far.
     pub(super) fn bits(&self) -> i64 {
-        8 * self.bytes.len() as i64 - i64::from((8 - self.taken) % 8)
+        8 * self.bytes.len() as i64 - i64::from((8 - self.used_bits) % 8)
     }
 
-    /// All bytes, the last one padded with zeros.
+    /// The bytes, with the last one padded with zeros.
     pub(super) fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }
 
-    /// Appends the upper bits of a byte.
+    /// Appends the `count` upper bits of a byte.
     fn push_bits(&mut self, octet: u8, count: u32) {
         let octet = octet & (0xFF00_u16 >> count) as u8;
-        match self.bytes.last_mut().filter(|_| self.taken > 0) {
+        match self.bytes.last_mut().filter(|_| self.used_bits > 0) {
             Some(last) => {
-                *last |= octet >> self.taken;
-                if self.taken + count > 8 {
-                    self.bytes.push(octet << (8 - self.taken));
+                *last |= octet >> self.used_bits;
+                if self.used_bits + count > 8 {
+                    self.bytes.push(octet << (8 - self.used_bits));
                 }
             }
             None => self.bytes.push(octet),
         }
-        self.taken = (self.taken + count) % 8;
+        self.used_bits = (self.used_bits + count) % 8;
     }
 }
 
@@ -72,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bits_are_lost_and_added_where_asked_for() {
+    fn bits_are_removed_and_inserted_at_the_given_place() {
         let bits = |bytes: &[u8]| bytes.iter().map(|octet| format!("{octet:08b}")).collect::<String>();
         let sent = [0b1011_0010, 0b0100_1101, 0b1110_0001];
         for bit in 0..24 {

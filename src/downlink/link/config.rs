@@ -1,4 +1,4 @@
-//! Configuration of a simulated link: what it does to a downlink.
+//! Configuration of a simulated link.
 
 use crate::downlink::wire::Format;
 use crate::units::{Checks, InvalidValue, keys};
@@ -41,7 +41,7 @@ keys! {
 }
 
 impl LinkConfig {
-    /// Whether the link has any faults.
+    /// Whether any fault is configured.
     #[must_use]
     #[doc(hidden)]
     pub fn is_on(&self) -> bool {
@@ -59,7 +59,7 @@ impl LinkConfig {
         self.second_station_frames > 0 || rates.iter().any(|rate| *rate != 0.0)
     }
 
-    /// All values that are invalid for a format; empty for a valid configuration.
+    /// The values that are invalid for a format; empty for a valid configuration.
     #[must_use]
     #[doc(hidden)]
     pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
@@ -78,12 +78,12 @@ impl LinkConfig {
             checks.require(key, value, (0.0..=1.0).contains(&value), "a probability, 0 to 1");
         }
         let bursts = self.burst_every_bits;
-        let good = bursts == 0.0 || (1.0..=1e15).contains(&bursts);
-        checks.require("burst_every_bits", bursts, good, "0, or 1 to 1e15");
-        let good = bursts == 0.0 || (1.0..=1e15).contains(&self.burst_bits);
-        checks.require("burst_bits", self.burst_bits, good, "1 to 1e15 where there are bursts");
-        let slips_are_possible = self.bit_slip == 0.0 || format == Format::Cadu;
-        checks.require("bit_slip", self.bit_slip, slips_are_possible, "0 unless format is \"cadu\"");
+        let is_valid = bursts == 0.0 || (1.0..=1e15).contains(&bursts);
+        checks.require("burst_every_bits", bursts, is_valid, "0, or 1 to 1e15");
+        let is_valid = bursts == 0.0 || (1.0..=1e15).contains(&self.burst_bits);
+        checks.require("burst_bits", self.burst_bits, is_valid, "1 to 1e15 where there are bursts");
+        let is_valid = self.bit_slip == 0.0 || format == Format::Cadu;
+        checks.require("bit_slip", self.bit_slip, is_valid, "0 unless format is \"cadu\"");
         for (key, value) in
             [("reorder_frames", self.reorder_frames), ("second_station_frames", self.second_station_frames)]
         {

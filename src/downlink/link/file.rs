@@ -1,4 +1,4 @@
-//! The link as a stage and between files. The truth is written beside the damaged file.
+//! The simulated link as a stage and between files. It writes the truth beside the damaged file.
 
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
@@ -13,10 +13,9 @@ use crate::downlink::wire::cadu::ReedSolomon;
 use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, write_atomically};
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Bytes read at a time.
 const READ_BYTES: usize = 1 << 18;
 
-/// Path of the truth about a damaged downlink: its name with the suffix `.truth.json`.
+/// Path of the truth about a damaged downlink: the downlink's path plus `.truth.json`.
 #[must_use]
 pub fn truth_path(downlink: &Path) -> PathBuf {
     let mut name = downlink.as_os_str().to_owned();
@@ -30,7 +29,7 @@ fn write_truth(downlink: &Path, truth: &LinkTruth) -> Result<(), DownlinkError> 
     text.and_then(|text| write_atomically(&path, &text)).map_err(io_error(&path, "write the truth"))
 }
 
-/// The link between spacecraft and ground, as a stage.
+/// The simulated link between spacecraft and ground, as a stage.
 #[derive(Debug)]
 pub struct LinkStage {
     simulator: LinkSimulator,
@@ -39,13 +38,13 @@ pub struct LinkStage {
 }
 
 impl LinkStage {
-    /// A link whose truth is written beside the file `downlink`; `None` for a link without faults and without a limit
-    /// of its rate.
+    /// A link that writes its truth beside the file `downlink`; `None` for a link without faults and without a limit of its
+    /// rate.
     ///
     /// # Errors
     /// The configuration is invalid.
     pub fn new(config: &DownlinkConfig, seed: u64, downlink: &Path) -> Result<Option<Self>, DownlinkError> {
-        // A limited rate makes the spacecraft drop data, which the truth reports too.
+        // With a limited rate the spacecraft drops data, which the truth reports too.
         if !config.link.is_on() && config.rate_bits_per_s_max == 0.0 {
             return Ok(None);
         }
@@ -53,7 +52,7 @@ impl LinkStage {
         Ok(Some(Self { simulator, downlink: downlink.to_owned(), bytes: 0 }))
     }
 
-    fn pass_on(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
+    fn forward(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
         self.bytes += bytes.len() as u64;
         if !bytes.is_empty() {
             out.push(bytes);
@@ -69,7 +68,7 @@ impl Stage for LinkStage {
     fn step(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
         let mut arrived = Vec::new();
         self.simulator.push(&bytes, &mut arrived)?;
-        self.pass_on(arrived, out);
+        self.forward(arrived, out);
         Ok(())
     }
 
@@ -77,7 +76,7 @@ impl Stage for LinkStage {
         let mut arrived = Vec::new();
         let truth = self.simulator.finish(&mut arrived)?;
         write_truth(&self.downlink, truth)?;
-        self.pass_on(arrived, out);
+        self.forward(arrived, out);
         Ok(())
     }
 
@@ -86,7 +85,7 @@ impl Stage for LinkStage {
     }
 }
 
-/// Sends an undamaged file over a link to another file, and writes the truth beside it.
+/// Sends an undamaged file over a simulated link to another file, and writes the truth beside it.
 ///
 /// # Errors
 /// A file cannot be read or written; the input is not an undamaged downlink; the configuration is invalid.
@@ -99,7 +98,7 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
     let mut source = DownlinkFile::open(from)?;
     let mut file = AtomicFile::create(to, IfUnfinished::Remove).map_err(io_error(to, "create the file"))?;
     let (mut bytes, mut arrived) = (Vec::new(), Vec::new());
-    let at = |error: DownlinkError| error.at(from);
+    let in_input = |error: DownlinkError| error.at(from);
     loop {
         bytes.clear();
         arrived.clear();
@@ -107,10 +106,10 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
         if read.map_err(io_error(from, "read"))? == 0 {
             break;
         }
-        simulator.push(&bytes, &mut arrived).map_err(at)?;
+        simulator.push(&bytes, &mut arrived).map_err(in_input)?;
         file.write_all(&arrived).map_err(io_error(to, "write"))?;
     }
-    let truth = simulator.finish(&mut arrived).map_err(at)?.clone();
+    let truth = simulator.finish(&mut arrived).map_err(in_input)?.clone();
     file.write_all(&arrived).map_err(io_error(to, "write"))?;
     file.finish().map_err(io_error(to, "finish the file"))?;
     write_truth(to, &truth)?;
@@ -120,10 +119,10 @@ pub fn corrupt(from: &Path, to: &Path, config: &LinkConfig, seed: u64) -> Result
 /// The code of a file's frames; `None` for plain packets.
 fn code_of(path: &Path) -> Result<Option<ReedSolomon>, DownlinkError> {
     let mut events = EventReader::open(path)?;
-    // The format is known by the first event, or at the end of the file.
+    // The receiver knows the format before it returns an event.
     events.find(|_| Some(()))?;
-    if events.intake().format().is_none() {
+    if events.receiver().format().is_none() {
         events.require_packets()?;
     }
-    Ok(events.intake().frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
+    Ok(events.receiver().frames().and_then(|frames| ReedSolomon::new(frames.interleave)))
 }

@@ -1,15 +1,15 @@
 //! A simulated link with seeded faults: bit errors, bursts, losses, duplicates, reordering, truncation.
 //!
-//! [`LinkSimulator`] takes an undamaged downlink of either format and records the truth: which frames and packets no
-//! receiver can recover any more. Tests hold the ground to it. [`LinkStage`] is the link in a pipeline, [`corrupt`]
-//! the link between two files.
+//! [`LinkSimulator`] damages a downlink of either format and records the truth: which frames and packets no receiver can
+//! recover. Tests compare the ground's counts with it. [`LinkStage`] is the link in a pipeline, [`corrupt`] the link
+//! between two files.
 //!
-//! Uses `wire`, and `receive` to detect a file's format. The same seed gives the same faults, for any chunk size.
+//! Uses `wire`, and `receive` to detect a file's format. The same seed gives the same faults for any chunk size.
 
+mod bit_errors;
 mod bit_writer;
 mod config;
 mod file;
-mod noise;
 mod simulator;
 mod splitter;
 mod truth;

@@ -1,11 +1,11 @@
-//! Applies the faults of a link to a downlink, and records the truth.
+//! Applies the faults of a link to a downlink and records the truth.
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
+use super::bit_errors::BitErrors;
 use super::bit_writer::BitWriter;
 use super::config::LinkConfig;
-use super::noise::Noise;
 use super::splitter::{SentPass, Splitter};
 use super::truth::{FrameFate, LinkTruth, list_packet};
 use crate::downlink::error::DownlinkError;
@@ -13,24 +13,25 @@ use crate::downlink::wire::Format;
 use crate::downlink::wire::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};
 use crate::units::{StreamKind, random_stream};
 
-/// A unit on its way to the ground.
+/// One copy of a unit that arrives on the ground.
 #[derive(Clone, Copy, Debug)]
-struct Dispatch {
+struct UnitCopy {
+    /// Index of the unit in its pass.
     unit: usize,
-    /// Rank in the order of arrival.
+    /// Sort key of the order of arrival.
     order: u64,
-    /// Number of its bytes that arrive.
     bytes: usize,
+    /// Whether a bit is lost or added.
     slips: bool,
 }
 
-/// A pass on its way.
+/// A pass and the copies of its units that arrive.
 #[derive(Debug)]
-struct Departure {
+struct PassInTransit {
     /// Number of the pass, from 1.
     number: u64,
     pass: SentPass,
-    copies: Vec<Dispatch>,
+    copies: Vec<UnitCopy>,
     outcomes: Vec<UnitOutcome>,
     random: ChaCha8Rng,
 }
@@ -38,24 +39,23 @@ struct Departure {
 /// What happened to a unit.
 #[derive(Clone, Copy, Debug, Default)]
 struct UnitOutcome {
-    /// Recoverable copies.
-    good: u32,
-    /// Of the other copies, the fate of the one that got furthest.
+    recoverable: u32,
+    /// The greatest fate of the other copies.
     fate: Option<FrameFate>,
 }
 
-/// Damages a downlink pass by pass, as a link would. Holds one pass, and a second one while two are swapped.
+/// Damages a downlink pass by pass. Holds one pass, or two while they are swapped.
 ///
-/// The faults of a pass depend only on the seed and its number.
+/// The faults of a pass depend only on the seed and the pass number.
 #[derive(Debug)]
 pub struct LinkSimulator {
     config: LinkConfig,
     code: Option<ReedSolomon>,
     splitter: Splitter,
-    /// A pass that arrives after the next.
-    held: Option<Departure>,
-    /// Shift of the frames since the receiver was last in lock, bits; `None` before that. Unless the shift is a whole
-    /// number of frames, the receiver finds the next frame only by its marker.
+    /// A pass that arrives after the next one.
+    delayed: Option<PassInTransit>,
+    /// Shift of the frames since the receiver was last in lock, bits; `None` before the first lock. Unless the shift is a
+    /// whole number of frames, the receiver finds the next frame only by its marker.
     shift_bits: Option<i64>,
     truth: LinkTruth,
 }
@@ -75,7 +75,7 @@ impl LinkSimulator {
             config: config.clone(),
             code,
             splitter: Splitter::new(code),
-            held: None,
+            delayed: None,
             shift_bits: None,
             truth,
         })
@@ -102,13 +102,13 @@ impl LinkSimulator {
         if let Some(pass) = self.splitter.finish()? {
             self.send(pass, out);
         }
-        if let Some(held) = self.held.take() {
-            self.deliver(held, out);
+        if let Some(delayed) = self.delayed.take() {
+            self.deliver(delayed, out);
         }
         Ok(&self.truth)
     }
 
-    /// The truth so far.
+    /// The truth about the passes sent so far.
     #[must_use]
     pub fn truth(&self) -> &LinkTruth {
         &self.truth
@@ -124,18 +124,18 @@ impl LinkSimulator {
         let mut copies = Vec::new();
         if lost {
             self.truth.passes_lost += 1;
-            outcomes.fill(UnitOutcome { good: 0, fate: Some(FrameFate::PassLost) });
+            outcomes.fill(UnitOutcome { recoverable: 0, fate: Some(FrameFate::PassLost) });
         } else {
             copies = self.schedule(&pass, &mut random, &mut outcomes);
         }
-        let departure = Departure { number, pass, copies, outcomes, random };
-        match self.held.take() {
+        let transit = PassInTransit { number, pass, copies, outcomes, random };
+        match self.delayed.take() {
             None if swapped => {
                 self.truth.passes_swapped += 1;
-                self.held = Some(departure);
+                self.delayed = Some(transit);
             }
             earlier => {
-                self.deliver(departure, out);
+                self.deliver(transit, out);
                 if let Some(earlier) = earlier {
                     self.deliver(earlier, out);
                 }
@@ -143,25 +143,25 @@ impl LinkSimulator {
         }
     }
 
-    fn deliver(&mut self, mut departure: Departure, out: &mut Vec<u8>) {
-        let bytes = self.carry(&mut departure);
-        self.record(&departure.pass, &departure.outcomes);
+    fn deliver(&mut self, mut transit: PassInTransit, out: &mut Vec<u8>) {
+        let bytes = self.transmit(&mut transit);
+        self.record(&transit.pass, &transit.outcomes);
         self.truth.bytes_delivered += bytes.len() as u64;
         out.extend_from_slice(&bytes);
     }
 
-    /// The copies that arrive, in the order of arrival.
+    /// Draws the copies that arrive, in the order of arrival.
     fn schedule(
         &mut self,
         pass: &SentPass,
         random: &mut ChaCha8Rng,
         outcomes: &mut [UnitOutcome],
-    ) -> Vec<Dispatch> {
+    ) -> Vec<UnitCopy> {
         let count = pass.units.len();
         let mut cut = (count, 0);
         if random.random_bool(self.config.pass_cut) && count > 0 {
             let unit = random.random_range(0..count);
-            // More is missing than any code can correct.
+            // At least half of the unit is missing, more than any code can correct.
             cut = (unit, random.random_range(0..=pass.units[unit].bytes.len() / 2));
             self.truth.passes_cut += 1;
         }
@@ -170,8 +170,8 @@ impl LinkSimulator {
         let second = (count - overlap..count).map(|unit| (unit, overlap + unit, false));
         let mut copies = Vec::with_capacity(count + overlap);
         for (unit, place, by_first) in first.chain(second) {
-            let again = random.random_bool(self.config.duplicate);
-            for _ in 0..=u32::from(again) {
+            let arrives_twice = random.random_bool(self.config.duplicate);
+            for _ in 0..=u32::from(arrives_twice) {
                 let lost = random.random_bool(self.config.frame_loss);
                 let slips = random.random_bool(self.config.bit_slip);
                 let late = random.random_bool(self.config.reorder) && self.config.reorder_frames > 0;
@@ -186,7 +186,7 @@ impl LinkSimulator {
                 outcomes[unit].fate = outcomes[unit].fate.max(fate);
                 if fate.is_none() || by_first && unit == cut.0 {
                     self.truth.copies_delayed += u64::from(late);
-                    copies.push(Dispatch { unit, order: place as u64 + delay, bytes, slips });
+                    copies.push(UnitCopy { unit, order: place as u64 + delay, bytes, slips });
                 }
             }
         }
@@ -194,17 +194,17 @@ impl LinkSimulator {
         copies
     }
 
-    /// The bytes that arrive, with all faults.
-    fn carry(&mut self, departure: &mut Departure) -> Vec<u8> {
-        let Departure { number, pass, copies, outcomes, random } = departure;
-        let mut noise =
-            Noise::new(&self.config, random_stream(self.truth.seed, StreamKind::Link, [*number, 1]));
+    /// Applies the faults to the copies; returns the bytes that arrive.
+    fn transmit(&mut self, transit: &mut PassInTransit) -> Vec<u8> {
+        let PassInTransit { number, pass, copies, outcomes, random } = transit;
+        let mut bit_errors =
+            BitErrors::new(&self.config, random_stream(self.truth.seed, StreamKind::Link, [*number, 1]));
         let mut writer = BitWriter::default();
         for copy in &*copies {
             let sent = &pass.units[copy.unit].bytes;
             let mut bytes = sent[..copy.bytes].to_vec();
             let mut flips = Vec::new();
-            noise.apply(&mut bytes, |bit| flips.push(bit));
+            bit_errors.apply(&mut bytes, |bit| flips.push(bit));
             self.truth.copies_delivered += 1;
             self.truth.copies_damaged += u64::from(!flips.is_empty());
             self.truth.bits_flipped += flips.len() as u64;
@@ -219,13 +219,13 @@ impl LinkSimulator {
                 self.shift_bits = Some(0);
                 None
             };
-            outcome.good += u32::from(fate.is_none());
+            outcome.recoverable += u32::from(fate.is_none());
             outcome.fate = outcome.fate.max(fate);
-            let begun = writer.bits();
+            let start_bits = writer.bits();
             match self.code.filter(|_| copy.slips && copy.bytes == sent.len()) {
                 Some(code) => {
                     self.truth.copies_slipped += 1;
-                    // Farther from both ends than any code can correct.
+                    // Far enough from both ends that no code can correct the shifted part.
                     let margin = 8 * (SYNC_MARKER_BYTES + 64 * code.interleave());
                     let bit = random.random_range(margin..8 * sent.len() - margin);
                     let added = random.random::<bool>().then(|| random.random());
@@ -233,11 +233,11 @@ impl LinkSimulator {
                 }
                 None => writer.push(&bytes),
             }
-            self.shift(writer.bits() - begun - 8 * sent.len() as i64);
+            self.shift(writer.bits() - start_bits - 8 * sent.len() as i64);
         }
-        let begun = writer.bits();
+        let start_bits = writer.bits();
         let bytes = writer.into_bytes();
-        self.shift(8 * bytes.len() as i64 - begun);
+        self.shift(8 * bytes.len() as i64 - start_bits);
         bytes
     }
 
@@ -245,32 +245,31 @@ impl LinkSimulator {
         self.shift_bits = self.shift_bits.map(|before| before + bits);
     }
 
-    /// Whether the receiver finds a frame of `bytes` bytes: where it is due, or by its marker.
+    /// Whether the receiver finds a frame of `bytes` bytes, where it is due or by its marker.
     fn is_found(&self, bytes: usize, flips: &[usize]) -> bool {
         let wrong = flips.iter().filter(|bit| **bit < 8 * SYNC_MARKER_BYTES).count();
         let is_due = self.shift_bits.is_some_and(|bits| bits % (8 * bytes as i64) == 0);
         self.code.is_none() || is_due || wrong <= MARKER_ERRORS_MAX as usize
     }
 
-    /// Adds the outcomes of a pass to the truth.
     fn record(&mut self, pass: &SentPass, outcomes: &[UnitOutcome]) {
         if let Some(report) = pass.report {
-            // Counts only grow; of two swapped passes the later one has the larger.
+            // The counts never decrease, so the maximum also holds for swapped passes.
             self.truth.visibilities_sampled = self.truth.visibilities_sampled.max(report.sampled);
             self.truth.visibilities_dropped = self.truth.visibilities_dropped.max(report.dropped);
         }
         for (unit, outcome) in pass.units.iter().zip(outcomes) {
             self.truth.frames_sent += 1;
-            self.truth.frames_recoverable += u64::from(outcome.good > 0);
-            self.truth.copies_duplicate += u64::from(outcome.good.saturating_sub(1));
-            if let (0, Some(fate), Some((channel, count))) = (outcome.good, outcome.fate, unit.frame) {
-                self.truth.lose_frame(channel, count, fate);
+            self.truth.frames_recoverable += u64::from(outcome.recoverable > 0);
+            self.truth.copies_duplicate += u64::from(outcome.recoverable.saturating_sub(1));
+            if let (0, Some(fate), Some((channel, count))) = (outcome.recoverable, outcome.fate, unit.frame) {
+                self.truth.add_lost_frame(channel, count, fate);
             }
         }
         for packet in &pass.packets {
             self.truth.packets_sent += 1;
             self.truth.visibilities_sent += packet.visibilities;
-            match packet.units.iter().map(|unit| outcomes[*unit].good).min().unwrap_or(0) {
+            match packet.units.iter().map(|unit| outcomes[*unit].recoverable).min().unwrap_or(0) {
                 0 => {
                     self.truth.visibilities_lost += packet.visibilities;
                     list_packet(&mut self.truth.packets_lost, packet.apid, packet.count);

@@ -1,4 +1,4 @@
-//! Splits an undamaged downlink into what a link can lose: passes, and frames or packets.
+//! Splits an undamaged downlink into the units that a link can lose: passes, and frames or packets.
 
 use std::collections::BTreeMap;
 
@@ -8,16 +8,16 @@ use crate::downlink::wire::cadu::{
     randomize,
 };
 use crate::downlink::wire::payload::{decode_housekeeping, visibilities_in};
-use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES};
+use crate::downlink::wire::{HEADER_BYTES, PacketHeader, PacketKind, TRAILER_BYTES};
 use crate::frames::Housekeeping;
 
 /// Octets of a space packet's primary header.
 const PRIMARY_BYTES: usize = 6;
 
-/// Leading octets of a packet that are kept: more than a housekeeping packet has.
+/// Number of leading octets that are kept of a packet: more than a housekeeping packet has.
 const HEAD_BYTES: usize = 128;
 
-/// A coded frame, or a packet if packets are sent plain.
+/// A coded frame, or a packet in a downlink of plain packets.
 #[derive(Debug)]
 pub(super) struct Unit {
     pub(super) bytes: Vec<u8>,
@@ -25,7 +25,7 @@ pub(super) struct Unit {
     pub(super) frame: Option<(u8, u32)>,
 }
 
-/// A packet, and the units that hold it.
+/// A packet and the units that hold parts of it.
 #[derive(Debug)]
 pub(super) struct SentPacket {
     pub(super) apid: u16,
@@ -34,27 +34,27 @@ pub(super) struct SentPacket {
     pub(super) units: Vec<usize>,
 }
 
-/// What is sent from the end of one window to the end of the next. No packet crosses from one pass into another.
+/// The data sent from the end of one window to the end of the next. No packet continues in another pass.
 #[derive(Debug, Default)]
 pub(super) struct SentPass {
     pub(super) units: Vec<Unit>,
     pub(super) packets: Vec<SentPacket>,
-    /// The spacecraft's own counts at the end of the pass.
+    /// The spacecraft's counts at the end of the pass.
     pub(super) report: Option<Housekeeping>,
-    /// Whether it holds positions or visibilities: the next report ends it, and does not begin it.
+    /// Whether the pass has positions or visibilities. If so, the next report ends it.
     has_data: bool,
 }
 
 impl SentPass {
-    /// Adds a packet that begins with `head`, or, if short, consists of it.
+    /// Adds a packet whose first [`HEAD_BYTES`] bytes are `head`.
     fn add(&mut self, head: &[u8], units: Vec<usize>) {
-        // Idle packets have no header of this format.
+        // Idle packets have no secondary header.
         let Some(header) = PacketHeader::parse(head) else { return };
         let payload = header.bytes - HEADER_BYTES - TRAILER_BYTES;
         let visibilities =
-            if header.kind == Kind::Visibilities { visibilities_in(payload) as u64 } else { 0 };
-        self.has_data |= matches!(header.kind, Kind::Ephemeris | Kind::Visibilities);
-        if header.kind == Kind::Housekeeping {
+            if header.kind == PacketKind::Visibilities { visibilities_in(payload) as u64 } else { 0 };
+        self.has_data |= matches!(header.kind, PacketKind::Ephemeris | PacketKind::Visibilities);
+        if header.kind == PacketKind::Housekeeping {
             let payload = head.get(HEADER_BYTES..HEADER_BYTES + payload);
             self.report = payload.and_then(|payload| decode_housekeeping(payload).ok()).or(self.report);
         }
@@ -62,15 +62,15 @@ impl SentPass {
     }
 }
 
-/// An incomplete packet.
+/// An incomplete packet of a virtual channel.
 #[derive(Debug, Default)]
-struct Open {
+struct PartialPacket {
     head: Vec<u8>,
     bytes: usize,
     units: Vec<usize>,
 }
 
-/// Splits an undamaged downlink; holds one pass.
+/// Splits an undamaged downlink into passes; holds one pass.
 #[derive(Debug)]
 pub(super) struct Splitter {
     /// Code of the frames; `None` for plain packets.
@@ -78,16 +78,17 @@ pub(super) struct Splitter {
     buffer: Vec<u8>,
     offset: u64,
     pass: SentPass,
-    open: BTreeMap<u8, Open>,
+    /// The incomplete packet of each virtual channel.
+    partial: BTreeMap<u8, PartialPacket>,
 }
 
 impl Splitter {
     /// A splitter for frames with the given code, or for plain packets.
     pub(super) fn new(code: Option<ReedSolomon>) -> Self {
-        Self { code, buffer: Vec::new(), offset: 0, pass: SentPass::default(), open: BTreeMap::new() }
+        Self { code, buffer: Vec::new(), offset: 0, pass: SentPass::default(), partial: BTreeMap::new() }
     }
 
-    /// Takes the next bytes; passes each completed pass to `done`.
+    /// Takes the next bytes; calls `done` with each completed pass.
     ///
     /// # Errors
     /// The bytes are not an undamaged downlink.
@@ -100,10 +101,10 @@ impl Splitter {
                 Some(code) => self.take_frame(rest, code)?,
                 None => self.take_packet(rest)?,
             };
-            let Some((bytes, ends)) = taken else { break };
+            let Some((bytes, may_end)) = taken else { break };
             rest = &rest[bytes..];
             self.offset += bytes as u64;
-            if ends && self.pass.has_data && self.open.values().all(|open| open.bytes == 0) {
+            if may_end && self.pass.has_data && self.partial.values().all(|partial| partial.bytes == 0) {
                 done(std::mem::take(&mut self.pass));
             }
         }
@@ -117,27 +118,27 @@ impl Splitter {
     /// The stream ends within a frame or packet.
     pub(super) fn finish(&mut self) -> Result<Option<SentPass>, DownlinkError> {
         if !self.buffer.is_empty() {
-            return Err(self.unsound());
+            return Err(self.damaged_input());
         }
         let pass = std::mem::take(&mut self.pass);
         Ok((!pass.units.is_empty()).then_some(pass))
     }
 
-    fn unsound(&self) -> DownlinkError {
-        DownlinkError::Unsound { offset: self.offset }
+    fn damaged_input(&self) -> DownlinkError {
+        DownlinkError::DamagedInput { offset: self.offset }
     }
 
-    /// Takes the next packet; returns its length and whether a pass ends with it.
+    /// Takes the next packet; returns its length and whether a pass may end with it.
     fn take_packet(&mut self, rest: &[u8]) -> Result<Option<(usize, bool)>, DownlinkError> {
         if rest.len() < HEADER_BYTES {
             return Ok(None);
         }
-        let header = PacketHeader::parse(rest).ok_or_else(|| self.unsound())?;
+        let header = PacketHeader::parse(rest).ok_or_else(|| self.damaged_input())?;
         let Some(bytes) = rest.get(..header.bytes) else { return Ok(None) };
         let units = vec![self.pass.units.len()];
         self.pass.add(bytes, units);
         self.pass.units.push(Unit { bytes: bytes.to_vec(), frame: None });
-        Ok(Some((header.bytes, header.kind == Kind::Housekeeping)))
+        Ok(Some((header.bytes, header.kind == PacketKind::Housekeeping)))
     }
 
     /// Takes the next coded frame; returns its length and whether a pass may end with it.
@@ -146,37 +147,38 @@ impl Splitter {
         let (marker, block) = bytes.split_at(SYNC_MARKER_BYTES);
         let mut block = block.to_vec();
         randomize(&mut block);
-        let sound = *marker == SYNC_MARKER.to_be_bytes() && code.decode(&mut block) == Ok(0);
-        let header = FrameHeader::parse(&block).filter(|_| sound).ok_or_else(|| self.unsound())?;
+        let is_undamaged = *marker == SYNC_MARKER.to_be_bytes() && code.decode(&mut block) == Ok(0);
+        let header =
+            FrameHeader::parse(&block).filter(|_| is_undamaged).ok_or_else(|| self.damaged_input())?;
         let unit = self.pass.units.len();
         self.pass.units.push(Unit { bytes: bytes.to_vec(), frame: Some((header.channel, header.count)) });
         if header.channel != IDLE {
-            self.walk(header.channel, unit, &block[FRAME_HEADER_BYTES + 2..code.data_bytes()]);
+            self.follow_packets(header.channel, unit, &block[FRAME_HEADER_BYTES + 2..code.data_bytes()]);
         }
         Ok(Some((bytes.len(), header.channel == HOUSEKEEPING)))
     }
 
-    /// Follows the packets of a virtual channel through a frame's zone.
-    fn walk(&mut self, channel: u8, unit: usize, zone: &[u8]) {
-        let open = self.open.entry(channel).or_default();
+    /// Follows the packets of a virtual channel through the packet zone of a frame.
+    fn follow_packets(&mut self, channel: u8, unit: usize, zone: &[u8]) {
+        let partial = self.partial.entry(channel).or_default();
         let mut rest = zone;
         while !rest.is_empty() {
-            if open.units.last() != Some(&unit) {
-                open.units.push(unit);
+            if partial.units.last() != Some(&unit) {
+                partial.units.push(unit);
             }
-            let total = match open.head[..] {
+            let total = match partial.head[..] {
                 [_, _, _, _, high, low, ..] => {
                     PRIMARY_BYTES + 1 + usize::from(u16::from_be_bytes([high, low]))
                 }
                 _ => PRIMARY_BYTES,
             };
-            let (part, after) = rest.split_at(rest.len().min(total - open.bytes));
-            let wanted = HEAD_BYTES - open.head.len().min(HEAD_BYTES);
-            open.head.extend_from_slice(&part[..part.len().min(wanted)]);
-            open.bytes += part.len();
+            let (part, after) = rest.split_at(rest.len().min(total - partial.bytes));
+            let wanted = HEAD_BYTES - partial.head.len().min(HEAD_BYTES);
+            partial.head.extend_from_slice(&part[..part.len().min(wanted)]);
+            partial.bytes += part.len();
             rest = after;
-            if total > PRIMARY_BYTES && open.bytes == total {
-                let Open { head, units, .. } = std::mem::take(open);
+            if total > PRIMARY_BYTES && partial.bytes == total {
+                let PartialPacket { head, units, .. } = std::mem::take(partial);
                 self.pass.add(&head, units);
             }
         }

@@ -1,4 +1,4 @@
-//! What happened to everything that was sent over a simulated link.
+//! The truth about a simulated link: what happened to each frame and packet.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -8,19 +8,20 @@ use serde::{Deserialize, Serialize};
 use super::config::LinkConfig;
 use crate::downlink::wire::Format;
 
-/// Why a frame cannot be recovered on the ground. Of several copies, that of the one that got furthest.
+/// Why a frame cannot be recovered on the ground. Of several copies, the greatest fate counts: that of the copy that got
+/// furthest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FrameFate {
-    /// Its pass did not arrive.
+    /// The pass did not arrive.
     PassLost,
-    /// Its pass was truncated before its end.
+    /// The pass was truncated before the end of the frame.
     CutOff,
-    /// It did not arrive.
+    /// The frame did not arrive.
     Lost,
-    /// A bit was lost or added in it.
+    /// A bit was lost or added in the frame.
     Slipped,
-    /// It has more errors than can be corrected; for a plain packet, any.
+    /// The frame has more errors than can be corrected; for a plain packet, any error.
     Spoilt,
 }
 
@@ -29,11 +30,11 @@ pub enum FrameFate {
 pub struct LostFrames {
     /// Virtual channel.
     pub channel: u8,
-    /// Count of the first.
+    /// Count of the first frame.
     pub from: u32,
-    /// Count of the last.
+    /// Count of the last frame.
     pub to: u32,
-    /// Reason.
+    /// Why they cannot be recovered.
     pub fate: FrameFate,
 }
 
@@ -42,14 +43,14 @@ pub struct LostFrames {
 pub struct PacketRange {
     /// Application process identifier.
     pub apid: u16,
-    /// Count of the first, 46 bits; the sequence count is its lower 14.
+    /// Count of the first packet, 46 bits; the sequence count of the primary header is its lower 14.
     pub from: u64,
-    /// Count of the last.
+    /// Count of the last packet.
     pub to: u64,
 }
 
 impl PacketRange {
-    /// The counts.
+    /// The counts as a range.
     #[must_use]
     pub fn counts(&self) -> RangeInclusive<u64> {
         self.from..=self.to
@@ -73,13 +74,13 @@ pub struct LinkTruth {
     pub passes_cut: u64,
     /// Passes that arrived after their successor.
     pub passes_swapped: u64,
-    /// Frames sent (packets if they are sent plain).
+    /// Frames sent, or packets if they are sent plain.
     pub frames_sent: u64,
     /// Frames with at least one recoverable copy.
     pub frames_recoverable: u64,
     /// Copies that arrived, complete or not.
     pub copies_delivered: u64,
-    /// Recoverable copies beyond the first of a frame.
+    /// Recoverable copies of frames beyond the first one of each.
     pub copies_duplicate: u64,
     /// Copies that arrived late.
     pub copies_delayed: u64,
@@ -89,13 +90,13 @@ pub struct LinkTruth {
     pub copies_slipped: u64,
     /// Wrong bits.
     pub bits_flipped: u64,
-    /// Bytes delivered.
+    /// Bytes that arrived.
     pub bytes_delivered: u64,
     /// Packets sent, without idle ones.
     pub packets_sent: u64,
     /// Visibilities that the spacecraft had integrated by the end of the last pass, by its own count.
     pub visibilities_sampled: u64,
-    /// Visibilities that it dropped because its store was full.
+    /// Visibilities that the spacecraft dropped because its store was full.
     pub visibilities_dropped: u64,
     /// Visibilities sent.
     pub visibilities_sent: u64,
@@ -144,7 +145,7 @@ impl fmt::Display for LinkTruth {
 }
 
 impl LinkTruth {
-    pub(super) fn lose_frame(&mut self, channel: u8, count: u32, fate: FrameFate) {
+    pub(super) fn add_lost_frame(&mut self, channel: u8, count: u32, fate: FrameFate) {
         match self.frames_lost.last_mut() {
             Some(last) if (last.channel, last.fate, last.to.wrapping_add(1)) == (channel, fate, count) => {
                 last.to = count;
@@ -154,7 +155,6 @@ impl LinkTruth {
     }
 }
 
-/// Adds a packet to a list of ranges.
 pub(super) fn list_packet(list: &mut Vec<PacketRange>, apid: u16, count: u64) {
     match list.last_mut() {
         Some(last) if (last.apid, last.to + 1) == (apid, count) => last.to = count,

@@ -1,42 +1,42 @@
-//! Counters of what the ground has received, lost and refused.
+//! Counters of the data that the ground has received, lost and refused.
 
 use serde::Serialize;
 
 use super::cadu::FrameCounters;
-use crate::downlink::wire::Kind;
+use crate::downlink::wire::PacketKind;
 use crate::downlink::wire::payload::PayloadFault;
 
-/// Packets of one kind.
+/// Counters of the packets of one kind.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct KindCounts {
-    /// Sound packets without duplicates.
+    /// Valid packets, without duplicates.
     pub packets: u64,
-    /// Bytes of those.
+    /// Bytes of these packets.
     pub bytes: u64,
-    /// Packets with sound headers and a bad packet checksum.
+    /// Packets with valid headers and an invalid packet checksum.
     pub damaged: u64,
     /// Packets received before.
     pub duplicates: u64,
     /// Gaps in the packet count.
     pub gaps: u64,
-    /// Packets in those gaps.
+    /// Packets missing in these gaps.
     pub missing: u64,
-    /// Packets that filled a gap, or replaced a damaged one, later.
+    /// Packets that arrived later and filled a gap or replaced a damaged packet.
     pub late: u64,
     /// Restarts of the packet count.
     pub restarts: u64,
-    /// Payloads, or parts of them, that lack a segment.
+    /// Incomplete payloads, and segments without the rest of their payload.
     pub orphans: u64,
 }
 
-/// Payloads refused although their packets' checksums are right, by reason.
+/// Counters of the payloads refused in spite of valid checksums, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct FaultCounts {
     /// Unknown format version.
     pub version: u64,
     /// Malformed record.
     pub record: u64,
-    /// Length that contradicts the record.
+    /// Length other than the record requires.
     pub length: u64,
     /// Value out of range.
     pub value: u64,
@@ -51,7 +51,7 @@ pub enum FaultKind {
     Version,
     /// Malformed record.
     Record,
-    /// Length other than the record asks for.
+    /// Length other than the record requires.
     Length,
     /// Value out of range.
     Value,
@@ -71,39 +71,39 @@ impl From<&PayloadFault> for FaultKind {
     }
 }
 
-/// What became of the payload that a packet completed.
+/// Result of decoding the payload that a packet completed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub enum PayloadOutcome {
-    /// It was decoded, or the packet completed none.
+    /// The payload was decoded, or the packet completed none.
     #[default]
     Decoded,
-    /// It was malformed.
+    /// The payload was refused.
     Refused(FaultKind),
-    /// No instrument was known.
+    /// The payload came before any instrument description.
     BeforeInstrument,
-    /// It followed a contradictory instrument description.
+    /// The payload followed a contradictory instrument description.
     Foreign,
-    /// It is a contradictory instrument description.
+    /// The payload is a contradictory instrument description.
     Contradictory,
 }
 
-/// What decoding one packet adds to the counters, beside the packet and its bytes.
+/// Result of decoding one packet: what it adds to the counters, apart from the packet and its bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, bincode::Encode, bincode::Decode)]
-pub struct PacketReading {
-    /// What became of the payload.
+pub struct PacketOutcome {
+    /// Result of the payload.
     pub payload: PayloadOutcome,
     /// Visibilities decoded.
     pub visibilities_decoded: u32,
-    /// Visibilities of bad value.
+    /// Visibilities dropped for a bad value.
     pub visibilities_bad_value: u32,
     /// Visibilities of a payload that was not decoded.
     pub visibilities_unread: u32,
-    /// Payloads given up with this packet, and segments that belong to none.
+    /// Partial payloads discarded with this packet, and segments that belong to none.
     pub orphans: u32,
 }
 
 impl FaultCounts {
-    fn of_mut(&mut self, fault: FaultKind) -> &mut u64 {
+    fn count_mut(&mut self, fault: FaultKind) -> &mut u64 {
         match fault {
             FaultKind::Version => &mut self.version,
             FaultKind::Record => &mut self.record,
@@ -113,7 +113,7 @@ impl FaultCounts {
         }
     }
 
-    /// All of them.
+    /// Number of all refused payloads.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.version + self.record + self.length + self.value + self.order
@@ -122,37 +122,38 @@ impl FaultCounts {
 
 /// Counters of a reception.
 ///
-/// `bytes = bytes_garbage + bytes_truncated + bytes_damaged + bytes_duplicate + bytes_beyond +` those of the kinds' packets.
-/// Visibilities in sound packets are `decoded + bad_value + refused + before_instrument + foreign`.
+/// `bytes` is the sum of `bytes_garbage`, `bytes_truncated`, `bytes_damaged`, `bytes_duplicate`, `bytes_beyond` and the
+/// `bytes` of all kinds. The number of visibilities in valid packets is
+/// `decoded + bad_value + refused + before_instrument + foreign`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ReceptionCounters {
-    /// Counters of coded frames, if packets came in such. All other counters are of recovered packets.
+    /// Counters of a coded stream; `None` for plain packets. All other counters are of recovered packets.
     pub frames: Option<FrameCounters>,
     /// Bytes received, without idle packets; for coded frames, recovered packet bytes.
     pub bytes: u64,
     /// Bytes that belong to no packet.
     pub bytes_garbage: u64,
-    /// Runs of such bytes.
+    /// Number of runs of such bytes.
     pub garbage_stretches: u64,
-    /// Bytes of unfinished packets at the end of a stream.
+    /// Bytes of truncated packets at the end of a stream.
     pub bytes_truncated: u64,
     /// Bytes of damaged packets.
     pub bytes_damaged: u64,
     /// Bytes of duplicate packets.
     pub bytes_duplicate: u64,
-    /// Bytes of new packets for which the received set had no room.
+    /// Bytes of new packets that were refused because the received set was full.
     pub bytes_beyond: u64,
-    /// New packets for which the received set had no room: refused.
+    /// New packets that were refused because the received set was full.
     pub packets_beyond: u64,
-    /// Instrument descriptions.
+    /// Packets of instrument descriptions.
     pub instrument: KindCounts,
-    /// Satellite positions.
+    /// Packets of satellite positions.
     pub ephemeris: KindCounts,
-    /// Visibilities.
+    /// Packets of visibilities.
     pub visibilities: KindCounts,
-    /// Calibration: reserved, counted and skipped.
+    /// Calibration packets, a reserved kind that is counted and skipped.
     pub calibration: KindCounts,
-    /// The spacecraft's own counts.
+    /// Packets of the spacecraft's counts.
     pub housekeeping: KindCounts,
     /// Refused payloads.
     pub faults: FaultCounts,
@@ -164,7 +165,7 @@ pub struct ReceptionCounters {
     pub payloads_before_instrument: u64,
     /// Visibilities decoded.
     pub visibilities_decoded: u64,
-    /// Visibilities dropped because they are not finite, or have zero weight or duration.
+    /// Visibilities dropped because they are not finite, or their weight or duration is not positive.
     pub visibilities_bad_value: u64,
     /// Visibilities in refused payloads.
     pub visibilities_refused: u64,
@@ -175,45 +176,45 @@ pub struct ReceptionCounters {
 }
 
 impl ReceptionCounters {
-    /// Counts of one kind.
+    /// Counters of one kind.
     #[must_use]
     #[doc(hidden)]
-    pub fn kind(&self, kind: Kind) -> &KindCounts {
+    pub fn kind(&self, kind: PacketKind) -> &KindCounts {
         match kind {
-            Kind::Instrument => &self.instrument,
-            Kind::Ephemeris => &self.ephemeris,
-            Kind::Visibilities => &self.visibilities,
-            Kind::Calibration => &self.calibration,
-            Kind::Housekeeping => &self.housekeeping,
+            PacketKind::Instrument => &self.instrument,
+            PacketKind::Ephemeris => &self.ephemeris,
+            PacketKind::Visibilities => &self.visibilities,
+            PacketKind::Calibration => &self.calibration,
+            PacketKind::Housekeeping => &self.housekeeping,
         }
     }
 
-    pub(crate) fn kind_mut(&mut self, kind: Kind) -> &mut KindCounts {
+    pub(crate) fn kind_mut(&mut self, kind: PacketKind) -> &mut KindCounts {
         match kind {
-            Kind::Instrument => &mut self.instrument,
-            Kind::Ephemeris => &mut self.ephemeris,
-            Kind::Visibilities => &mut self.visibilities,
-            Kind::Calibration => &mut self.calibration,
-            Kind::Housekeeping => &mut self.housekeeping,
+            PacketKind::Instrument => &mut self.instrument,
+            PacketKind::Ephemeris => &mut self.ephemeris,
+            PacketKind::Visibilities => &mut self.visibilities,
+            PacketKind::Calibration => &mut self.calibration,
+            PacketKind::Housekeeping => &mut self.housekeeping,
         }
     }
 
-    /// Adds a good packet that is no duplicate.
-    pub(crate) fn add_packet(&mut self, kind: Kind, bytes: u32, reading: &PacketReading) {
-        let PacketReading { payload, orphans, visibilities_unread: unread, .. } = *reading;
-        // A forged journal may claim anything: sums saturate.
+    /// Adds a valid packet that is not a duplicate.
+    pub(crate) fn add_packet(&mut self, kind: PacketKind, bytes: u32, outcome: &PacketOutcome) {
+        let PacketOutcome { payload, orphans, visibilities_unread: unread, .. } = *outcome;
+        // The sums saturate, as a forged journal may contain any numbers.
         let add = |count: &mut u64, more: u32| *count = count.saturating_add(u64::from(more));
         add(&mut self.bytes, bytes);
         let counts = self.kind_mut(kind);
         add(&mut counts.packets, 1);
         add(&mut counts.bytes, bytes);
         add(&mut counts.orphans, orphans);
-        add(&mut self.visibilities_decoded, reading.visibilities_decoded);
-        add(&mut self.visibilities_bad_value, reading.visibilities_bad_value);
+        add(&mut self.visibilities_decoded, outcome.visibilities_decoded);
+        add(&mut self.visibilities_bad_value, outcome.visibilities_bad_value);
         match payload {
             PayloadOutcome::Decoded => {}
             PayloadOutcome::Refused(fault) => {
-                add(self.faults.of_mut(fault), 1);
+                add(self.faults.count_mut(fault), 1);
                 add(&mut self.visibilities_refused, unread);
             }
             PayloadOutcome::BeforeInstrument => {
@@ -228,14 +229,14 @@ impl ReceptionCounters {
         }
     }
 
-    /// Adds a stream's counters of everything but sound packets: garbage, damage, a truncated end, and frames.
+    /// Adds a stream's counters of garbage, damage, truncation and frames, but not of valid packets.
     pub(crate) fn add_stream(&mut self, other: &Self) {
         self.bytes += other.bytes_garbage + other.bytes_truncated + other.bytes_damaged;
         self.bytes_garbage += other.bytes_garbage;
         self.garbage_stretches += other.garbage_stretches;
         self.bytes_truncated += other.bytes_truncated;
         self.bytes_damaged += other.bytes_damaged;
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             self.kind_mut(kind).damaged += other.kind(kind).damaged;
         }
         if let Some(frames) = &other.frames {
@@ -243,23 +244,23 @@ impl ReceptionCounters {
         }
     }
 
-    /// A sentence about restarts of the packet counts, if there were any.
+    /// A sentence about the restarts of the packet counts; `None` if there were none.
     pub(crate) fn restarts_text(&self) -> Option<String> {
-        let kinds = Kind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
-        let times: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
-        (!times.is_empty()).then(|| {
+        let kinds = PacketKind::ALL.into_iter().filter(|kind| self.kind(*kind).restarts > 0);
+        let counts: Vec<String> = kinds.map(|kind| format!("{kind} {}", self.kind(kind).restarts)).collect();
+        (!counts.is_empty()).then(|| {
             format!(
-                "the spacecraft restarted its packet counts (times: {}): losses just before a restart cannot be known",
-                times.join(", ")
+                "the spacecraft restarted its packet counts (number of restarts: {}): packets lost just before a restart are not known",
+                counts.join(", ")
             )
         })
     }
 
-    /// Sound packets of all kinds.
+    /// Number of valid packets of all kinds.
     #[must_use]
     #[doc(hidden)]
     pub fn packets(&self) -> u64 {
-        Kind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
+        PacketKind::ALL.iter().map(|kind| self.kind(*kind).packets).sum()
     }
 }
 
@@ -269,7 +270,7 @@ impl std::fmt::Display for ReceptionCounters {
         if let Some(frames) = &self.frames {
             writeln!(f, "{frames}")?;
         }
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let counts = self.kind(kind);
             if *counts != KindCounts::default() {
                 let KindCounts { packets, bytes, damaged, duplicates, missing, .. } = counts;
@@ -284,7 +285,7 @@ impl std::fmt::Display for ReceptionCounters {
         if self.packets_beyond > 0 {
             writeln!(
                 f,
-                "{} new packets refused: the set of received packets is full, as only a forger fills it",
+                "{} new packets refused: the set of received packets is full, which only forged packets can cause",
                 self.packets_beyond
             )?;
         }

@@ -1,19 +1,20 @@
-//! Packets to ground frames.
+//! Decodes packets into ground frames.
 
-use super::{Event, Packet, PacketReading, PayloadOutcome, ReceptionCounters};
+use super::{Event, Packet, PacketOutcome, PayloadOutcome, ReceptionCounters};
 use crate::downlink::wire::payload::{
     PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
     decode_visibilities,
 };
-use crate::downlink::wire::{CucTime, FORMAT_VERSION, Kind, PacketHeader, PacketSegment};
+use crate::downlink::wire::{CucTime, FORMAT_VERSION, PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument};
 
-/// Longest payload that is assembled from segments; the ephemeris of a window is a thousandth of it.
+/// Maximum length of a payload that is assembled from segments; the ephemeris of a window has a thousandth of this.
 const PAYLOAD_BYTES_MAX: usize = 1 << 24;
 
-/// A payload that lacks segments.
+/// A payload without its last segments.
 #[derive(Clone, Debug)]
-struct Partial {
+struct PartialPayload {
+    /// Packet count of the next segment.
     next: u64,
     time: CucTime,
     bytes: Vec<u8>,
@@ -25,23 +26,23 @@ enum DescriptionState {
     #[default]
     Unknown,
     Known,
-    /// The latest description contradicts the first: what follows it belongs to another array.
+    /// The latest description contradicts the first, so that the packets after it belong to another array.
     Contradicted,
 }
 
-/// What a decoder knows of the instrument; its counters and the segments of unfinished payloads are not part of it.
+/// The state of a decoder, without its counters and partial payloads.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct DecoderState {
     instrument: Option<Instrument>,
-    standing: DescriptionState,
+    description: DescriptionState,
 }
 
 impl DecoderState {
-    /// Takes the other's instrument if it knows none; returns whether both know the same.
+    /// Adopts the instrument of `other` if this state has none; returns whether both agree.
     #[must_use]
     pub fn merge(&mut self, other: Self) -> bool {
         match (&self.instrument, &other.instrument) {
-            (Some(ours), Some(theirs)) => return ours == theirs,
+            (Some(instrument), Some(other)) => return instrument == other,
             (None, Some(_)) => *self = other,
             _ => {}
         }
@@ -55,18 +56,18 @@ impl DecoderState {
     }
 }
 
-/// Decodes packets into ground frames, and counts.
+/// Decodes packets into ground frames, and counts events.
 ///
-/// The first instrument description is the valid one. Identical repeats are skipped. After a contradictory one all
-/// frames are refused until the first is repeated.
+/// The first instrument description is the valid one. Identical repeats are skipped. After a contradictory description
+/// all payloads are refused until the first description is repeated.
 #[derive(Debug, Default)]
 pub struct Decoder {
     instrument: Option<Instrument>,
-    standing: DescriptionState,
-    partial: [Option<Partial>; Kind::ALL.len()],
+    description: DescriptionState,
+    partial: [Option<PartialPayload>; PacketKind::ALL.len()],
     counters: ReceptionCounters,
-    /// Of the packet that is being decoded, or was decoded last.
-    reading: PacketReading,
+    /// Outcome of the packet that is being decoded, or was decoded last.
+    outcome: PacketOutcome,
     fault: Option<(u64, PayloadFault)>,
 }
 
@@ -77,24 +78,24 @@ impl Decoder {
         Self::default()
     }
 
-    /// What it knows of the instrument.
+    /// The state, with which [`Decoder::resume`] continues.
     #[must_use]
     pub fn state(&self) -> DecoderState {
-        DecoderState { instrument: self.instrument.clone(), standing: self.standing }
+        DecoderState { instrument: self.instrument.clone(), description: self.description }
     }
 
-    /// Resumes with a known instrument, and counters of what was decoded before.
+    /// A decoder that continues from a state and the counters so far.
     #[must_use]
     pub fn resume(state: DecoderState, counters: ReceptionCounters) -> Self {
-        let DecoderState { instrument, standing } = state;
-        Self { instrument, standing, counters, ..Self::new() }
+        let DecoderState { instrument, description } = state;
+        Self { instrument, description, counters, ..Self::new() }
     }
 
-    /// Whether this is the payload of another instrument's description than the one that holds.
+    /// Whether a payload describes another instrument than the valid one.
     #[must_use]
     pub fn contradicts(&self, payload: &[u8]) -> bool {
-        let known = self.instrument.as_ref();
-        known.is_some_and(|known| decode_instrument(payload).is_ok_and(|found| found != *known))
+        let valid = self.instrument.as_ref();
+        valid.is_some_and(|valid| decode_instrument(payload).is_ok_and(|found| found != *valid))
     }
 
     /// Counts an event; returns the frame that it completes.
@@ -132,9 +133,9 @@ impl Decoder {
         None
     }
 
-    /// Ends the stream: discards incomplete payloads. Another stream may follow.
+    /// Ends the stream: discards partial payloads. Another stream may follow.
     pub fn finish(&mut self) {
-        for kind in Kind::ALL {
+        for kind in PacketKind::ALL {
             let orphans = self.drop_partial(kind);
             self.counters.kind_mut(kind).orphans += u64::from(orphans);
         }
@@ -142,21 +143,21 @@ impl Decoder {
 
     /// Decodes a packet; returns the frame that it completes and what it adds to the counters.
     ///
-    /// If `is_last`, the stream ends with it: the payload is given up if it lacks a segment.
+    /// With `is_last` the stream ends, so a partial payload is discarded.
     pub(crate) fn decode(
         &mut self,
         packet: Packet<'_>,
         is_last: bool,
-    ) -> (Option<GroundFrame>, PacketReading) {
-        self.reading = PacketReading::default();
+    ) -> (Option<GroundFrame>, PacketOutcome) {
+        self.outcome = PacketOutcome::default();
         let PacketHeader { kind, bytes, .. } = packet.header;
         let frame = self.decode_packet(packet);
         if is_last {
-            self.give_up(kind);
+            self.discard_partial(kind);
         }
-        self.counters.add_packet(kind, bytes as u32, &self.reading);
+        self.counters.add_packet(kind, bytes as u32, &self.outcome);
         self.counters.kind_mut(kind).late += u64::from(packet.late);
-        (frame, self.reading)
+        (frame, self.outcome)
     }
 
     /// The counters so far.
@@ -171,7 +172,7 @@ impl Decoder {
         self.instrument.as_ref()
     }
 
-    /// The payload refused last: offset of its last packet, and the reason. Returned once.
+    /// The payload that was refused last: offset of its last packet, and the reason. Each is returned once.
     pub fn take_fault(&mut self) -> Option<(u64, PayloadFault)> {
         self.fault.take()
     }
@@ -182,30 +183,30 @@ impl Decoder {
             return self.refuse(packet, PayloadFault::Version { found: version, expected: FORMAT_VERSION });
         }
         if segment == PacketSegment::Whole {
-            self.give_up(kind);
+            self.discard_partial(kind);
             return self.decode_payload(packet, packet.payload);
         }
-        let whole = self.assemble(packet)?;
-        self.decode_payload(packet, &whole)
+        let payload = self.assemble(packet)?;
+        self.decode_payload(packet, &payload)
     }
 
     /// Adds a segment; returns the payload if it is complete.
     fn assemble(&mut self, packet: Packet<'_>) -> Option<Vec<u8>> {
         let PacketHeader { kind, segment, count, time, .. } = packet.header;
         if segment == PacketSegment::First {
-            self.give_up(kind);
+            self.discard_partial(kind);
             let bytes = packet.payload.to_vec();
-            self.partial[kind.index()] = Some(Partial { next: count + 1, time, bytes });
+            self.partial[kind.index()] = Some(PartialPayload { next: count + 1, time, bytes });
             return None;
         }
-        let fits = |partial: &Partial| {
+        let fits = |partial: &PartialPayload| {
             partial.next == count
                 && partial.time == time
                 && partial.bytes.len() + packet.payload.len() <= PAYLOAD_BYTES_MAX
         };
         let Some(mut partial) = self.partial[kind.index()].take_if(|partial| fits(partial)) else {
-            self.give_up(kind);
-            self.reading.orphans += 1;
+            self.discard_partial(kind);
+            self.outcome.orphans += 1;
             return None;
         };
         partial.bytes.extend_from_slice(packet.payload);
@@ -217,51 +218,51 @@ impl Decoder {
         None
     }
 
-    /// Discards an incomplete payload and counts it.
-    fn give_up(&mut self, kind: Kind) {
-        self.reading.orphans += self.drop_partial(kind);
+    /// Discards a partial payload and counts it as an orphan of this packet.
+    fn discard_partial(&mut self, kind: PacketKind) {
+        self.outcome.orphans += self.drop_partial(kind);
     }
 
-    /// Drops the segments of an unfinished payload; returns how many payloads there were.
-    fn drop_partial(&mut self, kind: Kind) -> u32 {
+    /// Drops the partial payload of a kind; returns 1 if there was one, otherwise 0.
+    fn drop_partial(&mut self, kind: PacketKind) -> u32 {
         u32::from(self.partial[kind.index()].take().is_some())
     }
 
     fn decode_payload(&mut self, packet: Packet<'_>, payload: &[u8]) -> Option<GroundFrame> {
         let kind = packet.header.kind;
         let decoded = match kind {
-            Kind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
-            _ if self.standing != DescriptionState::Known => {
-                self.set_aside(kind, payload);
+            PacketKind::Instrument => decode_instrument(payload).map(|found| self.take_instrument(found)),
+            _ if self.description != DescriptionState::Known => {
+                self.count_undecodable(kind, payload);
                 return None;
             }
-            Kind::Ephemeris => self.take_ephemeris(payload).map(Some),
-            Kind::Visibilities => self.take_visibilities(payload).map(Some),
-            Kind::Housekeeping => {
+            PacketKind::Ephemeris => self.take_ephemeris(payload).map(Some),
+            PacketKind::Visibilities => self.take_visibilities(payload).map(Some),
+            PacketKind::Housekeeping => {
                 decode_housekeeping(payload).map(|counts| Some(GroundFrame::Housekeeping(counts)))
             }
-            Kind::Calibration => return None,
+            PacketKind::Calibration => return None,
         };
         decoded.unwrap_or_else(|fault| {
-            if kind == Kind::Visibilities {
-                self.reading.visibilities_unread = count_visibilities(payload) as u32;
+            if kind == PacketKind::Visibilities {
+                self.outcome.visibilities_unread = count_visibilities(payload) as u32;
             }
             self.refuse(packet, fault)
         })
     }
 
     fn take_instrument(&mut self, found: Instrument) -> Option<GroundFrame> {
-        let first = match &self.instrument {
+        let is_first = match &self.instrument {
             None => true,
-            Some(known) if *known == found => false,
+            Some(valid) if *valid == found => false,
             Some(_) => {
-                self.standing = DescriptionState::Contradicted;
-                self.reading.payload = PayloadOutcome::Contradictory;
+                self.description = DescriptionState::Contradicted;
+                self.outcome.payload = PayloadOutcome::Contradictory;
                 return None;
             }
         };
-        self.standing = DescriptionState::Known;
-        if !first {
+        self.description = DescriptionState::Known;
+        if !is_first {
             return None;
         }
         self.instrument = Some(found.clone());
@@ -276,23 +277,23 @@ impl Decoder {
     fn take_visibilities(&mut self, payload: &[u8]) -> Result<GroundFrame, PayloadFault> {
         let instrument = self.instrument.as_ref().ok_or(PayloadFault::Record { what: "instrument" })?;
         let (block, bad) = decode_visibilities(payload, instrument)?;
-        self.reading.visibilities_bad_value = bad as u32;
-        self.reading.visibilities_decoded = block.len() as u32;
+        self.outcome.visibilities_bad_value = bad as u32;
+        self.outcome.visibilities_decoded = block.len() as u32;
         Ok(GroundFrame::Visibilities(block))
     }
 
-    /// Counts a payload that cannot be decoded because its instrument description is missing.
-    fn set_aside(&mut self, kind: Kind, payload: &[u8]) {
-        self.reading.visibilities_unread =
-            if kind == Kind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
-        self.reading.payload = match self.standing {
+    /// Counts a payload that cannot be decoded because no valid instrument description precedes it.
+    fn count_undecodable(&mut self, kind: PacketKind, payload: &[u8]) {
+        self.outcome.visibilities_unread =
+            if kind == PacketKind::Visibilities { count_visibilities(payload) as u32 } else { 0 };
+        self.outcome.payload = match self.description {
             DescriptionState::Unknown => PayloadOutcome::BeforeInstrument,
             _ => PayloadOutcome::Foreign,
         };
     }
 
     fn refuse(&mut self, packet: Packet<'_>, fault: PayloadFault) -> Option<GroundFrame> {
-        self.reading.payload = PayloadOutcome::Refused((&fault).into());
+        self.outcome.payload = PayloadOutcome::Refused((&fault).into());
         self.fault = Some((packet.offset, fault));
         None
     }

@@ -1,4 +1,4 @@
-//! A downlink file as a source of bytes, unpacked if it is packed.
+//! A downlink file as a source of bytes, decompressed if necessary.
 
 use std::fmt;
 use std::fs::File;
@@ -14,37 +14,39 @@ use crate::downlink::error::{DownlinkError, io_error};
 /// First bytes of gzip and zstd files.
 const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
-/// Memory for the history of a zstd file, bytes: that of its own program.
+/// Maximum window of a zstd file, bytes: the default limit of the zstd program.
 const WINDOW_BYTES_MAX: u64 = 1 << 27;
-/// A file may unpack to so many times its size, and so many bytes more: visibilities are noise, which packs to little less.
-const UNPACKED_TIMES_MAX: u64 = 256;
-const UNPACKED_BYTES_MORE: u64 = 1 << 26;
+/// A file may expand to this multiple of its size plus [`EXPANSION_BYTES`]. Visibilities are mostly noise, which hardly
+/// compresses.
+const EXPANSION_MAX: u64 = 256;
+/// Number of bytes by which a file may expand in addition.
+const EXPANSION_BYTES: u64 = 1 << 26;
 
-/// A downlink file as it was received, or packed by gzip or zstd, which its first bytes tell.
+/// A downlink file, which may be compressed by gzip or zstd; its first bytes tell.
 ///
-/// Unpacks as it is read, in bounded memory.
+/// Decompresses as it is read, in bounded memory.
 pub struct DownlinkFile {
     content: Content,
-    unpacked: u64,
+    expanded: u64,
 }
 
 enum Content {
     Plain(Chain<Cursor<Vec<u8>>, File>),
-    Gzip(Box<MultiGzDecoder<PackedBytes>>),
+    Gzip(Box<MultiGzDecoder<CountedBytes>>),
     Zstd(Box<ZstdFrames>),
 }
 
-/// The bytes of a packed file, counted.
-struct PackedBytes {
+/// The bytes of a compressed file, with their number.
+struct CountedBytes {
     source: Chain<Cursor<Vec<u8>>, File>,
     bytes: u64,
 }
 
 /// The frames of a zstd file, one after the other.
 struct ZstdFrames {
-    source: BufReader<PackedBytes>,
+    source: BufReader<CountedBytes>,
     decoder: FrameDecoder,
-    is_within: bool,
+    in_frame: bool,
 }
 
 impl DownlinkFile {
@@ -54,28 +56,28 @@ impl DownlinkFile {
     /// The file cannot be opened or read.
     pub fn open(path: &Path) -> Result<Self, DownlinkError> {
         let file = File::open(path).map_err(io_error(path, "open the file"))?;
-        Self::of(file).map_err(io_error(path, "read"))
+        Self::from_file(file).map_err(io_error(path, "read"))
     }
 
-    /// Reads from the place of an open file.
+    /// Reads from the current position of an open file.
     ///
     /// # Errors
     /// The file cannot be read.
-    pub fn of(mut file: File) -> io::Result<Self> {
+    pub fn from_file(mut file: File) -> io::Result<Self> {
         let mut head = Vec::new();
         Read::by_ref(&mut file).take(ZSTD.len() as u64).read_to_end(&mut head)?;
         let [is_gzip, is_zstd] = [GZIP, ZSTD].map(|signature| head.starts_with(signature));
         let source = Cursor::new(head).chain(file);
-        let packed = |source| PackedBytes { source, bytes: 0 };
+        let counted = |source| CountedBytes { source, bytes: 0 };
         let content = match (is_gzip, is_zstd) {
-            (true, _) => Content::Gzip(Box::new(MultiGzDecoder::new(packed(source)))),
-            (_, true) => Content::Zstd(Box::new(ZstdFrames::new(packed(source)))),
+            (true, _) => Content::Gzip(Box::new(MultiGzDecoder::new(counted(source)))),
+            (_, true) => Content::Zstd(Box::new(ZstdFrames::new(counted(source)))),
             _ => Content::Plain(source),
         };
-        Ok(Self { content, unpacked: 0 })
+        Ok(Self { content, expanded: 0 })
     }
 
-    /// The file itself.
+    /// The open file, unless it is compressed.
     pub(in crate::downlink) fn file(&self) -> Option<&File> {
         match &self.content {
             Content::Plain(source) => Some(source.get_ref().1),
@@ -83,8 +85,8 @@ impl DownlinkFile {
         }
     }
 
-    /// The packer, and the bytes read of the packed file.
-    fn packed(&self) -> Option<(&'static str, u64)> {
+    /// The name of the compression, and the number of compressed bytes read; `None` for a plain file.
+    fn compression(&self) -> Option<(&'static str, u64)> {
         match &self.content {
             Content::Plain(_) => None,
             Content::Gzip(source) => Some(("gzip", source.get_ref().bytes)),
@@ -100,23 +102,23 @@ impl Read for DownlinkFile {
             Content::Gzip(source) => source.read(bytes),
             Content::Zstd(source) => source.read(bytes),
         };
-        let Some((packer, packed)) = self.packed() else { return read };
-        let at = self.unpacked;
+        let Some((program, compressed)) = self.compression() else { return read };
+        let at = self.expanded;
         let read = read.map_err(|error| {
             let reason = match error.kind() {
                 io::ErrorKind::UnexpectedEof => "it ends early".to_owned(),
                 _ => error.to_string(),
             };
             let what = format!(
-                "the {packer} file is damaged behind {at} unpacked bytes ({reason}); expected one that `{packer} -t` passes"
+                "the {program} file is damaged after {at} decompressed bytes ({reason}); expected a file that passes `{program} -t`"
             );
             io::Error::new(io::ErrorKind::InvalidData, what)
         })?;
-        self.unpacked += read as u64;
-        if self.unpacked > UNPACKED_TIMES_MAX * packed + UNPACKED_BYTES_MORE {
+        self.expanded += read as u64;
+        if self.expanded > EXPANSION_MAX * compressed + EXPANSION_BYTES {
             let what = format!(
-                "{packed} bytes of the {packer} file unpack to more than {at} bytes; expected at most {UNPACKED_TIMES_MAX} times as \
-                 many, as visibilities are mostly noise. If it is a downlink, unpack it first"
+                "{compressed} bytes of the {program} file expand to more than {at} bytes; expected at most {EXPANSION_MAX} times as \
+                 many, as visibilities are mostly noise. If it is a downlink, decompress it first"
             );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
         }
@@ -126,12 +128,12 @@ impl Read for DownlinkFile {
 
 impl fmt::Debug for DownlinkFile {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (packed, unpacked) = (self.packed(), self.unpacked);
-        f.debug_struct("DownlinkFile").field("packed", &packed).field("unpacked", &unpacked).finish()
+        let (compressed, expanded) = (self.compression(), self.expanded);
+        f.debug_struct("DownlinkFile").field("compressed", &compressed).field("expanded", &expanded).finish()
     }
 }
 
-impl Read for PackedBytes {
+impl Read for CountedBytes {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
         let read = self.source.read(bytes)?;
         self.bytes += read as u64;
@@ -140,14 +142,14 @@ impl Read for PackedBytes {
 }
 
 impl ZstdFrames {
-    fn new(source: PackedBytes) -> Self {
+    fn new(source: CountedBytes) -> Self {
         let mut decoder = FrameDecoder::new();
         decoder.set_max_window_size(WINDOW_BYTES_MAX);
-        Self { source: BufReader::new(source), decoder, is_within: false }
+        Self { source: BufReader::new(source), decoder, in_frame: false }
     }
 
-    /// Opens the next frame of data, if there is one; those that others may skip are skipped.
-    fn begin(&mut self) -> io::Result<bool> {
+    /// Opens the next frame of data and skips skippable frames; returns false at the end.
+    fn open_frame(&mut self) -> io::Result<bool> {
         while !self.source.fill_buf()?.is_empty() {
             match self.decoder.init(&mut self.source) {
                 Ok(()) => return Ok(true),
@@ -167,26 +169,26 @@ impl ZstdFrames {
 impl Read for ZstdFrames {
     fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
         loop {
-            if !self.is_within {
-                self.is_within = self.begin()?;
+            if !self.in_frame {
+                self.in_frame = self.open_frame()?;
             }
-            if !self.is_within || bytes.is_empty() {
+            if !self.in_frame || bytes.is_empty() {
                 return Ok(0);
             }
             let decoder = &mut self.decoder;
             while decoder.can_collect() == 0 && !decoder.is_finished() {
-                let one = BlockDecodingStrategy::UptoBlocks(1);
-                decoder.decode_blocks(&mut self.source, one).map_err(io::Error::other)?;
+                let one_block = BlockDecodingStrategy::UptoBlocks(1);
+                decoder.decode_blocks(&mut self.source, one_block).map_err(io::Error::other)?;
             }
             let read = decoder.read(bytes)?;
             if read > 0 {
                 return Ok(read);
             }
-            let told = decoder.get_checksum_from_data();
-            if told.is_some() && told != decoder.get_calculated_checksum() {
+            let stored = decoder.get_checksum_from_data();
+            if stored.is_some() && stored != decoder.get_calculated_checksum() {
                 return Err(io::Error::other("the checksum of its content does not match"));
             }
-            self.is_within = false;
+            self.in_frame = false;
         }
     }
 }
@@ -211,18 +213,18 @@ mod tests {
         compress_to_vec(bytes, CompressionLevel::Fastest)
     }
 
-    fn unpacked(bytes: &[u8]) -> io::Result<Vec<u8>> {
+    fn decompressed(bytes: &[u8]) -> io::Result<Vec<u8>> {
         let mut file = tempfile::tempfile()?;
         file.write_all(bytes)?;
         io::Seek::rewind(&mut file)?;
         let mut found = Vec::new();
-        DownlinkFile::of(file)?.read_to_end(&mut found)?;
+        DownlinkFile::from_file(file)?.read_to_end(&mut found)?;
         Ok(found)
     }
 
     #[test]
-    fn what_was_packed_is_unpacked_also_in_several_members_and_frames() {
-        // Bytes in no order that repeats: a generator of full period.
+    fn files_of_several_members_or_frames_are_decompressed() {
+        // A generator of full period, so that the bytes hardly compress.
         let mut state = 1_u32;
         let mut next = || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -230,30 +232,30 @@ mod tests {
         };
         let bytes: Vec<u8> = (0..300_000).map(|_| next()).collect();
         let halves = bytes.split_at(100_001);
-        assert_eq!(unpacked(&bytes).unwrap(), bytes);
-        assert_eq!(unpacked(b"").unwrap(), b"");
-        for pack in [gzip, zstd] {
-            assert!(unpacked(&pack(&bytes)).unwrap() == bytes);
-            let apart = [pack(halves.0), pack(b""), pack(halves.1)].concat();
-            assert!(unpacked(&apart).unwrap() == bytes);
-            for end in [apart.len() - 1, apart.len() / 2] {
-                assert_eq!(unpacked(&apart[..end]).unwrap_err().kind(), io::ErrorKind::InvalidData);
+        assert_eq!(decompressed(&bytes).unwrap(), bytes);
+        assert_eq!(decompressed(b"").unwrap(), b"");
+        for compress in [gzip, zstd] {
+            assert!(decompressed(&compress(&bytes)).unwrap() == bytes);
+            let members = [compress(halves.0), compress(b""), compress(halves.1)].concat();
+            assert!(decompressed(&members).unwrap() == bytes);
+            for end in [members.len() - 1, members.len() / 2] {
+                assert_eq!(decompressed(&members[..end]).unwrap_err().kind(), io::ErrorKind::InvalidData);
             }
         }
         // A frame that readers may skip (RFC 8878, 3.1.2).
         let skippable = [&b"\x50\x2a\x4d\x18\x03\x00\x00\x00abc"[..], &zstd(&bytes)].concat();
-        assert!(unpacked(&[zstd(&bytes), skippable].concat()).unwrap() == [&bytes[..], &bytes].concat());
+        assert!(decompressed(&[zstd(&bytes), skippable].concat()).unwrap() == [&bytes[..], &bytes].concat());
     }
 
     #[test]
-    fn files_that_unpack_without_end_and_windows_too_large_are_refused() {
+    fn decompression_bombs_and_large_windows_are_refused() {
         let zeros = vec![0; 1 << 24];
-        for pack in [gzip, zstd] {
-            let error = unpacked(&pack(&zeros).repeat(40)).unwrap_err().to_string();
-            assert!(error.contains("unpack to more than"), "{error}");
+        for compress in [gzip, zstd] {
+            let error = decompressed(&compress(&zeros).repeat(40)).unwrap_err().to_string();
+            assert!(error.contains("expand to more than"), "{error}");
         }
-        // A frame that asks for a history of 2^41 bytes (window descriptor 0xF8: exponent 31 over 2^10).
-        let error = unpacked(b"\x28\xb5\x2f\xfd\x00\xf8\x01\x00\x00").unwrap_err().to_string();
+        // A frame that requires a window of 2^41 bytes (window descriptor 0xF8: exponent 31 over 2^10).
+        let error = decompressed(b"\x28\xb5\x2f\xfd\x00\xf8\x01\x00\x00").unwrap_err().to_string();
         assert!(error.contains("zstd") && error.to_lowercase().contains("window"), "{error}");
     }
 }

@@ -1,12 +1,12 @@
-//! The bytes of a file, or of any reader, to events.
+//! Reads the events of a file, or of any other source of bytes.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use super::{DownlinkFile, Event, Intake};
+use super::{DownlinkFile, DownlinkReceiver, Event};
 use crate::downlink::error::{DownlinkError, io_error, require_packets};
 
-/// Feeds a source to an intake, chunk by chunk, and names the source in errors.
+/// Feeds a source to a receiver, chunk by chunk, and names the source in errors.
 #[derive(Debug)]
 pub struct ByteFeed<R = DownlinkFile> {
     path: PathBuf,
@@ -31,16 +31,16 @@ impl<R: Read> ByteFeed<R> {
         Self { path: path.to_owned(), source, at_end: false }
     }
 
-    /// Feeds the next chunk, or the end of the source. Returns false if the end was fed before.
+    /// Feeds the next chunk, or the end of the source. Returns false once the end has been fed.
     ///
     /// # Errors
     /// The source cannot be read.
-    pub fn feed(&mut self, intake: &mut Intake) -> Result<bool, DownlinkError> {
+    pub fn feed(&mut self, receiver: &mut DownlinkReceiver) -> Result<bool, DownlinkError> {
         if self.at_end {
             return Ok(false);
         }
-        if intake.fill_from(&mut self.source).map_err(io_error(&self.path, "read"))? == 0 {
-            intake.finish();
+        if receiver.fill_from(&mut self.source).map_err(io_error(&self.path, "read"))? == 0 {
+            receiver.finish();
             self.at_end = true;
         }
         Ok(true)
@@ -51,10 +51,10 @@ impl<R: Read> ByteFeed<R> {
 #[derive(Debug)]
 pub struct EventReader<R = DownlinkFile> {
     feed: ByteFeed<R>,
-    intake: Intake,
+    receiver: DownlinkReceiver,
     packets: u64,
-    /// Whether the stream has been looked at for frames of another kind.
-    looked: bool,
+    /// Whether the stream has been checked for unsupported frames.
+    is_checked: bool,
 }
 
 impl EventReader<DownlinkFile> {
@@ -63,7 +63,7 @@ impl EventReader<DownlinkFile> {
     /// # Errors
     /// The file cannot be opened.
     pub fn open(path: &Path) -> Result<Self, DownlinkError> {
-        Ok(Self::of(ByteFeed::open(path)?))
+        Ok(Self::from_feed(ByteFeed::open(path)?))
     }
 }
 
@@ -71,57 +71,58 @@ impl<R: Read> EventReader<R> {
     /// Reads from any source; `path` names it in errors.
     #[must_use]
     pub fn new(source: R, path: &Path) -> Self {
-        Self::of(ByteFeed::new(source, path))
+        Self::from_feed(ByteFeed::new(source, path))
     }
 
-    fn of(feed: ByteFeed<R>) -> Self {
-        Self { feed, intake: Intake::new(), packets: 0, looked: false }
+    fn from_feed(feed: ByteFeed<R>) -> Self {
+        Self { feed, receiver: DownlinkReceiver::new(), packets: 0, is_checked: false }
     }
 
-    /// The same source through [`Intake::unfiltered`]: every sound packet, duplicates too.
+    /// Returns every valid packet, including duplicates, as [`DownlinkReceiver::unfiltered`] does.
     #[must_use]
     pub fn unfiltered(self) -> Self {
-        Self { intake: Intake::unfiltered(), ..self }
+        Self { receiver: DownlinkReceiver::unfiltered(), ..self }
     }
 
-    /// Reads on until `take` returns something; `None` at the end of the source.
+    /// Reads events until `take` returns a value; `None` at the end of the source.
     ///
     /// # Errors
-    /// The source cannot be read, or is of transfer frames of another kind.
+    /// The source cannot be read, or contains unsupported transfer frames.
     pub fn find<T>(
         &mut self,
         mut take: impl FnMut(&Event<'_>) -> Option<T>,
     ) -> Result<Option<T>, DownlinkError> {
         loop {
-            self.refuse_foreign_frames()?;
-            while let Some(event) = self.intake.next_event() {
+            self.refuse_unsupported_frames()?;
+            while let Some(event) = self.receiver.next_event() {
                 self.packets += u64::from(matches!(event, Event::Packet(_)));
                 if let Some(found) = take(&event) {
                     return Ok(Some(found));
                 }
             }
-            if !self.feed.feed(&mut self.intake)? {
+            if !self.feed.feed(&mut self.receiver)? {
                 return Ok(None);
             }
         }
     }
 
-    /// Packets may be seen in transfer frames of another kind, but most are cut by the frames' headers: once events are due, the stream
-    /// is looked at.
-    fn refuse_foreign_frames(&mut self) -> Result<(), DownlinkError> {
-        if self.looked || self.intake.bytes() == 0 {
+    /// Refuses unsupported transfer frames. Some packets would be found in them, but most are interrupted by frame headers.
+    fn refuse_unsupported_frames(&mut self) -> Result<(), DownlinkError> {
+        if self.is_checked || self.receiver.bytes() == 0 {
             return Ok(());
         }
-        self.looked = self.intake.has_whole_head();
-        match self.intake.foreign_frames() {
+        self.is_checked = self.receiver.has_full_head();
+        match self.receiver.unsupported_frames() {
             None => Ok(()),
-            name => {
-                Err(DownlinkError::Foreign { path: self.feed.path.clone(), bytes: self.intake.bytes(), name })
-            }
+            format => Err(DownlinkError::NotADownlink {
+                path: self.feed.path.clone(),
+                bytes: self.receiver.bytes(),
+                format,
+            }),
         }
     }
 
-    /// Reads to the end of the source and gives `take` every event.
+    /// Calls `take` with every event up to the end of the source.
     ///
     /// # Errors
     /// The source cannot be read; the first error of `take`.
@@ -132,12 +133,14 @@ impl<R: Read> EventReader<R> {
         self.find(|event| take(event).err())?.map_or(Ok(()), Err)
     }
 
-    /// Requires that a packet has been read.
+    /// Requires that at least one packet has been read.
     ///
     /// # Errors
-    /// [`DownlinkError::Empty`] for a source without a byte, [`DownlinkError::Foreign`] for one without a packet.
+    /// [`DownlinkError::EmptyFile`] for a source without bytes, [`DownlinkError::NotADownlink`] for one without packets.
     pub fn require_packets(&self) -> Result<(), DownlinkError> {
-        require_packets(&self.feed.path, self.intake.bytes(), self.packets, || self.intake.foreign_name())
+        require_packets(&self.feed.path, self.receiver.bytes(), self.packets, || {
+            self.receiver.foreign_format()
+        })
     }
 
     /// Packets read so far.
@@ -146,9 +149,9 @@ impl<R: Read> EventReader<R> {
         self.packets
     }
 
-    /// The intake, for what it has found out about the stream.
+    /// The receiver, with the format and the counters of the stream.
     #[must_use]
-    pub fn intake(&self) -> &Intake {
-        &self.intake
+    pub fn receiver(&self) -> &DownlinkReceiver {
+        &self.receiver
     }
 }

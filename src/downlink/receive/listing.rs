@@ -1,14 +1,14 @@
-//! Lists of bounded length.
+//! A list of bounded length.
 
 use serde::Serialize;
 
-/// Number of entries that a listing keeps; further ones are only counted.
+/// Maximum number of entries that a listing keeps; further entries are only counted.
 pub const LISTED_MAX: usize = 1_000;
 
-/// The first entries of a list, and the number of all of them.
+/// The first entries of a list, and the total number of entries.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Listing<T> {
-    /// Number of entries, listed or not.
+    /// Total number of entries.
     pub count: u64,
     /// The first [`LISTED_MAX`] entries.
     pub listed: Vec<T>,

@@ -1,45 +1,45 @@
-//! The packets of one kind received over all files and sessions.
+//! The set of packets of one kind that were received, over all files and sessions.
 
 use std::ops::Range;
 
 use crate::downlink::wire::CucTime;
 use crate::units::IntervalSet;
 
-/// The received set of one kind: packets by count and creation time, in any order of arrival. Memory grows with the
-/// number of distinct times and of gaps.
+/// The received packets of one kind by count and creation time, in any order of arrival. Memory grows with the number of
+/// distinct times and of gaps.
 ///
-/// Counts of 46 bits never wrap. They restart with the spacecraft, which the packets' times reveal: two packets with
-/// the same count and different times are two packets, of two eras.
+/// Counts of 46 bits never wrap. They restart with the spacecraft, so two packets with the same count and different times
+/// are different packets.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReceivedSet {
-    /// Intervals of counts with the same time: `(time, first)..(time, last + 1)`.
+    /// Intervals of consecutive counts with the same time: `(time, first)..(time, last + 1)`.
     packets: IntervalSet<(CucTime, u64)>,
 }
 
-/// What became of a packet that was to be added to a [`ReceivedSet`] of bounded size.
+/// The result of adding a packet to a [`ReceivedSet`] of bounded size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PacketInsertion {
-    /// It is new and was added.
+    /// The packet was added.
     New,
-    /// It was in the set.
+    /// The packet was in the set already.
     Known,
-    /// It is new, and there is no room for it.
+    /// The packet was not added, as the set is full.
     Full,
 }
 
-/// The counts received between two restarts of the spacecraft's count.
+/// The packets received between two restarts of the spacecraft's count.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Era {
-    /// Time of its first packet received.
+    /// Creation time of the first received packet.
     pub from: CucTime,
-    /// Missing counts: between packets received, and from 0 to the first.
+    /// Missing counts between the received packets, and from 0 to the first.
     pub missing: Vec<Range<u64>>,
-    /// One beyond the last count received. Packets sent after it, before the next era, are unknown.
+    /// Last received count plus 1. Packets after it that were lost before the restart are unknown.
     pub end: u64,
 }
 
 impl ReceivedSet {
-    /// Adds a packet. Returns whether it is new.
+    /// Adds a packet; returns whether it is new.
     pub fn insert(&mut self, count: u64, time: CucTime) -> bool {
         if self.contains(count, time) {
             return false;
@@ -48,14 +48,14 @@ impl ReceivedSet {
         true
     }
 
-    /// Adds a packet, unless the set would then have more than `intervals_max` intervals; returns what became of it.
-    pub fn insert_within(&mut self, count: u64, time: CucTime, intervals_max: usize) -> PacketInsertion {
+    /// Adds a packet, unless the set would then have more than `intervals_max` intervals.
+    pub fn insert_bounded(&mut self, count: u64, time: CucTime, intervals_max: usize) -> PacketInsertion {
         if self.contains(count, time) {
             return PacketInsertion::Known;
         }
         let extends = |count: Option<u64>| count.is_some_and(|count| self.contains(count, time));
-        let has_room = self.packets.intervals() < intervals_max;
-        if !has_room && !extends(count.checked_sub(1)) && !extends(count.checked_add(1)) {
+        let is_full = self.packets.intervals() >= intervals_max;
+        if is_full && !extends(count.checked_sub(1)) && !extends(count.checked_add(1)) {
             return PacketInsertion::Full;
         }
         self.packets.insert((time, count)..(time, count + 1));
@@ -85,23 +85,18 @@ impl ReceivedSet {
         self.packets.is_empty()
     }
 
-    /// Packets of consecutive counts made at one time, in the order of these times.
+    /// Intervals of consecutive counts with the same creation time, in the order of time.
     pub fn intervals(&self) -> impl Iterator<Item = (CucTime, Range<u64>)> + '_ {
-        self.packets.iter().map(|Range { start: (made, first), end: (_, end) }| (made, first..end))
+        self.packets.iter().map(|Range { start: (time, first), end: (_, end) }| (time, first..end))
     }
 
-    /// First and last time at which a packet was made; `None` of an empty set.
+    /// First and last creation time of a packet; `None` for an empty set.
     #[must_use]
     pub fn span(&self) -> Option<[CucTime; 2]> {
-        let made = |range: Range<(CucTime, u64)>| range.start.0;
-        self.packets
-            .lowest()
-            .map(made)
-            .zip(self.packets.highest().map(made))
-            .map(|(first, last)| [first, last])
+        Some([self.packets.lowest()?.start.0, self.packets.highest()?.start.0])
     }
 
-    /// The eras, by time: where counts decrease with time, a new one begins.
+    /// The eras in the order of time. A new one begins where the count decreases.
     #[must_use]
     pub fn eras(&self) -> Vec<Era> {
         let mut eras: Vec<Era> = Vec::new();
@@ -118,20 +113,18 @@ impl ReceivedSet {
         eras
     }
 
-    /// Number of missing counts, between packets received and from 0 to the first: all of them, and those that follow a
-    /// packet made after `time`.
+    /// Numbers of missing counts, between received packets and from 0 to the first: in total, and after packets made later
+    /// than `time`.
     #[must_use]
     pub fn missing_since(&self, time: CucTime) -> [u64; 2] {
         let (mut all, mut since) = (0_u64, 0_u64);
-        let mut before = None;
+        let mut before: Option<(CucTime, u64)> = None;
         for Range { start: (made, first), end: (_, end) } in self.packets.iter() {
-            // A lower count made later begins an era, at 0.
-            let (due, is_since) = match before {
-                Some((was_made, due)) if due <= first => (due, was_made > time),
-                _ => (0, before.is_some_and(|(was_made, _)| was_made > time)),
-            };
-            all = all.saturating_add(first - due);
-            since = since.saturating_add(if is_since { first - due } else { 0 });
+            // A lower count begins an era, at 0.
+            let expected = before.map_or(0, |(_, end)| if end <= first { end } else { 0 });
+            let is_since = before.is_some_and(|(made_before, _)| made_before > time);
+            all = all.saturating_add(first - expected);
+            since = since.saturating_add(if is_since { first - expected } else { 0 });
             before = Some((made, end));
         }
         [all, since]
@@ -140,12 +133,15 @@ impl ReceivedSet {
     /// Number of restarts among the packets received.
     #[must_use]
     pub fn restarts(&self) -> u64 {
-        let mut end = 0;
-        let decreases = |of: Range<(CucTime, u64)>| of.start.1 < std::mem::replace(&mut end, of.end.1);
-        self.packets.iter().map(decreases).filter(|decreases| *decreases).count() as u64
+        let (mut restarts, mut end_before) = (0, 0);
+        for Range { start: (_, start), end: (_, end) } in self.packets.iter() {
+            restarts += u64::from(start < end_before);
+            end_before = end;
+        }
+        restarts
     }
 
-    /// Drops the packets with the earliest times until at most `intervals_max` intervals are left.
+    /// Drops the intervals with the earliest times until at most `intervals_max` are left.
     pub(crate) fn remove_oldest(&mut self, intervals_max: usize) {
         self.packets.drop_lowest(intervals_max);
     }
@@ -169,11 +165,11 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_is_a_set_whatever_the_order(
+        fn the_set_does_not_depend_on_the_order_of_arrival(
             packets in proptest::collection::vec((0..60_u64, 0..2_u64), 1..150),
             out in 0..60_u64,
         ) {
-            // Two packets made at each instant, as those of a pass are; and once more after a restart.
+            // Two packets for each creation time; and all once more after a restart.
             let made = |(count, era): (u64, u64)| at(count / 2 + 40 * era);
             let (mut received, mut expected) = (ReceivedSet::default(), BTreeSet::new());
             for &(count, era) in &packets {
@@ -192,7 +188,7 @@ mod tests {
             prop_assert_eq!(received.eras().len(), 1 + usize::from(is_restart));
             let absent: Vec<Vec<u64>> = match is_restart {
                 true => eras.iter().map(|era| (0..era[era.len() - 1]).filter(|c| !era.contains(c)).collect()).collect(),
-                // One era as far as anyone knows.
+                // Nothing shows the restart.
                 false => {
                     let all = eras.concat();
                     vec![(0..all[all.len() - 1]).filter(|count| !all.contains(count)).collect()]
@@ -207,30 +203,30 @@ mod tests {
     }
 
     #[test]
-    fn a_full_set_takes_only_what_extends_it() {
+    fn a_full_set_accepts_only_packets_that_extend_its_intervals() {
         let mut received = ReceivedSet::default();
         for count in [10, 20, 30] {
-            assert_eq!(received.insert_within(count, at(count), 3), PacketInsertion::New);
+            assert_eq!(received.insert_bounded(count, at(count), 3), PacketInsertion::New);
         }
         let full = received.clone();
         for (count, s) in [(40, 40), (11, 20), (10, 11)] {
-            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::Full, "{count}");
+            assert_eq!(received.insert_bounded(count, at(s), 3), PacketInsertion::Full, "{count}");
         }
         assert_eq!(received, full);
-        assert_eq!(received.insert_within(20, at(20), 3), PacketInsertion::Known);
+        assert_eq!(received.insert_bounded(20, at(20), 3), PacketInsertion::Known);
         for (count, s) in [(11, 10), (9, 10), (21, 20), (31, 30)] {
-            assert_eq!(received.insert_within(count, at(s), 3), PacketInsertion::New, "{count}");
+            assert_eq!(received.insert_bounded(count, at(s), 3), PacketInsertion::New, "{count}");
         }
         assert_eq!(received.len(), 7);
     }
 
     #[test]
-    fn missing_counts_are_known_by_the_time_before_them() {
+    fn missing_counts_are_dated_by_the_packet_before_them() {
         let mut received = ReceivedSet::default();
         for (count, s) in [(2, 1), (5, 2), (6, 3), (9, 4), (1, 5), (3, 5)] {
             received.insert(count, at(s));
         }
-        // 0, 1, 3, 4, 7, 8; after the restart 0 and 2.
+        // Missing are 0, 1, 3, 4, 7, 8, and after the restart 0 and 2.
         assert_eq!(received.missing_since(at(0)), [8, 6]);
         assert_eq!(received.missing_since(at(2)), [8, 4]);
         assert_eq!(received.missing_since(at(4)), [8, 1]);
@@ -239,9 +235,9 @@ mod tests {
     }
 
     #[test]
-    fn a_count_made_at_another_time_is_another_packet() {
+    fn a_count_with_another_time_is_another_packet() {
         let mut received = ReceivedSet::default();
-        // What was sent after a restart comes first, then what was sent before it.
+        // Packets sent after a restart arrive before those sent before it.
         assert!(received.insert(0, at(8)) && received.insert(2, at(9)));
         assert!(received.insert(0, at(1)) && received.insert(2, at(2)) && received.insert(7, at(3)));
         assert!(!received.insert(2, at(2)) && !received.insert(2, at(9)));

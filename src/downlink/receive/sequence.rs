@@ -1,4 +1,4 @@
-//! Packet counts of one kind: what is missing, late or duplicate.
+//! The packet counts of one kind: which packets are missing, late or duplicate.
 
 use std::ops::Range;
 
@@ -6,29 +6,29 @@ use super::ReceivedSet;
 use crate::downlink::wire::CucTime;
 use crate::units::IntervalSet;
 
-/// Intervals of counts that are remembered, both of received packets and of missing ones that may arrive late. Fifteen
-/// times the packets of the paper's mission. Bounds the memory to some 100 MB a kind, whatever a forger sends.
+/// Maximum number of intervals of counts that are kept, of received packets and of missing ones that may arrive late:
+/// fifteen times the packets of the paper's mission. Limits memory to some 100 MB per kind, also with forged packets.
 const INTERVALS_MAX: usize = 1 << 20;
 
-/// How a packet's count relates to those before it.
+/// How the count of a packet relates to the packets before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Arrival {
-    /// The first of its kind, or the successor of the last.
+    /// It is the first of its kind, or the successor of the last.
     InOrder,
     /// Packets are missing before it.
     AfterGap {
-        /// The count that was due.
+        /// The count of the first missing packet.
         expected: u64,
     },
-    /// It fills a gap reported earlier.
+    /// It fills a gap that was reported earlier.
     Late,
-    /// It was sent before the first of its kind received, or before a restart.
+    /// It was sent before the first received packet of its kind, or before a restart.
     Early,
     /// It was received before.
     Duplicate,
-    /// Its count is lower, yet its time is later: the spacecraft restarted its count.
+    /// Its count is lower and its time later, so the spacecraft restarted its count.
     Restart {
-        /// The count that was due.
+        /// The count expected without a restart.
         expected: u64,
     },
 }
@@ -36,44 +36,45 @@ pub(super) enum Arrival {
 /// The counts received so far.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Sequence {
-    begun: bool,
+    has_begun: bool,
     /// Count of the first packet since the last restart.
     first: u64,
+    /// Expected count of the next packet.
     next: u64,
-    /// Latest time of a sound packet.
-    newest: CucTime,
-    /// Sound packets received.
+    /// Latest time of a valid packet.
+    latest: CucTime,
+    /// Valid packets received.
     received: ReceivedSet,
     /// Missing counts below `next`, in at most [`INTERVALS_MAX`] intervals.
     missing: IntervalSet<u64>,
 }
 
 impl Sequence {
-    /// Records a sound packet.
+    /// Records a valid packet.
     pub(super) fn receive(&mut self, count: u64, time: CucTime) -> Arrival {
         let arrival = self.classify(count, time);
         match arrival {
             Arrival::InOrder | Arrival::AfterGap { .. } | Arrival::Restart { .. } => self.next = count + 1,
-            Arrival::Late | Arrival::Early => self.fill(count),
+            Arrival::Late | Arrival::Early => self.mark_received(count),
             Arrival::Duplicate => return arrival,
         }
-        self.newest = self.newest.max(time);
+        self.latest = self.latest.max(time);
         self.received.insert(count, time);
         self.received.remove_oldest(INTERVALS_MAX);
         arrival
     }
 
-    /// Records a damaged packet with sound headers: its count is passed, but a sound copy may still arrive.
-    pub(super) fn pass_damaged(&mut self, count: u64, time: CucTime) -> Arrival {
+    /// Records a damaged packet with valid headers as missing: a valid copy may still arrive.
+    pub(super) fn receive_damaged(&mut self, count: u64, time: CucTime) -> Arrival {
         let arrival = self.classify(count, time);
         if !matches!(arrival, Arrival::Late | Arrival::Early | Arrival::Duplicate) {
-            self.miss(count..count + 1);
+            self.mark_missing(count..count + 1);
             self.next = count + 1;
         }
         arrival
     }
 
-    /// Restarts of the count.
+    /// Number of restarts of the count.
     pub(crate) fn restarts(&self) -> u64 {
         self.received.restarts()
     }
@@ -83,15 +84,15 @@ impl Sequence {
         if self.received.contains(count, time) {
             return Arrival::Duplicate;
         }
-        if !std::mem::replace(&mut self.begun, true) {
+        if !std::mem::replace(&mut self.has_begun, true) {
             self.begin(count);
             Arrival::InOrder
-        } else if time >= self.newest && count == expected {
+        } else if time >= self.latest && count == expected {
             Arrival::InOrder
-        } else if time >= self.newest && count > expected {
-            self.miss(expected..count);
+        } else if time >= self.latest && count > expected {
+            self.mark_missing(expected..count);
             Arrival::AfterGap { expected }
-        } else if time > self.newest {
+        } else if time > self.latest {
             self.begin(count);
             Arrival::Restart { expected }
         } else if count >= self.first && self.missing.contains(count) {
@@ -101,21 +102,21 @@ impl Sequence {
         }
     }
 
-    /// Starts with a packet. Packets sent before it are no gap, but may still arrive.
+    /// Starts with a packet. Packets sent before it are not a gap, but may still arrive.
     fn begin(&mut self, count: u64) {
         self.first = count;
         self.missing.clear();
-        self.miss(0..count);
+        self.mark_missing(0..count);
     }
 
     /// Marks counts as missing.
-    fn miss(&mut self, counts: Range<u64>) {
+    fn mark_missing(&mut self, counts: Range<u64>) {
         self.missing.insert(counts);
         self.missing.drop_lowest(INTERVALS_MAX);
     }
 
     /// Marks a count as received.
-    fn fill(&mut self, count: u64) {
+    fn mark_received(&mut self, count: u64) {
         self.missing.remove(count..count + 1);
         self.missing.drop_lowest(INTERVALS_MAX);
     }
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lower_count_made_later_is_a_restart() {
+    fn a_lower_count_with_a_later_time_is_a_restart() {
         let mut sequence = Sequence::default();
         sequence.receive(100, at(5));
         assert_eq!(sequence.receive(0, at(6)), Arrival::Restart { expected: 101 });
@@ -161,12 +162,12 @@ mod tests {
     }
 
     #[test]
-    fn what_was_sent_before_a_restart_may_come_after_it() {
+    fn packets_sent_before_a_restart_may_arrive_after_it() {
         let mut sequence = Sequence::default();
         for count in 0..3 {
             assert_eq!(sequence.receive(count, at(9)), Arrival::InOrder);
         }
-        // Lower counts, the one that is due, and higher ones: none is a duplicate, none reveals a gap.
+        // Counts below, at and above the expected one: none is a duplicate, and none reveals a gap.
         for count in 0..9 {
             assert_eq!(sequence.receive(count, at(1)), Arrival::Early, "{count}");
             assert_eq!(sequence.receive(count, at(1)), Arrival::Duplicate, "{count}");
@@ -176,10 +177,10 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_packet_may_come_again() {
+    fn a_valid_copy_of_a_damaged_packet_is_late() {
         let mut sequence = Sequence::default();
         sequence.receive(0, at(1));
-        assert_eq!(sequence.pass_damaged(1, at(1)), Arrival::InOrder);
+        assert_eq!(sequence.receive_damaged(1, at(1)), Arrival::InOrder);
         assert_eq!(sequence.receive(2, at(1)), Arrival::InOrder);
         assert_eq!(sequence.receive(1, at(1)), Arrival::Late);
     }

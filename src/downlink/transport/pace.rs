@@ -6,68 +6,67 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, RecvTimeoutError};
 
 use crate::downlink::error::DownlinkError;
-use crate::downlink::receive::{Event, Intake};
-use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
+use crate::downlink::receive::{DownlinkReceiver, Event};
+use crate::downlink::wire::{CucTime, Format, PacketHeader, PacketKind};
 use crate::runtime::{Flow, Outlet, Source, Units};
 
-/// Bytes examined between two decisions about their release: far less than a coded frame.
+/// Number of bytes examined between two decisions about their release, far less than a coded frame.
 const PIECE_BYTES: usize = 128;
 
-/// Longest wait between two checks for the end of the run.
+/// Maximum wait between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(100);
 
 /// When packets are released.
 pub enum Pace {
     /// At this multiple of real time.
     Speed(f64),
-    /// On request.
+    /// Step by step, on request.
     Steps(Steps),
 }
 
-/// Steps on request.
+/// A replay step by step.
 pub struct Steps {
     /// Mission time of a step, s; `None` for one pass per step.
     pub every_s: Option<f64>,
-    /// One step per message. The stream ends when the channel is disconnected.
-    pub go: Receiver<()>,
-    /// Called whenever the stream waits for a step.
-    pub tell: Box<dyn Fn(&str) + Send + Sync>,
+    /// Requests of steps, one per message. The stream ends when the channel is disconnected.
+    pub requests: Receiver<()>,
+    /// Called with a prompt whenever the stream waits for a request.
+    pub prompt: Box<dyn Fn(&str) + Send + Sync>,
 }
 
-/// What the stream waits for.
+/// Whether packets are released, and what the stream waits for otherwise.
 #[derive(Clone, Copy, Debug)]
 enum Gate {
     Open,
-    /// An instant.
+    /// Closed until an instant.
     Until(Instant),
-    /// The next step.
+    /// Closed until the next step is requested.
     Step,
 }
 
-/// Passes on the bytes of a source unchanged, but no packet before its time. Times are the creation times in the
-/// packets' headers.
+/// Forwards the bytes of a source unchanged, but no packet before its time, which is the creation time in its header.
 pub struct PacedSource<S> {
     source: S,
     pace: Pace,
     gate: Gate,
-    /// Finds the packets ahead of their release.
-    scout: Intake,
-    /// Chunks not yet released, and the number of bytes of the first that the scout has examined.
+    /// Receiver that finds packets before their release.
+    lookahead: DownlinkReceiver,
+    /// Chunks that have not been released.
     pending: VecDeque<Vec<u8>>,
-    scouted: usize,
-    /// Bytes released so far.
-    given: u64,
+    /// Number of bytes of the first chunk that have been examined.
+    examined: usize,
+    released: u64,
     /// When the first packet was released, and its time.
     start: Option<(Instant, CucTime)>,
-    newest: CucTime,
+    latest: CucTime,
     /// Packet time at which the next step begins.
-    mark: CucTime,
-    /// Whether a pass has ended since the last step.
-    pass_over: bool,
-    /// Whether positions or visibilities came since the last report of the spacecraft's counts.
+    next_step: CucTime,
+    /// Whether a pass has just ended.
+    pass_ended: bool,
+    /// Whether positions or visibilities came since the last housekeeping report.
     in_pass: bool,
     steps: u64,
-    ended: bool,
+    is_ended: bool,
 }
 
 impl<S> PacedSource<S> {
@@ -78,70 +77,72 @@ impl<S> PacedSource<S> {
             source,
             pace,
             gate: Gate::Open,
-            scout: Intake::unfiltered(),
+            lookahead: DownlinkReceiver::unfiltered(),
             pending: VecDeque::new(),
-            scouted: 0,
-            given: 0,
+            examined: 0,
+            released: 0,
             start: None,
-            newest: CucTime::default(),
-            mark: CucTime::default(),
-            pass_over: false,
+            latest: CucTime::default(),
+            next_step: CucTime::default(),
+            pass_ended: false,
             in_pass: false,
             steps: 0,
-            ended: false,
+            is_ended: false,
         }
     }
 
-    /// The source itself.
+    /// The source that is paced.
     pub fn source(&self) -> &S {
         &self.source
     }
 
-    /// Examines the next bytes. Returns how many may be released: all, unless the gate closes.
-    fn scout(&mut self, bytes: &[u8]) -> usize {
-        while self.scouted < bytes.len() {
-            let from = self.scouted;
+    /// Examines the next bytes; returns how many may be released: all, unless the gate closes.
+    fn examine(&mut self, bytes: &[u8]) -> usize {
+        while self.examined < bytes.len() {
+            let from = self.examined;
             let to = bytes.len().min(from + PIECE_BYTES);
-            self.scout.push(&bytes[from..to]);
-            self.scouted = to;
-            let mut first_held = None;
-            while let Some(event) = self.scout.next_event() {
+            self.lookahead.push(&bytes[from..to]);
+            self.examined = to;
+            let mut first_retained = None;
+            while let Some(event) = self.lookahead.next_event() {
                 let Event::Packet(packet) = event else { continue };
                 let (header, offset) = (packet.header, packet.offset);
-                if let Some(gate) = gate_for(&self.pace, self.start, self.mark, self.pass_over, &header) {
+                if let Some(gate) = gate_for(&self.pace, self.start, self.next_step, self.pass_ended, &header)
+                {
                     self.gate = gate;
-                    first_held.get_or_insert(offset);
+                    first_retained.get_or_insert(offset);
                 }
-                self.note(&header);
+                self.record(&header);
             }
-            if let Some(offset) = first_held {
-                let plain = self.scout.format() != Some(Format::Cadu);
-                let packet = offset.saturating_sub(self.given) as usize;
-                return if plain { from.min(packet) } else { from };
+            if let Some(offset) = first_retained {
+                let is_plain = self.lookahead.format() != Some(Format::Cadu);
+                let packet = offset.saturating_sub(self.released) as usize;
+                return if is_plain { from.min(packet) } else { from };
             }
         }
         bytes.len()
     }
 
-    /// Records a packet that is released now or when the gate opens.
-    fn note(&mut self, header: &PacketHeader) {
+    /// Records a packet, which is released now or when the gate opens.
+    fn record(&mut self, header: &PacketHeader) {
         self.start.get_or_insert_with(|| (Instant::now(), header.time));
-        self.newest = self.newest.max(header.time);
-        // A report ends a pass if something else came since the last one; else it begins the next.
-        self.pass_over = header.kind == Kind::Housekeeping && self.in_pass;
+        self.latest = self.latest.max(header.time);
+        // A report ends a pass if data came since the last report; otherwise it begins a pass.
+        self.pass_ended = header.kind == PacketKind::Housekeeping && self.in_pass;
         match header.kind {
-            Kind::Housekeeping => self.in_pass = false,
-            Kind::Ephemeris | Kind::Visibilities => self.in_pass = true,
-            Kind::Instrument | Kind::Calibration => {}
+            PacketKind::Housekeeping => self.in_pass = false,
+            PacketKind::Ephemeris | PacketKind::Visibilities => self.in_pass = true,
+            PacketKind::Instrument | PacketKind::Calibration => {}
         }
         if let Pace::Steps(Steps { every_s: Some(every_s), .. }) = self.pace {
             let step = ((every_s * f64::from(1 << 24)) as u64).max(1);
-            let begun = self.newest.0.saturating_sub(self.mark.0);
-            let first = self.mark == CucTime::default();
-            if first {
-                self.mark = CucTime(self.newest.0.saturating_add(step));
-            } else if self.newest >= self.mark {
-                self.mark = CucTime(self.mark.0.saturating_add((begun / step + 1).saturating_mul(step)));
+            let excess = self.latest.0.saturating_sub(self.next_step.0);
+            let is_first = self.next_step == CucTime::default();
+            if is_first {
+                self.next_step = CucTime(self.latest.0.saturating_add(step));
+            } else if self.latest >= self.next_step {
+                self.next_step =
+                    CucTime(self.next_step.0.saturating_add((excess / step + 1).saturating_mul(step)));
             }
         }
     }
@@ -155,39 +156,41 @@ impl<S> PacedSource<S> {
                     self.gate = Gate::Open;
                 }
             }
-            (Gate::Step, Pace::Steps(steps)) => match steps.go.recv_timeout(POLL) {
+            (Gate::Step, Pace::Steps(steps)) => match steps.requests.recv_timeout(POLL) {
                 Ok(()) => self.gate = Gate::Open,
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => self.ended = true,
+                Err(RecvTimeoutError::Disconnected) => self.is_ended = true,
             },
             _ => self.gate = Gate::Open,
         }
     }
 
-    /// Releases bytes.
-    fn give(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
-        self.given += bytes.len() as u64;
+    fn release(&mut self, bytes: Vec<u8>, out: &mut Outlet<Vec<u8>>) {
+        self.released += bytes.len() as u64;
         if !bytes.is_empty() {
             out.push(bytes);
         }
     }
 
-    fn announce_step(&mut self) {
+    fn prompt(&mut self) {
         self.steps += 1;
         if let Pace::Steps(steps) = &self.pace {
-            let (now, start) = (self.newest.tai_s(), self.start.map_or(0.0, |(_, time)| time.tai_s()));
+            let (now, start) = (self.latest.tai_s(), self.start.map_or(0.0, |(_, time)| time.tai_s()));
             let hours = (now - start) / 3600.0;
-            (steps.tell)(&format!("step {} at {hours:.2} h: Enter continues, end of input ends", self.steps));
+            (steps.prompt)(&format!(
+                "step {} at {hours:.2} h: Enter continues, end of input ends the run",
+                self.steps
+            ));
         }
     }
 }
 
-/// What a packet has to wait for, if anything.
+/// What a packet has to wait for; `None` if it may be released.
 fn gate_for(
     pace: &Pace,
     start: Option<(Instant, CucTime)>,
-    mark: CucTime,
-    pass_over: bool,
+    next_step: CucTime,
+    pass_ended: bool,
     header: &PacketHeader,
 ) -> Option<Gate> {
     let (since, time) = start?;
@@ -196,8 +199,8 @@ fn gate_for(
             let due = since + Duration::from_secs_f64((header.time.tai_s() - time.tai_s()).max(0.0) / speed);
             (due > Instant::now()).then_some(Gate::Until(due))
         }
-        Pace::Steps(Steps { every_s: Some(_), .. }) => (header.time >= mark).then_some(Gate::Step),
-        Pace::Steps(Steps { every_s: None, .. }) => pass_over.then_some(Gate::Step),
+        Pace::Steps(Steps { every_s: Some(_), .. }) => (header.time >= next_step).then_some(Gate::Step),
+        Pace::Steps(Steps { every_s: None, .. }) => pass_ended.then_some(Gate::Step),
     }
 }
 
@@ -208,7 +211,7 @@ impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for PacedSource<S> 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
         if !matches!(self.gate, Gate::Open) {
             out.await_input(|| self.wait());
-            return Ok(if self.ended { Flow::Done } else { Flow::Continue });
+            return Ok(if self.is_ended { Flow::Done } else { Flow::Continue });
         }
         let Some(mut bytes) = self.pending.pop_front() else {
             let mut read = Outlet::collect();
@@ -216,22 +219,22 @@ impl<S: Source<Out = Vec<u8>, Error = DownlinkError>> Source for PacedSource<S> 
             self.pending.extend(read.into_vec());
             return Ok(if self.pending.is_empty() { flow } else { Flow::Continue });
         };
-        let goes = self.scout(&bytes);
-        if goes < bytes.len() || !matches!(self.gate, Gate::Open) {
-            let rest = bytes.split_off(goes);
-            self.scouted -= goes;
+        let releasable = self.examine(&bytes);
+        if releasable < bytes.len() || !matches!(self.gate, Gate::Open) {
+            let rest = bytes.split_off(releasable);
+            self.examined -= releasable;
             self.pending.push_front(rest);
         } else {
-            self.scouted = 0;
+            self.examined = 0;
         }
-        self.give(bytes, out);
+        self.release(bytes, out);
         if matches!(self.gate, Gate::Step) {
-            self.announce_step();
+            self.prompt();
         }
         Ok(Flow::Continue)
     }
 
     fn units(&self) -> Units {
-        Units::of(self.given, "bytes")
+        Units::of(self.released, "bytes")
     }
 }

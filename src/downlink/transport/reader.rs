@@ -24,7 +24,7 @@ use crate::frames::GroundFrame;
 ///         good += block.flags.iter().filter(|flags| flags.is_good()).count();
 ///     }
 /// }
-/// // What is in it as a whole, and what is wrong with it.
+/// // The whole contents of the file, and all damage.
 /// let contents = Contents::read(&file)?;
 /// assert!(good > 0 && good as u64 <= contents.visibilities.count);
 /// # Ok(())
@@ -54,7 +54,7 @@ impl<R: Read> DownlinkReader<R> {
         Self { events: EventReader::new(source, path), decoder: Decoder::new() }
     }
 
-    /// Continues with the decoder of an earlier file: its instrument description and its counters.
+    /// Continues with the decoder of an earlier file, with its instrument description and counters.
     #[must_use]
     #[doc(hidden)]
     pub fn with_decoder(self, decoder: Decoder) -> Self {
@@ -71,7 +71,7 @@ impl<R: Read> DownlinkReader<R> {
     /// The next frame; `None` at the end of the file.
     ///
     /// # Errors
-    /// The file cannot be read, is empty, or holds no packet at all. Damage is counted instead.
+    /// The file cannot be read, is empty, or contains no packet. Damage is counted instead.
     pub fn next_frame(&mut self) -> Result<Option<GroundFrame>, DownlinkError> {
         let frame = self.events.find(|event| self.decoder.accept(event))?;
         if frame.is_none() {
@@ -87,16 +87,16 @@ impl<R: Read> DownlinkReader<R> {
         self.decoder.counters()
     }
 
-    /// Bytes read so far.
+    /// Number of bytes read.
     #[must_use]
     pub fn bytes(&self) -> u64 {
-        self.events.intake().bytes()
+        self.events.receiver().bytes()
     }
 
-    /// The counters of the coded frames, if the file holds any.
+    /// The counters of the coded frames; `None` for a file of packets.
     #[must_use]
     #[doc(hidden)]
     pub fn frames(&self) -> Option<FrameCounters> {
-        self.events.intake().frames()
+        self.events.receiver().frames()
     }
 }

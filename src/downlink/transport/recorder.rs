@@ -1,4 +1,4 @@
-//! Writes the bytes that pass through it to a file, or to standard output.
+//! A stage or sink that writes a byte stream to a file or to standard output.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -7,23 +7,23 @@ use crate::downlink::error::{DownlinkError, io_error};
 use crate::files::{AtomicFile, IfUnfinished};
 use crate::runtime::{Outlet, Sink, Stage, Units};
 
-/// Records a byte stream in a file. As a stage it passes the bytes on, as a sink it consumes them.
+/// Records a byte stream in a file. As a stage it forwards the bytes, as a sink it consumes them.
 #[derive(Debug)]
 pub struct Recorder {
     path: PathBuf,
-    /// `None` before the first bytes, and once finished: there are no empty files.
+    /// `None` before the first bytes, so that no empty file is written, and after the end.
     file: Option<AtomicFile>,
     to_standard_output: bool,
     bytes: u64,
 }
 
 impl Recorder {
-    /// A recorder to a file, which is created with the first bytes.
+    /// A recorder to a file, which it creates with the first bytes.
     ///
     /// # Errors
-    /// The file cannot be created, or is being written by another process.
+    /// The file cannot be created, or another process is writing it.
     pub fn create(path: &Path) -> Result<Self, DownlinkError> {
-        // What can go wrong is told before anything is computed.
+        // Errors appear before anything is computed.
         drop(create(path)?);
         Ok(Self { path: path.to_owned(), file: None, to_standard_output: false, bytes: 0 })
     }

@@ -1,4 +1,4 @@
-//! The spacecraft's end of the link, as a stage: ground frames to bytes.
+//! The stage that encodes ground frames, on the spacecraft.
 
 use crate::downlink::config::DownlinkConfig;
 use crate::downlink::error::DownlinkError;
@@ -6,7 +6,7 @@ use crate::downlink::wire::Transmission;
 use crate::frames::GroundFrame;
 use crate::runtime::{Outlet, Stage, Units};
 
-/// Encodes ground frames as packets, or as coded frames of packets.
+/// Encodes ground frames as packets or as CADUs, depending on the configuration.
 #[derive(Debug)]
 pub struct Transmitter {
     transmission: Transmission,

@@ -1,4 +1,4 @@
-//! Writes downlink files of either format.
+//! A writer of downlink files of either format.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -9,10 +9,10 @@ use crate::downlink::wire::Transmission;
 use crate::files::{AtomicFile, IfUnfinished};
 use crate::frames::GroundFrame;
 
-/// Writes ground frames to a file of packets, or of coded frames of packets.
+/// Writes ground frames to a file of packets or of CADUs, depending on the configuration.
 ///
-/// The file takes its name, and replaces an older file, when [`DownlinkWriter::finish`] has put all of it on disk. One that
-/// is dropped before becomes `NAME.partial`, which can be read as far as it goes.
+/// [`DownlinkWriter::finish`] gives the file its name, and replaces an older file, once all of it is on disk. A writer that
+/// is dropped before leaves `NAME.partial`, which is readable as far as it goes.
 #[derive(Debug)]
 pub struct DownlinkWriter {
     path: PathBuf,
@@ -35,14 +35,14 @@ impl DownlinkWriter {
     /// Appends the bytes that a frame adds to the downlink.
     ///
     /// # Errors
-    /// Those of [`Transmission::send`]; the file cannot be written.
+    /// The errors of [`Transmission::send`]; the file cannot be written.
     pub fn write(&mut self, frame: &GroundFrame) -> Result<(), DownlinkError> {
         self.pending.clear();
         self.transmission.send(frame, &mut self.pending)?;
         self.file.write_all(&self.pending).map_err(io_error(&self.path, "write"))
     }
 
-    /// Bytes written so far.
+    /// Number of bytes written.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.file.bytes()

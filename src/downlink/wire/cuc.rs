@@ -49,7 +49,7 @@ impl CucTime {
         self.0 as f64 / f64::from(1 << 24)
     }
 
-    /// P-field and T-field.
+    /// Encodes the time as P-field and T-field.
     #[must_use]
     pub fn to_bytes(self) -> [u8; 8] {
         let mut bytes = self.0.to_be_bytes();
@@ -57,7 +57,7 @@ impl CucTime {
         bytes
     }
 
-    /// The time of eight bytes; `None` if the P-field differs.
+    /// Decodes P-field and T-field; `None` for another P-field.
     #[must_use]
     pub fn from_bytes(mut bytes: [u8; 8]) -> Option<Self> {
         let p_field = std::mem::take(&mut bytes[0]);
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_are_those_of_the_standard() {
+    fn bytes_follow_the_standard() {
         // 2020-01-01T00:00:00 TAI is 22645 days after 1958-01-01: 1 956 528 000 s = 0x749E_3F80.
         let time = CucTime::new(1_956_528_000.0, MissionTime(500_000)).unwrap();
         assert_eq!(time.to_bytes(), [0x1F, 0x74, 0x9E, 0x3F, 0x80, 0x80, 0, 0]);

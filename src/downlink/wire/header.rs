@@ -1,8 +1,8 @@
-//! Packet headers: CCSDS 133.0-B, section 4.1, followed by fields of our own.
+//! Packet headers: the primary header of CCSDS 133.0-B, section 4.1, and a mission-specific secondary header.
 
 use crc_fast::{CrcAlgorithm, checksum};
 
-use super::{CucTime, Kind};
+use super::{CucTime, PacketKind};
 
 /// Version of headers and payloads. A receiver skips packets of another version and counts them.
 pub const FORMAT_VERSION: u8 = 1;
@@ -18,7 +18,7 @@ pub const PACKET_BYTES_MAX: usize = 65_542;
 
 const PRIMARY_BYTES: usize = 6;
 const MAGIC: u8 = 0x4C;
-/// Version 000, telemetry, secondary header: the bits above the APID.
+/// Bits above the APID: version 000, telemetry, secondary header present.
 const IDENTIFICATION: u16 = 1 << 11;
 const COUNT_BITS: u32 = 14;
 
@@ -29,13 +29,13 @@ pub(crate) const COUNT_MAX: u64 = (1 << 46) - 1;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 #[repr(u8)]
 pub enum PacketSegment {
-    /// Neither first nor last.
+    /// A segment between the first and the last.
     Continuation = 0b00,
-    /// The first of several.
+    /// The first of several segments.
     First = 0b01,
-    /// The last of several.
+    /// The last of several segments.
     Last = 0b10,
-    /// The whole payload.
+    /// The complete payload.
     Whole = 0b11,
 }
 
@@ -43,10 +43,10 @@ pub enum PacketSegment {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct PacketHeader {
     /// Kind, by APID.
-    pub kind: Kind,
-    /// Part of the payload.
+    pub kind: PacketKind,
+    /// Segmentation flags.
     pub segment: PacketSegment,
-    /// Packets of this kind sent before this one, 46 bits.
+    /// Number of packets of this kind sent before this one, 46 bits.
     pub count: u64,
     /// Creation time of the packet.
     pub time: CucTime,
@@ -57,9 +57,7 @@ pub struct PacketHeader {
 }
 
 impl PacketHeader {
-    /// The headers as they are sent.
-    ///
-    /// `bytes` must be in `HEADER_BYTES + TRAILER_BYTES ..= PACKET_BYTES_MAX`.
+    /// Encodes the headers; `bytes` must be in `HEADER_BYTES + TRAILER_BYTES ..= PACKET_BYTES_MAX`.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; HEADER_BYTES] {
         let identification = IDENTIFICATION | self.kind.apid();
@@ -75,7 +73,7 @@ impl PacketHeader {
         out[14] = MAGIC;
         out[15] = self.version;
         out[16..20].copy_from_slice(&high.to_be_bytes());
-        let check = header_check(&out);
+        let check = header_checksum(&out);
         out[20..22].copy_from_slice(&check.to_be_bytes());
         out
     }
@@ -85,13 +83,13 @@ impl PacketHeader {
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let bytes: &[u8; HEADER_BYTES] = bytes.first_chunk()?;
         let word = |at: usize| u16::from_be_bytes([bytes[at], bytes[at + 1]]);
-        let kind = Kind::of_apid(word(0) ^ IDENTIFICATION)?;
+        let kind = PacketKind::of_apid(word(0) ^ IDENTIFICATION)?;
         let length = usize::from(word(4)) + PRIMARY_BYTES + 1;
         if bytes[14] != MAGIC || length < HEADER_BYTES + TRAILER_BYTES {
             return None;
         }
         let time = CucTime::from_bytes(*bytes[6..].first_chunk()?)?;
-        if word(20) != header_check(bytes) {
+        if word(20) != header_checksum(bytes) {
             return None;
         }
         let high = u32::from_be_bytes(*bytes[16..].first_chunk()?);
@@ -110,23 +108,23 @@ impl PacketHeader {
         })
     }
 
-    /// First byte of every packet: all APIDs share their upper three bits.
+    /// First byte of every packet, since all APIDs share their upper three bits.
     pub(crate) const FIRST_BYTE: u8 = ((IDENTIFICATION | crate::downlink::wire::APID_BASE) >> 8) as u8;
 }
 
-/// CRC-16 of CCSDS (0x1021, start 0xFFFF, not reflected) of the bytes before it.
-fn header_check(bytes: &[u8; HEADER_BYTES]) -> u16 {
+/// CRC-16 of CCSDS (0x1021, start 0xFFFF, not reflected) of the header without its last two bytes.
+fn header_checksum(bytes: &[u8; HEADER_BYTES]) -> u16 {
     checksum(CrcAlgorithm::Crc16Ibm3740, &bytes[..HEADER_BYTES - 2]) as u16
 }
 
-/// CRC-32C of a packet without its last four bytes.
-pub(crate) fn packet_check(bytes: &[u8]) -> [u8; TRAILER_BYTES] {
+/// CRC-32C of headers and payload.
+pub(crate) fn packet_checksum(bytes: &[u8]) -> [u8; TRAILER_BYTES] {
     crc_fast::crc32_iscsi(bytes).to_be_bytes()
 }
 
 /// Whether the last four bytes of a packet are the checksum of the others.
-pub(crate) fn packet_holds(bytes: &[u8]) -> bool {
-    bytes.split_last_chunk().is_some_and(|(body, check)| packet_check(body) == *check)
+pub(crate) fn has_valid_checksum(bytes: &[u8]) -> bool {
+    bytes.split_last_chunk().is_some_and(|(body, check)| packet_checksum(body) == *check)
 }
 
 #[cfg(test)]
@@ -135,7 +133,7 @@ mod tests {
 
     fn header() -> PacketHeader {
         PacketHeader {
-            kind: Kind::Visibilities,
+            kind: PacketKind::Visibilities,
             segment: PacketSegment::Whole,
             count: (5 << 14) | 7,
             time: CucTime(0x749E_3B80 << 24),
@@ -145,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn fields_stand_where_the_standard_puts_them() {
+    fn fields_are_at_their_standard_positions() {
         let bytes = header().to_bytes();
         // Version 000, type 0, secondary header 1, APID 0x103; flags 11, count 7; length 100 - 7.
         assert_eq!(bytes[..6], [0x09, 0x03, 0xC0, 0x07, 0x00, 93]);
@@ -155,14 +153,14 @@ mod tests {
     }
 
     #[test]
-    fn checks_are_the_published_ones() {
+    fn checksums_have_the_published_check_values() {
         // Catalogue of parametrised CRC algorithms: check values of "123456789".
         assert_eq!(checksum(CrcAlgorithm::Crc16Ibm3740, b"123456789"), 0x29B1);
-        assert_eq!(packet_check(b"123456789"), 0xE306_9283_u32.to_be_bytes());
+        assert_eq!(packet_checksum(b"123456789"), 0xE306_9283_u32.to_be_bytes());
     }
 
     #[test]
-    fn any_flipped_bit_of_the_header_is_noticed() {
+    fn any_flipped_bit_of_the_header_is_detected() {
         let bytes = header().to_bytes();
         for bit in 0..8 * HEADER_BYTES {
             let mut flipped = bytes;
@@ -172,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn greatest_count_and_length_survive() {
+    fn largest_count_and_length_are_encoded() {
         let header = PacketHeader {
             count: COUNT_MAX,
             bytes: PACKET_BYTES_MAX,

@@ -1,19 +1,19 @@
-//! Kinds of packet and their application process identifiers.
+//! Kinds of packets and their application process identifiers.
 
 use std::fmt;
 
 use serde::Serialize;
 
-/// The APID of a kind is this plus the kind's number; chosen among the 2040 that CCSDS leaves to missions.
+/// Base of the APIDs: a kind has this plus its number. It lies among the 2040 APIDs that CCSDS leaves to missions.
 pub const APID_BASE: u16 = 0x100;
 
-/// What a packet carries. Each kind has its own APID and packet count.
+/// Content of a packet. Each kind has its own APID and packet count.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, bincode::Encode, bincode::Decode,
 )]
 #[serde(rename_all = "lowercase")]
 #[repr(u8)]
-pub enum Kind {
+pub enum PacketKind {
     /// The instrument description, APID 0x101.
     Instrument = 1,
     /// Satellite positions, APID 0x102.
@@ -22,12 +22,12 @@ pub enum Kind {
     Visibilities = 3,
     /// Calibration, APID 0x104: reserved. The ground counts such packets and skips them.
     Calibration = 4,
-    /// The spacecraft's own counts, APID 0x105.
+    /// Housekeeping: the spacecraft's counts, APID 0x105.
     Housekeeping = 5,
 }
 
-impl Kind {
-    /// Every kind, in the order of their APIDs.
+impl PacketKind {
+    /// All kinds, in the order of their APIDs.
     pub const ALL: [Self; 5] =
         [Self::Instrument, Self::Ephemeris, Self::Visibilities, Self::Calibration, Self::Housekeeping];
 
@@ -43,14 +43,14 @@ impl Kind {
         Self::ALL.into_iter().find(|kind| kind.apid() == apid)
     }
 
-    /// Index in [`Kind::ALL`].
+    /// Index in [`PacketKind::ALL`].
     #[must_use]
     pub fn index(self) -> usize {
         self as usize - 1
     }
 }
 
-impl fmt::Display for Kind {
+impl fmt::Display for PacketKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             Self::Instrument => "instrument",

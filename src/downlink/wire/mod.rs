@@ -1,4 +1,4 @@
-//! The format on the link, and its encoders: payloads, space packets, coded transfer frames.
+//! The format on the link and its encoders: payloads, space packets, coded transfer frames.
 //!
 //! | layer | encoder |
 //! |---|---|
@@ -7,8 +7,8 @@
 //! | coded frame | [`cadu::CaduEncoder`] |
 //! | either format | [`Transmission`] |
 //!
-//! Uses `frames` and `units`. The same ground frames give the same bytes; `fixtures/` holds a file to prove it. The
-//! tables of the format are in [`crate::downlink`] and [`cadu`].
+//! Uses `frames` and `units`. The same ground frames give the same bytes, which a file in `fixtures/` checks. The tables
+//! of the format are in [`crate::downlink`] and [`cadu`].
 
 pub mod cadu;
 mod cuc;
@@ -21,11 +21,11 @@ mod transmission;
 
 pub use cuc::CucTime;
 pub use format::Format;
-pub(crate) use header::{COUNT_MAX, packet_check, packet_holds};
+pub(crate) use header::{COUNT_MAX, has_valid_checksum, packet_checksum};
 pub use header::{
     FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketSegment, TRAILER_BYTES,
 };
-pub use kind::{APID_BASE, Kind};
+pub use kind::{APID_BASE, PacketKind};
 pub use packetizer::Packetizer;
 pub use payload::{NODES_MIN, PayloadFault, VisibilitiesOutline};
 pub use transmission::Transmission;

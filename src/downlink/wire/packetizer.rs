@@ -1,24 +1,24 @@
-//! Ground frames to packets: the spacecraft's end.
+//! Encodes ground frames as packets, on the spacecraft.
 
 use super::payload::{
     check_visibilities, encode_ephemeris, encode_housekeeping, encode_instrument, encode_visibilities,
     visibilities_in,
 };
 use super::{
-    COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, Kind, PacketHeader, PacketSegment, TRAILER_BYTES,
-    packet_check,
+    COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, PacketHeader, PacketKind, PacketSegment, TRAILER_BYTES,
+    packet_checksum,
 };
 use crate::downlink::config::DownlinkConfig;
 use crate::downlink::error::DownlinkError;
 use crate::frames::{EphemerisSegment, GroundFrame, Instrument, VisibilityBlock};
 use crate::units::MissionTime;
 
-/// Ephemeris segments that are repeated: those of one window, split at the formation's turnarounds.
+/// Maximum number of ephemeris segments that are repeated: a window's, split at the formation's turnarounds.
 const REPEATED_SEGMENTS_MAX: usize = 8;
 
 /// Encodes ground frames as packets.
 ///
-/// A visibility block becomes packets that can each be decoded alone, so that a lost one costs only its own
+/// A visibility block becomes packets that can part_bytes be decoded alone, so that a lost one costs only its own
 /// visibilities. Other payloads are segmented if they exceed a packet. The instrument description and the latest
 /// ephemeris segments are repeated at intervals.
 #[derive(Debug)]
@@ -26,15 +26,16 @@ pub struct Packetizer {
     packet_bytes_max: usize,
     repeat_bytes: u64,
     instrument: Option<Instrument>,
-    /// The segments sent since the last frame of another kind.
+    /// The latest run of ephemeris segments, which is repeated.
     ephemeris: Vec<EphemerisSegment>,
-    ephemeris_is_open: bool,
-    /// Whether positions or visibilities were sent since the last report of the spacecraft's counts.
+    /// Whether the next segment continues this run, as no other data were sent since.
+    continues_ephemeris: bool,
+    /// Whether positions or visibilities were sent since the last housekeeping report.
     in_pass: bool,
     bytes_since_repeat: u64,
-    /// Latest time of anything sampled so far.
+    /// Creation time of packets: the latest time of the data sampled so far.
     now: Option<MissionTime>,
-    counts: [u64; Kind::ALL.len()],
+    counts: [u64; PacketKind::ALL.len()],
     payload: Vec<u8>,
 }
 
@@ -52,11 +53,11 @@ impl Packetizer {
             repeat_bytes: config.repeat_bytes,
             instrument: None,
             ephemeris: Vec::new(),
-            ephemeris_is_open: false,
+            continues_ephemeris: false,
             in_pass: false,
             bytes_since_repeat: 0,
             now: None,
-            counts: [0; Kind::ALL.len()],
+            counts: [0; PacketKind::ALL.len()],
             payload: Vec::new(),
         })
     }
@@ -77,7 +78,7 @@ impl Packetizer {
         result
     }
 
-    /// Repeats instrument and ephemeris if they are due.
+    /// Repeats the instrument description and the ephemeris if they are due.
     fn repeat(&mut self, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         if self.bytes_since_repeat < self.repeat_bytes {
             return Ok(());
@@ -92,8 +93,7 @@ impl Packetizer {
         sent
     }
 
-    /// Whether positions or visibilities were sent since the last report of the spacecraft's counts: the next report
-    /// ends the pass.
+    /// Whether positions or visibilities were sent since the last housekeeping report, so that the next one ends the pass.
     #[must_use]
     pub fn is_in_pass(&self) -> bool {
         self.in_pass
@@ -108,27 +108,27 @@ impl Packetizer {
             GroundFrame::Ephemeris(segment) => {
                 self.send_ephemeris(segment, out)?;
                 self.in_pass = true;
-                self.remember(segment);
+                self.keep_for_repeat(segment);
                 Ok(())
             }
             GroundFrame::Visibilities(block) => {
-                self.ephemeris_is_open = false;
+                self.continues_ephemeris = false;
                 self.send_visibilities(block, out)?;
                 self.in_pass = true;
                 Ok(())
             }
             GroundFrame::Housekeeping(counts) => {
-                self.ephemeris_is_open = false;
+                self.continues_ephemeris = false;
                 self.payload.clear();
                 encode_housekeeping(counts, &mut self.payload)?;
                 let ends_pass = std::mem::take(&mut self.in_pass);
                 let now = match (ends_pass && !counts.is_last(), self.now) {
                     (true, _) => self.advance(counts.time),
-                    // The counts are known ahead of what follows, so they do not advance the clock.
+                    // These counts include data that are sent later, so they do not advance the clock.
                     (false, Some(now)) => now,
                     (false, None) => MissionTime::default().min(counts.time),
                 };
-                self.send_payload(Kind::Housekeeping, now, out)
+                self.send_payload(PacketKind::Housekeeping, now, out)
             }
         }
     }
@@ -136,20 +136,20 @@ impl Packetizer {
     fn send_instrument(&mut self, instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         self.payload.clear();
         encode_instrument(instrument, &mut self.payload)?;
-        self.send_payload(Kind::Instrument, self.now.unwrap_or_default(), out)
+        self.send_payload(PacketKind::Instrument, self.now.unwrap_or_default(), out)
     }
 
     fn send_ephemeris(&mut self, segment: &EphemerisSegment, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         self.payload.clear();
         encode_ephemeris(segment, instrument, &mut self.payload)?;
-        // Positions are known ahead, so they do not advance the clock.
+        // Positions are predictions, so they do not advance the clock.
         let now = *self.now.get_or_insert(segment.start);
-        self.send_payload(Kind::Ephemeris, now, out)
+        self.send_payload(PacketKind::Ephemeris, now, out)
     }
 
-    fn remember(&mut self, segment: &EphemerisSegment) {
-        if !std::mem::replace(&mut self.ephemeris_is_open, true) {
+    fn keep_for_repeat(&mut self, segment: &EphemerisSegment) {
+        if !std::mem::replace(&mut self.continues_ephemeris, true) {
             self.ephemeris.clear();
         }
         if self.ephemeris.len() < REPEATED_SEGMENTS_MAX {
@@ -160,33 +160,33 @@ impl Packetizer {
     fn send_visibilities(&mut self, block: &VisibilityBlock, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let instrument = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?;
         check_visibilities(block, instrument)?;
-        let each = visibilities_in(self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES);
-        for first in (0..block.len()).step_by(each) {
-            let range = first..block.len().min(first + each);
+        let per_packet = visibilities_in(self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES);
+        for first in (0..block.len()).step_by(per_packet) {
+            let range = first..block.len().min(first + per_packet);
             let last = range.end - 1;
             let end = i64::from(block.offset_ticks[last]) + i64::from(block.duration_ticks[last]);
             let now = self.advance(block.start.plus_ticks(end));
-            let time = self.code(now)?;
+            let time = self.time_code(now)?;
             let start = out.len();
             out.resize(start + HEADER_BYTES, 0);
             encode_visibilities(block, range, out)?;
-            self.seal(Kind::Visibilities, PacketSegment::Whole, time, start, out);
+            self.seal(PacketKind::Visibilities, PacketSegment::Whole, time, start, out);
         }
         Ok(())
     }
 
-    /// Sends `self.payload` in as many segments as necessary.
+    /// Sends `self.payload` in as many segments as needed.
     fn send_payload(
         &mut self,
-        kind: Kind,
+        kind: PacketKind,
         time: MissionTime,
         out: &mut Vec<u8>,
     ) -> Result<(), DownlinkError> {
-        let time = self.code(time)?;
+        let time = self.time_code(time)?;
         let payload = std::mem::take(&mut self.payload);
-        let each = self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES;
-        let segments = payload.len().div_ceil(each);
-        for (k, part) in payload.chunks(each).enumerate() {
+        let part_bytes = self.packet_bytes_max - HEADER_BYTES - TRAILER_BYTES;
+        let segments = payload.len().div_ceil(part_bytes);
+        for (k, part) in payload.chunks(part_bytes).enumerate() {
             let segment = match (k == 0, k + 1 == segments) {
                 (true, true) => PacketSegment::Whole,
                 (true, false) => PacketSegment::First,
@@ -203,22 +203,29 @@ impl Packetizer {
     }
 
     /// Fills in the headers of the packet that begins at `start` and appends its checksum.
-    fn seal(&mut self, kind: Kind, segment: PacketSegment, time: CucTime, start: usize, out: &mut Vec<u8>) {
+    fn seal(
+        &mut self,
+        kind: PacketKind,
+        segment: PacketSegment,
+        time: CucTime,
+        start: usize,
+        out: &mut Vec<u8>,
+    ) {
         let bytes = out.len() - start + TRAILER_BYTES;
         let count = &mut self.counts[kind.index()];
         let header = PacketHeader { kind, segment, count: *count, time, version: FORMAT_VERSION, bytes };
         *count = (*count + 1) & COUNT_MAX;
         out[start..start + HEADER_BYTES].copy_from_slice(&header.to_bytes());
-        let check = packet_check(&out[start..]);
+        let check = packet_checksum(&out[start..]);
         out.extend_from_slice(&check);
     }
 
-    /// Advances the clock to `time`, never back. The clock gives packets their creation time.
+    /// Advances the clock to `time`, but never back; returns its time.
     fn advance(&mut self, time: MissionTime) -> MissionTime {
         *self.now.insert(self.now.map_or(time, |now| now.max(time)))
     }
 
-    fn code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
+    fn time_code(&self, time: MissionTime) -> Result<CucTime, DownlinkError> {
         let epoch_tai_s = self.instrument.as_ref().ok_or(DownlinkError::NoInstrument)?.epoch_tai_s;
         let error = || DownlinkError::Time { epoch_tai_s, time_s: time.seconds() };
         CucTime::new(epoch_tai_s, time).ok_or_else(error)

@@ -1,4 +1,4 @@
-//! Ground frames to the bytes of a downlink, in either format: the spacecraft's end.
+//! Encodes ground frames as the bytes of a downlink, in either format, on the spacecraft.
 
 use super::Packetizer;
 use super::cadu::CaduEncoder;
@@ -23,11 +23,11 @@ impl Transmission {
         Ok(Self { packetizer: Packetizer::new(config)?, encoder: config.encoder(), packets: Vec::new() })
     }
 
-    /// Appends the bytes that a frame adds to the downlink. Housekeeping ends a pass, or begins it: then nothing else
-    /// of the pass was sent.
+    /// Appends the bytes that a frame adds to the downlink. A housekeeping frame ends the pass if data were sent in it, and
+    /// begins one otherwise.
     ///
     /// # Errors
-    /// Those of [`Packetizer::encode`].
+    /// The errors of [`Packetizer::encode`].
     pub fn send(&mut self, frame: &GroundFrame, out: &mut Vec<u8>) -> Result<(), DownlinkError> {
         let Some(encoder) = &mut self.encoder else { return self.packetizer.encode(frame, out) };
         self.packets.clear();
@@ -42,7 +42,7 @@ impl Transmission {
         Ok(())
     }
 
-    /// Appends what is still buffered.
+    /// Appends the bytes that are still buffered.
     pub fn finish(&mut self, out: &mut Vec<u8>) {
         if let Some(encoder) = &mut self.encoder {
             encoder.end_pass(out);

@@ -257,9 +257,9 @@ mod tests {
 
     use super::*;
     use crate::calibration::{Calibrator, Identity};
-    use crate::downlink::receive::PacketReading;
+    use crate::downlink::receive::PacketOutcome;
     use crate::downlink::{
-        CucTime, DownlinkConfig, FORMAT_VERSION, Kind, PacketHeader, PacketSegment, Transmission,
+        CucTime, DownlinkConfig, FORMAT_VERSION, PacketHeader, PacketKind, PacketSegment, Transmission,
     };
     use crate::frames::{
         AntennaResponse, Channel, Flags, GroundFrame, Housekeeping, Instrument, PlacedFrame, VisibilityBlock,
@@ -317,10 +317,10 @@ mod tests {
         collector.push(&bytes);
         collector.finish();
         while collector.next_delivery(&|_| true).unwrap().is_some() {}
-        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(3));
+        let (kind, segment, time) = (PacketKind::Visibilities, PacketSegment::Whole, CucTime(3));
         let header = PacketHeader { kind, segment, count: 3, time, version: FORMAT_VERSION, bytes: 60 };
         let mut journal = Journal::default();
-        let packet = DeliveredPacket { header, checksum: 1, counts: PacketReading::default() };
+        let packet = DeliveredPacket { header, checksum: 1, counts: PacketOutcome::default() };
         journal.record_visibilities(&packet, RecordDraft::default(), &ledger.report());
         let settings = vec![("map.nside".to_owned(), "4".to_owned())];
         take(&ArchiveHeadView {

@@ -246,7 +246,7 @@ impl StateFolder {
 
     /// Checks that the path still leads to the locked folder, as another process may use a folder that replaced it.
     fn require_same_folder(&self) -> Result<(), GroundError> {
-        match self.lock.as_ref().and_then(FolderLock::lost) {
+        match self.lock.as_ref().and_then(FolderLock::loss) {
             None => Ok(()),
             Some(what) => Err(GroundError::FolderLost { path: self.path.clone(), what }),
         }

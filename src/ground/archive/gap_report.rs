@@ -5,7 +5,7 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::entry::JournalEntry;
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::units::{ChannelId, Pair};
 
 /// Channel and pair of a stream of packets. In each window the streams are sent one after another.
@@ -58,7 +58,7 @@ impl LostStream {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapReport {
     /// Kind of the packets.
-    pub kind: Kind,
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the first missing packet.
@@ -78,7 +78,7 @@ pub struct GapReport {
 
 impl GapReport {
     pub(super) fn new(
-        kind: Kind,
+        kind: PacketKind,
         gap: &Range<u64>,
         between_s: [Option<f64>; 2],
         lost: Vec<LostStream>,

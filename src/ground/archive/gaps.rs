@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
 use super::packet_order::{PacketStreams, SendingOrder, windows_of};
-use crate::downlink::{CucTime, Era, Kind, ReceivedSet};
+use crate::downlink::{CucTime, Era, PacketKind, ReceivedSet};
 use crate::units::MissionTime;
 
 /// The received packets, as input to [`find_gaps`].
@@ -18,7 +18,7 @@ pub struct ReceivedPackets {
     /// Every ephemeris packet that was decoded, in the order of sending.
     pub ephemerides: Vec<EphemerisPacket>,
     /// Received sets by kind.
-    pub sets: Vec<(Kind, ReceivedSet)>,
+    pub sets: Vec<(PacketKind, ReceivedSet)>,
     /// Frequencies of the instrument's channels, Hz.
     pub frequencies_hz: Vec<f64>,
 }
@@ -38,7 +38,7 @@ pub struct EphemerisPacket {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RestartReport {
     /// Kind of the packets.
-    pub kind: Kind,
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the last packet received before the restart. Whether more were sent is unknown.
@@ -101,7 +101,7 @@ pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
         let mut weights: BTreeMap<u16, f64> = BTreeMap::new();
         for lost in &gap.lost {
             let Some(coverage) = channels.get_mut(&lost.channel) else { continue };
-            if gap.kind == Kind::Visibilities {
+            if gap.kind == PacketKind::Visibilities {
                 coverage.missing_integration_s += lost.integration_s;
                 coverage.missing_weight += lost.weight;
             }
@@ -120,7 +120,7 @@ pub fn find_gaps(received: &ReceivedPackets) -> Gaps {
 
 fn gaps_of_era(
     received: &ReceivedPackets,
-    kind: Kind,
+    kind: PacketKind,
     era: &Era,
     in_era: &dyn Fn(CucTime) -> bool,
 ) -> Vec<GapReport> {
@@ -129,16 +129,18 @@ fn gaps_of_era(
     }
     let visibilities = received.packets.iter().filter(|packet| in_era(packet.entry.made));
     let schedule = SendingOrder::new(match kind {
-        Kind::Visibilities => visibilities.copied().collect(),
+        PacketKind::Visibilities => visibilities.copied().collect(),
         _ => Vec::new(),
     });
     let mut positions: Vec<EphemerisPacket> = match kind {
-        Kind::Ephemeris => received.ephemerides.iter().filter(|known| in_era(known.made)).copied().collect(),
+        PacketKind::Ephemeris => {
+            received.ephemerides.iter().filter(|known| in_era(known.made)).copied().collect()
+        }
         _ => Vec::new(),
     };
     positions.sort_by_key(|known| known.count);
     let report = |gap: &Range<u64>| match kind {
-        Kind::Ephemeris => missing_ephemeris(&received.packets, &positions, &era.missing, gap),
+        PacketKind::Ephemeris => missing_ephemeris(&received.packets, &positions, &era.missing, gap),
         _ => schedule.report(kind, gap),
     };
     era.missing.iter().map(report).collect()
@@ -206,7 +208,7 @@ fn missing_ephemeris(
     }
     let [before_s, after_s] = [before.map(|before| before.span[1]), after.map(|after| after.span[0])];
     let between_s = [before_s, after_s].map(|time| time.map(MissionTime::seconds));
-    GapReport::new(Kind::Ephemeris, gap, between_s, lost.into_values().collect())
+    GapReport::new(PacketKind::Ephemeris, gap, between_s, lost.into_values().collect())
 }
 
 /// Fraction of the loss of each window due to a gap: the missing packets of the window in the gap, over all its missing packets.
@@ -296,7 +298,7 @@ mod tests {
             }
         }
         let packets = kept.into_iter().map(read).collect();
-        let sets = vec![(Kind::Visibilities, set)];
+        let sets = vec![(PacketKind::Visibilities, set)];
         (find_gaps(&ReceivedPackets { packets, sets, ..ReceivedPackets::default() }), held)
     }
 
@@ -327,7 +329,7 @@ mod tests {
         let far = JournalEntry { count: last + missing, start: MissionTime::from_seconds(1e9), ..entries[0] };
         let far = JournalEntry { end: MissionTime::from_seconds(1e9 + 600.0), ..far };
         let schedule = SendingOrder::new([entries, vec![far]].concat().into_iter().map(read).collect());
-        let report = schedule.report(Kind::Visibilities, &(last..last + missing));
+        let report = schedule.report(PacketKind::Visibilities, &(last..last + missing));
         let packets: Vec<u64> = report.lost.iter().map(|lost| lost.packets).collect();
         let windows = missing / 12;
         let [one, three] = [windows + 1, 3 * windows];
@@ -348,7 +350,7 @@ mod tests {
     #[test]
     fn nothing_missing_and_nothing_received() {
         assert!(without(&[]).0.gaps.is_empty());
-        let sets = vec![(Kind::Visibilities, ReceivedSet::default())];
+        let sets = vec![(PacketKind::Visibilities, ReceivedSet::default())];
         assert_eq!(find_gaps(&ReceivedPackets { sets, ..ReceivedPackets::default() }), Gaps::default());
     }
 }

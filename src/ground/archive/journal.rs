@@ -9,9 +9,9 @@ use bincode::{Decode, Encode};
 
 use super::draft::RecordDraft;
 use super::entry::JournalEntry;
-use crate::downlink::receive::PacketReading;
+use crate::downlink::receive::PacketOutcome;
 use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
-use crate::downlink::{Kind, PacketHeader};
+use crate::downlink::{PacketHeader, PacketKind};
 use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
 pub(super) use crate::ground::hold_buffer::SendingKey;
@@ -25,7 +25,7 @@ pub(super) struct JournalRecord {
     pub(super) window: MissionTime,
     pub(super) checksum: u32,
     pub(super) bytes: u32,
-    pub(super) counts: PacketReading,
+    pub(super) counts: PacketOutcome,
     /// Whether its block had been received already, in another packet.
     pub(super) is_duplicate: bool,
     /// Digest of the positions, values and weights offered to the sums.
@@ -50,7 +50,7 @@ pub(super) struct SumsSpan {
 pub(super) struct OtherRecord {
     pub(super) checksum: u32,
     pub(super) bytes: u32,
-    pub(super) counts: PacketReading,
+    pub(super) counts: PacketOutcome,
     /// First and last count of the packets of its payload.
     pub(super) payload: [u64; 2],
     /// Start of the ephemeris segment in it; `None` if another segment with that start is used.
@@ -63,7 +63,7 @@ pub(super) struct OtherRecord {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Journal {
     pub(super) visibilities: BTreeMap<SendingKey, JournalRecord>,
-    pub(super) others: BTreeMap<(Kind, SendingKey), OtherRecord>,
+    pub(super) others: BTreeMap<(PacketKind, SendingKey), OtherRecord>,
 }
 
 impl Journal {
@@ -82,7 +82,7 @@ impl Journal {
     pub(super) fn contains(&self, header: &PacketHeader) -> bool {
         let sent = (header.time, header.count);
         match header.kind {
-            Kind::Visibilities => self.visibilities.contains_key(&sent),
+            PacketKind::Visibilities => self.visibilities.contains_key(&sent),
             kind => self.others.contains_key(&(kind, sent)),
         }
     }
@@ -156,9 +156,9 @@ mod tests {
     use crate::downlink::{CucTime, FORMAT_VERSION, PacketSegment};
 
     fn packet(count: u64, checksum: u32) -> DeliveredPacket {
-        let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
+        let (kind, segment, time) = (PacketKind::Visibilities, PacketSegment::Whole, CucTime(7 * count));
         let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
-        DeliveredPacket { header, checksum, counts: PacketReading::default() }
+        DeliveredPacket { header, checksum, counts: PacketOutcome::default() }
     }
 
     const FAR: VisibilityReason = VisibilityReason::BaselineBeyondMap;
@@ -209,12 +209,12 @@ mod tests {
         assert!(!with(COUNT_MAX + 1, 60).is_sound() && !with(u64::MAX, 60).is_sound());
         assert!(!with(1, PACKET_BYTES_MAX + 1).is_sound());
         let (mut others, visibilities) = (Journal::default(), with(1, 60));
-        let (checksum, bytes, counts) = (1, 60, PacketReading::default());
+        let (checksum, bytes, counts) = (1, 60, PacketOutcome::default());
         let record =
             OtherRecord { checksum, bytes, counts, payload: [1, 1], ephemeris_start: None, report: None };
-        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
+        others.others.insert((PacketKind::Ephemeris, (CucTime(1), COUNT_MAX)), record);
         assert!(others.is_sound() && visibilities.is_sound());
-        others.others.insert((Kind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
+        others.others.insert((PacketKind::Ephemeris, (CucTime(1), COUNT_MAX + 1)), record);
         assert!(!others.is_sound());
     }
 }

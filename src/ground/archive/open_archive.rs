@@ -12,7 +12,7 @@ use super::names::parts_with;
 use super::settings::{require_equal, settings_of};
 use super::store::Archive;
 use crate::calibration::AutoTable;
-use crate::downlink::{DownlinkError, Kind};
+use crate::downlink::{DownlinkError, PacketKind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::live_view::LiveViewWriter;
 use crate::ground::promises::SenderPromises;
@@ -55,8 +55,8 @@ impl ArchiveContents {
         }
         self.calibration.version = self.calibration.version.max(other.calibration.version);
         self.journal.merge(other.journal).map_err(|count| {
-            let apid = Kind::Visibilities.apid();
-            DownlinkError::TakenTwice { apid, count }
+            let apid = PacketKind::Visibilities.apid();
+            DownlinkError::DuplicatePacket { apid, count }
         })?;
         self.collector.merge(other.collector, |header| self.journal.contains(header))?;
         // If two segments start at the same time, the first is used.

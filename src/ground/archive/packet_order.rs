@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use super::gap_report::{GapReport, LostStream, Stream, VisibilityPacket};
 use super::journal::SendingKey;
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 
 /// Time between windows, s, longer than any gap between packets within a window.
 const WINDOW_GAP_S: f64 = 600.0;
@@ -93,7 +93,7 @@ impl SendingOrder {
         Self { packets, windows, streams }
     }
 
-    pub(super) fn report(&self, kind: Kind, gap: &Range<u64>) -> GapReport {
+    pub(super) fn report(&self, kind: PacketKind, gap: &Range<u64>) -> GapReport {
         let next = self.packets.partition_point(|packet| packet.entry.count < gap.start);
         let before = next.checked_sub(1).map(|at| &self.packets[at].entry);
         let after = self.packets.get(next).map(|packet| &packet.entry);

@@ -11,7 +11,7 @@ use super::journal::{Journal, JournalRecord, SendingKey};
 use super::settings::settings_of;
 use crate::calibration::{AntennaGains, AutoTable, CalibrationHook, Calibrator, ReceivedBlocks};
 use crate::downlink::receive::EventReader;
-use crate::downlink::{Event, Kind};
+use crate::downlink::{Event, PacketKind};
 use crate::frames::GroundFrame;
 use crate::ground::{DeliveredPacket, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::imaging::EngineKind;
@@ -140,7 +140,7 @@ fn for_each_packet(
     for path in files {
         let mut events = EventReader::open(path)?.unfiltered();
         events.for_each(|event| match event {
-            Event::Packet(packet) if packet.header.kind == Kind::Visibilities => {
+            Event::Packet(packet) if packet.header.kind == PacketKind::Visibilities => {
                 take(&HeldPacket::new(packet))
             }
             _ => Ok(()),

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::folder::checkpoints;
 use crate::downlink::transport::packet_archive::{
-    ArchiveReading, PacketArchive, PacketName, bytes_behind, read_archive, read_behind,
+    ArchiveScan, PacketArchive, PacketName, read_archive, read_unsaved, unsaved_bytes,
 };
 use crate::files::write_atomically;
 use crate::ground::{Ground, GroundConfig, GroundError};
@@ -34,7 +34,7 @@ impl Ground {
         let checkpoint = self.archive.as_ref().and_then(|archive| archive.folder.newest());
         // Opened first, so that no other process writes to it.
         let packets = continues_archive.then(|| PacketArchive::open(&folder, u64::MAX)).transpose()?;
-        let reading = read_behind(&folder, checkpoint, |chunk| self.take_chunk(chunk))?;
+        let reading = read_unsaved(&folder, checkpoint, |chunk| self.take_chunk(chunk))?;
         self.note_recovered(&folder, reading);
         if let Some(archive) = &mut self.archive {
             archive.packets = packets;
@@ -66,8 +66,8 @@ impl Ground {
             None => PacketArchive::open(&folder, bytes_max)?,
         };
         keep_settings(&folder, &archive.settings)?;
-        packets.limit(bytes_max);
-        packets.know(self.collector.received());
+        packets.set_bytes_max(bytes_max);
+        packets.set_received(self.collector.received());
         archive.packets = Some(packets.clone());
         Ok(Some(packets))
     }
@@ -80,7 +80,7 @@ impl Ground {
         folder: &Path,
         archive: &Path,
         config: &GroundConfig,
-    ) -> Result<(Self, ArchiveReading), GroundError> {
+    ) -> Result<(Self, ArchiveScan), GroundError> {
         if folder.is_dir() && !checkpoints(folder)?.is_empty() {
             return Err(GroundError::Occupied { path: folder.to_owned() });
         }
@@ -104,8 +104,8 @@ impl Ground {
         self.step(chunk, &mut Outlet::collect())
     }
 
-    fn note_recovered(&mut self, folder: &Path, reading: ArchiveReading) {
-        let ArchiveReading { packets, bytes, damaged, .. } = reading;
+    fn note_recovered(&mut self, folder: &Path, reading: ArchiveScan) {
+        let ArchiveScan { packets, bytes, damaged, .. } = reading;
         let Some(archive) = &mut self.archive else { return };
         if packets > 0 {
             let folder = folder.display();
@@ -138,7 +138,7 @@ pub(super) fn kept_settings(folder: &Path) -> Option<Vec<(String, String)>> {
 
 /// Returns an error if the raw archive of a state has packets that its checkpoint may lack.
 pub(super) fn require_saved(state: &Path, checkpoint: Option<u64>) -> Result<(), GroundError> {
-    match bytes_behind(&packets_folder(state), checkpoint)? {
+    match unsaved_bytes(&packets_folder(state), checkpoint)? {
         0 => Ok(()),
         bytes => Err(GroundError::Unsaved { path: state.to_owned(), bytes }),
     }

@@ -11,7 +11,7 @@ use super::journal::{Journal, OtherRecord, SendingKey};
 use super::recovery::record_retraction;
 use crate::downlink::receive::EventReader;
 use crate::downlink::transport::packet_archive::PacketName;
-use crate::downlink::{Event, Kind, PacketHeader};
+use crate::downlink::{Event, PacketHeader, PacketKind};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
 
@@ -21,7 +21,7 @@ const REFUSED_LISTED: usize = 20;
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct RefusedPacket {
     /// Kind of the packet.
-    pub kind: Kind,
+    pub kind: PacketKind,
     /// Count of the packet.
     pub count: u64,
     /// Reason for keeping it.
@@ -51,7 +51,7 @@ pub struct Retracted {
     pub refused_packets: Vec<RefusedPacket>,
 }
 
-type RecordKey = (Kind, SendingKey);
+type RecordKey = (PacketKind, SendingKey);
 
 /// A retraction in progress. It removes records and subtracts their visibilities; derived data follow from the journal when
 /// the checkpoint is next opened.
@@ -136,7 +136,7 @@ impl Retraction {
         }
         let held = self.ground.collector.held().get(&header).map(|held| held.checksum);
         let checksum = held.or_else(|| match header.kind {
-            Kind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.checksum),
+            PacketKind::Visibilities => self.journal.visibilities.get(&key.1).map(|record| record.checksum),
             _ => self.journal.others.get(&key).map(|record| record.checksum),
         });
         match checksum {
@@ -152,7 +152,7 @@ impl Retraction {
                 self.report.packets += 1;
                 self.report.held += 1;
             }
-            Some(_) if header.kind == Kind::Visibilities => return self.retract_visibilities(packet),
+            Some(_) if header.kind == PacketKind::Visibilities => return self.retract_visibilities(packet),
             Some(_) => {
                 self.others.insert(key);
             }
@@ -205,7 +205,7 @@ impl Retraction {
 
     /// Removes payloads of other kinds of which all packets were given, except ephemeris segments that remaining visibilities need.
     fn retract_others(&mut self) {
-        let mut payloads: BTreeMap<(Kind, SendingKey), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
+        let mut payloads: BTreeMap<(PacketKind, SendingKey), (OtherRecord, Vec<RecordKey>)> = BTreeMap::new();
         for key @ (kind, (time, _)) in &self.others {
             let Some(record) = self.journal.others.get(key) else { continue };
             let first = (*kind, (*time, record.payload[0]));

@@ -9,7 +9,7 @@ use super::folder::{StateFolder, checkpoints};
 use super::journal::{Journal, OtherRecord};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::{EphemerisSegment, VisibilityReason};
 use crate::ground::pass_gate::PassGate;
@@ -51,7 +51,7 @@ impl Archive {
     ) -> LedgerReport<VisibilityReason> {
         let posts = self.take_posts();
         let (Some(first), Some(last)) = (packets.first(), packets.last()) else { return posts };
-        if first.header.kind == Kind::Visibilities {
+        if first.header.kind == PacketKind::Visibilities {
             self.since_attempt += u64::from(draft.entry.visibilities);
             self.journal.record_visibilities(first, draft, &posts);
             return posts;
@@ -100,7 +100,7 @@ impl Archive {
     /// after a restart.
     pub(in crate::ground) fn mark_packets(&self, bytes: u64) {
         if let (Some(packets), Some(newest)) = (&self.packets, self.folder.newest()) {
-            let _ = packets.mark(newest, bytes, &self.folder.numbers());
+            let _ = packets.record_checkpoint(newest, bytes, &self.folder.numbers());
         }
     }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::entry::JournalEntry;
 use super::journal::{Journal, JournalRecord, SendingKey, SumsSpan};
 use crate::calibration::{BlockKey, ReceivedBlocks};
-use crate::downlink::{Kind, ReceptionCounters};
+use crate::downlink::{PacketKind, ReceptionCounters};
 use crate::frames::VisibilityReason;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
@@ -28,15 +28,15 @@ impl Journal {
         })
     }
 
-    pub(super) fn delivered(&self) -> impl Iterator<Item = (Kind, SendingKey)> {
-        let visibilities = self.visibilities.keys().map(|sent| (Kind::Visibilities, *sent));
+    pub(super) fn delivered(&self) -> impl Iterator<Item = (PacketKind, SendingKey)> {
+        let visibilities = self.visibilities.keys().map(|sent| (PacketKind::Visibilities, *sent));
         visibilities.chain(self.others.keys().copied())
     }
 
     pub(super) fn reception(&self) -> ReceptionCounters {
         let mut counters = ReceptionCounters::default();
         for record in self.visibilities.values() {
-            counters.add_packet(Kind::Visibilities, record.bytes, &record.counts);
+            counters.add_packet(PacketKind::Visibilities, record.bytes, &record.counts);
         }
         for ((kind, _), record) in &self.others {
             counters.add_packet(*kind, record.bytes, &record.counts);
@@ -109,7 +109,7 @@ mod tests {
 
     use super::*;
     use crate::calibration::CalibrationConfig;
-    use crate::downlink::receive::PacketReading;
+    use crate::downlink::receive::PacketOutcome;
     use crate::downlink::{
         CucTime, DownlinkConfig, FORMAT_VERSION, PacketHeader, PacketSegment, Transmission,
     };
@@ -264,7 +264,7 @@ mod tests {
     fn spans_are_of_the_channels_of_the_sums() {
         let mut journal = Journal::default();
         for (count, times_s) in [(0, [3.0, 4.0]), (1, [1.0, 2.0])] {
-            let (kind, segment, time) = (Kind::Visibilities, PacketSegment::Whole, CucTime(count));
+            let (kind, segment, time) = (PacketKind::Visibilities, PacketSegment::Whole, CucTime(count));
             let header = PacketHeader { kind, segment, count, time, version: FORMAT_VERSION, bytes: 60 };
             let mut draft = RecordDraft::new(Some(&block(Pair { i: 0, j: 1 }, 200)));
             // The second of two sub-bands of channel 2.
@@ -272,7 +272,7 @@ mod tests {
             let channel = ChannelId(2);
             draft.offer(&PlacedFrame::Visibilities(PlacedVisibilities { channel, ..Default::default() }));
             draft.used_s = Some(times_s);
-            let packet = DeliveredPacket { header, checksum: 1, counts: PacketReading::default() };
+            let packet = DeliveredPacket { header, checksum: 1, counts: PacketOutcome::default() };
             journal.record_visibilities(&packet, draft, &LedgerReport::default());
         }
         assert_eq!(journal.spans_s(), BTreeMap::from([(ChannelId(2), [1.0, 4.0])]));

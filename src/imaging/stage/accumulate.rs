@@ -448,7 +448,7 @@ impl Accumulator {
                 }
                 return self.add(&placed);
             }
-            PlacedFrame::Elsewhere(counted) => {
+            PlacedFrame::NotMapped(counted) => {
                 self.emit_if_due(counted.first_s, out)?;
                 self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, counted.visibilities);
             }

@@ -1,4 +1,4 @@
-//! The settings of the maps that belong to a downlink, for a ground that is told none.
+//! The settings that a ground segment uses for a downlink if the user gives none.
 
 use std::path::PathBuf;
 
@@ -6,41 +6,41 @@ use super::source::{ConfigSource, QUICKLOOK};
 use crate::frames::Instrument;
 use crate::ground::Collector;
 
-/// Name of the file of settings that `run` leaves among its products.
+/// Name of the settings file among the products of `run`.
 pub(in crate::pipeline) const SETTINGS: &str = "pipeline.toml";
 
-/// Sections that decide what maps are made. Those of the runtime change no byte, and are the machine's.
+/// Sections that decide the maps. `[runtime]` depends on the machine and changes no byte.
 const SECTIONS: [&str; 3] = ["calibration", "map", "products"];
 
 impl ConfigSource {
-    /// This source with the settings of the maps that `run` makes of the same data, before its own overrides, and where they are
-    /// from: `pipeline.toml` beside the first of `files`, or the quicklook, if the downlink carries the hash and the seed of its
-    /// space segment. Only without a file; otherwise, and of a downlink that nobody knows, this source as it is.
+    /// Adds the map settings of the pipeline that made a downlink, and returns where they are from; overrides of this source take
+    /// precedence.
     ///
-    /// So `simulate` and `replay` give the maps of `run` when none of them is told anything. Only ordinary files are looked at: what
-    /// is read from a pipe is gone.
+    /// The pipeline is `pipeline.toml` beside the first of `files`, or the quicklook, if its hash and seed of the space segment are
+    /// those in the downlink. So `simulate` and `replay` make the same maps as `run`. A source with a file is returned unchanged, as is
+    /// one for an unknown downlink or for a pipe, which can be read only once.
     #[must_use]
     #[doc(hidden)]
-    pub fn of_downlink(mut self, files: &[PathBuf]) -> (Self, Option<String>) {
+    pub fn with_downlink_settings(mut self, files: &[PathBuf]) -> (Self, Option<String>) {
         let first = files.first().filter(|path| self.file.is_none() && path.is_file());
-        // A file that cannot be read is told when the ground reads it.
+        // A file that cannot be read is reported when the ground segment opens it.
         let Some((path, instrument)) =
             first.and_then(|path| Some((path, Collector::instrument_of(path).ok()??)))
         else {
             return (self, None);
         };
         let beside = path.with_file_name(SETTINGS);
-        let known = [Self { file: Some(beside), ..Self::default() }, Self::default()];
-        let Some((from, settings)) =
-            known.iter().find_map(|source| Some((source.origin(), source.map_settings(&instrument)?)))
+        let candidates = [Self { file: Some(beside), ..Self::default() }, Self::default()];
+        let Some((origin, settings)) =
+            candidates.iter().find_map(|source| Some((source.origin(), source.map_settings(&instrument)?)))
         else {
             return (self, None);
         };
         self.overrides = settings.into_iter().chain(self.overrides).collect();
-        (self, Some(from))
+        (self, Some(origin))
     }
 
-    /// The settings of the maps, as overrides, if the spacecraft is that of the instrument.
+    /// The settings of the maps, as overrides; `None` if the instrument is of another space segment.
     fn map_settings(&self, instrument: &Instrument) -> Option<Vec<String>> {
         let config = self.load().ok()?;
         if (config.seed, config.space_hash()) != (instrument.seed, instrument.configuration_hash) {

@@ -1,4 +1,4 @@
-//! Keys that are set and have no effect with the other settings: an error, which says when they have one.
+//! Reports keys that are set but have no effect with the other settings, and the setting that they need.
 
 use thiserror::Error;
 use toml::{Table, Value};
@@ -8,7 +8,6 @@ use super::problems::Problems;
 use super::sections::Config;
 use crate::units::{Level, shortened};
 
-/// Most characters of a value that are shown.
 const SHOWN_MAX: usize = 60;
 
 /// A key that is set and has no effect.
@@ -17,23 +16,23 @@ const SHOWN_MAX: usize = 60;
 pub struct NoEffect {
     /// Full key.
     pub key: String,
-    /// Its value.
+    /// Value of the key.
     pub value: String,
-    /// When it has an effect.
+    /// Condition under which the key has an effect.
     pub only_with: String,
 }
 
 impl Config {
-    /// Keys of these sections (all if there are none) that differ from their defaults and have no effect.
+    /// Keys of `sections` (of all sections if the list is empty) that differ from their defaults and have no effect.
     pub(super) fn without_effect(&self, sections: &[&str]) -> Problems {
         let mut found = Problems::default();
         // A configuration always has a TOML form: the test of the reference relies on it too.
         let set = Table::try_from(self).unwrap_or_default();
         let keys = flat_keys();
-        let is_asked = |key: &&FlatKey| {
+        let is_in_sections = |key: &&FlatKey| {
             sections.is_empty() || sections.contains(&key.path.split('.').next().unwrap_or(""))
         };
-        for key in keys.iter().filter(|key| key.key.level != Level::Section).filter(is_asked) {
+        for key in keys.iter().filter(|key| key.key.level != Level::Section).filter(is_in_sections) {
             let Some(value) = value_of(&set, &key.path).filter(|value| Some(*value) != key.default.as_ref())
             else {
                 continue;
@@ -50,7 +49,7 @@ impl Config {
     }
 }
 
-/// The value of a key with sections.
+/// The value at a dotted path.
 fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     let (first, rest) = path.split_once('.').map_or((path, None), |(first, rest)| (first, Some(rest)));
     let value = table.get(first)?;
@@ -60,17 +59,18 @@ fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     }
 }
 
-/// Whether any comparison of a condition holds: `key = value`, `key > number`, or a key alone, which differs from its default.
+/// Whether any comparison of a condition holds: `key = value`, `key > number`, or a key alone, which is true if the key differs from its
+/// default.
 fn holds(condition: &str, set: &Table, keys: &[FlatKey]) -> bool {
     condition.split(" or ").any(|comparison| {
         let mut words = comparison.splitn(3, ' ');
         let (path, sign, wanted) = (words.next().unwrap_or(""), words.next(), words.next());
-        let usual = keys.iter().find(|key| key.path == path).and_then(|key| key.default.as_ref());
-        let value = value_of(set, path).or(usual);
+        let default = keys.iter().find(|key| key.path == path).and_then(|key| key.default.as_ref());
+        let value = value_of(set, path).or(default);
         let wanted =
             wanted.and_then(|text| toml::from_str::<Table>(&format!("v = {text}")).ok()?.remove("v"));
         match (sign, value, wanted) {
-            (None, value, _) => value != usual,
+            (None, value, _) => value != default,
             (Some("="), Some(value), Some(wanted)) => *value == wanted,
             (Some(">"), Some(value), Some(wanted)) => is_above(value, &wanted),
             _ => false,
@@ -90,14 +90,13 @@ fn is_above(value: &Value, limit: &Value) -> bool {
 mod tests {
     use super::*;
 
-    /// The problems of a pipeline, by its text.
-    fn told(text: &str) -> Vec<String> {
+    fn messages(text: &str) -> Vec<String> {
         let config: Config = toml::from_str(text).unwrap();
         config.problems().iter().map(ToString::to_string).collect()
     }
 
     #[test]
-    fn a_key_without_effect_is_told_with_its_value_and_when_it_has_one() {
+    fn a_key_without_effect_is_reported_with_its_value_and_condition() {
         for (text, expected) in [
             ("map.l_max = 10", "map.l_max = 10 has an effect only with map.engine = \"harmonic\""),
             (
@@ -123,28 +122,28 @@ mod tests {
             ),
             ("sky.frequency = { spectral_index = -2.5 }", "has an effect only with sky.file"),
         ] {
-            let found = told(text);
+            let found = messages(text);
             assert_eq!(found.len(), 1, "{text}: {found:?}");
             assert!(found[0].ends_with(expected), "{text}: {found:?}");
         }
     }
 
     #[test]
-    fn what_has_an_effect_or_is_the_default_is_not_told() {
+    fn keys_with_an_effect_and_defaults_are_not_reported() {
         for text in [
             "",
             "map.l_max = 0",
             "map.matrix = \"free\"\nmap.iterations_max = 7",
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
-            // A strength of zero is a value like others.
+            // A key that is set to zero still sets its section.
             "instrument.clock_ns = { drift_rms = 0.0, drift_time_s = 60.0 }",
         ] {
-            assert_eq!(told(text), Vec::<String>::new(), "{text}");
+            assert_eq!(messages(text), Vec::<String>::new(), "{text}");
         }
     }
 
     #[test]
-    fn every_condition_names_keys_that_there_are() {
+    fn every_condition_names_existing_keys() {
         let keys = flat_keys();
         for comparison in keys.iter().flat_map(|key| &key.only_with).flat_map(|only| only.split(" or ")) {
             let words: Vec<&str> = comparison.split(' ').collect();

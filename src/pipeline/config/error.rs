@@ -10,35 +10,35 @@ use crate::runtime::{LedgerImbalance, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 
-/// Why a pipeline did not run.
+/// Errors that prevent or end a run of a pipeline.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PipelineError {
-    /// The configuration.
+    /// An invalid configuration.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The array.
+    /// An invalid array or orbit.
     #[error(transparent)]
     Array(#[from] ArrayError),
     /// A map of the simulated sky or a prior map.
     #[error(transparent)]
     Map(#[from] MapError),
-    /// The generated sky.
+    /// The generated sky cannot be computed.
     #[error(transparent)]
     GeneratedSky(#[from] crate::sky::generated::GeneratedSkyError),
-    /// What is added to a map of the sky.
+    /// The sources or components added to a sky map are invalid.
     #[error(transparent)]
     AddedSky(#[from] crate::sky::generated::AddedSkyError),
     /// The harmonic coefficients of the simulated sky cannot be computed.
     #[error("the harmonic coefficients of the simulated sky: {0}")]
     Coefficients(#[from] crate::sky::harmonics::HarmonicsError),
-    /// A value of the configuration that does not fit the files that it names.
+    /// A value of the configuration that does not fit the named files.
     #[error(transparent)]
     Invalid(#[from] crate::units::InvalidValue),
     /// An invalid model of visibilities.
     #[error(transparent)]
     Model(#[from] crate::response::model::ModelError),
-    /// A map file.
+    /// A map file is unreadable or invalid.
     #[error(transparent)]
     Fits(#[from] FitsError),
     /// A stage failed.
@@ -53,16 +53,16 @@ pub enum PipelineError {
     /// Calibration cannot be set up.
     #[error(transparent)]
     Calibration(#[from] crate::calibration::CalibrationError),
-    /// The downlink.
+    /// The downlink cannot be read, written, sent or received.
     #[error(transparent)]
     Downlink(#[from] crate::downlink::DownlinkError),
     /// Products cannot be written.
     #[error(transparent)]
     Products(#[from] crate::products::ProductsError),
-    /// A map cannot be made of sums.
+    /// The solution for a map failed.
     #[error(transparent)]
     Solve(#[from] crate::imaging::SolveError),
-    /// The ground failed.
+    /// The ground segment failed.
     #[error(transparent)]
     Ground(#[from] crate::ground::GroundError),
     /// No data for any map.
@@ -71,37 +71,37 @@ pub enum PipelineError {
         summary.display()
     )]
     NoMap {
-        /// Where the summary is.
+        /// Path of the summary.
         summary: std::path::PathBuf,
         /// The ledger of visibilities.
         ledger: Box<crate::runtime::LedgerReport<VisibilityReason>>,
     },
-    /// The ground's last checkpoint could not be written.
+    /// The last checkpoint of the ground segment could not be written.
     #[error(
         "the state was not saved: {reason}. Maps and {} hold all data; the state holds that of its newest checkpoint: \
          mend the cause, and replay the same files again",
         summary.display()
     )]
     Unsaved {
-        /// Where the summary is.
+        /// Path of the summary.
         summary: std::path::PathBuf,
-        /// Why it could not be written.
+        /// Why the checkpoint could not be written.
         reason: String,
     },
-    /// One rank of several was interrupted, so that there is no common sum.
+    /// One rank of several was interrupted, so the ranks hold different data and no map can be made.
     #[error(
-        "interrupted: ranks hold no common sums of the data so far, so there is no map of them; maps made before stay"
+        "interrupted: the ranks have not received the same data, so no map was made of them; earlier maps are kept"
     )]
     RankInterrupted,
-    /// Settings with which ranks cannot share the sums.
+    /// Settings with which ranks cannot share the normal equations.
     #[error("--mpi: found {found}, expected {expected}")]
     NotShareable {
-        /// What was set.
+        /// The setting.
         found: &'static str,
-        /// What can be shared.
+        /// The required setting.
         expected: &'static str,
     },
-    /// No observing window.
+    /// The mission has no observing window.
     #[error(
         "spacecraft.duration_s = {duration_s}: there is no observing window in it. The first begins when the Earth sets for \
          daughter 1, within an orbit of {orbit_s:.0} s, and spacecraft.thin and every_nth_window leave out more"
@@ -109,67 +109,66 @@ pub enum PipelineError {
     NoWindow {
         /// Length of the mission, s.
         duration_s: f64,
-        /// An orbit, s.
+        /// Orbital period, s.
         orbit_s: f64,
     },
     /// A downlink that cannot be read more than once.
-    #[error("{}: not a regular file; expected one with --groups, which reads the downlink once a group", path.display())]
+    #[error("{}: not a regular file; expected one with --groups, which reads the downlink once per group", path.display())]
     NotRepeatable {
-        /// What was named.
+        /// Path of the downlink.
         path: std::path::PathBuf,
     },
     /// A downlink that describes no instrument.
     #[error(
-        "{}: no description of the instrument; expected one, as every downlink of ours has near its beginning: is a file \
-         before it missing?",
+        "{}: no description of the instrument; expected one near the beginning of the downlink: is an earlier file missing?",
         path.display()
     )]
     NoInstrument {
         /// The first file.
         path: std::path::PathBuf,
     },
-    /// Files that changed while they were read once a group.
+    /// Files that changed between the readings for two groups.
     #[error(
-        "the files hold {now} visibilities, and held {before} when the group of channels before was mapped; expected \
-         files that stay: repeat the command once they are complete"
+        "the files hold {now} visibilities, but held {before} when the previous group of channels was mapped; expected \
+         unchanged files: repeat the command once they are complete"
     )]
     FilesChanged {
-        /// Visibilities at first.
+        /// Visibilities in the earlier reading.
         before: u64,
         /// Visibilities now.
         now: u64,
     },
-    /// What cannot be done group by group.
+    /// A run that cannot be done group by group.
     #[error("--groups: found {found}, expected {expected}")]
     NotInGroups {
-        /// What was set.
+        /// The setting.
         found: &'static str,
-        /// What can be.
+        /// The required setting.
         expected: &'static str,
     },
-    /// Visibilities that were put aside are gone.
-    #[error("{}: gone while the others were simulated; expected it to stay: repeat the command", path.display())]
+    /// A spool file was removed before it was merged.
+    #[error("{}: removed while other groups were simulated; expected it to stay: repeat the command", path.display())]
     SpoolGone {
-        /// The file.
+        /// Path of the spool file.
         path: std::path::PathBuf,
     },
-    /// Visibilities cannot be put aside, or read back.
+    /// A spool file cannot be written or read back.
     #[error(transparent)]
     Spool(#[from] crate::mother::SpoolError),
-    /// An estimate that is not a number.
+    /// An estimate of the cost that is not finite.
     #[error(
         "the estimated {what} is {value}: nothing bounds this run; expected settings of which the work can be estimated: look for periods, \
          motions and times near 0, and for very large numbers"
     )]
     Unbounded {
-        /// What was estimated.
+        /// The estimated quantity.
         what: String,
-        /// The estimate.
+        /// Value of the estimate.
         value: f64,
     },
-    /// More memory needed than there is.
+    /// The run needs more memory than is available.
     #[error(
-        "an estimated {} of memory are needed, and {} are available ({}): expected at most that; lower map.nside, \
+        "an estimated {} of memory are needed, but {} are available ({}): lower map.nside, \
          map.l_max or the number of channels, take some of them at a time (--groups auto), or state another limit, as in --memory-max {}GB",
         gigabytes(*needed_bytes), gigabytes(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
     )]
@@ -182,14 +181,13 @@ pub enum PipelineError {
     /// The thread pool cannot be started.
     #[error("cannot start {threads} worker threads: {reason}")]
     Threads {
-        /// Threads asked for.
+        /// Requested number of threads.
         threads: usize,
         /// The system's error.
         reason: String,
     },
 }
 
-/// Bytes as gigabytes.
 fn gigabytes(bytes: f64) -> String {
     match bytes {
         1e8.. => format!("{:.2} GB", bytes / 1e9),

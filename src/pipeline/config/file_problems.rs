@@ -14,7 +14,7 @@ use crate::sky::{AddedSky, SkyConfig};
 use crate::units::InvalidValue;
 
 impl Plan {
-    /// Reads every file that the configuration names; everything that is wrong with them, empty if they are good.
+    /// Reads every file that the configuration names, and returns all problems with them.
     #[must_use]
     #[doc(hidden)]
     pub fn file_problems(&self) -> Problems {
@@ -26,20 +26,24 @@ impl Plan {
         let priors = self.config.map.prior_files.iter();
         let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
         let priors = priors.map(|path| read_prior(path, &options));
-        // A file that stands for several channels is told once.
-        let mut told = BTreeSet::new();
+        // A file may serve several channels.
+        let mut reported = BTreeSet::new();
         for problem in skies.chain(priors).filter_map(Result::err) {
-            if told.insert(problem.to_string()) {
+            if reported.insert(problem.to_string()) {
                 found.push(|| problem);
             }
         }
         for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
-            let of_channels = files.iter().zip(&spacecraft.channels_hz);
-            let of_channels = of_channels.filter(|_| files.len() == spacecraft.channels_hz.len());
+            if files.len() != spacecraft.channels_hz.len() {
+                continue;
+            }
             // Unreadable files are reported elsewhere.
-            let is_other = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
-            let checked = of_channels.filter_map(|(path, &hz)| check_frequency(path, hz).err());
-            checked.filter(is_other).for_each(|problem| found.push(|| problem));
+            let is_keyword = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
+            let errors = files
+                .iter()
+                .zip(&spacecraft.channels_hz)
+                .filter_map(|(path, &frequency_hz)| check_frequency(path, frequency_hz).err());
+            errors.filter(is_keyword).for_each(|problem| found.push(|| problem));
         }
         for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
             found.push(|| problem);
@@ -59,27 +63,27 @@ impl Plan {
         found
     }
 
-    /// A greatest degree of the sky that some channel's map does not determine.
+    /// A `sky.l_max` above what the map of some channel determines.
     fn sky_l_max_problem(&self) -> Option<InvalidValue> {
-        let least = self.sky_nsides().into_iter().min()?;
-        SkyConfig::check_l_max(self.config.sky.l_max, least).err()
+        let nside_min = self.sky_nsides().into_iter().min()?;
+        SkyConfig::check_l_max(self.config.sky.l_max, nside_min).err()
     }
 
-    /// A line of description for every map and catalogue that the configuration names. Files that cannot be read are told
-    /// by [`Plan::file_problems`].
+    /// One line of description for every map and catalogue that the configuration names. Files that cannot be read are left out;
+    /// [`Plan::file_problems`] reports them.
     #[must_use]
     #[doc(hidden)]
-    pub fn files_understood(&self) -> Vec<String> {
+    pub fn file_descriptions(&self) -> Vec<String> {
         let Config { sky, spacecraft, map, calibrate, .. } = &self.config;
         let mut lines: Vec<String> = Vec::new();
-        let mut tell = |key: &str, line: Option<String>| {
+        let mut add_line = |key: &str, line: Option<String>| {
             let line = line.map(|line| format!("{key}: {line}"));
             lines.extend(line.filter(|line| !lines.contains(line)));
         };
         for (channel, &hz) in spacecraft.channels_hz.iter().enumerate() {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
-            let read = path.and_then(|path| MapOutline::read(&path, &sky_options(sky, hz)).ok());
-            tell("sky.file", read.map(|read| read.to_string()));
+            let outline = path.and_then(|path| MapOutline::read(&path, &sky_options(sky, hz)).ok());
+            add_line("sky.file", outline.map(|outline| outline.to_string()));
         }
         for (key, files, frame) in [
             ("map.prior_files", &map.prior_files, map.prior_frame),
@@ -87,17 +91,17 @@ impl Plan {
         ] {
             let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
             for path in files {
-                tell(key, MapOutline::read(path, &options).ok().map(|read| read.to_string()));
+                add_line(key, MapOutline::read(path, &options).ok().map(|outline| outline.to_string()));
             }
         }
         let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());
-        tell("sky.added.catalogue", catalogue);
+        add_line("sky.added.catalogue", catalogue);
         lines
     }
 }
 
 impl Config {
-    /// Every file that the configuration names: what a run reads, and must not replace.
+    /// Every file that the configuration names. A run reads these files and must not overwrite them.
     #[must_use]
     pub fn input_files(&self) -> Vec<PathBuf> {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());

@@ -5,20 +5,18 @@ use toml::{Table, Value};
 use super::sections::Config;
 use crate::units::{Key, Level};
 
-/// A key with its sections.
+/// A key with its full path.
 #[derive(Clone, Debug)]
 pub(super) struct FlatKey {
-    /// Full key.
     pub(super) path: String,
-    /// Its declaration.
     pub(super) key: &'static Key,
-    /// Its default.
+    /// Default value; `None` for a section or an optional key.
     pub(super) default: Option<Value>,
-    /// Conditions of its sections, and its own: all have to hold.
+    /// Conditions under which the key has an effect: those of its sections and its own. All have to hold.
     pub(super) only_with: Vec<String>,
 }
 
-/// All keys, and sections before theirs.
+/// All keys and sections; each section precedes its keys.
 pub(super) fn flat_keys() -> Vec<FlatKey> {
     let mut found = Vec::new();
     collect("", Config::KEYS, &[], &mut found);
@@ -28,8 +26,8 @@ pub(super) fn flat_keys() -> Vec<FlatKey> {
 fn collect(section: &str, keys: &'static [Key], only_with: &[String], found: &mut Vec<FlatKey>) {
     for key in keys {
         let path = joined(section, key.name);
-        let own = (!key.only_with.is_empty()).then(|| key.only_with.to_owned());
-        let only_with: Vec<String> = only_with.iter().cloned().chain(own).collect();
+        let condition = (!key.only_with.is_empty()).then(|| key.only_with.to_owned());
+        let only_with: Vec<String> = only_with.iter().cloned().chain(condition).collect();
         let is_section = key.level == Level::Section;
         let default = if is_section { None } else { (key.default)() };
         found.push(FlatKey { path: path.clone(), key, default, only_with: only_with.clone() });
@@ -41,11 +39,10 @@ fn joined(section: &str, key: &str) -> String {
     if section.is_empty() { key.to_owned() } else { format!("{section}.{key}") }
 }
 
-/// All keys as a table with their sections; without what serialisation leaves out, and with those that are absent by default.
+/// All keys as nested tables, including keys that are absent by default. Each key has the value `false`.
 pub(super) fn known_keys(keys: &'static [Key]) -> Table {
     let value = |key: &'static Key| match key.level {
         Level::Section => Value::Table(known_keys(key.keys)),
-        // No table, so that nothing is sought in it.
         _ => Value::Boolean(false),
     };
     keys.iter().map(|key| (key.name.to_owned(), value(key))).collect()
@@ -56,13 +53,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn at_most_sixty_keys_are_for_every_day() {
+    fn at_most_sixty_keys_are_everyday() {
         let everyday = flat_keys().iter().filter(|key| key.key.level == Level::Everyday).count();
         assert!((20..=60).contains(&everyday), "{everyday}");
     }
 
     #[test]
-    fn every_field_is_declared_with_the_default_that_it_has() {
+    fn every_field_is_declared_with_its_default() {
         fn compare(path: &str, all: &Table, keys: &[FlatKey]) {
             for (name, value) in all {
                 let path = joined(path, name);

@@ -1,27 +1,27 @@
-//! Memory that a run may take.
+//! Memory available to a run.
 
 use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Memory that a run may take.
+/// Limit of the memory that a run may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MemoryLimit {
     /// Bytes.
     pub bytes: u64,
-    /// What sets the limit.
+    /// Origin of the limit.
     pub source: MemorySource,
 }
 
-/// What limits memory.
+/// Origin of a memory limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum MemorySource {
-    /// Memory that the system has free or can free.
+    /// Memory that is free in the system or can be freed.
     System,
-    /// The limit of a control group, as containers and job schedulers set it.
+    /// The limit of a control group, as set by containers and job schedulers.
     ControlGroup,
-    /// The user.
+    /// A limit given by the user.
     User,
 }
 
@@ -36,20 +36,20 @@ impl fmt::Display for MemorySource {
 }
 
 impl MemoryLimit {
-    /// A limit that a user set.
+    /// A limit given by the user.
     #[must_use]
     pub fn of_user(bytes: u64) -> Self {
         Self { bytes, source: MemorySource::User }
     }
 
-    /// Memory available to this process; `None` where the system does not say.
+    /// Memory available to this process; `None` if the system does not report it.
     #[must_use]
     pub fn of_machine() -> Option<Self> {
-        Self::below(Path::new("/"))
+        Self::from_system_files(Path::new("/"))
     }
 
-    /// As [`Self::of_machine`], with the system's files below `root`.
-    fn below(root: &Path) -> Option<Self> {
+    /// Memory available according to the system's files below `root`.
+    fn from_system_files(root: &Path) -> Option<Self> {
         let system = available_bytes(&fs::read_to_string(root.join("proc/meminfo")).ok()?);
         let system = system.map(|bytes| Self { bytes, source: MemorySource::System });
         let groups = group_bytes(root).map(|bytes| Self { bytes, source: MemorySource::ControlGroup });
@@ -57,20 +57,20 @@ impl MemoryLimit {
     }
 }
 
-/// MemAvailable of `/proc/meminfo`, bytes.
 fn available_bytes(meminfo: &str) -> Option<u64> {
     let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
     kibibytes.checked_mul(1024)
 }
 
-/// The least memory that a control group of this process, or one above it, has left, bytes.
+/// Memory left in the tightest of this process's control groups and their ancestors, bytes.
 fn group_bytes(root: &Path) -> Option<u64> {
     let groups = fs::read_to_string(root.join("proc/self/cgroup")).ok()?;
     groups.lines().filter_map(|line| group_line_bytes(root, line)).min()
 }
 
-/// The group in one line of `/proc/self/cgroup`: `0::PATH` of version 2, or `ID:CONTROLLERS:PATH` of version 1.
+/// Memory left in the control group named by one line of `/proc/self/cgroup`: `0::PATH` of version 2, or `ID:CONTROLLERS:PATH` of
+/// version 1.
 fn group_line_bytes(root: &Path, line: &str) -> Option<u64> {
     let mut parts = line.splitn(3, ':').skip(1);
     let (controllers, path) = (parts.next()?, parts.next()?);
@@ -82,13 +82,13 @@ fn group_line_bytes(root: &Path, line: &str) -> Option<u64> {
         ),
         _ => return None,
     };
-    // Within a container the path may be that of the host, and the container's own group the mount itself.
-    let own: PathBuf = mount.join(path.trim_start_matches('/'));
-    let folders = own.ancestors().take_while(|folder| folder.starts_with(&mount));
+    // In a container the path may be that of the host, while the mount itself is the container's group.
+    let innermost: PathBuf = mount.join(path.trim_start_matches('/'));
+    let folders = innermost.ancestors().take_while(|folder| folder.starts_with(&mount));
     folders.filter_map(|folder| folder_bytes(folder, files)).min()
 }
 
-/// Memory that one group has left: file pages that nobody uses can be freed, so they do not count.
+/// Memory left in one control group, bytes. Inactive file pages can be freed, so they do not count as used.
 fn folder_bytes(folder: &Path, [limit, usage, unused]: [&str; 3]) -> Option<u64> {
     let number = |name: &str| fs::read_to_string(folder.join(name)).ok()?.trim().parse::<u64>().ok();
     let stat = fs::read_to_string(folder.join("memory.stat")).unwrap_or_default();
@@ -101,7 +101,6 @@ fn folder_bytes(folder: &Path, [limit, usage, unused]: [&str; 3]) -> Option<u64>
 mod tests {
     use super::*;
 
-    /// A folder with these files.
     fn system(files: &[(&str, &str)]) -> tempfile::TempDir {
         let root = tempfile::tempdir().unwrap();
         for (name, text) in files {
@@ -116,7 +115,7 @@ mod tests {
         ("proc/meminfo", "MemTotal:       24000000 kB\nMemAvailable:   20000000 kB\nBuffers:  1 kB\n");
 
     fn limit(files: &[(&str, &str)]) -> Option<(u64, MemorySource)> {
-        let limit = MemoryLimit::below(system(files).path());
+        let limit = MemoryLimit::from_system_files(system(files).path());
         limit.map(|limit| (limit.bytes, limit.source))
     }
 
@@ -160,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn this_machine_says_what_it_has() {
+    fn this_machine_has_a_limit() {
         if cfg!(target_os = "linux") {
             assert!(MemoryLimit::of_machine().is_some_and(|limit| limit.bytes > 0));
         }

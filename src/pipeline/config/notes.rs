@@ -1,4 +1,4 @@
-//! Notes on valid configurations that are probably not meant.
+//! Notes on configurations that are valid but probably unintended.
 
 use std::f64::consts::TAU;
 use std::path::PathBuf;
@@ -12,18 +12,18 @@ use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
 
-/// Angle, deg, by which baselines that have been corrected may lie off the common circle.
+/// Angle, deg, by which baselines between corrected positions may lie off the common circular orbit.
 const CORRECTED_DEG: f64 = 2.0;
 
-/// Part of a period that thinning may leave without a window, beyond what the mission leaves. A map from 17 windows with gaps of 0.3 had
-/// rho_2 = 0.74 and a mean 12 % too low; one from 122 windows with gaps of 0.1 has rho_2 = 1.00 and its mean to 0.1 %.
+/// Fraction of a period that thinning may leave without a window, beyond the gaps of the full mission. A map from 17 windows with gaps of
+/// 0.3 had rho_2 = 0.74 and a mean 12 % too low; one from 122 windows with gaps of 0.1 had rho_2 = 1.00 and a mean within 0.1 %.
 const GAP_MAX: f64 = 0.15;
 
-/// Relative difference of the orbital period from Kepler's that is accepted; the paper's is 2e-4.
-const PERIOD_PART: f64 = 0.01;
+/// Accepted relative difference of the orbital period from Kepler's third law; the paper's is 2e-4.
+const PERIOD_TOLERANCE: f64 = 0.01;
 
 impl Config {
-    /// Notes on values that are valid and probably not meant.
+    /// Notes on values that are valid but probably unintended.
     #[must_use]
     #[doc(hidden)]
     pub fn notes(&self) -> Vec<String> {
@@ -31,20 +31,20 @@ impl Config {
         notes.into_iter().flatten().collect()
     }
 
-    /// Positions that may be further off than they are searched while the data arrive.
+    /// A note if position errors may exceed the range that is searched while the data arrive.
     fn reach_note(&self) -> Option<String> {
         let solves = self.calibration.hook == CalibrationHook::Solve;
         solves.then(|| self.calibrate.reach_note(&self.spacecraft.channels_hz)).flatten()
     }
 
-    /// Positions that are corrected, and limits that refuse what is corrected.
+    /// A note if positions are corrected, but the limits of the harmonic engine refuse the corrected baselines.
     #[must_use]
     #[doc(hidden)]
     pub fn positions_note(&self) -> Option<String> {
         let (map, calibration) = (&self.map, &self.calibration);
         let limits = &map.limits;
-        let narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
-        if map.engine != EngineKind::Harmonic || map.refine.is_on() || !narrow {
+        let are_narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
+        if map.engine != EngineKind::Harmonic || map.refine.is_on() || !are_narrow {
             return None;
         }
         let has_positions =
@@ -64,13 +64,13 @@ impl Config {
         })
     }
 
-    /// An orbital period that does not fit the altitude.
+    /// A note if the orbital period does not fit the altitude.
     fn period_note(&self) -> Option<String> {
         let array = &self.array;
         let radius_m = array.moon_radius_m + array.altitude_m;
         let kepler_s = TAU * (radius_m.powi(3) / MOON_GM_M3_S2).sqrt();
-        let differs = (array.orbital_period_s / kepler_s - 1.0).abs() > PERIOD_PART;
-        // Another body than the Moon has another mass.
+        let differs = (array.orbital_period_s / kepler_s - 1.0).abs() > PERIOD_TOLERANCE;
+        // Kepler's law is checked for the mass of the Moon only.
         let is_formation = !array.has_own_orbits();
         (differs && is_formation && array.moon_radius_m == MOON_RADIUS_M).then(|| {
             format!(
@@ -82,11 +82,11 @@ impl Config {
         })
     }
 
-    /// Coarse samples without a correction of their correlations.
+    /// A note if samples are coarsely quantised and the correlations are not corrected.
     fn quantiser_note(&self) -> Option<String> {
         let bits = self.daughters.bits;
-        let coarse = self.spacecraft.fidelity == Fidelity::Samples && VanVleck::new(bits).is_ok();
-        (coarse && self.calibration.quantiser_bits == 0).then(|| {
+        let is_coarse = self.spacecraft.fidelity == Fidelity::Samples && VanVleck::new(bits).is_ok();
+        (is_coarse && self.calibration.quantiser_bits == 0).then(|| {
             format!(
                 "daughters.bits = {bits}: correlations of such samples are too small; calibration.quantiser_bits = {bits} \
                  corrects them"
@@ -96,7 +96,7 @@ impl Config {
 }
 
 impl Plan {
-    /// Periods that `spacecraft.every_nth_window` does not sample evenly.
+    /// Notes on periods that `spacecraft.every_nth_window` does not sample evenly.
     #[must_use]
     #[doc(hidden)]
     pub fn thinning_notes(&self) -> Vec<String> {
@@ -139,7 +139,7 @@ mod tests {
         let mut config = Config::default();
         assert_eq!(config.notes(), Vec::<String>::new());
         config.array.altitude_m = 50e3;
-        // Two pi times the root of 1787.1 km cubed over 4902.8 km^3/s^2.
+        // 2 pi sqrt((1787.1 km)^3 / (4902.8 km^3/s^2)).
         assert!(
             config.notes()[0].contains("an orbit 50 km above the Moon takes 6779"),
             "{:?}",
@@ -159,12 +159,12 @@ mod tests {
         let mut config = Config::default();
         config.calibration.hook = CalibrationHook::Solve;
         config.spacecraft.channels_hz = vec![30e6, 10e6];
-        // Fifteen radians are 15 / (2 pi) of 29.979 m: 71.57 m, three times 23.86 m.
+        // 15 rad at a wavelength of 29.979 m: 15 / (2 pi) * 29.979 m = 71.57 m = 3 * 23.86 m.
         config.calibrate.position_sigma_m = 23.8;
         assert_eq!(config.reach_note(), None);
         config.calibrate.position_sigma_m = 30.0;
         let note = config.reach_note().unwrap();
-        // 10 MHz times 23.86 / 30.
+        // 10 MHz * 23.86 / 30 = 7.952 MHz.
         for part in ["71.6 m at 10.000 MHz", "up to 90.0 m", "7.952 MHz or below", "known to 23.9 m"] {
             assert!(note.contains(part), "{part}: {note}");
         }
@@ -208,7 +208,7 @@ mod tests {
             (config.spacecraft.every_nth_window, config.spacecraft.thin) = (every_nth, thin);
             Plan::new(config).unwrap().thinning_notes().join("\n")
         };
-        // A month has 286.2 orbits: 300 of them are nearly one, 143 half of one, and 146 the 14 days of a breath.
+        // A month has 286.2 orbits: 300 orbits are nearly a month, 143 half a month, and 146 the 14 days of breathing.
         for (every_nth, period) in [
             (300, "month of 27.3 days"),
             (143, "month of 27.3 days"),

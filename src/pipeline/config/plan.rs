@@ -1,4 +1,4 @@
-//! A checked pipeline and what follows from its configuration.
+//! A checked configuration, with the array, schedules and observing windows that follow from it.
 
 use std::sync::Arc;
 
@@ -11,23 +11,23 @@ use crate::mother::{Fidelity, Observer, Schedule};
 use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
-/// A configuration that has been checked, with what follows from it.
+/// A checked configuration, with the array, schedules and observing windows that follow from it.
 #[derive(Clone, Debug)]
 pub struct Plan {
     /// The configuration.
     pub config: Config,
     /// The array.
     pub array: Arc<Array>,
-    /// The description that the spacecraft sends.
+    /// The instrument description in the downlink.
     pub instrument: Instrument,
-    /// One schedule a channel.
+    /// Integration schedule of each channel.
     pub schedules: Vec<Schedule>,
-    /// The windows in which it observes.
+    /// Observing windows, after thinning.
     pub windows: Vec<ObservingWindow>,
 }
 
 impl Plan {
-    /// The plan of a configuration that [`crate::pipeline::ConfigSource::load`] has checked.
+    /// Makes the plan of a configuration, which [`crate::pipeline::ConfigSource::load`] has to have checked.
     ///
     /// # Errors
     /// An invalid array, or one that never observes.
@@ -64,7 +64,7 @@ impl Plan {
         Ok(Self { config, array, instrument, schedules, windows })
     }
 
-    /// The channel for which a sky is read.
+    /// Properties of a channel that decide how its sky map is read.
     #[must_use]
     pub(in crate::pipeline) fn sky_channel(&self, channel: usize) -> SkyChannel {
         let Config { sky, spacecraft, .. } = &self.config;
@@ -76,7 +76,7 @@ impl Plan {
         }
     }
 
-    /// Rate that the daughters' samples need on their links, bit/s; `None` without samples.
+    /// Data rate of the samples of all daughters on their links, bit/s; `None` if samples are not simulated.
     #[must_use]
     #[doc(hidden)]
     pub fn samples_bits_per_s(&self) -> Option<f64> {
@@ -86,8 +86,7 @@ impl Plan {
             .then(|| daughters.rate_bits_per_s(count, channels, spacecraft.channel_width_hz))
     }
 
-    /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; `None` without
-    /// samples or limit.
+    /// Data rate of one daughter's samples, and the limit of its link, bit/s; `None` without samples or without a limit.
     #[must_use]
     #[doc(hidden)]
     pub fn link_bits_per_s(&self) -> Option<[f64; 2]> {
@@ -96,7 +95,7 @@ impl Plan {
         (limit > 0.0).then_some([needed, limit])
     }
 
-    /// Errors of the instrument and of what packets say of positions and times; `None` if there are none.
+    /// Errors of the instrument and of the positions and times in packets; `None` if there are none.
     #[must_use]
     #[doc(hidden)]
     pub fn instrument_errors(&self) -> Option<Arc<InstrumentErrors>> {
@@ -105,7 +104,7 @@ impl Plan {
         InstrumentErrors::new(instrument, navigation, *seed, &self.array, &channels).map(Arc::new)
     }
 
-    /// Antennas of the daughters that are not ideal; `None` if all are.
+    /// Errors of the daughters' antennas; `None` if all are ideal.
     #[must_use]
     #[doc(hidden)]
     pub fn antenna_errors(&self) -> Option<Arc<AntennaErrors>> {
@@ -113,14 +112,14 @@ impl Plan {
         AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, elements)
     }
 
-    /// The true errors in every pass as a table (CSV); `None` if there are none.
+    /// The true instrument errors of every pass as a table (CSV); `None` if there are none.
     #[must_use]
     #[doc(hidden)]
     pub fn instrument_truth(&self) -> Option<String> {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
     }
 
-    /// Rate of the ninth daughter's spectra while the array observes, bit/s; `None` without it.
+    /// Data rate of the ninth daughter's spectra while the array observes, bit/s; `None` without that daughter.
     #[must_use]
     #[doc(hidden)]
     pub fn ninth_bits_per_s(&self) -> Option<f64> {
@@ -128,17 +127,17 @@ impl Plan {
         ninth.on.then(|| ninth.bits_per_s())
     }
 
-    /// Windows by which progress is measured; 0 for samples, whose stages do not take whole windows.
+    /// Number of windows for progress reports; 0 if samples are simulated, as their stages do not process whole windows.
     #[must_use]
     #[doc(hidden)]
-    pub fn windows_watched(&self) -> u64 {
+    pub fn progress_windows(&self) -> u64 {
         match self.config.spacecraft.fidelity {
             Fidelity::Visibilities => self.windows.len() as u64,
             Fidelity::Samples => 0,
         }
     }
 
-    /// Estimated visibilities of each channel, sent down and within the map's limit.
+    /// Estimated numbers of visibilities of each channel, sent and mapped.
     #[must_use]
     pub fn visibilities(&self) -> Vec<Expected> {
         let map = &self.config.map;
@@ -163,11 +162,11 @@ impl Plan {
     }
 }
 
-/// Visibilities expected in one channel.
+/// Estimated numbers of visibilities in one channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Expected {
-    /// Sent down.
+    /// Visibilities in the downlink.
     pub sent: f64,
-    /// Of these, within the map's longest baseline.
+    /// Visibilities within the map's longest baseline.
     pub mapped: f64,
 }

@@ -1,17 +1,17 @@
-//! What is wrong with a pipeline, from any section.
+//! Collection of the problems of a pipeline, from all sections.
 
 use std::error::Error;
 use std::fmt;
 
 use crate::units::InvalidValue;
 
-/// Any problem.
+/// A problem of any type.
 pub type Problem = Box<dyn Error + Send + Sync>;
 
-/// Most problems that are kept and shown; the others are counted.
+/// Maximum number of problems that are kept and shown; the others are only counted.
 const KEPT_MAX: usize = 20;
 
-/// Everything that is wrong with a pipeline: the first problems and the number of all.
+/// Problems of a pipeline: the first ones, and the number of all.
 #[derive(Debug, Default)]
 pub struct Problems {
     kept: Vec<Problem>,
@@ -19,7 +19,7 @@ pub struct Problems {
 }
 
 impl Problems {
-    /// Adds a problem, which is made only if there is room for it.
+    /// Adds a problem; `problem` is called only if it is kept.
     pub fn push<P: Into<Problem>>(&mut self, problem: impl FnOnce() -> P) {
         self.count += 1;
         if self.kept.len() < KEPT_MAX {
@@ -27,19 +27,19 @@ impl Problems {
         }
     }
 
-    /// Adds others.
+    /// Adds the problems of another collection.
     pub fn append(&mut self, others: Self) {
         self.count += others.count - others.kept.len();
         others.kept.into_iter().for_each(|problem| self.push(|| problem));
     }
 
-    /// Keeps problems whose text does not match `is_other`; those that do are not counted.
-    pub(in crate::pipeline) fn without(self, is_other: impl Fn(&str) -> bool) -> Self {
-        let mut left = Self { kept: Vec::new(), count: self.count - self.kept.len() };
-        for problem in self.kept.into_iter().filter(|problem| !is_other(&problem.to_string())) {
-            left.push(|| problem);
+    /// Removes the kept problems whose text matches `is_excluded`.
+    pub(in crate::pipeline) fn without(self, is_excluded: impl Fn(&str) -> bool) -> Self {
+        let mut remaining = Self { kept: Vec::new(), count: self.count - self.kept.len() };
+        for problem in self.kept.into_iter().filter(|problem| !is_excluded(&problem.to_string())) {
+            remaining.push(|| problem);
         }
-        left
+        remaining
     }
 
     /// Number of all problems, kept or only counted.
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_are_shown_and_the_others_are_counted() {
+    fn the_first_problems_are_shown_and_the_others_are_counted() {
         let mut problems = Problems::default();
         let mut made = 0;
         for index in 0..1000 {

@@ -1,4 +1,4 @@
-//! From TOML to a configuration: whatever can be read is, and everything that cannot is told.
+//! Conversion of TOML to a configuration. It reads as much as possible and reports all keys and values that it cannot read.
 
 use std::collections::HashMap;
 
@@ -11,7 +11,7 @@ use super::problems::{Problem, Problems};
 use super::sections::Config;
 use crate::units::{Dimension, shortened};
 
-/// Old names of keys, and the new ones; those of values that change their unit say so.
+/// Old and new names of keys. The new name includes the unit if it changed.
 const RENAMED_KEYS: [(&str, &str); 18] = [
     ("map.regularisation_exponent", "map.regulariser, as { degree = 2.0 }"),
     ("map.regularisation_files", "map.regulariser, as { file = [\"cl.csv\"] }"),
@@ -36,11 +36,11 @@ const RENAMED_KEYS: [(&str, &str); 18] = [
     ("daughters.disturbances", "daughters.tones, and [instrument] for gains, phases and clocks"),
 ];
 
-/// Old names of values of keys, and the new ones.
+/// Keys with old and new names of their values.
 const RENAMED_VALUES: [(&str, &str, &str); 2] =
     [("map.matrix", "held", "stored"), ("map.matrix", "remade", "free")];
 
-/// Most characters of a key, an override or the parser's message that are shown.
+/// Maximum number of characters of a key, an override or the parser's message that are shown.
 pub(in crate::pipeline) const SHOWN_MAX: usize = 160;
 
 /// A key or value that the configuration cannot hold.
@@ -54,23 +54,23 @@ pub enum ReadProblem {
         line: usize,
         /// Column, from 1.
         column: usize,
-        /// What was expected.
+        /// The parser's message.
         message: String,
     },
     /// A key or section that does not exist.
     #[error("{place}{key}: no such key; {known}")]
     Unknown {
-        /// Where it stands.
+        /// Line or override in which the key is set.
         place: String,
         /// Full key.
         key: String,
-        /// The keys that there are.
+        /// Similar and existing keys.
         known: String,
     },
     /// A value of the wrong type.
     #[error("{place}{key}: {message}")]
     Type {
-        /// Where it stands.
+        /// Line or override in which the key is set.
         place: String,
         /// Full key.
         key: String,
@@ -79,68 +79,67 @@ pub enum ReadProblem {
     },
 }
 
-/// A configuration as far as it could be read.
-pub(in crate::pipeline) struct Reading {
+/// A configuration in which unreadable values are replaced by defaults.
+pub(in crate::pipeline) struct PartialConfig {
     /// The values that could be read; defaults for the others.
     pub(in crate::pipeline) config: Config,
-    /// The keys and values that could not.
     pub(in crate::pipeline) problems: Problems,
-    /// Keys whose values could not be read.
     unread: Vec<String>,
 }
 
-impl Reading {
-    /// Reads `table`; `lines` are those of its keys, where they are known.
-    pub(in crate::pipeline) fn new(table: Table, lines: &Lines<'_>) -> Self {
+impl PartialConfig {
+    /// Reads `table`; `locator` locates its keys for messages.
+    pub(in crate::pipeline) fn new(table: Table, locator: &KeyLocator<'_>) -> Self {
         if let Ok(config) = table.clone().try_into() {
             return Self { config, problems: Problems::default(), unread: Vec::new() };
         }
-        let mut walk = SectionReader { lines, problems: Problems::default(), unread: Vec::new() };
-        let good = walk.section(&[], table, &known_keys(Config::KEYS));
-        let SectionReader { mut problems, unread, .. } = walk;
-        let config = good.try_into().unwrap_or_else(|error: toml::de::Error| {
-            // Good keys that are bad together: there are none today.
+        let mut reader = SectionReader { locator, problems: Problems::default(), unread: Vec::new() };
+        let valid = reader.section(&[], table, &known_keys(Config::KEYS));
+        let SectionReader { mut problems, unread, .. } = reader;
+        let config = valid.try_into().unwrap_or_else(|error: toml::de::Error| {
+            // Keys that are valid one by one but not together; there are none today.
             problems.push(|| error);
             Config::default()
         });
         Self { config, problems, unread }
     }
 
-    /// All problems: `others` first, then those of reading, then those `of_values` that do not follow from them.
-    pub(in crate::pipeline) fn tell<E: Into<Problem>>(
+    /// Collects all problems: `override_problems`, problems of reading, and those of `value_problems` that are not due to a value
+    /// that could not be read.
+    pub(in crate::pipeline) fn all_problems<E: Into<Problem>>(
         &mut self,
-        of_values: Problems,
-        others: Vec<E>,
+        value_problems: Problems,
+        override_problems: Vec<E>,
     ) -> Problems {
-        let mut told = Problems::default();
-        others.into_iter().for_each(|other| told.push(|| other));
-        told.append(std::mem::take(&mut self.problems));
-        told.append(of_values.without(|problem| self.may_follow(problem)));
-        told
+        let mut found = Problems::default();
+        override_problems.into_iter().for_each(|problem| found.push(|| problem));
+        found.append(std::mem::take(&mut self.problems));
+        found.append(value_problems.without(|problem| self.may_be_secondary(problem)));
+        found
     }
 
-    /// Whether a problem of the values that were read may be only that another value could not be read: a default was
-    /// taken in its place.
-    fn may_follow(&self, problem: &str) -> bool {
-        let counts = |key: &str| match key {
+    /// Whether a problem may be due to the default that replaces a value that could not be read.
+    fn may_be_secondary(&self, problem: &str) -> bool {
+        let decides_a_count = |key: &str| match key {
             "spacecraft.channels_hz" => problem.contains("channels"),
             "array.satellites" => problem.contains("a daughter"),
             _ => false,
         };
-        self.unread.iter().any(|key| problem.contains(key.as_str()) || counts(key))
+        self.unread.iter().any(|key| problem.contains(key.as_str()) || decides_a_count(key))
     }
 }
 
+/// Reads sections key by key, and collects the problems.
 struct SectionReader<'a> {
-    lines: &'a Lines<'a>,
+    locator: &'a KeyLocator<'a>,
     problems: Problems,
     unread: Vec<String>,
 }
 
 impl SectionReader<'_> {
-    /// The part of a section at `path` that can be read.
+    /// The keys of the section at `path` whose values can be read; `known` holds the keys that exist.
     fn section(&mut self, path: &[&str], table: Table, known: &Table) -> Table {
-        let mut good = Table::new();
+        let mut valid = Table::new();
         for (key, value) in table {
             let path = [path, &[key.as_str()]].concat();
             let value = match (known.get(&key), value) {
@@ -149,7 +148,7 @@ impl SectionReader<'_> {
                 }
                 (Some(Value::Table(_)), value) => {
                     let found = value.type_str();
-                    self.refuse(&path, || format!("found one value ({found}), expected a section"));
+                    self.report_type(&path, || format!("found one value ({found}), expected a section"));
                     None
                 }
                 (None, Value::Table(table)) if is_renamed_below(&path) => {
@@ -157,83 +156,81 @@ impl SectionReader<'_> {
                     None
                 }
                 (None, _) => {
-                    let lines = self.lines;
+                    let locator = self.locator;
                     self.problems.push(|| ReadProblem::Unknown {
-                        place: lines.place(&path),
+                        place: locator.place(&path),
                         key: shortened(&path.join("."), SHOWN_MAX),
-                        known: keys_of(&path, known),
+                        known: known_keys_message(&path, known),
                     });
                     None
                 }
-                (_, value) => match alone(&path, value.clone()).try_into::<Config>() {
+                (_, value) => match nested_table(&path, value.clone()).try_into::<Config>() {
                     Ok(_) => Some(value),
                     Err(error) => {
-                        let units = units_of(&key, &value);
+                        let units = expected_units(&key, &value);
                         let renamed = renamed_value(&path, &value);
-                        self.refuse(&path, || {
-                            renamed.unwrap_or_else(|| with_units(&plain(error.message()), units))
+                        self.report_type(&path, || {
+                            renamed.unwrap_or_else(|| with_units(&plain_type_names(error.message()), units))
                         });
                         None
                     }
                 },
             };
             if let Some(value) = value {
-                good.insert(key, value);
+                valid.insert(key, value);
             }
         }
-        good
+        valid
     }
 
-    fn refuse(&mut self, path: &[&str], message: impl FnOnce() -> String) {
-        let (lines, key) = (self.lines, path.join("."));
+    fn report_type(&mut self, path: &[&str], message: impl FnOnce() -> String) {
+        let (locator, key) = (self.locator, path.join("."));
         self.unread.push(key.clone());
-        self.problems.push(|| ReadProblem::Type { place: lines.place(path), key, message: message() });
+        self.problems.push(|| ReadProblem::Type { place: locator.place(path), key, message: message() });
     }
 }
 
-/// A table with one value.
-fn alone(path: &[&str], value: Value) -> Table {
+/// Nested tables that contain only `value`, at `path`.
+fn nested_table(path: &[&str], value: Value) -> Table {
     let mut path = path.iter().rev();
     let last = path.next().map(|key| (*key).to_owned());
     let innermost: Table = last.map(|key| (key, value)).into_iter().collect();
     path.fold(innermost, |table, key| Table::from_iter([((*key).to_owned(), Value::Table(table))]))
 }
 
-/// Whether keys of the section at `path` have other names now.
 fn is_renamed_below(path: &[&str]) -> bool {
-    let inside = format!("{}.", path.join("."));
-    RENAMED_KEYS.iter().any(|(before, _)| before.starts_with(&inside))
+    let prefix = format!("{}.", path.join("."));
+    RENAMED_KEYS.iter().any(|(before, _)| before.starts_with(&prefix))
 }
 
-/// What to write in place of an old name of a value.
+/// Message for an old name of a value; `None` if it is not one.
 fn renamed_value(path: &[&str], value: &Value) -> Option<String> {
     let (path, value) = (path.join("."), value.as_str()?);
     let (_, before, now) = RENAMED_VALUES.iter().find(|(key, before, _)| *key == path && *before == value)?;
     Some(format!("\"{before}\" was renamed to \"{now}\""))
 }
 
-/// The keys of the section that lacks `path`, for a message; first the one that is spelled most like it.
-fn keys_of(path: &[&str], known: &Table) -> String {
+/// Message for the unknown key at `path`: its new name, or the similar and the existing keys of its section.
+fn known_keys_message(path: &[&str], known: &Table) -> String {
+    let full_key = path.join(".");
     let Some((wrong, path)) = path.split_last() else { return String::new() };
-    let whole = [path, &[*wrong]].concat().join(".");
-    if let Some((_, now)) = RENAMED_KEYS.iter().find(|(before, _)| *before == whole) {
+    if let Some((_, now)) = RENAMED_KEYS.iter().find(|(before, _)| *before == full_key) {
         return format!("it was renamed to {now}");
     }
     let section = path.join(".");
     let keys: Vec<&str> = known.keys().map(String::as_str).collect();
     let section = if path.is_empty() { "a pipeline".to_owned() } else { format!("[{section}]") };
     let has = format!("{section} has {}", keys.join(", "));
-    // One slip in three letters.
-    let nearest = keys.iter().map(|key| (slips(wrong, key), key)).min();
-    match nearest.filter(|(slips, key)| 3 * slips <= key.len()) {
+    // At most one wrong letter in three.
+    let nearest = keys.iter().map(|key| (edit_distance(wrong, key), key)).min();
+    match nearest.filter(|(distance, key)| 3 * distance <= key.len()) {
         Some((_, key)) => format!("did you mean {key}? {has}"),
         None => has,
     }
 }
 
-/// Letters to be changed, added or left out to make one word of another (Levenshtein's distance).
-fn slips(from: &str, to: &str) -> usize {
-    // Nobody means a key by a word of hundreds of letters.
+fn edit_distance(from: &str, to: &str) -> usize {
+    // No key is hundreds of letters long.
     let from = from.bytes().take(2 * SHOWN_MAX);
     let mut row: Vec<usize> = (0..=to.len()).collect();
     for (k, a) in from.enumerate() {
@@ -247,8 +244,8 @@ fn slips(from: &str, to: &str) -> usize {
     row[to.len()]
 }
 
-/// A message of the parser without the language's names of types.
-fn plain(message: &str) -> String {
+/// Replaces Rust's type names in a message of the parser.
+fn plain_type_names(message: &str) -> String {
     ["usize", "u64", "u32", "u16", "u8"]
         .map(|name| (name, "a whole number, not negative"))
         .into_iter()
@@ -258,13 +255,13 @@ fn plain(message: &str) -> String {
         })
 }
 
-/// The units that the key of a text, or of a list with texts, takes, by its name.
-fn units_of(key: &str, value: &Value) -> Option<&'static str> {
+/// The units that a key accepts, if its value is a text or a list with texts.
+fn expected_units(key: &str, value: &Value) -> Option<&'static str> {
     let is_text = value.is_str() || value.as_array().is_some_and(|list| list.iter().any(Value::is_str));
     Dimension::from_key(key).filter(|_| is_text).map(Dimension::expected)
 }
 
-/// A message of the parser, with the units that the key takes.
+/// Adds the units that the key accepts to a message of the parser.
 fn with_units(message: &str, units: Option<&str>) -> String {
     let Some(units) = units else { return shortened(message, SHOWN_MAX) };
     match message.strip_suffix("a number") {
@@ -273,34 +270,33 @@ fn with_units(message: &str, units: Option<&str>) -> String {
     }
 }
 
-/// Where keys stand.
+/// Locates keys for messages: by line of the file or by override.
 #[derive(Default)]
-pub(in crate::pipeline) struct Lines<'a> {
+pub(in crate::pipeline) struct KeyLocator<'a> {
     text: &'a str,
     table: Option<Spanned<DeTable<'a>>>,
-    /// By key of an override, its text.
     overrides: HashMap<String, String>,
 }
 
-impl<'a> Lines<'a> {
-    /// The lines of a text that has been parsed.
-    pub(in crate::pipeline) fn of(text: &'a str) -> Self {
+impl<'a> KeyLocator<'a> {
+    pub(in crate::pipeline) fn new(text: &'a str) -> Self {
         Self { text, table: DeTable::parse(text).ok(), overrides: HashMap::new() }
     }
 
-    /// Notes that a key was set by an override.
-    pub(in crate::pipeline) fn set(&mut self, key: &str, text: &str) {
+    pub(in crate::pipeline) fn add_override(&mut self, key: &str, text: &str) {
         self.overrides.insert(key.to_owned(), shortened(text, SHOWN_MAX));
     }
 
+    /// Prefix of a message: the override or the line that sets the key.
     fn place(&self, path: &[&str]) -> String {
-        // An override stands for the sections that it makes, too.
+        // An override also creates the sections of its key.
         let key = path.join(".");
-        let below =
+        let is_below =
             |set: &str| set.strip_prefix(&key).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
         let line = self.line(path);
-        let of_override = self.overrides.iter().filter(|(set, _)| below(set)).map(|(_, text)| text).min();
-        match (self.overrides.get(&key).or(of_override.filter(|_| line.is_none())), line) {
+        let override_below =
+            self.overrides.iter().filter(|(set, _)| is_below(set)).map(|(_, text)| text).min();
+        match (self.overrides.get(&key).or(override_below.filter(|_| line.is_none())), line) {
             (Some(text), _) => format!("--set {text}: "),
             (None, Some(line)) => format!("line {line}: "),
             (None, None) => String::new(),
@@ -310,26 +306,24 @@ impl<'a> Lines<'a> {
     fn line(&self, path: &[&str]) -> Option<usize> {
         let mut table = self.table.as_ref()?.get_ref();
         let (last, sections) = path.split_last()?;
-        let find = |table: &'_ DeTable<'a>, key: &str| {
-            table.keys().find(|found| found.get_ref() == key).map(Spanned::span)
-        };
         for section in sections {
             let (_, value) = table.iter().find(|(found, _)| found.get_ref() == section)?;
             let DeValue::Table(inner) = value.get_ref() else { return None };
             table = inner;
         }
-        Some(position(self.text, find(table, last)?.start).0)
+        let key = table.keys().find(|found| found.get_ref() == last)?;
+        Some(position(self.text, key.span().start).0)
     }
 }
 
-/// Line and column of a byte, from 1.
+/// Line and column of a byte, counted from 1.
 fn position(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
     (before.matches('\n').count() + 1, before[line_start..].chars().count() + 1)
 }
 
-/// The TOML of a text, or every place where it is not TOML.
+/// Parses a TOML text; the error lists all syntax errors.
 pub(in crate::pipeline) fn parse_table(text: &str) -> Result<Table, Problems> {
     toml::from_str(text).map_err(|error| {
         let mut problems = Problems::default();

@@ -1,4 +1,4 @@
-//! Every key of a pipeline file with its default and what it means, written from the declarations.
+//! The reference of all keys with defaults and meanings, generated from their declarations.
 
 use std::fmt::Write;
 
@@ -8,36 +8,35 @@ use toml::Value;
 use super::key_list::{FlatKey, flat_keys};
 use crate::units::{Key, Level};
 
-/// Longest line of the reference, characters.
+/// Maximum length of a line of the reference, characters.
 const WIDTH: usize = 110;
 
-/// A key, or a section.
+/// Description of a key or a section.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct KeyDescription {
     /// Name, with its sections: `map.epsilon`.
     pub key: String,
-    /// Default, as TOML; `None` for a section, and for a key that is not there by default.
+    /// Default, as TOML; `None` for a section, and for a key that is absent by default.
     pub default: Option<String>,
-    /// What it means.
+    /// Meaning.
     pub about: String,
-    /// When it has an effect, if not always: all of these.
+    /// Conditions under which it has an effect; all have to hold.
     pub only_with: Vec<String>,
-    /// Whether it is one of the keys for every day; a section is if one of its keys is.
+    /// Whether it is an everyday key, or a section with one.
     pub everyday: bool,
 }
 
 /// All keys and sections, in the order of the data path.
 #[must_use]
 pub fn key_descriptions() -> Vec<KeyDescription> {
-    let everyday = |key: &Key| is_everyday(key);
-    let described = |FlatKey { path, key, default, only_with }: FlatKey| KeyDescription {
+    let describe = |FlatKey { path, key, default, only_with }: FlatKey| KeyDescription {
         key: path,
-        default: default.as_ref().map(toml_of),
-        about: text_of(key),
-        everyday: everyday(key),
+        default: default.as_ref().map(value_text),
+        about: about_text(key),
+        everyday: is_everyday(key),
         only_with,
     };
-    flat_keys().into_iter().map(described).collect()
+    flat_keys().into_iter().map(describe).collect()
 }
 
 fn is_everyday(key: &Key) -> bool {
@@ -48,13 +47,13 @@ fn is_everyday(key: &Key) -> bool {
     }
 }
 
-fn text_of(key: &Key) -> String {
+fn about_text(key: &Key) -> String {
     let lines: Vec<&str> = key.about.iter().map(|line| line.trim()).collect();
     lines.join(" ")
 }
 
-/// A value as a file has it, with exponents where they are shorter.
-fn toml_of(value: &Value) -> String {
+/// A value as TOML, with an exponent if that is shorter.
+fn value_text(value: &Value) -> String {
     match value {
         Value::Float(number) if *number != 0.0 && !(1e-3..1e5).contains(&number.abs()) => {
             format!("{number:e}")
@@ -66,15 +65,15 @@ fn toml_of(value: &Value) -> String {
 /// Which keys a reference shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shown {
-    /// Those for every day.
+    /// Everyday keys.
     Everyday,
-    /// Those for every day, and the others as comments.
+    /// Everyday keys, and the others as comments.
     Folded,
-    /// All.
+    /// All keys.
     All,
 }
 
-/// A pipeline file with these keys, each with its default, its unit and its meaning.
+/// A pipeline file with the chosen keys, each with its default, unit and meaning.
 #[must_use]
 pub fn reference(shown: Shown) -> String {
     let mut text = match shown {
@@ -96,9 +95,8 @@ pub fn reference(shown: Shown) -> String {
         if shown == Shown::Everyday && !is_everyday(section.key) {
             continue;
         }
-        let own: Vec<&FlatKey> = keys.iter().filter(|key| is_in(&key.path, &section.path)).collect();
         put_section(&mut text, section);
-        // Sections of the same struct have the same keys: they are told once, but a file that is open to all has all.
+        // Sections of the same struct have the same keys: they are described once, unless all keys are shown.
         let same = written.iter().find(|(keys, _): &&(&[Key], &str)| are_alike(keys, section.key.keys));
         match same {
             Some((_, first)) if shown != Shown::All => {
@@ -106,21 +104,22 @@ pub fn reference(shown: Shown) -> String {
             }
             _ => {
                 written.push((section.key.keys, section.path.as_str()));
-                let own = own.iter().filter(|key| key.key.level != Level::Section);
-                own.for_each(|key| put_key(&mut text, key, shown));
+                keys.iter()
+                    .filter(|key| is_in(&key.path, &section.path) && key.key.level != Level::Section)
+                    .for_each(|key| put_key(&mut text, key, shown));
             }
         }
     }
     text
 }
 
-fn are_alike(some: &[Key], others: &[Key]) -> bool {
-    let told = |keys: &[Key]| keys.iter().map(|key| (key.name, key.about)).collect::<Vec<_>>();
-    told(some) == told(others)
+fn are_alike(a: &[Key], b: &[Key]) -> bool {
+    let texts = |keys: &[Key]| keys.iter().map(|key| (key.name, key.about)).collect::<Vec<_>>();
+    texts(a) == texts(b)
 }
 
 fn is_in(path: &str, section: &str) -> bool {
-    path.rsplit_once('.').is_some_and(|(of, _)| of == section)
+    path.rsplit_once('.').is_some_and(|(parent, _)| parent == section)
 }
 
 fn put_section(text: &mut String, section: &FlatKey) {
@@ -137,14 +136,14 @@ fn put_key(text: &mut String, key: &FlatKey, shown: Shown) {
     put_comment(text, &with_condition(key));
     let fold = if key.key.level == Level::Everyday || shown == Shown::All { "" } else { "#" };
     let _ = match &key.default {
-        Some(value) => writeln!(text, "{fold}{} = {}", key.key.name, toml_of(value)),
+        Some(value) => writeln!(text, "{fold}{} = {}", key.key.name, value_text(value)),
         None => writeln!(text, "#{} =", key.key.name),
     };
 }
 
-/// Its meaning and its own condition.
+/// The meaning of a key and its own condition.
 fn with_condition(key: &FlatKey) -> String {
-    let about = text_of(key.key);
+    let about = about_text(key.key);
     match key.only_with.last().filter(|_| !key.key.only_with.is_empty()) {
         Some(only) => format!("{about} Only with {only}."),
         None => about,
@@ -172,7 +171,7 @@ mod tests {
     use crate::pipeline::config::sections::Config;
 
     #[test]
-    fn the_reference_file_is_that_of_the_declarations() {
+    fn the_reference_file_matches_the_declarations() {
         let kept = std::fs::read_to_string("pipelines/reference.toml").unwrap();
         let written = reference(Shown::Folded);
         assert!(
@@ -203,14 +202,14 @@ mod tests {
     #[test]
     fn descriptions_have_default_meaning_and_condition() {
         let found = key_descriptions();
-        let of = |key: &str| found.iter().find(|described| described.key == key).unwrap();
-        assert_eq!(of("map.residual_max").default.as_deref(), Some("1e-4"));
-        assert!(of("map.epsilon").everyday && !of("map.l_max").everyday && of("map").everyday);
-        assert_eq!(of("map.l_max").only_with, ["map.engine = \"harmonic\""]);
-        // The condition of the key, and of its section.
-        assert_eq!(of("array.propagate.keep").only_with, ["array.propagate.keep_every_days > 0"]);
-        assert_eq!(of("daughters.tones.calibration_k_sr").only_with, ["spacecraft.fidelity = \"samples\""]);
-        // Not there by default.
-        assert!(of("sky.file").default.is_none() && of("sky.file").about.starts_with("Map of the sky"));
+        let find = |key: &str| found.iter().find(|described| described.key == key).unwrap();
+        assert_eq!(find("map.residual_max").default.as_deref(), Some("1e-4"));
+        assert!(find("map.epsilon").everyday && !find("map.l_max").everyday && find("map").everyday);
+        assert_eq!(find("map.l_max").only_with, ["map.engine = \"harmonic\""]);
+        // Conditions of the key and of its section.
+        assert_eq!(find("array.propagate.keep").only_with, ["array.propagate.keep_every_days > 0"]);
+        assert_eq!(find("daughters.tones.calibration_k_sr").only_with, ["spacecraft.fidelity = \"samples\""]);
+        // Absent by default.
+        assert!(find("sky.file").default.is_none() && find("sky.file").about.starts_with("Map of the sky"));
     }
 }

@@ -1,4 +1,4 @@
-//! The configuration of a whole pipeline: its checks and its hashes.
+//! The configuration of a whole pipeline, with its checks and hashes.
 
 use std::path::{Path, PathBuf};
 
@@ -59,7 +59,7 @@ keys! {
 }
 
 impl Config {
-    /// Everything that is wrong with a whole pipeline; empty if it is good.
+    /// All problems of a whole pipeline.
     #[must_use]
     pub fn problems(&self) -> Problems {
         let channels = self.spacecraft.channels_hz.len();
@@ -84,8 +84,8 @@ impl Config {
                     if let Some(problem) = self.spacecraft.dump_problem(&array) {
                         found.push(|| problem);
                     }
-                    found.extend(self.unknown_positions(&array));
-                    found.extend(self.misdated(&array));
+                    found.extend(self.position_problems(&array));
+                    found.extend(self.epoch_problems(&array));
                 }
                 Ok(_) => {}
                 Err(problem) => found.push(|| problem),
@@ -94,53 +94,52 @@ impl Config {
         found.extend(array);
         let width_hz = self.spacecraft.channel_width_hz;
         found.extend(self.daughters.problems(width_hz));
-        let samples = self.spacecraft.fidelity == Fidelity::Samples;
-        found.extend(self.instrument.problems(self.array.satellites, channels, samples));
+        let is_sampled = self.spacecraft.fidelity == Fidelity::Samples;
+        found.extend(self.instrument.problems(self.array.satellites, channels, is_sampled));
         found.extend(self.navigation.problems(self.array.satellites));
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
         found.extend(self.map.mismatches(channels));
-        found.append(self.ground_values());
+        found.append(self.ground_value_problems());
         found.append(self.without_effect(&[]));
         found
     }
 
-    /// Whether anything differs from an ideal instrument, or from what packets say of it.
+    /// Whether the instrument has errors, or the positions and times in packets have.
     #[must_use]
     pub(in crate::pipeline) fn has_errors(&self) -> bool {
         self.instrument.is_on() || self.navigation.is_on()
     }
 
-    /// The same without any of these errors; with the schedule of the artificial signal.
+    /// A copy without errors of the instrument and of navigation; it keeps the schedule of the artificial signal.
     #[must_use]
     pub(in crate::pipeline) fn without_errors(&self) -> Self {
         let instrument = self.instrument.without_errors();
         Self { instrument, navigation: NavigationConfig::default(), ..self.clone() }
     }
 
-    /// Epoch of the mission, TAI seconds since 1958-01-01: that of the orbits, where they have dates.
-    #[doc(hidden)]
+    /// Epoch of the mission, TAI seconds since 1958-01-01. Orbits from dated files set the epoch.
     #[must_use]
     #[doc(hidden)]
     pub fn epoch_tai_s(&self, array: &Array) -> f64 {
         array.epoch_tai_s().unwrap_or(self.spacecraft.epoch_tai_s)
     }
 
-    /// Requires that no other epoch is given than that of orbits with dates, and that time codes hold it.
-    fn misdated(&self, array: &Array) -> Vec<InvalidValue> {
+    /// Requires that the given epoch agrees with that of dated orbits, and that the packets' time code can represent it.
+    fn epoch_problems(&self, array: &Array) -> Vec<InvalidValue> {
         let mut checks = Checks::new("spacecraft");
         if let Some(dated_s) = array.epoch_tai_s() {
             let given_s = self.spacecraft.epoch_tai_s;
-            let usual_s = SpacecraftConfig::default().epoch_tai_s;
+            let default_s = SpacecraftConfig::default().epoch_tai_s;
             let expected = format!("nothing with array.oem: by the dates of the files it is {dated_s}");
-            checks.number("epoch_tai_s", given_s, given_s == usual_s || given_s == dated_s, expected);
+            checks.number("epoch_tai_s", given_s, given_s == default_s || given_s == dated_s, expected);
             let date = utc_text(dated_s);
-            let inside = (0.0..=3.0e9).contains(&dated_s);
+            let is_representable = (0.0..=3.0e9).contains(&dated_s);
             let expected = "an epoch from 1958 to 2053, which is what the packets' time code holds";
             checks.require(
                 "epoch_tai_s",
                 format_args!("(by the files of array.oem) {date} UTC"),
-                inside,
+                is_representable,
                 expected,
             );
         }
@@ -148,12 +147,12 @@ impl Config {
     }
 
     /// Requires that positions are known for the whole mission.
-    fn unknown_positions(&self, array: &Array) -> Vec<InvalidValue> {
+    fn position_problems(&self, array: &Array) -> Vec<InvalidValue> {
         let Some([from_s, until_s]) = array.known_s() else { return Vec::new() };
         let mut checks = Checks::new("spacecraft");
         let duration_s = self.spacecraft.duration_s;
-        // Dates of files are to a microsecond.
-        let good = from_s <= 1e-6 && until_s + 1e-6 >= duration_s;
+        // Dates in files are rounded to a microsecond.
+        let is_covered = from_s <= 1e-6 && until_s + 1e-6 >= duration_s;
         let source = match self.array.propagate.is_on() {
             true => "what array.propagate.days gives",
             false => "what the files of array.oem hold",
@@ -161,7 +160,7 @@ impl Config {
         let expected = format!(
             "at most {source} without a gap: from {from_s:.3} s to {until_s:.3} s after the mission's epoch"
         );
-        checks.number("duration_s", duration_s, good, expected);
+        checks.number("duration_s", duration_s, is_covered, expected);
         checks.finish()
     }
 
@@ -173,14 +172,14 @@ impl Config {
         }
     }
 
-    /// Requires what satellites that do not share a circle can have.
+    /// Requires settings that are possible for satellites that do not share a circular orbit.
     fn check_orbits(&self, checks: &mut Checks) {
         if self.array.is_circle() {
             return;
         }
         let Self { spacecraft, map, .. } = self;
         let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
-        let anywhere = spacecraft.model != ModelChoice::Harmonic;
+        let is_general = spacecraft.model != ModelChoice::Harmonic;
         let isotropic = spacecraft.antenna == Antenna::Isotropic;
         for (key, value, good, expected) in [
             (
@@ -190,7 +189,7 @@ impl Config {
                 "\"pixel\", or map.refine,",
             ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
-            ("spacecraft.model", "\"harmonic\"", anywhere, "\"auto\", \"general\" or \"direct\""),
+            ("spacecraft.model", "\"harmonic\"", is_general, "\"auto\", \"general\" or \"direct\""),
             (
                 "spacecraft.antenna",
                 "(dipoles)",
@@ -219,35 +218,35 @@ impl Config {
         }
     }
 
-    /// Requires what antennas that are not ideal can have.
+    /// Requires settings that are possible with three dipoles, and with antenna errors.
     fn check_antennas(&self, checks: &mut Checks) {
-        let samples = self.spacecraft.fidelity == Fidelity::Samples;
-        let one = self.spacecraft.antenna != Antenna::ThreeDipoles;
+        let is_sampled = self.spacecraft.fidelity == Fidelity::Samples;
+        let has_one_receiver = self.spacecraft.antenna != Antenna::ThreeDipoles;
         let expected = "one receiver a daughter with spacecraft.fidelity = \"samples\": \"isotropic\" or \"dipole-normal\"";
-        checks.require("spacecraft.antenna", "\"three-dipoles\"", one || !samples, expected);
+        checks.require("spacecraft.antenna", "\"three-dipoles\"", has_one_receiver || !is_sampled, expected);
         if !self.instrument.has_own_antennas() {
             return;
         }
         let spacecraft = &self.spacecraft;
-        let direct = samples || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
-        let mirror = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
+        let is_direct = is_sampled || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
+        let is_flat = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
         for (key, value, good, expected) in [
-            ("spacecraft.model", "(other)", direct, "\"direct\" or \"general\""),
+            ("spacecraft.model", "(other)", is_direct, "\"direct\" or \"general\""),
             ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
-            ("spacecraft.moon_mirror", "\"sphere\"", mirror, "\"flat\""),
+            ("spacecraft.moon_mirror", "\"sphere\"", is_flat, "\"flat\""),
         ] {
             let expected = format!(
                 "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern or pattern_by_frequency"
             );
             checks.require(key, value, good, expected);
         }
-        // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
-        let upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
+        // The image in a flat mirror is seen from below, where an antenna with a radial tilt has another response.
+        let is_upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
         let expected = "0 with instrument.tilt_radial_deg";
-        checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, upright, expected);
+        checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, is_upright, expected);
     }
 
-    /// Requires that a van Vleck correction is that of the daughters' quantiser.
+    /// Requires that the van Vleck correction is for the daughters' quantiser.
     fn check_quantiser(&self, checks: &mut Checks) {
         let (ground, bits) = (self.calibration.quantiser_bits, self.daughters.bits);
         let (fidelity, accepted) = match self.spacecraft.fidelity {
@@ -263,16 +262,16 @@ impl Config {
         checks.require("calibration.quantiser_bits", ground, good, expected);
     }
 
-    /// Everything that is wrong with the ground segment's sections; empty if they are good.
+    /// All problems of the ground segment's sections.
     #[must_use]
     #[doc(hidden)]
     pub fn ground_problems(&self) -> Problems {
-        let mut found = self.ground_values();
+        let mut found = self.ground_value_problems();
         found.append(self.without_effect(&["calibration", "calibrate", "map", "products", "runtime"]));
         found
     }
 
-    fn ground_values(&self) -> Problems {
+    fn ground_value_problems(&self) -> Problems {
         let mut found = Problems::default();
         found.extend(self.downlink.listen.problems());
         found.extend(self.calibration.problems());
@@ -286,21 +285,20 @@ impl Config {
         found
     }
 
-    /// A hash of what the spacecraft measures, for provenance: of the sections that shape it, and of the contents of the
-    /// files that they name. The downlink is not part of it: the same data may arrive through two stations, or in two
-    /// formats.
+    /// Hash of the settings that decide the measured data, including the contents of named files, for provenance. `[downlink]` is not
+    /// part of it: the same data may arrive through two stations, or in two formats.
     #[must_use]
     #[doc(hidden)]
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
-        array.oem = array.oem.iter().map(|path| contents(path)).collect();
-        sky.file = sky.file.map(|files| files.map(|path| contents(path)));
+        array.oem = array.oem.iter().map(|path| content_checksum(path)).collect();
+        sky.file = sky.file.map(|files| files.map(|path| content_checksum(path)));
         if let Some(added) = &mut sky.added {
-            added.catalogue = added.catalogue.as_deref().map(contents);
+            added.catalogue = added.catalogue.as_deref().map(content_checksum);
         }
-        let daughters = HashedDaughters::of(daughters);
-        // Data of an ideal instrument are those of before there were errors, byte for byte.
+        let daughters = HashedDaughters::new(daughters);
+        // Without errors, the hash must equal that of versions before these sections existed.
         match (instrument.is_on(), navigation.is_on()) {
             (false, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft)),
             (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument)),
@@ -308,28 +306,27 @@ impl Config {
         }
     }
 
-    /// A hash of the sections that shape maps from a downlink, and of the contents of the files that they name, for
-    /// provenance.
+    /// Hash of the settings that decide the maps of a downlink, including the contents of named files, for provenance.
     #[must_use]
     #[doc(hidden)]
     pub fn ground_hash(&self) -> u64 {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
-        calibration.gains_file = calibration.gains_file.as_deref().map(contents);
-        map.prior_files = map.prior_files.iter().map(|path| contents(path)).collect();
+        calibration.gains_file = calibration.gains_file.as_deref().map(content_checksum);
+        map.prior_files = map.prior_files.iter().map(|path| content_checksum(path)).collect();
         if let Some(RegulariserChoice::File(files)) = &mut map.regulariser {
-            files.iter_mut().for_each(|path| *path = contents(path));
+            files.iter_mut().for_each(|path| *path = content_checksum(path));
         }
         if calibration.hook != CalibrationHook::Solve {
             return hash(&(calibration, map));
         }
         let mut calibrate = self.calibrate.clone();
-        calibrate.model_files = calibrate.model_files.iter().map(|path| contents(path)).collect();
+        calibrate.model_files = calibrate.model_files.iter().map(|path| content_checksum(path)).collect();
         hash(&(calibration, map, calibrate))
     }
 }
 
-/// `[daughters]` as hashes have it: with `disturbances` in place of `tones`, as when it also had lists of gains, phases and clocks.
-/// So data keep their hashes.
+/// `[daughters]` in the form that is hashed: with the former section `disturbances` in place of `tones`, so that hashes of existing data
+/// remain valid.
 #[derive(Serialize)]
 struct HashedDaughters<'a> {
     #[serde(flatten)]
@@ -350,8 +347,8 @@ struct HashedTones<'a> {
 }
 
 impl<'a> HashedDaughters<'a> {
-    fn of(daughters: &'a DaughtersConfig) -> Self {
-        // Without tones of its own, which are then left out.
+    fn new(daughters: &'a DaughtersConfig) -> Self {
+        // Default tones are left out of the serialised form.
         let others = DaughtersConfig { tones: Tones::default(), ..daughters.clone() };
         let disturbances = HashedTones {
             gain_error: [],
@@ -366,16 +363,15 @@ impl<'a> HashedDaughters<'a> {
     }
 }
 
-/// Whether a name stays within the folder that it is joined to; an empty one is that folder.
+/// Whether a name is short and stays within the folder that it is joined to. An empty name is allowed.
 pub(in crate::pipeline) fn is_folder_name(name: &str) -> bool {
-    let bad = |c: char| c.is_control() || c == '/' || c == '\\';
-    !(name.len() > 60 || name.contains(bad) || [".", ".."].contains(&name))
+    let is_forbidden = |c: char| c.is_control() || c == '/' || c == '\\';
+    !(name.len() > 60 || name.contains(is_forbidden) || [".", ".."].contains(&name))
 }
 
-/// Replaces the path of a file in a hash: a checksum of its content, or its name if it cannot be read. Such a file ends the
-/// run when it is needed.
-fn contents(path: &Path) -> PathBuf {
-    // Devices and pipes may never end.
+/// Replacement for the path of a file in a hash: the checksum of its content, or the path itself if the file cannot be read.
+fn content_checksum(path: &Path) -> PathBuf {
+    // Devices and pipes may be endless.
     if !path.is_file() {
         return path.to_owned();
     }
@@ -383,9 +379,9 @@ fn contents(path: &Path) -> PathBuf {
     sum.map_or_else(|_| path.to_owned(), |sum| PathBuf::from(format!("{sum:016x}")))
 }
 
-/// The first 64 bits of a CRC over the JSON form: stable over runs, machines and field order.
+/// CRC-64 of the JSON form, which is the same on every machine.
 fn hash(value: &impl Serialize) -> u64 {
-    // Maps with string keys and finite numbers always have a JSON form.
+    // A structure with string keys and finite numbers always has a JSON form.
     let text = serde_json::to_vec(value).unwrap_or_default();
     crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
 }
@@ -401,7 +397,7 @@ mod tests {
     }
 
     #[test]
-    fn corrections_are_of_the_quantiser_that_is_there() {
+    fn a_correction_has_to_fit_the_quantiser() {
         let problems = |bits: u32, ground: u32, fidelity: &str| {
             let fidelity = format!("spacecraft.fidelity={fidelity}");
             let (bits, ground) =
@@ -421,8 +417,8 @@ mod tests {
     }
 
     #[test]
-    fn data_of_before_keep_their_hash() {
-        // In the packets of version 0.1.0 before [daughters.disturbances] became [daughters.tones].
+    fn existing_data_keep_their_hash() {
+        // From packets of version 0.1.0, before [daughters.disturbances] became [daughters.tones].
         let thin = ["spacecraft.every_nth_window=1500", "sky.nside=8", "sky.l_max=8"];
         assert_eq!(with(&thin).unwrap().space_hash(), 0x85d8_7b8e_cfbe_4d84);
         let toned = with(&["daughters.tones.calibration_k_sr=1.0"]).unwrap();
@@ -450,12 +446,12 @@ mod tests {
         assert!(first[0] != other[0] && first[1] != other[1] && first[2] == other[2]);
         std::fs::write(path("gains"), "d").unwrap();
         assert_ne!(first[2], hashes("one")[2]);
-        // Nothing there: the name alone.
+        // Missing files: the hash contains the path.
         assert_ne!(hashes("none"), hashes("neither"));
     }
 
     #[test]
-    fn hashes_follow_what_they_stand_for() {
+    fn hashes_depend_on_their_segment_only() {
         let base = with(&[]).unwrap();
         let mapped = with(&["map.nside=8"]).unwrap();
         let flown = with(&["spacecraft.thermal_noise=false"]).unwrap();

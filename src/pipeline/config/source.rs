@@ -1,4 +1,4 @@
-//! Where a configuration comes from: a file or the embedded default, and overrides from the command line.
+//! Sources of a configuration: a file or the embedded default, and overrides from the command line.
 
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -8,22 +8,21 @@ use thiserror::Error;
 use super::channel_lists;
 use super::problems::Problems;
 use super::quantities::read_units;
-use super::reader::{Lines, Reading, SHOWN_MAX, parse_table};
+use super::reader::{KeyLocator, PartialConfig, SHOWN_MAX, parse_table};
 use super::sections::Config;
 use crate::units::shortened;
 
-/// Name of the default pipeline in messages.
 const QUICKLOOK_NAME: &str = "embedded quicklook";
-/// The default pipeline, which runs when no file is named.
+/// The default pipeline, which is used if no file is named.
 pub const QUICKLOOK: &str = include_str!("../../../pipelines/quicklook.toml");
 
-/// Longest pipeline file, bytes: a hundred times one with every key, and little enough to be held many times over.
+/// Maximum length of a pipeline file, bytes; a hundred times that of a file with every key.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// Most sections of an override's key; the deepest key has three.
+/// Maximum number of sections in the key of an override; the deepest key has three.
 const DEPTH_MAX: usize = 8;
 
-/// Why there is no usable configuration.
+/// Errors of reading and checking a configuration.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConfigError {
@@ -35,7 +34,7 @@ pub enum ConfigError {
         /// The system's error.
         source: std::io::Error,
     },
-    /// The file is no text.
+    /// The file is not text.
     #[error(
         "{}: not text; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
         path.display()
@@ -49,7 +48,7 @@ pub enum ConfigError {
     Study {
         /// Path.
         path: PathBuf,
-        /// The key that no pipeline has.
+        /// A key that only studies have.
         key: &'static str,
     },
     /// The file is too long for a pipeline file.
@@ -61,32 +60,32 @@ pub enum ConfigError {
     /// A `--set` that is not `key=value`.
     #[error("--set {0}: expected key=value, for example --set map.nside=32")]
     Override(String),
-    /// A `--set` with a key below one that is not a section.
+    /// A `--set` with a key below a value.
     #[error("--set {key}: `{part}` is not a section")]
     NotASection {
-        /// Whole key.
+        /// Full key.
         key: String,
-        /// Part of the key.
+        /// The part of the key that is not a section.
         part: String,
     },
-    /// Text that is not TOML, unknown keys, wrong types, invalid values: all that could be found.
+    /// Syntax errors, unknown keys, wrong types and invalid values, all together.
     #[error("{origin}: {problems}")]
     Values {
-        /// File, or the embedded default's name.
+        /// Path of the file, or name of the embedded default.
         origin: String,
-        /// What is wrong.
+        /// The problems.
         problems: Problems,
     },
 }
 
-/// Where a configuration comes from, and overrides of it.
+/// Source of a configuration: a pipeline file and overrides.
 #[derive(Clone, Debug, Default)]
 pub struct ConfigSource {
     /// Pipeline file; `None` for the embedded quicklook.
     pub file: Option<PathBuf>,
     /// `key=value` overrides, in order.
     pub overrides: Vec<String>,
-    /// Seed that replaces the file's.
+    /// Seed that replaces the one in the file.
     pub seed: Option<u64>,
 }
 
@@ -98,16 +97,16 @@ impl ConfigSource {
         self.file.as_deref().map_or_else(|| QUICKLOOK_NAME.into(), |path| path.display().to_string())
     }
 
-    /// Reads the file, applies the overrides and parses; does not check values.
+    /// Reads the file and applies the overrides, without checking values.
     ///
     /// # Errors
-    /// An unreadable file; everything that is not TOML, not a key or not of its type, and every bad override.
+    /// An unreadable file; all syntax errors, unknown keys, wrong types and invalid overrides.
     #[doc(hidden)]
     pub fn parse(&self) -> Result<Config, ConfigError> {
         self.parse_text(&self.text()?)
     }
 
-    /// As [`Self::parse`], with this text instead of the file.
+    /// Parses `text` in place of the file, and applies the overrides, without checking values.
     ///
     /// # Errors
     /// As [`Self::parse`].
@@ -128,16 +127,16 @@ impl ConfigSource {
         stem.map_or_else(|| "lunarray".into(), |stem| stem.to_string_lossy().into_owned())
     }
 
-    /// [`Self::parse`], and every check of a whole pipeline.
+    /// Reads the file, applies the overrides and checks the values of a whole pipeline.
     ///
     /// # Errors
-    /// As [`Self::parse`]; invalid values; all of them together.
+    /// As [`Self::parse`]; invalid values. All problems are reported together.
     pub fn load(&self) -> Result<Config, ConfigError> {
         self.load_noting(&mut Vec::new())
     }
 
-    /// As [`Self::load`]; adds to `notes` what was not said in so many words: where an override changes the channels, lists
-    /// with a value for each take those of the nearest channel that the file has.
+    /// Loads the configuration as [`Self::load`] does, and adds a note for each list that was adapted because an override changes the
+    /// channels.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -146,8 +145,9 @@ impl ConfigSource {
         self.checked_noting(&self.text()?, self.origin(), Config::problems, notes)
     }
 
-    /// [`Self::parse`], and the checks of the sections of the ground segment. Without a file these have their defaults,
-    /// which fit any downlink; those of the quicklook are for its own three channels.
+    /// Reads the file, applies the overrides and checks the values of the ground segment.
+    ///
+    /// Without a file the keys have their defaults, which fit any downlink; the quicklook's values fit only its three channels.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -158,21 +158,21 @@ impl ConfigSource {
         }
     }
 
-    /// Reads `text` and the overrides, and requires that neither reading nor values have problems.
+    /// Parses `text`, applies the overrides and requires that neither parsing nor `value_problems` finds a problem.
     fn checked(
         &self,
         text: &str,
         origin: String,
-        problems_of: impl Fn(&Config) -> Problems,
+        value_problems: impl Fn(&Config) -> Problems,
     ) -> Result<Config, ConfigError> {
-        self.checked_noting(text, origin, problems_of, &mut Vec::new())
+        self.checked_noting(text, origin, value_problems, &mut Vec::new())
     }
 
     fn checked_noting(
         &self,
         text: &str,
         origin: String,
-        problems_of: impl Fn(&Config) -> Problems,
+        value_problems: impl Fn(&Config) -> Problems,
         notes: &mut Vec<String>,
     ) -> Result<Config, ConfigError> {
         let mut table = match parse_table(text) {
@@ -183,50 +183,48 @@ impl ConfigSource {
             return Err(ConfigError::Study { path: path.clone(), key });
         }
         read_units(&mut table);
-        let mut lines = Lines::of(text);
-        let mut bad_overrides = Vec::new();
+        let mut locator = KeyLocator::new(text);
+        let mut override_problems = Vec::new();
         let channels_hz = channel_lists::channels_hz(&table);
         let mut keys = Vec::new();
         for text in &self.overrides {
-            match set(&mut table, text) {
+            match apply_override(&mut table, text) {
                 Ok(key) => {
-                    lines.set(key, text);
+                    locator.add_override(key, text);
                     keys.push(key);
                 }
-                Err(error) => bad_overrides.push(error),
+                Err(error) => override_problems.push(error),
             }
         }
         read_units(&mut table);
-        channel_lists::of_one(&mut table);
+        channel_lists::wrap_single_channel(&mut table);
         if let Some(before) = channels_hz {
-            notes.extend(channel_lists::follow(&mut table, &before, |key| keys.contains(&key)));
+            notes.extend(channel_lists::adapt_lists(&mut table, &before, |key| keys.contains(&key)));
         }
-        let mut reading = Reading::new(table, &lines);
+        let mut partial = PartialConfig::new(table, &locator);
         if let Some(seed) = self.seed {
-            reading.config.seed = seed;
+            partial.config.seed = seed;
         }
-        if reading.config.name.is_empty() {
-            reading.config.name = self.default_name();
+        if partial.config.name.is_empty() {
+            partial.config.name = self.default_name();
         }
-        reading.config.choose_engine();
-        let of_values = problems_of(&reading.config);
-        let told = reading.tell(of_values, bad_overrides);
-        match told.is_empty() {
-            true => Ok(reading.config),
-            false => Err(ConfigError::Values { origin, problems: told }),
+        partial.config.choose_engine();
+        let problems = partial.all_problems(value_problems(&partial.config), override_problems);
+        match problems.is_empty() {
+            true => Ok(partial.config),
+            false => Err(ConfigError::Values { origin, problems }),
         }
     }
 }
 
-/// Keys of a study that a pipeline has not.
+/// Top-level keys that only studies have.
 const STUDY_KEYS: [&str; 6] = ["realisations", "calibrated", "covariance_at_deg", "model", "pipeline", "set"];
 
-/// Whether a table has sections of a pipeline.
 pub(in crate::pipeline) fn has_sections(table: &toml::Table) -> bool {
     ["array", "map", "sky", "spacecraft"].iter().any(|section| table.contains_key(*section))
 }
 
-/// A key that shows a table to be a study's, which has axes where a pipeline has sections.
+/// A key that shows that a table is a study; `None` for a pipeline.
 pub(in crate::pipeline) fn study_key(table: &toml::Table) -> Option<&'static str> {
     if table.get("axis").is_some_and(toml::Value::is_array) {
         return Some("[[axis]]");
@@ -240,19 +238,21 @@ fn read(path: &Path) -> Result<String, ConfigError> {
     let mut bytes = Vec::new();
     file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(failed)?;
     let is_long = bytes.len() as u64 > FILE_BYTES_MAX;
-    // The last character of a part may be cut.
-    let is_text = |error: std::str::Utf8Error| is_long && error.error_len().is_none();
+    // In a long file, the last character that was read may be incomplete.
+    let is_truncated_text = |error: std::str::Utf8Error| is_long && error.error_len().is_none();
     match String::from_utf8(bytes) {
-        Err(error) if !is_text(error.utf8_error()) => Err(ConfigError::NotText { path: path.to_owned() }),
+        Err(error) if !is_truncated_text(error.utf8_error()) => {
+            Err(ConfigError::NotText { path: path.to_owned() })
+        }
         Ok(text) if !is_long => Ok(text),
         _ => Err(ConfigError::TooLong { path: path.to_owned() }),
     }
 }
 
-/// Sets `key=value` in a table; a value that is not TOML is a string. Returns the key.
-fn set<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigError> {
-    let bad = || ConfigError::Override(shortened(text, SHOWN_MAX));
-    let (key, value) = text.split_once('=').ok_or_else(bad)?;
+/// Applies an override `key=value` to a table; a value that is not TOML is taken as a string. Returns the key.
+fn apply_override<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigError> {
+    let invalid = || ConfigError::Override(shortened(text, SHOWN_MAX));
+    let (key, value) = text.split_once('=').ok_or_else(invalid)?;
     let key = key.trim();
     let parsed = toml::from_str::<toml::Table>(&format!("value = {value}"));
     let value = parsed
@@ -261,17 +261,17 @@ fn set<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigErro
         .unwrap_or_else(|| toml::Value::String(value.trim().to_owned()));
     let (sections, last) = key.rsplit_once('.').map_or(("", key), |(head, last)| (head, last));
     if last.is_empty() || sections.split('.').count() > DEPTH_MAX {
-        return Err(bad());
+        return Err(invalid());
     }
-    let mut here = table;
+    let mut section = table;
     for part in sections.split('.').filter(|part| !part.is_empty()) {
-        let next = here.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        here = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
+        let next = section.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        section = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
             key: shortened(key, SHOWN_MAX),
             part: shortened(part, SHOWN_MAX),
         })?;
     }
-    here.insert(last.to_owned(), value);
+    section.insert(last.to_owned(), value);
     Ok(key)
 }
 
@@ -286,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn the_embedded_pipeline_is_good() {
+    fn the_embedded_pipeline_is_valid() {
         assert!(ConfigSource::default().load().is_ok());
     }
 
@@ -327,7 +327,7 @@ mod tests {
         }
     }
 
-    /// The problems of a text with overrides, a line each.
+    /// The problems of a text with overrides, as lines.
     fn told(text: &str, overrides: &[&str]) -> Vec<String> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
         let source = ConfigSource { overrides, ..ConfigSource::default() };
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_keys_wrong_types_and_bad_values_are_told_together() {
+    fn unknown_keys_wrong_types_and_invalid_values_are_reported_together() {
         let text = "sed = 1\n[map]\nnside = \"big\"\nepsilon = -1.0\nl_maxx = 3\n\n[sat]\na = 1\nb = 2\n[spacecraft]\n\
                     duration_s = -3\nninth = 9\n[sky]\nfile = 7\nnside = 7\n[products]\npictures = 1";
         let found = told(text, &["map.weight_max=lots", "runtime.threads", "spacecraft.antenna=\"dish\""]);
@@ -375,8 +375,8 @@ mod tests {
     }
 
     #[test]
-    fn what_may_follow_from_an_unreadable_value_is_not_told() {
-        // As many values as the channels that cannot be read, and a quantiser that the ground would correct.
+    fn consequences_of_an_unreadable_value_are_not_reported() {
+        // Lists that fit the unreadable channels, and a correction that fits the unreadable quantiser.
         let text = "[spacecraft]\nchannels_hz = [1e6, \"two MHz\"]\nevery_nth_integration = [1, 1]\nfidelity = \"samples\"\n\
                     [daughters]\nbits = \"two\"\n[calibration]\nquantiser_bits = 2\n[map]\nepsilon = [1e-4, 1e-4]\n\
                     [array]\nsatellites = \"four\"\n[instrument.amplitude]\nconstant = [0.1, 0.1, 0.1, 0.1]\n";
@@ -403,7 +403,7 @@ mod tests {
         assert_eq!((config.spacecraft.channels_hz, config.spacecraft.window_s_max), (vec![3e6, 10e6], 300.0));
         let config = load("", &["calibrate.clock_sigma_ns=1us", "calibrate.position_sigma_m=1km"]).unwrap();
         assert_eq!((config.calibrate.clock_sigma_ns, config.calibrate.position_sigma_m), (1e3, 1e3));
-        // What a key takes is told with what was found.
+        // Messages name the units that a key accepts, and what was found.
         for (bad, part) in [
             (
                 "array.altitude_m=300MHz",
@@ -422,7 +422,7 @@ mod tests {
             let told = load("", &[bad]).unwrap_err().to_string();
             assert!(told.contains(part), "{bad}: {told}");
         }
-        // Other units, and keys without one, stay texts of the wrong type.
+        // Texts with other units, or at keys without a unit, have the wrong type.
         for bad in ["spacecraft.duration_s=3MHz", "map.nside=16m", "spacecraft.channels_hz=[3MHz, 1d]"] {
             let told = load("", &[bad]).unwrap_err().to_string();
             assert!(told.contains("invalid type: string"), "{bad}: {told}");
@@ -458,7 +458,7 @@ mod tests {
             notes.iter().any(|note| note.starts_with("spacecraft.every_nth_integration = [4, 1]: as for")),
             "{notes:?}"
         );
-        // What is set is as it was set, also if it is wrong.
+        // Lists that are set by overrides are not adapted, even if their length is wrong.
         let (config, notes) = load(&["map.epsilon=0.1", "spacecraft.channels_hz=[5e6]"]).unwrap();
         assert_eq!((config.map.epsilon().get(0), notes.len()), (Some(0.1), 1));
         let (_, notes) = load(&["map.epsilon=0.1"]).unwrap();
@@ -467,7 +467,7 @@ mod tests {
     }
 
     #[test]
-    fn text_that_is_not_toml_is_told_by_place() {
+    fn syntax_errors_are_reported_with_line_and_column() {
         let found = told("seed = 1\n[map\nnside = 3\n", &[]);
         assert!(found[1].contains("line 2, column 5: "), "{found:?}");
         let long = format!("seed = 1\nname = {}", "x".repeat(100_000));
@@ -493,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_no_pipeline_is_not_read_whole() {
+    fn a_long_file_is_not_read_whole() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("long.toml");
         std::fs::write(&path, "# comment\n".repeat(200_000)).unwrap();

@@ -1,43 +1,43 @@
-//! What a ground should know before the sums of its channels grow beyond the memory that there is.
+//! Warning for a ground segment whose normal equations will outgrow memory.
 
 use std::fmt;
 
 use super::estimate::memory_bytes;
-use super::groups::{complete_costs, solutions_of};
+use super::groups::{complete_costs, memory_solutions};
 use crate::frames::Instrument;
 use crate::imaging::MapConfig;
 use crate::imaging::cost::EngineCost;
 use crate::pipeline::config::{Config, MemoryLimit};
 
-/// Warning that the sums of all channels will outgrow memory.
+/// Warning that the normal equations of all channels will outgrow memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MemoryAdvice {
-    /// Channels that are mapped.
+    /// Number of mapped channels.
     pub channels: usize,
-    /// nside of their maps.
+    /// nside of the maps.
     pub nside: usize,
-    /// Estimated memory of the complete sums of all of them, bytes.
+    /// Estimated memory of the complete sums of all channels, bytes.
     pub needed_bytes: f64,
-    /// What is available.
+    /// Available memory.
     pub limit: MemoryLimit,
     /// A smaller nside whose sums fit, and their memory, bytes.
     pub fitting: Option<(usize, f64)>,
 }
 
 impl MemoryAdvice {
-    /// Advice for a ground with these settings; `None` if the complete sums fit.
+    /// Advice for a ground segment with these settings; `None` if the complete sums fit.
     #[must_use]
-    pub fn of(config: &Config, instrument: &Instrument, limit: MemoryLimit) -> Option<Self> {
+    pub fn new(config: &Config, instrument: &Instrument, limit: MemoryLimit) -> Option<Self> {
         let needed = |map: &MapConfig| {
             let costs: Vec<EngineCost> = complete_costs(instrument, map).into_values().collect();
-            (costs.len(), memory_bytes(0.0, &costs, solutions_of(map)))
+            (costs.len(), memory_bytes(0.0, &costs, memory_solutions(map)))
         };
         let (channels, needed_bytes) = needed(&config.map);
         if needed_bytes <= limit.bytes as f64 {
             return None;
         }
-        let halves = std::iter::successors(Some(config.map.nside / 2), |nside| Some(nside / 2));
-        let fitting = halves.take_while(|nside| *nside > 0).find_map(|nside| {
+        let smaller_nsides = std::iter::successors(Some(config.map.nside / 2), |nside| Some(nside / 2));
+        let fitting = smaller_nsides.take_while(|nside| *nside > 0).find_map(|nside| {
             let map = MapConfig { nside, l_max: 0, ..config.map.clone() };
             Some((nside, needed(&map).1)).filter(|(_, bytes)| *bytes <= limit.bytes as f64)
         });

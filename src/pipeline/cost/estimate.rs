@@ -1,4 +1,4 @@
-//! What a pipeline will cost, before anything runs: counts, bytes, operations, and times estimated from them.
+//! Estimates of the cost of a pipeline before it runs: visibilities, bytes, operations and times.
 
 use std::fmt;
 
@@ -14,14 +14,15 @@ use crate::response::model::{ModelKind, ModelPlan};
 use crate::sky::healpix::pixel_count;
 use crate::units::ChannelId;
 
-/// Visibilities that wait for a batch of the model, at most, and the memory of one with its position, bytes.
+/// Maximum number of visibilities that wait for a batch of the model.
 const QUEUED_VISIBILITIES_MAX: f64 = 1e6;
+/// Memory of a waiting visibility with its positions, bytes.
 const QUEUED_VISIBILITY_BYTES: f64 = 200.0;
 
-/// Memory of the program, its queues and its pictures, bytes.
+/// Memory of the program, queues and pictures, bytes.
 const BASE_BYTES: f64 = 5e7;
 
-/// Memory of a snapshot's line in the summary and of the names of its files, bytes.
+/// Memory of a snapshot's record in the summary, bytes.
 const SNAPSHOT_RECORD_BYTES: f64 = 500.0;
 
 /// The cost of one channel.
@@ -29,83 +30,81 @@ const SNAPSHOT_RECORD_BYTES: f64 = 500.0;
 pub struct ChannelCost {
     /// Frequency, Hz.
     pub frequency_hz: f64,
-    /// Visibilities sent down.
+    /// Visibilities in the downlink.
     pub visibilities_sent: f64,
-    /// Of these, within the map's longest baseline.
+    /// Visibilities within the map's longest baseline.
     pub visibilities_mapped: f64,
     /// Longest baseline used in the map, m.
     pub baseline_m_max: f64,
-    /// How the visibilities are simulated and what it costs, in fringes: of a direct sum one a pixel and
-    /// visibility (some 30 operations), of harmonics what takes as long.
+    /// The chosen model and its cost in fringes. A fringe is one pixel and visibility of a direct sum, some 30 operations; other models
+    /// are converted by time.
     pub simulation: ModelPlan,
     /// Estimated time of the simulation by direct sums, s.
     pub simulation_direct_s: f64,
-    /// Estimated time of the simulation through harmonics, s: set-up and visibilities.
+    /// Estimated time of the simulation by harmonics, s: set-up and visibilities.
     pub simulation_harmonic_s: [f64; 2],
-    /// Estimated time of the simulation with rows of any positions, s.
+    /// Estimated time of the simulation by the general model, s.
     pub simulation_general_s: f64,
     /// Multiply-adds of the normal equations.
     pub accumulation_multiply_adds: f64,
     /// Multiply-adds of one solution.
     pub solution_multiply_adds: f64,
-    /// Estimated time of the sums and of all solutions, s.
+    /// Estimated time of accumulation and of all solutions, s.
     pub mapping_s: f64,
 }
 
 /// The cost of a whole pipeline.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Cost {
-    /// Channel by channel.
+    /// Cost of each channel.
     pub channels: Vec<ChannelCost>,
-    /// Observing windows used.
+    /// Number of observing windows.
     pub windows: usize,
-    /// Snapshot solutions of each channel, the final one included.
+    /// Number of solutions of each channel: snapshots and the final map.
     pub solutions: u64,
     /// Size of the downlink file, bytes.
     pub downlink_bytes: f64,
-    /// Memory for sums, snapshots, solving and the simulated sky, bytes.
+    /// Peak memory of the whole run, bytes.
     pub memory_bytes: f64,
-    /// Of these, what the space segment takes, bytes.
+    /// Memory of the space segment, bytes.
     pub simulation_memory_bytes: f64,
-    /// Rate that the daughters' samples need on their links to the mother, all together, bit/s; with
-    /// samples alone.
+    /// Data rate of the samples of all daughters on their links to the mother, bit/s; `None` if no samples are simulated.
     pub samples_bits_per_s: Option<f64>,
-    /// Rate that one daughter's samples need on its link, and the greatest that the link has, bit/s; with samples and a
-    /// limit alone.
+    /// Data rate of one daughter's samples, and the limit of its link, bit/s; `None` without samples or without a limit.
     pub link_bits_per_s: Option<[f64; 2]>,
-    /// Rate of the ninth daughter's spectra on the downlink while the array observes, bit/s; with it alone.
+    /// Data rate of the ninth daughter's spectra while the array observes, bit/s; `None` without that daughter.
     pub ninth_bits_per_s: Option<f64>,
-    /// Bytes that ranks exchange; memory and time are then those of one rank. `None` for one rank.
+    /// Exchange between ranks; memory and time are then those of one rank. `None` for one rank.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ranks: Option<RankCost>,
-    /// Estimated time to draw, quantise, send and correlate the samples, s; with samples alone.
+    /// Estimated time to draw, quantise, send and correlate the samples, s; `None` if no samples are simulated.
     pub sampling_s: Option<f64>,
-    /// Estimated time of the whole run, s, at the rates of one machine and with as many cores as this one.
+    /// Estimated time of the whole run, s, at measured rates per core and with the number of cores of this machine.
     pub predicted_s: f64,
 }
 
-/// Ranks that share the sums of each channel.
+/// Cost of ranks that share the normal equations of each channel.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct RankCost {
     /// Number of ranks.
     pub ranks: usize,
-    /// Bytes that each gives to the others, and gets, in all solutions.
+    /// Bytes that each rank sends to the others, and receives, in all solutions.
     pub reduced_bytes: f64,
-    /// Memory of a node, bytes, and the number of nodes that hold all ranks, once [`Cost::on_nodes`] has been asked.
+    /// Memory of a node, bytes, and the number of nodes that hold all ranks; set by [`Cost::on_nodes`].
     pub nodes: Option<(f64, usize)>,
 }
 
-/// Part of a pipeline that is to run.
+/// Part of a pipeline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Segment {
-    /// All of it.
+    /// Space and ground segment.
     Whole,
-    /// Up to the downlink.
+    /// Space segment alone, up to the downlink.
     Space,
 }
 
 impl ChannelCost {
-    /// Estimated time of the simulation as it will be done, s.
+    /// Estimated time of the simulation by the chosen model, s.
     #[must_use]
     pub fn simulation_s(&self) -> f64 {
         match self.simulation.kind {
@@ -117,21 +116,21 @@ impl ChannelCost {
 }
 
 impl Plan {
-    /// Cost of a pipeline. Nothing is measured: times are estimates from the rates of a named machine.
+    /// Estimated cost of a pipeline. Times follow from rates that were measured on one machine.
     #[must_use]
     #[doc(hidden)]
     pub fn cost(&self) -> Cost {
         self.cost_with_ranks(1)
     }
 
-    /// As [`Plan::cost`], for one of some ranks that share the sums.
+    /// Estimated cost for one of `ranks` ranks that share the normal equations.
     #[must_use]
     #[doc(hidden)]
     pub fn cost_with_ranks(&self, ranks: usize) -> Cost {
         let map = &self.config.map;
         let nsides = self.sky_nsides();
         let fringes_per_s = FRINGES_PER_S * cores();
-        // Harmonics of a circle have averages in closed form; other models see their instants.
+        // The harmonic model averages in closed form; other models average over instants.
         let instants = if self.config.spacecraft.smear_integrations { AVERAGE_INSTANTS } else { 1.0 };
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
@@ -207,13 +206,12 @@ impl Plan {
         }
     }
 
-    /// Mission time in which the array observes, s.
     fn observing_s(&self) -> f64 {
         let length_s = |window: &ObservingWindow| window.end.seconds() - window.start.seconds();
         self.windows.iter().map(length_s).sum()
     }
 
-    /// Estimated time to make visibilities of samples, s; none without samples.
+    /// Estimated time to simulate and correlate samples, s; `None` if no samples are simulated.
     fn sampling_s(&self) -> Option<f64> {
         let width_hz = self.config.spacecraft.channel_width_hz;
         let channels = self.config.spacecraft.channels_hz.len();
@@ -222,16 +220,17 @@ impl Plan {
         is_sampled.then(|| samples_per_s * self.observing_s() / (SAMPLES_PER_S * cores()))
     }
 
-    /// Bytes of the daughters' auto-correlations.
+    /// Size of the daughters' auto-correlations in the downlink, bytes.
     fn auto_bytes(&self) -> f64 {
         let spacecraft = &self.config.spacecraft;
         let streams = self.array.satellites() * spacecraft.channels_hz.len() * spacecraft.sub_bands;
-        let each_s = spacecraft.autos_s();
-        let powers = if each_s > 0.0 { self.observing_s() / each_s * streams as f64 } else { 0.0 };
-        powers * VISIBILITY_BYTES as f64
+        let integration_s = spacecraft.autos_s();
+        let count =
+            if integration_s > 0.0 { self.observing_s() / integration_s * streams as f64 } else { 0.0 };
+        count * VISIBILITY_BYTES as f64
     }
 
-    /// Bytes of the ninth daughter's spectra, with the headers of one packet for each channel and window.
+    /// Size of the ninth daughter's spectra in the downlink, with one packet header for each channel and window, bytes.
     fn ninth_bytes(&self) -> f64 {
         const PACKET_BYTES: f64 = 42.0;
         let Some(rate) = self.ninth_bits_per_s() else { return 0.0 };
@@ -239,82 +238,82 @@ impl Plan {
         self.observing_s() * rate / 8.0 + PACKET_BYTES * packets as f64
     }
 
-    /// Solutions of each channel for `sent` visibilities of all: one for each snapshot step with data in it, and the final
-    /// one.
+    /// Number of solutions of each channel: one for each snapshot interval with data, and the final one. `sent` is the number of
+    /// visibilities of all channels.
     fn solutions(&self, sent: f64) -> u64 {
         let every_s = self.config.map.snapshot_every_s;
         if every_s <= 0.0 {
             return 1;
         }
-        let steps = (self.config.spacecraft.duration_s / every_s).ceil();
+        let intervals = (self.config.spacecraft.duration_s / every_s).ceil();
         let observed = (self.observing_s() / every_s).ceil() + self.windows.len() as f64;
-        steps.min(observed).min(sent.ceil()).max(1.0) as u64
+        intervals.min(observed).min(sent.ceil()).max(1.0) as u64
     }
 
-    /// Memory that a simulation of any channels takes, and that of each channel's sky and model, bytes.
+    /// Memory of a simulation without channels, and additional memory of each channel's sky and model, bytes.
     pub(in crate::pipeline) fn simulation_bytes_by_channel(&self) -> (f64, Vec<f64>) {
         let nsides = self.sky_nsides();
         let sky = |nside: &usize| 8.0 * pixel_count(*nside) as f64;
-        let turned = 3.0 * nsides.iter().map(sky).fold(0.0, f64::max);
+        let resampling = 3.0 * nsides.iter().map(sky).fold(0.0, f64::max);
         let models = self.model_plans(&nsides);
         let each = nsides.iter().zip(&models).map(|(nside, model)| sky(nside) + model.bytes).collect();
         let tables = self.array.table_bytes() as f64;
-        (turned + tables + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
+        (resampling + tables + QUEUED_VISIBILITIES_MAX * QUEUED_VISIBILITY_BYTES + BASE_BYTES, each)
     }
 
-    /// Memory of the space segment besides its models, bytes.
+    /// Memory of the space segment without its models, bytes.
     fn simulation_bytes(&self, sent: f64, nsides: &[usize]) -> f64 {
         let pixels: Vec<f64> = nsides.iter().map(|&nside| pixel_count(nside) as f64).collect();
-        // Every sky, and three copies of one that is turned and resampled.
+        // Every sky, and three copies of the largest while it is rotated and resampled.
         let skies = pixels.iter().sum::<f64>() + 3.0 * pixels.iter().copied().fold(0.0, f64::max);
         let tables = self.array.table_bytes() as f64;
         8.0 * skies + tables + sent.min(QUEUED_VISIBILITIES_MAX) * QUEUED_VISIBILITY_BYTES
     }
 }
 
-/// Memory of all, bytes, at the time when it is greatest: while the sums grow, or at the end, when the space segment is gone.
+/// Peak memory of a run, bytes: during accumulation, or at the end, when the space segment has been freed.
 pub(in crate::pipeline) fn memory_bytes(
     simulation_bytes: f64,
     engines: &[EngineCost],
     solutions: u64,
 ) -> f64 {
-    let greatest = |of: fn(&EngineCost) -> f64| engines.iter().map(of).fold(0.0, f64::max);
+    let largest = |bytes: fn(&EngineCost) -> f64| engines.iter().map(bytes).fold(0.0, f64::max);
     let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
         + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
-    let copy = greatest(|engine| engine.copy_bytes);
+    let copy = largest(|engine| engine.copy_bytes);
     // One copy is made, one waits in the queue, and one is in the solver.
     let solving = |copies: usize| match copies {
         0 => 0.0,
-        copies => copies.min(3) as f64 * copy + greatest(|engine| engine.other_bytes),
+        copies => copies.min(3) as f64 * copy + largest(|engine| engine.other_bytes),
     };
-    let growing = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
-    let last = if engines.iter().any(|engine| engine.copies_final) { engines.len() } else { 0 };
-    growing.max(sums + solving(last)) + BASE_BYTES
+    let accumulating = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
+    let final_copies = if engines.iter().any(|engine| engine.copies_final) { engines.len() } else { 0 };
+    accumulating.max(sums + solving(final_copies)) + BASE_BYTES
 }
 
 impl Cost {
-    /// Adds the number of nodes with this memory that hold all ranks, if a node holds at least one.
+    /// Adds the number of nodes with memory `limit` that hold all ranks, if a node holds at least one rank.
     #[must_use]
     pub fn on_nodes(mut self, limit: Option<MemoryLimit>) -> Self {
         if let (Some(limit), Some(cost)) = (limit, &mut self.ranks) {
             let bytes = limit.bytes as f64;
-            let on_one = (bytes / self.memory_bytes) as usize;
-            cost.nodes = (on_one > 0).then(|| (bytes, cost.ranks.div_ceil(on_one)));
+            let ranks_per_node = (bytes / self.memory_bytes) as usize;
+            cost.nodes = (ranks_per_node > 0).then(|| (bytes, cost.ranks.div_ceil(ranks_per_node)));
         }
         self
     }
 
-    /// Requires that all estimates are finite: what cannot be estimated may never end.
+    /// Requires that all estimates are finite; a run without a finite estimate may never end.
     ///
     /// # Errors
     /// [`PipelineError::Unbounded`].
     pub fn require_finite(&self) -> Result<(), PipelineError> {
         let channels = self.channels.iter().flat_map(|channel| {
-            let of = |what| format!("{what} of the channel at {:.3} MHz", channel.frequency_hz / 1e6);
+            let name = |what| format!("{what} of the channel at {:.3} MHz", channel.frequency_hz / 1e6);
             [
-                (of("number of visibilities"), channel.visibilities_sent),
-                (of("time of the simulation"), channel.simulation_s()),
-                (of("time of the map"), channel.mapping_s),
+                (name("number of visibilities"), channel.visibilities_sent),
+                (name("time of the simulation"), channel.simulation_s()),
+                (name("time of the map"), channel.mapping_s),
             ]
         });
         let whole = [
@@ -330,10 +329,10 @@ impl Cost {
         }
     }
 
-    /// Requires that the memory that a segment needs is within the limit.
+    /// Requires that a segment fits into memory.
     ///
     /// # Errors
-    /// [`PipelineError::Memory`]; those of [`Cost::require_finite`].
+    /// [`PipelineError::Memory`]; as [`Cost::require_finite`].
     pub fn require_memory(&self, segment: Segment, limit: Option<MemoryLimit>) -> Result<(), PipelineError> {
         self.require_finite()?;
         let needed_bytes = match segment {

@@ -1,4 +1,4 @@
-//! Which channels fit into memory together: groups for the simulation and for the maps.
+//! Division of channels into groups that fit into memory, for the simulation and for the maps.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,7 +13,7 @@ use crate::mother::Fidelity;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::units::ChannelId;
 
-/// How many channels are mapped at a time.
+/// Number of channels per group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GroupSize {
     /// As many as memory allows.
@@ -25,13 +25,13 @@ pub enum GroupSize {
 /// Channels that are mapped together.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct MapGroup {
-    /// Channels.
+    /// The channels.
     pub channels: ChannelGroup,
-    /// Parts in which their sums are made, each by reading the downlink, to wait on disk for the solution; 1 for sums in memory.
+    /// Number of parts in which the sums are accumulated, with one reading of the downlink and a file for each; 1 for sums in memory.
     pub parts: usize,
 }
 
-/// Groups of channels in which a run is made.
+/// Groups of channels of a whole run.
 #[derive(Clone, Debug, Serialize)]
 pub struct RunGroups {
     /// Groups of channels that are simulated together.
@@ -59,24 +59,24 @@ impl fmt::Display for RunGroups {
 }
 
 impl Plan {
-    /// The groups of a run: of this size, or as many channels as memory has room for.
+    /// Divides the channels into groups of the given size, or into groups that fit into memory.
     ///
     /// # Errors
-    /// Samples; a channel for which alone there is too little memory.
+    /// A simulation of samples; a single channel that does not fit into memory.
     #[doc(hidden)]
     pub fn run_groups(
         &self,
         size: GroupSize,
         limit: Option<MemoryLimit>,
     ) -> Result<RunGroups, PipelineError> {
-        let mapped = groups_of(&self.instrument, &self.config, size, limit)?;
+        let mapped = map_groups(&self.instrument, &self.config, size, limit)?;
         Ok(RunGroups { simulated: self.simulation_groups(size, limit)?, mapped })
     }
 
-    /// Groups of the channels for a simulation, in their order.
+    /// Divides the channels into groups for the simulation, in order.
     ///
     /// # Errors
-    /// Samples, which are simulated for all channels together; a channel for which alone there is too little memory.
+    /// A simulation of samples, which has to include all channels; a single channel that does not fit into memory.
     #[doc(hidden)]
     pub fn simulation_groups(
         &self,
@@ -89,16 +89,22 @@ impl Plan {
                 expected: "\"visibilities\": samples hold all channels together",
             });
         }
-        let (shared, each) = self.simulation_bytes_by_channel();
-        let needed = |group: &[ChannelId]| {
-            shared + group.iter().filter_map(|channel| each.get(usize::from(channel.0))).sum::<f64>()
+        let (shared_bytes, channel_bytes) = self.simulation_bytes_by_channel();
+        let needed_bytes = |group: &[ChannelId]| {
+            let bytes = group.iter().filter_map(|channel| channel_bytes.get(usize::from(channel.0)));
+            shared_bytes + bytes.sum::<f64>()
         };
-        let channels = (0..).map(ChannelId).take(each.len());
-        partition(channels, size, limit, needed)
+        let channels = (0..).map(ChannelId).take(channel_bytes.len());
+        partition(channels, size, limit, needed_bytes)
     }
 }
 
-pub(in crate::pipeline) fn groups_of(
+/// Divides the mapped channels of an instrument into groups. A channel whose sums do not fit into memory is a group of its own, with
+/// sums in parts.
+///
+/// # Errors
+/// A single channel that does not fit into memory.
+pub(in crate::pipeline) fn map_groups(
     instrument: &Instrument,
     config: &Config,
     size: GroupSize,
@@ -106,28 +112,28 @@ pub(in crate::pipeline) fn groups_of(
 ) -> Result<Vec<MapGroup>, PipelineError> {
     let map = &config.map;
     let costs = complete_costs(instrument, map);
-    let of_costs = |costs: &[EngineCost]| memory_bytes(0.0, costs, solutions_of(map));
-    // Of a channel alone: what its sums in parts need, which have no snapshots on the way.
+    let group_bytes = |costs: &[EngineCost]| memory_bytes(0.0, costs, memory_solutions(map));
+    // Sums in parts have no snapshots before the end.
     let parts = |channel: &ChannelId| {
         let needed = |cost| match cost == costs[channel] {
-            true => of_costs(&[cost]),
+            true => group_bytes(&[cost]),
             false => memory_bytes(0.0, &[cost], 1),
         };
         limit.map_or(Some(1), |limit| costs[channel].parts_within(map, limit.bytes as f64, needed))
     };
     let needed = |group: &[ChannelId]| match group {
         [only] if parts(only).is_some_and(|parts| parts > 1) => 0.0,
-        _ => of_costs(&group.iter().filter_map(|channel| costs.get(channel)).copied().collect::<Vec<_>>()),
+        _ => group_bytes(&group.iter().filter_map(|channel| costs.get(channel)).copied().collect::<Vec<_>>()),
     };
     let groups = partition(costs.keys().copied(), size, limit, needed)?;
     let with_parts = |channels: ChannelGroup| {
-        let alone = channels.first().filter(|_| channels.len() == 1);
-        MapGroup { parts: alone.and_then(parts).unwrap_or(1), channels }
+        let single = channels.first().filter(|_| channels.len() == 1);
+        MapGroup { parts: single.and_then(parts).unwrap_or(1), channels }
     };
     Ok(groups.into_iter().map(with_parts).collect())
 }
 
-/// Memory of a channel's sums at the end of a mission of any length.
+/// Cost of each mapped channel at the end of a mission of unlimited length.
 pub(in crate::pipeline) fn complete_costs(
     instrument: &Instrument,
     map: &MapConfig,
@@ -139,19 +145,19 @@ pub(in crate::pipeline) fn complete_costs(
     };
     channels
         .filter(|(channel, _)| map.is_mapped(*channel))
-        .map(|(channel, described)| (channel, cost(described.frequency_hz)))
+        .map(|(id, channel)| (id, cost(channel.frequency_hz)))
         .collect()
 }
 
-/// Solutions that matter to memory.
-pub(in crate::pipeline) fn solutions_of(map: &MapConfig) -> u64 {
+/// Number of solutions for estimates of memory: 2 stands for any number of snapshots.
+pub(in crate::pipeline) fn memory_solutions(map: &MapConfig) -> u64 {
     if map.snapshot_every_s > 0.0 { 2 } else { 1 }
 }
 
-/// Divides channels into groups of neighbours of this size, or of as many as `limit` has room for.
+/// Divides channels into groups of consecutive channels, of the given size or as large as `limit` permits.
 ///
 /// # Errors
-/// A channel for which alone there is too little memory.
+/// A single channel that does not fit into memory.
 pub(in crate::pipeline) fn partition(
     channels: impl Iterator<Item = ChannelId>,
     size: GroupSize,
@@ -168,7 +174,7 @@ pub(in crate::pipeline) fn partition(
             group.push(channel);
             let has_room = match size {
                 GroupSize::Automatic => exceeded(group).is_none(),
-                GroupSize::Channels(most) => group.len() <= most,
+                GroupSize::Channels(count) => group.len() <= count,
             };
             if has_room {
                 continue;
@@ -185,13 +191,13 @@ mod tests {
     use super::*;
     use crate::pipeline::ConfigSource;
 
-    fn planned(size: GroupSize, limit_gb: u64, sets: &[&str]) -> Result<Vec<Vec<u16>>, PipelineError> {
+    fn grouped(size: GroupSize, limit_gb: u64, sets: &[&str]) -> Result<Vec<Vec<u16>>, PipelineError> {
         let mut overrides = vec!["spacecraft.channels_hz=[1e6, 3e6, 10e6, 20e6, 30e6]".to_owned()];
         overrides.extend(sets.iter().map(|set| (*set).to_owned()));
         let config = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap();
         let plan = crate::pipeline::Plan::new(config).unwrap();
         let limit = Some(MemoryLimit::of_user(limit_gb * 1_000_000_000));
-        let groups = groups_of(&plan.instrument, &plan.config, size, limit)?;
+        let groups = map_groups(&plan.instrument, &plan.config, size, limit)?;
         Ok(groups
             .into_iter()
             .map(|group| group.channels.into_iter().map(|channel| channel.0).collect())
@@ -199,25 +205,25 @@ mod tests {
     }
 
     #[test]
-    fn as_many_channels_as_memory_holds_are_a_group() {
-        // Half of a symmetric matrix of 49152 pixels, 9.7 GB a channel.
+    fn groups_are_as_large_as_memory_permits() {
+        // Half of a symmetric matrix of 49152 pixels: 9.7 GB per channel.
         let fine = ["map.nside=64", "map.snapshot_every_s=0", "map.engine=pixel"];
-        let automatic = |limit_gb| planned(GroupSize::Automatic, limit_gb, &fine);
+        let automatic = |limit_gb| grouped(GroupSize::Automatic, limit_gb, &fine);
         assert_eq!(automatic(1000).unwrap(), [vec![0, 1, 2, 3, 4]]);
         assert_eq!(automatic(24).unwrap(), [vec![0, 1], vec![2, 3], vec![4]]);
         assert_eq!(automatic(12).unwrap(), [[0], [1], [2], [3], [4]]);
         assert!(matches!(automatic(8), Err(PipelineError::Memory { .. })));
-        let by_three = planned(GroupSize::Channels(3), 1000, &fine).unwrap();
+        let by_three = grouped(GroupSize::Channels(3), 1000, &fine).unwrap();
         assert_eq!(by_three, [vec![0, 1, 2], vec![3, 4]]);
-        // A number is the user's to choose; what cannot be at all is refused.
-        assert!(planned(GroupSize::Channels(1), 8, &fine).is_err());
+        // The user chooses the size, but a single channel has to fit.
+        assert!(grouped(GroupSize::Channels(1), 8, &fine).is_err());
         let some =
-            planned(GroupSize::Channels(2), 1000, &["map.channels=[4, 0, 3]", "map.snapshot_every_s=0"])
+            grouped(GroupSize::Channels(2), 1000, &["map.channels=[4, 0, 3]", "map.snapshot_every_s=0"])
                 .unwrap();
         assert_eq!(some, [vec![0, 3], vec![4]]);
-        // The sums of the harmonic engine count as complete.
+        // The harmonic engine's sums are estimated at their full size.
         let harmonic = ["map.nside=64", "map.snapshot_every_s=0", "map.engine=harmonic", "map.l_max=160"];
-        let groups = planned(GroupSize::Automatic, 20, &harmonic).unwrap();
+        let groups = grouped(GroupSize::Automatic, 20, &harmonic).unwrap();
         assert!(groups.len() > 1 && groups.concat() == [0, 1, 2, 3, 4], "{groups:?}");
     }
 }

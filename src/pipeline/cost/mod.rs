@@ -1,4 +1,4 @@
-//! What a plan costs before it runs: operations, bytes, memory and time, and the channels that fit into memory together.
+//! Estimated cost of a plan before it runs: operations, bytes, memory and time; groups of channels that fit into memory.
 
 mod advice;
 mod estimate;
@@ -8,5 +8,5 @@ mod rates;
 
 pub use advice::MemoryAdvice;
 pub use estimate::{ChannelCost, Cost, RankCost, Segment};
-pub(super) use groups::groups_of;
+pub(super) use groups::map_groups;
 pub use groups::{GroupSize, MapGroup, RunGroups};

@@ -17,26 +17,23 @@ use crate::units::vector::{Vec3, norm, sub};
 use crate::units::{Pair, all_pairs};
 
 impl Plan {
-    /// The choice of model for each channel, with skies of these nsides, channel by channel.
+    /// Chooses the model of each channel; `nsides` are those of the channels' skies.
     #[must_use]
     #[doc(hidden)]
     pub fn model_plans(&self, nsides: &[usize]) -> Vec<ModelPlan> {
         self.model_plans_for(&self.visibilities(), nsides)
     }
 
-    /// As [`Self::model_plans`], for the visibilities of [`Self::visibilities`].
+    /// Chooses the model of each channel for given numbers of visibilities.
     pub(in crate::pipeline) fn model_plans_for(
         &self,
         expected: &[Expected],
         nsides: &[usize],
     ) -> Vec<ModelPlan> {
         let spacecraft = &self.config.spacecraft;
-        let apart_m = match self.array.formation() {
-            Some(_) => 0.0,
-            None => farthest_apart_m(&self.array, &self.windows),
-        };
+        let distance_m_max = self.distance_m_max();
         let plan = |((schedule, expected), &sky_nside): ((&Schedule, &Expected), &usize)| {
-            let longest = longest_baseline_wavelengths(&self.array, apart_m, schedule);
+            let longest = longest_baseline_wavelengths(&self.array, distance_m_max, schedule);
             let (frequencies, stretch) = match spacecraft.smear_bandwidth {
                 true => {
                     let width_hz = spacecraft.channel_width_hz;
@@ -55,7 +52,7 @@ impl Plan {
                 is_on_circle: self.array.formation().is_some(),
             };
             if spacecraft.fidelity == Fidelity::Samples {
-                // The sampler needs auto-correlations and pairs stretched over the channel; the others are made for neither.
+                // The sampler needs auto-correlations and baselines scaled over the channel, which only direct sums provide.
                 let direct = ModelPlan::new(ModelChoice::Direct, load);
                 return ModelPlan { why: "samples take direct sums", ..direct };
             }
@@ -63,10 +60,16 @@ impl Plan {
         };
         self.schedules.iter().zip(expected).zip(nsides).map(plan).collect()
     }
-}
 
-impl Plan {
-    /// nside of each channel's simulated sky; a map file that cannot be read counts as a generated sky.
+    /// Greatest distance of two satellites without a formation, m; 0 with one.
+    fn distance_m_max(&self) -> f64 {
+        match self.array.formation() {
+            Some(_) => 0.0,
+            None => satellite_distance_m_max(&self.array, &self.windows),
+        }
+    }
+
+    /// nside of each channel's simulated sky; for a map file that cannot be read, that of a generated sky.
     #[must_use]
     #[doc(hidden)]
     pub fn sky_nsides(&self) -> Vec<usize> {
@@ -74,42 +77,38 @@ impl Plan {
         let nside = |channel: usize| {
             let path = sky.file.as_ref().and_then(|files| files.get(channel));
             let options = sky_options(sky, self.schedules[channel].frequency_hz);
-            let of_map = path.and_then(|path| read_nside(&path, &options).ok());
-            let least = if sky.added.is_some() { sky.nside } else { 1 };
-            of_map.map_or(sky.nside, |nside| nside.max(least))
+            let map_nside = path.and_then(|path| read_nside(&path, &options).ok());
+            let nside_min = if sky.added.is_some() { sky.nside } else { 1 };
+            map_nside.map_or(sky.nside, |nside| nside.max(nside_min))
         };
         (0..self.schedules.len()).map(nside).collect()
     }
 
-    /// Channels whose baselines see finer scales than the sky's pixels hold, if there are any: direct sums take pixels for points,
-    /// harmonics leave out what is finer, and neither is the sky.
+    /// A note if the baselines of some channels resolve finer scales than the sky's pixels represent.
     #[must_use]
     pub(in crate::pipeline) fn coarse_sky_note(&self) -> Option<String> {
-        let apart_m = match self.array.formation() {
-            Some(_) => 0.0,
-            None => farthest_apart_m(&self.array, &self.windows),
-        };
+        let distance_m_max = self.distance_m_max();
         let coarse: Vec<(String, usize, usize)> = self
             .schedules
             .iter()
             .zip(self.sky_nsides())
             .map(|(schedule, nside)| {
-                let longest = longest_baseline_wavelengths(&self.array, apart_m, schedule);
+                let longest = longest_baseline_wavelengths(&self.array, distance_m_max, schedule);
                 let name = format!("{:.3} MHz ({longest:.1} wavelengths)", schedule.frequency_hz / 1e6);
                 (name, l_max_of_fringes(longest), nside)
             })
             .filter(|&(_, seen, nside)| seen > SkyConfig::l_max_determined(nside))
             .collect();
         let (_, seen, nside) = coarse.iter().max_by_key(|(_, seen, _)| *seen)?;
-        let (held, most) =
-            (SkyConfig::l_max_determined(*nside), SkyConfig::l_max_determined(GENERATED_NSIDE_MAX));
+        let held = SkyConfig::l_max_determined(*nside);
+        let held_max = SkyConfig::l_max_determined(GENERATED_NSIDE_MAX);
         let names: Vec<&str> = coarse.iter().map(|(name, ..)| name.as_str()).take(4).collect();
         let more = if coarse.len() > names.len() { ", .." } else { "" };
         let needed = (0..)
             .map(|k| 1 << k)
             .find(|&nside| SkyConfig::l_max_determined(nside) >= *seen)
             .unwrap_or(nside * 2);
-        let mend = match *seen <= most {
+        let mend = match *seen <= held_max {
             true => format!("a sky of nside {needed} (sky.nside, or a finer map) or shorter baselines"),
             false => "shorter baselines".to_owned(),
         };
@@ -121,7 +120,7 @@ impl Plan {
         ))
     }
 
-    /// Memory of the known sky from whose visibilities gains are found while the data arrive, bytes; what cannot be read counts nothing.
+    /// Memory of the sky model for gains that are solved while data arrive, bytes; 0 for maps that cannot be read.
     pub(in crate::pipeline) fn known_sky_bytes(&self) -> f64 {
         let solver = &self.config.calibrate;
         if self.config.calibration.hook != CalibrationHook::Solve || solver.mode == CalibrationMode::Beacon {
@@ -147,18 +146,19 @@ impl Plan {
     }
 }
 
-/// Memory of a pixel of a direct sum, bytes: its direction, and its value twice.
+/// Memory of a pixel in a direct sum, bytes: its direction, and two copies of its value.
 const DIRECTION_BYTES: f64 = 40.0;
 
-/// The longest baseline of a schedule, wavelengths. The limit holds at the start of an integration; until its middle a
-/// baseline moves by less than the rule allows. Without a formation satellites are `apart_m` apart at most.
-fn longest_baseline_wavelengths(array: &Array, apart_m: f64, schedule: &Schedule) -> f64 {
+/// Longest baseline of a schedule, wavelengths. `distance_m_max` is the greatest distance of satellites without a formation.
+///
+/// The limit of the schedule holds at the start of an integration; until the middle a baseline can move by as much as the rule permits.
+fn longest_baseline_wavelengths(array: &Array, distance_m_max: f64, schedule: &Schedule) -> f64 {
     let Some(formation) = array.formation() else {
         let limit = schedule.baseline_wavelengths_max;
-        let most = apart_m * schedule.frequency_hz / SPEED_OF_LIGHT_M_S;
-        return if limit > 0.0 { most.min(limit + schedule.rule.motion_wavelengths_max) } else { most };
+        let longest = distance_m_max * schedule.frequency_hz / SPEED_OF_LIGHT_M_S;
+        return if limit > 0.0 { longest.min(limit + schedule.rule.motion_wavelengths_max) } else { longest };
     };
-    // Arcs are greatest at the start of a period.
+    // Arcs are longest at the start of a breathing period.
     let arcs = (0..array.satellites()).map(|n| formation.arc_m(n, 0.0).0);
     let arc_m = arcs.fold(0.0, f64::max);
     let radius_m = array.orbit_radius_m();
@@ -170,25 +170,27 @@ fn longest_baseline_wavelengths(array: &Array, apart_m: f64, schedule: &Schedule
     }
 }
 
-/// Windows in which distances are looked at, at most, and instants of each.
+/// Maximum number of windows in which distances are computed.
 const WINDOWS_MAX: usize = 500;
+/// Instants of each window at which distances are computed.
 const INSTANTS: usize = 5;
 
-/// About the greatest distance of two satellites while they observe, m: a tenth more than at some instants, and at most that of
-/// opposite sides.
-fn farthest_apart_m(array: &Array, windows: &[ObservingWindow]) -> f64 {
+/// Estimated greatest distance of two satellites in observing windows, m: 10 % above the greatest at some instants, but at most the
+/// diameter of the orbits.
+fn satellite_distance_m_max(array: &Array, windows: &[ObservingWindow]) -> f64 {
     let step = windows.len().div_ceil(WINDOWS_MAX).max(1);
     let chosen: Vec<&ObservingWindow> = windows.iter().step_by(step).collect();
     let pairs = all_pairs(array.satellites());
     let in_window = |window: &&ObservingWindow| {
         let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
-        let at = |k: usize| start_s + (end_s - start_s) * k as f64 / (INSTANTS - 1) as f64;
-        let distance = |t_s: f64| {
-            let places: Vec<Vec3> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
-            let apart = |pair: &Pair| norm(sub(places[usize::from(pair.i)], places[usize::from(pair.j)]));
-            pairs.iter().map(apart).fold(0.0, f64::max)
+        let time_s = |k: usize| start_s + (end_s - start_s) * k as f64 / (INSTANTS - 1) as f64;
+        let distance_m_max = |t_s: f64| {
+            let positions_m: Vec<Vec3> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
+            let distance_m =
+                |pair: &Pair| norm(sub(positions_m[usize::from(pair.i)], positions_m[usize::from(pair.j)]));
+            pairs.iter().map(distance_m).fold(0.0, f64::max)
         };
-        (0..INSTANTS).map(at).map(distance).fold(0.0, f64::max)
+        (0..INSTANTS).map(time_s).map(distance_m_max).fold(0.0, f64::max)
     };
     let found = chosen.par_iter().map(in_window).reduce(|| 0.0, f64::max);
     (1.1 * found).min(2.0 * array.farthest_m())

@@ -1,8 +1,8 @@
-//! Rates of one core of the simulation, measured once, from which times are estimated: of the machine that `imaging/rates.rs` names.
+//! Rates of the simulation per core, measured on the machine that `imaging/rates.rs` names.
 
-/// Fringes of direct sums in a second (bench `response`).
+/// Fringes of direct sums per second (bench `response`).
 pub(in crate::pipeline) const FRINGES_PER_S: f64 = 7.2e8;
 
-/// Samples of one daughter and channel that are drawn, quantised, sent and correlated in a second, with eight daughters
-/// (`lunarray bench`: 30 channels of 8 kHz at 23 times real time).
+/// Samples drawn, quantised, sent and correlated per second, counted per daughter and channel, with eight daughters (`lunarray
+/// bench`: 30 channels of 8 kHz at 23 times real time).
 pub(in crate::pipeline) const SAMPLES_PER_S: f64 = 2.2e7;

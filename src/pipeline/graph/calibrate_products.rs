@@ -12,10 +12,9 @@ use crate::products::ProductsError;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 use crate::units::constants::DAY_S;
 
-/// Creates a folder.
-pub(in crate::pipeline) fn create(folder: &Path) -> Result<(), PipelineError> {
-    let made = std::fs::create_dir_all(folder);
-    Ok(made.map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?)
+pub(in crate::pipeline) fn create_folder(folder: &Path) -> Result<(), PipelineError> {
+    let created = std::fs::create_dir_all(folder);
+    Ok(created.map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?)
 }
 
 fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
@@ -23,7 +22,6 @@ fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
     Ok(written.map_err(|source| ProductsError::Write { path: path.to_owned(), source })?)
 }
 
-/// Writes a value as JSON.
 pub(in crate::pipeline) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), PipelineError> {
     let text = serde_json::to_vec(value)
         .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
@@ -37,8 +35,8 @@ struct SolutionsFile<'a> {
     solutions: &'a [PassSolution],
 }
 
-/// Writes everything; the file of gains last.
-pub(in crate::pipeline) fn write(
+/// Writes all products; `gains.json` last.
+pub(in crate::pipeline) fn write_products(
     out: &Path,
     found: &FoundSolutions,
     summary: &CalibrateSummary,
@@ -53,10 +51,10 @@ pub(in crate::pipeline) fn write(
         let picture = draw_plots("Gains by daughter and day", &plots, 2).map_err(ProductsError::from)?;
         picture.write(&out.join("solutions.png")).map_err(ProductsError::from)?;
     }
-    // Last: where it is, all the others are.
+    // If it exists, all other products do.
     match found.gains(false) {
         Some(gains) => write_json(&out.join("gains.json"), &gains),
-        // Those of an earlier command would be taken for this one's.
+        // Gains of an earlier command would be taken for the result of this one.
         None => match std::fs::remove_file(out.join("gains.json")) {
             Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
                 Err(ProductsError::Write { path: out.join("gains.json"), source }.into())
@@ -66,16 +64,16 @@ pub(in crate::pipeline) fn write(
     }
 }
 
-/// Phases and amplitudes of a channel over time.
 fn plots(solutions: &[PassSolution], channel: usize) -> [Plot; 2] {
-    let satellites = solutions.first().map_or(0, |one| one.daughters.len());
-    let frequency_hz = solutions.first().map_or(0.0, |one| one.daughters[0].gains[channel].frequency_hz);
-    let plot = |name: &str, label: &str, of: &dyn Fn(&GainEstimate) -> f64| {
+    let satellites = solutions.first().map_or(0, |solution| solution.daughters.len());
+    let frequency_hz =
+        solutions.first().map_or(0.0, |solution| solution.daughters[0].gains[channel].frequency_hz);
+    let plot = |name: &str, label: &str, quantity: &dyn Fn(&GainEstimate) -> f64| {
         let curve = |n: usize| {
-            let point = |one: &PassSolution| {
-                let gain = &one.daughters[n].gains[channel];
-                let value = if gain.state == GainState::Good { of(gain) } else { f64::NAN };
-                (0.5 * (one.from_s + one.until_s) / DAY_S, value)
+            let point = |solution: &PassSolution| {
+                let gain = &solution.daughters[n].gains[channel];
+                let value = if gain.state == GainState::Good { quantity(gain) } else { f64::NAN };
+                (0.5 * (solution.from_s + solution.until_s) / DAY_S, value)
             };
             let points = solutions.iter().map(point).collect();
             Curve { label: format!("daughter {}", n + 1), points, dashed: false }

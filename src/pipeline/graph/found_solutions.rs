@@ -1,35 +1,35 @@
-//! Solutions of the passes of a downlink, and what is told of them.
+//! Gain solutions of the passes of a downlink, and their summary.
 
 use std::fmt;
 
 use serde::Serialize;
 
 use crate::calibration::solver::{
-    CalibrationMode, GainState, InstrumentEvent, PassSolution, SolverConfig, gains_file, instrument_events,
+    CalibrationMode, GainEstimate, GainState, InstrumentEvent, PassSolution, SolverConfig, gains_file,
+    instrument_events,
 };
 use crate::calibration::{GainsFile, SolvedGains};
 use crate::frames::Instrument;
 use crate::numerics::median;
 
-/// Most events that are printed.
 const EVENTS_SHOWN: usize = 20;
 
-/// One solution of all passes, and the map that it was made with.
+/// One round of calibration: all passes solved with one sky model.
 #[derive(Clone, Debug, Serialize)]
 pub struct CalibrateRound {
-    /// Number; 0 with the given model.
+    /// Number of the round; 0 uses the given model.
     pub round: u32,
     /// The known signal: the sky, the artificial signal, or both.
     pub mode: CalibrationMode,
-    /// Root mean square change of the gains since the round before, relative to one.
+    /// Root mean square of the relative change of the gains since the previous round.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub change_rms: Option<f64>,
-    /// Mean of chi_square over the passes that make maps.
+    /// Mean reduced chi-square of the passes that are used for maps.
     pub chi_square: f64,
-    /// The same of passes that are held out.
+    /// Mean reduced chi-square of the held-out passes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub chi_square_held_out: Option<f64>,
-    /// Power by degree of the maps of this round, by channel, K^2; those that the round was made with.
+    /// Angular power spectrum of the maps that this round was solved with, by channel, K^2.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub map_cl_k2: Vec<Vec<f64>>,
 }
@@ -37,25 +37,25 @@ pub struct CalibrateRound {
 /// Summary of `lunarray calibrate`.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CalibrateSummary {
-    /// Passes.
+    /// Number of passes.
     pub passes: u64,
-    /// Solutions.
+    /// Number of solutions; a pass may have several.
     pub solutions: u64,
     /// Solutions that converged.
     pub converged: u64,
     /// Visibilities used.
     pub visibilities: u64,
-    /// Left out as outliers.
+    /// Visibilities left out as outliers.
     pub outliers: u64,
-    /// Left out because of a flag, or without positions.
+    /// Visibilities left out because they are flagged or have no positions.
     pub unused: u64,
     /// Visibilities that arrived after their pass was solved.
     pub late: u64,
-    /// Gains that are not good, and all gains.
+    /// Number of gains that are not good, and of all gains.
     pub gains_not_good: [u64; 2],
     /// Median standard deviation of a daughter's phase, deg, by channel and daughter.
     pub phase_sigma_deg: Vec<Vec<f64>>,
-    /// Rounds.
+    /// The rounds, in order.
     pub rounds: Vec<CalibrateRound>,
     /// Events of the instrument: jumps of clocks, steps of gains, interference, bursts.
     pub events: Vec<InstrumentEvent>,
@@ -63,7 +63,7 @@ pub struct CalibrateSummary {
     pub conventions: Vec<String>,
     /// Warnings, and how to mend what is wrong.
     pub warnings: Vec<String>,
-    /// Whether it was ended early: then nothing is written.
+    /// Whether the calibration was interrupted: then nothing is written.
     pub cancelled: bool,
 }
 
@@ -92,7 +92,7 @@ impl fmt::Display for CalibrateSummary {
     }
 }
 
-/// Solutions of all passes.
+/// Solutions of all passes, with counts of the data outside of them.
 #[derive(Default)]
 pub(in crate::pipeline) struct FoundSolutions {
     pub(in crate::pipeline) instrument: Option<Instrument>,
@@ -103,8 +103,8 @@ pub(in crate::pipeline) struct FoundSolutions {
 }
 
 impl FoundSolutions {
-    /// Solutions that a ground has found so far.
-    pub(in crate::pipeline) fn of(gains: &SolvedGains) -> Self {
+    /// Solutions that the ground segment has found so far.
+    pub(in crate::pipeline) fn from_gains(gains: &SolvedGains) -> Self {
         let passes = gains.passes();
         Self {
             instrument: gains.instrument(),
@@ -115,8 +115,8 @@ impl FoundSolutions {
         }
     }
 
-    /// The summary of solutions with the given maps, or without.
-    pub(in crate::pipeline) fn of_one_round(
+    /// The summary of a calibration of one round; `has_maps`: it was solved with maps of the sky.
+    pub(in crate::pipeline) fn single_round_summary(
         &self,
         solver: &SolverConfig,
         has_maps: bool,
@@ -126,14 +126,14 @@ impl FoundSolutions {
         summary
     }
 
-    /// The file of gains; `None` without solutions.
+    /// The content of `gains.json`; `None` without solutions.
     pub(in crate::pipeline) fn gains(&self, without_held_out: bool) -> Option<GainsFile> {
         let instrument = self.instrument.as_ref()?;
         (!self.solutions.is_empty())
             .then(|| gains_file(&self.solutions, &instrument.channels, without_held_out))
     }
 
-    /// A round of these solutions.
+    /// The record of the round that found these solutions.
     pub(in crate::pipeline) fn round(
         &self,
         round: u32,
@@ -141,10 +141,14 @@ impl FoundSolutions {
         change_rms: Option<f64>,
         map_cl_k2: Vec<Vec<f64>>,
     ) -> CalibrateRound {
-        let mean = |held_out: bool| {
+        let mean = |is_held_out: bool| {
             // A part of a pass may have no data.
-            let of = self.solutions.iter().filter(|one| one.is_held_out == held_out && one.visibilities > 0);
-            let (sum, count) = of.fold((0.0, 0.0), |(sum, count), one| (sum + one.chi_square, count + 1.0));
+            let solutions = self
+                .solutions
+                .iter()
+                .filter(|solution| solution.is_held_out == is_held_out && solution.visibilities > 0);
+            let (sum, count) =
+                solutions.fold((0.0, 0.0), |(sum, count), found| (sum + found.chi_square, count + 1.0));
             (count > 0.0).then(|| sum / count)
         };
         CalibrateRound {
@@ -157,7 +161,11 @@ impl FoundSolutions {
         }
     }
 
-    /// Warnings about data that are not in the solutions.
+    fn all_gains(&self) -> impl Iterator<Item = &GainEstimate> + Clone {
+        self.solutions.iter().flat_map(|solution| &solution.daughters).flat_map(|daughter| &daughter.gains)
+    }
+
+    /// Warnings about late data, and about solutions without a good gain.
     fn warnings(&self, solver: &SolverConfig) -> Vec<String> {
         let mut warnings = Vec::new();
         if self.late > 0 {
@@ -167,8 +175,8 @@ impl FoundSolutions {
                 self.late
             ));
         }
-        let gains = self.solutions.iter().flat_map(|one| &one.daughters).flat_map(|daughter| &daughter.gains);
-        if !self.solutions.is_empty() && gains.clone().all(|gain| gain.state != GainState::Good) {
+        let mut gains = self.all_gains();
+        if !self.solutions.is_empty() && gains.all(|gain| gain.state != GainState::Good) {
             warnings.push(format!(
                 "no gain is good, so that a replay with them maps nothing: the reference (calibrate.reference_daughter = {}) has to have \
                  data, and the model has to be that of the data (chi-square)",
@@ -178,25 +186,24 @@ impl FoundSolutions {
         warnings
     }
 
-    /// Their summary.
+    /// The summary of the solutions, without rounds.
     pub(in crate::pipeline) fn summary(&self, solver: &SolverConfig) -> CalibrateSummary {
         let satellites = self.instrument.as_ref().map_or(0, |instrument| usize::from(instrument.satellites));
-        let hz = |instrument: &Instrument| instrument.channels.iter().map(|one| one.frequency_hz).collect();
-        let frequencies_hz: Vec<f64> = self.instrument.as_ref().map_or_else(Vec::new, hz);
+        let frequencies_hz = self.instrument.as_ref().map_or_else(Vec::new, Instrument::frequencies_hz);
         let channels = frequencies_hz.len();
         let sigma_deg = |c: usize, n: usize| {
-            let sigmas = self.solutions.iter().map(|one| one.daughters[n].gains[c].phase_sigma_deg);
+            let sigmas = self.solutions.iter().map(|solution| solution.daughters[n].gains[c].phase_sigma_deg);
             median(sigmas.collect()).unwrap_or(f64::NAN)
         };
-        let gains = self.solutions.iter().flat_map(|one| &one.daughters).flat_map(|daughter| &daughter.gains);
-        let (bad, all) =
-            gains.fold((0, 0), |(bad, all), gain| (bad + u64::from(gain.state != GainState::Good), all + 1));
+        let (bad, all) = self
+            .all_gains()
+            .fold((0, 0), |(bad, all), gain| (bad + u64::from(gain.state != GainState::Good), all + 1));
         CalibrateSummary {
             passes: self.passes,
             solutions: self.solutions.len() as u64,
-            converged: self.solutions.iter().filter(|one| one.converged).count() as u64,
-            visibilities: self.solutions.iter().map(|one| one.visibilities).sum(),
-            outliers: self.solutions.iter().map(|one| one.outliers).sum(),
+            converged: self.solutions.iter().filter(|solution| solution.converged).count() as u64,
+            visibilities: self.solutions.iter().map(|solution| solution.visibilities).sum(),
+            outliers: self.solutions.iter().map(|solution| solution.outliers).sum(),
             unused: self.unused,
             late: self.late,
             gains_not_good: [bad, all],

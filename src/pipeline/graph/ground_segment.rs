@@ -1,4 +1,4 @@
-//! The ground segment as a graph: bytes, sums, maps, products.
+//! The stages of the ground segment: from downlink bytes to normal equations, maps and products.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -15,22 +15,19 @@ use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Pr
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::{ReadOptions, read_prior};
 
-/// Name of the stage that keeps the state.
+/// Name of the stage that decodes, calibrates and accumulates, and keeps the state.
 pub(in crate::pipeline) const GROUND: &str = "ground";
 
-/// Name of the stage that makes maps.
 pub(in crate::pipeline) const SOLVE: &str = "solve";
 
 impl Config {
-    /// Configuration of the ground, with a hold buffer of `wait_bytes`.
+    /// Configuration of the ground segment, with a hold buffer of `wait_bytes`.
     #[must_use]
     pub fn ground(&self, wait_bytes: u64) -> GroundConfig {
-        let (calibration, calibrate) = (self.calibration.clone(), self.calibrate.clone());
-        let map = self.map.clone();
         GroundConfig {
-            calibration,
-            calibrate,
-            map,
+            calibration: self.calibration.clone(),
+            calibrate: self.calibrate.clone(),
+            map: self.map.clone(),
             wait_bytes,
             memory_max_bytes: None,
             group: None,
@@ -38,10 +35,10 @@ impl Config {
         }
     }
 
-    /// Setup of the solver, which `watch` follows.
+    /// Setup of the solver; `watch` reports its progress and ends it early.
     ///
     /// # Errors
-    /// Prior maps and tables of power that cannot be read.
+    /// Prior maps and power spectra that cannot be read.
     #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
@@ -63,30 +60,24 @@ impl Config {
     }
 }
 
-/// Results of the ground segment besides its files.
+/// Results of the ground segment in memory, beside its files.
 #[derive(Clone, Debug)]
 pub(in crate::pipeline) struct SegmentOutcome {
-    /// The ground's outcome.
     pub(in crate::pipeline) ground: GroundOutcome,
-    /// Final map of each channel, in figures.
     pub(in crate::pipeline) channels: Arc<Mutex<Vec<ChannelSummary>>>,
 }
 
-/// What the ground segment needs to make maps of its sums.
+/// Destination, input sky and handles for the maps of the ground segment.
 pub(in crate::pipeline) struct MappingContext<'a> {
-    /// Folder for the products.
     pub(in crate::pipeline) out: &'a Path,
-    /// The true sky, to compare the maps with.
     pub(in crate::pipeline) truth: Truth,
-    /// Follows solutions.
     pub(in crate::pipeline) watch: SolveWatch,
-    /// Sees maps.
     pub(in crate::pipeline) viewers: MapWatch,
-    /// Is told of products that cannot be written, which then end nothing.
-    pub(in crate::pipeline) trouble: Option<ProductsWatch>,
+    /// State of the product files; `Some` if a failure to write them does not end the run.
+    pub(in crate::pipeline) product_state: Option<ProductsWatch>,
 }
 
-/// Adds the ground segment to `graph`. It takes the bytes of a downlink and nothing else from space.
+/// Adds the ground segment to `graph`. Its only input is the bytes of the downlink.
 ///
 /// # Errors
 /// Prior maps that cannot be read.
@@ -97,7 +88,7 @@ pub(in crate::pipeline) fn add(
     ground: Ground,
     mapping: MappingContext<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let MappingContext { out, truth, watch, viewers, trouble } = mapping;
+    let MappingContext { out, truth, watch, viewers, product_state } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let iteration_folder = config.map.refine.is_on().then(|| out.to_owned());
@@ -112,17 +103,17 @@ pub(in crate::pipeline) fn add(
     let channels = Arc::clone(&outcome.channels);
     let publisher =
         Publisher::new(config.products.clone(), out, truth, provenance, channels)?.with_viewers(viewers);
-    let publisher = trouble.iter().fold(publisher, Publisher::with_retries);
+    let publisher = product_state.iter().fold(publisher, Publisher::with_retries);
     let mut writer = GainsWriter::new(config, out);
     let ground = ground.with_observer(Box::new(move |gains| writer.update(gains)));
-    // Sums are large: one waits while another is solved.
+    // Snapshots are large: only one waits while another is solved.
     let sums = graph.stage(GROUND, 1, bytes, ground);
     let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));
     graph.sink("publish", maps, publisher);
     Ok(outcome)
 }
 
-/// Drops the maps of a rank: the first rank publishes the same.
+/// Drops the maps of a rank, as the first rank publishes identical ones.
 struct NullSink;
 
 impl Sink for NullSink {
@@ -134,7 +125,7 @@ impl Sink for NullSink {
     }
 }
 
-/// R by channel.
+/// The regulariser R of each channel; a single one is for all channels.
 fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     Ok(match map.regulariser() {
         RegulariserChoice::Data => vec![Regulariser::Data],
@@ -146,6 +137,7 @@ fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     })
 }
 
+/// Prior maps of the channels, smoothed and at the resolution of the maps, K.
 fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
     let map = &config.map;
     let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };

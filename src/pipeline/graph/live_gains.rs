@@ -1,23 +1,22 @@
-//! The gains that a ground finds while data arrive: their products, after each pass and at the end.
+//! Products of gains that are solved while data arrive: written after passes and at the end.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use super::calibrate_products::write;
+use super::calibrate_products::write_products;
 use super::found_solutions::{CalibrateSummary, FoundSolutions};
 use crate::calibration::SolvedGains;
 use crate::calibration::solver::SolverConfig;
 use crate::pipeline::config::{Config, PipelineError};
 
-/// Products grow with the mission: they are written again once this many times as long has passed as the last time took.
-const PATIENCE: u32 = 20;
+/// Least time between two writings, in units of the last one's duration: products grow with the mission.
+const REWRITE_INTERVAL: u32 = 20;
 
-/// Writes the products of gains into a folder.
 pub(in crate::pipeline) struct GainsWriter {
     out: PathBuf,
     solver: SolverConfig,
     pictures: bool,
-    /// When they were written last, and how long that took.
+    /// End and duration of the last writing.
     last: Option<(Instant, Duration)>,
 }
 
@@ -27,20 +26,20 @@ impl GainsWriter {
         Self { out, solver, pictures, last: None }
     }
 
-    /// A pass is closed. What cannot be written now is written after another pass, or at the end.
+    /// Writes the products after a pass, unless the last writing is recent. Errors are ignored: a later pass or the end
+    /// writes again.
     pub(in crate::pipeline) fn update(&mut self, gains: &SolvedGains) {
-        if self.last.is_none_or(|(at, took)| at.elapsed() >= took * PATIENCE) {
-            let begun = Instant::now();
+        if self.last.is_none_or(|(ended, took)| ended.elapsed() >= took * REWRITE_INTERVAL) {
+            let started = Instant::now();
             let _ = self.write(gains);
-            self.last = Some((Instant::now(), begun.elapsed()));
+            self.last = Some((Instant::now(), started.elapsed()));
         }
     }
 
-    /// Writes all of them.
     pub(in crate::pipeline) fn write(&self, gains: &SolvedGains) -> Result<CalibrateSummary, PipelineError> {
-        let found = FoundSolutions::of(gains);
-        let summary = found.of_one_round(&self.solver, !self.solver.model_files.is_empty());
-        write(&self.out, &found, &summary, self.pictures)?;
+        let found = FoundSolutions::from_gains(gains);
+        let summary = found.single_round_summary(&self.solver, !self.solver.model_files.is_empty());
+        write_products(&self.out, &found, &summary, self.pictures)?;
         Ok(summary)
     }
 }

@@ -24,17 +24,18 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// # Errors
 /// A sky whose coefficients cannot be computed; an invalid model.
 pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<ChannelModel>, PipelineError> {
-    let nside = |(sky, usual): (&Option<&SkyMap>, usize)| sky.map_or(usual, SkyMap::nside);
+    let nside = |(sky, default): (&Option<&SkyMap>, usize)| sky.map_or(default, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
     nsides.iter().try_for_each(|&nside| SkyConfig::check_l_max(plan.config.sky.l_max, nside))?;
     let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
-        let own = antennas.as_ref().map(|antennas| Arc::new(antennas.at(schedule.frequency_hz)));
-        let antennas = own.map(|own| own as Arc<dyn AntennaPatterns>);
-        let made =
+        let antennas = antennas
+            .as_ref()
+            .map(|antennas| Arc::new(antennas.at(schedule.frequency_hz)) as Arc<dyn AntennaPatterns>);
+        let model =
             sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
-        models.push(ChannelModel { batch: choice.kind.batch(), model: made.transpose()? });
+        models.push(ChannelModel { batch: choice.kind.batch(), model: model.transpose()? });
     }
     Ok(models)
 }
@@ -51,7 +52,8 @@ pub(crate) fn build_all(
     Ok(build(plan, &skies)?.into_iter().filter_map(|channel| channel.model).collect())
 }
 
-/// The model of a channel, with antennas that are not ideal; `rotations` holds the tables that channels share.
+/// The model of a channel. `antennas` are patterns with errors, `None` if they are ideal; `rotations` holds tables that channels
+/// share.
 fn channel_model(
     (plan, antennas): (&Plan, Option<&Arc<dyn AntennaPatterns>>),
     choice: &ModelPlan,
@@ -62,32 +64,34 @@ fn channel_model(
     let array = &plan.array;
     let (frequency_hz, response) = (schedule.frequency_hz, plan.instrument.response);
     if choice.kind == ModelKind::Direct {
-        // On a common circle all dipoles are normal to one plane, and to that of each pair.
-        let own = own_dipoles(plan).filter(|_| array.formation().is_none());
-        let antennas = antennas.or(own.as_ref());
-        let direct = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-            let sky = less(sky, less_k)?;
+        // On a common circular orbit all dipoles are normal to one plane, which the model assumes.
+        let dipoles = orbit_dipoles(plan).filter(|_| array.formation().is_none());
+        let antennas = antennas.or(dipoles.as_ref());
+        let direct = |moon_m, offset_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            let sky = minus_temperature(sky, offset_k)?;
             let sum = DirectSum::new(&sky, frequency_hz, moon_m, response);
             Ok(match antennas {
                 Some(antennas) => Box::new(AntennaSum::new(sum, Arc::clone(antennas))),
                 None => Box::new(sum),
             })
         };
-        // Pixels hold twice nside degrees.
+        // A map of HEALPix pixels determines l up to twice nside.
         let model = with_moon(plan, direct, sky, frequency_hz)?;
-        return Ok(in_time(plan, averaged(plan, model, frequency_hz), frequency_hz, 2 * sky.nside()));
+        let model = averaged_over_channel(plan, model, frequency_hz);
+        return Ok(averaged_over_integrations(plan, model, frequency_hz, 2 * sky.nside()));
     }
     let alm = coefficients(sky, choice.l_max)?;
     if choice.kind == ModelKind::General {
-        let own = own_dipoles(plan);
-        let antennas = antennas.or(own.as_ref());
-        let general = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-            let (sky, alm) = (less(sky, less_k)?, less_alm(&alm, less_k));
+        let dipoles = orbit_dipoles(plan);
+        let antennas = antennas.or(dipoles.as_ref());
+        let general = |moon_m, offset_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            let (sky, alm) = (minus_temperature(sky, offset_k)?, alm_minus_temperature(&alm, offset_k));
             let antennas = antennas.map(Arc::clone);
             Ok(Box::new(GeneralSum::new(&sky, alm, frequency_hz, moon_m, antennas)?))
         };
         let model = with_moon(plan, general, sky, frequency_hz)?;
-        return Ok(in_time(plan, averaged(plan, model, frequency_hz), frequency_hz, choice.l_max));
+        let model = averaged_over_channel(plan, model, frequency_hz);
+        return Ok(averaged_over_integrations(plan, model, frequency_hz, choice.l_max));
     }
     let setup = |moon_radius_m| HarmonicSumSetup {
         frequency_hz,
@@ -100,64 +104,77 @@ fn channel_model(
     };
     let table = || Arc::new(RotationTable::new(choice.l_max, array.inclination_rad()));
     let rotation = Arc::clone(rotations.entry(choice.l_max).or_insert_with(table));
-    let harmonic = |moon_m, less_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
-        Ok(Box::new(HarmonicSum::new(less_alm(&alm, less_k), setup(moon_m), Arc::clone(&rotation))?))
+    let harmonic = |moon_m, offset_k| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+        let alm = alm_minus_temperature(&alm, offset_k);
+        Ok(Box::new(HarmonicSum::new(alm, setup(moon_m), Arc::clone(&rotation))?))
     };
-    Ok(averaged(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
+    Ok(averaged_over_channel(plan, with_moon(plan, harmonic, sky, frequency_hz)?, frequency_hz))
 }
 
-/// Dipoles along the normals of the daughters' own orbits, if they have dipoles, and along their tracks, if they have three.
-fn own_dipoles(plan: &Plan) -> Option<Arc<dyn AntennaPatterns>> {
-    let elements = plan.instrument.response;
-    let own = || Arc::new(OrbitAntennas::new(Arc::clone(&plan.array), elements));
-    (elements != AntennaResponse::Isotropic).then(|| own() as Arc<dyn AntennaPatterns>)
+/// Dipoles oriented by each daughter's own orbit; `None` for isotropic antennas.
+fn orbit_dipoles(plan: &Plan) -> Option<Arc<dyn AntennaPatterns>> {
+    match plan.instrument.response {
+        AntennaResponse::Isotropic => None,
+        response => Some(Arc::new(OrbitAntennas::new(Arc::clone(&plan.array), response))),
+    }
 }
 
-/// The sky less a temperature in all directions.
-fn less(sky: &SkyMap, less_k: f64) -> Result<Cow<'_, SkyMap>, MapError> {
-    if less_k == 0.0 {
+fn minus_temperature(sky: &SkyMap, offset_k: f64) -> Result<Cow<'_, SkyMap>, MapError> {
+    if offset_k == 0.0 {
         return Ok(Cow::Borrowed(sky));
     }
-    let values_k = sky.values().iter().map(|value| value - less_k).collect();
+    let values_k = sky.values().iter().map(|value| value - offset_k).collect();
     Ok(Cow::Owned(SkyMap::new(sky.frame(), values_k)?))
 }
 
-/// As [`less`], of its coefficients: 1 K in all directions is sqrt(4 pi) of l = 0.
-fn less_alm(alm: &Alm, less_k: f64) -> Alm {
+/// Subtracts a uniform temperature from harmonic coefficients: 1 K is sqrt(4 pi) in `a_00`.
+fn alm_minus_temperature(alm: &Alm, offset_k: f64) -> Alm {
     let mut alm = alm.clone();
-    alm.get_mut(0, 0).re -= less_k * (4.0 * PI).sqrt();
+    alm.get_mut(0, 0).re -= offset_k * (4.0 * PI).sqrt();
     alm
 }
 
-/// The model that `of` makes for a radius of the Moon, m, and of the sky's `map` less a temperature, K; with the Moon's emission and
-/// the image of the sky if the configuration asks for them.
+/// Builds the model of the sky `map`, with the Moon's emission and its reflection of the sky if they are configured.
+///
+/// `build` makes the model for a radius of the Moon, m, and the map minus a uniform temperature, K.
 fn with_moon(
     plan: &Plan,
-    of: impl Fn(f64, f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
+    build: impl Fn(f64, f64) -> Result<Box<dyn VisibilityModel>, PipelineError>,
     map: &SkyMap,
     frequency_hz: f64,
 ) -> Result<Box<dyn VisibilityModel>, PipelineError> {
     let moon_k = plan.config.spacecraft.moon_temperature_k;
-    let mut sky = of(plan.array.moon_radius_m(), moon_k)?;
+    let mut sky = build(plan.array.moon_radius_m(), moon_k)?;
     if moon_k > 0.0 {
         sky = Box::new(WithEmission::new(sky, frequency_hz, plan.instrument.response, moon_k));
     }
-    let share = plan.config.spacecraft.moon_reflection;
-    if share == 0.0 {
+    let reflectivity = plan.config.spacecraft.moon_reflection;
+    if reflectivity == 0.0 {
         return Ok(sky);
     }
     if plan.config.spacecraft.moon_mirror == MoonMirror::Sphere {
         let (radius_m, response) = (plan.array.moon_radius_m(), plan.instrument.response);
         let map = map.clone();
-        return Ok(Box::new(WithSphereReflection::new(sky, map, frequency_hz, response, radius_m, share)));
+        return Ok(Box::new(WithSphereReflection::new(
+            sky,
+            map,
+            frequency_hz,
+            response,
+            radius_m,
+            reflectivity,
+        )));
     }
-    // A Moon that all but touches the orbit hides what is below the horizontal: to 5e-5 rad.
-    let above = of(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
-    Ok(Box::new(WithFlatReflection::new(sky, above, share)))
+    // A Moon just below the orbit hides everything below the local horizontal, to 5e-5 rad.
+    let above_horizontal = build(plan.array.orbit_radius_m() * (1.0 - 1e-9), 0.0)?;
+    Ok(Box::new(WithFlatReflection::new(sky, above_horizontal, reflectivity)))
 }
 
-/// The model, averaged over its channel if the configuration asks for it.
-fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> Box<dyn VisibilityModel> {
+/// The model, averaged over the channel's bandwidth if the configuration asks for it.
+fn averaged_over_channel(
+    plan: &Plan,
+    model: Box<dyn VisibilityModel>,
+    frequency_hz: f64,
+) -> Box<dyn VisibilityModel> {
     let spacecraft = &plan.config.spacecraft;
     match spacecraft.smear_bandwidth {
         true => Box::new(BandAverage::new(model, frequency_hz, spacecraft.channel_width_hz)),
@@ -165,8 +182,8 @@ fn averaged(plan: &Plan, model: Box<dyn VisibilityModel>, frequency_hz: f64) -> 
     }
 }
 
-/// A model of instants, averaged over its integrations if the configuration asks for it.
-fn in_time(
+/// A model of instantaneous visibilities, averaged over the integrations if the configuration asks for it.
+fn averaged_over_integrations(
     plan: &Plan,
     model: Box<dyn VisibilityModel>,
     frequency_hz: f64,
@@ -181,10 +198,10 @@ fn in_time(
     }
 }
 
-/// Coefficients of a map in any frame on ecliptic axes, up to `l_max`.
+/// Harmonic coefficients of a map in ecliptic coordinates, up to `l_max`.
 ///
 /// # Errors
-/// More degrees than the map determines; a map with values that are not finite.
+/// An `l_max` above what the map determines; a map with values that are not finite.
 fn coefficients(sky: &SkyMap, l_max: usize) -> Result<Alm, PipelineError> {
     SkyConfig::check_l_max(l_max, sky.nside())?;
     let options = AnalysisOptions { method: Method::ACCURATE };

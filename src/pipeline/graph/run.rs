@@ -23,26 +23,25 @@ use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
 
-/// Handles to watch a running graph.
+/// Handles to monitor a running graph.
 #[derive(Clone, Debug)]
-pub struct Watched {
-    /// Counters and times of its stages.
+pub struct RunHandles {
+    /// Counters and times of the stages.
     pub metrics: Arc<Metrics>,
-    /// The solution in progress.
+    /// Progress of the solution.
     pub solving: SolveWatch,
-    /// The senders, if the ground listens.
+    /// The senders, if the ground segment listens.
     pub listening: Option<Listening>,
-    /// Ledger, reception and checkpoints of the ground, if there is one.
+    /// Ledger, reception and checkpoints of the ground segment, if there is one.
     pub ground: Option<GroundOutcome>,
-    /// The maps, for those who want to see them.
+    /// The maps, for display.
     pub maps: MapWatch,
-    /// How their files go, of a ground that goes on without them.
+    /// State of the product files; `Some` if a failure to write them does not end the run.
     pub products: Option<ProductsWatch>,
 }
 
-impl Watched {
-    /// Handles of a graph without a ground.
-    pub(in crate::pipeline) fn of_space(graph: &Graph) -> Self {
+impl RunHandles {
+    pub(in crate::pipeline) fn without_ground(graph: &Graph) -> Self {
         let (solving, maps) = (SolveWatch::default(), MapWatch::default());
         Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps, products: None }
     }
@@ -50,12 +49,12 @@ impl Watched {
 
 /// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
-    /// Its senders, if it listens.
+    /// The senders, if the source listens on a socket.
     fn listening(&self) -> Option<Listening> {
         None
     }
 
-    /// Whether it goes on until it is told to end: reception then does not end because maps cannot be written.
+    /// Whether the source runs until it is cancelled. If so, a failure to write maps does not end reception.
     fn is_service(&self) -> bool {
         false
     }
@@ -88,9 +87,9 @@ impl GroundSource for SocketSource {
 pub struct Destination {
     /// A file.
     pub file: Option<PathBuf>,
-    /// Standard output, in place of a file.
+    /// Whether to write to standard output if there is no file.
     pub standard_output: bool,
-    /// A listening ground.
+    /// A connection to a listening ground segment.
     pub socket: Option<SocketSink>,
 }
 
@@ -100,16 +99,15 @@ impl<P: AsRef<Path>> From<&P> for Destination {
     }
 }
 
-/// Receives the handles of a graph that is about to run.
-pub type Watcher<'a> = &'a mut dyn FnMut(Watched);
+/// Callback that receives the handles of a graph once, just before it runs.
+pub type OnStart<'a> = &'a mut dyn FnMut(RunHandles);
 
 /// Name of the stage that reads the downlink.
 pub const READ: &str = "read";
 
-/// Name of the stage that writes the downlink file.
 pub(in crate::pipeline) const RECORD: &str = "record";
 
-/// Name of the downlink file that `run` leaves among its products.
+/// Name of the downlink file among the products of `run`.
 #[must_use]
 pub fn downlink_file(format: Format) -> &'static str {
     match format {
@@ -118,30 +116,32 @@ pub fn downlink_file(format: Format) -> &'static str {
     }
 }
 
-/// The whole chain in one process: sky, spacecraft, downlink bytes, ground, products in `out`.
+/// Runs the whole chain in one process: sky, spacecraft, downlink, ground segment, products in `out`.
 ///
 /// # Errors
-/// The first failure of any stage; a ledger that does not close; no visibility for any map.
+/// The first failure of any stage; a ledger that does not balance; no visibility for any map.
 pub fn run(
     plan: &Plan,
     out: &Path,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    run_with_ranks(&Ranks::single(), plan, out, cancel, watch)
+    run_with_ranks(&Ranks::single(), plan, out, cancel, on_start)
 }
 
-/// As [`run`], as one rank of several that share the sums. Each simulates and receives everything; the first alone writes into
-/// `out`, and its summary alone has maps. A rank whose run ends early or with an error has to end the job.
+/// Runs the whole chain as one of several MPI ranks that share the normal equations.
+///
+/// Each rank simulates and receives everything. Only the first writes into `out` and has maps in its summary. A rank that is
+/// interrupted or fails has to end the job.
 ///
 /// # Errors
-/// Those of a run; settings with which sums cannot be shared.
+/// As [`run`]; settings with which the normal equations cannot be shared.
 pub fn run_with_ranks(
     ranks: &Ranks,
     plan: &Plan,
     out: &Path,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
     plan.config.require_shareable(ranks.share().count)?;
     let DownlinkConfig { link, rate_bits_per_s_max, .. } = &plan.config.downlink;
@@ -171,56 +171,71 @@ pub fn run_with_ranks(
     }
     let truth = Truth::new(&skies, plan.config.map_shape())?;
     drop(skies);
-    let grace = Grace::of(&plan.config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.to_iterate);
+    let grace = Grace::new(&plan.config.runtime);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.iterate);
     let ground =
-        Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.to_add).with_ranks(ranks);
+        Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.accumulate).with_ranks(ranks);
     let maps = MapWatch::default();
-    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), trouble: None };
+    let mapping =
+        MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), product_state: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
-    let ground = Some(outcome.ground.clone());
-    let watched =
-        Watched { metrics: graph.metrics(), solving, listening: None, ground, maps, products: None };
-    let report = start(graph, ranks, &plan.config.runtime, cancel, (watched, watch))?;
-    let samples = close_samples(&counts, plan, &report)?;
-    let ended = FinishedGraph { report, outcome, listening: None, samples };
-    conclude(RunScope::Whole, ranks, &plan.config, out, ended)
+    let handles = RunHandles {
+        metrics: graph.metrics(),
+        solving,
+        listening: None,
+        ground: Some(outcome.ground.clone()),
+        maps,
+        products: None,
+    };
+    on_start(handles);
+    let report = start(graph, ranks, &plan.config.runtime, cancel)?;
+    let samples = sample_summary(&counts, plan, &report)?;
+    let finished = FinishedGraph { report, outcome, listening: None, samples };
+    collect_and_write_summary(RunScope::Whole, ranks, &plan.config, out, finished)
 }
 
-/// The space segment alone, to a downlink file, a ground that listens, or both.
+/// Runs the space segment alone; its downlink goes to a file, a listening ground segment, or both.
 ///
 /// # Errors
 /// The first failure of any stage; a link with faults and no file.
 pub fn simulate(
     plan: &Plan,
-    to: impl Into<Destination>,
+    destination: impl Into<Destination>,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<Report, PipelineError> {
-    let to = to.into();
-    if plan.config.downlink.link.is_on() && to.file.is_none() {
-        return Err(DownlinkError::from(SocketError::TruthNowhere).into());
+    let destination = destination.into();
+    if plan.config.downlink.link.is_on() && destination.file.is_none() {
+        return Err(DownlinkError::from(SocketError::NoTruthFile).into());
     }
-    if let Some(file) = &to.file {
+    if let Some(file) = &destination.file {
         write_instrument_truth(plan, file)?;
     }
-    let recorder = match &to.file {
+    let recorder = match &destination.file {
         Some(file) => Some(Recorder::create(file)?),
-        None => to.standard_output.then(Recorder::to_standard_output),
+        None => destination.standard_output.then(Recorder::to_standard_output),
     };
     let skies = space_segment::skies(plan)?;
-    simulate_sky(plan, &skies, (to, recorder), cancel, watch)
+    let sinks = DownlinkSinks { file: destination.file, recorder, socket: destination.socket };
+    simulate_skies(plan, &skies, sinks, cancel, on_start)
 }
 
-/// As [`simulate`], of these skies, one a channel; the recorder is that of the file.
-pub(in crate::pipeline) fn simulate_sky(
+pub(in crate::pipeline) struct DownlinkSinks {
+    /// Path of the downlink file, if `recorder` writes to one.
+    pub(in crate::pipeline) file: Option<PathBuf>,
+    pub(in crate::pipeline) recorder: Option<Recorder>,
+    pub(in crate::pipeline) socket: Option<SocketSink>,
+}
+
+/// Runs the space segment with the given skies, one per channel.
+pub(in crate::pipeline) fn simulate_skies(
     plan: &Plan,
     skies: &[SkyMap],
-    (to, recorder): (Destination, Option<Recorder>),
+    sinks: DownlinkSinks,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<Report, PipelineError> {
-    let Destination { file, socket, .. } = to;
+    let DownlinkSinks { file, recorder, socket } = sinks;
     let mut graph = Graph::new();
     let counts = SampleCounts::default();
     let mut bytes = space_segment::add(&mut graph, plan, skies, &counts)?;
@@ -234,18 +249,18 @@ pub(in crate::pipeline) fn simulate_sky(
         }
         (Some(recorder), None) => graph.sink(RECORD, bytes, recorder),
         (None, Some(socket)) => graph.sink("send", bytes, socket),
-        // The graph says that its end is open.
+        // Neither file nor socket: `Graph::run` reports the unconnected link as an error.
         (None, None) => drop(bytes),
     }
-    let watched = Watched::of_space(&graph);
-    let report = start_alone(graph, &plan.config.runtime, cancel, watched, watch)?;
-    close_samples(&counts, plan, &report)?;
+    on_start(RunHandles::without_ground(&graph));
+    let report = start_single_process(graph, &plan.config.runtime, cancel)?;
+    sample_summary(&counts, plan, &report)?;
     Ok(report)
 }
 
-/// The ground segment alone: `ground`, made with the same configuration, takes downlink files or what senders send.
+/// Runs the ground segment alone, on downlink files or a socket. `ground` has to be made with the same configuration.
 ///
-/// As [`run_with_ranks`], for a ground that is one rank's ([`Ground::with_ranks`]).
+/// A ground made with [`Ground::with_ranks`] runs as one of several ranks; see [`run_with_ranks`].
 ///
 /// # Errors
 /// A file that cannot be read; the first failure of any stage; a last checkpoint that could not be written; no
@@ -256,59 +271,65 @@ pub fn replay<S: GroundSource + 'static>(
     ground: Ground,
     out: &Path,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    replay_knowing(Truth::unknown(), source, config, ground, out, cancel, watch)
+    replay_with_truth(Truth::unknown(), source, config, ground, out, cancel, on_start)
 }
 
-/// As [`replay`], of a simulation whose skies are known.
-pub(in crate::pipeline) fn replay_knowing<S: GroundSource + 'static>(
+/// Runs the ground segment alone on a simulation whose input sky is known, to compare the maps with it.
+pub(in crate::pipeline) fn replay_with_truth<S: GroundSource + 'static>(
     truth: Truth,
     source: S,
     config: &Config,
     ground: Ground,
     out: &Path,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let ranks = ground.ranks().clone();
     config.require_shareable(ranks.share().count)?;
     let _lock = ranks.is_first().then(|| lock_products(config, out)).transpose()?;
-    let ended = ground_alone(truth, source, config, ground, out, cancel, watch)?;
-    conclude(RunScope::Ground, &ranks, config, out, ended)
+    let finished = run_ground(truth, source, config, ground, out, cancel, on_start)?;
+    collect_and_write_summary(RunScope::Ground, &ranks, config, out, finished)
 }
 
-/// Runs the ground on a source; the output folder is locked.
-pub(in crate::pipeline) fn ground_alone<S: GroundSource + 'static>(
+/// Runs the ground segment on a source, without a summary. The caller has locked `out`.
+pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     truth: Truth,
     source: S,
     config: &Config,
     ground: Ground,
     out: &Path,
     cancel: &Cancel,
-    watch: Watcher<'_>,
+    on_start: OnStart<'_>,
 ) -> Result<FinishedGraph, PipelineError> {
     let mut graph = Graph::new();
     let (listening, is_service) = (source.listening(), source.is_service());
     let bytes = graph.source(READ, config.runtime.queue_capacity, source);
-    let grace = Grace::of(&config.runtime);
-    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.to_iterate);
+    let grace = Grace::new(&config.runtime);
+    let solving = SolveWatch::new(cancel.clone()).with_grace(grace.iterate);
     let ranks = ground.ranks().clone();
-    let ground = ground.with_cancel(cancel, grace.to_add);
+    let ground = ground.with_cancel(cancel, grace.accumulate);
     let maps = MapWatch::default();
-    let trouble = is_service.then(ProductsWatch::default);
-    let (viewers, products) = (maps.clone(), trouble.clone());
-    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, trouble };
+    let products = is_service.then(ProductsWatch::default);
+    let (viewers, product_state) = (maps.clone(), products.clone());
+    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, product_state };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
-    let ground = Some(outcome.ground.clone());
-    let watched =
-        Watched { metrics: graph.metrics(), solving, listening: listening.clone(), ground, maps, products };
-    let report = start(graph, &ranks, &config.runtime, cancel, (watched, watch))?;
+    let handles = RunHandles {
+        metrics: graph.metrics(),
+        solving,
+        listening: listening.clone(),
+        ground: Some(outcome.ground.clone()),
+        maps,
+        products,
+    };
+    on_start(handles);
+    let report = start(graph, &ranks, &config.runtime, cancel)?;
     Ok(FinishedGraph { report, outcome, listening, samples: None })
 }
 
 impl Config {
-    /// Requires settings with which so many ranks can share the sums.
+    /// Requires settings with which this number of ranks can share the normal equations.
     ///
     /// # Errors
     /// [`PipelineError::NotShareable`].
@@ -328,7 +349,7 @@ impl Config {
         }
     }
 
-    /// The maps that a truth is compared with.
+    /// Resolution and processing of the maps, for a comparison with the input sky.
     pub(in crate::pipeline) fn map_shape(&self) -> MapShape {
         let Self { map, products, .. } = self;
         let l_max = (map.engine == EngineKind::Harmonic).then(|| map.degree());
@@ -336,8 +357,8 @@ impl Config {
     }
 }
 
-/// Closes the ledger of samples; not of a run that was cut short, whose stages may still be counting.
-fn close_samples(
+/// The summary of samples; `None` without samples, or if stages were abandoned and may still be counting.
+fn sample_summary(
     counts: &SampleCounts,
     plan: &Plan,
     report: &Report,
@@ -358,7 +379,7 @@ pub(in crate::pipeline) fn add_link(
     })
 }
 
-/// Leaves the true errors of the instrument beside a downlink file, if it has any.
+/// Writes the true errors of the instrument beside a downlink file, if it has any.
 pub(in crate::pipeline) fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
     let Some(text) = plan.instrument_truth() else { return Ok(()) };
     let mut name = file.as_os_str().to_owned();
@@ -367,7 +388,7 @@ pub(in crate::pipeline) fn write_instrument_truth(plan: &Plan, file: &Path) -> R
     Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
 }
 
-/// Leaves all settings of a run beside its products, as a pipeline file that repeats it.
+/// Writes all settings of a run beside its products, as a pipeline file that repeats the run.
 pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
     let path = out.join(SETTINGS);
     let settings = toml::to_string_pretty(config)
@@ -377,19 +398,19 @@ pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result
         "# All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were \
          given.\n\n{settings}"
     );
-    // A run of the settings that it left may leave them.
-    let has_its_length =
+    // If the run was started from this very file, it is not rewritten.
+    let has_same_length =
         fs::metadata(&path).is_ok_and(|found| found.is_file() && found.len() == text.len() as u64);
-    if has_its_length && fs::read(&path).is_ok_and(|known| known == text.as_bytes()) {
+    if has_same_length && fs::read(&path).is_ok_and(|found| found == text.as_bytes()) {
         return Ok(());
     }
     Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
 }
 
-/// As [`lock_folder`], for maps: no file that the configuration names may be in the place of one.
+/// Locks a folder for maps; an error if an input file of the configuration lies where a product would be written.
 pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
     for input in config.input_files() {
-        if is_place_of_product(&input, out) {
+        if is_in_channel_folder(&input, out) {
             let reason = "the configuration names it as an input, and the run would replace it; expected another output folder";
             let source = io::Error::new(io::ErrorKind::InvalidInput, reason);
             return Err(ProductsError::Write { path: input, source }.into());
@@ -398,50 +419,48 @@ pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<
     lock_folder(out)
 }
 
-/// Creates and locks the folder before anything is computed, so that an error shows at once.
+/// Creates and locks a folder; before anything is computed, so that an error shows early.
 pub(in crate::pipeline) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
     locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
 }
 
-/// Whether a file lies in one of the folders of channels in `out`.
-fn is_place_of_product(input: &Path, out: &Path) -> bool {
+/// Whether a file lies in a channel's folder (`...MHz`) of `out`.
+fn is_in_channel_folder(input: &Path, out: &Path) -> bool {
     let (Ok(input), Ok(out)) = (fs::canonicalize(input), fs::canonicalize(out)) else { return false };
     let Some(folder) = input.parent() else { return false };
     folder.parent() == Some(out.as_path())
         && folder.file_name().is_some_and(|name| name.to_string_lossy().ends_with("MHz"))
 }
 
-/// How the time after cancellation is divided.
+/// Division of the grace period after cancellation.
 struct Grace {
-    /// For the sums, if they are not saved.
-    to_add: Duration,
-    /// Until iterations end; making maps of what they have found takes the rest.
-    to_iterate: Duration,
+    /// Time to add the visibilities in queues, if there is no state that saves them.
+    accumulate: Duration,
+    /// Time until the solver stops iterating; the rest is for writing maps.
+    iterate: Duration,
 }
 
 impl Grace {
-    fn of(config: &RuntimeConfig) -> Self {
-        let whole = Duration::from_secs_f64(config.grace_s);
-        Self { to_add: whole / 4, to_iterate: whole * 7 / 10 }
+    fn new(config: &RuntimeConfig) -> Self {
+        let total = Duration::from_secs_f64(config.grace_s);
+        Self { accumulate: total / 4, iterate: total * 7 / 10 }
     }
 }
 
-/// How long stages have to end after a failure.
+/// Time limit for stages to end after a failure.
 pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
 
-/// How long stages of one rank of several have to end after a failure: they may be waiting for the others.
-const SHUTDOWN_OF_RANK: Duration = Duration::from_secs(3);
+/// Time limit for the stages of one of several ranks to end after a failure; shorter, as they may be waiting for other ranks.
+const RANK_SHUTDOWN: Duration = Duration::from_secs(3);
 
-/// Runs a graph in one process.
-pub(in crate::pipeline) fn start_alone(
+/// Runs a graph that is not shared with other ranks.
+pub(in crate::pipeline) fn start_single_process(
     graph: Graph,
     config: &RuntimeConfig,
     cancel: &Cancel,
-    watched: Watched,
-    watch: Watcher<'_>,
 ) -> Result<Report, PipelineError> {
-    start(graph, &Ranks::single(), config, cancel, (watched, watch))
+    start(graph, &Ranks::single(), config, cancel)
 }
 
 fn start(
@@ -449,15 +468,13 @@ fn start(
     ranks: &Ranks,
     config: &RuntimeConfig,
     cancel: &Cancel,
-    (watched, watch): (Watched, Watcher<'_>),
 ) -> Result<Report, PipelineError> {
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
-    // These stages save data: they end in order, however long it takes.
+    // The named stages save data: they may finish without a time limit.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
-    watch(watched);
-    Ok(graph.run(cancel, if ranks.is_distributed() { SHUTDOWN_OF_RANK } else { SHUTDOWN })?)
+    Ok(graph.run(cancel, if ranks.is_distributed() { RANK_SHUTDOWN } else { SHUTDOWN })?)
 }
 
 /// Results of a run that ended without a failure.
@@ -469,47 +486,46 @@ pub(in crate::pipeline) struct FinishedGraph {
 }
 
 impl FinishedGraph {
-    /// Auto-correlations that were taken.
-    pub(in crate::pipeline) fn powers(&self) -> u64 {
+    pub(in crate::pipeline) fn autocorrelation_count(&self) -> u64 {
         self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
     }
 }
 
-/// The summary of a run, which the first rank writes.
-fn conclude(
+/// Collects the summary of a run; the first rank writes it.
+fn collect_and_write_summary(
     segment: RunScope,
     ranks: &Ranks,
     config: &Config,
     out: &Path,
-    ended: FinishedGraph,
+    finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    if ranks.is_distributed() && ended.report.cancelled {
+    if ranks.is_distributed() && finished.report.cancelled {
         return Err(PipelineError::RankInterrupted);
     }
     if ranks.is_first() {
-        return finish(summarise(segment, config, out, ended)?, out);
+        return write_summary(collect_summary(segment, config, out, finished)?, out);
     }
-    let FinishedGraph { report, outcome, .. } = ended;
+    let FinishedGraph { report, outcome, .. } = finished;
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
 }
 
-/// The summary of a run; writes the auto-correlations.
-pub(in crate::pipeline) fn summarise(
+/// Collects the summary of a run, and writes the auto-correlations and gains.
+pub(in crate::pipeline) fn collect_summary(
     segment: RunScope,
     config: &Config,
     out: &Path,
-    ended: FinishedGraph,
+    finished: FinishedGraph,
 ) -> Result<RunSummary, PipelineError> {
-    let FinishedGraph { report, outcome, listening, samples } = ended;
+    let FinishedGraph { report, outcome, listening, samples } = finished;
     let SegmentOutcome { ground, channels } = outcome;
     let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = ground.ledger.balanced_report()?;
     let listening = listening.map(|listening| listening.report());
-    if let Some(account) = &listening {
-        account.complete(&mut reception);
+    if let Some(report) = &listening {
+        report.complete(&mut reception);
     }
     let mut autos = ground.autos.lock().unwrap_or_else(PoisonError::into_inner);
     write_autos(&mut autos, out, config.products.pictures)?;
@@ -522,8 +538,14 @@ pub(in crate::pipeline) fn summarise(
     Ok(summary)
 }
 
-/// Writes the summary of a run, and says what failed in the end.
-pub(in crate::pipeline) fn finish(summary: RunSummary, out: &Path) -> Result<RunSummary, PipelineError> {
+/// Writes the summary of a run.
+///
+/// # Errors
+/// A summary that cannot be written; a last checkpoint that could not be saved; no visibility for any map.
+pub(in crate::pipeline) fn write_summary(
+    summary: RunSummary,
+    out: &Path,
+) -> Result<RunSummary, PipelineError> {
     let path = summary.write(out)?;
     if let Some(reason) = summary.saving.as_ref().and_then(|saving| saving.unsaved.clone()) {
         return Err(PipelineError::Unsaved { summary: path, reason });
@@ -534,14 +556,13 @@ pub(in crate::pipeline) fn finish(summary: RunSummary, out: &Path) -> Result<Run
     Ok(summary)
 }
 
-/// Starts as many worker threads as configured; once, before anything runs.
+/// Starts the configured number of worker threads. Call it once, before anything runs.
 ///
 /// # Errors
-/// Threads that cannot be started, or a number other than the one that the process already has.
+/// Threads that cannot be started; another number of threads than the process already has.
 pub fn use_threads(config: &RuntimeConfig) -> Result<(), PipelineError> {
     let threads = config.threads;
-    let built = rayon::ThreadPoolBuilder::new().num_threads(threads).build_global();
-    match built {
+    match rayon::ThreadPoolBuilder::new().num_threads(threads).build_global() {
         Err(error) if threads != 0 && threads != rayon::current_num_threads() => {
             Err(PipelineError::Threads { threads, reason: error.to_string() })
         }

@@ -12,65 +12,65 @@ use crate::mother::correlator::CorrelatorCounts;
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::runtime::{Ledger, LedgerImbalance, LedgerReport};
 
-/// Counters of the stages of sample fidelity.
+/// Shared counters of the stages that simulate samples.
 #[derive(Clone, Default)]
 pub struct SampleCounts {
-    /// Sampling.
+    /// Counters of the sampler.
     pub sampler: Arc<Mutex<SamplerCounts>>,
-    /// The links to the mother.
+    /// Counters of the links from the daughters to the mother.
     pub link: Arc<Mutex<LinkCounts>>,
-    /// The correlator.
+    /// Counters of the correlator.
     pub correlator: Arc<Mutex<CorrelatorCounts>>,
 }
 
 impl SampleCounts {
-    /// The summary of the samples of a plan's run; `None` without samples.
+    /// The summary of the samples of a run; `None` if it simulates no samples.
     pub(crate) fn close(&self, plan: &Plan) -> Result<Option<SampleSummary>, PipelineError> {
-        let sampled = plan.config.spacecraft.fidelity == Fidelity::Samples;
-        Ok(sampled.then(|| SampleSummary::close(self)).transpose()?)
+        let has_samples = plan.config.spacecraft.fidelity == Fidelity::Samples;
+        Ok(has_samples.then(|| SampleSummary::close(self)).transpose()?)
     }
 }
 
-/// A run's samples in figures; complex samples of all daughters and channels.
+/// Statistics of a run's complex samples, over all daughters and channels.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SampleSummary {
-    /// Real and imaginary parts beyond a quantiser's range.
+    /// Number of real and imaginary parts beyond the quantiser's range.
     pub saturated: u64,
-    /// Correlations that were checked while samples were drawn.
+    /// Correlations of the covariance matrices that samples were drawn from.
     pub correlations: u64,
-    /// Correlations that were reduced so that a matrix became a covariance.
+    /// Correlations that were reduced to make their matrix positive semidefinite.
     pub repaired: u64,
-    /// Greatest change of a correlation, as a part of the two daughters' powers.
+    /// Greatest change of a correlation, as a fraction of the two daughters' powers.
     pub repair_max: f32,
     /// Blocks that the links carried and dropped.
     pub link: LinkCounts,
     /// Blocks at the mother.
     pub blocks: BlockSummary,
-    /// Visibilities made of the samples.
+    /// Number of correlated visibilities.
     pub visibilities: u64,
     /// The ledger of samples.
     pub ledger: LedgerReport<SampleReason>,
 }
 
-/// Blocks at the mother.
+/// Numbers of sample blocks at the mother.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct BlockSummary {
-    /// Correlated.
+    /// Blocks that were correlated.
     pub used: u64,
-    /// Absent when the others were correlated.
+    /// Blocks absent when the others of their time were correlated.
     pub missing: u64,
-    /// Received after the others had been correlated.
+    /// Blocks received after the others of their time had been correlated.
     pub late: u64,
-    /// Duplicates.
+    /// Duplicate blocks.
     pub duplicate: u64,
-    /// Malformed.
+    /// Malformed blocks.
     pub malformed: u64,
-    /// Outside any window.
+    /// Blocks outside every observing window.
     pub stray: u64,
 }
 
 impl SampleSummary {
-    /// Closes the ledger of samples: sampled = correlated + lost.
+    /// Collects the counters and checks the ledger of samples.
     ///
     /// # Errors
     /// [`LedgerImbalance`] unless sampled = correlated + lost.

@@ -1,4 +1,4 @@
-//! The space segment in sample fidelity: samples, links, correlator.
+//! The stages of the space segment that simulate samples: sampler, links, correlator.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use crate::pipeline::config::Plan;
 use crate::response::model::VisibilityModel;
 use crate::runtime::{Graph, Link};
 
-/// The stages of sample fidelity for a plan, not yet in a graph.
+/// Makes the sampler, links and correlator of a plan, not yet in a graph.
 #[must_use]
 pub fn sample_stages(
     plan: &Plan,
@@ -35,13 +35,13 @@ pub fn sample_stages(
     // On the downlink each sub-band is a channel of its own.
     let channels = division.divided(&instrument.channels);
     let instrument = Instrument { channels, ..instrument.clone() };
-    let of_band = |(k, band): (usize, &Channel)| Schedule {
+    let band_schedule = |(k, band): (usize, &Channel)| Schedule {
         frequency_hz: band.frequency_hz,
         ..schedules[k / division.sub_bands]
     };
     let setup = CorrelatorSetup {
         array: Arc::clone(array),
-        schedules: instrument.channels.iter().enumerate().map(of_band).collect(),
+        schedules: instrument.channels.iter().enumerate().map(band_schedule).collect(),
         instrument,
         division,
         auto_integration_s: config.spacecraft.autos_s(),
@@ -53,8 +53,7 @@ pub fn sample_stages(
     (sampler, link, correlator)
 }
 
-/// Adds the stages of sample fidelity to `graph`.
-pub(crate) fn samples(
+pub(crate) fn add_sample_stages(
     graph: &mut Graph,
     plan: &Plan,
     models: Vec<Box<dyn VisibilityModel>>,

@@ -1,10 +1,10 @@
-//! The space segment as part of a graph: windows, visibilities, the onboard store, packets.
+//! The stages of the space segment: from observing windows to visibilities, the onboard store and packets.
 
 use std::sync::Arc;
 
 use super::models;
 use super::sample_summary::SampleCounts;
-use super::sampling::samples;
+use super::sampling::add_sample_stages;
 use crate::downlink::Transmitter;
 use crate::frames::GroundFrame;
 use crate::mother::{
@@ -19,13 +19,13 @@ use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
 use crate::units::ChannelId;
 
-/// Name of the stage by whose windows progress is measured.
+/// Name of the stage whose count of windows measures progress.
 pub const INTEGRATE: &str = "integrate";
 
-/// The simulated sky of every channel, in its own pixels and frame.
+/// The simulated sky of every channel, at the map's own resolution and frame.
 ///
 /// # Errors
-/// A map that cannot be read, that has pixels that are no temperature of a sky, or that is of another frequency.
+/// A map that cannot be read, with pixels that are no sky temperature, or for another frequency.
 pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
     (0..).map(ChannelId).take(plan.schedules.len()).map(|channel| sky(plan, channel)).collect()
 }
@@ -63,7 +63,7 @@ pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
         let Some(path) = sky.file.as_ref().and_then(|files| files.get(channel)) else { continue };
         for note in read_notes(&path, &sky_options(sky, frequency_hz))? {
             let note = format!("{}: {note}", path.display());
-            // A file that stands for several channels is told once.
+            // A file may serve several channels.
             if !notes.contains(&note) {
                 notes.push(note);
             }
@@ -73,8 +73,8 @@ pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
     Ok(notes)
 }
 
-/// Adds the space segment to `graph`; its output are the bytes of the downlink. With sample fidelity its stages count in
-/// `counts`.
+/// Adds the space segment to `graph` and returns its output, the bytes of the downlink. `counts` is filled if samples are
+/// simulated.
 ///
 /// # Errors
 /// An invalid model of the visibilities or configuration of the downlink.
@@ -85,19 +85,19 @@ pub fn add(
     counts: &SampleCounts,
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     if plan.config.spacecraft.fidelity == Fidelity::Samples {
-        let frames = samples(graph, plan, models::build_all(plan, skies)?, counts);
-        return send(graph, plan, frames);
+        let frames = add_sample_stages(graph, plan, models::build_all(plan, skies)?, counts);
+        return add_downlink(graph, plan, frames);
     }
     let skies: Vec<Option<&SkyMap>> = skies.iter().map(Some).collect();
-    let frames = integrate(graph, plan, &skies)?;
-    send(graph, plan, frames)
+    let frames = add_integration(graph, plan, &skies)?;
+    add_downlink(graph, plan, frames)
 }
 
-/// Adds the integration of the visibilities of the channels that have skies.
+/// Adds the stages that simulate visibilities of the channels that have a sky.
 ///
 /// # Errors
 /// An invalid model.
-pub(in crate::pipeline) fn integrate(
+pub(in crate::pipeline) fn add_integration(
     graph: &mut Graph,
     plan: &Plan,
     skies: &[Option<&SkyMap>],
@@ -123,17 +123,17 @@ pub(in crate::pipeline) fn integrate(
     Ok(graph.stage(INTEGRATE, config.runtime.queue_capacity, windows, integrator))
 }
 
-/// Adds what follows on the frames of all channels, to the bytes of the downlink.
+/// Adds the stages from the frames of all channels to the bytes of the downlink.
 ///
 /// # Errors
-/// A sky that the ninth daughter cannot take; an invalid configuration of the downlink.
-pub(in crate::pipeline) fn send(
+/// A sky that the ninth daughter cannot use; an invalid configuration of the downlink.
+pub(in crate::pipeline) fn add_downlink(
     graph: &mut Graph,
     plan: &Plan,
     frames: Link<GroundFrame>,
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     let frames = add_ninth(graph, plan, frames)?;
-    transmit(graph, plan, frames)
+    add_transmitter(graph, plan, frames)
 }
 
 /// Adds the spectra of the ninth daughter to the frames, if it is on.
@@ -160,11 +160,13 @@ fn add_ninth(
     })
 }
 
-/// The sky of the ninth daughter: the generated sky at its own frequencies, or the map file of the highest channel,
-/// continued as a power of frequency.
+/// The sky of the ninth daughter: the generated sky at nodes of its band, or the map file of the highest channel,
+/// extrapolated by a power law of frequency.
 fn ninth_sky(plan: &Plan) -> Result<NinthSky, PipelineError> {
     let Plan { config, array, instrument, .. } = plan;
-    let model = |sky: &SkyMap, at_hz| DirectSum::new(sky, at_hz, array.moon_radius_m(), instrument.response);
+    let model = |sky: &SkyMap, frequency_hz| {
+        DirectSum::new(sky, frequency_hz, array.moon_radius_m(), instrument.response)
+    };
     let ninth = &config.spacecraft.ninth;
     let channels = (0..).map(ChannelId).zip(&config.spacecraft.channels_hz);
     let highest = channels.max_by(|a, b| a.1.total_cmp(b.1));
@@ -175,15 +177,14 @@ fn ninth_sky(plan: &Plan) -> Result<NinthSky, PipelineError> {
             index: ninth.file_index,
         });
     }
-    let map = |at_hz: f64| -> Result<(f64, DirectSum), PipelineError> {
-        let values = generate(&config.sky.generated, at_hz, config.sky.nside, config.seed)?;
-        Ok((at_hz, model(&SkyMap::new(Frame::Ecliptic, values)?, at_hz)))
+    let map = |node_hz: f64| -> Result<(f64, DirectSum), PipelineError> {
+        let values = generate(&config.sky.generated, node_hz, config.sky.nside, config.seed)?;
+        Ok((node_hz, model(&SkyMap::new(Frame::Ecliptic, values)?, node_hz)))
     };
     Ok(NinthSky::Maps(NinthSky::nodes_hz(ninth.band_hz).into_iter().map(map).collect::<Result<_, _>>()?))
 }
 
-/// Adds the onboard store and the transmitter.
-fn transmit(
+fn add_transmitter(
     graph: &mut Graph,
     plan: &Plan,
     frames: Link<GroundFrame>,

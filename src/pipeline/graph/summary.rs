@@ -31,7 +31,7 @@ pub enum RunScope {
     Ground,
 }
 
-/// The results of a run.
+/// The results of a run: the content of `summary.json`.
 #[derive(Clone, Debug, Serialize)]
 pub struct RunSummary {
     /// Version of the program.
@@ -40,11 +40,11 @@ pub struct RunSummary {
     pub name: String,
     /// Which part of the chain ran.
     pub segment: RunScope,
-    /// Whether it was cancelled.
+    /// Whether the run was cancelled.
     pub cancelled: bool,
-    /// Seed of the space segment, as the instrument description has it.
+    /// Seed of the space segment, from the instrument description.
     pub seed: Option<u64>,
-    /// Hash of the space segment's configuration, as the instrument description has it.
+    /// Hash of the space segment's configuration, from the instrument description.
     pub space_hash: Option<String>,
     /// Hash of the ground's configuration.
     pub ground_hash: String,
@@ -54,7 +54,7 @@ pub struct RunSummary {
     pub ledger: LedgerReport<VisibilityReason>,
     /// Whether the ledger is known to be complete.
     pub completeness: Completeness,
-    /// Statistics of samples; absent without sample fidelity.
+    /// Statistics of samples; absent if no samples were simulated.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub samples: Option<SampleSummary>,
     /// Counters of what was received and of its faults.
@@ -65,12 +65,12 @@ pub struct RunSummary {
     /// Checkpoints of the ground's state, if it keeps one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub saving: Option<SavingReport>,
-    /// The gains that were found, with `calibration.hook = "solve"`.
+    /// Summary of the solved gains, with `calibration.hook = "solve"`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrateSummary>,
-    /// Stages: throughput, times, queues; of the last pass, if the channels were mapped in groups.
+    /// Throughput, times and queues of the stages; for the last reading, if the channels were mapped in groups.
     pub report: Report,
-    /// Counts of the passes before it.
+    /// Reports of the earlier readings.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub earlier_reports: Vec<Report>,
 }
@@ -107,10 +107,11 @@ impl RunSummary {
         }
     }
 
-    /// The summary of this pass and an earlier one over the same downlink, for other channels.
-    pub(in crate::pipeline) fn after(self, earlier: GroupRecord) -> Self {
+    /// Merges this summary with that of an earlier reading of the same downlink, which mapped other channels.
+    pub(in crate::pipeline) fn merged_with_earlier(self, earlier: GroupRecord) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
-        let ledger = earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_sums, elsewhere);
+        let ledger =
+            earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_accumulation, elsewhere);
         Self {
             seed: earlier.seed.or(self.seed),
             space_hash: earlier.space_hash.or(self.space_hash),
@@ -120,7 +121,7 @@ impl RunSummary {
         }
     }
 
-    /// Whether maps are missing because the time after cancellation did not suffice.
+    /// Whether maps are missing because the grace period after cancellation was too short.
     #[must_use]
     #[doc(hidden)]
     pub fn lacks_maps(&self) -> bool {
@@ -137,16 +138,18 @@ impl RunSummary {
         let path = folder.join("summary.json");
         let text = serde_json::to_vec_pretty(self)
             .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
-        let before = std::fs::read(&path).unwrap_or_default();
+        let previous = std::fs::read(&path).unwrap_or_default();
         write_atomically(&path, &text)
             .map_err(|source| ProductsError::Write { path: path.clone(), source })?;
         let ours: BTreeSet<&str> =
             self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
-        // A run that was cut short has not made all of its maps; those of the run before stay.
-        let is_whole = !self.lacks_maps();
-        for file in files_of(&before).iter().filter(|file| is_whole && !ours.contains(file.as_str())) {
+        // If this run lacks maps, those of the previous run are kept.
+        let is_complete = !self.lacks_maps();
+        for file in
+            product_files(&previous).iter().filter(|file| is_complete && !ours.contains(file.as_str()))
+        {
             let file = folder.join(file);
-            // A file may be gone already, and a folder may hold other files.
+            // The file may no longer exist, and the folder may hold other files.
             let _ = std::fs::remove_file(&file);
             let _ = file.parent().map(std::fs::remove_dir);
         }
@@ -154,18 +157,18 @@ impl RunSummary {
     }
 }
 
-/// Record of a mapped group.
+/// Part of a summary that is kept on disk for a mapped group of channels, until all groups are mapped.
 #[derive(bincode::Encode, bincode::Decode)]
 pub(in crate::pipeline) struct GroupRecord {
-    /// Checksums of its products, in the order in which its channels name them.
-    sums: Vec<u64>,
+    /// Checksums of the product files, in the order of `channels`.
+    checksums: Vec<u64>,
     pub(in crate::pipeline) ledger: LedgerReport<VisibilityReason>,
     pub(in crate::pipeline) channels: Vec<ChannelSummary>,
     pub(in crate::pipeline) seed: Option<u64>,
     pub(in crate::pipeline) space_hash: Option<String>,
 }
 
-/// Greatest record that is read: a channel's curves take some 100 kB.
+/// Maximum size of a record, bytes: a channel's curves take some 100 kB.
 const RECORD_BYTES_MAX: usize = 1 << 28;
 
 const CODEC: Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> = bincode::config::standard()
@@ -178,15 +181,14 @@ impl GroupRecord {
     ///
     /// # Errors
     /// A product that cannot be read.
-    pub(in crate::pipeline) fn of(summary: &RunSummary, out: &Path) -> Result<Self, ProductsError> {
-        let sum = |file: &String| {
+    pub(in crate::pipeline) fn new(summary: &RunSummary, out: &Path) -> Result<Self, ProductsError> {
+        let checksum = |file: &String| {
             let path = out.join(file);
-            checksum_of(&path).map_err(|source| ProductsError::Read { path, source })
+            file_checksum(&path).map_err(|source| ProductsError::Read { path, source })
         };
-        let sums =
-            summary.channels.iter().flat_map(|channel| &channel.files).map(sum).collect::<Result<_, _>>()?;
+        let files = summary.channels.iter().flat_map(|channel| &channel.files);
         Ok(Self {
-            sums,
+            checksums: files.map(checksum).collect::<Result<_, _>>()?,
             ledger: summary.ledger.clone(),
             channels: summary.channels.clone(),
             seed: summary.seed,
@@ -194,23 +196,23 @@ impl GroupRecord {
         })
     }
 
-    /// The record of a group that is mapped by the same settings; `None` if there is none, or if its products are gone or
-    /// are no longer what they were.
+    /// Reads the record of a mapped group; `None` if there is none, if it has another key, or if its products are missing or
+    /// changed.
     pub(in crate::pipeline) fn read(path: &Path, key: u64, out: &Path) -> Option<Self> {
         let bytes = fs::read(path).ok().filter(|bytes| bytes.len() <= RECORD_BYTES_MAX)?;
         let (body, crc) = bytes.split_last_chunk::<8>()?;
         let (found, body) = body.split_first_chunk::<8>()?;
-        let sum = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, body);
-        if u64::from_le_bytes(*found) != key || u64::from_le_bytes(*crc) != sum {
+        let expected_crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, body);
+        if u64::from_le_bytes(*found) != key || u64::from_le_bytes(*crc) != expected_crc {
             return None;
         }
         let (record, _) = bincode::decode_from_slice::<Self, _>(body, CODEC).ok()?;
         let mut files = record.channels.iter().flat_map(|channel| &channel.files);
-        let holds = files
+        let are_unchanged = files
             .by_ref()
-            .zip(&record.sums)
-            .all(|(file, sum)| checksum_of(&out.join(file)).is_ok_and(|found| found == *sum));
-        (holds && files.next().is_none()).then_some(record)
+            .zip(&record.checksums)
+            .all(|(file, checksum)| file_checksum(&out.join(file)).is_ok_and(|found| found == *checksum));
+        (are_unchanged && files.next().is_none()).then_some(record)
     }
 
     pub(in crate::pipeline) fn write(&self, path: &Path, key: u64) -> Result<(), ProductsError> {
@@ -223,8 +225,8 @@ impl GroupRecord {
     }
 }
 
-/// Checksum of a file, read piece by piece.
-fn checksum_of(path: &Path) -> std::io::Result<u64> {
+/// Checksum of a file, read in small pieces.
+fn file_checksum(path: &Path) -> std::io::Result<u64> {
     let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc64Nvme);
     let mut file = std::io::BufReader::with_capacity(1 << 16, fs::File::open(path)?);
     loop {
@@ -238,25 +240,25 @@ fn checksum_of(path: &Path) -> std::io::Result<u64> {
     }
 }
 
-/// The maps and pictures that a summary names: files in folders of channels, and nothing outside of them.
-fn files_of(summary: &[u8]) -> Vec<String> {
+/// Files that a `summary.json` lists, restricted to the channels' folders, so that no other file can be removed.
+fn product_files(summary: &[u8]) -> Vec<String> {
     #[derive(Default, Deserialize)]
     #[serde(default)]
-    struct Named {
-        channels: Vec<Files>,
+    struct Summary {
+        channels: Vec<Channel>,
     }
     #[derive(Default, Deserialize)]
     #[serde(default)]
-    struct Files {
+    struct Channel {
         files: Vec<String>,
     }
-    let named: Named = serde_json::from_slice(summary).unwrap_or_default();
+    let summary: Summary = serde_json::from_slice(summary).unwrap_or_default();
     let is_product = |file: &String| {
         let parts: Vec<&str> = file.split('/').collect();
         let [folder, name] = parts[..] else { return false };
         folder.ends_with("MHz") && !name.is_empty() && !folder.contains('\\') && !name.contains('\\')
     };
-    named.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
+    summary.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
 }
 
 impl fmt::Display for RunSummary {
@@ -298,7 +300,7 @@ mod tests {
         let summary =
             br#"{"channels": [{"files": ["3.000MHz/map.fits", "../MHz/x", "/MHz", "3.000MHz/../../x",
             "3.000MHz", "notes/x.txt"]}, {}], "more": 1}"#;
-        assert_eq!(files_of(summary), ["3.000MHz/map.fits"]);
-        assert!(files_of(b"").is_empty() && files_of(b"[1]").is_empty());
+        assert_eq!(product_files(summary), ["3.000MHz/map.fits"]);
+        assert!(product_files(b"").is_empty() && product_files(b"[1]").is_empty());
     }
 }

@@ -1,4 +1,4 @@
-//! What a pass of a planned array can tell of its gains at best.
+//! Cramer-Rao bounds of the gains in one pass of a planned array.
 
 use std::fmt;
 
@@ -12,14 +12,14 @@ use crate::response::model::{DaughterPosition, DirectSum, ModelError, Visibility
 use crate::sky::SkyMap;
 use crate::units::{ChannelId, InvalidValue, Pair, TICKS_PER_SECOND, all_pairs};
 
-/// Bounds of one pass.
+/// Cramer-Rao bounds of one pass.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BoundSummary {
-    /// Number of the observing window.
+    /// Number of the observing window, from 0.
     pub pass: u64,
-    /// Its start and end, s since the epoch.
+    /// Start and end of the window, s since the epoch.
     pub span_s: [f64; 2],
-    /// By daughter.
+    /// Bounds by daughter.
     pub daughters: Vec<DaughterBound>,
 }
 
@@ -52,10 +52,11 @@ impl fmt::Display for BoundSummary {
     }
 }
 
-/// Bounds of one of a plan's windows, counted from 0, with maps (K) of the sky, one a channel. Noise is that of the maps' power.
+/// Computes the bounds of observing window `pass` with maps (K) of the sky, one per channel. The noise follows from the power
+/// of the maps.
 ///
 /// # Errors
-/// A pass that is not there; maps that are not those of the channels; a known signal that is not the sky.
+/// A pass that does not exist; maps that do not fit the channels; a known signal other than the sky.
 pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, PipelineError> {
     let solver = &plan.config.calibrate;
     let invalid = |key: &str, value: String, expected: String| InvalidValue {
@@ -87,7 +88,7 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
             plan.instrument.response,
         );
         for pair in &pairs {
-            let block = observed(plan, &mut sky, (channel, *pair), window)?;
+            let block = observation(plan, &mut sky, (channel, *pair), window)?;
             if !block.is_empty() {
                 placed.push(block);
             }
@@ -100,23 +101,24 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
     Ok(BoundSummary { pass: pass as u64, span_s, daughters })
 }
 
-/// The visibilities of a pair in a window: times, positions, and weights by the daughters' powers.
-fn observed(
+/// Times, positions and weights of a pair's visibilities in a window; the values are zero. The weights follow from the powers of
+/// the daughters.
+fn observation(
     plan: &Plan,
     sky: &mut DirectSum,
     (channel, pair): (usize, Pair),
     window: ObservingWindow,
 ) -> Result<PlacedVisibilities, ModelError> {
-    let of_channel = plan.instrument.channels[channel];
+    let band = plan.instrument.channels[channel];
     let integrations = plan.schedules[channel].integrations(&plan.array, window, pair);
     let mut times = Vec::with_capacity(integrations.len());
-    let mut lengths = Vec::with_capacity(integrations.len());
+    let mut durations_s = Vec::with_capacity(integrations.len());
     let mut daughters = Vec::with_capacity(2 * integrations.len());
-    for one in &integrations {
-        let middle = i64::from(one.offset_ticks) + i64::from(one.duration_ticks / 2);
+    for integration in &integrations {
+        let middle = i64::from(integration.offset_ticks) + i64::from(integration.duration_ticks / 2);
         let t_s = window.start.plus_ticks(middle).seconds();
         times.push(t_s);
-        lengths.push(f64::from(one.duration_ticks) / TICKS_PER_SECOND as f64);
+        durations_s.push(f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64);
         for n in [pair.i, pair.j].map(usize::from) {
             let (r_m, normal_hat) = (plan.array.position_m(n, t_s), plan.array.normal_hat(n, t_s));
             daughters.push(DaughterPosition { r_m, normal_hat, daughter_time: None });
@@ -124,25 +126,23 @@ fn observed(
     }
     let mut powers = vec![0.0; daughters.len()];
     sky.predict_powers(&daughters, &mut powers)?;
-    let of = |side: usize| daughters.iter().skip(side).step_by(2).map(|one| one.r_m).collect();
-    // Of either part: P_i P_j / (2 width time).
-    let weights = powers.chunks(2).zip(&lengths);
-    let weight = weights.map(|(of, length)| {
-        let variance = of[0] * of[1] / (2.0 * of_channel.width_hz * length);
-        // No power: nothing is seen of the sky.
+    let positions_m =
+        |side: usize| daughters.iter().skip(side).step_by(2).map(|daughter| daughter.r_m).collect();
+    // Variance of the real or imaginary part: P_i P_j / (2 bandwidth duration). Without power the sky is hidden.
+    let weight = powers.chunks(2).zip(&durations_s).map(|(pair_powers, duration_s)| {
+        let variance = pair_powers[0] * pair_powers[1] / (2.0 * band.width_hz * duration_s);
         if variance > 0.0 { variance.recip() } else { 0.0 }
     });
-    let weight = weight.collect();
     Ok(PlacedVisibilities {
         channel: ChannelId(channel as u16),
         band: 0,
-        frequency_hz: of_channel.frequency_hz,
+        frequency_hz: band.frequency_hz,
         pair,
         value_k_sr: vec![Complex64::ZERO; times.len()],
         time_s: times,
-        r_i_m: of(0),
-        r_j_m: of(1),
-        weight,
+        r_i_m: positions_m(0),
+        r_j_m: positions_m(1),
+        weight: weight.collect(),
         duration_s: Vec::new(),
     })
 }
@@ -168,7 +168,7 @@ mod tests {
         let source =
             ConfigSource { file: None, overrides: overrides.map(str::to_owned).to_vec(), seed: None };
         let plan = Plan::new(source.load().unwrap()).unwrap();
-        // One pixel towards the orbit's normal, which the Moon never hides.
+        // One pixel in the direction of the orbit's normal, which the Moon never occults.
         let normal = plan.array.normal_hat(0, 0.0);
         let mut map = SkyMap::new(Frame::Ecliptic, vec![0.0; 12 * 16]).unwrap();
         let towards = map.directions_ecliptic();
@@ -178,8 +178,8 @@ mod tests {
         values[brightest] = 1e7;
         map = SkyMap::new(Frame::Ecliptic, values).unwrap();
         let found = bound(&plan, &[map], 0).unwrap();
-        // Every pair has the information 2 width time, as its signal is as strong as its noise. Between two of N nodes of a complete
-        // network with such conductances there are 2 / (N conductance).
+        // The signal of every pair equals its noise, so its Fisher information is 2 bandwidth duration. In a complete network of N nodes
+        // with such conductances, the resistance between two nodes is 2 / (N conductance).
         let [from_s, until_s] = found.span_s;
         let information = 2.0 * plan.instrument.channels[0].width_hz * (until_s - from_s);
         let expected_deg = (2.0 / (8.0 * information)).sqrt().to_degrees();

@@ -1,4 +1,4 @@
-//! Calibration of a downlink: solutions pass by pass from a known signal, in turn with the map if asked for.
+//! Calibration of a downlink: gains of each pass from a known signal, alternating with maps (self-calibration) if configured.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use crate::downlink::{DownlinkReader, FileSource};
 use crate::frames::{GroundFrame, VisibilityBlock};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
-use crate::pipeline::graph::calibrate_products::{create, write, write_json};
+use crate::pipeline::graph::calibrate_products::{create_folder, write_json, write_products};
 use crate::pipeline::graph::found_solutions::FoundSolutions;
 use crate::pipeline::graph::run::lock_folder;
 use crate::pipeline::graph::{CalibrateSummary, replay};
@@ -24,43 +24,43 @@ use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
 use crate::units::InvalidValue;
 
-/// What names the maps of the known sky.
+/// Option that names the maps of the known sky, for error messages.
 const MODEL: &str = "--model";
 
-/// A downlink to be calibrated.
+/// Inputs and output of the calibration of a downlink.
 pub struct CalibrateJob<'a> {
     /// Settings of the ground segment.
     pub config: &'a Config,
-    /// Downlink files; where they can be read twice, they are taken in the order of their first visibilities.
+    /// Downlink files; sorted by the times of their first visibilities if they can be read twice.
     pub files: &'a [PathBuf],
     /// Map of the sky for each channel, K; may be empty if an artificial signal is known.
     pub models: Vec<SkyMap>,
-    /// The files of these maps, whose frequencies have to be those of the channels; empty for maps of no files.
+    /// Files of these maps, whose frequencies are checked against the channels; empty for maps that are not from files.
     pub model_files: &'a [PathBuf],
     /// Folder for the products.
     pub out: &'a Path,
-    /// Is told after each pass how far it is.
+    /// Called after each pass with the progress.
     pub watch: CalibrateWatcher<'a>,
 }
 
-/// Follows a calibration.
+/// Callback that receives the progress of a calibration.
 pub type CalibrateWatcher<'a> = &'a mut dyn FnMut(CalibrateProgress);
 
-/// How far a calibration is.
+/// Progress of a calibration.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct CalibrateProgress {
-    /// Number of the round; 0 with the given model.
+    /// Number of the round; 0 uses the given model.
     pub round: u32,
-    /// Number of the last one, unless gains settle before.
+    /// Number of the last round, unless the gains converge earlier.
     pub last_round: u32,
-    /// Passes solved in it; `None` while its map is made.
+    /// Passes solved in the round; `None` while its maps are made.
     pub passes: Option<u64>,
-    /// Part of the data that it has read, 0 to 1.
+    /// Fraction of the data that the round has read.
     pub read: f64,
 }
 
-/// Finds the gains of every pass, and writes them: `gains.json` for a replay, `solutions.csv`, `solutions.json` and
-/// `solutions.png`. Nothing of it is there before all of it is known, so a repetition after an interruption gives the same.
+/// Solves for the gains of every pass, and writes `gains.json` for a replay, `solutions.csv`, `solutions.json` and
+/// `solutions.png`. They are written at the end only, so a repetition after an interruption gives the same result.
 ///
 /// # Errors
 /// Files that cannot be read; maps that do not fit the channels; a failed replay.
@@ -68,18 +68,18 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
     let CalibrateJob { config, files, models, model_files, out, watch } = job;
     let solver = &config.calibrate;
     check(config, &models)?;
-    let files = &in_order(files)?[..];
+    let files = &sorted_by_time(files)?[..];
     let _lock = lock_folder(out)?;
     let first = SolverConfig { mode: solver.known_signal(!models.is_empty()), ..solver.clone() };
     let van_vleck = config.calibration.van_vleck()?;
     let bytes = files.iter().map(|file| std::fs::metadata(file).map_or(0, |file| file.len())).sum::<u64>();
     let last_round = solver.map_rounds;
     let solve = |round: u32, solver: &SolverConfig, maps: &[SkyMap], watch: CalibrateWatcher<'_>| {
-        // Maps of later rounds are made of the data themselves.
+        // Maps of later rounds are made from the data, so their frequencies need no check.
         let model_files = if round == 0 { model_files } else { &[] };
         let van_vleck = van_vleck.as_ref();
-        let passes = Passes { solver, files, maps, model_files, model_key: MODEL, van_vleck, cancel };
-        passes.solve(&mut |passes, read_bytes| {
+        let pass_round = Round { solver, files, maps, model_files, model_key: MODEL, van_vleck, cancel };
+        pass_round.solve(&mut |passes, read_bytes| {
             let read = read_bytes as f64 / bytes.max(1) as f64;
             watch(CalibrateProgress { round, last_round, passes: Some(passes), read });
         })
@@ -96,10 +96,10 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
         if cancel.is_cancelled() {
             break;
         }
-        let powers = maps.iter().map(power).collect::<Result<_, PipelineError>>()?;
+        let map_cl_k2 = maps.iter().map(map_cl_k2).collect::<Result<_, PipelineError>>()?;
         let next = solve(round, solver, &maps, watch)?;
         let change = change_rms(&found.solutions, &next.solutions);
-        rounds.push(next.round(round, solver.mode, Some(change), powers));
+        rounds.push(next.round(round, solver.mode, Some(change), map_cl_k2));
         found = next;
         if change < solver.settled {
             break;
@@ -109,7 +109,7 @@ pub fn calibrate(job: CalibrateJob<'_>, cancel: &Cancel) -> Result<CalibrateSumm
     summary.rounds = rounds;
     summary.cancelled = cancel.is_cancelled();
     if !summary.cancelled {
-        write(out, &found, &summary, config.products.pictures)?;
+        write_products(out, &found, &summary, config.products.pictures)?;
     }
     Ok(summary)
 }
@@ -122,6 +122,7 @@ fn invalid(
     InvalidValue { key: key.to_owned(), value: value.to_string(), expected: expected.into() }.into()
 }
 
+/// Checks that the settings and the number of maps permit a calibration.
 fn check(config: &Config, models: &[SkyMap]) -> Result<(), PipelineError> {
     let (solver, calibration) = (&config.calibrate, &config.calibration);
     if calibration.sub_bands != 1 {
@@ -150,8 +151,8 @@ fn check(config: &Config, models: &[SkyMap]) -> Result<(), PipelineError> {
     Ok(())
 }
 
-/// The passes of a downlink.
-struct Passes<'a> {
+/// One round: the passes of a downlink, and the model to solve them with.
+struct Round<'a> {
     solver: &'a SolverConfig,
     files: &'a [PathBuf],
     maps: &'a [SkyMap],
@@ -161,7 +162,7 @@ struct Passes<'a> {
     cancel: &'a Cancel,
 }
 
-/// The pass that is being read.
+/// Visibilities of the pass that is being read.
 #[derive(Default)]
 struct OpenPass {
     blocks: Vec<VisibilityBlock>,
@@ -169,8 +170,8 @@ struct OpenPass {
 }
 
 impl OpenPass {
-    /// Solves a pass that has ended.
-    fn close(
+    /// Solves the pass, if it has data, and adds the solution to `found`.
+    fn solve(
         self,
         found: &mut FoundSolutions,
         solver: &mut PassSolver,
@@ -188,8 +189,8 @@ impl OpenPass {
     }
 }
 
-impl Passes<'_> {
-    /// Solves all passes; `watch` hears after each their number and the bytes that are read.
+impl Round<'_> {
+    /// Solves all passes; `watch` receives after each pass the number of solved passes and of bytes read.
     fn solve(&self, watch: &mut dyn FnMut(u64, u64)) -> Result<FoundSolutions, PipelineError> {
         let mut found = FoundSolutions::default();
         let mut ephemeris = Ephemeris::default();
@@ -210,29 +211,29 @@ impl Passes<'_> {
                             found.instrument = Some(instrument);
                         }
                         Some(before) if *before == instrument => {}
-                        Some(_) => return Err(self.of_another_instrument(file)),
+                        Some(_) => return Err(self.other_instrument_error(file)),
                     },
                     GroundFrame::Ephemeris(segment) => {
                         ephemeris.insert(segment);
                     }
                     GroundFrame::Visibilities(block) if block.pair.i != block.pair.j && !block.is_empty() => {
                         let last = block.len() - 1;
-                        let of = [block.middle_s(0), block.middle_s(last)];
+                        let block_s = [block.middle_s(0), block.middle_s(last)];
                         let gap_s = self.solver.pass_gap_s;
                         match open.span_s {
-                            Some([_, until_s]) if of[0] > until_s + gap_s => {
+                            Some([_, until_s]) if block_s[0] > until_s + gap_s => {
                                 let pass = std::mem::take(&mut open);
-                                pass.close(&mut found, &mut solver, &ephemeris)?;
+                                pass.solve(&mut found, &mut solver, &ephemeris)?;
                                 watch(found.passes, bytes_before + reader.bytes());
                             }
-                            Some([from_s, _]) if of[1] < from_s - gap_s => {
+                            Some([from_s, _]) if block_s[1] < from_s - gap_s => {
                                 found.late += block.len() as u64;
                                 continue;
                             }
                             _ => {}
                         }
-                        let [from_s, until_s] = open.span_s.unwrap_or(of);
-                        open.span_s = Some([from_s.min(of[0]), until_s.max(of[1])]);
+                        let [from_s, until_s] = open.span_s.unwrap_or(block_s);
+                        open.span_s = Some([from_s.min(block_s[0]), until_s.max(block_s[1])]);
                         open.blocks.push(block);
                     }
                     _ => {}
@@ -240,7 +241,7 @@ impl Passes<'_> {
             }
             bytes_before += reader.bytes();
         }
-        open.close(&mut found, &mut solver, &ephemeris)?;
+        open.solve(&mut found, &mut solver, &ephemeris)?;
         if found.instrument.is_none() {
             return Err(invalid("downlink", self.names(), "files with a description of the instrument"));
         }
@@ -258,7 +259,7 @@ impl Passes<'_> {
         self.files.iter().map(|file| file.display().to_string()).collect::<Vec<_>>().join(", ")
     }
 
-    fn of_another_instrument(&self, file: &Path) -> PipelineError {
+    fn other_instrument_error(&self, file: &Path) -> PipelineError {
         let first = self.files.first().map_or_else(String::new, |first| first.display().to_string());
         let expected =
             format!("the instrument of {first}, its daughters and channels: one mission at a time");
@@ -266,23 +267,23 @@ impl Passes<'_> {
     }
 }
 
-/// Files in the order of their first visibilities: solutions are found pass by pass. Those without come last; where one cannot be
-/// read twice, all stay as they are.
-fn in_order(files: &[PathBuf]) -> Result<Vec<PathBuf>, PipelineError> {
+/// Sorts files by the times of their first visibilities, as passes are solved in order of time. Files without visibilities come last.
+/// If any file cannot be read twice, the order is unchanged.
+fn sorted_by_time(files: &[PathBuf]) -> Result<Vec<PathBuf>, PipelineError> {
     let is_repeatable = |file: &PathBuf| std::fs::metadata(file).is_ok_and(|found| found.is_file());
     if files.len() < 2 || !files.iter().all(is_repeatable) {
         return Ok(files.to_vec());
     }
-    let mut begun = files
+    let mut timed = files
         .iter()
-        .map(|file| Ok((first_s(file)?, file.clone())))
+        .map(|file| Ok((first_time_s(file)?, file.clone())))
         .collect::<Result<Vec<(f64, PathBuf)>, PipelineError>>()?;
-    begun.sort_by(|(a, _), (b, _)| a.total_cmp(b));
-    Ok(begun.into_iter().map(|(_, file)| file).collect())
+    timed.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    Ok(timed.into_iter().map(|(_, file)| file).collect())
 }
 
-/// Time of the first visibilities of a file, s.
-fn first_s(file: &Path) -> Result<f64, PipelineError> {
+/// Time of the first visibility of a file, s; infinity without any.
+fn first_time_s(file: &Path) -> Result<f64, PipelineError> {
     let mut reader = DownlinkReader::open(file)?;
     while let Some(frame) = reader.next_frame()? {
         match frame {
@@ -293,7 +294,7 @@ fn first_s(file: &Path) -> Result<f64, PipelineError> {
     Ok(f64::INFINITY)
 }
 
-/// Root mean square of the relative change of gains that are good in both.
+/// Root mean square of the relative change of the gains that are good in both rounds.
 fn change_rms(before: &[PassSolution], after: &[PassSolution]) -> f64 {
     let (mut sum, mut count) = (0.0, 0.0);
     for (before, after) in before.iter().zip(after) {
@@ -311,7 +312,7 @@ fn change_rms(before: &[PassSolution], after: &[PassSolution]) -> f64 {
     if count > 0.0 { (sum / count).sqrt() } else { f64::INFINITY }
 }
 
-/// `config` with the gains of a file.
+/// Returns `config` with the gains of a file applied.
 #[must_use]
 pub fn with_gains(config: &Config, gains: PathBuf) -> Config {
     let mut config = config.clone();
@@ -320,7 +321,7 @@ pub fn with_gains(config: &Config, gains: PathBuf) -> Config {
     config
 }
 
-/// Maps of the data with solutions, one a channel.
+/// Maps the calibrated data without the held-out passes, one map per channel; empty without solutions.
 fn make_maps(
     config: &Config,
     files: &[PathBuf],
@@ -331,14 +332,14 @@ fn make_maps(
     let Some((gains, instrument)) = found.gains(true).zip(found.instrument.as_ref()) else {
         return Ok(Vec::new());
     };
-    create(folder)?;
+    create_folder(folder)?;
     let path = folder.join("gains.json");
     write_json(&path, &gains)?;
     let mut config = with_gains(config, path);
     config.products.pictures = false;
     config.map.snapshot_every_s = 0.0;
     let ground = Ground::new(&config.ground(WAIT_BYTES))?;
-    replay(FileSource::open(files)?, &config, ground, folder, cancel, &mut |_watched| {})?;
+    replay(FileSource::open(files)?, &config, ground, folder, cancel, &mut |_| {})?;
     if cancel.is_cancelled() {
         return Ok(Vec::new());
     }
@@ -349,7 +350,6 @@ fn make_maps(
     instrument.channels.iter().map(read).collect()
 }
 
-/// Power of a map by degree, K^2.
-fn power(map: &SkyMap) -> Result<Vec<f64>, PipelineError> {
+fn map_cl_k2(map: &SkyMap) -> Result<Vec<f64>, PipelineError> {
     Ok(auto_cl(&map.harmonics(2 * map.nside(), &AnalysisOptions::default())?))
 }

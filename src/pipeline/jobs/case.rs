@@ -1,34 +1,34 @@
-//! A finished case of a study, and what decides whether it has to be made again.
+//! Summary of a finished case of a study, and the marker file that tells whether it is up to date.
 
 use serde::{Deserialize, Serialize};
 
 use super::study_file::StudyCase;
 use crate::products::RunFigures;
 
-/// A finished case.
+/// Summary of a finished case.
 #[derive(Clone, Debug, Serialize)]
 pub struct CaseSummary {
-    /// Folder of its products.
+    /// Folder of the products.
     pub folder: String,
-    /// Its overrides of the pipeline.
+    /// Overrides of the pipeline.
     pub overrides: Vec<String>,
-    /// Realisations of its noise-only map.
+    /// Number of realisations of the noise-only map.
     pub realisations: usize,
-    /// Its figures.
+    /// Figures of merit of the maps.
     pub figures: RunFigures,
 }
 
-/// Key of a case: if it changes, the case is made again.
+/// Content of the marker file: everything that decides the result of a case. If it differs, the case is run again.
 #[derive(PartialEq, Serialize, Deserialize)]
 pub(in crate::pipeline) struct CaseMarker {
     space_hash: u64,
     ground_hash: u64,
-    /// All settings but those of the runtime, which change no result.
+    /// All settings except `[runtime]`, which changes no result.
     config: serde_json::Value,
 }
 
 impl CaseMarker {
-    pub(in crate::pipeline) fn of(case: &StudyCase) -> Self {
+    pub(in crate::pipeline) fn new(case: &StudyCase) -> Self {
         let config = &case.plan.config;
         let mut value = serde_json::to_value(config).unwrap_or_default();
         if let Some(sections) = value.as_object_mut() {
@@ -44,5 +44,4 @@ impl CaseMarker {
     }
 }
 
-/// Name of the file in a case's folder that says that it is finished.
 pub(in crate::pipeline) const MARKER: &str = "case.json";

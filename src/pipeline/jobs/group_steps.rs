@@ -2,17 +2,17 @@
 
 use std::fmt;
 
-use crate::pipeline::graph::Watched;
+use crate::pipeline::graph::RunHandles;
 use crate::units::ChannelId;
 
-/// A reading of the downlink that is about to begin.
+/// One reading of the downlink, for a group or a part of its sums.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MapStep {
     /// Number of the group, from 0.
     pub group: usize,
-    /// Part of its sums, from 0.
+    /// Part of the group's sums, from 0.
     pub part: usize,
-    /// Parts of its sums.
+    /// Number of parts of the group's sums.
     pub parts: usize,
 }
 
@@ -28,15 +28,15 @@ impl fmt::Display for MapStep {
 /// The next step of a run in groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GroupStep {
-    /// Make the sky of a channel.
+    /// Generate or read the sky of a channel.
     Sky(ChannelId),
     /// Simulate the group of this number, from 0.
-    Simulated(usize),
-    /// Make the downlink of all that was simulated.
-    Merged,
+    Simulate(usize),
+    /// Merge the simulated groups into one downlink.
+    Merge,
     /// Read the downlink for a group, and map it.
-    Mapped(MapStep),
+    Map(MapStep),
 }
 
-/// Receives what is about to be done, and the handles of its graph; a sky is made without one.
-pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Option<Watched>);
+/// Callback that receives each step before it runs, with the handles of its graph; [`GroupStep::Sky`] has none.
+pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Option<RunHandles>);

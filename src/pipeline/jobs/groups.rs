@@ -1,6 +1,8 @@
-//! Maps of many channels, group by group: the downlink is read once a group, so that the sums of a few channels are in memory
-//! at a time. Maps and ledger are those of all channels at once. A group that is mapped stays mapped: a run that was cancelled goes
-//! on with the next one.
+//! Maps of many channels in groups, to save memory: the downlink is read once per group, and only the sums of its channels are in
+//! memory.
+//!
+//! The maps and the ledger are identical to those of mapping all channels in one run. After a cancellation, the same call resumes
+//! with the next group.
 
 use std::cell::RefCell;
 use std::fs;
@@ -15,23 +17,25 @@ use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
 use crate::imaging::ChannelGroup;
 use crate::imaging::circle::SumPart;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
-use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, groups_of};
-use crate::pipeline::graph::run::{finish, ground_alone, lock_products, summarise, write_settings};
+use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, map_groups};
+use crate::pipeline::graph::run::{
+    FinishedGraph, collect_summary, lock_products, run_ground, write_settings, write_summary,
+};
 use crate::pipeline::graph::summary::GroupRecord;
-use crate::pipeline::graph::{RunScope, RunSummary, Watched, downlink_file, space_segment};
+use crate::pipeline::graph::{RunHandles, RunScope, RunSummary, downlink_file, space_segment};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::Cancel;
 
-/// Receives what is about to be read, and the handles of its graph, which is about to run.
-pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, Watched);
+/// Callback that receives the step and the handles of its graph before each reading of the files.
+pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunHandles);
 
-/// Groups of the channels that the first of `files` describes, in their order.
+/// Divides the channels of the instrument that `files` describe into groups, in order.
 ///
-/// Nothing is known of the length of the mission, so that the sums of the harmonic engine count as complete.
+/// The length of the mission is unknown, so the memory of the harmonic engine is estimated for its full size.
 ///
 /// # Errors
-/// A file that cannot be read twice, or describes no instrument; settings that do not fit it; a channel for which alone
-/// there is too little memory.
+/// A file that cannot be read twice; no description of the instrument; settings that do not fit it; a single channel whose sums do
+/// not fit into memory.
 pub fn channel_groups(
     files: &[PathBuf],
     config: &Config,
@@ -41,27 +45,29 @@ pub fn channel_groups(
     if let Some(path) = files.iter().find(|path| !path.is_file()) {
         return Err(PipelineError::NotRepeatable { path: path.clone() });
     }
-    let mut described = None;
+    let mut instrument = None;
     for path in files {
-        described = Collector::instrument_of(path)?;
-        if described.is_some() {
+        instrument = Collector::instrument_of(path)?;
+        if instrument.is_some() {
             break;
         }
     }
-    let Some(described) = described else {
+    let Some(instrument) = instrument else {
         let path = files.first().cloned().unwrap_or_default();
         return Err(PipelineError::NoInstrument { path });
     };
     let settings = config.ground(WAIT_BYTES);
-    settings.fits(&described)?;
-    groups_of(&settings.described(&described)?, config, size, limit)
+    settings.fits(&instrument)?;
+    map_groups(&settings.described(&instrument)?, config, size, limit)
 }
 
-/// As [`replay`](crate::pipeline::replay) of files, group by group. When it is cancelled, the maps of the groups before stay, and those
-/// of a first group; a later call with the same files, settings and folder goes on with the next group.
+/// Replays files group by group; see [`replay`](crate::pipeline::replay).
+///
+/// If it is cancelled, the maps of completed groups are kept, and those of the interrupted group only if it is the first. A later
+/// call with the same files, settings and folder resumes with the next group.
 ///
 /// # Errors
-/// Those of a replay; files that change on the way.
+/// As [`replay`](crate::pipeline::replay); files that change between readings.
 pub fn replay_in_groups(
     files: &[PathBuf],
     config: &Config,
@@ -71,13 +77,13 @@ pub fn replay_in_groups(
     watch: GroupWatcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let _lock = lock_products(config, out)?;
-    let readings = GroupReadings { scope: RunScope::Ground, files, config, groups, out };
-    let summary = readings.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
-    finish(summary, out)
+    let job = GroupedReplay { scope: RunScope::Ground, files, config, groups, out };
+    let summary = job.run(&|_| Ok(Truth::unknown()), cancel, watch)?;
+    write_summary(summary, out)
 }
 
-/// Settings for maps, group by group, of the same files.
-struct GroupReadings<'a> {
+/// A replay of the same files for each group of channels.
+struct GroupedReplay<'a> {
     scope: RunScope,
     files: &'a [PathBuf],
     config: &'a Config,
@@ -85,74 +91,56 @@ struct GroupReadings<'a> {
     out: &'a Path,
 }
 
-impl GroupReadings<'_> {
-    /// Maps the groups that no earlier call has.
+impl GroupedReplay<'_> {
+    /// Maps the groups that no earlier call has mapped; returns the merged summary.
     fn run(
         &self,
         truth: &dyn Fn(&ChannelGroup) -> Result<Truth, PipelineError>,
         cancel: &Cancel,
         watch: GroupWatcher<'_>,
     ) -> Result<RunSummary, PipelineError> {
-        let Self { scope, files, config, groups, out } = *self;
+        let Self { scope, config, groups, out, .. } = *self;
         let mut done: Vec<GroupRecord> = Vec::new();
         let mut last: Option<RunSummary> = None;
         for (number, MapGroup { channels: group, parts }) in groups.iter().enumerate() {
-            let (path, key) = (out.join(record_name(group)), self.key(group));
+            let (path, key) = (out.join(record_name(group)), self.resume_key(group));
             let is_last = number + 1 == groups.len();
-            // The summary is that of the last pass, which is always made.
+            // The last group is always read, as its report goes into the summary.
             if let Some(record) = GroupRecord::read(&path, key, out).filter(|_| !is_last) {
                 done.push(record);
                 continue;
             }
-            let mut step = MapStep { group: number, part: 0, parts: *parts };
-            let mut part = (*parts > 1).then(|| SumPart::first(*parts, out));
-            let ended = loop {
-                let next = part.as_ref().and_then(SumPart::next);
-                let settings = GroundConfig {
-                    group: Some(group.clone()),
-                    part: part.take(),
-                    ..config.ground(WAIT_BYTES)
-                };
-                let (source, ground) = (FileSource::open(files)?, Ground::new(&settings)?);
-                // Only with the last part there is a map.
-                let truth = if next.is_some() { Truth::unknown() } else { truth(group)? };
-                let mut watch = |watched| watch(step, watched);
-                let ended = ground_alone(truth, source, config, ground, out, cancel, &mut watch)?;
-                if next.is_none() || cancel.is_cancelled() {
-                    break ended;
-                }
-                part = next;
-                step.part += 1;
-            };
-            let powers = ended.powers();
-            let mut pass = summarise(scope, config, out, ended)?;
+            let finished =
+                self.read_group(MapStep { group: number, part: 0, parts: *parts }, truth, cancel, watch)?;
+            let autocorrelations = finished.autocorrelation_count();
+            let mut reading = collect_summary(scope, config, out, finished)?;
             if number > 0 {
-                // Each pass takes the auto-correlations of all channels; they count in the first.
-                pass.ledger.accumulated = pass.ledger.accumulated.saturating_sub(powers);
+                // Each reading accumulates the auto-correlations of all channels; only those of the first count.
+                reading.ledger.accumulated = reading.ledger.accumulated.saturating_sub(autocorrelations);
             }
-            let is_cut = pass.cancelled;
-            if let Some(before) = done.pop_if(|_| is_cut) {
-                // Its maps hold less data than those before, and no ledger could be common to both.
-                pass.channels.iter().flat_map(|channel| &channel.files).for_each(|file| {
+            let is_cancelled = reading.cancelled;
+            if is_cancelled && let Some(before) = done.pop() {
+                // The maps of this group hold less data than those of earlier groups, so the ledgers could not be merged.
+                reading.channels.iter().flat_map(|channel| &channel.files).for_each(|file| {
                     let _ = fs::remove_file(out.join(file));
                 });
-                (pass.ledger, pass.channels) = (before.ledger, before.channels);
+                (reading.ledger, reading.channels) = (before.ledger, before.channels);
             }
             let sampled = done.last().map(|before| before.ledger.sampled);
-            if let Some(before) = sampled.filter(|before| *before != pass.ledger.sampled) {
-                return Err(PipelineError::FilesChanged { before, now: pass.ledger.sampled });
+            if let Some(before) = sampled.filter(|before| *before != reading.ledger.sampled) {
+                return Err(PipelineError::FilesChanged { before, now: reading.ledger.sampled });
             }
             if let Some(before) = last.take() {
-                pass.earlier_reports = before.earlier_reports;
-                pass.earlier_reports.push(before.report);
+                reading.earlier_reports = before.earlier_reports;
+                reading.earlier_reports.push(before.report);
             }
-            if !is_cut && !is_last {
-                let record = GroupRecord::of(&pass, out)?;
+            if !is_cancelled && !is_last {
+                let record = GroupRecord::new(&reading, out)?;
                 record.write(&path, key)?;
                 done.push(record);
             }
-            last = Some(pass);
-            if is_cut {
+            last = Some(reading);
+            if is_cancelled {
                 break;
             }
         }
@@ -160,10 +148,10 @@ impl GroupReadings<'_> {
             return Err(PipelineError::NotInGroups { found: "no channel", expected: "at least one" });
         };
         for record in done.into_iter().rev() {
-            summary = summary.after(record);
+            summary = summary.merged_with_earlier(record);
         }
         if !summary.cancelled {
-            // Whoever repeats the command wants all of it again.
+            // All groups are mapped: a repeated command computes everything anew.
             groups.iter().for_each(|group| {
                 let _ = fs::remove_file(out.join(record_name(&group.channels)));
             });
@@ -171,14 +159,41 @@ impl GroupReadings<'_> {
         Ok(summary)
     }
 
-    /// Calls with the same number can go on where one of them was cancelled.
-    fn key(&self, group: &ChannelGroup) -> u64 {
+    /// Reads the files for one group, once for each part of its sums; the last reading makes the maps.
+    fn read_group(
+        &self,
+        mut step: MapStep,
+        truth: &dyn Fn(&ChannelGroup) -> Result<Truth, PipelineError>,
+        cancel: &Cancel,
+        watch: GroupWatcher<'_>,
+    ) -> Result<FinishedGraph, PipelineError> {
+        let Self { files, config, groups, out, .. } = *self;
+        let group = &groups[step.group].channels;
+        let mut part = (step.parts > 1).then(|| SumPart::first(step.parts, out));
+        loop {
+            let next = part.as_ref().and_then(SumPart::next);
+            let settings =
+                GroundConfig { group: Some(group.clone()), part: part.take(), ..config.ground(WAIT_BYTES) };
+            let (source, ground) = (FileSource::open(files)?, Ground::new(&settings)?);
+            let truth = if next.is_some() { Truth::unknown() } else { truth(group)? };
+            let mut on_start = |handles| watch(step, handles);
+            let finished = run_ground(truth, source, config, ground, out, cancel, &mut on_start)?;
+            if next.is_none() || cancel.is_cancelled() {
+                return Ok(finished);
+            }
+            part = next;
+            step.part += 1;
+        }
+    }
+
+    /// Hash of everything that must be unchanged for a cancelled call to be resumed.
+    fn resume_key(&self, group: &ChannelGroup) -> u64 {
         let Self { files, config, .. } = self;
         let file = |path: &PathBuf| {
             let found = fs::metadata(path).ok();
-            let changed = found.as_ref().and_then(|found| found.modified().ok());
-            let since = changed.and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
-            (path.clone(), found.map(|found| found.len()), since)
+            let modified = found.as_ref().and_then(|found| found.modified().ok());
+            let since_1970 = modified.and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok());
+            (path.clone(), found.map(|found| found.len()), since_1970)
         };
         let files: Vec<_> = files.iter().map(file).collect();
         let channels: Vec<u16> = group.iter().map(|channel| channel.0).collect();
@@ -189,13 +204,14 @@ impl GroupReadings<'_> {
     }
 }
 
-/// Simulates the channels and maps them in `out`, group by group: first all visibilities, then the maps.
+/// Simulates the channels group by group, and then maps them group by group in `out`.
 ///
-/// Leaves the products of [`run`](crate::pipeline::run()), byte for byte but for times and the number of readings in the summary; `None` if it was cancelled
-/// before there was a downlink. After a cancellation the same call goes on: groups that are simulated or mapped stay as they are.
+/// The products are identical to those of [`run`](crate::pipeline::run()), except for times and the number of readings in the summary.
+/// Returns `None` if it was cancelled before the downlink was complete. After a cancellation the same call resumes: groups that are
+/// simulated or mapped are kept.
 ///
 /// # Errors
-/// Those of a run.
+/// As [`run`](crate::pipeline::run()).
 pub fn run_in_groups(
     plan: &Plan,
     groups: &RunGroups,
@@ -209,8 +225,7 @@ pub fn run_in_groups(
     let RunGroups { simulated, mapped } = groups;
     let file = out.join(downlink_file(config.downlink.format));
     let marker = out.join(SIMULATED);
-    let is_made = |key: String| fs::read(&marker).is_ok_and(|found| found == key.as_bytes());
-    if !is_made(downlink_key(plan, &file)) {
+    if !fs::read(&marker).is_ok_and(|found| found == downlink_key(plan, &file).as_bytes()) {
         let reports = simulate_in_groups(plan, simulated, &file, cancel, watch)?;
         if reports.last().is_some_and(|report| report.cancelled) {
             return Ok(None);
@@ -226,28 +241,28 @@ pub fn run_in_groups(
         })
     };
     let files = [file];
-    let readings = GroupReadings { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
-    let summary = readings.run(&truth, cancel, &mut |step, watched| {
-        (watch.borrow_mut())(GroupStep::Mapped(step), Some(watched));
+    let job = GroupedReplay { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
+    let summary = job.run(&truth, cancel, &mut |step, handles| {
+        (watch.borrow_mut())(GroupStep::Map(step), Some(handles));
     })?;
-    let summary = finish(summary, out)?;
+    let summary = write_summary(summary, out)?;
     if !summary.cancelled {
         let _ = fs::remove_file(&marker);
     }
     Ok(Some(summary))
 }
 
-/// Name of the file that says that the downlink of a run in groups is whole, and of what.
+/// Name of the marker file of a complete simulated downlink; it contains the downlink's key.
 const SIMULATED: &str = ".simulated";
 
-/// Key and length of a downlink.
+/// Text that identifies a downlink by version, settings and length.
 fn downlink_key(plan: &Plan, file: &Path) -> String {
     let config = &plan.config;
     let bytes = fs::metadata(file).map_or(0, |found| found.len());
     format!("{} {:016x} {:?} {bytes}", env!("CARGO_PKG_VERSION"), config.space_hash(), config.downlink)
 }
 
-/// Name of the file that keeps what a summary says of a group that is mapped.
+/// Name of the file that keeps the record of a mapped group.
 fn record_name(group: &ChannelGroup) -> String {
     let channels: Vec<String> = group.iter().map(ToString::to_string).collect();
     let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc32Iscsi, channels.join(",").as_bytes());

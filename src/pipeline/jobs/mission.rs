@@ -1,4 +1,4 @@
-//! The common run, step by step: a pipeline with some keys changed, simulated, replayed, or both.
+//! Builder for the common uses: change some keys of a pipeline, then simulate, replay or run it.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -10,9 +10,9 @@ use crate::pipeline::cost::Segment;
 use crate::pipeline::graph::{RunSummary, replay, run, simulate, use_threads};
 use crate::runtime::{Cancel, Report};
 
-/// A mission that is simulated, mapped, or both: a pipeline file with some keys changed.
+/// A mission to simulate, to map, or both: a pipeline with some keys changed.
 ///
-/// Keys are those of `pipelines/reference.toml`. All errors are reported together when the mission is planned.
+/// The keys are listed in `pipelines/reference.toml`. All errors are reported together when the mission is planned.
 ///
 /// ```
 /// use lunarray::prelude::*;
@@ -42,8 +42,8 @@ pub struct Mission {
 }
 
 impl Mission {
-    /// The paper's array of eight satellites and its three channels of 1, 3 and 10 MHz over one precession of the orbit, thinned
-    /// to seconds or minutes of work: what `lunarray run` does without a file.
+    /// The mission of `lunarray run` without a file: the paper's array of eight satellites, with channels of 1, 3 and 10 MHz over
+    /// one precession of the orbit, thinned to run in seconds or minutes.
     pub fn dsl() -> Self {
         Self { source: ConfigSource::default(), out: None, cancel: Cancel::new() }
     }
@@ -54,18 +54,18 @@ impl Mission {
         Self { source, ..Self::dsl() }
     }
 
-    /// Centre frequencies of the channels, Hz. Settings by channel follow the nearest channel of the pipeline.
+    /// Sets the centre frequencies of the channels, Hz. Settings by channel are copied from the nearest channel of the pipeline.
     pub fn channels(self, channels_hz: &[f64]) -> Self {
         let listed: Vec<String> = channels_hz.iter().map(|hz| format!("{hz:e}")).collect();
         self.set("spacecraft.channels_hz", format!("[{}]", listed.join(", ")))
     }
 
-    /// Resolution of the maps: 12 nside^2 pixels.
+    /// Sets the resolution of the maps: 12 nside^2 pixels.
     pub fn nside(self, nside: usize) -> Self {
         self.set("map.nside", nside)
     }
 
-    /// Seed of all that is random; the same seed gives the same bytes.
+    /// Sets the seed of all random numbers; the same seed gives the same bytes.
     pub fn seed(self, seed: u64) -> Self {
         Self { source: ConfigSource { seed: Some(seed), ..self.source }, ..self }
     }
@@ -76,17 +76,17 @@ impl Mission {
         self
     }
 
-    /// Folder of the products; `out/NAME` without this.
+    /// Sets the folder of the products; the default is `out/NAME`.
     pub fn out(self, folder: impl Into<PathBuf>) -> Self {
         Self { out: Some(folder.into()), ..self }
     }
 
-    /// Ends the run in order once this is cancelled, with products of the data so far.
+    /// Sets a handle that ends the run when it is cancelled, with products of the data so far.
     pub fn cancelled_by(self, cancel: &Cancel) -> Self {
         Self { cancel: cancel.clone(), ..self }
     }
 
-    /// The settings, checked, with what follows from them.
+    /// Checks the settings and makes the plan of the mission.
     ///
     /// # Errors
     /// Everything that is wrong with the settings.
@@ -96,7 +96,7 @@ impl Mission {
         Ok(plan)
     }
 
-    /// Simulates the mission and maps the sky: downlink, maps, pictures and `summary.json` are in the folder of products.
+    /// Simulates the mission and maps the sky. Downlink, maps, pictures and `summary.json` are in the folder of products.
     ///
     /// # Errors
     /// Wrong settings; more memory than the machine has; the first failure of any stage.
@@ -106,7 +106,7 @@ impl Mission {
         run(&plan, &self.folder(&plan), &self.cancel, &mut |_| {})
     }
 
-    /// Simulates the space segment alone, to a downlink file.
+    /// Simulates the space segment alone, into a downlink file.
     ///
     /// # Errors
     /// Wrong settings; the first failure of any stage.
@@ -119,7 +119,7 @@ impl Mission {
     /// let file = folder.path().join("mission.ccsds");
     /// let mission = Mission::dsl().channels(&[3e6]).nside(4).set("spacecraft.every_nth_integration", 30).out(folder.path());
     /// mission.simulate(&file)?;
-    /// // The ground makes the maps of the bytes alone.
+    /// // The ground segment makes the maps from the downlink alone.
     /// let summary = mission.replay(&[file])?;
     /// assert_eq!(summary.ledger.accumulated, summary.channels[0].visibilities);
     /// # Ok(())
@@ -129,7 +129,7 @@ impl Mission {
         simulate(&self.plan()?, &file, &self.cancel, &mut |_| {})
     }
 
-    /// Maps downlink files, of this mission or another, with the settings of this one.
+    /// Maps downlink files of this or another mission with the settings of this one.
     ///
     /// # Errors
     /// Wrong settings; a file that cannot be read; the first failure of any stage; no visibility for any map.

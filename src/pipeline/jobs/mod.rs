@@ -1,4 +1,4 @@
-//! Jobs of several graphs that can be resumed: groups of channels, studies, realisations, rounds of calibration, maps of states.
+//! Jobs that run several graphs: groups of channels, studies, noise realisations, rounds of calibration, maps of states.
 
 mod bound;
 mod calibrate;

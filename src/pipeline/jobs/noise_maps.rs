@@ -1,4 +1,4 @@
-//! Maps of noise of many realisations from one downlink: its weights are summed and the matrix is prepared once for many.
+//! Maps of many noise realisations from one downlink: the weights are accumulated and the matrix is prepared only once.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -10,40 +10,37 @@ use crate::imaging::{EngineKind, Snapshot, SnapshotData};
 use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError};
 use crate::pipeline::graph::ground_segment::GROUND;
-use crate::pipeline::graph::run::start_alone;
-use crate::pipeline::graph::{READ, Watched, Watcher};
+use crate::pipeline::graph::run::start_single_process;
+use crate::pipeline::graph::{OnStart, READ, RunHandles};
 use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Most realisations of one reading.
-const AT_ONCE: usize = 50;
-/// Part of the memory that sums may take.
-const MEMORY_PART: f64 = 0.7;
+/// Maximum number of realisations in one reading of the downlink.
+const PER_READING_MAX: usize = 50;
+/// Fraction of the memory that sums may take.
+const MEMORY_FRACTION: f64 = 0.7;
 
-/// Realisations of noise of a downlink, besides that of the map's own companion.
+/// Maps of additional noise realisations; the first realisation is the map's own `noise.fits`.
 pub(in crate::pipeline) struct NoiseMaps<'a> {
-    /// Settings of the ground.
     pub(in crate::pipeline) config: &'a Config,
-    /// The downlink.
     pub(in crate::pipeline) file: &'a Path,
-    /// Folder of the products.
     pub(in crate::pipeline) out: &'a Path,
-    /// A seed for each; their numbers begin with 2.
+    /// Seeds of realisations 2, 3, ...
     pub(in crate::pipeline) seeds: &'a [u64],
 }
 
 impl Config {
-    /// Whether realisations of the noise-only map can share all but their noise: with the harmonic engine, without refinement, and if
-    /// errors of the instrument do not differ with them.
+    /// Whether noise realisations can share the weights and the matrix: with the harmonic engine, without iterative refinement and
+    /// without random errors of the instrument.
     pub(in crate::pipeline) fn shares_realisations(&self) -> bool {
         self.map.engine == EngineKind::Harmonic && !self.map.refine.is_on() && !self.has_errors()
     }
 }
 
-/// The file of a realisation of noise in a folder of products, numbered from 1; the first is that of the map's companion.
+/// The map file of a noise realisation in a folder of products. Realisation 1 is the map's own `noise.fits`.
 pub(in crate::pipeline) fn noise_file(out: &Path, frequency_hz: f64, number: usize) -> PathBuf {
     let folder = out.join(format!("{:.3}MHz", frequency_hz / 1e6));
     match number {
@@ -53,15 +50,15 @@ pub(in crate::pipeline) fn noise_file(out: &Path, frequency_hz: f64, number: usi
 }
 
 impl NoiseMaps<'_> {
-    /// Makes the maps, with as many realisations at a time as memory allows; whether all of them were made.
+    /// Makes the maps, with as many realisations per reading as memory allows; `false` if it was cancelled.
     pub(in crate::pipeline) fn make(
         &self,
         cancel: &Cancel,
-        watch: Watcher<'_>,
+        watch: OnStart<'_>,
     ) -> Result<bool, PipelineError> {
         let mut number = 2;
-        for seeds in self.seeds.chunks(self.at_once()) {
-            if !self.make_some(number, seeds, cancel, watch)? {
+        for seeds in self.seeds.chunks(self.realisations_per_reading()) {
+            if !self.make_in_one_reading(number, seeds, cancel, watch)? {
                 return Ok(false);
             }
             number += seeds.len();
@@ -69,28 +66,28 @@ impl NoiseMaps<'_> {
         Ok(true)
     }
 
-    /// Realisations that fit beside the other sums; at least one.
-    fn at_once(&self) -> usize {
+    /// Number of realisations that fit into memory beside the other sums; at least one.
+    fn realisations_per_reading(&self) -> usize {
         let map = &self.config.map;
         let channels = &self.config.spacecraft.channels_hz;
         let sizes = channels.iter().map(|&frequency_hz| {
             let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
             let memory = memory(map.degree(), u_max, rayon::current_num_threads(), NOISES_TOGETHER);
-            // One copy waits while another is solved.
+            // One snapshot waits while another is solved.
             let sums = 2 * memory.sums + memory.tables + memory.workspace;
             [sums, NoiseSums::bytes_each(map.degree(), u_max)]
         });
         let [sums, each] = sizes.fold([0.0, 1.0], |[a, b], [c, d]| [a + c as f64, b + d as f64]);
-        let limit = MemoryLimit::of_machine().map_or(0.0, |limit| MEMORY_PART * limit.bytes as f64);
-        (((limit - sums) / each) as usize).clamp(1, AT_ONCE)
+        let limit = MemoryLimit::of_machine().map_or(0.0, |limit| MEMORY_FRACTION * limit.bytes as f64);
+        (((limit - sums) / each) as usize).clamp(1, PER_READING_MAX)
     }
 
-    fn make_some(
+    fn make_in_one_reading(
         &self,
         first: usize,
         seeds: &[u64],
         cancel: &Cancel,
-        watch: Watcher<'_>,
+        watch: OnStart<'_>,
     ) -> Result<bool, PipelineError> {
         let config = self.config;
         let mut graph = Graph::new();
@@ -102,16 +99,15 @@ impl NoiseMaps<'_> {
         let solving = SolveWatch::new(cancel.clone());
         let setup = config.solver(solving.clone())?;
         graph.sink("noise maps", sums, NoiseMapSolver { setup, out: self.out.to_owned(), first });
-        let watched = Watched { solving, ..Watched::of_space(&graph) };
-        Ok(!start_alone(graph, &config.runtime, cancel, watched, watch)?.cancelled)
+        watch(RunHandles { solving, ..RunHandles::without_ground(&graph) });
+        Ok(!start_single_process(graph, &config.runtime, cancel)?.cancelled)
     }
 }
 
-/// Solves for the realisations in sums, and writes their maps.
+/// Solves for the noise realisations in a snapshot, and writes their maps.
 struct NoiseMapSolver {
     setup: SolverSetup,
     out: PathBuf,
-    /// Number of the first.
     first: usize,
 }
 
@@ -135,7 +131,7 @@ impl Sink for NoiseMapSolver {
             Err(SolveError::Interrupted) => return Ok(()),
             maps => maps?,
         };
-        // As those of the solver, which divides maps by what the Moon is taken to reflect.
+        // The solver divides its maps by the same factor.
         let factor = 1.0 + setup.moon_reflection;
         for (number, mut map_k) in (self.first..).zip(maps) {
             map_k.iter_mut().for_each(|value| *value /= factor);

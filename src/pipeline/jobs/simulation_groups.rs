@@ -1,5 +1,5 @@
-//! Simulation of more channels than memory has room for at a time: group by group to files beside the downlink, which is then made
-//! of them. It has the same bytes as one of all channels at once.
+//! Simulation of channels in groups, to save memory: each group goes to a spool file beside the downlink, and these are merged into
+//! the downlink. Its bytes are the same as without groups.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -11,40 +11,39 @@ use crate::imaging::ChannelGroup;
 use crate::mother::{Merger, SpoolReader, SpoolWriter};
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::pipeline::graph::run;
-use crate::pipeline::graph::{Watched, space_segment};
+use crate::pipeline::graph::{RunHandles, space_segment};
 use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Report};
 use crate::sky::SkyMap;
 use crate::units::ChannelId;
 
-/// Name of the stage that puts visibilities aside.
+/// Name of the stage that writes a group's visibilities to its spool file.
 const SPOOL: &str = "spool";
-/// Name of the source that makes frames of what groups have left; it takes window by window.
+/// Name of the source that merges the spool files into frames, window by window.
 pub const MERGE: &str = "merge";
 
 impl Plan {
-    /// Key by which stored visibilities are known to be of this plan.
     fn spool_key(&self) -> u64 {
         let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
         crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
     }
 }
 
-/// Where the visibilities of a group are put aside.
 fn spool_path(file: &Path, group: &ChannelGroup) -> PathBuf {
-    let end = |channel: Option<&ChannelId>| channel.map_or(0, |channel| channel.0);
+    let number = |channel: Option<&ChannelId>| channel.map_or(0, |channel| channel.0);
     let mut name = file.as_os_str().to_owned();
-    name.push(format!(".channels-{}-{}.spool", end(group.first()), end(group.last())));
+    name.push(format!(".channels-{}-{}.spool", number(group.first()), number(group.last())));
     name.into()
 }
 
-/// As [`simulate`](crate::pipeline::simulate) to a file, group by group. Groups that an earlier call, which was cancelled, has put aside are
-/// taken as they are; what was put aside is removed once the downlink is whole.
+/// Simulates a downlink file group by group; see [`simulate`](crate::pipeline::simulate).
 ///
-/// `watch` gets what is about to be done. The reports are of each that ran, and last of the downlink; the last one says whether all were cancelled.
+/// Spool files of an earlier call that was cancelled are reused. They are removed once the downlink is complete. `watch` receives
+/// each step before it runs. Returns the report of each group that was simulated, and of the downlink; the last report tells whether
+/// the call was cancelled.
 ///
 /// # Errors
-/// The first failure of any stage; another process that simulates to the same file.
+/// The first failure of any stage; another process that simulates into the same file.
 pub fn simulate_in_groups(
     plan: &Plan,
     groups: &[ChannelGroup],
@@ -54,7 +53,7 @@ pub fn simulate_in_groups(
 ) -> Result<Vec<Report>, PipelineError> {
     let key = plan.spool_key();
     run::write_instrument_truth(plan, file)?;
-    // An unwritable place shows before anything is computed.
+    // An unwritable path is reported before anything is computed.
     let recorder = Recorder::create(file)?;
     let mut reports = Vec::new();
     for (number, group) in groups.iter().enumerate() {
@@ -73,22 +72,20 @@ pub fn simulate_in_groups(
             .map(|channel| group.contains(&channel).then(|| sky(channel)).transpose())
             .collect::<Result<_, _>>()?;
         let present: Vec<Option<&SkyMap>> = skies.iter().map(Option::as_ref).collect();
-        let frames = space_segment::integrate(&mut graph, plan, &present)?;
+        let frames = space_segment::add_integration(&mut graph, plan, &present)?;
         drop(skies);
         graph.sink(SPOOL, frames, writer);
-        let watched = Watched::of_space(&graph);
-        let report = run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |watched| {
-            watch(GroupStep::Simulated(number), Some(watched));
-        })?;
-        let is_cut = report.cancelled;
+        watch(GroupStep::Simulate(number), Some(RunHandles::without_ground(&graph)));
+        let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
+        let is_cancelled = report.cancelled;
         reports.push(report);
-        if is_cut {
+        if is_cancelled {
             return Ok(reports);
         }
     }
     let open = |group: &ChannelGroup| {
         let path = spool_path(file, group);
-        // It was there, or has just been written.
+        // The file existed, or has just been written.
         SpoolReader::open(&path, key)?.ok_or(PipelineError::SpoolGone { path })
     };
     let spools = groups.iter().map(open).collect::<Result<Vec<_>, _>>()?;
@@ -101,13 +98,11 @@ pub fn simulate_in_groups(
         plan.instrument_errors(),
     );
     let frames = graph.source(MERGE, plan.config.runtime.queue_capacity, merger);
-    let bytes = space_segment::send(&mut graph, plan, frames)?;
+    let bytes = space_segment::add_downlink(&mut graph, plan, frames)?;
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
-    let watched = Watched::of_space(&graph);
-    let report = run::start_alone(graph, &plan.config.runtime, cancel, watched, &mut |watched| {
-        watch(GroupStep::Merged, Some(watched));
-    })?;
+    watch(GroupStep::Merge, Some(RunHandles::without_ground(&graph)));
+    let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
     if !report.cancelled {
         remove_spools(groups, file)?;
     }

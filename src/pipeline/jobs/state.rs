@@ -1,4 +1,4 @@
-//! A state on its own: the settings that it was made with, and maps of its sums without new data.
+//! Use of a saved state without new data: its settings, and maps of its normal equations.
 
 use std::path::Path;
 
@@ -11,27 +11,27 @@ use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
 
 impl ConfigSource {
-    /// This source with the settings of the state in `folder` before its own overrides, so that the state can be used without
-    /// naming them again. Only without a file: what a file says stands, and is compared with the state.
+    /// Adds the settings of the state in `folder`, so that the user need not repeat them; overrides of this source take precedence.
+    /// A source with a file is returned unchanged: its settings are compared with the state later.
     ///
     /// # Errors
-    /// A folder without a usable state; [`GroundError::FilesOfState`] where the state was made with gains of a file, or maps of
-    /// the known sky, that no override names: it holds only their checksums.
+    /// A folder without a usable state; [`GroundError::FilesOfState`] if the state was made with a gains file or maps of the known
+    /// sky that no override names, as the state holds only their checksums.
     #[doc(hidden)]
-    pub fn of_state(self, folder: &Path) -> Result<Self, GroundError> {
-        self.of_settings(folder, Ground::settings_in)
+    pub fn with_state_settings(self, folder: &Path) -> Result<Self, GroundError> {
+        self.with_settings(folder, Ground::settings_in)
     }
 
-    /// As [`ConfigSource::of_state`], for each of several ranks before they open the folder.
+    /// Adds the settings of the state in `folder` without locking it, for each of several ranks before they open it.
     ///
     /// # Errors
-    /// Likewise.
+    /// As [`ConfigSource::with_state_settings`].
     #[doc(hidden)]
-    pub fn of_state_for_ranks(self, folder: &Path) -> Result<Self, GroundError> {
-        self.of_settings(folder, Ground::settings_for_ranks)
+    pub fn with_state_settings_for_ranks(self, folder: &Path) -> Result<Self, GroundError> {
+        self.with_settings(folder, Ground::settings_for_ranks)
     }
 
-    fn of_settings(
+    fn with_settings(
         mut self,
         folder: &Path,
         settings_in: impl Fn(&Path) -> Result<Vec<(String, String)>, GroundError>,
@@ -40,20 +40,20 @@ impl ConfigSource {
             let settings = settings_in(folder)?;
             require_files(folder, &settings, &self.overrides)?;
             let overrides =
-                settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)));
+                settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", setting_toml(value)?)));
             self.overrides = overrides.chain(std::mem::take(&mut self.overrides)).collect();
         }
         Ok(self)
     }
 }
 
-/// Requires that files whose checksums a state holds are named: without them it cannot be opened.
+/// Requires an override for each file of which the state holds only the checksum, as it cannot be opened without them.
 fn require_files(
     folder: &Path,
     settings: &[(String, String)],
     overrides: &[String],
 ) -> Result<(), GroundError> {
-    for (key, what, expected) in [
+    for (key, description, expected) in [
         (
             "calibration.gains_file",
             "gains of",
@@ -65,38 +65,38 @@ fn require_files(
             "--set calibrate.model_files=[FILE, ...]",
         ),
     ] {
-        let is_of = |(name, value): &&(String, String)| {
+        let is_file = |(name, value): &&(String, String)| {
             name.strip_prefix(key).is_some_and(|rest| rest.is_empty() || rest.starts_with('['))
-                && value.starts_with(A_FILE)
+                && value.starts_with(FILE_PREFIX)
         };
-        let files: Vec<&str> = settings.iter().filter(is_of).map(|(_, value)| value.as_str()).collect();
-        // A section may be set as a whole.
-        let names = |text: &String| {
-            let set = text.split_once('=').map_or("", |(set, _)| set.trim());
-            set == key || key.split_once('.').is_some_and(|(section, _)| set == section)
+        let files: Vec<&str> = settings.iter().filter(is_file).map(|(_, value)| value.as_str()).collect();
+        // An override may also set the whole section.
+        let sets_key = |text: &String| {
+            let name = text.split_once('=').map_or("", |(name, _)| name.trim());
+            name == key || key.split_once('.').is_some_and(|(section, _)| name == section)
         };
-        if !files.is_empty() && !overrides.iter().any(names) {
-            let (path, found) = (folder.to_owned(), format!("{what} {}", files.join(", ")));
+        if !files.is_empty() && !overrides.iter().any(sets_key) {
+            let (path, found) = (folder.to_owned(), format!("{description} {}", files.join(", ")));
             return Err(GroundError::FilesOfState { path, found, expected });
         }
     }
     Ok(())
 }
 
-/// How the checksum of a file begins, which stands for its path in a state.
-const A_FILE: &str = "a file of";
+/// Beginning of the checksum text that stands for the path of a file in a state.
+const FILE_PREFIX: &str = "a file of";
 
-/// Passes of a map from a state that holds visibilities one by one, if nobody says how many: `map.refine.residual_max` ends them.
-const PASSES_MAX: usize = 10;
+/// Default limit of refinement iterations for a state of stored visibilities; `map.refine.residual_max` ends them earlier.
+const REFINE_ITERATIONS_MAX: usize = 10;
 
-/// A setting as a checkpoint has it (Rust's debug form: `16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`) as a value of TOML;
-/// `None` for a file: only its checksum is known.
-fn toml_of(value: &str) -> Option<String> {
-    if value.starts_with(A_FILE) {
+/// Converts a setting of a checkpoint, in Rust's debug form (`16`, `AntennaGains`, `Limits { a: 1.0, b: 2.0 }`), to TOML; `None` for a
+/// file, of which only the checksum is known.
+fn setting_toml(value: &str) -> Option<String> {
+    if value.starts_with(FILE_PREFIX) {
         return None;
     }
     if value == REFINED {
-        return Some(PASSES_MAX.to_string());
+        return Some(REFINE_ITERATIONS_MAX.to_string());
     }
     if let Some((_, fields)) = value.split_once(" { ") {
         return Some(format!("{{ {}", fields.replace(": ", " = ")));
@@ -104,7 +104,7 @@ fn toml_of(value: &str) -> Option<String> {
     if !value.starts_with(|c: char| c.is_ascii_uppercase()) {
         return Some(value.to_owned());
     }
-    // A variant, which files write in kebab case.
+    // Enum variants are kebab case in TOML.
     let mut text = String::new();
     for (k, c) in value.char_indices() {
         if c.is_ascii_uppercase() && k > 0 {
@@ -115,10 +115,10 @@ fn toml_of(value: &str) -> Option<String> {
     Some(format!("{text:?}"))
 }
 
-/// Maps of the sums in a state, without new data: of every channel, with each of these epsilons (`R = epsilon W_max I`, unless the
-/// configuration has another R with an epsilon), or those of the
-/// configuration if there are none. The state stays as it is. `found` gets each map as soon as it is made, with its epsilon;
-/// `watch` follows, and ends it early.
+/// Maps every channel of a state without new data, for each epsilon in `epsilons`, or for the configured epsilon if it is empty.
+///
+/// R is that of the configuration, or `epsilon W_max I` if that has no epsilon. The state is unchanged. `found` receives each map as
+/// soon as it is made; `watch` reports progress and ends the solution early.
 ///
 /// # Errors
 /// A state that cannot be read or was made with other settings; a solution that fails.
@@ -129,22 +129,23 @@ pub fn solve_state(
     watch: &SolveWatch,
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
-    let given = epsilons.iter().map(|&epsilon| PerChannel::All(epsilon));
-    let each: Vec<_> = if epsilons.is_empty() { vec![config.map.epsilon()] } else { given.collect() };
-    for epsilon in each {
-        // Solving takes the sums: they are read again for the next.
+    let choices = match epsilons {
+        [] => vec![config.map.epsilon()],
+        epsilons => epsilons.iter().map(|&epsilon| PerChannel::All(epsilon)).collect(),
+    };
+    for epsilon in choices {
         let mut setup = SolverSetup { epsilon, ..config.solver(watch.clone())? };
         if !epsilons.is_empty() && config.map.regulariser() == RegulariserChoice::Data {
-            // Who names an epsilon asks for the R that has one.
+            // R from the data has no epsilon.
             setup.regularisers = vec![Regulariser::default()];
         }
+        // Solving consumes the sums, so they are read again for each epsilon.
         solve_sums(folder, config, setup, found)?;
     }
     Ok(())
 }
 
-/// Maps of the sums in a state with `count` others that are as likely, draws from the posterior of R from the data. The state stays as
-/// it is.
+/// Maps every channel of a state, with `count` samples from the posterior; R is estimated from the data. The state is unchanged.
 ///
 /// # Errors
 /// As [`solve_state`].
@@ -159,11 +160,11 @@ pub fn sample_state(
     solve_sums(folder, config, setup, found)
 }
 
-/// Maps of several channels together, of the sums in one state or several; `request` makes of the first state's stopping rule what is asked
-/// for. The states stay as they are.
+/// Solves for the maps of several channels jointly, from one or more states. `request` makes the joint request from the first state's
+/// stopping rule. The states are unchanged.
 ///
 /// # Errors
-/// As [`solve_state`]; sums that are not over harmonics; as [`solve_jointly`].
+/// As [`solve_state`] and [`solve_jointly`]; sums of another engine than the harmonic one.
 pub fn solve_states_jointly(
     states: &[(&Path, Config)],
     request: &dyn Fn(StoppingRule) -> JointRequest,
@@ -190,6 +191,7 @@ pub fn solve_states_jointly(
     Ok(solve_jointly(channels, &request(rule), watch)?)
 }
 
+/// Reads the sums of a state, and solves for the map of every channel.
 fn solve_sums(
     folder: &Path,
     config: &Config,
@@ -222,20 +224,20 @@ mod tests {
             MapConfig { nside: 4, rows: PixelMethod::AverageExact, weight_max: 2e-9, ..MapConfig::default() };
         let limits = GeometryLimits { altitude_m_max: 1e-3, ..GeometryLimits::default() };
         let harmonic = MapConfig { engine: EngineKind::Harmonic, l_max: 7, limits, ..MapConfig::default() };
-        let refine = RefineConfig { passes_max: PASSES_MAX, ..RefineConfig::default() };
+        let refine = RefineConfig { passes_max: REFINE_ITERATIONS_MAX, ..RefineConfig::default() };
         let refined = MapConfig { refine, ..harmonic.clone() };
         for map in [pixel, harmonic, refined] {
             let mut overrides: Vec<String> = map
                 .sum_settings()
                 .iter()
-                .filter_map(|(key, value)| Some(format!("{key}={}", toml_of(value)?)))
+                .filter_map(|(key, value)| Some(format!("{key}={}", setting_toml(value)?)))
                 .collect();
             overrides.push(format!("calibration.quantiser_bits={}", calibration.quantiser_bits));
             let config = ConfigSource { overrides, ..ConfigSource::default() }.load_ground().unwrap();
             assert_eq!((config.map, config.calibration), (map, calibration.clone()));
         }
-        let hook = toml_of(&format!("{:?}", CalibrationHook::AntennaGains));
+        let hook = setting_toml(&format!("{:?}", CalibrationHook::AntennaGains));
         assert_eq!(hook.as_deref(), Some("\"antenna-gains\""));
-        assert_eq!(toml_of("a file of checksum 0123"), None);
+        assert_eq!(setting_toml("a file of checksum 0123"), None);
     }
 }

@@ -1,7 +1,7 @@
-//! Studies: one simulation, many solutions.
+//! Studies: parameter sweeps that share simulations and normal equations.
 //!
-//! A study runs a pipeline at every combination of some settings. Cases that differ only in the ground segment share the
-//! downlink of one simulation; those that differ only in the solution (epsilon, prior) share the sums of one state.
+//! A study runs a pipeline at every combination of some settings. Cases that differ only in the ground segment share one simulated
+//! downlink. Cases that differ only in the solution (epsilon, prior) also share the normal equations of one state.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -12,15 +12,15 @@ use serde::Serialize;
 use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
 use super::case::{CaseMarker, CaseSummary, MARKER};
 use super::noise_maps::NoiseMaps;
-use super::realisations::{RealisationSpread, SpreadProducts, csv_of, spreads};
+use super::realisations::{RealisationSpread, SpreadProducts, spreads, spreads_csv};
 use super::study_file::{Study, StudyCase};
 use crate::calibration::solver::SolverConfig;
 use crate::downlink::{FileSource, Recorder};
 use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
-use crate::pipeline::graph::run::{replay_knowing, simulate_sky};
-use crate::pipeline::graph::{Destination, Watched, downlink_file, space_segment};
+use crate::pipeline::graph::run::{DownlinkSinks, replay_with_truth, simulate_skies};
+use crate::pipeline::graph::{RunHandles, downlink_file, space_segment};
 use crate::products::{
     Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, crossings, draw_epsilons,
     draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv,
@@ -28,45 +28,45 @@ use crate::products::{
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
 
-/// Visibilities between checkpoints of a case's state: a minute's work or more.
+/// Number of visibilities between checkpoints of a shared state: a minute's work or more.
 const CHECKPOINT_EVERY: u64 = 20_000_000;
 
-/// The step of a study for a case.
+/// A step of a study, for one case.
 #[derive(Clone, Debug)]
 pub enum StudyStep {
-    /// Simulating the downlink that it shares with others, with the handles of the graph.
-    Simulate(Watched),
-    /// Finding the gains of its data.
+    /// Simulate the downlink that the case shares with others.
+    Simulate(RunHandles),
+    /// Calibrate the data.
     Calibrate(CalibrateProgress),
-    /// Mapping it, with the handles of the graph.
-    Map(Watched),
-    /// Making further realisations of its noise-only map, with the handles of the graph.
-    Realise(Watched),
+    /// Map the data.
+    Map(RunHandles),
+    /// Map additional noise realisations.
+    Realise(RunHandles),
 }
 
-/// Follows a study: the number of the case, from 0, and what is done for it.
+/// Callback that receives the number of the case, from 0, and each step before it runs.
 pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyStep);
 
 /// Results of a study.
 #[derive(Clone, Debug, Serialize)]
 pub struct StudySummary {
-    /// Its name.
+    /// Name of the study.
     pub name: String,
-    /// Whether it was ended early: repeat the command to go on.
+    /// Whether the study was interrupted: the same command resumes it.
     pub cancelled: bool,
-    /// Its finished cases.
+    /// The finished cases.
     pub cases: Vec<CaseSummary>,
-    /// Where the traces cross, for cases that differ in map.epsilon alone.
+    /// Values of `map.epsilon` where the two traces cross, for cases that differ only in `map.epsilon`.
     pub crossings: Vec<Crossing>,
-    /// epsilon as several rules choose it, for the same cases, where at least three have traces.
+    /// Choices of `map.epsilon` by several rules, for the same cases, if at least three have traces.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub epsilons: Vec<EpsilonChoices>,
-    /// Scatter of realisations.
+    /// Scatter over realisations.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub spreads: Vec<RealisationSpread>,
 }
 
-/// Input of a case's maps: data, gains, and sums that it shares with others.
+/// Inputs for the maps of a case: data, gains, and a state that it shares with other cases.
 struct CaseInputs<'a> {
     file: &'a Path,
     /// The file as a list; empty if the state already holds it.
@@ -75,18 +75,17 @@ struct CaseInputs<'a> {
     state: Option<&'a PathBuf>,
 }
 
-/// What all steps of a study need.
-struct StudyContext<'a> {
+struct StudyRun<'a> {
     study: &'a Study,
     out: &'a Path,
     cancel: &'a Cancel,
     watch: StudyWatcher<'a>,
 }
 
-/// Makes the cases of a study that are not in `out` yet, and tables and curves of all.
+/// Runs the cases of a study that are not finished in `out`, and writes tables and curves of all cases.
 ///
-/// Leaves in `out`: a folder of products for each case, `study.json`, `study.csv`, `spectra.csv` and `study.png`. The shared
-/// downlinks and states are removed once they are used up, unless `keep`.
+/// Writes into `out` a folder of products for each case, `study.json`, `study.csv`, `spectra.csv` and `study.png`. Shared downlinks and
+/// states are removed after their last use, unless `keep` is set.
 ///
 /// # Errors
 /// As [`crate::pipeline::run()`]; tables and pictures that cannot be written.
@@ -103,23 +102,22 @@ pub fn run_study(
     };
     fs::create_dir_all(out).map_err(failed(out))?;
     let _lock = FolderLock::acquire(out, ".lock", true).map_err(failed(out))?;
-    let mut making = StudyContext { study, out, cancel, watch };
+    let mut run = StudyRun { study, out, cancel, watch };
     let pending = |k: &usize| !is_done(&study.cases[*k], out);
     let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
-    let mut is_cut = false;
-    // The first case that is left, and all that share its downlink.
-    while let (Some(&first), false) = (pending.first(), is_cut) {
+    let mut is_cancelled = false;
+    while let (Some(&first), false) = (pending.first(), is_cancelled) {
         let key = downlink_key(&study.cases[first].plan.config);
         let (group, rest): (Vec<usize>, Vec<usize>) =
             pending.iter().partition(|&&k| downlink_key(&study.cases[k].plan.config) == key);
         let file = out.join(format!("downlink-{key:016x}.{}", extension(&study.cases[first].plan.config)));
-        is_cut = !making.make(&group, &file, keep)?;
-        if !is_cut && !keep {
+        is_cancelled = !run.make_group(&group, &file, keep)?;
+        if !is_cancelled && !keep {
             fs::remove_file(&file).map_err(failed(&file))?;
         }
         pending = rest;
     }
-    let summary = summarise(study, out, is_cut)?;
+    let summary = summarise(study, out, is_cancelled)?;
     write_results(&summary, out)?;
     Ok(summary)
 }
@@ -132,53 +130,48 @@ fn extension(config: &Config) -> &'static str {
 fn is_done(case: &StudyCase, out: &Path) -> bool {
     let marker = fs::read(out.join(case.folder()).join(MARKER)).ok();
     let found = marker.and_then(|bytes| serde_json::from_slice::<CaseMarker>(&bytes).ok());
-    found.is_some_and(|found| found == CaseMarker::of(case))
+    found.is_some_and(|found| found == CaseMarker::new(case))
 }
 
-/// A number that cases of equal downlinks share.
+/// Hash of the settings that decide the downlink.
 fn downlink_key(config: &Config) -> u64 {
     let text = serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default();
     crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
 }
 
-/// A number that cases of equal sums of one downlink share.
+/// Hash of the settings that decide the sums of a downlink.
 fn sums_key(case: &StudyCase) -> u64 {
     let config = &case.plan.config;
     let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
     let sums = (map.sum_settings(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
-    // Alternation with the map depends on how the map is solved for.
+    // Self-calibration depends on the settings of the solution, too.
     let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
     let text = serde_json::to_vec(&(sums, solution));
     let text = text.unwrap_or_default();
     crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
 }
 
-/// The truth for the last shape of maps, as neighbouring cases have the same.
+/// Cache of the input sky for one shape of maps, as consecutive cases often share it.
 struct LastTruth {
     shape: MapShape,
     truth: Truth,
 }
 
-impl StudyContext<'_> {
-    /// Makes the cases of one downlink; whether all of them were made.
-    fn make(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
+impl StudyRun<'_> {
+    /// Runs the cases of one downlink; `false` if it was cancelled.
+    fn make_group(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
         let cases = &self.study.cases;
         let plan = &cases[group[0]].plan;
         let skies = space_segment::skies(plan)?;
         if !file.exists() {
             let recorder = Some(Recorder::create(file)?);
+            let sinks = DownlinkSinks { file: Some(file.to_owned()), recorder, socket: None };
             let watch = &mut self.watch;
-            let report = simulate_sky(
-                plan,
-                &skies,
-                (Destination::from(&file), recorder),
-                self.cancel,
-                &mut |watched| {
-                    watch(group[0], StudyStep::Simulate(watched));
-                },
-            )?;
+            let report = simulate_skies(plan, &skies, sinks, self.cancel, &mut |handles| {
+                watch(group[0], StudyStep::Simulate(handles));
+            })?;
             if report.cancelled {
-                // What was simulated is less than the mission.
+                // The downlink is incomplete.
                 let _ = fs::remove_file(file);
                 return Ok(false);
             }
@@ -190,7 +183,7 @@ impl StudyContext<'_> {
             let (same, rest): (Vec<usize>, Vec<usize>) =
                 left.iter().partition(|&&k| sums_key(&cases[k]) == key);
             let state = self.out.join(format!("state-{key:016x}"));
-            // Snapshots need the data to arrive.
+            // Snapshots are made while data arrive, so a state cannot be shared.
             let map = &cases[first].plan.config.map;
             let is_shared = same.len() > 1 && map.snapshot_every_s == 0.0;
             let gains = if cases[first].calibrated {
@@ -200,11 +193,11 @@ impl StudyContext<'_> {
                 None
             };
             for (number, &k) in same.iter().enumerate() {
-                // The state has taken the file in once its first case is made.
+                // After the first case, the shared state holds the data.
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
-                let given =
+                let inputs =
                     CaseInputs { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
-                if !self.map(k, given, &skies, &mut last)? {
+                if !self.map(k, inputs, &skies, &mut last)? {
                     return Ok(false);
                 }
             }
@@ -217,8 +210,8 @@ impl StudyContext<'_> {
         Ok(true)
     }
 
-    /// Finds the gains of a downlink with the settings of a case, in a folder within that of its products; `None` if it was
-    /// ended early.
+    /// Calibrates a downlink with the settings of a case, in a subfolder of its products. Returns the path of the gains; `None` if it
+    /// was cancelled.
     fn calibrate(&mut self, number: usize, file: &Path) -> Result<Option<PathBuf>, PipelineError> {
         let case = &self.study.cases[number];
         let folder = self.out.join(case.folder());
@@ -238,15 +231,15 @@ impl StudyContext<'_> {
         Ok((!summary.cancelled).then(|| out.join("gains.json")))
     }
 
-    /// Maps a case; whether it was finished.
+    /// Maps a case; `false` if it was cancelled.
     fn map(
         &mut self,
         number: usize,
-        given: CaseInputs<'_>,
+        inputs: CaseInputs<'_>,
         skies: &[SkyMap],
         last: &mut Option<LastTruth>,
     ) -> Result<bool, PipelineError> {
-        let CaseInputs { file, files, gains, state } = given;
+        let CaseInputs { file, files, gains, state } = inputs;
         let case = &self.study.cases[number];
         let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
         let config = with_gains.as_ref().unwrap_or(&case.plan.config);
@@ -264,30 +257,35 @@ impl StudyContext<'_> {
         };
         let source = FileSource::open(files)?;
         let watch = &mut self.watch;
-        let summary = replay_knowing(truth, source, config, ground, &folder, self.cancel, &mut |watched| {
-            watch(number, StudyStep::Map(watched));
-        })?;
-        if summary.cancelled || !self.map_noises(number, config, file)? {
+        let summary =
+            replay_with_truth(truth, source, config, ground, &folder, self.cancel, &mut |handles| {
+                watch(number, StudyStep::Map(handles));
+            })?;
+        if summary.cancelled || !self.map_noise_realisations(number, config, file)? {
             return Ok(false);
         }
         let path = folder.join(MARKER);
-        let text = serde_json::to_vec_pretty(&CaseMarker::of(case)).unwrap_or_default();
+        let text = serde_json::to_vec_pretty(&CaseMarker::new(case)).unwrap_or_default();
         write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
         Ok(true)
     }
-}
 
-impl StudyContext<'_> {
-    /// Makes the further realisations of a case's noise-only map; whether all of them were made.
-    fn map_noises(&mut self, number: usize, config: &Config, file: &Path) -> Result<bool, PipelineError> {
+    /// Maps the additional noise realisations of a case; `false` if it was cancelled.
+    fn map_noise_realisations(
+        &mut self,
+        number: usize,
+        config: &Config,
+        file: &Path,
+    ) -> Result<bool, PipelineError> {
         let case = &self.study.cases[number];
         let out = self.out.join(case.folder());
         let maps = NoiseMaps { config, file, out: &out, seeds: &case.noise_seeds };
         let watch = &mut self.watch;
-        maps.make(self.cancel, &mut |watched| watch(number, StudyStep::Realise(watched)))
+        maps.make(self.cancel, &mut |handles| watch(number, StudyStep::Realise(handles)))
     }
 }
 
+/// Collects the figures of the finished cases, and what their comparison shows.
 fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary, PipelineError> {
     let mut cases = Vec::new();
     let mut groups: Vec<(Vec<u8>, Vec<usize>)> = Vec::new();
@@ -310,16 +308,16 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
         .collect();
     let (crossings, epsilons) = (crossings(&groups), epsilon_choices(&groups));
-    note_power_kept(&done, &mut cases);
+    compare_with_ideal(&done, &mut cases);
     let products = SpreadProducts { covariance_at_deg: &study.covariance_at_deg, folder: out };
     let spreads =
-        if study.realisations > 1 { spreads(&realised(study, &cases), products)? } else { Vec::new() };
+        if study.realisations > 1 { spreads(&families(study, &cases), products)? } else { Vec::new() };
     Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, epsilons, spreads })
 }
 
-/// Compares each case of a study of the instrument's errors with the one that has none of them and is not calibrated.
-fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
-    let ideal_of = |case: &StudyCase| {
+/// Compares each case of a study of instrument errors with the case that has no errors and is not calibrated.
+fn compare_with_ideal(done: &[&StudyCase], cases: &mut [CaseSummary]) {
+    let ideal_key = |case: &StudyCase| {
         let mut config = case.plan.config.without_errors();
         config.calibrate = SolverConfig::default();
         serde_json::to_value(&config).unwrap_or_default()
@@ -336,20 +334,21 @@ fn note_power_kept(done: &[&StudyCase], cases: &mut [CaseSummary]) {
         .iter()
         .zip(cases.iter())
         .filter(|(case, _)| !has_errors(case))
-        .map(|(case, summary)| (ideal_of(case), summary.figures.clone()))
+        .map(|(case, summary)| (ideal_key(case), summary.figures.clone()))
         .collect();
     for (case, summary) in done.iter().zip(cases) {
-        let key = ideal_of(case);
+        let key = ideal_key(case);
         if let Some((_, ideal)) = ideals.iter().find(|(found, _)| *found == key) {
             summary.figures.set_power_kept(ideal);
         }
     }
 }
 
-/// Cases that differ in their realisation alone, with what they have in common.
-fn realised<'a>(study: &Study, cases: &'a [CaseSummary]) -> Vec<(String, Vec<&'a CaseSummary>)> {
-    let families = study.cases.chunk_by(|a, b| a.family == b.family);
-    families
+/// Groups the cases that differ only in their realisation, with their common label.
+fn families<'a>(study: &Study, cases: &'a [CaseSummary]) -> Vec<(String, Vec<&'a CaseSummary>)> {
+    study
+        .cases
+        .chunk_by(|a, b| a.family == b.family)
         .map(|members| {
             let folders: BTreeSet<String> = members.iter().map(StudyCase::folder).collect();
             let label = members[0].labels.split_last().map(|(_, common)| common.join(", "));
@@ -367,8 +366,8 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
         ("study.json", json),
         ("study.csv", runs_csv(&runs).into_bytes()),
         ("spectra.csv", spectra_csv(&runs).into_bytes()),
-        ("realisations.csv", if_any(&summary.spreads, csv_of)),
-        ("epsilons.csv", if_any(&summary.epsilons, epsilons_csv)),
+        ("realisations.csv", table_if_any(&summary.spreads, spreads_csv)),
+        ("epsilons.csv", table_if_any(&summary.epsilons, epsilons_csv)),
     ] {
         if bytes.is_empty() {
             continue;
@@ -389,7 +388,7 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
     Ok(())
 }
 
-/// A table of something; empty of nothing.
-fn if_any<T>(of: &[T], table: impl Fn(&[T]) -> String) -> Vec<u8> {
-    if of.is_empty() { Vec::new() } else { table(of).into_bytes() }
+/// The bytes of a table; empty if it has no rows.
+fn table_if_any<T>(rows: &[T], table: impl Fn(&[T]) -> String) -> Vec<u8> {
+    if rows.is_empty() { Vec::new() } else { table(rows).into_bytes() }
 }

@@ -1,4 +1,4 @@
-//! A study's file, and the cases that it names.
+//! Study files: reading, checks, and the cases that follow from the axes.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,16 +13,14 @@ use crate::pipeline::config::{ConfigSource, PipelineError, Plan, has_sections, i
 use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, check_frequencies, read_known_sky};
 
-/// Most cases of a study.
 const CASES_MAX: usize = 1000;
-/// Most directions of `covariance_at_deg`: each takes a map of memory.
+/// Maximum number of directions in `covariance_at_deg`: each needs a map in memory.
 const COVARIANCES_MAX: usize = 16;
-/// Longest study file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
-/// Most characters of the name of a case's folder, besides its beginning.
+/// Maximum length of the name of a case's folder, without `case-`.
 const FOLDER_CHARACTERS_MAX: usize = 100;
 
-/// Why a study cannot be made.
+/// Errors in a study file or its cases.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum StudyError {
@@ -34,7 +32,7 @@ pub enum StudyError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The file is no study.
+    /// The content is not a valid study.
     #[error("{}: {found}; expected {expected}", path.display())]
     File {
         /// Path.
@@ -44,37 +42,37 @@ pub enum StudyError {
         /// What was expected.
         expected: &'static str,
     },
-    /// A case whose settings are not a pipeline.
+    /// A case whose settings are invalid.
     #[error("case {label}: {source}")]
     Case {
-        /// Its label.
+        /// Label of the case.
         label: String,
         /// What is wrong.
         source: Box<PipelineError>,
     },
 }
 
-/// A study file.
+/// Content of a study file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct StudyFile {
     name: Option<String>,
-    /// Beside the study; the embedded quicklook if absent.
+    /// Path of the pipeline, relative to the study's folder; the embedded quicklook if absent.
     pipeline: Option<PathBuf>,
     /// Overrides of all cases.
     #[serde(default)]
     set: Vec<String>,
     #[serde(default)]
     axis: Vec<AxisFile>,
-    /// Realisations of each case: of the noise-only map's noise, and of the instrument's random errors if it has any.
+    /// Number of realisations of each case: of the noise-only map, and of the instrument's random errors if it has any.
     realisations: Option<usize>,
-    /// Directions with which the noise of all pixels has a covariance that is wanted: ecliptic longitude and latitude, degrees.
+    /// Directions whose noise covariance with all pixels is computed: ecliptic longitude and latitude, degrees.
     #[serde(default)]
     covariance_at_deg: Vec<[f64; 2]>,
-    /// Whether each case is made twice: with the data as sent, and with gains that are found from them.
+    /// Whether each case is run twice: with the data as sent, and with the data calibrated.
     #[serde(default)]
     calibrated: bool,
-    /// Maps of the sky to calibrate with, one a channel; beside the study. Without, those of `calibrate.model_files`.
+    /// Paths of maps of the sky to calibrate with, one per channel, relative to the study's folder; `calibrate.model_files` if empty.
     #[serde(default)]
     model: Vec<PathBuf>,
 }
@@ -95,12 +93,12 @@ struct CaseFile {
     set: Vec<String>,
 }
 
-/// Labels of a case, and the overrides that make it.
+/// Labels and overrides of a case.
 #[derive(Clone, Default)]
 struct Draft {
     labels: Vec<String>,
     sets: Vec<String>,
-    /// Seeds of further realisations that share its sums.
+    /// Seeds of additional noise realisations that share the sums.
     noise_seeds: Vec<u64>,
 }
 
@@ -113,7 +111,7 @@ impl Draft {
     }
 }
 
-fn wrong(path: &Path, found: String, expected: &'static str) -> StudyError {
+fn invalid(path: &Path, found: String, expected: &'static str) -> StudyError {
     StudyError::File { path: path.to_owned(), found, expected }
 }
 
@@ -121,12 +119,12 @@ impl StudyFile {
     fn read(path: &Path) -> Result<Self, StudyError> {
         let text = read_study(path)?;
         toml::from_str(&text).map_err(|error| match is_pipeline(&text) {
-            true => wrong(
+            true => invalid(
                 path,
                 "a pipeline".to_owned(),
                 "a study: pipeline = \"FILE\" and [[axis]] with key and values, or with cases; `lunarray run` runs a pipeline",
             ),
-            false => wrong(
+            false => invalid(
                 path,
                 error.to_string().trim_end().to_owned(),
                 "name, pipeline, set and [[axis]] with key and values, or with cases",
@@ -134,16 +132,16 @@ impl StudyFile {
         })
     }
 
-    /// Checks everything but its cases.
-    fn check(&self, path: &Path, more: &[String]) -> Result<(), StudyError> {
+    /// Checks everything except the cases.
+    fn check(&self, path: &Path, extra_overrides: &[String]) -> Result<(), StudyError> {
         if self.axis.is_empty() && self.realisations.is_none() && !self.calibrated {
             let expected =
                 "[[axis]] with key and values, or with cases; or realisations = N, or calibrated = true";
-            return Err(wrong(path, "nothing that makes cases".to_owned(), expected));
+            return Err(invalid(path, "nothing that makes cases".to_owned(), expected));
         }
-        if let Some(found) = self.set_twice(more) {
+        if let Some(found) = self.duplicate_key(extra_overrides) {
             let expected = "each key on one axis alone: what is set last would hold under both labels";
-            return Err(wrong(path, found, expected));
+            return Err(invalid(path, found, expected));
         }
         let directions = &self.covariance_at_deg;
         let is_direction =
@@ -152,24 +150,24 @@ impl StudyFile {
         let are_few = directions.len() <= COVARIANCES_MAX && names.len() == directions.len();
         if !are_few || !directions.iter().all(is_direction) {
             let expected = "at most 16 of [longitude, latitude], ecliptic, degrees, each once";
-            return Err(wrong(path, format!("covariance_at_deg = {directions:?}"), expected));
+            return Err(invalid(path, format!("covariance_at_deg = {directions:?}"), expected));
         }
         if self.realisations.unwrap_or(1) == 1 && !directions.is_empty() {
             let found = "covariance_at_deg without realisations".to_owned();
-            return Err(wrong(path, found, "realisations = 2 or more with it"));
+            return Err(invalid(path, found, "realisations = 2 or more with it"));
         }
         Ok(())
     }
 
-    /// Every step of each axis with every step of the others.
+    /// All combinations of the values of the axes.
     fn combinations(&self, path: &Path) -> Result<Vec<Draft>, StudyError> {
         let mut combinations = vec![Draft::default()];
         for (number, axis) in self.axis.iter().enumerate() {
             let expected = "key with values, or cases with label and set; at least one";
-            let steps = steps(axis).ok_or_else(|| wrong(path, format!("axis {}", number + 1), expected))?;
+            let steps = steps(axis).ok_or_else(|| invalid(path, format!("axis {}", number + 1), expected))?;
             if combinations.len().saturating_mul(steps.len()) > CASES_MAX {
                 let found = format!("more than {CASES_MAX} combinations");
-                return Err(wrong(path, found, "at most 1000 cases"));
+                return Err(invalid(path, found, "at most 1000 cases"));
             }
             let with_steps = |draft: &Draft| {
                 steps.iter().map(|(label, sets)| draft.with(label.clone(), sets)).collect::<Vec<Draft>>()
@@ -179,114 +177,114 @@ impl StudyFile {
         let realisations = self.realisations.unwrap_or(1);
         if realisations == 0 || combinations.len().saturating_mul(realisations) > CASES_MAX {
             let found = format!("realisations = {realisations} of {} cases", combinations.len());
-            return Err(wrong(path, found, "1 or more, at most 1000 cases in all"));
+            return Err(invalid(path, found, "1 or more, at most 1000 cases in all"));
         }
         Ok(combinations)
     }
 
-    /// The realisations of a combination: one case, if they can share its sums, or a case each.
-    fn realised(&self, combination: &Draft, source: &ConfigSource) -> Vec<Draft> {
+    /// The realisations of a combination: one case if they can share its sums, otherwise one case per realisation.
+    fn realisation_cases(&self, combination: &Draft, source: &ConfigSource) -> Vec<Draft> {
         let realisations = self.realisations.unwrap_or(1);
-        // Errors are reported with the case.
+        // Errors of the configuration are reported with the case.
         let Some(base) = source.load().ok().filter(|_| realisations > 1) else {
             return vec![combination.clone(); realisations];
         };
         let seed = |number: usize| base.map.companion_seed.wrapping_add(number as u64);
-        let of_seed = |number| format!("map.companion_seed={}", seed(number));
+        let seed_override = |number| format!("map.companion_seed={}", seed(number));
         if base.shares_realisations() && !self.calibrated {
-            let shared = combination.with(format!("realisations 1 to {realisations}"), &[of_seed(1)]);
+            let shared = combination.with(format!("realisations 1 to {realisations}"), &[seed_override(1)]);
             return vec![Draft { noise_seeds: (2..=realisations).map(seed).collect(), ..shared }];
         }
-        let of_errors = |number: usize| {
+        let errors_override = |number: usize| {
             let realisation = base.instrument.realisation.saturating_add(number as u32);
             base.has_errors().then(|| format!("instrument.realisation={realisation}"))
         };
         let case = |number| {
-            let sets: Vec<String> = [of_seed(number)].into_iter().chain(of_errors(number)).collect();
+            let sets: Vec<String> =
+                [seed_override(number)].into_iter().chain(errors_override(number)).collect();
             combination.with(format!("realisation {number}"), &sets)
         };
         (1..=realisations).map(case).collect()
     }
 
-    /// Files of the maps to calibrate with.
     fn model_files(&self, path: &Path, common: &ConfigSource) -> Result<Vec<PathBuf>, StudyError> {
         if self.model.is_empty() && self.calibrated {
-            // As `lunarray calibrate`; what is wrong is told with the cases.
+            // Errors of the configuration are reported with the cases.
             return Ok(common.load().map_or_else(|_| Vec::new(), |common| common.calibrate.model_files));
         }
         if !self.model.is_empty() && !self.calibrated {
             let found = "model without calibration".to_owned();
-            return Err(wrong(path, found, "calibrated = true with a model"));
+            return Err(invalid(path, found, "calibrated = true with a model"));
         }
-        Ok(self.model.iter().map(|model| beside(path, model)).collect())
+        Ok(self.model.iter().map(|model| resolve_path(path, model)).collect())
     }
 
-    /// A key that two axes set, or an axis and the overrides `more` of all cases, in words.
-    fn set_twice(&self, more: &[String]) -> Option<String> {
+    /// Describes a key that is set by two axes, or by an axis and by `--set`; `None` without one.
+    fn duplicate_key(&self, extra_overrides: &[String]) -> Option<String> {
         let key = |set: &String| set.split_once('=').map_or(set.as_str(), |(key, _)| key).trim().to_owned();
         let keys = |axis: &AxisFile| -> BTreeSet<String> {
-            let of_cases = axis.cases.iter().flatten().flat_map(|case| &case.set).map(key);
-            axis.key.iter().map(|key| key.trim().to_owned()).chain(of_cases).collect()
+            let case_keys = axis.cases.iter().flatten().flat_map(|case| &case.set).map(key);
+            axis.key.iter().map(|key| key.trim().to_owned()).chain(case_keys).collect()
         };
         let named = self.axis.iter().zip(1..).map(|(axis, number)| (format!("axis {number}"), keys(axis)));
         let mut named: Vec<(String, BTreeSet<String>)> = named.collect();
-        named.push(("--set".to_owned(), more.iter().map(key).collect()));
-        // A section holds all of its keys.
-        let holds =
+        named.push(("--set".to_owned(), extra_overrides.iter().map(key).collect()));
+        // Setting a section sets all of its keys.
+        let contains =
             |a: &str, b: &str| b.strip_prefix(a).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
         named.iter().enumerate().find_map(|(k, (first, keys))| {
             named[k + 1..].iter().find_map(|(second, others)| {
-                let both = |key: &&String| others.iter().any(|other| holds(key, other) || holds(other, key));
-                keys.iter().find(both).map(|key| format!("{key} is set by {first} and by {second}"))
+                let overlaps =
+                    |key: &&String| others.iter().any(|other| contains(key, other) || contains(other, key));
+                keys.iter().find(overlaps).map(|key| format!("{key} is set by {first} and by {second}"))
             })
         })
     }
 }
 
-/// A study: its cases, with their configurations.
+/// A study: cases with their configurations.
 #[derive(Clone, Debug)]
 pub struct Study {
     /// Name; results go to `out/NAME` by default.
     pub name: String,
-    /// Its cases, in order; those that differ in their realisation alone follow each other.
+    /// The cases, in order; cases that differ only in their realisation are consecutive.
     pub cases: Vec<StudyCase>,
-    /// Realisations of each case; 1 for none but its own.
+    /// Number of realisations of each case.
     pub realisations: usize,
-    /// Directions with which the noise of all pixels has a covariance that is wanted: ecliptic longitude and latitude, degrees.
+    /// Directions whose noise covariance with all pixels is computed: ecliptic longitude and latitude, degrees.
     pub covariance_at_deg: Vec<[f64; 2]>,
-    /// Maps of the sky to calibrate with, K; empty if none is calibrated, or if an artificial signal is enough.
+    /// Maps of the sky to calibrate with, K; empty if no case is calibrated, or if an artificial signal is used.
     pub models: Vec<SkyMap>,
-    /// Their files.
+    /// Files of the maps to calibrate with.
     pub model_files: Vec<PathBuf>,
 }
 
 /// A case of a study.
 #[derive(Clone, Debug)]
 pub struct StudyCase {
-    /// Its labels, one for each axis.
+    /// Labels, one for each axis.
     pub labels: Vec<String>,
-    /// Its overrides of the pipeline.
+    /// Overrides of the pipeline.
     pub overrides: Vec<String>,
-    /// Its plan.
+    /// The plan.
     pub plan: Plan,
-    /// Whether gains are found from its data and applied.
+    /// Whether the data are calibrated before they are mapped.
     pub calibrated: bool,
-    /// Seeds of further realisations of its noise-only map, which share all the rest with it.
+    /// Seeds of additional realisations of the noise-only map.
     pub noise_seeds: Vec<u64>,
-    /// The number of what its realisations have in common, from 0.
+    /// Number shared by the cases that differ only in their realisation.
     pub(in crate::pipeline) family: usize,
-    /// A number that changes with the maps to calibrate with.
     pub(in crate::pipeline) models_hash: u64,
 }
 
 impl StudyCase {
-    /// Its parts in one.
+    /// The labels of all axes, joined by commas.
     #[must_use]
     pub fn label(&self) -> String {
         self.labels.join(", ")
     }
 
-    /// Name of the folder of its products: its label without blanks and signs.
+    /// Name of the folder for products: the label without blanks and signs.
     #[must_use]
     pub fn folder(&self) -> String {
         let label = self.label();
@@ -297,36 +295,36 @@ impl StudyCase {
 }
 
 impl Study {
-    /// Reads a study, with more overrides of all its cases, and checks the configuration of every case.
+    /// Reads a study and checks the configuration of every case; `extra_overrides` apply to all cases.
     ///
     /// # Errors
     /// A file that cannot be read or is no study; a case whose settings are wrong.
-    pub fn read(path: &Path, more: &[String]) -> Result<Self, StudyError> {
+    pub fn read(path: &Path, extra_overrides: &[String]) -> Result<Self, StudyError> {
         let file = StudyFile::read(path)?;
-        file.check(path, more)?;
-        let pipeline = file.pipeline.as_ref().map(|pipeline| beside(path, pipeline));
+        file.check(path, extra_overrides)?;
+        let pipeline = file.pipeline.as_ref().map(|pipeline| resolve_path(path, pipeline));
         let source = |sets: &[String]| {
-            let overrides = [file.set.as_slice(), sets, more].concat();
+            let overrides = [file.set.as_slice(), sets, extra_overrides].concat();
             ConfigSource { file: pipeline.clone(), overrides, seed: None }
         };
         let combinations = file.combinations(path)?;
-        let realised = combinations.iter().map(|draft| file.realised(draft, &source(&draft.sets)));
-        let realised: Vec<Vec<Draft>> = realised.collect();
+        let families: Vec<Vec<Draft>> =
+            combinations.iter().map(|draft| file.realisation_cases(draft, &source(&draft.sets))).collect();
         let model_files = file.model_files(path, &source(&[]))?;
         let (models, models_hash) = read_models(&model_files)?;
         let kinds: &[bool] = if file.calibrated { &[false, true] } else { &[false] };
         let mut cases = Vec::new();
-        // Realisations of a case stay together.
-        for (number, of_case) in realised.iter().enumerate() {
+        // Realisations of a case have to be consecutive.
+        for (number, realisations) in families.iter().enumerate() {
             for (kind, &calibrated) in kinds.iter().enumerate() {
                 let family = number * kinds.len() + kind;
-                for draft in of_case {
+                for draft in realisations {
                     let mut labels = draft.labels.clone();
                     if file.calibrated {
                         labels.insert(0, if calibrated { "calibrated" } else { "as sent" }.to_owned());
                     }
                     let source = source(&draft.sets);
-                    let plan = planned(&source, calibrated.then_some(&model_files)).map_err(|source| {
+                    let plan = case_plan(&source, calibrated.then_some(&model_files)).map_err(|source| {
                         StudyError::Case { label: labels.join(", "), source: Box::new(source) }
                     })?;
                     let (overrides, noise_seeds) = (source.overrides, draft.noise_seeds.clone());
@@ -343,16 +341,16 @@ impl Study {
             }
         }
         let mut folders = BTreeSet::new();
-        if let Some(twice) = cases.iter().find(|case| !folders.insert(case.folder())) {
-            let found = format!("two cases with products in {}", twice.folder());
-            return Err(wrong(path, found, "labels that differ in letters or digits"));
+        if let Some(duplicate) = cases.iter().find(|case| !folders.insert(case.folder())) {
+            let found = format!("two cases with products in {}", duplicate.folder());
+            return Err(invalid(path, found, "labels that differ in letters or digits"));
         }
         let stem =
             path.file_stem().map_or_else(|| "study".into(), |stem| stem.to_string_lossy().into_owned());
         let name = file.name.unwrap_or(stem);
         if name.is_empty() || !is_folder_name(&name) {
             let expected = "1 to 60 bytes, without slashes and control characters";
-            return Err(wrong(path, format!("name = {name:?}"), expected));
+            return Err(invalid(path, format!("name = {name:?}"), expected));
         }
         let realisations = file.realisations.unwrap_or(1);
         let covariance_at_deg = file.covariance_at_deg;
@@ -360,13 +358,13 @@ impl Study {
     }
 }
 
-/// A path that a study names, which is relative to its folder.
-fn beside(study: &Path, named: &Path) -> PathBuf {
+/// Resolves a path in a study file, which is relative to the study's folder.
+fn resolve_path(study: &Path, named: &Path) -> PathBuf {
     study.parent().unwrap_or(Path::new("")).join(named)
 }
 
-/// The plan of a case; with the maps that it is calibrated with, checked before anything is simulated.
-fn planned(source: &ConfigSource, model_files: Option<&Vec<PathBuf>>) -> Result<Plan, PipelineError> {
+/// The plan of a case. The frequencies of `model_files`, the maps to calibrate with, are checked before anything is simulated.
+fn case_plan(source: &ConfigSource, model_files: Option<&Vec<PathBuf>>) -> Result<Plan, PipelineError> {
     let plan = source.load().map_err(PipelineError::from).and_then(Plan::new)?;
     if let Some(files) = model_files {
         check_frequencies(files, &plan.config.spacecraft.channels_hz)?;
@@ -374,15 +372,15 @@ fn planned(source: &ConfigSource, model_files: Option<&Vec<PathBuf>>) -> Result<
     Ok(plan)
 }
 
-/// Whether a text has sections of a pipeline, and no axis.
+/// Whether a text has sections of a pipeline, and no key of a study.
 fn is_pipeline(text: &str) -> bool {
     let table: toml::Table = toml::from_str(text).unwrap_or_default();
     study_key(&table).is_none() && has_sections(&table)
 }
 
-/// Maps to calibrate with, and a number that changes with their bytes.
+/// Reads the maps to calibrate with; returns them and a hash of the files.
 fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
-    let (mut maps, mut sums) = (Vec::new(), Vec::new());
+    let (mut maps, mut checksums) = (Vec::new(), Vec::new());
     for path in paths {
         let failed = |reason: String| StudyError::File {
             path: path.clone(),
@@ -391,9 +389,10 @@ fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
         };
         maps.push(read_known_sky(path, &ReadOptions::default()).map_err(|error| failed(error.to_string()))?);
         let bytes = fs::read(path).map_err(|error| failed(error.to_string()))?;
-        sums.extend_from_slice(&crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes).to_le_bytes());
+        checksums
+            .extend_from_slice(&crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes).to_le_bytes());
     }
-    Ok((maps, crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &sums)))
+    Ok((maps, crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &checksums)))
 }
 
 fn read_study(path: &Path) -> Result<String, StudyError> {
@@ -407,7 +406,7 @@ fn read_study(path: &Path) -> Result<String, StudyError> {
     })
 }
 
-/// Label and overrides of each step of an axis; `None` for one without steps.
+/// Label and overrides of each value of an axis; `None` if it has no values.
 fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
     let steps: Vec<_> = match (&axis.key, &axis.values, &axis.cases) {
         (Some(key), Some(values), None) => {
@@ -423,8 +422,7 @@ fn steps(axis: &AxisFile) -> Option<Vec<(String, Vec<String>)>> {
     (!steps.is_empty()).then_some(steps)
 }
 
-/// A direction as a part of a file's name.
 pub(in crate::pipeline) fn direction_name([longitude_deg, latitude_deg]: [f64; 2]) -> String {
-    // Zero has no sign.
+    // Adding 0.0 turns -0.0 into 0.0.
     format!("{:.3}_{:.3}", longitude_deg + 0.0, latitude_deg + 0.0)
 }

@@ -1,4 +1,4 @@
-// The array in its orbit at the time of the latest data, and how its baselines fill the space of u, v, w.
+// The array in its orbit at the time of the latest data, the density of its baselines in u, v, w, and the auto-correlations.
 import { $, brush, css, number, short, utc } from "/tools.js";
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -7,10 +7,10 @@ const minus = (a, b) => a.map((v, k) => v - b[k]);
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const length = (a) => Math.sqrt(dot(a, a));
 const unit = (a) => scaled(1 / (length(a) || 1), a);
-/** Part of `a` across `n`, as a unit vector; any direction across it if there is none. */
+/** Unit vector of the component of `a` perpendicular to `n`; any perpendicular direction if it is zero. */
 const across = (a, n) => { const rest = minus(a, scaled(dot(a, n), n)); return length(rest) > 1e-6 ? unit(rest) : unit(cross(n, Math.abs(n[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0])); };
 
-/** Axes of the picture: to the right, up, towards the viewer. */
+/** Axes of the picture: right, up, and towards the viewer. */
 export function axesOf(view, { normal_hat, earth_hat }) {
   if (view === "earth" && earth_hat) { const up = across([0, 0, 1], earth_hat); return [cross(up, earth_hat), up, earth_hat]; }
   if (view === "pole") return [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
@@ -18,11 +18,11 @@ export function axesOf(view, { normal_hat, earth_hat }) {
   return [right, cross(normal_hat, right), normal_hat];
 }
 
-/** Whether the Moon hides a direction from a place. */
+/** Whether the Moon occults direction `n` at position `r`. */
 const isHidden = (r, n, radius) => -dot(n, r) > Math.sqrt(Math.max(0, dot(r, r) - radius * radius));
 
 const RULER = 44;
-/** Places on the canvas, in CSS pixels, of places in space; the Moon is in the middle above the ruler. */
+/** Projection of positions to CSS pixels of the canvas; the Moon is in the centre above the ruler. */
 export function frameOf(view, geometry, width, height) {
   const axes = axesOf(view, geometry), reach = Math.max(...[...geometry.orbit_m, ...geometry.track_m].map(length));
   const per = 0.44 * Math.min(width, height - RULER) / reach, middle = [width / 2, (height - RULER) / 2];
@@ -38,12 +38,12 @@ export function drawOrbit(canvas, geometry, view) {
   const side = earth && [dot(earth, axes[0]), dot(earth, axes[1])], flat = earth ? Math.hypot(...side) : 0;
   const turn = earth && flat > 0.05 ? Math.atan2(-side[1], side[0]) : null;
   if (turn !== null) {
-    // Where the Earth cannot be seen.
+    // The region in which the Earth is occulted.
     c.save(); c.beginPath(); c.rect(0, 0, width, height - RULER); c.clip(); c.translate(...middle); c.rotate(turn);
     c.fillStyle = css("--track"); c.fillRect(-2 * (width + height), -r, 2 * (width + height), 2 * r);
     c.restore();
   }
-  // The orbit: wide where the Earth is hidden, left out behind the Moon.
+  // The orbit: wide where the Earth is occulted, left out behind the Moon.
   const stroke = (points, closes) => points.forEach((p, k) => {
     const next = points[k + 1] ?? (closes ? points[0] : null);
     if (!next || behind(p) || behind(next)) return;
@@ -69,12 +69,12 @@ export function drawOrbit(canvas, geometry, view) {
     c.strokeStyle = css("--good"); c.fillStyle = css("--good"); c.lineWidth = 1.5;
     c.beginPath(); c.moveTo(middle[0] + (r + 6) * Math.cos(turn), middle[1] + (r + 6) * Math.sin(turn)); c.lineTo(x, y); c.stroke();
     c.save(); c.translate(x, y); c.rotate(turn); c.beginPath(); c.moveTo(0, 0); c.lineTo(-9, -5); c.lineTo(-9, 5); c.fill(); c.restore();
-    // Beside a steep arrow, above a flat one.
+    // The label is beside a steep arrow and above a flat one.
     const isSteep = Math.abs(Math.sin(turn)) > 0.5;
     c.textAlign = isSteep || Math.cos(turn) < 0 ? "left" : "right";
     c.fillText("Earth", x + (isSteep ? 12 : 0), Math.max(10, y - 12));
   }
-  // Satellites: all at nearly one place on this scale; those behind the Moon are rings.
+  // Satellites, which nearly coincide on this scale; those behind the Moon are rings.
   satellites.forEach(({ position_m: p }) => {
     c.fillStyle = c.strokeStyle = css("--cool"); c.lineWidth = 1.5;
     c.beginPath(); c.arc(...put(p), 4, 0, 7);
@@ -83,7 +83,7 @@ export function drawOrbit(canvas, geometry, view) {
   drawRuler(c, width, height, satellites.map(({ position_m }) => position_m));
 }
 
-/** Distances from satellite 1 on a logarithmic scale, as the satellites stand in their orbit too close together to tell. */
+/** Draws distances from satellite 1 on a logarithmic scale, as the satellites are too close together to resolve in the orbit. */
 function drawRuler(c, width, height, positions) {
   const apart = positions.slice(1).map((p) => length(minus(p, positions[0])) / 1e3).filter((d) => d > 0);
   if (!apart.length) return;
@@ -105,7 +105,7 @@ export function tellOrbit(geometry) {
   $("orbittext").textContent = `Latest data: day ${(time_s / 86400).toFixed(2)}, ${utc(epoch_tai_s, time_s)} UTC. ${sight}; ${high.toFixed(0)} km above the mean surface. Below: distances from daughter 1.`;
 }
 
-/** Counts of plane `k` at both signs of the baselines. */
+/** Counts of a plane, including the baselines of opposite sign. */
 export const bothSigns = (plane) => plane.map((count, k) => count + plane[plane.length - 1 - k]);
 
 export function drawUvw(canvas, density, colours) {
@@ -119,7 +119,7 @@ export function drawUvw(canvas, density, colours) {
   planesShown.forEach((plane, n) => {
     const small = document.createElement("canvas"), image = new ImageData(cells, cells);
     small.width = small.height = cells;
-    // Rows of a picture go down.
+    // The first row of a picture is at the top.
     for (let row = 0, k = 0; row < cells; row++) for (let column = 0; column < cells; column++, k += 4) {
       const count = plane[(cells - 1 - row) * cells + column];
       image.data.set([...(count ? colour(count) : empty), 255], k);
@@ -135,14 +135,14 @@ export function drawUvw(canvas, density, colours) {
   $("uvwtext").textContent = `±${short(extent)} wavelengths, ecliptic axes, both signs of ${number.format(density.visibilities)} visibilities of this session; one of ${density.every} is drawn. ${(100 * met).toFixed(1)} % of the u-v cells met.`;
 }
 
-/** Limits of the colours of powers: from 1 % to 99 % of all. */
+/** Colour limits of powers: the quantiles of 1 % and 99 %. */
 export function limitsOf(powers) {
   const sorted = Float64Array.from(powers.flat().filter((v) => v !== null)).sort(), at = (q) => sorted[Math.round(q * (sorted.length - 1))];
   const [low, high] = [at(0.01), at(0.99)];
   return high > low ? [low, high] : [low - 1, low + 1];
 }
 
-/** Rows are daughters, columns the times at which there are powers. */
+/** Draws powers: rows are daughters, columns the times with data. */
 export function drawPowers(canvas, waterfall, colours) {
   const at = brush(canvas);
   if (!at || !waterfall) return;

@@ -1,4 +1,4 @@
-// The page: events in, panels out. Everything comes from this server; nothing is sent to it.
+// The page: receives events and draws the panels. All data come from this server; none are sent to it.
 import { Sky, isSeen, rmsNear } from "/sky.js";
 import { Passes } from "/passes.js";
 import { drawOrbit, drawPowers, drawUvw, tellOrbit } from "/array.js";
@@ -32,7 +32,7 @@ const channelNow = () => state.status?.channels.find((c) => c.channel === state.
 
 // ---- Maps ----
 async function fetchMap(name) {
-  // It grows with the data, and stands for all of them.
+  // The hits are not cached, as they grow with the data.
   if (name === "hits") {
     const found = await (await fetch(`/api/hits/${state.channel}`)).json();
     return found && Float32Array.from(found.hits);
@@ -45,14 +45,14 @@ async function fetchMap(name) {
   const bytes = new DataView(await answer.arrayBuffer());
   const values = new Float32Array(bytes.byteLength / 4);
   for (let k = 0; k < values.length; k++) values[k] = bytes.getFloat32(4 * k, true);
-  // A noise map stands for the last snapshot only.
+  // The noise map changes with each snapshot, so it is not cached.
   if (name !== "noise") state.maps.set(key, values);
   const bytesHeld = () => [...state.maps.values()].reduce((sum, map) => sum + map.byteLength, 0);
   while (state.maps.size > 2 && bytesHeld() > HELD_BYTES) state.maps.delete(state.maps.keys().next().value);
   return values;
 }
 
-/** Maps that the server has thinned away can no longer be chosen. */
+/** Removes maps from the cache that the server no longer holds. */
 function forgetMaps(channels) {
   const held = new Set(channels.flatMap(({ channel, held }) => ["input", ...held].map((name) => `${channel}/${name}`)));
   for (const key of state.maps.keys()) if (!held.has(key)) state.maps.delete(key);
@@ -73,7 +73,7 @@ async function showSky() {
   if (state.blink && state.blinkOn) [first, second] = [channel.has_input ? "input" : String(before ?? state.number), null];
   const [a, b] = await Promise.all([fetchMap(first), second === null ? null : fetchMap(second)]);
   if (turn !== drawing) return;
-  if (!a) return; // Thinned away meanwhile; the next status names what is held.
+  if (!a) return; // The server has removed the map; the next status lists the maps that it holds.
   $("waiting").hidden = true;
   const isDifference = show === "difference" || show === "error";
   sky.show(a, isDifference ? (b ?? a) : null);
@@ -94,10 +94,10 @@ async function limits(a, b) {
     const [low, high] = [Number($("from").value), Number($("to").value)];
     if (low < high && (look.scale !== "log" || low > 0)) { look.low = low; look.high = high; return; }
   }
-  // As the program's pictures: from 0.5 % to 99.5 %, or symmetric; of the input, if there is one to compare with.
+  // Limits as in the program's pictures: from 0.5 % to 99.5 %, or symmetric. While blinking, those of the input.
   let values = a;
   if (state.blink && !isDifference) values = (channelNow()?.has_input && await fetchMap("input")) || a;
-  // A large map's quantiles are those of every so many pixels.
+  // Quantiles of a large map are taken over a subset of its pixels.
   let used = [];
   for (let k = 0, step = Math.ceil(values.length / SAMPLE); k < values.length; k += step) used.push(b ? values[k] - b[k] : values[k]);
   used = used.filter(isSeen);
@@ -187,15 +187,15 @@ function showStages(stages) {
     const unit = { visibilities: "vis", bytes: "B" }[stage.unit] ?? stage.unit;
     rate.textContent = stage.unit ? `${prefixed(stage.units_per_s)}${unit}/s` : `${number.format(stage.items_out)} items`;
     step.textContent = stage.working.count ? `step ${duration(stage.working.p99_s)}` : "no step yet";
-    latency.textContent = stage.since_source.count ? `age ${duration(stage.since_source.p99_s)}` : `${(100 * stage.busy).toFixed(0)} % busy`;
-    box.title = `${stage.name}: ${number.format(stage.units)} ${stage.unit || "items"} so far, ${(100 * stage.busy).toFixed(0)} % busy; p99 of a step ${duration(stage.working.p99_s)}, p99 of an item's age since the source ${duration(stage.since_source.p99_s)}${stage.ended ? "; ended" : ""}`;
+    latency.textContent = stage.since_source.count ? `latency ${duration(stage.since_source.p99_s)}` : `${(100 * stage.busy).toFixed(0)} % busy`;
+    box.title = `${stage.name}: ${number.format(stage.units)} ${stage.unit || "items"} so far, ${(100 * stage.busy).toFixed(0)} % busy; p99 of a step ${duration(stage.working.p99_s)}, p99 of the latency since the source ${duration(stage.since_source.p99_s)}${stage.ended ? "; ended" : ""}`;
     const queue = item.querySelector(".queue");
     if (queue) {
       const { depth, capacity, depth_max } = stage.queue;
       queue.querySelector("i").style.width = `${100 * depth / capacity}%`;
       queue.classList.toggle("full", depth >= capacity);
       queue.querySelector("span").textContent = `${depth} / ${capacity}`;
-      queue.title = `queue before ${stage.name}: ${depth} of ${capacity} items, at most ${depth_max} so far`;
+      queue.title = `input queue of ${stage.name}: ${depth} of ${capacity} items, at most ${depth_max} so far`;
     }
   });
 }
@@ -229,11 +229,11 @@ function showLedger(ledger, phase) {
     return part;
   }));
   const isKnown = isOver && rest !== null;
-  const verdict = isKnown ? (rest === 0 ? ["good", "✔ closed"] : ["bad", "✖ does not close"]) : ["", isOver ? "not closed: the run failed" : "open while data flow"];
+  const verdict = isKnown ? (rest === 0 ? ["good", "✔ balanced"] : ["bad", "✖ not balanced"]) : ["", isOver ? "not balanced: the run failed" : "not final while running"];
   $("verdict").className = `verdict ${verdict[0]}`; $("verdict").textContent = verdict[1];
   bar.className = `ledgerbar ${isKnown ? (rest === 0 ? "closed" : "open") : ""}`;
   bar.setAttribute("aria-label", parts.map(([, name, count]) => `${name} ${count}`).join(", "));
-  const rows = [["", "sampled", ledger.sampled ?? "told at the end"], ...parts];
+  const rows = [["", "sampled", ledger.sampled ?? "known at the end"], ...parts];
   $("ledgerkeys").replaceChildren(...rows.map(([kind, name, count]) => make("li", {}, make("i", { class: kind }), make("span", {}, name), make("b", {}, typeof count === "string" ? count : number.format(count)))));
 }
 
@@ -241,7 +241,7 @@ function showReception(status) {
   const { reception, listening, saving } = status;
   document.querySelector(".reception").hidden = !reception;
   if (!reception) return;
-  const head = make("tr", {}, ...["packets", "received", "missing", "damaged", "again"].map((name) => make("th", { scope: "col" }, name)));
+  const head = make("tr", {}, ...["packets", "received", "missing", "damaged", "duplicates"].map((name) => make("th", { scope: "col" }, name)));
   const kinds = ["instrument", "ephemeris", "visibilities", "housekeeping"];
   const cell = (count, isBad) => make("td", isBad && count > 0 ? { class: "bad" } : {}, number.format(count));
   $("packets").replaceChildren(head, ...kinds.map((kind) => {
@@ -250,15 +250,15 @@ function showReception(status) {
   }));
   const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
   const stations = Object.entries(listening?.report.stations ?? {}).map(([name, counts]) => `${name} ${prefixed(counts.bytes)}B`).join(", ");
-  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B wait${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
+  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B queued${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
   showSaving(saving, listening, status.products);
 }
 
-/** What is on disk, and what is not: trouble first. */
+/** Shows what is saved on disk; failures come first. */
 function showSaving(saving, listening, products) {
   const archive = listening?.archive, said = [];
   const say = (isBad, text) => said.push(make("span", isBad ? { class: "bad" } : {}, text));
-  if (archive?.unwritten) say(true, `▲ nothing is taken: the raw archive cannot be written: ${archive.unwritten}`);
+  if (archive?.unwritten) say(true, `▲ no data are accepted: the raw archive cannot be written: ${archive.unwritten}`);
   if (saving?.unsaved) say(true, `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}`);
   if (products?.unwritten) say(true, `▲ maps are not written: ${products.unwritten}`);
   if (saving && !saving.unsaved) {
@@ -311,7 +311,7 @@ function drawCurve() {
   c.font = "11px system-ui, sans-serif"; c.fillStyle = css("--quiet");
   if (!all.length) {
     c.textAlign = "center";
-    c.fillText(channel ? "needs the true sky, which only a simulation knows" : "curves begin with the first map", box.width / 2, box.height / 2);
+    c.fillText(channel ? "needs the input sky, which only a simulation has" : "curves begin with the first map", box.width / 2, box.height / 2);
     return;
   }
   const t = plot.log ? Math.log10 : (v) => v;
@@ -360,7 +360,7 @@ async function fetchGaps() {
   if (!answer.ok) { $("gapsnote").textContent = await answer.text(); return; }
   const { gaps, restarts } = await answer.json();
   const rows = gaps.slice(0, 50);
-  const head = make("tr", {}, ...["APID", "from", "to", "lost, h", "adds %"].map((name) => make("th", { scope: "col" }, name)));
+  const head = make("tr", {}, ...["APID", "from", "to", "lost, h", "gain, %"].map((name) => make("th", { scope: "col" }, name)));
   $("gaps").replaceChildren(head, ...rows.map((gap) => make("tr", {}, make("td", {}, `0x${gap.apid.toString(16)}`), make("td", {}, String(gap.from)), make("td", {}, String(gap.to)), make("td", {}, (gap.integration_s / 3600).toFixed(3)), make("td", {}, (100 * gap.gain).toFixed(4)))));
   $("gaps").hidden = rows.length === 0;
   $("gapsnote").textContent = (gaps.length ? `${gaps.length} gaps, most valuable first, as of the last checkpoint` : "No packets are missing between those received, as of the last checkpoint.") + (restarts?.length ? `; ${restarts.length} restarts of the counts` : "");
@@ -374,7 +374,7 @@ async function fetchOf(path) {
   return answer.ok ? answer.json() : null;
 }
 
-/** Fetches what the ground has received since, not more often than it is worth, and one answer after the other. */
+/** Fetches passes, geometry, baselines and powers if new data have arrived; at most every LOOK_MS, one request set at a time. */
 async function fetchArray(status) {
   const known = `${status.phase}/${status.reception.bytes}/${state.channel}`;
   if (document.hidden || state.fetching || known === state.arrayKnown || Date.now() - state.arrayAt < LOOK_MS) return;
@@ -435,7 +435,7 @@ function update(status) {
   syncSlider();
 }
 
-/** Says whether what is shown is of now; since when not, and whether another run has taken the place. */
+/** Shows whether the page is connected, the age of its data if not, and whether another run has started. */
 function stale(is) {
   document.body.classList.toggle("stale", is);
   const began = state.began ? ` · another run since ${state.began.toISOString().slice(0, 19)}Z` : "";
@@ -451,7 +451,7 @@ function listen() {
   setInterval(() => { if (document.body.classList.contains("stale")) stale(true); }, 1000);
   source.addEventListener("status", (event) => {
     const status = JSON.parse(event.data);
-    // Another run has taken the place: nothing that is held is of it.
+    // Another run has started: cached data are of the old one.
     if (state.status && status.up_s < state.status.up_s - 1) {
       state.began = new Date(Date.now() - 1000 * status.up_s);
       state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; state.arrayKnown = null; $("log").replaceChildren();
@@ -470,15 +470,15 @@ function listen() {
   });
 }
 
-/** There is no standard deviation of each pixel; the noise-only map of the newest snapshot has one of all pixels. */
-// Pixels of the noise-only map over which its rms is taken about the cursor: known to 7 %.
+// Number of pixels around the cursor for the rms of the noise-only map, which is then known to 7 %.
 const NEAR_PIXELS = 100;
+/** Text on the noise near a direction. It is estimated from the noise-only map of the newest snapshot. */
 function noiseOfMap(direction) {
   const channel = channelNow(), isMap = $("show").value === "map" && !state.blink;
   if (!isMap || !channel || channel.is_noiseless || state.number !== channel.held.at(-1)) return "";
   const whole = `of the whole map ${short(channel.noise_rms_k)} K`, key = `${state.channel}/${state.number}`;
   if (state.noise?.key !== key) {
-    // At the next move it is there.
+    // The map is used at a later move of the cursor.
     state.noise = { key, values: null };
     fetchMap("noise").then((values) => { if (state.noise.key === key) state.noise.values = values; });
   }

@@ -1,4 +1,4 @@
-// Passes on a time line: packets received and missing, by the mission time at which they were made.
+// Passes on a time line: packets received and missing, by the mission time of their data.
 import { $, brush, copyText, css, make, nice, number, short, stored, ticks, utc } from "/tools.js";
 
 const LEFT = 72, RIGHT = 10, TOP = 6, BARS = 84, LANE = 12, SPACE = 5, ROWS = 50, DAY_S = 86400;
@@ -31,7 +31,7 @@ export class Passes {
   bins() { return this.line?.kinds[0]?.received.length ?? 0; }
 
   show(line) {
-    // Wider bins, or another mission: what was chosen is elsewhere.
+    // With wider bins or another mission, the selection is no longer valid.
     if (this.line && line && (this.line.bin_s !== line.bin_s || this.line.start_s !== line.start_s)) this.chosen = null;
     this.line = line;
     this.draw(); this.tell();
@@ -63,7 +63,7 @@ export class Passes {
     return long ? `day ${(timeS / DAY_S).toFixed(2)}` : short(timeS / DAY_S);
   }
 
-  /** Listed ranges that lie in the chosen bins, or may. */
+  /** Listed ranges that may overlap the selected bins. */
   ranges() {
     if (!this.line) return [];
     const { start_s, bin_s, ranges } = this.line, bin = (t) => Math.floor((t - start_s) / bin_s);
@@ -72,7 +72,7 @@ export class Passes {
     return ranges.filter(({ between_s: [a, b] }) => bin(a) <= to && bin(b) >= from);
   }
 
-  /** Says what is in the bins chosen, in the one below the mouse, or in all. */
+  /** Shows the counts of the selected bins, of the bin below the mouse, or of all bins. */
   tell(below) {
     const line = this.line, last = this.bins() - 1;
     $("nopasses").hidden = last >= 0;
@@ -125,7 +125,7 @@ export class Passes {
         const [received, missing] = [lane.received[bin], lane.missing[bin]];
         if (!received && !missing) continue;
         const left = Math.floor(x(bin)), wide = Math.max(1, Math.ceil(x(bin + 1)) - left - (w / bins > 6 ? 1 : 0));
-        // Bars by number; lanes are full if there is anything. One packet of many that is missing has to be seen.
+        // Bars are proportional to the counts; lanes are full if there is any packet. A single missing packet must be visible.
         const up = received ? Math.max(2, k === 0 ? Math.round(high * received / most) : high) : 0;
         const above = missing ? Math.max(4, Math.round(high * missing / most)) : 0;
         c.fillStyle = colours.received; c.fillRect(left, base - up, wide, up);

@@ -1,6 +1,6 @@
-// The sky on a canvas: HEALPix RING pixels on ecliptic axes, drawn by WebGL2 from the raw numbers, or without it by the CPU.
+// The sky on a canvas: HEALPix RING pixels in ecliptic axes, drawn by WebGL2 from the raw numbers, or else by the CPU.
 
-const UNSEEN = -1e30; // Below it, or not a number: not measured.
+const UNSEEN = -1e30; // Values below it, and NaN, are unmeasured.
 const SCALES = { linear: 0, log: 1, asinh: 2 };
 
 /** Number of the pixel in the direction (x, y, z), a unit vector. */
@@ -119,7 +119,7 @@ export function placeOf(v, { scale, low, high }) {
   }
   return (v - low) / (high - low);
 }
-/** RMS of a map within the circle about a direction that has the area of so many pixels, and its radius in degrees. */
+/** RMS of a map within a circle about a direction, with the area of a number of pixels, and the radius of the circle in degrees. */
 export function rmsNear(values, direction, pixels) {
   const nside = Math.round(Math.sqrt(values.length / 12)), height = Math.min(2, 2 * pixels / values.length);
   const [x, y, z] = direction, side = Math.abs(z) < 0.9 ? [0, 0, 1] : [1, 0, 0];
@@ -128,7 +128,7 @@ export function rmsNear(values, direction, pixels) {
   e = e.map((v) => v / Math.hypot(...e));
   const f = cross(direction, e), count = 4 * pixels;
   let sum = 0, seen = 0;
-  // A spiral of equal areas.
+  // Sample points on a spiral, with equal areas.
   for (let k = 0; k < count; k++) {
     const c = 1 - height * (k + 0.5) / count, s = Math.sqrt(1 - c * c), turn = 2.399963229728653 * k, [p, q] = [s * Math.cos(turn), s * Math.sin(turn)];
     const v = values[pixelAt(nside, [c * x + p * e[0] + q * f[0], c * y + p * e[1] + q * f[1], c * z + p * e[2] + q * f[2]])];
@@ -178,7 +178,7 @@ export class Sky {
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   }
 
-  /** Shows `a`, or `a` - `b`: pixels of one length. */
+  /** Shows `a`, or `a` - `b`, which have the same number of pixels. */
   show(a, b) {
     this.a = a; this.b = b && b.length === a?.length ? b : null;
     this.nside = a ? Math.round(Math.sqrt(a.length / 12)) : 0;
@@ -198,7 +198,7 @@ export class Sky {
     }
   }
 
-  /** From the screen's axes (towards the middle, left, up) to the map's. */
+  /** Rotation from the screen's axes (towards the centre, left, up) to the map's. */
   turn(view = this.view) {
     const { lon, lat, frame, projection } = view, tilt = projection === "globe" ? lat : 0;
     const [a, b] = [lon * Math.PI / 180, tilt * Math.PI / 180];
@@ -207,7 +207,7 @@ export class Sky {
     return { turned, toMap: multiply(transpose(this.frames[frame]), turned) };
   }
 
-  /** Half the width and height of the sky on the canvas, in its pixels. */
+  /** Half the width and height of the sky, in pixels of the canvas. */
   half() {
     const { width, height } = this.canvas, margin = 0.985;
     if (this.view.projection === "globe") { const r = margin * Math.min(width, height) / 2; return [r, r]; }
@@ -266,7 +266,7 @@ export class Sky {
     context.putImageData(image, 0, 0);
   }
 
-  /** Direction on the axes of the screen, from a place on the canvas in its pixels; undefined outside of the sky. */
+  /** Direction in the screen's axes of a position on the canvas, in pixels; undefined outside of the sky. */
   screenDirection(px, py) {
     const half = this.half(), s = [(px - this.canvas.width / 2) / half[0], (this.canvas.height / 2 - py) / half[1]];
     const r2 = s[0] * s[0] + s[1] * s[1];
@@ -289,7 +289,7 @@ export class Sky {
     return isSeen(this.b[pixel]) ? x - this.b[pixel] : this.b[pixel];
   }
 
-  /** What is below the mouse: pixel, value, longitude and latitude on the axes shown in degrees, direction on those of the map. */
+  /** Pixel and value below the mouse, with longitude and latitude (degrees) in the axes shown, and direction in the map's axes. */
   probe(clientX, clientY) {
     const box = this.canvas.getBoundingClientRect();
     const d = this.screenDirection((clientX - box.left) * this.ratio, (clientY - box.top) * this.ratio);
@@ -299,7 +299,7 @@ export class Sky {
     return { pixel, value: this.value(pixel), lon, lat, direction };
   }
 
-  /** Place on the canvas of a direction on the axes shown; undefined on the far side. */
+  /** Position on the canvas of a direction in the axes shown; undefined on the far side. */
   project(lonDeg, latDeg) {
     const [lon, lat] = [lonDeg * Math.PI / 180, latDeg * Math.PI / 180];
     const f = [Math.cos(lat) * Math.cos(lon), Math.cos(lat) * Math.sin(lon), Math.sin(lat)];

@@ -1,4 +1,4 @@
-// What all parts of the page use.
+// Functions shared by the scripts of the page.
 
 export const $ = (id) => document.getElementById(id);
 
@@ -21,11 +21,11 @@ export const stored = (key, value) => {
   try { if (value !== undefined) localStorage.setItem(`lunarray.${key}`, value); return localStorage.getItem(`lunarray.${key}`); } catch { return null; }
 };
 
-/** A step of 1, 2 or 5 times a power of ten that divides a span into about so many. */
+/** A step of 1, 2 or 5 times a power of ten that divides a span into about `wanted` parts. */
 export const nice = (span, wanted) => { const raw = span / wanted, p = 10 ** Math.floor(Math.log10(raw)); return p * ([1, 2, 5, 10].find((m) => m * p >= raw) ?? 10); };
 export const ticks = (from, to, step) => { const found = []; for (let v = Math.ceil(from / step - 1e-9) * step; v <= to + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-12 * step ? 0 : v); return found; };
 
-/** Prepares a canvas for drawing in CSS pixels; undefined while it is not shown. */
+/** Prepares a canvas for drawing in CSS pixels; undefined while it is hidden. */
 export function brush(canvas) {
   const box = canvas.getBoundingClientRect(), ratio = Math.min(devicePixelRatio || 1, 2);
   if (!box.width) return undefined;
@@ -36,9 +36,9 @@ export function brush(canvas) {
   return { c, width: box.width, height: box.height, ratio };
 }
 
-/** Copies a text, also where the page is not trusted with the clipboard: on another machine's address without encryption. */
+/** Copies a text; also without access to the clipboard, which browsers refuse to remote pages without encryption. */
 export async function copyText(text) {
-  if (navigator.clipboard) { try { await navigator.clipboard.writeText(text); return true; } catch { /* The old way. */ } }
+  if (navigator.clipboard) { try { await navigator.clipboard.writeText(text); return true; } catch { /* Falls through to the old method. */ } }
   const area = make("textarea", { readonly: "" });
   area.value = text;
   document.body.append(area);
@@ -48,7 +48,7 @@ export async function copyText(text) {
   return done;
 }
 
-// A mission's epoch counts TAI seconds since 1958; UTC is whole seconds behind. Rows of when (TAI since 1970, s) and by how many.
+// The epoch of a mission is in TAI seconds since 1958. Leap seconds are rows of start (TAI since 1970, s) and TAI minus UTC (s).
 const TO_1970_S = 4383 * 86400;
 let leaps = [];
 export const learnLeaps = (rows) => { leaps = rows; };

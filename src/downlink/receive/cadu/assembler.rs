@@ -1,8 +1,8 @@
-//! Frames of one virtual channel to packets, in any order of arrival.
+//! Assembles packets from the frames of one virtual channel, in any order of arrival.
 //!
-//! A frame yields the packets that lie wholly in it, and leaves two pieces at most: the end of a packet begun in an
-//! earlier frame, and the beginning of one that ends in a later frame. Pieces are joined by frame counts. So a frame
-//! that arrives late, or from another station, completes its packets.
+//! A frame yields the packets that lie entirely in it, and leaves at most two pieces: the end of a packet from an earlier
+//! frame, and the beginning of a packet that continues in a later frame. Pieces are joined by frame counts, so a frame that
+//! arrives late, or from another station, completes its packets.
 
 use std::collections::BTreeMap;
 
@@ -11,44 +11,43 @@ use crate::downlink::receive::sequence::{Arrival, Sequence};
 use crate::downlink::wire::cadu::DATA_BYTES;
 use crate::downlink::wire::cadu::frame::{FrameHeader, IDLE_ZONE, NO_HEADER, ZONE_START};
 use crate::downlink::wire::cadu::framer::{IDLE_APID, PACKET_HEADER_BYTES};
-
 use crate::downlink::wire::{CucTime, PACKET_BYTES_MAX};
 
-/// Number of frames whose pieces are kept; bounds memory to some megabytes per channel.
+/// Maximum number of frames whose pieces are kept; bounds memory to some megabytes per channel.
 const PIECES_MAX: usize = 4096;
 
-/// Number of shortest frames that the longest packet can touch.
-const FRAMES_A_PACKET_MAX: u64 = (PACKET_BYTES_MAX / (DATA_BYTES - ZONE_START) + 2) as u64;
+/// Maximum number of frames that a packet can touch: the longest packet and the shortest frames.
+const FRAMES_PER_PACKET_MAX: u64 = (PACKET_BYTES_MAX / (DATA_BYTES - ZONE_START) + 2) as u64;
 
-/// Number of frames remembered for the detection of duplicates.
+/// Maximum number of frames that are kept to detect duplicates.
 const SEEN_MAX: usize = 1 << 16;
 
-/// Counts are unwrapped to values near this one, so that earlier ones do not underflow.
+/// Offset of unwrapped counts, so that earlier ones do not underflow.
 const ORIGIN: u64 = 1 << 40;
 
-/// Where a piece ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum PieceEnd {
-    /// At the end of its packet; another begins after it.
+    /// With its packet; another packet begins after it.
     Packet,
-    /// At the end of its frame; the packet may continue.
+    /// With its frame; the packet may continue.
     Frame,
 }
 
-/// The two pieces of a frame.
+/// The incomplete pieces of a frame.
 #[derive(Debug, Default)]
 struct Pieces {
-    /// The end, or a middle part, of a packet begun in an earlier frame.
+    /// The end, or a middle part, of a packet that begins in an earlier frame.
     tail: Option<(Vec<u8>, PieceEnd)>,
     /// The beginning of a packet that continues in later frames.
     head: Option<Vec<u8>>,
 }
 
-/// Assembles the packets of one virtual channel.
 #[derive(Debug, Default)]
 pub(super) struct Assembler {
-    newest: Option<u64>,
+    /// Highest unwrapped frame count.
+    highest: Option<u64>,
     sequence: Sequence,
+    /// Checksums of recent frames by count.
     seen: BTreeMap<u64, u32>,
     pieces: BTreeMap<u64, Pieces>,
     counts: ChannelCounts,
@@ -63,22 +62,22 @@ impl Assembler {
         &self.counts
     }
 
-    /// Number and bytes of the pieces held.
-    pub(super) fn waiting(&self) -> (u64, u64) {
+    /// Number and bytes of the pieces that are kept.
+    pub(super) fn fragments(&self) -> (u64, u64) {
         let tails = self.pieces.values().filter_map(|pieces| pieces.tail.as_ref().map(|(bytes, _)| bytes));
         let heads = self.pieces.values().filter_map(|pieces| pieces.head.as_ref());
         tails.chain(heads).fold((0, 0), |(count, bytes), piece| (count + 1, bytes + piece.len() as u64))
     }
 
-    /// Approximate memory held, bytes: pieces, and the entries of the maps.
-    pub(super) fn held_bytes(&self) -> usize {
+    /// Approximate memory, bytes: pieces, and the entries of the maps.
+    pub(super) fn memory_bytes(&self) -> usize {
         let entries =
             self.pieces.len() * size_of::<(u64, Pieces)>() + self.seen.len() * size_of::<(u64, u32)>();
-        self.waiting().1 as usize + 2 * entries
+        self.fragments().1 as usize + 2 * entries
     }
 
     /// Processes a frame; appends the packets that it completes to `out`.
-    pub(super) fn take(
+    pub(super) fn receive(
         &mut self,
         header: FrameHeader,
         frame: &[u8],
@@ -86,7 +85,7 @@ impl Assembler {
         out: &mut Vec<u8>,
     ) {
         let count = self.unwrap_count(header);
-        if self.is_duplicate(count, frame) {
+        if self.record_frame(count, frame) {
             self.counts.duplicates += 1;
             return;
         }
@@ -103,32 +102,32 @@ impl Assembler {
                 }
             },
         };
-        let (tail, reach) = tail;
-        let had = self
+        let (tail, end) = tail;
+        let replaced = self
             .pieces
-            .insert(count, Pieces { tail: (!tail.is_empty()).then(|| (tail.to_vec(), reach)), head: None });
-        self.drop_pieces(had, counters);
+            .insert(count, Pieces { tail: (!tail.is_empty()).then(|| (tail.to_vec(), end)), head: None });
+        self.drop_pieces(replaced, counters);
         self.complete(count, counters, out);
-        if let Some(head) = walk(body, counters, out) {
+        if let Some(head) = extract_packets(body, counters, out) {
             self.pieces.entry(count).or_default().head = Some(head.to_vec());
             self.complete_from(count, counters, out);
         }
-        self.forget(count);
-        self.bound(counters);
+        self.remove_if_empty(count);
+        self.drop_oldest(counters);
     }
 
-    /// Unwraps the count: of all values with these low bits, the nearest to the newest.
+    /// Unwraps a count: of all values with these low bits, returns the nearest to the highest so far.
     fn unwrap_count(&mut self, header: FrameHeader) -> u64 {
         let span = 1_u64 << header.count_bits;
-        let newest = self.newest.unwrap_or(ORIGIN | u64::from(header.count));
-        let ahead = u64::from(header.count).wrapping_sub(newest) & (span - 1);
-        let count = if ahead < span / 2 { newest + ahead } else { newest.saturating_sub(span - ahead) };
-        self.newest = Some(newest.max(count));
+        let highest = self.highest.unwrap_or(ORIGIN | u64::from(header.count));
+        let ahead = u64::from(header.count).wrapping_sub(highest) & (span - 1);
+        let count = if ahead < span / 2 { highest + ahead } else { highest.saturating_sub(span - ahead) };
+        self.highest = Some(highest.max(count));
         count
     }
 
-    /// Records the count. Returns whether the same frame was received before.
-    fn is_duplicate(&mut self, count: u64, frame: &[u8]) -> bool {
+    /// Records a frame; returns whether it was received before.
+    fn record_frame(&mut self, count: u64, frame: &[u8]) -> bool {
         let check = crc_fast::crc32_iscsi(frame);
         if self.seen.insert(count, check) == Some(check) {
             return true;
@@ -136,7 +135,7 @@ impl Assembler {
         if self.seen.len() > SEEN_MAX {
             self.seen.pop_first();
         }
-        // Frames carry no time, so a lower count is never a restart here. Packets reveal restarts.
+        // Frames have no time, so a lower count is never taken for a restart; packets show restarts.
         match self.sequence.receive(count, CucTime(0)) {
             Arrival::AfterGap { expected } => {
                 self.counts.gaps += 1;
@@ -149,12 +148,12 @@ impl Assembler {
         false
     }
 
-    /// Completes the packet of the tail at `count`, if its head and all pieces between are held.
+    /// Completes the packet to which the tail of frame `count` belongs, if all its pieces have arrived.
     fn complete(&mut self, count: u64, counters: &mut FrameCounters, out: &mut Vec<u8>) {
         if self.pieces.get(&count).is_none_or(|pieces| pieces.tail.is_none()) {
             return;
         }
-        for at in (count.saturating_sub(FRAMES_A_PACKET_MAX)..count).rev() {
+        for at in (count.saturating_sub(FRAMES_PER_PACKET_MAX)..count).rev() {
             match self.pieces.get(&at) {
                 Some(Pieces { head: Some(_), .. }) => return self.complete_from(at, counters, out),
                 Some(Pieces { tail: Some((_, PieceEnd::Frame)), .. }) => {}
@@ -163,20 +162,20 @@ impl Assembler {
         }
     }
 
-    /// Completes the packet that begins in frame `count`, if all its pieces are held.
+    /// Completes the packet that begins in frame `count`, if all its pieces have arrived.
     fn complete_from(&mut self, count: u64, counters: &mut FrameCounters, out: &mut Vec<u8>) {
-        let Some((last, fits)) = self.extent(count) else { return };
+        let Some((last, has_right_length)) = self.extent(count) else { return };
         let start = out.len();
         for at in count..=last {
             let Some(pieces) = self.pieces.get_mut(&at) else { continue };
             let piece =
                 if at == count { pieces.head.take() } else { pieces.tail.take().map(|(tail, _)| tail) };
             out.extend(piece.unwrap_or_default());
-            self.forget(at);
+            self.remove_if_empty(at);
         }
         let bytes = (out.len() - start) as u64;
-        if !fits {
-            // Frames that do not belong together despite their counts, or a forged length.
+        if !has_right_length {
+            // Frames that do not belong together in spite of their counts, or a forged length.
             counters.fragments += 1 + last - count;
             counters.bytes_fragments += bytes;
             out.truncate(start);
@@ -186,8 +185,8 @@ impl Assembler {
         }
     }
 
-    /// The last frame of the packet that begins in frame `count`, and whether its pieces add up to its length; `None` if
-    /// pieces are missing.
+    /// The last frame of the packet that begins in frame `count`, and whether its pieces have the right total length; `None`
+    /// if pieces are missing.
     fn extent(&self, count: u64) -> Option<(u64, bool)> {
         let mut piece = self.pieces.get(&count)?.head.as_ref()?;
         let (mut header, mut found, mut at) = (Vec::with_capacity(PACKET_HEADER_BYTES), 0, count);
@@ -196,7 +195,7 @@ impl Assembler {
             found += piece.len();
             match packet_bytes(&header) {
                 Some(bytes) if found >= bytes => return Some((at, found == bytes)),
-                _ if at > count && self.reach(at) == Some(PieceEnd::Packet) => return Some((at, false)),
+                _ if at > count && self.tail_end(at) == Some(PieceEnd::Packet) => return Some((at, false)),
                 _ => {}
             }
             at += 1;
@@ -204,18 +203,20 @@ impl Assembler {
         }
     }
 
-    fn reach(&self, at: u64) -> Option<PieceEnd> {
-        self.pieces.get(&at)?.tail.as_ref().map(|(_, reach)| *reach)
+    /// Where the tail of frame `count` ends.
+    fn tail_end(&self, count: u64) -> Option<PieceEnd> {
+        self.pieces.get(&count)?.tail.as_ref().map(|(_, end)| *end)
     }
 
-    /// Removes an empty entry.
-    fn forget(&mut self, count: u64) {
+    /// Removes the entry of a frame that has no pieces left.
+    fn remove_if_empty(&mut self, count: u64) {
         if self.pieces.get(&count).is_some_and(|pieces| pieces.tail.is_none() && pieces.head.is_none()) {
             self.pieces.remove(&count);
         }
     }
 
-    fn bound(&mut self, counters: &mut FrameCounters) {
+    /// Drops the pieces of the oldest frames beyond [`PIECES_MAX`].
+    fn drop_oldest(&mut self, counters: &mut FrameCounters) {
         while self.pieces.len() > PIECES_MAX {
             let oldest = self.pieces.pop_first().map(|(_, pieces)| pieces);
             self.drop_pieces(oldest, counters);
@@ -231,8 +232,8 @@ impl Assembler {
     }
 }
 
-/// Appends the packets that lie wholly in `body`; returns the rest, the beginning of another.
-fn walk<'a>(body: &'a [u8], counters: &mut FrameCounters, out: &mut Vec<u8>) -> Option<&'a [u8]> {
+/// Appends the packets that lie entirely in `body`; returns the rest, the beginning of another packet.
+fn extract_packets<'a>(body: &'a [u8], counters: &mut FrameCounters, out: &mut Vec<u8>) -> Option<&'a [u8]> {
     let mut rest = body;
     while let Some((packet, after)) = packet_bytes(rest).and_then(|bytes| rest.split_at_checked(bytes)) {
         if is_idle(packet) {
@@ -245,7 +246,7 @@ fn walk<'a>(body: &'a [u8], counters: &mut FrameCounters, out: &mut Vec<u8>) -> 
     (!rest.is_empty()).then_some(rest)
 }
 
-/// Length of the packet that begins here, if its length field is present.
+/// Length of the packet at the beginning of `bytes`; `None` if its header is incomplete.
 fn packet_bytes(bytes: &[u8]) -> Option<usize> {
     let header = bytes.first_chunk::<PACKET_HEADER_BYTES>()?;
     Some(PACKET_HEADER_BYTES + 1 + usize::from(u16::from_be_bytes([header[4], header[5]])))

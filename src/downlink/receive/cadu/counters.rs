@@ -1,21 +1,21 @@
-//! Counters of a coded stream.
+//! Counters of a coded stream and its virtual channels.
 
 use std::fmt;
 
 use serde::Serialize;
 
-/// Frames of one virtual channel.
+/// Counters of the frames of one virtual channel.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct ChannelCounts {
     /// Virtual channel.
     pub channel: u8,
-    /// Sound frames without duplicates.
+    /// Valid frames, without duplicates.
     pub frames: u64,
     /// Gaps in the frame count.
     pub gaps: u64,
-    /// Frames in those gaps.
+    /// Frames missing in these gaps.
     pub missing: u64,
-    /// Frames that filled a gap later.
+    /// Frames that arrived later and filled a gap.
     pub late: u64,
     /// Frames received before.
     pub duplicates: u64,
@@ -26,42 +26,42 @@ pub struct ChannelCounts {
 pub struct FrameCounters {
     /// Bytes received.
     pub bytes: u64,
-    /// Codewords interleaved in a block; 0 if no frame was found.
+    /// Number of codewords interleaved in a block; 0 if no frame was found.
     pub interleave: usize,
-    /// Sound frames, including idle ones and duplicates.
+    /// Frames received with a correctable block, including idle frames and duplicates.
     pub frames: u64,
-    /// Sound frames after correction.
+    /// Frames in which errors were corrected.
     pub frames_corrected: u64,
-    /// Bytes corrected in them.
+    /// Bytes corrected in these frames.
     pub bytes_corrected: u64,
     /// Uncorrectable frames.
     pub frames_uncorrectable: u64,
-    /// Sound frames of another version or spacecraft, or of virtual channels beyond the supported number.
+    /// Frames of another version or spacecraft, or of virtual channels beyond the supported number.
     pub frames_foreign: u64,
-    /// Sound frames with a pointer beyond their end.
+    /// Frames whose first header pointer is beyond their end.
     pub frames_malformed: u64,
-    /// Sound frames of idle data.
+    /// Frames of idle data.
     pub frames_idle: u64,
-    /// Losses of synchronisation.
+    /// Number of losses of synchronisation.
     pub sync_losses: u64,
     /// Bits skipped in searches for a marker.
     pub bits_skipped: u64,
-    /// Changes of polarity.
+    /// Number of changes of polarity.
     pub inversions: u64,
     /// Bytes of an incomplete frame at the end.
     pub bytes_truncated: u64,
     /// Bytes of idle packets.
     pub bytes_idle_packets: u64,
-    /// Pieces of packets whose other frames have not arrived, or never did.
+    /// Fragments of packets whose other frames have not arrived.
     pub fragments: u64,
-    /// Bytes of these pieces.
+    /// Bytes of these fragments.
     pub bytes_fragments: u64,
-    /// Virtual channels, without that of idle frames.
+    /// Counters by virtual channel, without the idle channel.
     pub channels: Vec<ChannelCounts>,
 }
 
 impl FrameCounters {
-    /// Adds the counters of another stream. The interleave remains that of the first.
+    /// Adds the counters of another stream, but keeps the interleave of this one.
     pub(in crate::downlink) fn add(&mut self, other: &Self) {
         self.bytes += other.bytes;
         self.interleave = if self.interleave == 0 { other.interleave } else { self.interleave };
@@ -80,22 +80,21 @@ impl FrameCounters {
         self.fragments += other.fragments;
         self.bytes_fragments += other.bytes_fragments;
         for counts in &other.channels {
-            let known = self.channels.iter_mut().find(|known| known.channel == counts.channel);
-            let Some(known) = known else {
+            let Some(own) = self.channels.iter_mut().find(|own| own.channel == counts.channel) else {
                 self.channels.push(counts.clone());
                 continue;
             };
-            known.frames += counts.frames;
-            known.gaps += counts.gaps;
-            known.missing += counts.missing;
-            known.late += counts.late;
-            known.duplicates += counts.duplicates;
+            own.frames += counts.frames;
+            own.gaps += counts.gaps;
+            own.missing += counts.missing;
+            own.late += counts.late;
+            own.duplicates += counts.duplicates;
         }
     }
 
-    /// Whether nothing is missing and nothing was corrected.
+    /// Whether the stream had no errors: nothing is missing and nothing was corrected.
     #[must_use]
-    pub fn is_sound(&self) -> bool {
+    pub fn is_undamaged(&self) -> bool {
         let faults =
             self.frames_corrected + self.frames_uncorrectable + self.frames_malformed + self.sync_losses;
         let gaps: u64 = self.channels.iter().map(|channel| channel.gaps).sum();
@@ -122,7 +121,7 @@ impl fmt::Display for FrameCounters {
         }
         write!(
             f,
-            "  stream       {} times lost, {} bits passed over, {} inversions, {} bytes in a cut end, {} fragments \
+            "  stream       {} losses of lock, {} bits skipped, {} inversions, {} bytes in a truncated frame, {} fragments \
              of packets",
             self.sync_losses, self.bits_skipped, self.inversions, self.bytes_truncated, self.fragments
         )

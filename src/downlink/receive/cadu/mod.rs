@@ -1,4 +1,4 @@
-//! Coded transfer frames to packets: synchronisation at any bit, error correction, packet assembly.
+//! Reception of coded transfer frames: synchronisation at any bit, error correction, packet assembly.
 
 mod assembler;
 mod counters;

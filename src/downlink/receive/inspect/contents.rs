@@ -1,12 +1,12 @@
-//! What a downlink file contains.
+//! The contents of a downlink file, as written to JSON.
 
 use serde::Serialize;
 
 use crate::downlink::receive::cadu::FrameCounters;
 use crate::downlink::receive::{Listing, ReceptionCounters};
-use crate::downlink::wire::{Format, Kind};
+use crate::downlink::wire::{Format, PacketKind};
 
-/// An interval of mission time, with dates.
+/// An interval of mission time, with its dates.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TimeSpan {
     /// Start, s since the mission epoch.
@@ -48,83 +48,84 @@ pub struct InstrumentSummary {
     pub spectrometer: Option<String>,
 }
 
-/// Packets of one kind.
+/// Summary of the packets of one kind.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindSummary {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
-    /// Sound packets.
+    /// Valid packets.
     pub packets: u64,
-    /// Bytes of those.
+    /// Bytes of these packets.
     pub bytes: u64,
-    /// Count of the first packet received: the number of packets sent before it.
+    /// Count of the first packet received, which is the number of packets sent before it.
     pub first_count: Option<u64>,
     /// Highest count received.
     pub last_count: Option<u64>,
 }
 
-/// Numbers of visibilities, for some pairs and channels.
+/// Counts of visibilities.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct VisibilityCounts {
     /// Number of visibilities.
     pub count: u64,
     /// Sum of their integration times, s.
     pub integration_s: f64,
-    /// Number of flagged ones.
+    /// Number of flagged visibilities.
     pub flagged: u64,
 }
 
-/// A channel and its visibilities.
+/// A channel and the counts of its visibilities.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ChannelContents {
-    /// Index in the instrument description.
+    /// Index of the channel in the instrument description.
     pub channel: u16,
     /// Centre frequency, Hz.
     pub frequency_hz: f64,
     /// Width, Hz.
     pub width_hz: f64,
-    /// Visibilities of all pairs.
+    /// Counts for all pairs.
     #[serde(flatten)]
     pub visibilities: VisibilityCounts,
 }
 
-/// Visibilities of one pair in one channel.
+/// Counts of the visibilities of one pair in one channel.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PairSummary {
-    /// Pair, counted from 1, as in "1-2".
+    /// Satellites of the pair, numbered from 1, as in "1-2".
     pub pair: String,
-    /// Index in the instrument description.
+    /// Index of the channel in the instrument description.
     pub channel: u16,
-    /// Visibilities.
+    /// Counts.
     #[serde(flatten)]
     pub visibilities: VisibilityCounts,
 }
 
-/// The ephemeris.
+/// Summary of the ephemeris.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct EphemerisSummary {
-    /// Segments, repeats included.
+    /// Number of segments, including repeats.
     pub segments: u64,
-    /// Nodes of those.
+    /// Number of nodes of these segments.
     pub nodes: u64,
     /// Time covered, s.
     pub covered_s: f64,
     /// Intervals covered: start and end, s since the mission epoch.
     pub covered: Listing<[f64; 2]>,
-    /// Segments that say other positions than one that begins at the same time, which the ground keeps.
+    /// Segments whose positions contradict an earlier segment with the same start, which the ground keeps.
     pub contradictory: u64,
-    /// Segments at whose ends the Moon hides the Earth, where that is by the dates: all, unless the mission's Earth is idealised.
+    /// Segments at whose ends the Moon occults the Earth as it is at their dates: all, unless the mission's Earth is idealised.
     pub earth_hidden_by_date: u64,
-    /// Greatest error of positions between nodes, m, as the nodes themselves tell; `None` without segments.
+    /// Maximum interpolation error of positions between nodes, m, estimated from the nodes; `None` without segments.
     pub interpolation_error_m_max: Option<f64>,
 }
 
-/// The spacecraft's own counts: the latest report.
+/// The latest report of the spacecraft's counts.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct HousekeepingSummary {
-    /// Time up to which the counts hold, s since the mission epoch; `None` for all time: the last report of a mission.
+    /// Time up to which the counts are valid, s since the mission epoch; `None` in the last report of a mission, which is
+    /// valid for all time.
     pub time_s: Option<f64>,
     /// Visibilities sampled since the mission epoch.
     pub sampled: u64,
@@ -132,11 +133,11 @@ pub struct HousekeepingSummary {
     pub dropped: u64,
 }
 
-/// A gap in the packet counts of a kind. Counts have 46 bits, so no gap is ambiguous.
+/// A gap in the packet counts of one kind.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GapEntry {
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Count of the first missing packet.
@@ -153,18 +154,18 @@ pub struct GapEntry {
     pub before_s: Option<f64>,
 }
 
-/// A packet with sound headers and a bad checksum.
+/// A packet with valid headers and an invalid checksum.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DamagedEntry {
     /// Offset in the file, bytes.
     pub offset: u64,
-    /// Kind.
-    pub kind: Kind,
+    /// Kind of the packets.
+    pub kind: PacketKind,
     /// Application process identifier.
     pub apid: u16,
     /// Packet count.
     pub count: u64,
-    /// Length by its headers.
+    /// Length according to its headers.
     pub bytes: u64,
     /// Creation time, s since the mission epoch.
     pub time_s: Option<f64>,
@@ -179,7 +180,7 @@ pub struct GarbageEntry {
     pub bytes: u64,
 }
 
-/// A payload that was refused although its packet's checksum is right.
+/// A payload that was refused in spite of a valid checksum.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FaultEntry {
     /// Offset of its last packet, bytes.
@@ -188,16 +189,16 @@ pub struct FaultEntry {
     pub reason: String,
 }
 
-/// What a downlink file contains.
+/// The contents of a downlink file: instrument, visibilities, ephemeris, and all damage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Contents {
-    /// The file.
+    /// Path of the file.
     pub file: String,
-    /// Its length, bytes.
+    /// Length of the file, bytes.
     pub bytes: u64,
-    /// Plain packets, or packets in coded frames. For frames, the offsets below count the recovered packet bytes.
+    /// Format of the file. In coded frames, the offsets below count the recovered packet bytes.
     pub format: Format,
-    /// From the start of the first to the end of the last integration.
+    /// Time from the start of the first to the end of the last integration.
     pub span: Option<TimeSpan>,
     /// The instrument description.
     pub instrument: Option<InstrumentSummary>,
@@ -205,13 +206,13 @@ pub struct Contents {
     pub channels: Vec<ChannelContents>,
     /// Packets by kind.
     pub packets: Vec<KindSummary>,
-    /// All visibilities.
+    /// Counts of all visibilities.
     pub visibilities: VisibilityCounts,
-    /// Visibilities by pair and channel.
+    /// Counts of visibilities by pair and channel.
     pub baselines: Vec<PairSummary>,
     /// The ephemeris.
     pub ephemeris: EphemerisSummary,
-    /// The spacecraft's own counts.
+    /// The spacecraft's counts.
     pub housekeeping: Option<HousekeepingSummary>,
     /// Gaps in the packet counts.
     pub gaps: Listing<GapEntry>,
@@ -221,7 +222,7 @@ pub struct Contents {
     pub garbage: Listing<GarbageEntry>,
     /// Refused payloads.
     pub faults: Listing<FaultEntry>,
-    /// Bytes of an unfinished packet at the end.
+    /// Bytes of a truncated packet at the end.
     pub truncated_bytes: u64,
     /// Bytes of idle packets.
     pub idle_bytes: u64,
@@ -230,11 +231,11 @@ pub struct Contents {
 }
 
 impl Contents {
-    /// Visibilities in sound packets less those that the spacecraft's latest report counts as sampled and not dropped on board: 0
-    /// if all that were sent are in the file. `None` without a report.
+    /// Number of visibilities in valid packets minus the number that the spacecraft's latest report counts as sampled and not
+    /// dropped on board: 0 if the file is complete. `None` without a report.
     #[must_use]
     #[doc(hidden)]
-    pub fn found_less_reported(&self) -> Option<i64> {
+    pub fn found_minus_reported(&self) -> Option<i64> {
         let HousekeepingSummary { sampled, dropped, .. } = self.housekeeping.as_ref()?;
         let found = self.visibilities.count + self.reception.visibilities_bad_value;
         Some(
@@ -243,21 +244,22 @@ impl Contents {
         )
     }
 
-    /// Whether nothing is missing or damaged and every payload was decoded, and all visibilities that the spacecraft has sampled are
-    /// in the file or were dropped on board.
+    /// Whether the file is undamaged and complete: all visibilities that the spacecraft has sampled are in the file or were
+    /// dropped on board.
     #[must_use]
     pub fn is_sound(&self) -> bool {
-        self.is_undamaged() && self.found_less_reported() == Some(0)
+        self.is_undamaged() && self.found_minus_reported() == Some(0)
     }
 
-    /// Whether it has no gaps and no damage, and every payload was decoded.
+    /// Whether the file has no gaps and no damage, and every payload was decoded.
     #[must_use]
     #[doc(hidden)]
     pub fn is_undamaged(&self) -> bool {
-        let clean = self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
-        let frames_sound = self.reception.frames.as_ref().is_none_or(FrameCounters::is_sound);
+        let has_no_entries =
+            self.gaps.count + self.bad_checksums.count + self.garbage.count + self.faults.count == 0;
+        let frames_undamaged = self.reception.frames.as_ref().is_none_or(FrameCounters::is_undamaged);
         let all_decoded =
             self.reception.instruments_contradictory + self.reception.payloads_before_instrument == 0;
-        frames_sound && clean && self.truncated_bytes == 0 && all_decoded
+        frames_undamaged && has_no_entries && self.truncated_bytes == 0 && all_decoded
     }
 }

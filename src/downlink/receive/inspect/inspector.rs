@@ -1,4 +1,4 @@
-//! Reads a downlink file and gathers its contents.
+//! Reads a downlink file and summarises its contents.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -13,20 +13,20 @@ use crate::downlink::error::DownlinkError;
 use crate::downlink::receive::{
     Decoder, DownlinkFile, Event, EventReader, LISTED_MAX, Listing, ReceptionCounters,
 };
-use crate::downlink::wire::{CucTime, Format, Kind, PacketHeader};
+use crate::downlink::wire::{CucTime, Format, PacketHeader, PacketKind};
 use crate::frames::{
-    AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, VisibilityBlock,
+    AntennaResponse, EphemerisSegment, GroundFrame, Housekeeping, Instrument, Spectrometer, VisibilityBlock,
 };
 use crate::units::calendar::tai_text;
 use crate::units::time_scales::utc_text;
 use crate::units::{ChannelId, IntervalSet, MissionTime, Pair, TICKS_PER_SECOND};
 
-/// Rows of the table by pair and channel: all 28 pairs in every channel of the band. Rows beyond them count in the
-/// sums alone.
+/// Maximum number of rows of the table by pair and channel: 28 pairs in every channel of the band. Visibilities of further
+/// rows count in the sums only.
 const ROWS_MAX: usize = 1 << 17;
 
-/// Intervals of ephemeris coverage that are kept apart: as many as observing windows in three precession periods.
-/// Beyond them, holes are bridged.
+/// Maximum number of intervals of ephemeris coverage: the observing windows of three precession periods. Beyond it, gaps
+/// are bridged.
 const COVERED_MAX: usize = 1 << 14;
 
 impl Contents {
@@ -38,33 +38,33 @@ impl Contents {
         Self::read_with(path, &mut |_| {})
     }
 
-    /// Inspects a file and gives every frame to `see`.
+    /// Inspects a file and calls `visit` with every frame.
     ///
     /// # Errors
-    /// Those of [`Contents::read`].
+    /// The errors of [`Contents::read`].
     #[doc(hidden)]
-    pub fn read_with(path: &Path, see: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
-        Self::read_from(DownlinkFile::open(path)?, path, see)
+    pub fn read_with(path: &Path, visit: &mut dyn FnMut(&GroundFrame)) -> Result<Self, DownlinkError> {
+        Self::read_from(DownlinkFile::open(path)?, path, visit)
     }
 
-    /// Inspects any source, which `path` names, and gives every frame to `see`.
+    /// Inspects any source and calls `visit` with every frame; `path` names the source in errors.
     ///
     /// # Errors
-    /// Those of [`Contents::read`].
+    /// The errors of [`Contents::read`].
     #[doc(hidden)]
     pub fn read_from(
         source: impl Read,
         path: &Path,
-        see: &mut dyn FnMut(&GroundFrame),
+        visit: &mut dyn FnMut(&GroundFrame),
     ) -> Result<Self, DownlinkError> {
         let mut events = EventReader::new(source, path);
         let mut decoder = Decoder::new();
         let mut inspector = Inspector::default();
         events.for_each(|event| {
-            inspector.see_event(event);
+            inspector.add_event(event);
             if let Some(frame) = decoder.accept(event) {
-                inspector.see_frame(&frame);
-                see(&frame);
+                inspector.add_frame(&frame);
+                visit(&frame);
             }
             if let Some((offset, fault)) = decoder.take_fault() {
                 inspector.faults.push(FaultEntry { offset, reason: fault.to_string() });
@@ -73,16 +73,15 @@ impl Contents {
         })?;
         decoder.finish();
         events.require_packets()?;
-        let intake = events.intake();
-        let mut reception = ReceptionCounters { frames: intake.frames(), ..decoder.counters().clone() };
-        for kind in Kind::ALL {
-            reception.kind_mut(kind).restarts = intake.restarts(kind);
+        let receiver = events.receiver();
+        let mut reception = ReceptionCounters { frames: receiver.frames(), ..decoder.counters().clone() };
+        for kind in PacketKind::ALL {
+            reception.kind_mut(kind).restarts = receiver.restarts(kind);
         }
-        Ok(inspector.conclude(path, intake.bytes(), &reception))
+        Ok(inspector.into_contents(path, receiver.bytes(), &reception))
     }
 }
 
-/// Running counts of visibilities.
 #[derive(Clone, Copy, Debug, Default)]
 struct Tally {
     count: u64,
@@ -103,7 +102,7 @@ impl Tally {
     }
 }
 
-/// Extent of the packets of one kind: counts, and the latest creation time.
+/// First and last count of the packets of one kind, and their latest creation time.
 #[derive(Clone, Copy, Debug, Default)]
 struct KindExtent {
     first: Option<u64>,
@@ -111,7 +110,6 @@ struct KindExtent {
     time: Option<CucTime>,
 }
 
-/// What has been read of a file so far.
 #[derive(Debug, Default)]
 struct Inspector {
     instrument: Option<Instrument>,
@@ -121,14 +119,15 @@ struct Inspector {
     total: Tally,
     segments: u64,
     nodes: u64,
-    in_shadow: u64,
+    /// Number of segments during which the Moon occults the Earth of their dates.
+    earth_hidden_by_date: u64,
     interpolation_error_m: Option<f64>,
-    /// By start: a checksum of a segment's positions. As many as intervals are kept apart.
-    told: BTreeMap<MissionTime, u64>,
+    /// Checksums of segments by their start, at most [`COVERED_MAX`].
+    checksums: BTreeMap<MissionTime, u64>,
     contradictory: u64,
     covered: EphemerisCoverage,
     housekeeping: Option<Housekeeping>,
-    seen: [KindExtent; Kind::ALL.len()],
+    extents: [KindExtent; PacketKind::ALL.len()],
     gaps: Listing<(GapEntry, Option<CucTime>, CucTime)>,
     damaged: Listing<(DamagedEntry, CucTime)>,
     garbage: Listing<GarbageEntry>,
@@ -137,12 +136,12 @@ struct Inspector {
 }
 
 impl Inspector {
-    fn see_event(&mut self, event: &Event<'_>) {
+    fn add_event(&mut self, event: &Event<'_>) {
         match *event {
-            Event::Packet(packet) => self.see_packet(packet.header),
+            Event::Packet(packet) => self.add_packet(packet.header),
             Event::Gap { offset, header, expected } => {
                 let PacketHeader { kind, count: found, time, .. } = header;
-                let after = self.seen[kind.index()].time;
+                let after = self.extents[kind.index()].time;
                 let entry = GapEntry {
                     kind,
                     apid: kind.apid(),
@@ -167,35 +166,37 @@ impl Inspector {
         }
     }
 
-    fn see_packet(&mut self, header: PacketHeader) {
-        let seen = &mut self.seen[header.kind.index()];
-        seen.first.get_or_insert(header.count);
-        seen.last = seen.last.max(Some(header.count));
-        seen.time = seen.time.max(Some(header.time));
+    fn add_packet(&mut self, header: PacketHeader) {
+        let extent = &mut self.extents[header.kind.index()];
+        extent.first.get_or_insert(header.count);
+        extent.last = extent.last.max(Some(header.count));
+        extent.time = extent.time.max(Some(header.time));
     }
 
-    fn see_frame(&mut self, frame: &GroundFrame) {
+    fn add_frame(&mut self, frame: &GroundFrame) {
         match frame {
             GroundFrame::Instrument(instrument) => self.instrument = Some(instrument.clone()),
-            GroundFrame::Ephemeris(segment) => self.see_segment(segment),
-            GroundFrame::Visibilities(block) => self.see_block(block),
+            GroundFrame::Ephemeris(segment) => self.add_segment(segment),
+            GroundFrame::Visibilities(block) => self.add_block(block),
             GroundFrame::Housekeeping(counts) => {
-                let newest = self.housekeeping.filter(|known| known.time > counts.time);
-                self.housekeeping = newest.or(Some(*counts));
+                let later = self.housekeeping.filter(|known| known.time > counts.time);
+                self.housekeeping = later.or(Some(*counts));
             }
         }
     }
 
-    fn see_segment(&mut self, segment: &EphemerisSegment) {
+    fn add_segment(&mut self, segment: &EphemerisSegment) {
         self.segments += 1;
         self.nodes += segment.nodes() as u64;
         let bytes: Vec<u8> =
             segment.positions_m.as_flattened().iter().flat_map(|x| x.to_le_bytes()).collect();
-        let sum =
+        let checksum =
             crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &bytes) ^ u64::from(segment.step_ticks);
-        match self.told.get(&segment.start) {
-            Some(known) => self.contradictory += u64::from(*known != sum),
-            None if self.told.len() < COVERED_MAX => drop(self.told.insert(segment.start, sum)),
+        match self.checksums.get(&segment.start) {
+            Some(known) => self.contradictory += u64::from(*known != checksum),
+            None if self.checksums.len() < COVERED_MAX => {
+                self.checksums.insert(segment.start, checksum);
+            }
             None => {}
         }
         self.interpolation_error_m = [self.interpolation_error_m, interpolation_error_m(segment)]
@@ -204,11 +205,12 @@ impl Inspector {
             .reduce(f64::max);
         self.covered.add(segment.start, segment.end());
         if let Some(Instrument { epoch_tai_s, moon_radius_m, .. }) = &self.instrument {
-            self.in_shadow += u64::from(earth_is_hidden_by_date(segment, *epoch_tai_s, *moon_radius_m));
+            self.earth_hidden_by_date +=
+                u64::from(earth_is_hidden_by_date(segment, *epoch_tai_s, *moon_radius_m));
         }
     }
 
-    fn see_block(&mut self, block: &VisibilityBlock) {
+    fn add_block(&mut self, block: &VisibilityBlock) {
         let (Some(first), Some(last)) = (block.offset_ticks.first(), block.offset_ticks.last()) else {
             return;
         };
@@ -230,8 +232,8 @@ impl Inspector {
         }
     }
 
-    /// The contents of the file, once all of it has been read.
-    fn conclude(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
+    /// The contents of the file, which has been read to its end.
+    fn into_contents(self, path: &Path, bytes: u64, reception: &ReceptionCounters) -> Contents {
         let epoch_tai_s = self.instrument.as_ref().map(|instrument| instrument.epoch_tai_s);
         let mission_s = |time: CucTime| epoch_tai_s.map(|epoch_tai_s| time.tai_s() - epoch_tai_s);
         let place_gap = |(gap, after, before): (GapEntry, Option<CucTime>, CucTime)| GapEntry {
@@ -241,15 +243,15 @@ impl Inspector {
         };
         let place_damaged =
             |(entry, time): (DamagedEntry, CucTime)| DamagedEntry { time_s: mission_s(time), ..entry };
-        let packets = Kind::ALL.map(|kind| {
-            let (counts, seen) = (reception.kind(kind), self.seen[kind.index()]);
+        let packets = PacketKind::ALL.map(|kind| {
+            let (counts, extent) = (reception.kind(kind), self.extents[kind.index()]);
             KindSummary {
                 kind,
                 apid: kind.apid(),
                 packets: counts.packets,
                 bytes: counts.bytes,
-                first_count: seen.first,
-                last_count: seen.last,
+                first_count: extent.first,
+                last_count: extent.last,
             }
         });
         let pair = |((pair, channel), row): (&(Pair, ChannelId), &Tally)| PairSummary {
@@ -261,7 +263,7 @@ impl Inspector {
             file: path.display().to_string(),
             bytes,
             format: if reception.frames.is_some() { Format::Cadu } else { Format::Packets },
-            span: self.span.zip(epoch_tai_s).map(|(span, epoch_tai_s)| span_of(span, epoch_tai_s)),
+            span: self.span.zip(epoch_tai_s).map(|(span, epoch_tai_s)| time_span(span, epoch_tai_s)),
             channels: self.channels(),
             instrument: self.instrument.as_ref().map(instrument_summary),
             packets: packets.into(),
@@ -269,7 +271,7 @@ impl Inspector {
             baselines: self.rows.iter().map(pair).collect(),
             ephemeris: EphemerisSummary {
                 contradictory: self.contradictory,
-                earth_hidden_by_date: self.in_shadow,
+                earth_hidden_by_date: self.earth_hidden_by_date,
                 interpolation_error_m_max: self.interpolation_error_m,
                 ..self.covered.summary(self.segments, self.nodes)
             },
@@ -323,14 +325,14 @@ fn instrument_summary(instrument: &Instrument) -> InstrumentSummary {
         },
         seed: instrument.seed,
         configuration_hash: format!("{:016x}", instrument.configuration_hash),
-        spectrometer: instrument.spectrometer.map(|own| {
-            let (low, high) = (own.low_hz, own.low_hz + own.width_hz * f64::from(own.channels));
-            format!("{:.3} to {:.3} MHz in {} channels", low / 1e6, high / 1e6, own.channels)
+        spectrometer: instrument.spectrometer.map(|Spectrometer { low_hz, width_hz, channels }| {
+            let high_hz = low_hz + width_hz * f64::from(channels);
+            format!("{:.3} to {:.3} MHz in {channels} channels", low_hz / 1e6, high_hz / 1e6)
         }),
     }
 }
 
-fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
+fn time_span([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
     let (start_s, end_s) = (start.seconds(), end.seconds());
     let tai = |time_s| tai_text(epoch_tai_s + time_s);
     TimeSpan {
@@ -343,7 +345,7 @@ fn span_of([start, end]: [MissionTime; 2], epoch_tai_s: f64) -> TimeSpan {
     }
 }
 
-/// The intervals of time that ephemeris segments cover, both ends included; segments a tick apart are joined.
+/// The intervals of time that ephemeris segments cover, with both ends included. Segments one tick apart are joined.
 #[derive(Debug, Default)]
 struct EphemerisCoverage(IntervalSet<MissionTime>);
 
@@ -353,14 +355,17 @@ impl EphemerisCoverage {
     }
 
     fn summary(&self, segments: u64, nodes: u64) -> EphemerisSummary {
-        let each =
+        let intervals =
             || self.0.iter().map(|covered| [covered.start.seconds(), covered.end.plus_ticks(-1).seconds()]);
         EphemerisSummary {
             segments,
             nodes,
-            // An empty sum of f64 is -0.
-            covered_s: each().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
-            covered: Listing { count: self.0.intervals() as u64, listed: each().take(LISTED_MAX).collect() },
+            // A fold, since an empty sum of f64 is -0.
+            covered_s: intervals().fold(0.0, |sum, [start_s, end_s]| sum + (end_s - start_s)),
+            covered: Listing {
+                count: self.0.intervals() as u64,
+                listed: intervals().take(LISTED_MAX).collect(),
+            },
             ..EphemerisSummary::default()
         }
     }

@@ -1,7 +1,7 @@
-//! What a downlink file contains: the library side of `lunarray inspect`.
+//! The contents of a downlink file, for `lunarray inspect`.
 //!
-//! [`Contents::read`] streams the file and keeps what the file says, not its bytes: one row per pair and channel, and
-//! at most [`LISTED_MAX`](super::LISTED_MAX) entries per list. `Display` renders the contents as tables.
+//! [`Contents::read`] streams the file and keeps counts only: one row per pair and channel, and at most
+//! [`LISTED_MAX`](super::LISTED_MAX) entries per list. `Display` renders the contents as tables.
 
 mod contents;
 mod inspector;

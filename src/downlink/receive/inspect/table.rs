@@ -1,4 +1,4 @@
-//! Renders contents as tables.
+//! Renders the contents of a downlink file as tables.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -7,10 +7,9 @@ use super::{Contents, HousekeepingSummary, VisibilityCounts};
 use crate::downlink::receive::{Listing, ReceptionCounters};
 use crate::units::printable;
 
-/// Channels side by side.
-const CHANNELS_A_ROW: usize = 6;
+const CHANNELS_PER_ROW: usize = 6;
 
-/// Entries shown per list; `--json` has more.
+/// Maximum number of entries shown per list; `--json` shows more.
 const SHOWN_MAX: usize = 10;
 
 impl fmt::Display for Contents {
@@ -39,7 +38,9 @@ fn duration(s: f64) -> String {
 impl Contents {
     fn show_head(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.instrument {
-            None => writeln!(f, "\ninstrument    none found: nothing else can be decoded without it")?,
+            None => {
+                writeln!(f, "\ninstrument    no description found: nothing else can be decoded without it")?
+            }
             Some(i) => {
                 writeln!(
                     f,
@@ -57,24 +58,29 @@ impl Contents {
                 if let Some(spectrometer) = &i.spectrometer {
                     writeln!(
                         f,
-                        "              satellite {} a spectrometer: {spectrometer}",
+                        "              satellite {} is a spectrometer: {spectrometer}",
                         i.satellites + 1
                     )?;
                 }
             }
         }
         if let Some(span) = &self.span {
-            let length = duration(span.end_s - span.start_s);
-            writeln!(f, "span          {:.6} s to {:.6} s ({length})", span.start_s, span.end_s)?;
+            let total = duration(span.end_s - span.start_s);
+            writeln!(f, "span          {:.6} s to {:.6} s ({total})", span.start_s, span.end_s)?;
             writeln!(f, "              {} to {} UTC", span.start_utc, span.end_utc)?;
         }
         let VisibilityCounts { count, integration_s, flagged } = self.visibilities;
         let integration = duration(integration_s);
-        writeln!(f, "visibilities  {count}, integrating {integration} together; {flagged} flagged")?;
+        writeln!(
+            f,
+            "visibilities  {count}, with a total integration time of {integration}; {flagged} flagged"
+        )?;
         if let Some(counts) = &self.housekeeping {
             let (sampled, dropped) = (counts.sampled, counts.dropped);
-            let end = || "the end of the mission".to_owned();
-            let until = counts.time_s.map_or_else(end, |time_s| format!("{time_s:.0} s"));
+            let until = match counts.time_s {
+                Some(time_s) => format!("{time_s:.0} s"),
+                None => "the end of the mission".to_owned(),
+            };
             writeln!(f, "on board      {sampled} sampled, {dropped} dropped until {until}")?;
         }
         let ephemeris = &self.ephemeris;
@@ -92,12 +98,12 @@ impl Contents {
             let hidden = ephemeris.earth_hidden_by_date;
             write!(
                 f,
-                "              the Moon hides the Earth of these dates in {hidden} of {segments} segments"
+                "              the Moon hides the Earth at these dates in {hidden} of {segments} segments"
             )?;
             writeln!(f, "{}", if hidden < segments { ": the mission's Earth is idealised" } else { "" })?;
         }
         match ephemeris.interpolation_error_m_max {
-            Some(error_m) => writeln!(f, "              positions between nodes to {}", length(error_m)),
+            Some(error_m) => writeln!(f, "              positions between nodes within {}", length(error_m)),
             None => Ok(()),
         }
     }
@@ -155,9 +161,9 @@ impl Contents {
         pairs.dedup();
         let rows = self.baselines.iter().map(|row| ((&*row.pair, row.channel), row.visibilities.count));
         let counts: BTreeMap<(&str, u16), u64> = rows.collect();
-        // The spectrometer has channels of its own.
+        // Spectrometer channels are not in this table.
         pairs.retain(|pair| self.channels.iter().any(|row| counts.contains_key(&(*pair, row.channel))));
-        for channels in self.channels.chunks(CHANNELS_A_ROW) {
+        for channels in self.channels.chunks(CHANNELS_PER_ROW) {
             if pairs.is_empty() {
                 break;
             }
@@ -185,26 +191,26 @@ impl Contents {
         if self.is_sound() {
             return writeln!(
                 f,
-                "\nsound: no gaps, no bad checksums, no garbage, not truncated; all visibilities that were sampled and not dropped on \
-                 board are here"
+                "\nsound: no gaps, no bad checksums, no garbage, not truncated; complete: all visibilities that were sampled and not \
+                 dropped on board are in this file"
             );
         }
         if self.is_undamaged() {
             writeln!(f, "\nno gaps, no bad checksums, no garbage, not truncated")?;
         }
-        match self.found_less_reported().zip(self.housekeeping.as_ref()) {
+        match self.found_minus_reported().zip(self.housekeeping.as_ref()) {
             None => writeln!(
                 f,
-                "\nno report of the spacecraft's counts: whether visibilities are missing is not known"
+                "\nno report of the spacecraft's counts: it is not known whether visibilities are missing"
             )?,
-            Some((found, HousekeepingSummary { sampled, dropped, .. })) if found < 0 => writeln!(
+            Some((excess, HousekeepingSummary { sampled, dropped, .. })) if excess < 0 => writeln!(
                 f,
                 "\nnot sound: {} of {sampled} visibilities that were sampled are not in this file ({dropped} were dropped on board)",
-                found.unsigned_abs()
+                excess.unsigned_abs()
             )?,
-            Some((found, _)) if found > 0 => writeln!(
+            Some((excess, _)) if excess > 0 => writeln!(
                 f,
-                "\n{found} visibilities follow the last report of the spacecraft's counts: whether more are missing is not known"
+                "\n{excess} visibilities follow the last report of the spacecraft's counts: it is not known whether others are missing"
             )?,
             Some(_) => {}
         }
@@ -235,15 +241,15 @@ impl Contents {
             let visibilities = self.reception.visibilities_before_instrument;
             writeln!(
                 f,
-                "\n{payloads} payloads with {visibilities} visibilities precede any instrument description and are in no \
-                table above; a replay holds them until the description arrives"
+                "\n{payloads} payloads with {visibilities} visibilities precede the first instrument description and are in no \
+                table above; a replay keeps them until the description arrives"
             )?;
         }
         if self.reception.instruments_contradictory > 0 {
             let count = self.reception.instruments_contradictory;
             writeln!(
                 f,
-                "\n{count} instrument descriptions contradict the first; what follows them was refused"
+                "\n{count} instrument descriptions contradict the first; the payloads after them were refused"
             )?;
         }
         Ok(())
@@ -269,7 +275,7 @@ fn show_list<T>(
     }
 }
 
-/// A length with a unit in which it is not too long.
+/// A length in a convenient unit.
 fn length(length_m: f64) -> String {
     match length_m {
         m if m < 1e-4 => format!("{:.2} um", 1e6 * m),

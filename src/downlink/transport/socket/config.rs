@@ -1,4 +1,4 @@
-//! Configuration of a listening ground: limits of its senders.
+//! Configuration of a listening ground: limits for senders.
 
 use crate::units::{Checks, InvalidValue, keys};
 
@@ -26,7 +26,7 @@ keys! {
 }
 
 impl ListenConfig {
-    /// All invalid limits; empty for a valid configuration.
+    /// The invalid limits; empty for a valid configuration.
     #[must_use]
     pub fn problems(&self) -> Vec<InvalidValue> {
         let mut checks = Checks::new("downlink.listen");
@@ -39,15 +39,15 @@ impl ListenConfig {
         ] {
             checks.require(key, value, (0.0..=1e9).contains(&value), "0 s to 1e9 s");
         }
-        let good = rate == 0.0 || (1e3..=1e12).contains(&rate);
-        checks.require("bytes_per_s_max", rate, good, "1e3 to 1e12 bytes a second, or 0 for no limit");
-        for (key, value, least, expected) in [
+        let is_valid = rate == 0.0 || (1e3..=1e12).contains(&rate);
+        checks.require("bytes_per_s_max", rate, is_valid, "1e3 to 1e12 bytes per second, or 0 for no limit");
+        for (key, value, minimum, expected) in [
             ("garbage_bytes_max", self.garbage_bytes_max, 1 << 16, "65536 to 2^40 bytes"),
             ("memory_bytes_max", self.memory_bytes_max, 1 << 21, "2097152 to 2^40 bytes"),
             ("backlog_bytes_max", self.backlog_bytes_max, 1 << 17, "131072 to 2^30 bytes"),
         ] {
-            let most = if key == "backlog_bytes_max" { 1 << 30 } else { 1 << 40 };
-            checks.require(key, value, (least..=most).contains(&value), expected);
+            let maximum = if key == "backlog_bytes_max" { 1 << 30 } else { 1 << 40 };
+            checks.require(key, value, (minimum..=maximum).contains(&value), expected);
         }
         checks.finish()
     }

@@ -1,4 +1,4 @@
-//! Receives datagrams over UDP, each a packet or a frame.
+//! Receives datagrams over UDP, each with packets or a frame.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -9,34 +9,34 @@ use tokio::net::UdpSocket;
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, timeout};
 
-use super::listener::{First, ListenContext, PacketBatch, first};
+use super::instrument_filter::SharedReception;
+use super::listener::{ListenContext, PacketBatch, Race, race};
 use super::preamble::Preamble;
 use super::report::DatagramReport;
-use super::sender_intake::{Mission, SenderIntake};
+use super::stream_receiver::StreamReceiver;
 use crate::downlink::transport::packet_archive::Ticket;
 use crate::downlink::wire::cadu::SYNC_MARKER;
 
-/// Longest datagram, bytes.
 const DATAGRAM_BYTES_MAX: usize = 1 << 16;
-/// Datagrams that are taken at once, bytes.
+/// Number of bytes of datagrams after which they are processed.
 const ROUND_BYTES: usize = 1 << 20;
-/// Senders that are told apart; one more takes the place of the one that has been silent longest.
+/// Maximum number of senders; a further one replaces the one that has been silent longest.
 const SENDERS_MAX: usize = 64;
-/// Interval at which what came reaches the disk, and the system's count of lost datagrams is read.
+/// Interval at which packets are synchronised to disk and the system's count of dropped datagrams is read.
 const TICK: Duration = Duration::from_secs(1);
 
-/// Packets and frames of one sender: a packet is whole in its datagram, and a frame goes on with the one before it.
+/// The receivers of one sender of datagrams. A packet is complete in its datagram; a frame continues the one before it.
 struct DatagramSender {
     peer: SocketAddr,
-    packets: SenderIntake,
-    frames: SenderIntake,
-    heard: Instant,
+    packets: StreamReceiver,
+    frames: StreamReceiver,
+    last_received: Instant,
 }
 
 impl DatagramSender {
-    fn new(peer: SocketAddr, mission: &Mission) -> Self {
-        let intake = || SenderIntake::new(mission.clone(), Preamble::new(None, false));
-        Self { peer, packets: intake(), frames: intake(), heard: Instant::now() }
+    fn new(peer: SocketAddr, reception: &SharedReception) -> Self {
+        let receiver = || StreamReceiver::new(reception.clone(), Preamble::new(None, false));
+        Self { peer, packets: receiver(), frames: receiver(), last_received: Instant::now() }
     }
 
     fn packets(&self) -> u64 {
@@ -44,19 +44,19 @@ impl DatagramSender {
     }
 }
 
-/// All senders of datagrams.
 struct DatagramSenders {
-    mission: Mission,
+    reception: SharedReception,
     senders: Vec<DatagramSender>,
 }
 
 impl DatagramSenders {
+    /// The receivers of a sender, which may be new.
     fn sender(&mut self, peer: SocketAddr) -> &mut DatagramSender {
         let at = match self.senders.iter().position(|sender| sender.peer == peer) {
             Some(at) => at,
             None => {
-                let new = DatagramSender::new(peer, &self.mission);
-                let oldest = self.senders.iter().enumerate().min_by_key(|(_, sender)| sender.heard);
+                let new = DatagramSender::new(peer, &self.reception);
+                let oldest = self.senders.iter().enumerate().min_by_key(|(_, sender)| sender.last_received);
                 match oldest.map(|(at, _)| at).filter(|_| self.senders.len() >= SENDERS_MAX) {
                     Some(at) => {
                         self.senders[at] = new;
@@ -72,8 +72,8 @@ impl DatagramSenders {
         &mut self.senders[at]
     }
 
-    /// Takes one datagram, and appends its packets to `out`. Returns whether there was a sound packet or frame.
-    fn take(
+    /// Processes a datagram and appends its packets to `out`; returns whether it had a valid packet or frame.
+    fn receive(
         &mut self,
         peer: SocketAddr,
         bytes: &[u8],
@@ -82,33 +82,33 @@ impl DatagramSenders {
     ) -> bool {
         let sender = self.sender(peer);
         let before = sender.packets();
-        let found = match bytes.starts_with(&SYNC_MARKER.to_be_bytes()) {
-            true => sender.frames.take_frame(bytes, out),
-            false => sender.packets.take_packet(bytes, out),
+        let activity = match bytes.starts_with(&SYNC_MARKER.to_be_bytes()) {
+            true => sender.frames.receive_next(bytes, out),
+            false => sender.packets.receive_alone(bytes, out),
         };
-        sender.heard = Instant::now();
+        sender.last_received = Instant::now();
         report.received += 1;
         report.bytes += bytes.len() as u64;
         report.packets += sender.packets() - before;
-        match found {
-            Ok(signs) => {
-                report.malformed += u64::from(!signs.is_alive);
-                signs.is_alive
+        match activity {
+            Ok(activity) => {
+                report.malformed += u64::from(!activity.has_valid);
+                activity.has_valid
             }
             Err(_) => {
                 report.refused += 1;
-                // Another at the same address may be of the ground's mission.
+                // The next datagrams from this address may describe the ground's instrument.
                 self.senders.retain(|sender| sender.peer != peer);
                 false
             }
         }
     }
 
-    /// Passes on what waited for the end.
+    /// Ends the streams of all senders; appends their remaining packets to `out`.
     fn finish(&mut self, out: &mut Vec<u8>, report: &mut DatagramReport) {
         for sender in &mut self.senders {
             let before = sender.packets();
-            // What was not confirmed until now never will be.
+            // Packets of an unconfirmed instrument are refused.
             let _ = (sender.packets.finish(out), sender.frames.finish(out));
             report.packets += sender.packets() - before;
         }
@@ -117,16 +117,16 @@ impl DatagramSenders {
 
 /// Receives datagrams until the run ends.
 pub(super) async fn receive(socket: UdpSocket, shared: Arc<ListenContext>) {
-    let mut senders = DatagramSenders { mission: shared.mission.clone(), senders: Vec::new() };
+    let mut senders = DatagramSenders { reception: shared.reception.clone(), senders: Vec::new() };
     let mut buffer = vec![0; DATAGRAM_BYTES_MAX];
     let mut unsynced = None;
     let mut tick = Instant::now();
     loop {
         let mut round = Vec::new();
-        match first(shared.stopped(), timeout(TICK, socket.recv_from(&mut buffer))).await {
-            First::A(()) => break,
-            First::B(Ok(Ok((length, peer)))) => round.push((peer, buffer[..length].to_vec())),
-            First::B(_) => {}
+        match race(shared.stopped(), timeout(TICK, socket.recv_from(&mut buffer))).await {
+            Race::A(()) => break,
+            Race::B(Ok(Ok((length, peer)))) => round.push((peer, buffer[..length].to_vec())),
+            Race::B(_) => {}
         }
         let mut bytes = 0;
         while bytes < ROUND_BYTES && !round.is_empty() {
@@ -134,19 +134,16 @@ pub(super) async fn receive(socket: UdpSocket, shared: Arc<ListenContext>) {
             bytes += length;
             round.push((peer, buffer[..length].to_vec()));
         }
-        let (back, packets) = match take_round(senders, round, &shared).await {
-            Some(taken) => taken,
-            None => return,
-        };
-        senders = back;
-        match pass_on(packets, &shared).await {
+        let Some((returned, packets)) = process_round(senders, round, &shared).await else { return };
+        senders = returned;
+        match forward(packets, &shared).await {
             Some(ticket) => unsynced = ticket.or(unsynced),
             None => break,
         }
         if tick.elapsed() >= TICK {
             tick = Instant::now();
             if let Some(report) = &mut shared.listening.write().datagrams {
-                report.dropped_by_system = dropped(&socket);
+                report.dropped_by_system = dropped_by_system(&socket);
             }
             sync(unsynced.take(), &shared).await;
         }
@@ -154,14 +151,14 @@ pub(super) async fn receive(socket: UdpSocket, shared: Arc<ListenContext>) {
     let mut packets = Vec::new();
     if let Some(report) = &mut shared.listening.write().datagrams {
         senders.finish(&mut packets, report);
-        report.dropped_by_system = dropped(&socket);
+        report.dropped_by_system = dropped_by_system(&socket);
     }
-    let last = pass_on(packets, &shared).await.flatten();
+    let last = forward(packets, &shared).await.flatten();
     sync(last.or(unsynced), &shared).await;
 }
 
-/// Finds the packets of some datagrams, on another thread: the work must not delay other senders.
-async fn take_round(
+/// Finds the packets of some datagrams on another thread, so that the work does not delay other senders.
+async fn process_round(
     mut senders: DatagramSenders,
     round: Vec<(SocketAddr, Vec<u8>)>,
     shared: &Arc<ListenContext>,
@@ -169,55 +166,55 @@ async fn take_round(
     let status = &shared.listening.status;
     status.bytes.fetch_add(round.iter().map(|(_, bytes)| bytes.len() as u64).sum(), Ordering::Relaxed);
     let mut report = shared.listening.write().datagrams.clone().unwrap_or_default();
-    let taken = spawn_blocking(move || {
-        let (mut packets, mut is_alive) = (Vec::new(), false);
+    let processed = spawn_blocking(move || {
+        let (mut packets, mut has_valid) = (Vec::new(), false);
         for (peer, bytes) in round {
-            is_alive |= senders.take(peer, &bytes, &mut packets, &mut report);
+            has_valid |= senders.receive(peer, &bytes, &mut packets, &mut report);
         }
-        (senders, packets, report, is_alive)
+        (senders, packets, report, has_valid)
     });
-    let (senders, packets, report, is_alive) = taken.await.ok()?;
+    let (senders, packets, report, has_valid) = processed.await.ok()?;
     shared.listening.write().datagrams = Some(report);
-    if is_alive {
-        shared.note_sign();
-        status.note_heard();
+    if has_valid {
+        shared.record_activity();
+        status.record_activity();
     }
     Some((senders, packets))
 }
 
-/// Passes packets to the ground once there is room. Returns what has to reach the disk; `None` if the ground takes no more.
-async fn pass_on(bytes: Vec<u8>, shared: &Arc<ListenContext>) -> Option<Option<Ticket>> {
+/// Forwards packets to the ground once the backlog has space; returns a ticket for those that must be on disk, and `None` if
+/// the ground accepts no more packets.
+async fn forward(bytes: Vec<u8>, shared: &Arc<ListenContext>) -> Option<Option<Ticket>> {
     if bytes.is_empty() {
         return Some(None);
     }
-    let needed = bytes.len().min(ListenContext::room_bytes(&shared.config));
+    let needed = bytes.len().min(ListenContext::backlog_capacity(&shared.config));
     let needed = u32::try_from(needed).unwrap_or(u32::MAX);
-    let room = Arc::clone(&shared.room).acquire_many_owned(needed).await.ok()?;
-    let batch = PacketBatch { bytes, room, arrived: std::time::Instant::now() };
+    let space = Arc::clone(&shared.backlog).acquire_many_owned(needed).await.ok()?;
+    let batch = PacketBatch { bytes, space, arrived: std::time::Instant::now() };
     let shared = Arc::clone(shared);
-    // A disk may be slow.
-    let passed = spawn_blocking(move || shared.pass(batch)).await.ok().flatten()?;
-    // Nobody can be told to send again; the archive tells that it cannot be written.
-    Some(passed.ticket.ok().flatten())
+    // The disk may be slow.
+    let forwarded = spawn_blocking(move || shared.forward(batch)).await.ok().flatten()?;
+    // A sender of datagrams gets no answer; the archive's report has the failure.
+    Some(forwarded.ticket.ok().flatten())
 }
 
-/// Brings to the disk what came.
 async fn sync(ticket: Option<Ticket>, shared: &ListenContext) {
     if let (Some(ticket), Some(archive)) = (ticket, shared.archive.clone()) {
-        // As above.
+        // The archive's report has a failure.
         let _ = spawn_blocking(move || archive.sync(ticket)).await;
     }
 }
 
-/// Datagrams that the system has dropped before they were read, where it says so.
+/// Number of datagrams that the system dropped before they were read; `None` if the system does not report it.
 #[cfg(not(unix))]
-fn dropped(_: &UdpSocket) -> Option<u64> {
+fn dropped_by_system(_: &UdpSocket) -> Option<u64> {
     None
 }
 
-/// Datagrams that the system has dropped before they were read, where it says so.
+/// Number of datagrams that the system dropped before they were read; `None` if the system does not report it.
 #[cfg(unix)]
-fn dropped(socket: &UdpSocket) -> Option<u64> {
+fn dropped_by_system(socket: &UdpSocket) -> Option<u64> {
     use std::os::fd::AsRawFd;
     let link = std::fs::read_link(format!("/proc/self/fd/{}", socket.as_raw_fd())).ok()?;
     let inode = link.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?.to_owned();
@@ -238,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_system_says_how_many_datagrams_it_dropped() {
+    fn the_number_of_dropped_datagrams_is_read_from_the_systems_table() {
         let table = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode ref pointer drops\n\
                      1: 0100007F:1267 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 4711 2 0000000000000000 0\n\
                      2: 0100007F:1268 00000000:0000 07 00000000:00000000 00:00000000 00000000     0        0 4712 2 0000000000000000 31\n";

@@ -1,4 +1,4 @@
-//! Errors of a socket as a whole. Faults of senders are counted instead.
+//! Errors of a socket as a whole. Faults of single senders are counted instead.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,7 +9,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// The text is no URL of a socket.
+    /// The text is not the URL of a socket.
     #[error(
         "{text:?}: expected tcp://HOST:PORT, such as tcp://127.0.0.1:4711 or tcp://[::1]:4711; `replay --listen` also takes udp://HOST:PORT"
     )]
@@ -50,7 +50,7 @@ pub enum SocketError {
     },
     /// The listener's thread panicked.
     #[error("the listener stopped unexpectedly, which is a bug in the program")]
-    Fallen,
+    Panicked,
     /// No connection could be made.
     #[error(
         "{url}: no connection within {waited_s} s: {source}; start `lunarray replay --listen {url}` first, or wait \
@@ -61,30 +61,30 @@ pub enum SocketError {
         url: String,
         /// Time spent trying, s.
         waited_s: f64,
-        /// The system's last error.
+        /// The last error of the system.
         source: io::Error,
     },
     /// The receiver closed the connection.
-    #[error("{url}: the receiver closed the connection; {bytes} bytes had been sent: {reason}")]
+    #[error("{url}: the receiver closed the connection after {bytes} bytes: {reason}")]
     Closed {
         /// The URL.
         url: String,
-        /// Bytes sent until then.
+        /// Number of bytes sent.
         bytes: u64,
         /// The receiver's answer, or the system's error.
         reason: String,
     },
-    /// The file of stations and their tokens.
+    /// The file of stations and their tokens is invalid.
     #[error("stations {}: {found}", path.display())]
     Stations {
-        /// Path.
+        /// The file.
         path: PathBuf,
         /// What is wrong, and what was expected.
         found: String,
     },
-    /// The link has faults, but there is no file beside which to write their truth.
+    /// The link has faults, but there is no downlink file beside which the truth can be written.
     #[error(
-        "downlink.link has faults, and their truth goes beside the downlink file; name one with --out FILE"
+        "downlink.link has faults, and their truth is written beside the downlink file; give one with --out FILE"
     )]
-    TruthNowhere,
+    NoTruthFile,
 }

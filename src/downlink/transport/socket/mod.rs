@@ -1,36 +1,37 @@
 //! The downlink over TCP: a ground that listens to several stations at once, and a spacecraft that sends to it.
 //!
-//! A connection carries the bytes of a downlink file, in either format, and needs nothing else. So any tool that sends a
-//! file over TCP can be a station. The ground works in three places:
+//! A connection carries the bytes of a downlink file in either format and nothing else, so any tool that sends a file over
+//! TCP can be a station. The ground works on three kinds of threads:
 //!
 //! | task | where | on |
 //! |---|---|---|
-//! | accepts, reads, keeps time | `listener`, `connection` | one thread, the only one with an event loop |
-//! | finds packets in the bytes of one connection | `sender_intake` | a pool, so that one busy connection does not delay others |
-//! | passes whole packets to the pipeline | [`SocketSource`] | the source's thread |
+//! | accepts and reads connections, enforces time limits | `listener`, `connection` | one thread, the only one with an event loop |
+//! | finds packets in the bytes of one connection | `stream_receiver` | a pool, so that a busy connection does not delay others |
+//! | forwards complete packets to the pipeline | [`SocketSource`] | the source's thread |
 //!
-//! The backlog between the second and the third is bounded in bytes; connections get room in the order of request. A
-//! connection that waits for room does not read, so TCP slows its sender and no other. Segments of one payload stay
-//! together, so that those of two connections never mix.
+//! The backlog between the second and the third is bounded in bytes; connections get space in the order of request. A
+//! connection that waits for space does not read, so TCP slows its sender and no other. Segments of a payload stay
+//! together, so that segments of two connections never mix.
 //!
-//! When all places are taken, the least useful connection gives way to a newcomer (`seats`). A ground without an
-//! instrument takes that of the first sender whose visibilities have positions; until then it holds each sender's packets
-//! back, so that a mere description shuts nobody out.
+//! When all slots are in use, a new connection may evict another (`slots`). A ground without an instrument adopts that of
+//! the first sender whose visibilities have positions. Until then it keeps each sender's packets back, so that a mere
+//! description cannot exclude other senders.
 //!
 //! A sender that violates the limits of [`ListenConfig`] is disconnected, counted by reason and reported; the others
-//! continue. Once a sender has closed its side and all its packets are passed on, the ground answers with a line of
-//! text, `taken N bytes`, and closes.
+//! continue. Once a sender has closed its side and all its packets are forwarded, the ground answers with a line of text,
+//! `taken N bytes`, and closes the connection.
 //!
-//! A sender that begins with the line `answer held` is also told `held N bytes`, once a checkpoint on disk has all of it
-//! ([`HeldAnswers`]). The source asks the ground for a checkpoint with an empty piece of the stream. The connection's place is
-//! free while it waits; the last checkpoint of the run, which comes after the listener has ended, answers too.
+//! A sender that begins with the line `answer held` also gets the answer `held N bytes`, once a checkpoint on disk contains
+//! all its packets ([`HeldAnswers`]). The source requests a checkpoint with an empty piece of the stream. A waiting
+//! connection occupies no slot. The last checkpoint of the run, which is written after the listener has ended, is answered
+//! too.
 //!
-//! Datagrams over UDP, each a packet or a frame, come in beside connections (`datagrams`): nothing answers them, so what is lost shows as
-//! missing packets, and in counters of their own.
+//! Datagrams over UDP (`datagrams`), each with packets or a frame, are not answered. Lost ones show as missing packets and
+//! in separate counters.
 //!
-//! Packets carry no signature: whoever can connect can add to the maps. Therefore addresses other than those of this
-//! machine require an explicit option. With [`Stations`] a connection has to begin with the line `token TOKEN` of one of them, and
-//! is reported by its name.
+//! Packets have no signature: everyone who can connect can add to the maps. Therefore addresses that other machines can
+//! reach require an explicit option. With [`Stations`] a connection must begin with the line `token TOKEN` of a station, and
+//! is reported under its name.
 
 mod accept;
 mod answers;
@@ -38,25 +39,27 @@ mod config;
 mod connection;
 mod datagrams;
 mod error;
+mod instrument_filter;
 mod listener;
 mod preamble;
 mod report;
-mod seats;
-mod sender_intake;
 mod sink;
+mod slots;
 mod source;
 mod stations;
+mod stream_receiver;
 mod url;
 
 pub use answers::HeldAnswers;
 pub use config::ListenConfig;
 pub use error::SocketError;
+pub use instrument_filter::InstrumentCheck;
 pub use listener::{ListenLimits, NoteHandler};
 pub use report::{
     ConnectionEnd, DatagramReport, ListenNote, ListenReport, ListenStatus, Listening, SenderReport,
     StationCounts,
 };
-pub use sender_intake::InstrumentCheck;
+
 pub use sink::{SendOptions, SocketSink};
 pub use source::SocketSource;
 pub use stations::Stations;

@@ -1,76 +1,75 @@
-//! What a connection begins with, before its packets: the token of its station, and the question what checkpoints hold.
+//! The lines that a connection may begin with, before its packets: the token of its station and the request of `held`.
 
 use std::sync::Arc;
 
-use super::answers::ASKS_HELD;
+use super::answers::HELD_REQUEST;
 use super::report::ConnectionEnd;
 use super::stations::{Stations, TOKEN_BYTES_MAX};
 
-/// Begins the line with a token. No packet and no frame begins like it: packets of version 1 begin with a zero bit and their
-/// type, frames with their marker.
+/// Beginning of the line with a token. No packet and no frame begins like it: a packet begins with its version and type, a
+/// frame with its sync marker.
 pub(super) const TOKEN: &[u8] = b"token ";
 
-/// The lines before the packets: `token TOKEN`, then `answer held`, or either, or none. Whatever differs from them belongs to the
-/// packets.
+/// Parser of the lines before the packets: `token TOKEN`, then `answer held`, or either, or none. All other bytes belong to
+/// the packets.
 pub(super) struct Preamble {
-    /// Who may send; `None` for everyone.
+    /// The stations that may send; `None` if every sender may.
     stations: Option<Arc<Stations>>,
-    /// Whether a sender may ask what checkpoints hold.
-    may_ask: bool,
+    /// Whether the ground has checkpoints, so that a sender may request `held`.
+    has_checkpoints: bool,
     /// The beginning of a line that may become one of the two.
     line: Vec<u8>,
     bytes: u64,
     has_token: bool,
     station: Option<String>,
-    asks_held: bool,
+    requests_held: bool,
     is_over: bool,
 }
 
-/// What a beginning of a line may become.
 enum LineStart {
-    /// One of the two lines.
-    Line,
-    /// The line with a token, which is here.
+    /// The incomplete beginning of one of the two lines.
+    Incomplete,
+    /// The complete line with a token.
     Token,
-    /// The question.
-    Question,
-    /// Packets.
+    /// The complete request of `held`.
+    HeldRequest,
+    /// The beginning of the packets.
     Packets,
 }
 
 impl Preamble {
-    pub(super) fn new(stations: Option<Arc<Stations>>, may_ask: bool) -> Self {
+    pub(super) fn new(stations: Option<Arc<Stations>>, has_checkpoints: bool) -> Self {
         Self {
             stations,
-            may_ask,
+            has_checkpoints,
             line: Vec::new(),
             bytes: 0,
             has_token: false,
             station: None,
-            asks_held: false,
+            requests_held: false,
             is_over: false,
         }
     }
 
-    /// Takes the next bytes; returns those that belong to the packets: what was held back, and the rest.
+    /// Takes the next bytes; returns those that belong to the packets: buffered bytes, and the rest of `bytes`.
     ///
     /// # Errors
-    /// A token that no station has, or none where there has to be one; a question that the ground cannot answer.
+    /// The token is missing or unknown; the ground has no checkpoints, so that it cannot answer `held`.
     pub(super) fn take<'a>(&mut self, bytes: &'a [u8]) -> Result<(Vec<u8>, &'a [u8]), ConnectionEnd> {
         let mut rest = bytes;
         while !self.is_over {
             let Some((&octet, after)) = rest.split_first() else { return Ok((Vec::new(), rest)) };
             rest = after;
             self.line.push(octet);
-            match self.becoming() {
-                LineStart::Line => {}
+            match self.classify() {
+                LineStart::Incomplete => {}
                 LineStart::Token => {
                     self.has_token = true;
-                    self.know()?;
+                    self.identify_station()?;
                     self.end_line();
                 }
-                LineStart::Question => {
-                    self.asks_held = true;
+                LineStart::HeldRequest => {
+                    self.requests_held = true;
                     self.end_line();
                     self.end()?;
                 }
@@ -80,10 +79,10 @@ impl Preamble {
         Ok((std::mem::take(&mut self.line), rest))
     }
 
-    /// The connection has ended; returns what belongs to the packets after all.
+    /// Ends the connection; returns the buffered bytes, which belong to the packets.
     ///
     /// # Errors
-    /// As [`Preamble::take`]. A connection without a byte needs no token.
+    /// The errors of [`Preamble::take`]. A connection without bytes needs no token.
     pub(super) fn finish(&mut self) -> Result<Vec<u8>, ConnectionEnd> {
         let is_empty = self.line.is_empty() && self.bytes == 0;
         if !self.is_over && !is_empty {
@@ -92,10 +91,10 @@ impl Preamble {
         Ok(std::mem::take(&mut self.line))
     }
 
-    fn becoming(&self) -> LineStart {
+    fn classify(&self) -> LineStart {
         let Self { line, .. } = self;
-        if line == ASKS_HELD {
-            return LineStart::Question;
+        if line == HELD_REQUEST {
+            return LineStart::HeldRequest;
         }
         let may_be_token = !self.has_token
             && match line.strip_prefix(TOKEN) {
@@ -107,17 +106,16 @@ impl Preamble {
             };
         match may_be_token {
             true if line.ends_with(b"\n") => LineStart::Token,
-            true => LineStart::Line,
-            false if ASKS_HELD.starts_with(line) => LineStart::Line,
+            true => LineStart::Incomplete,
+            false if HELD_REQUEST.starts_with(line) => LineStart::Incomplete,
             false => LineStart::Packets,
         }
     }
 
-    /// Finds the station of the token in the line.
-    fn know(&mut self) -> Result<(), ConnectionEnd> {
+    fn identify_station(&mut self) -> Result<(), ConnectionEnd> {
         let token = self.line.strip_prefix(TOKEN).and_then(|token| token.strip_suffix(b"\n"));
         if let Some(stations) = &self.stations {
-            let found = token.and_then(|token| stations.of(token)).map(str::to_owned);
+            let found = token.and_then(|token| stations.station(token)).map(str::to_owned);
             self.station = Some(found.ok_or(ConnectionEnd::UnknownToken)?);
         }
         Ok(())
@@ -128,27 +126,26 @@ impl Preamble {
         self.line.clear();
     }
 
-    /// Packets follow.
+    /// Ends the preamble, as packets follow.
     fn end(&mut self) -> Result<(), ConnectionEnd> {
         self.is_over = true;
         if self.stations.is_some() && self.station.is_none() {
             self.line.clear();
             return Err(ConnectionEnd::NoToken);
         }
-        if self.asks_held && !self.may_ask { Err(ConnectionEnd::NoState) } else { Ok(()) }
+        if self.requests_held && !self.has_checkpoints { Err(ConnectionEnd::NoState) } else { Ok(()) }
     }
 
-    /// Whether the sender asks to be told what checkpoints hold.
-    pub(super) fn asks_held(&self) -> bool {
-        self.asks_held
+    pub(super) fn requests_held(&self) -> bool {
+        self.requests_held
     }
 
-    /// The station whose token the connection gave.
+    /// The station whose token the connection sent.
     pub(super) fn station(&self) -> Option<&str> {
         self.station.as_deref()
     }
 
-    /// Bytes of whole lines before the packets.
+    /// Number of bytes of the lines before the packets.
     pub(super) fn bytes(&self) -> u64 {
         self.bytes
     }
@@ -164,12 +161,12 @@ mod tests {
         Some(Arc::new(Stations::parse("urumqi 0123456789abcdef\nmalargue fedcba9876543210").unwrap()))
     }
 
-    /// Everything that belongs to the packets, or why the connection ends, in pieces of `piece` bytes.
+    /// All bytes that belong to the packets, or why the connection ends. Sends pieces of `piece` bytes.
     fn through(preamble: &mut Preamble, bytes: &[u8], piece: usize) -> Result<Vec<u8>, ConnectionEnd> {
         let mut packets = Vec::new();
         for bytes in bytes.chunks(piece) {
-            let (held, rest) = preamble.take(bytes)?;
-            packets.extend_from_slice(&held);
+            let (buffered, rest) = preamble.take(bytes)?;
+            packets.extend_from_slice(&buffered);
             packets.extend_from_slice(rest);
         }
         packets.extend(preamble.finish()?);
@@ -177,42 +174,42 @@ mod tests {
     }
 
     #[test]
-    fn a_station_is_known_by_its_token_however_it_comes_in_pieces() {
+    fn a_station_is_identified_by_its_token_in_pieces_of_any_size() {
         let packets = b"token and answer are only read before the packets\nanswer held\n";
         for piece in [1, 3, 7, 1000] {
-            for (question, asks) in [(b"".as_slice(), false), (ASKS_HELD, true)] {
+            for (question, asks) in [(b"".as_slice(), false), (HELD_REQUEST, true)] {
                 let mut preamble = Preamble::new(stations(), true);
                 let sent = [TOKEN, SECRET, b"\n", question, &packets[..]].concat();
                 assert_eq!(through(&mut preamble, &sent, piece).as_deref(), Ok(packets.as_slice()));
-                assert_eq!((preamble.station(), preamble.asks_held()), (Some("urumqi"), asks));
+                assert_eq!((preamble.station(), preamble.requests_held()), (Some("urumqi"), asks));
                 assert_eq!(preamble.bytes() as usize, sent.len() - packets.len());
             }
         }
     }
 
     #[test]
-    fn without_the_token_of_a_station_nothing_is_taken() {
+    fn without_the_token_of_a_station_nothing_is_accepted() {
         let ends = |sent: &[u8]| through(&mut Preamble::new(stations(), true), sent, 5).unwrap_err();
         for wrong in [b"0123456789abcdeg".as_slice(), b"0123456789abcde", b"", b"urumqi"] {
             assert_eq!(ends(&[TOKEN, wrong, b"\npackets"].concat()), ConnectionEnd::UnknownToken);
         }
-        // A long line, blanks, another ending, the wrong order, half a line: no token.
+        // A long line, a blank, another line ending, the wrong order and half a line are not tokens.
         let long = [TOKEN, &[b'x'; TOKEN_BYTES_MAX + 1], b"\n"].concat();
         let spaced = [TOKEN, b" ", SECRET, b"\n"].concat();
         let returned = [TOKEN, SECRET, b"\r\n"].concat();
-        let late = [ASKS_HELD, TOKEN, SECRET, b"\n"].concat();
-        for sent in [b"packets".as_slice(), &long, &spaced, &returned, &late, b"token 01234", ASKS_HELD] {
+        let late = [HELD_REQUEST, TOKEN, SECRET, b"\n"].concat();
+        for sent in [b"packets".as_slice(), &long, &spaced, &returned, &late, b"token 01234", HELD_REQUEST] {
             assert_eq!(ends(sent), ConnectionEnd::NoToken, "{}", String::from_utf8_lossy(sent));
         }
-        // Nothing at all, as who looks whether somebody listens: no harm.
+        // A connection without bytes, which only tests whether the ground listens, is accepted.
         assert_eq!(through(&mut Preamble::new(stations(), true), b"", 5), Ok(Vec::new()));
     }
 
     #[test]
-    fn a_ground_that_asks_for_no_token_skips_it() {
-        let sent = [TOKEN, b"whatever-it-is\n", ASKS_HELD, b"packets"].concat();
+    fn a_ground_without_stations_skips_the_token() {
+        let sent = [TOKEN, b"whatever-it-is\n", HELD_REQUEST, b"packets"].concat();
         let mut preamble = Preamble::new(None, true);
         assert_eq!(through(&mut preamble, &sent, 4).as_deref(), Ok(b"packets".as_slice()));
-        assert!(preamble.station().is_none() && preamble.asks_held());
+        assert!(preamble.station().is_none() && preamble.requests_held());
     }
 }

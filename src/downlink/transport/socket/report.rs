@@ -1,4 +1,4 @@
-//! Reports on what came over a socket: from whom, how much, and how it ended.
+//! Reports on connections and datagrams: senders, amounts, and how connections ended.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -13,10 +13,10 @@ use crate::downlink::receive::ReceptionCounters;
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::wire::Format;
 
-/// Begins an answer after which a sender may try again.
+/// Beginning of an answer after which a sender may try again.
 pub(super) const BUSY: &str = "busy: ";
 
-/// Begins an answer after which it is of no use to try again.
+/// Beginning of an answer after which trying again is useless.
 pub(super) const CLOSED: &str = "closed ";
 
 /// How a connection ended.
@@ -24,42 +24,42 @@ pub(super) const CLOSED: &str = "closed ";
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum ConnectionEnd {
-    /// The sender closed it.
+    /// The sender closed the connection.
     Whole,
-    /// It broke.
+    /// The connection broke.
     Broken,
     /// The ground ended its run.
     Stopped,
-    /// No sound packet or frame within `first_packet_s_max`.
+    /// No valid packet or frame came within `first_packet_s_max`.
     FirstPacket,
-    /// No sound packet or frame for `idle_s_max`.
+    /// No valid packet or frame came for `idle_s_max`.
     Idle,
-    /// No sound packet or frame in `garbage_bytes_max` bytes.
+    /// No valid packet or frame came in `garbage_bytes_max` bytes.
     Garbage,
-    /// More than `memory_bytes_max` of incomplete data.
+    /// The incomplete data exceeded `memory_bytes_max`.
     Memory,
-    /// A description of another instrument than the ground's.
+    /// The sender described another instrument than the ground's.
     OtherInstrument,
-    /// A description of an instrument of which the ground can make no maps.
+    /// The sender described an instrument that the ground cannot map.
     UnfitInstrument,
-    /// The ground knows no instrument, and this one came without visibilities and their positions.
+    /// The ground had no instrument, and no visibilities with positions confirmed the sender's.
     Unconfirmed,
-    /// It asked to be told what checkpoints hold, and the ground has no state.
+    /// The sender requested `held`, and the ground has no checkpoints.
     NoState,
-    /// It did not begin with a token.
+    /// The connection did not begin with a token.
     NoToken,
-    /// It began with a token that no station has.
+    /// The connection began with a token that no station has.
     UnknownToken,
-    /// Its packets could not be written into the raw archive.
+    /// The packets could not be written to the raw archive.
     NotOnDisk,
-    /// All places were taken, and it was the least useful.
+    /// The connection was evicted for a new one.
     GaveWay,
-    /// Its receiver failed: a bug in the program.
+    /// The receiver panicked, which is a bug in the program.
     Failed,
 }
 
 impl ConnectionEnd {
-    /// All of them.
+    /// All ends.
     pub const ALL: [Self; 16] = [
         Self::Whole,
         Self::Broken,
@@ -86,52 +86,53 @@ impl fmt::Display for ConnectionEnd {
             Self::Whole => "the sender closed it",
             Self::Broken => "the connection broke",
             Self::Stopped => "the ground ended its run",
-            Self::FirstPacket => "no sound packet within downlink.listen.first_packet_s_max",
-            Self::Idle => "no sound packet for downlink.listen.idle_s_max",
-            Self::Garbage => "no sound packet in downlink.listen.garbage_bytes_max",
+            Self::FirstPacket => "no valid packet within downlink.listen.first_packet_s_max",
+            Self::Idle => "no valid packet for downlink.listen.idle_s_max",
+            Self::Garbage => "no valid packet in downlink.listen.garbage_bytes_max",
             Self::Memory => "more incomplete data than downlink.listen.memory_bytes_max",
             Self::OtherInstrument => "packets of another instrument than the ground's",
             Self::UnfitInstrument => "an instrument that does not fit the ground's configuration",
             Self::Unconfirmed => {
-                "no visibilities with positions confirmed its instrument, and the ground knows none"
+                "no visibilities with positions confirmed its instrument, and the ground has none"
             }
             Self::NoState => {
-                "it asks for `held`, and the ground has no checkpoints; expected a ground with --state"
+                "it requests `held`, and the ground has no checkpoints; expected a ground with --state"
             }
             Self::NoToken => "it did not begin with `token TOKEN`, and the ground has --stations",
             Self::UnknownToken => "no station has its token",
-            Self::NotOnDisk => "its packets could not be written into the archive; it has to send them again",
-            Self::GaveWay => "it gave way to another; all downlink.listen.connections_max were taken",
+            Self::NotOnDisk => "its packets could not be written to the archive; it has to send them again",
+            Self::GaveWay => {
+                "it gave way to another connection, as downlink.listen.connections_max were open"
+            }
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
     }
 }
 
-/// One connection.
+/// The report on one connection.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SenderReport {
-    /// Its address.
+    /// Address of the sender.
     pub peer: String,
-    /// The station whose token it gave.
+    /// The station whose token the sender gave.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub station: Option<String>,
-    /// Format of its stream, if it was detected.
+    /// Format of the stream, if it was detected.
     pub format: Option<Format>,
-    /// Bytes read.
+    /// Number of bytes read.
     pub bytes: u64,
-    /// Sound packets passed to the ground.
+    /// Number of valid packets forwarded to the ground.
     pub packets: u64,
-    /// How it ended.
+    /// How the connection ended.
     pub ended: ConnectionEnd,
 }
 
-/// Something that happened to a connection, told when it happens. As a value it has the field `event`.
+/// A note about an event of a connection, reported when it happens. In JSON, its field `event` has the kind of event.
 #[derive(Debug, Serialize)]
 pub struct ListenNote<'a> {
-    /// What it was.
     #[serde(flatten)]
-    pub(super) what: ListenEvent<'a>,
-    /// Notes before it that were not told, as there were too many.
+    pub(super) event: ListenEvent<'a>,
+    /// Number of notes before this one that were suppressed, as there were too many.
     #[serde(skip_serializing_if = "is_zero")]
     pub(super) untold: u64,
 }
@@ -139,11 +140,11 @@ pub struct ListenNote<'a> {
 #[derive(Debug, Serialize)]
 #[serde(tag = "event", rename_all = "kebab-case")]
 pub(super) enum ListenEvent<'a> {
-    /// It ended.
+    /// A connection ended.
     Sender(&'a SenderReport),
-    /// It found no place.
+    /// A connection was refused, as there was no slot.
     SenderRefused { peer: String },
-    /// It could not be accepted.
+    /// A connection could not be accepted.
     AcceptFailed { reason: String },
 }
 
@@ -153,22 +154,22 @@ fn is_zero(count: &u64) -> bool {
 }
 
 impl ListenNote<'_> {
-    /// Whether it is the regular end of a connection.
+    /// Whether the note is the regular end of a connection.
     #[must_use]
     pub fn is_regular(&self) -> bool {
-        matches!(self.what, ListenEvent::Sender(SenderReport { ended: ConnectionEnd::Whole, .. }))
+        matches!(self.event, ListenEvent::Sender(SenderReport { ended: ConnectionEnd::Whole, .. }))
     }
 }
 
 impl fmt::Display for ListenNote<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.what {
+        match &self.event {
             ListenEvent::Sender(SenderReport { peer, station, bytes, packets, ended, .. }) => {
                 let station = station.iter().map(|name| format!(" ({name})")).collect::<String>();
                 write!(f, "{peer}{station}: {bytes} bytes, {packets} packets; {ended}")
             }
             ListenEvent::SenderRefused { peer } => {
-                write!(f, "{peer}: refused; there are downlink.listen.connections_max others")
+                write!(f, "{peer}: refused; downlink.listen.connections_max other connections are open")
             }
             ListenEvent::AcceptFailed { reason } => write!(f, "cannot accept a connection: {reason}"),
         }?;
@@ -179,90 +180,90 @@ impl fmt::Display for ListenNote<'_> {
     }
 }
 
-/// What came from a station.
+/// Counters of a station.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct StationCounts {
-    /// Its connections that have ended.
+    /// Number of its connections that have ended.
     pub connections: u64,
-    /// Bytes read, also from those that are open.
+    /// Number of bytes read, including those of open connections.
     pub bytes: u64,
-    /// Sound packets passed to the ground by those that have ended.
+    /// Number of valid packets that ended connections have forwarded to the ground.
     pub packets: u64,
-    /// When a sound packet or frame came last.
+    /// When the last valid packet or frame came.
     #[serde(skip)]
     pub heard: Option<Instant>,
 }
 
-/// What came in datagrams.
+/// Counters of datagrams.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct DatagramReport {
     /// Address on which the ground listens.
     pub address: String,
-    /// Datagrams received.
+    /// Number of datagrams received.
     pub received: u64,
-    /// Bytes in them.
+    /// Number of bytes in them.
     pub bytes: u64,
-    /// Sound packets passed to the ground.
+    /// Number of valid packets forwarded to the ground.
     pub packets: u64,
-    /// Datagrams without a sound packet or frame.
+    /// Datagrams without a valid packet or frame.
     pub malformed: u64,
     /// Datagrams of another instrument than the ground's.
     pub refused: u64,
-    /// Datagrams that the system dropped because they came faster than they were read; `None` if it does not say.
+    /// Datagrams that the system dropped because they came faster than they were read; `None` if the system does not report it.
     pub dropped_by_system: Option<u64>,
 }
 
-/// All connections of a run.
+/// The report on all connections and datagrams of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ListenReport {
     /// Address on which the ground listened.
     pub address: String,
-    /// Accepted connections.
+    /// Number of accepted connections.
     pub connections: u64,
-    /// Connections refused because `connections_max` were open, all of them useful.
+    /// Number of connections refused because `connections_max` active ones were open.
     pub refused: u64,
-    /// Bytes read.
+    /// Number of bytes read.
     pub bytes: u64,
-    /// Sound packets passed to the ground.
+    /// Number of valid packets forwarded to the ground.
     pub packets: u64,
-    /// Sound packets refused because their connection described another instrument.
+    /// Number of valid packets refused because of their sender's instrument.
     pub packets_refused: u64,
-    /// Largest backlog of packets, bytes.
+    /// Maximum backlog of packets, bytes.
     pub backlog_bytes_max: u64,
-    /// Connections by end.
+    /// Number of connections by end.
     pub ended: BTreeMap<ConnectionEnd, u64>,
-    /// What came in datagrams, if the ground listens for them.
+    /// Counters of datagrams, if the ground listens for them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub datagrams: Option<DatagramReport>,
-    /// What came from each station that is known by its token.
+    /// Counters of each station, by name.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub stations: BTreeMap<String, StationCounts>,
-    /// The first connections.
+    /// Reports on the first connections.
     pub senders: Listing<SenderReport>,
-    /// Counters of everything in the streams but packets.
+    /// Counters of everything in the streams except valid packets.
     #[serde(skip)]
     pub(super) streams: ReceptionCounters,
 }
 
 impl ListenReport {
-    /// Adds what the pipeline has not seen to the counters of a reception: everything but packets.
+    /// Adds the counters of everything except valid packets, which the pipeline does not receive.
     pub fn complete(&self, reception: &mut ReceptionCounters) {
         reception.add_stream(&self.streams);
     }
 
-    /// Stations that may send.
-    pub(super) fn know<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+    /// Adds the stations that may send, so that the report also shows those that never do.
+    pub(super) fn add_stations<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         self.stations.extend(names.map(|name| (name.to_owned(), StationCounts::default())));
     }
 
-    /// Counts bytes from a station; `is_sound` if there was a sound packet or frame among them.
-    pub(super) fn hear(&mut self, station: &str, bytes: u64, is_sound: bool) {
+    /// Counts bytes from a station; `has_valid` if there was a valid packet or frame among them.
+    pub(super) fn record_bytes(&mut self, station: &str, bytes: u64, has_valid: bool) {
         if !self.stations.contains_key(station) {
             self.stations.insert(station.to_owned(), StationCounts::default());
         }
         if let Some(counts) = self.stations.get_mut(station) {
             counts.bytes += bytes;
-            counts.heard = if is_sound { Some(Instant::now()) } else { counts.heard };
+            counts.heard = if has_valid { Some(Instant::now()) } else { counts.heard };
         }
     }
 
@@ -322,56 +323,54 @@ pub struct ListenStatus {
     pub(super) open: AtomicUsize,
     pub(super) bytes: AtomicU64,
     pub(super) backlog_bytes: AtomicU64,
-    /// Connections that wait for room in the backlog.
+    /// Number of connections that wait for space in the backlog.
     pub(super) waiting: AtomicUsize,
-    /// Ended connections that delivered packets.
+    /// Number of ended connections that delivered packets.
     pub(super) done: AtomicU64,
-    /// When the last sound packet or frame arrived.
-    heard: Mutex<Option<Instant>>,
+    /// When the last valid packet or frame arrived.
+    last_activity: Mutex<Option<Instant>>,
 }
 
 impl ListenStatus {
-    /// Open connections.
+    /// Number of open connections.
     #[must_use]
     pub fn open(&self) -> usize {
         self.open.load(Ordering::Relaxed)
     }
 
-    /// Bytes read so far.
+    /// Number of bytes read.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Time since the last sound packet or frame from anyone; `None` before the first.
+    /// Time since the last valid packet or frame from any sender; `None` before the first.
     #[must_use]
     pub fn silence(&self) -> Option<Duration> {
-        self.heard.lock().unwrap_or_else(PoisonError::into_inner).map(|heard| heard.elapsed())
+        self.last_activity.lock().unwrap_or_else(PoisonError::into_inner).map(|instant| instant.elapsed())
     }
 
-    /// A sound packet or frame has arrived.
-    pub(super) fn note_heard(&self) {
-        *self.heard.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
+    pub(super) fn record_activity(&self) {
+        *self.last_activity.lock().unwrap_or_else(PoisonError::into_inner) = Some(Instant::now());
     }
 
-    /// Marks the backlog as empty.
     pub(super) fn clear_backlog(&self) {
         self.backlog_bytes.store(0, Ordering::Relaxed);
     }
 
-    /// Backlog of packets at the last addition, bytes.
+    /// Backlog of packets after the last addition, bytes.
     #[must_use]
     pub fn backlog_bytes(&self) -> u64 {
         self.backlog_bytes.load(Ordering::Relaxed)
     }
 }
 
-/// Status and report, shared between threads.
+/// Status and report of a listening ground, shared between threads.
 #[derive(Clone, Debug, Default)]
 pub struct Listening {
     /// Live status.
     pub status: Arc<ListenStatus>,
-    /// Where packets are kept before they are taken, if they are.
+    /// The raw archive, if packets are kept.
     pub archive: Option<PacketArchive>,
     report: Arc<Mutex<ListenReport>>,
 }

@@ -1,4 +1,4 @@
-//! Sends a byte stream over TCP: the spacecraft's end of a connection.
+//! The sink that sends a byte stream over TCP, on the spacecraft.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpStream};
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use super::answers::ASKS_HELD;
+use super::answers::HELD_REQUEST;
 use super::error::SocketError;
 use super::preamble::TOKEN;
 use super::report::{BUSY, CLOSED};
@@ -15,43 +15,41 @@ use crate::downlink::error::DownlinkError;
 use crate::runtime::{Cancel, Sink, Units};
 use crate::units::printable;
 
-/// Longest blocking of a system call between two checks for the end of the run.
+/// Maximum time that a system call blocks between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(200);
 
-/// Patience with a stalled receiver once the run has been cancelled.
+/// Maximum wait for a stalled receiver once the run has been cancelled.
 const GRACE: Duration = Duration::from_secs(10);
 
-/// Bytes sent between two checks of the rate.
+/// Number of bytes sent between two checks of the rate.
 const PIECE_BYTES: usize = 1 << 16;
 
-/// Bytes kept from the beginning, to be sent again to a receiver that was busy.
+/// Maximum number of bytes that are kept from the beginning of the stream, to send them again to a receiver that was busy.
 const RESEND_BYTES_MAX: usize = 1 << 24;
 
-/// Pause before the first new attempt; each further one is twice as long, up to the longest.
+/// Pause before the first new attempt; it doubles with each attempt, up to [`PAUSE_MAX`].
 const PAUSE: Duration = Duration::from_millis(200);
 const PAUSE_MAX: Duration = Duration::from_secs(5);
 
-/// Maximum length of an answer, bytes.
 const ANSWER_BYTES_MAX: u64 = 1 << 10;
 
 /// Options for sending.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SendOptions {
-    /// Time limit for connecting, and for finding a receiver that is busy free again, s.
+    /// Time limit for connecting and for attempts to reach a busy receiver, s.
     pub connect_s: f64,
-    /// Maximum rate, bytes/s; 0 for as fast as the receiver reads.
+    /// Maximum rate, bytes per second; 0 for no limit.
     pub bytes_per_s: f64,
-    /// Whether to wait until a checkpoint of the receiver holds everything.
+    /// Whether to wait until a checkpoint of the receiver contains everything.
     pub held: bool,
-    /// Token of the station, for a receiver that asks for one.
+    /// Token of the station, for a receiver that requires one.
     pub token: Option<String>,
 }
 
-/// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not
-/// read.
+/// Sends a byte stream to a listening ground. Connects with the first bytes, and blocks while the receiver does not read.
 ///
-/// A receiver that is busy, or loses the connection, is tried again with the stream from its beginning, as long as that
-/// is kept: what was received before is not applied twice.
+/// If the receiver is busy or the connection breaks, the sink connects again and sends the stream from its beginning, while
+/// that is kept. The ground does not apply packets twice.
 #[derive(Debug)]
 pub struct SocketSink {
     url: TcpUrl,
@@ -62,13 +60,13 @@ pub struct SocketSink {
     /// When the first byte was sent.
     since: Instant,
     bytes: u64,
-    /// The stream from its beginning; `None` once it is longer than what is kept.
+    /// The stream from its beginning; `None` once it exceeds [`RESEND_BYTES_MAX`].
     sent: Option<Vec<u8>>,
     confirmed: Arc<AtomicU64>,
 }
 
 impl SocketSink {
-    /// A sink that is not connected yet.
+    /// A sink without a connection.
     ///
     /// # Errors
     /// The host has no address.
@@ -86,7 +84,7 @@ impl SocketSink {
         })
     }
 
-    /// Bytes that the receiver has confirmed: all of them, or none without an answer.
+    /// Number of bytes that the receiver has confirmed: all, or 0 before its answer.
     #[must_use]
     pub fn confirmed(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.confirmed)
@@ -115,7 +113,6 @@ impl SocketSink {
         }
     }
 
-    /// Waits, but not once the run has been cancelled.
     fn pause(&self, length: Duration) {
         let until = Instant::now() + length;
         while let Some(left) = until.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
@@ -126,7 +123,7 @@ impl SocketSink {
         }
     }
 
-    /// Sends pieces on a connection, a new one if there is none.
+    /// Sends bytes in pieces, on a new connection if there is none.
     fn send_all(&mut self, bytes: &[u8]) -> Result<(), SocketError> {
         let mut stream = match self.stream.take() {
             Some(stream) => stream,
@@ -136,7 +133,7 @@ impl SocketSink {
                     self.send(&mut stream, &[TOKEN, token.as_bytes(), b"\n"].concat())?;
                 }
                 if self.options.held {
-                    self.send(&mut stream, ASKS_HELD)?;
+                    self.send(&mut stream, HELD_REQUEST)?;
                 }
                 (self.since, self.bytes) = (Instant::now(), 0);
                 stream
@@ -144,7 +141,7 @@ impl SocketSink {
         };
         for piece in bytes.chunks(PIECE_BYTES) {
             self.send(&mut stream, piece)?;
-            self.hold_back();
+            self.limit_rate();
         }
         self.stream = Some(stream);
         Ok(())
@@ -159,7 +156,7 @@ impl SocketSink {
         }
         match answer.starts_with(BUSY) {
             true => Err(self.closed()(answer)),
-            // It has ended, or is one that does not know the question.
+            // The receiver has ended, or does not support the request.
             false if self.options.held => {
                 Err(self.closed()(format!("no checkpoint is known to hold them; it answered {answer:?}")))
             }
@@ -167,7 +164,7 @@ impl SocketSink {
         }
     }
 
-    /// The answer after which the sender has no more to do.
+    /// The answer that confirms everything.
     fn expected(&self) -> String {
         let bytes = self.bytes;
         match self.options.held {
@@ -176,14 +173,14 @@ impl SocketSink {
         }
     }
 
-    /// After a failure, does the same again with all that was sent so far, until it succeeds or the time is over.
+    /// After a failure, sends the kept stream again and repeats `operation`, until it succeeds or the time limit is reached.
     fn retry<T>(
         &mut self,
         failure: SocketError,
-        again: impl Fn(&mut Self) -> Result<T, SocketError>,
+        operation: impl Fn(&mut Self) -> Result<T, SocketError>,
     ) -> Result<T, SocketError> {
         let (since, mut failure, mut pause, mut attempts) = (Instant::now(), failure, PAUSE, 0);
-        while self.may_try_again(&failure) && since.elapsed().as_secs_f64() < self.options.connect_s {
+        while self.may_retry(&failure) && since.elapsed().as_secs_f64() < self.options.connect_s {
             self.pause(pause);
             pause = (2 * pause).min(PAUSE_MAX);
             attempts += 1;
@@ -191,9 +188,9 @@ impl SocketSink {
             let Some(sent) = self.sent.take() else { break };
             let resent = self.send_all(&sent);
             self.sent = Some(sent);
-            match resent.and_then(|()| again(self)) {
-                Ok(done) => return Ok(done),
-                // The reason why it closed says more than that nobody listens now.
+            match resent.and_then(|()| operation(self)) {
+                Ok(result) => return Ok(result),
+                // The earlier reason is more useful than a failed connection.
                 Err(SocketError::Connect { .. }) => {}
                 Err(error) => failure = error,
             }
@@ -209,14 +206,14 @@ impl SocketSink {
         }
     }
 
-    /// Whether the receiver may take the stream from its beginning: it was busy, or the connection broke.
-    fn may_try_again(&self, failure: &SocketError) -> bool {
+    /// Whether the stream can be sent again from its beginning, as the receiver was busy or the connection broke.
+    fn may_retry(&self, failure: &SocketError) -> bool {
         let SocketError::Closed { reason, .. } = failure else { return false };
         let is_final = reason.starts_with(CLOSED);
         self.sent.is_some() && !is_final && !self.cancel.is_cancelled()
     }
 
-    /// Keeps bytes for another attempt, as long as there is room.
+    /// Keeps bytes for another attempt, unless the stream has become too long.
     fn keep(&mut self, bytes: &[u8]) {
         if let Some(sent) = &mut self.sent {
             match sent.len() + bytes.len() <= RESEND_BYTES_MAX {
@@ -226,49 +223,50 @@ impl SocketSink {
         }
     }
 
+    /// Makes the error of a closed connection from its reason.
     fn closed<E: ToString>(&self) -> impl Fn(E) -> SocketError + use<E> {
         let (url, bytes) = (self.url.clone(), self.bytes);
-        // The receiver's words are shown as they are, but for what a terminal would take for a command.
+        // The receiver's answer may contain control characters, which a terminal would interpret.
         let shown = |reason: E| printable(&reason.to_string()).into_owned();
         move |reason| SocketError::Closed { url: url.to_string(), bytes, reason: shown(reason) }
     }
 
     /// Sends a piece; blocks while the receiver does not read.
     fn send(&mut self, stream: &mut TcpStream, mut piece: &[u8]) -> Result<(), SocketError> {
-        let mut taken = Instant::now();
+        let mut progress = Instant::now();
         while !piece.is_empty() {
             match stream.write(piece) {
-                Ok(0) => return Err(self.refused(stream, &"it accepts no more bytes")),
+                Ok(0) => return Err(self.refusal(stream, &"it accepts no more bytes")),
                 Ok(bytes) => {
                     self.bytes += bytes as u64;
                     piece = &piece[bytes..];
-                    taken = Instant::now();
+                    progress = Instant::now();
                 }
-                Err(error) if may_go_on(&error) => self.require_patience(taken, "read the rest")?,
-                Err(error) => return Err(self.refused(stream, &error)),
+                Err(error) if is_transient(&error) => self.require_progress(progress, "read the rest")?,
+                Err(error) => return Err(self.refusal(stream, &error)),
             }
         }
         Ok(())
     }
 
-    /// The receiver closed the connection; it may have sent a reason.
-    fn refused(&self, stream: &mut TcpStream, error: &dyn ToString) -> SocketError {
-        let mut said = String::new();
-        let _ = stream.take(ANSWER_BYTES_MAX).read_to_string(&mut said);
-        let reason = if said.trim().is_empty() { error.to_string() } else { said.trim().to_owned() };
+    /// The error of a connection that the receiver has closed, with the reason that it may have sent.
+    fn refusal(&self, stream: &mut TcpStream, error: &dyn ToString) -> SocketError {
+        let mut answer = String::new();
+        let _ = stream.take(ANSWER_BYTES_MAX).read_to_string(&mut answer);
+        let reason = if answer.trim().is_empty() { error.to_string() } else { answer.trim().to_owned() };
         self.closed()(reason)
     }
 
-    /// After cancellation, limits the wait for a stalled receiver, which does not do `what`.
-    fn require_patience(&self, since: Instant, what: &str) -> Result<(), SocketError> {
+    /// Limits the wait for a stalled receiver after cancellation; the receiver does not do `what`.
+    fn require_progress(&self, since: Instant, what: &str) -> Result<(), SocketError> {
         match self.cancel.is_cancelled() && since.elapsed() > GRACE {
-            true => Err(self.closed()(format!("the run was ended early, and the receiver does not {what}"))),
+            true => Err(self.closed()(format!("the run was interrupted, and the receiver does not {what}"))),
             false => Ok(()),
         }
     }
 
-    /// Waits as long as the rate requires, counted from the first byte.
-    fn hold_back(&self) {
+    /// Waits as long as the maximum rate requires, counted from the first byte.
+    fn limit_rate(&self) {
         if self.options.bytes_per_s <= 0.0 {
             return;
         }
@@ -281,32 +279,32 @@ impl SocketSink {
         }
     }
 
-    /// The receiver's answer after the last byte.
+    /// Ends the stream and reads the receiver's answer.
     fn answer(&self, stream: &mut TcpStream) -> Result<String, SocketError> {
         if let Err(error) = stream.shutdown(Shutdown::Write) {
-            return Err(self.refused(stream, &error));
+            return Err(self.refusal(stream, &error));
         }
         let since = Instant::now();
-        let mut said = Vec::new();
+        let mut answer = Vec::new();
         let mut piece = [0; 256];
         loop {
             match stream.read(&mut piece) {
-                Ok(0) => return Ok(String::from_utf8_lossy(&said).trim().to_owned()),
-                Ok(bytes) if said.len() as u64 + bytes as u64 > ANSWER_BYTES_MAX => {
+                Ok(0) => return Ok(String::from_utf8_lossy(&answer).trim().to_owned()),
+                Ok(bytes) if answer.len() as u64 + bytes as u64 > ANSWER_BYTES_MAX => {
                     return Err(self.closed()("its answer is not a line of text"));
                 }
-                Ok(bytes) => said.extend_from_slice(&piece[..bytes]),
-                Err(error) if may_go_on(&error) => self.require_patience(since, "answer")?,
-                Err(error) if said.is_empty() => return Err(self.closed()(error)),
-                // What it said before the connection broke says more.
-                Err(_) => return Err(self.closed()(String::from_utf8_lossy(&said).trim().to_owned())),
+                Ok(bytes) => answer.extend_from_slice(&piece[..bytes]),
+                Err(error) if is_transient(&error) => self.require_progress(since, "answer")?,
+                Err(error) if answer.is_empty() => return Err(self.closed()(error)),
+                // The beginning of an answer is more useful than the error.
+                Err(_) => return Err(self.closed()(String::from_utf8_lossy(&answer).trim().to_owned())),
             }
         }
     }
 }
 
-/// Whether the operation may be tried again.
-fn may_go_on(error: &io::Error) -> bool {
+/// Whether a system call can be repeated after an error.
+fn is_transient(error: &io::Error) -> bool {
     use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
     matches!(error.kind(), Interrupted | TimedOut | WouldBlock)
 }
@@ -320,7 +318,7 @@ impl Sink for SocketSink {
         self.keep(&bytes);
         match sent {
             Ok(()) => Ok(()),
-            // All that is kept includes these bytes.
+            // The kept stream includes these bytes.
             Err(failure) => Ok(self.retry(failure, |_| Ok(()))?),
         }
     }

@@ -1,4 +1,4 @@
-//! The packets of all senders, as a source.
+//! The source of the packets of all senders.
 
 use std::io;
 use std::net::SocketAddr;
@@ -13,30 +13,30 @@ use super::accept::listen;
 use super::answers::HeldAnswers;
 use super::config::ListenConfig;
 use super::error::SocketError;
+use super::instrument_filter::{InstrumentCheck, SharedReception};
 use super::listener::{ListenContext, ListenLimits, NoteHandler, Notes, PacketBatch};
 use super::report::{DatagramReport, Listening};
-use super::seats::Seats;
-use super::sender_intake::{InstrumentCheck, Mission};
+use super::slots::ConnectionSlots;
 use super::stations::Stations;
-use super::url::{TcpUrl, udp_name};
+use super::url::{TcpUrl, udp_url};
 use crate::downlink::error::DownlinkError;
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::Instrument;
 use crate::runtime::{Flow, Outlet, Source, Units};
 
-/// Longest wait for packets between two checks for the end of the run.
+/// Maximum wait for packets between two checks for the end of the run.
 const POLL: Duration = Duration::from_millis(100);
 
-/// Listens, and passes on whole packets of all senders in the order in which they are found.
+/// Listens, and forwards the complete packets of all senders in the order in which they are found.
 pub struct SocketSource {
     addresses: Vec<String>,
     config: ListenConfig,
     until: ListenLimits,
-    /// Set until the run starts.
-    waiting: Option<(Option<std::net::TcpListener>, Mission, NoteHandler)>,
+    /// What the listener's thread needs; `None` once it has started.
+    pending: Option<PendingListener>,
     datagrams: Option<std::net::UdpSocket>,
     running: Option<(Receiver<PacketBatch>, JoinHandle<()>)>,
-    room: Arc<Semaphore>,
+    backlog: Arc<Semaphore>,
     held: Option<HeldAnswers>,
     archive: Option<PacketArchive>,
     stations: Option<Arc<Stations>>,
@@ -45,9 +45,15 @@ pub struct SocketSource {
     bytes: u64,
 }
 
+struct PendingListener {
+    listener: Option<std::net::TcpListener>,
+    reception: SharedReception,
+    note_handler: NoteHandler,
+}
+
 impl SocketSource {
-    /// Binds one of the addresses; without any, only datagrams come. Senders may connect from now on; they are served when the run
-    /// starts.
+    /// Binds one of the addresses; without addresses, the source receives only datagrams. Senders can connect from now on, and
+    /// are served once the run starts.
     ///
     /// # Errors
     /// No address can be bound.
@@ -57,9 +63,9 @@ impl SocketSource {
         until: ListenLimits,
     ) -> Result<Self, SocketError> {
         let failed = |source| {
-            let none = SocketAddr::from(([0, 0, 0, 0], 0));
+            let unspecified = SocketAddr::from(([0, 0, 0, 0], 0));
             SocketError::Listen {
-                url: TcpUrl::from(addresses.first().copied().unwrap_or(none)).to_string(),
+                url: TcpUrl::from(addresses.first().copied().unwrap_or(unspecified)).to_string(),
                 source,
             }
         };
@@ -69,17 +75,24 @@ impl SocketSource {
             Ok((TcpUrl::from(listener.local_addr()?).to_string(), listener))
         };
         let bound = (!addresses.is_empty()).then(bind).transpose().map_err(failed)?;
-        let (addresses, listener) = bound.map_or((Vec::new(), None), |(url, it)| (vec![url], Some(it)));
+        let (addresses, listener) = match bound {
+            Some((url, listener)) => (vec![url], Some(listener)),
+            None => (Vec::new(), None),
+        };
         let listening = Listening::default();
         listening.write().address = addresses.concat();
         Ok(Self {
             addresses,
             config: config.clone(),
             until,
-            waiting: Some((listener, Mission::default(), Box::new(|_| {}))),
+            pending: Some(PendingListener {
+                listener,
+                reception: SharedReception::default(),
+                note_handler: Box::new(|_| {}),
+            }),
             datagrams: None,
             running: None,
-            room: Arc::new(Semaphore::new(ListenContext::room_bytes(config))),
+            backlog: Arc::new(Semaphore::new(ListenContext::backlog_capacity(config))),
             held: None,
             archive: None,
             stations: None,
@@ -89,7 +102,7 @@ impl SocketSource {
         })
     }
 
-    /// Listens for datagrams too, each a packet or a frame, at one of the addresses.
+    /// Also receives datagrams, each with packets or a frame, at one of the addresses.
     ///
     /// # Errors
     /// No address can be bound.
@@ -97,10 +110,10 @@ impl SocketSource {
         let bind = || {
             let socket = std::net::UdpSocket::bind(addresses)?;
             socket.set_nonblocking(true)?;
-            Ok((udp_name(socket.local_addr()?), socket))
+            Ok((udp_url(socket.local_addr()?), socket))
         };
         let failed = |source| SocketError::Listen {
-            url: addresses.first().map_or(String::new(), |first| udp_name(*first)),
+            url: addresses.first().map_or(String::new(), |first| udp_url(*first)),
             source,
         };
         let (address, socket) = bind().map_err(failed)?;
@@ -111,78 +124,79 @@ impl SocketSource {
         Ok(self)
     }
 
-    /// Accepts packets of this instrument only; with `None`, of the first whose visibilities come with positions.
+    /// Accepts packets of this instrument only. With `None`, the source adopts the first instrument whose visibilities come with
+    /// positions.
     #[must_use]
-    pub fn knowing(self, instrument: Option<Instrument>) -> Self {
-        if let (Some((_, mission, _)), Some(instrument)) = (&self.waiting, &instrument) {
-            mission.confirm(instrument);
+    pub fn with_instrument(self, instrument: Option<Instrument>) -> Self {
+        if let (Some(pending), Some(instrument)) = (&self.pending, &instrument) {
+            pending.reception.adopt_or_compare(instrument);
         }
         self
     }
 
-    /// Accepts an instrument only if `fits` says so.
+    /// Adopts an instrument only if `is_supported` returns true.
     #[must_use]
-    pub fn accepting(mut self, fits: InstrumentCheck) -> Self {
-        if let Some((listener, mission, tell)) = self.waiting.take() {
-            self.waiting = Some((listener, mission.accepting(fits), tell));
+    pub fn with_instrument_check(mut self, is_supported: InstrumentCheck) -> Self {
+        if let Some(pending) = &mut self.pending {
+            pending.reception.set_instrument_check(is_supported);
         }
         self
     }
 
-    /// Answers senders that ask what checkpoints hold, through `answers`; the ground that writes them has to share it. Without it they
-    /// are refused.
+    /// Answers senders that request `held`, through `answers`, which the ground that writes the checkpoints must share. Without
+    /// it such senders are refused.
     #[must_use]
-    pub fn answering(mut self, answers: &HeldAnswers) -> Self {
+    pub fn with_held_answers(mut self, answers: &HeldAnswers) -> Self {
         self.held = Some(answers.clone());
         self
     }
 
-    /// Keeps packets in `archive` before it tells a sender that they are taken.
+    /// Keeps packets in `archive` before they are acknowledged to their sender.
     #[must_use]
-    pub fn keeping(mut self, archive: &PacketArchive) -> Self {
+    pub fn with_archive(mut self, archive: &PacketArchive) -> Self {
         self.archive = Some(archive.clone());
         self.listening.archive = Some(archive.clone());
         self
     }
 
-    /// Takes packets of these stations only.
+    /// Accepts packets of these stations only.
     #[must_use]
-    pub fn of_stations(mut self, stations: Stations) -> Self {
-        // Also those that never send.
-        self.listening.write().know(stations.names());
+    pub fn with_stations(mut self, stations: Stations) -> Self {
+        self.listening.write().add_stations(stations.names());
         self.stations = Some(Arc::new(stations));
         self
     }
 
-    /// Reports what happens to connections, one note at a time.
+    /// Calls `note_handler` with events of connections.
     #[must_use]
-    pub fn telling(mut self, tell: NoteHandler) -> Self {
-        if let Some((_, _, teller)) = &mut self.waiting {
-            *teller = tell;
+    pub fn with_note_handler(mut self, note_handler: NoteHandler) -> Self {
+        if let Some(pending) = &mut self.pending {
+            pending.note_handler = note_handler;
         }
         self
     }
 
-    /// The addresses bound, with the ports that the system chose for port 0.
+    /// The bound addresses, with the ports that the system chose for port 0.
     #[must_use]
     pub fn addresses(&self) -> &[String] {
         &self.addresses
     }
 
-    /// Status and report of its connections.
+    /// Status and report of the connections.
     #[must_use]
     pub fn listening(&self) -> Listening {
         self.listening.clone()
     }
 
-    /// Starts the listener's thread.
     fn start(&mut self) -> Result<(), SocketError> {
-        let Some((listener, mission, tell)) = self.waiting.take() else { return Ok(()) };
+        let Some(PendingListener { listener, reception, note_handler }) = self.pending.take() else {
+            return Ok(());
+        };
         let failed = |source: io::Error| SocketError::Start { source };
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_io()
             .enable_time()
-            // Two more: packets of a connection that ends reach the disk while another takes its place, and datagrams.
+            // Two more: for datagrams, and for a connection whose packets are synchronised to disk while another has its slot.
             .max_blocking_threads(self.config.connections_max + 2)
             .thread_name("listen-work")
             .build()
@@ -193,23 +207,23 @@ impl SocketSource {
             let datagrams = self.datagrams.take().map(tokio::net::UdpSocket::from_std);
             (listener, datagrams.transpose().map_err(failed)?)
         };
-        // Bounded by the room that batches occupy.
+        // Bounded by the space that batches occupy in the backlog.
         let (batches, receiver) = unbounded();
         let shared = Arc::new(ListenContext {
             config: self.config.clone(),
             until: self.until,
-            mission,
+            reception,
             listening: self.listening.clone(),
-            seats: Seats::default(),
-            room: Arc::clone(&self.room),
+            slots: ConnectionSlots::default(),
+            backlog: Arc::clone(&self.backlog),
             batches,
-            passed: Mutex::new(0),
+            forwarded: Mutex::new(0),
             held: self.held.clone(),
             archive: self.archive.clone(),
             stations: self.stations.clone(),
             stop: Arc::clone(&self.stop),
-            notes: Notes::new(tell),
-            sign: Mutex::new(tokio::time::Instant::now()),
+            notes: Notes::new(note_handler),
+            last_activity: Mutex::new(tokio::time::Instant::now()),
         });
         let run = move || runtime.block_on(listen(sockets, shared));
         let thread = std::thread::Builder::new().name("listen-net".to_owned()).spawn(run).map_err(failed)?;
@@ -217,16 +231,17 @@ impl SocketSource {
         Ok(())
     }
 
-    fn give(&mut self, batch: PacketBatch, out: &mut Outlet<Vec<u8>>) {
+    /// Forwards a batch and frees its space in the backlog.
+    fn forward(&mut self, batch: PacketBatch, out: &mut Outlet<Vec<u8>>) {
         self.bytes += batch.bytes.len() as u64;
         out.push_since(batch.bytes, batch.arrived);
-        drop(batch.room);
+        drop(batch.space);
     }
 
     /// Waits for the listener's thread, which is about to end.
     fn join(&mut self) -> Result<(), SocketError> {
         match self.running.take().map(|(_, thread)| thread.join()) {
-            Some(Err(_)) => Err(SocketError::Fallen),
+            Some(Err(_)) => Err(SocketError::Panicked),
             _ => Ok(()),
         }
     }
@@ -237,32 +252,32 @@ impl Source for SocketSource {
     type Error = DownlinkError;
 
     fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
-        if self.waiting.is_some() && self.held.is_some() {
-            // Nothing for the ground to take, but an occasion to show what its state holds.
+        if self.pending.is_some() && self.held.is_some() {
+            // An empty piece lets the ground report the bytes that its state contains.
             out.push(Vec::new());
         }
         self.start()?;
         let Some((receiver, _)) = &self.running else { return Ok(Flow::Done) };
         match out.await_input(|| receiver.recv_timeout(POLL)) {
-            Ok(batch) => self.give(batch, out),
+            Ok(batch) => self.forward(batch, out),
             Err(RecvTimeoutError::Timeout) => self.listening.status.clear_backlog(),
             Err(RecvTimeoutError::Disconnected) => {
                 self.join()?;
                 return Ok(Flow::Done);
             }
         }
-        if self.held.as_ref().is_some_and(|held| held.ask(self.bytes)) {
-            // Nothing for the ground to take, but an occasion for a checkpoint.
+        if self.held.as_ref().is_some_and(|held| held.request_checkpoint(self.bytes)) {
+            // An empty piece lets the ground write a checkpoint.
             out.push(Vec::new());
         }
         Ok(Flow::Continue)
     }
 
-    /// Stops reading, but passes on what has been read.
+    /// Stops reading, and forwards all packets that have been read.
     fn finish(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<(), DownlinkError> {
         self.stop.send_replace(true);
         while let Some(batch) = self.running.as_ref().and_then(|(receiver, _)| receiver.recv().ok()) {
-            self.give(batch, out);
+            self.forward(batch, out);
         }
         Ok(self.join()?)
     }
@@ -273,9 +288,9 @@ impl Source for SocketSource {
 }
 
 impl Drop for SocketSource {
-    /// After a failure elsewhere nobody drains the backlog: connections that wait for room must not wait for ever.
+    /// Ends connections that wait for space in the backlog, which nobody empties after a failure elsewhere.
     fn drop(&mut self) {
         self.stop.send_replace(true);
-        self.room.close();
+        self.backlog.close();
     }
 }

@@ -1,4 +1,4 @@
-//! The stations that may send, each with its token.
+//! The stations that may send, with their tokens.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -6,23 +6,22 @@ use std::path::Path;
 
 use super::error::SocketError;
 
-/// Shortest token: 16 characters that nobody guesses, such as the first of `openssl rand -hex 16`.
+/// Minimum length of a token, so that it cannot be guessed if it is random.
 const TOKEN_BYTES_MIN: usize = 16;
-/// Longest token.
 pub(super) const TOKEN_BYTES_MAX: usize = 256;
 const NAME_CHARACTERS_MAX: usize = 64;
 const STATIONS_MAX: usize = 1000;
-/// Longest file, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 
-/// Stations by their tokens. A file of them has a line `NAME TOKEN` for each; empty lines and those that begin with `#` are skipped.
+/// Stations with their tokens. Their file has a line `NAME TOKEN` for each; empty lines and lines that begin with `#` are
+/// skipped.
 pub struct Stations(Vec<(String, Vec<u8>)>);
 
 impl Stations {
-    /// Reads a file that only its owner can read.
+    /// Reads a file, which only its owner may be able to read.
     ///
     /// # Errors
-    /// A file that cannot be read, that others can read, or that has a line of another form.
+    /// The file cannot be read; others can read it; a line has another form.
     pub fn read(path: &Path) -> Result<Self, SocketError> {
         let failed = |found: String| SocketError::Stations { path: path.to_owned(), found };
         let unread = |error: io::Error| failed(error.to_string());
@@ -52,7 +51,7 @@ impl Stations {
             if line.is_empty() || line.starts_with('#') {
                 continue;
             }
-            // What is wrong is not shown: it may be a token.
+            // The message does not show the line, which may contain a token.
             let wrong = |expected: &str| Err(format!("line {number}: expected {expected}"));
             let mut words = line.split_whitespace();
             let (Some(name), Some(token), None) = (words.next(), words.next(), words.next()) else {
@@ -62,11 +61,11 @@ impl Stations {
             if name.len() > NAME_CHARACTERS_MAX || !name.chars().all(is_name) {
                 return wrong("a name of at most 64 letters, digits, '-', '_' and '.'");
             }
-            let is_long = (TOKEN_BYTES_MIN..=TOKEN_BYTES_MAX).contains(&token.len());
-            if !is_long || !token.bytes().all(|c| c.is_ascii_graphic()) {
+            let has_valid_length = (TOKEN_BYTES_MIN..=TOKEN_BYTES_MAX).contains(&token.len());
+            if !has_valid_length || !token.bytes().all(|c| c.is_ascii_graphic()) {
                 return wrong("a token of 16 to 256 ASCII characters (openssl rand -hex 16)");
             }
-            if found.iter().any(|(other, held)| other == name || held == token.as_bytes()) {
+            if found.iter().any(|(other, other_token)| other == name || other_token == token.as_bytes()) {
                 return wrong("a name and a token that no other line has");
             }
             found.push((name.to_owned(), token.as_bytes().to_owned()));
@@ -77,17 +76,17 @@ impl Stations {
         if found.is_empty() { Err("no station; expected lines NAME TOKEN".into()) } else { Ok(Self(found)) }
     }
 
-    /// Names of the stations.
     pub(super) fn names(&self) -> impl Iterator<Item = &str> {
         self.0.iter().map(|(name, _)| name.as_str())
     }
 
-    /// The station that has this token. The time it takes does not tell how much of a token was right.
-    pub(super) fn of(&self, token: &[u8]) -> Option<&str> {
+    /// The station that has this token. The comparison takes the same time for every token of a length, so that its duration
+    /// does not reveal correct characters.
+    pub(super) fn station(&self, token: &[u8]) -> Option<&str> {
         let mut found = None;
-        for (name, held) in &self.0 {
-            let differences = held.iter().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b));
-            if std::hint::black_box(differences) == 0 && held.len() == token.len() {
+        for (name, expected) in &self.0 {
+            let differences = expected.iter().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b));
+            if std::hint::black_box(differences) == 0 && expected.len() == token.len() {
                 found = Some(name.as_str());
             }
         }
@@ -97,7 +96,7 @@ impl Stations {
     /// The token of the only station, for a sender.
     ///
     /// # Errors
-    /// A file with several.
+    /// The file has several stations.
     pub fn only_token(self, path: &Path) -> Result<String, SocketError> {
         match <[_; 1]>::try_from(self.0) {
             Ok([(_, token)]) => Ok(String::from_utf8_lossy(&token).into_owned()),
@@ -114,18 +113,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stations_are_told_apart_by_their_tokens() {
+    fn stations_are_identified_by_their_tokens() {
         let text = "# ours\nurumqi 0123456789abcdef\n\n  malargue  fedcba9876543210fedcba9876543210 \n";
         let stations = Stations::parse(text).unwrap();
-        assert_eq!(stations.of(b"0123456789abcdef"), Some("urumqi"));
-        assert_eq!(stations.of(b"fedcba9876543210fedcba9876543210"), Some("malargue"));
+        assert_eq!(stations.station(b"0123456789abcdef"), Some("urumqi"));
+        assert_eq!(stations.station(b"fedcba9876543210fedcba9876543210"), Some("malargue"));
         for wrong in [b"fedcba9876543210".as_slice(), b"", b"0123456789abcdeF", b"0123456789abcdef0"] {
-            assert_eq!(stations.of(wrong), None);
+            assert_eq!(stations.station(wrong), None);
         }
     }
 
     #[test]
-    fn what_is_no_list_of_stations_is_refused_by_line_and_without_showing_it() {
+    fn an_invalid_list_is_refused_with_its_line_but_without_its_text() {
         for (text, line, expected) in [
             ("urumqi", 1, "NAME TOKEN"),
             ("# x\nurumqi secret", 2, "16 to 256"),
@@ -135,9 +134,9 @@ mod tests {
             ("a 0123456789abcdef\na 0123456789abcdeg", 2, "no other line"),
             ("a 0123456789abcde\u{e9}", 1, "16 to 256"),
         ] {
-            let said = Stations::parse(text).err().unwrap();
-            assert!(said.starts_with(&format!("line {line}: ")) && said.contains(expected), "{said}");
-            assert!(!said.contains("secret") && !said.contains("0123"), "{said}");
+            let error = Stations::parse(text).err().unwrap();
+            assert!(error.starts_with(&format!("line {line}: ")) && error.contains(expected), "{error}");
+            assert!(!error.contains("secret") && !error.contains("0123"), "{error}");
         }
         assert!(Stations::parse("# nobody\n").err().unwrap().contains("no station"));
         assert!(Stations::parse("\n").err().unwrap().contains("no station"));

@@ -1,4 +1,4 @@
-//! Addresses of the form `tcp://HOST:PORT`.
+//! URLs of sockets, such as `tcp://HOST:PORT`.
 
 use std::fmt;
 use std::net::{SocketAddr, ToSocketAddrs};
@@ -6,12 +6,12 @@ use std::str::FromStr;
 
 use super::error::SocketError;
 
-/// Where a ground listens: for connections (`tcp://`), or for datagrams (`udp://`).
+/// Address at which a ground listens: for connections (`tcp://`) or for datagrams (`udp://`).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ListenUrl {
-    /// For connections.
+    /// Address for connections.
     Tcp(TcpUrl),
-    /// For datagrams.
+    /// Address for datagrams.
     Udp(TcpUrl),
 }
 
@@ -29,12 +29,11 @@ impl FromStr for ListenUrl {
     }
 }
 
-/// The address of a socket for datagrams.
-pub(super) fn udp_name(address: SocketAddr) -> String {
+pub(super) fn udp_url(address: SocketAddr) -> String {
     TcpUrl::from(address).to_string().replacen("tcp", "udp", 1)
 }
 
-/// A TCP host and port.
+/// The host and port of a TCP socket.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TcpUrl {
     host: String,
@@ -42,10 +41,10 @@ pub struct TcpUrl {
 }
 
 impl TcpUrl {
-    /// Its addresses.
+    /// The addresses of the host.
     ///
     /// # Errors
-    /// The host has none.
+    /// The host has no address.
     pub fn addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
         let found = (self.host.as_str(), self.port).to_socket_addrs().map(Vec::from_iter);
         match found {
@@ -58,15 +57,15 @@ impl TcpUrl {
         }
     }
 
-    /// Its addresses, if all are loopback addresses.
+    /// The addresses of the host, if all are loopback addresses.
     ///
     /// # Errors
     /// [`SocketError::Remote`]; the host has no address.
-    pub fn own_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
+    pub fn loopback_addresses(&self) -> Result<Vec<SocketAddr>, SocketError> {
         let found = self.addresses()?;
         match found.iter().all(|address| address.ip().to_canonical().is_loopback()) {
             true => Ok(found),
-            // Of either protocol.
+            // Without the scheme, as the address may be that of a `udp` URL.
             false => {
                 Err(SocketError::Remote { address: self.to_string().trim_start_matches("tcp://").to_owned() })
             }
@@ -93,10 +92,11 @@ impl FromStr for TcpUrl {
                 }
                 None => host,
             };
-            let bad = |c: char| c.is_whitespace() || c.is_control() || "/@[]?#".contains(c);
-            let of_numbers = text.contains('[');
-            let good = !host.is_empty() && !host.contains(bad) && (of_numbers || !host.contains(':'));
-            good.then(|| Self { host: host.to_owned(), port })
+            let is_forbidden = |c: char| c.is_whitespace() || c.is_control() || "/@[]?#".contains(c);
+            let is_ipv6 = text.contains('[');
+            let is_valid =
+                !host.is_empty() && !host.contains(is_forbidden) && (is_ipv6 || !host.contains(':'));
+            is_valid.then(|| Self { host: host.to_owned(), port })
         };
         parse().ok_or_else(|| SocketError::Url { text: text.to_owned() })
     }
@@ -117,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn places_are_read_and_written() {
+    fn urls_are_parsed_and_displayed() {
         for text in
             ["tcp://127.0.0.1:4711", "tcp://[::1]:0", "tcp://localhost:65535", "tcp://ground.example:1"]
         {
@@ -146,8 +146,8 @@ mod tests {
     }
 
     #[test]
-    fn only_this_machine_is_its_own() {
-        for (text, own) in [
+    fn only_loopback_addresses_are_loopback() {
+        for (text, is_loopback) in [
             ("tcp://127.0.0.1:1", true),
             ("tcp://127.9.9.9:1", true),
             ("tcp://[::1]:1", true),
@@ -157,7 +157,7 @@ mod tests {
             ("tcp://192.0.2.7:1", false),
             ("tcp://[2001:db8::7]:1", false),
         ] {
-            assert_eq!(text.parse::<TcpUrl>().unwrap().own_addresses().is_ok(), own, "{text}");
+            assert_eq!(text.parse::<TcpUrl>().unwrap().loopback_addresses().is_ok(), is_loopback, "{text}");
         }
     }
 }

@@ -4,11 +4,11 @@ use multiversion::multiversion;
 
 use super::SYNC_MARKER;
 
-/// Maximum number of wrong bits in a marker. Noise has as few wrong or as few right bits at 2.6e-6 of all places; a
-/// true marker has more wrong bits with a probability of 2e-6 at a bit error rate of 1 in 400.
+/// Maximum number of wrong bits in a sync marker of either polarity. Noise passes at 2.6e-6 of all bit positions; at a bit
+/// error rate of 1 in 400 a true marker fails with a probability of 2e-6.
 pub const MARKER_ERRORS_MAX: u32 = 3;
 
-/// The 32 bits from bit `at` on, zeros beyond the end.
+/// The 32 bits from bit `at` on, with zeros beyond the end.
 pub(crate) fn word_at(bytes: &[u8], at: usize) -> u32 {
     let mut eight = [0; 8];
     let rest = bytes.get(at / 8..).unwrap_or_default();
@@ -30,8 +30,8 @@ pub(crate) fn copy_at(bytes: &[u8], at: usize, out: &mut [u8]) {
     }
 }
 
-/// The polarity of a marker, if 32 bits are one.
-pub(crate) fn marker(word: u32) -> Option<Polarity> {
+/// The polarity of a sync marker; `None` if the 32 bits are not a marker.
+pub(crate) fn marker_polarity(word: u32) -> Option<Polarity> {
     match (word ^ SYNC_MARKER).count_ones() {
         0..=MARKER_ERRORS_MAX => Some(Polarity::Upright),
         wrong if wrong >= 32 - MARKER_ERRORS_MAX => Some(Polarity::Inverted),
@@ -39,7 +39,6 @@ pub(crate) fn marker(word: u32) -> Option<Polarity> {
     }
 }
 
-/// Number of wrong bits in a marker.
 pub(crate) fn marker_errors(word: u32, polarity: Polarity) -> u32 {
     let wrong = (word ^ SYNC_MARKER).count_ones();
     if polarity == Polarity::Upright { wrong } else { 32 - wrong }
@@ -53,16 +52,16 @@ pub(crate) enum Polarity {
     Inverted,
 }
 
-/// The first place in `from..to` (bits) with a marker. The bytes of a marker at the last place must exist.
+/// The first bit in `from..to` at which a marker begins. The bytes of a marker at the last bit must exist.
 pub(crate) fn find_marker(bytes: &[u8], from: usize, to: usize) -> Option<usize> {
     let mut at = from;
     while at < to {
-        // Whole bytes are searched many bits at once; a byte with a hit is searched bit by bit.
+        // A vectorised search finds the byte; then its bits are searched one by one.
         if at.is_multiple_of(8) {
             at = 8 * find_byte(bytes, at / 8, to / 8);
         }
         let end = to.min(at / 8 * 8 + 8);
-        if let Some(found) = (at..end).find(|at| marker(word_at(bytes, *at)).is_some()) {
+        if let Some(found) = (at..end).find(|at| marker_polarity(word_at(bytes, *at)).is_some()) {
             return Some(found);
         }
         at = end;
@@ -70,12 +69,12 @@ pub(crate) fn find_marker(bytes: &[u8], from: usize, to: usize) -> Option<usize>
     None
 }
 
-/// The first byte from `from` on in which a marker begins; or `to`; or a byte just before the end, where too little is
-/// left to examine many bits at once.
+/// The first byte from `from` on in which a marker begins, or `to`, or the first of the last bytes of the buffer, which are
+/// too few for the vectorised search.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl+avx512vpopcntdq", "x86_64+avx2+popcnt"))]
 fn find_byte(bytes: &[u8], from: usize, to: usize) -> usize {
     const MARKER: u64 = SYNC_MARKER as u64;
-    let near = |word: u64, shift: u32| {
+    let is_marker = |word: u64, shift: u32| {
         let wrong = ((word >> (32 - shift) & 0xFFFF_FFFF) ^ MARKER).count_ones();
         wrong <= MARKER_ERRORS_MAX || wrong >= 32 - MARKER_ERRORS_MAX
     };
@@ -86,7 +85,7 @@ fn find_byte(bytes: &[u8], from: usize, to: usize) -> usize {
         let word = u64::from_be_bytes(eight);
         let mut any = false;
         for shift in 0..8 {
-            any |= near(word, shift);
+            any |= is_marker(word, shift);
         }
         if any {
             return from + k;
@@ -122,11 +121,12 @@ mod tests {
     }
 
     #[test]
-    fn noise_is_searched_as_bit_by_bit() {
+    fn the_vectorised_search_of_noise_finds_what_a_search_bit_by_bit_finds() {
         let mut noise = vec![0; 1 << 20];
         random_stream(5, StreamKind::Probe, [5, 5]).fill_bytes(&mut noise);
         let to = 8 * (noise.len() - 4);
-        let plain: Vec<usize> = (0..to).filter(|at| marker(word_at(&noise, *at)).is_some()).collect();
+        let plain: Vec<usize> =
+            (0..to).filter(|at| marker_polarity(word_at(&noise, *at)).is_some()).collect();
         let mut found = Vec::new();
         let mut at = 0;
         while let Some(hit) = find_marker(&noise, at, to) {

@@ -11,6 +11,6 @@ pub const ERRORS_MAX: usize = PARITY_BYTES / 2;
 /// Permitted depths of interleaving.
 pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
 
-/// Exponents of the generator's roots: 11 times 112 to 143.
+/// The generator's roots are the powers 11 j of the primitive element, j = 112 to 143.
 pub(super) const ROOT_STEP: usize = 11;
 pub(super) const ROOT_FIRST: usize = 112;

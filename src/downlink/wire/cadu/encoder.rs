@@ -1,11 +1,11 @@
-//! Packets to CADUs: the spacecraft's end of the coded link.
+//! Encodes packets as CADUs, on the spacecraft.
 
 use super::framer::{Framer, PACKET_HEADER_BYTES};
 use super::reed_solomon::ReedSolomon;
 use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, randomize};
-use crate::downlink::wire::Kind;
+use crate::downlink::wire::PacketKind;
 
-/// Packs packets into frames and encodes these as CADUs.
+/// Fills transfer frames with packets and encodes the frames as CADUs.
 #[derive(Debug)]
 pub struct CaduEncoder {
     code: ReedSolomon,
@@ -31,12 +31,12 @@ impl CaduEncoder {
         }
     }
 
-    /// Appends the CADUs that complete packets fill. Ignores an incomplete packet at the end.
+    /// Appends the CADUs that the packets fill. Ignores an incomplete packet at the end.
     pub fn encode(&mut self, packets: &[u8], out: &mut Vec<u8>) {
         let code = self.code;
         if !std::mem::replace(&mut self.in_pass, true) {
             for _ in 0..self.idle_frames {
-                self.idle.idle(|frame| code_frame(code, frame, out));
+                self.idle.send_idle(|frame| code_frame(code, frame, out));
             }
         }
         let mut rest = packets;
@@ -45,28 +45,27 @@ impl CaduEncoder {
             let Some((packet, after)) = rest.split_at_checked(bytes) else { return };
             rest = after;
             let apid = u16::from_be_bytes([header[0], header[1]]) & 0x7FF;
-            let of_housekeeping = apid == Kind::Housekeeping.apid();
-            let framer = if of_housekeeping { &mut self.housekeeping } else { &mut self.science };
+            let is_housekeeping = apid == PacketKind::Housekeeping.apid();
+            let framer = if is_housekeeping { &mut self.housekeeping } else { &mut self.science };
             framer.add(packet, |frame| code_frame(code, frame, out));
         }
     }
 
-    /// Appends the partial frames, padded with idle packets: what a pass begins with does not wait for its end. Science
-    /// before housekeeping, so that the instrument's description comes first.
+    /// Appends the partial frames, padded with idle packets, so that the start of a pass does not wait for its end. The
+    /// science channel comes first, as it has the instrument description.
     pub fn flush(&mut self, out: &mut Vec<u8>) {
         let code = self.code;
         self.science.flush(|frame| code_frame(code, frame, out));
         self.housekeeping.flush(|frame| code_frame(code, frame, out));
     }
 
-    /// Ends a pass: as [`CaduEncoder::flush`], and the next pass begins with idle frames.
+    /// Ends a pass: flushes the partial frames. The next pass begins with idle frames.
     pub fn end_pass(&mut self, out: &mut Vec<u8>) {
         self.flush(out);
         self.in_pass = false;
     }
 }
 
-/// Appends the CADU of a frame.
 fn code_frame(code: ReedSolomon, frame: &[u8], out: &mut Vec<u8>) {
     out.extend_from_slice(&SYNC_MARKER.to_be_bytes());
     let start = out.len();

@@ -1,4 +1,4 @@
-//! The field of the code: GF(2^8) of x^8 + x^7 + x^2 + x + 1, and the dual basis (CCSDS 131.0-B, 4.3 and annex F).
+//! The Galois field of the code, GF(2^8) with x^8 + x^7 + x^2 + x + 1, and the dual basis (CCSDS 131.0-B, 4.3 and annex F).
 
 /// The field's polynomial without its leading term.
 const POLYNOMIAL: u8 = 0x87;
@@ -7,10 +7,9 @@ const POLYNOMIAL: u8 = 0x87;
 /// (131.0-B, annex F).
 const TO_DUAL: [u8; 8] = [0x8D, 0xEF, 0xEC, 0x86, 0xFA, 0x99, 0xAF, 0x7B];
 
-/// Number of powers of the primitive element.
 pub(super) const ORDER: usize = 255;
 
-/// Stands for the logarithm of 0: larger than any sum of two others.
+/// Placeholder for the logarithm of 0, larger than any sum of two others.
 const LOG_OF_ZERO: u16 = 511;
 
 /// Tables of the field.
@@ -18,11 +17,11 @@ const LOG_OF_ZERO: u16 = 511;
 pub(super) struct GaloisField {
     /// Powers of the primitive element, repeated once, so that sums of two logarithms need no reduction; then zeros.
     exp: [u8; 1024],
-    /// Logarithms; that of 0 is so large that its sum with any other indexes a zero.
+    /// Logarithms. The sum of [`LOG_OF_ZERO`] and any other indexes a zero of `exp`.
     log: [u16; 256],
-    /// Symbols in the dual basis by those in the conventional one.
+    /// Symbols in the dual basis, indexed by symbols in the conventional basis.
     pub(super) to_dual: [u8; 256],
-    /// Symbols in the conventional basis by those in the dual one.
+    /// Symbols in the conventional basis, indexed by symbols in the dual basis.
     pub(super) to_conventional: [u8; 256],
 }
 
@@ -66,12 +65,11 @@ impl GaloisField {
         self.exp[self.log(a) + self.log(b)]
     }
 
-    /// Logarithm of a non-zero element.
     pub(super) fn log(&self, a: u8) -> usize {
         usize::from(self.log[usize::from(a)])
     }
 
-    /// `a` over a non-zero `b`.
+    /// `a` divided by a non-zero `b`.
     pub(super) fn divide(&self, a: u8, b: u8) -> u8 {
         self.exp[self.log(a) + ORDER - self.log(b)]
     }
@@ -87,7 +85,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tables_are_those_of_the_standard() {
+    fn tables_follow_the_standard() {
         // 131.0-B, annex F, and the tables of libfec (Karn): powers 0, 1, 2, 7, 8, 31, 254 and transformed symbols.
         let powers = [(0, 0x01), (1, 0x02), (2, 0x04), (7, 0x80), (8, 0x87), (31, 0xCD), (254, 0xC3)];
         assert!(powers.iter().all(|&(power, element)| FIELD.power(power) == element));
@@ -97,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_a_field() {
+    fn multiplication_has_inverses_and_is_distributive() {
         for a in 1..=255 {
             assert_eq!(FIELD.multiply(a, 2), times_primitive(a));
             assert_eq!(FIELD.multiply(FIELD.divide(1, a), a), 1);

@@ -3,14 +3,14 @@
 /// Octets of a frame's primary header.
 pub const FRAME_HEADER_BYTES: usize = 6;
 
-/// Octets before the packets: the primary header and the header of the packet zone.
+/// Offset of the packet zone: the octets of the primary header and of the packet zone's header.
 pub(crate) const ZONE_START: usize = FRAME_HEADER_BYTES + 2;
 
-/// Virtual channel of instrument, ephemeris and visibilities.
+/// Virtual channel of instrument descriptions, ephemeris and visibilities.
 pub const SCIENCE: u8 = 1;
-/// Virtual channel of the spacecraft's own counts.
+/// Virtual channel of housekeeping.
 pub const HOUSEKEEPING: u8 = 2;
-/// Virtual channel of idle frames: all ones, by the standard.
+/// Virtual channel of idle frames: all ones, as the standard requires.
 pub const IDLE: u8 = 0x3F;
 
 /// First header pointer of a zone in which no packet begins.
@@ -30,12 +30,12 @@ pub struct FrameHeader {
     pub channel: u8,
     /// Number of frames of this virtual channel sent before this one, modulo `count_bits` bits.
     pub count: u32,
-    /// 24, or 28 where the count cycle is used, as here.
+    /// Bits of the count: 24, or 28 with the count cycle, which the encoder uses.
     pub count_bits: u32,
 }
 
 impl FrameHeader {
-    /// The header as it is sent.
+    /// Encodes the header.
     #[must_use]
     pub fn to_bytes(self) -> [u8; FRAME_HEADER_BYTES] {
         let identification =
@@ -54,13 +54,13 @@ impl FrameHeader {
         if identification >> 14 != u16::from(VERSION) {
             return None;
         }
-        let used = signaling & CYCLE_USED != 0;
-        let cycle = if used { signaling & 0x0F } else { 0 };
+        let has_cycle = signaling & CYCLE_USED != 0;
+        let cycle = if has_cycle { signaling & 0x0F } else { 0 };
         Some(Self {
             spacecraft: (identification >> 6) as u8,
             channel: (identification & 0x3F) as u8,
             count: u32::from_be_bytes([cycle, c0, c1, c2]),
-            count_bits: if used { 28 } else { 24 },
+            count_bits: if has_cycle { 28 } else { 24 },
         })
     }
 }
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fields_stand_where_the_standard_puts_them() {
+    fn fields_are_at_their_standard_positions() {
         let header = FrameHeader { spacecraft: 0xA5, channel: 0x2A, count: 0xB12_3456, count_bits: 28 };
         // 01 10100101 101010 | 12 34 56 | replay 0, usage 1, spare 00, cycle 1011.
         assert_eq!(header.to_bytes(), [0b0110_1001, 0b0110_1010, 0x12, 0x34, 0x56, 0x4B]);

@@ -1,18 +1,17 @@
-//! Packs packets into the packet zones of one virtual channel's frames (CCSDS 732.0-B, section 4.1.4.2).
+//! Fills the packet zones of one virtual channel's frames (CCSDS 732.0-B, section 4.1.4.2).
 
 use super::frame::{FrameHeader, NO_HEADER, ZONE_START};
 
-/// Identification of idle packets: APID all ones, no secondary header.
+/// APID of idle packets: all ones. They have no secondary header.
 pub(crate) const IDLE_APID: u16 = 0x7FF;
 /// Octets of a space packet's primary header.
 pub(crate) const PACKET_HEADER_BYTES: usize = 6;
-/// Content of idle packets; the randomizer provides bit transitions.
+/// Octet that fills idle packets; the randomizer provides bit transitions.
 const IDLE_OCTET: u8 = 0x55;
 
-/// Bits of a frame count.
 const COUNT_BITS: u32 = 28;
 
-/// Fills the frames of one virtual channel.
+/// Fills the frames of one virtual channel with packets.
 #[derive(Debug)]
 pub(super) struct Framer {
     spacecraft: u8,
@@ -25,9 +24,9 @@ pub(super) struct Framer {
     idle: IdleData,
 }
 
-/// Content of idle frames: the sequence of x^32 + x^22 + x^2 + x + 1 from all ones, never restarted.
+/// Content of idle frames: the pseudo-random sequence of x^32 + x^22 + x^2 + x + 1 from all ones, never restarted.
 ///
-/// A constant will not do: a block of equal octets is a codeword at every depth of interleaving.
+/// A block of equal octets would be a codeword at every depth of interleaving.
 #[derive(Debug)]
 struct IdleData(u32);
 
@@ -67,42 +66,42 @@ impl Framer {
             self.frame.extend_from_slice(part);
             rest = after;
             if self.frame.len() == self.frame_bytes {
-                self.seal(&mut send);
+                self.send_full(&mut send);
             }
         }
     }
 
-    /// Pads the current frame, unless it is empty, with an idle packet, which runs into a second frame if the room left is
-    /// shorter than the shortest packet.
+    /// Pads the current frame with an idle packet, unless the frame is empty. The packet continues in a second frame if the
+    /// first has no space for the shortest packet.
     pub(super) fn flush(&mut self, send: impl FnMut(&[u8])) {
         if self.frame.len() == ZONE_START {
             return;
         }
-        let room = self.frame_bytes - self.frame.len();
+        let free = self.frame_bytes - self.frame.len();
         let zone = self.frame_bytes - ZONE_START;
-        let length = if room > PACKET_HEADER_BYTES { room } else { room + zone };
+        let length = if free > PACKET_HEADER_BYTES { free } else { free + zone };
         self.add(&idle_packet(length), send);
     }
 
-    /// Sends a frame of idle data only.
-    pub(super) fn idle(&mut self, mut send: impl FnMut(&[u8])) {
-        // There is no packet zone: idle data begins after the primary header.
+    pub(super) fn send_idle(&mut self, mut send: impl FnMut(&[u8])) {
+        // Idle data begins after the primary header, as there is no packet zone.
         let pointer = u16::from_be_bytes([self.idle.octet(), self.idle.octet()]);
         let rest = self.frame_bytes - ZONE_START;
         self.frame.extend((0..rest).map(|_| self.idle.octet()));
-        self.head(pointer);
+        self.write_headers(pointer);
         send(&self.frame);
         self.frame.truncate(ZONE_START);
     }
 
-    fn seal(&mut self, send: &mut impl FnMut(&[u8])) {
-        self.head(self.first_header);
+    fn send_full(&mut self, send: &mut impl FnMut(&[u8])) {
+        self.write_headers(self.first_header);
         send(&self.frame);
         self.frame.truncate(ZONE_START);
         self.first_header = NO_HEADER;
     }
 
-    fn head(&mut self, pointer: u16) {
+    /// Writes the headers of the frame, with the first header pointer or, in an idle frame, the octets in its place.
+    fn write_headers(&mut self, pointer: u16) {
         let Self { spacecraft, channel, count, .. } = *self;
         let header = FrameHeader { spacecraft, channel, count, count_bits: COUNT_BITS };
         self.frame[..ZONE_START - 2].copy_from_slice(&header.to_bytes());
@@ -111,7 +110,7 @@ impl Framer {
     }
 }
 
-/// An idle packet of `bytes` octets, which must exceed its header.
+/// An idle packet of `bytes` octets, which must be more than its header has.
 fn idle_packet(bytes: usize) -> Vec<u8> {
     let mut packet = vec![IDLE_OCTET; bytes];
     let length = (bytes - PACKET_HEADER_BYTES - 1) as u16;

@@ -1,4 +1,4 @@
-//! Syndromes to errors: Berlekamp-Massey, Chien's search, Forney's formula.
+//! Finds errors from syndromes: Berlekamp-Massey algorithm, Chien search, Forney formula.
 
 use std::sync::LazyLock;
 
@@ -12,16 +12,16 @@ use super::field::{FIELD, ORDER, times_primitive};
 pub(super) struct Errors {
     /// Number of errors; only this many elements of the arrays are valid.
     pub(super) count: usize,
-    /// Places in the codeword, the first octet sent being 0.
+    /// Positions in the codeword, from 0 for the first octet sent.
     pub(super) places: [u8; ERRORS_MAX],
-    /// Values to add there, in the conventional basis.
+    /// Error values at these positions, in the conventional basis; adding them corrects the codeword.
     pub(super) values: [u8; ERRORS_MAX],
 }
 
-/// A polynomial by rising powers.
+/// Coefficients of a polynomial by rising powers.
 type Polynomial = [u8; PARITY_BYTES + 1];
 
-/// Inverses of the locators X = a^(11 (254 - place)) by place; padded with zeros, which are no root.
+/// Inverses of the locators X = a^(11 (254 - place)) by place, padded with zeros, which are never roots.
 static INVERSE_LOCATORS: LazyLock<[u8; 256]> =
     LazyLock::new(|| std::array::from_fn(|place| if place < ORDER { inverse_locator(place) } else { 0 }));
 
@@ -88,26 +88,24 @@ fn evaluator(syndromes: &[u8; PARITY_BYTES], locator: &Polynomial, count: usize)
     product
 }
 
-/// The error at a place: X^(1 - 112) evaluator(1/X) / locator'(1/X).
+/// The error value at a place: X^(1 - 112) evaluator(1/X) / locator'(1/X).
 fn forney(evaluator: &[u8], locator: &[u8], place: usize) -> Option<u8> {
     let inverse = inverse_locator(place);
-    let at = |coefficients: &mut dyn DoubleEndedIterator<Item = u8>, x: u8| {
+    let value_at = |coefficients: &mut dyn DoubleEndedIterator<Item = u8>, x: u8| {
         coefficients.rev().fold(0, |sum, coefficient| FIELD.multiply(sum, x) ^ coefficient)
     };
-    let above = at(&mut evaluator.iter().copied(), inverse);
+    let numerator = value_at(&mut evaluator.iter().copied(), inverse);
     // In characteristic 2 the derivative has only the odd terms, each one power lower.
     let square = FIELD.multiply(inverse, inverse);
-    let below = at(&mut locator.iter().skip(1).step_by(2).copied(), square);
-    if below == 0 || above == 0 {
+    let denominator = value_at(&mut locator.iter().skip(1).step_by(2).copied(), square);
+    if denominator == 0 || numerator == 0 {
         return None;
     }
     let log = FIELD.log(inverse) * (ROOT_FIRST - 1);
-    Some(FIELD.multiply(FIELD.divide(above, below), FIELD.power(log)))
+    Some(FIELD.multiply(FIELD.divide(numerator, denominator), FIELD.power(log)))
 }
 
-/// Replaces each x by the value of a polynomial there.
-///
-/// All at once by Horner's rule, with multiplications that the compiler vectorises.
+/// Replaces each x by the value of a polynomial at x: Horner's rule for all x at once, which the compiler vectorises.
 #[multiversion(targets("x86_64+avx512f+avx512bw", "x86_64+avx2"))]
 fn evaluate(coefficients: &[u8], x: &mut [u8; 256]) {
     let mut sum = [0_u8; 256];

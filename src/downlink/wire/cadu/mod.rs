@@ -19,12 +19,12 @@
 //! | 8.. | packets, one running into the next frame | |
 //!
 //! Managed parameters: no frame header error control, no insert zone, no operational control field, and no frame
-//! error control field, which 732.0-B omits where Reed-Solomon decoding detects bad frames (a wrong correction has a
-//! probability of 5e-14, and packets have checksums of their own).
+//! error control field (CRC), which 732.0-B omits where Reed-Solomon decoding detects bad frames: a wrong correction has a
+//! probability of 5e-14, and packets have checksums.
 //!
 //! Virtual channels: [`SCIENCE`] (instrument, ephemeris, visibilities), [`HOUSEKEEPING`], [`IDLE`] (frames of idle data
-//! at the start of each pass, for the ground to synchronise). A pass ends with its housekeeping packet; the rest of
-//! the frame is filled with an idle packet, so that a lost pass does not damage its neighbours.
+//! at the start of each pass, for the ground to synchronise). A pass ends with its housekeeping packet. An idle packet
+//! fills the rest of the frame, so that a lost pass does not damage its neighbours.
 
 pub(crate) mod bits;
 mod code;

@@ -1,11 +1,11 @@
 //! The Reed-Solomon code (255, 223) with interleaving and the dual basis (CCSDS 131.0-B, section 4).
 //!
-//! The octets of a block belong to its codewords in turn. Of each codeword 223 octets are data and 32 are parity: the
-//! remainder of the data times x^32 by g(x) = prod (x - a^(11 j)), j = 112..=143. Up to 16 wrong octets of a codeword
-//! are corrected.
+//! The octets of a block belong to its codewords in turn. A codeword has 223 octets of data and 32 of parity, which are the
+//! remainder of the data times x^32 divided by g(x) = prod (x - a^(11 j)), j = 112..=143. Up to 16 wrong octets of a
+//! codeword are corrected.
 //!
 //! The remainder is linear in the data, also in the dual basis, so it is computed from tables, four octets at a time
-//! (like CRCs by slicing). A received codeword is clean if the remainder of its data equals its parity. Otherwise its
+//! (as in sliced CRCs). A received codeword has no errors if the remainder of its data equals its parity. Otherwise the
 //! syndromes follow from the difference of the two.
 
 use std::sync::LazyLock;
@@ -19,24 +19,23 @@ use super::locator::{Errors, locate};
 
 /// Octets processed per table lookup.
 const SLICE: usize = 4;
-/// Slices of a codeword's data; the first lacks its first octet.
+/// Number of slices of a codeword's data; the first slice has one octet less.
 const SLICES: usize = DATA_BYTES.div_ceil(SLICE);
 
-/// 32 octets, the first sent in the upper bits of the first word.
+/// Parity of a codeword: 32 octets, the first one sent in the upper bits of the first word.
 type Parity = [u32; PARITY_BYTES / 4];
 
-/// Indexed by place, half and value.
+/// Syndromes indexed by place, half octet and value.
 type SyndromeTables = [[[[u8; PARITY_BYTES]; 16]; 2]; PARITY_BYTES];
 
-/// A codeword has more wrong octets than can be corrected.
+/// The error of a codeword with more wrong octets than can be corrected.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Uncorrectable;
 
-/// Remainders, in the dual basis, of an octet by its value and its place in a slice.
+/// Remainders (dual basis) of an octet, by its place in a slice and its value.
 static REMAINDERS: LazyLock<Box<[[Parity; 256]; SLICE]>> = LazyLock::new(remainder_tables);
 
-/// Syndromes, in the conventional basis, of half an octet of a difference (dual basis) by its place,
-/// half (upper first) and value.
+/// Syndromes (conventional basis) of half an octet of a difference (dual basis), by place, half (upper first) and value.
 static SYNDROMES: LazyLock<Box<SyndromeTables>> = LazyLock::new(syndrome_tables);
 
 /// The code at a depth of interleaving.
@@ -46,7 +45,7 @@ pub struct ReedSolomon {
 }
 
 impl ReedSolomon {
-    /// The code at a depth; `None` for a depth outside the standard, see [`INTERLEAVES`].
+    /// The code at a depth of interleaving; `None` if it is not one of [`INTERLEAVES`].
     #[must_use]
     pub fn new(interleave: usize) -> Option<Self> {
         INTERLEAVES.contains(&interleave).then_some(Self { interleave })
@@ -70,7 +69,7 @@ impl ReedSolomon {
         CODEWORD_BYTES * self.interleave
     }
 
-    /// Fills in the parity of a block of [`ReedSolomon::block_bytes`] octets that begins with its data.
+    /// Computes the parity of a block of [`ReedSolomon::block_bytes`] octets, whose data are filled in.
     pub fn encode(self, block: &mut [u8]) {
         let found = self.remainders(block);
         for (at, row) in block[self.data_bytes()..].chunks_exact_mut(self.interleave).enumerate() {
@@ -106,7 +105,6 @@ impl ReedSolomon {
         Ok(wrong)
     }
 
-    /// Remainder of the data of each codeword.
     fn remainders(self, block: &[u8]) -> [Parity; 8] {
         let mut found = [Parity::default(); 8];
         let data = &block[..self.data_bytes()];
@@ -123,7 +121,6 @@ impl ReedSolomon {
     }
 }
 
-/// Octet `at` of a parity.
 fn octet_of(parity: &Parity, at: usize) -> u8 {
     (parity[at / 4] >> (24 - 8 * (at % 4))) as u8
 }
@@ -145,11 +142,11 @@ fn divide<const I: usize>(data: &[u8], tables: &[[Parity; 256]; SLICE], out: &mu
     out[..I].copy_from_slice(&registers);
 }
 
-/// The register after four more octets.
+/// Advances a remainder by four octets of data.
 #[inline(always)]
 fn advance(register: &Parity, word: u32, tables: &[[Parity; 256]; SLICE]) -> Parity {
-    let fed = (register[0] ^ word).to_be_bytes();
-    let [a, b, c, d] = [0, 1, 2, 3].map(|k| &tables[k][usize::from(fed[k])]);
+    let feedback = (register[0] ^ word).to_be_bytes();
+    let [a, b, c, d] = [0, 1, 2, 3].map(|k| &tables[k][usize::from(feedback[k])]);
     let mut next = [0; PARITY_BYTES / 4];
     for k in 0..PARITY_BYTES / 4 {
         let shifted = if k + 1 < PARITY_BYTES / 4 { register[k + 1] } else { 0 };
@@ -175,7 +172,8 @@ fn syndromes(difference: &Parity) -> [u8; PARITY_BYTES] {
 /// Coefficients of the generator without its leading one, the highest first.
 fn generator() -> [u8; PARITY_BYTES] {
     let mut g = [0_u8; PARITY_BYTES + 1];
-    g[0] = 1; // By rising powers while it grows.
+    // Coefficients by rising powers.
+    g[0] = 1;
     for j in 0..PARITY_BYTES {
         let root = FIELD.power(ROOT_STEP * (ROOT_FIRST + j));
         for k in (0..=j + 1).rev() {
@@ -189,7 +187,7 @@ fn generator() -> [u8; PARITY_BYTES] {
 fn remainder_tables() -> Box<[[Parity; 256]; SLICE]> {
     let generator = generator();
     let mut tables = Box::new([[Parity::default(); 256]; SLICE]);
-    // x^32 mod g, then x^33 and so on: the last octet of a slice stands lowest.
+    // x^32 mod g for the last octet of a slice, x^33 mod g for the one before, and so on.
     let mut remainder = generator;
     for table in tables.iter_mut().rev() {
         for (value, row) in table.iter_mut().enumerate() {
@@ -233,7 +231,7 @@ mod tests {
     use super::*;
     use crate::units::{StreamKind, random_stream};
 
-    /// Parity that libfec 1.0 (Debian, encode_rs_ccsds) makes of two blocks of data, octet i being i, and 7 i^2 + 13.
+    /// Parity by libfec 1.0 (Debian, encode_rs_ccsds) of two data blocks, with octet i equal to i and to 7 i^2 + 13.
     const LIBFEC: [[u8; PARITY_BYTES]; 2] = [
         [
             0x4F, 0xFB, 0x92, 0xDD, 0x55, 0x7E, 0xC6, 0x7F, 0x27, 0xFB, 0x89, 0x82, 0xCF, 0x58, 0xF8, 0xFD,
@@ -253,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn parity_is_that_of_libfec() {
+    fn parity_equals_libfec() {
         let code = ReedSolomon::new(1).unwrap();
         let data: [fn(usize) -> usize; 2] = [|i| i, |i| 7 * i * i + 13];
         for (octet, parity) in data.into_iter().zip(LIBFEC) {
@@ -264,8 +262,8 @@ mod tests {
     }
 
     #[test]
-    fn the_generator_is_its_own_mirror() {
-        // 131.0-B, 4.3.3: its coefficients are symmetric; those by libfec begin with a^0, a^249, a^59, a^66.
+    fn the_generator_is_symmetric() {
+        // 131.0-B, 4.3.3: the coefficients are symmetric. In libfec they begin with a^0, a^249, a^59, a^66.
         let g = generator();
         for (at, power) in [(0, 249), (1, 59), (2, 66), (30, 249), (31, 0)] {
             assert_eq!(g[at], FIELD.power(power), "{at}");
@@ -274,16 +272,16 @@ mod tests {
     }
 
     #[test]
-    fn interleaved_codewords_are_those_of_depth_one() {
+    fn interleaved_codewords_are_codewords_of_depth_one() {
         let single = ReedSolomon::new(1).unwrap();
         for depth in INTERLEAVES {
             let block = random_block(ReedSolomon::new(depth).unwrap(), depth as u64);
             for codeword in 0..depth {
-                let mut own: Vec<u8> = block.iter().skip(codeword).step_by(depth).copied().collect();
-                let sent = own.clone();
-                own[DATA_BYTES..].fill(0);
-                single.encode(&mut own);
-                assert_eq!(own, sent);
+                let sent: Vec<u8> = block.iter().skip(codeword).step_by(depth).copied().collect();
+                let mut encoded = sent.clone();
+                encoded[DATA_BYTES..].fill(0);
+                single.encode(&mut encoded);
+                assert_eq!(encoded, sent);
             }
         }
     }
@@ -311,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn seventeen_errors_are_refused_and_never_taken_for_fewer() {
+    fn more_than_sixteen_errors_are_refused_and_never_miscorrected() {
         let mut random = random_stream(2, StreamKind::Probe, [2, 0]);
         let code = ReedSolomon::new(1).unwrap();
         for trial in 0..2_000 {
@@ -326,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn depths_that_the_standard_lacks_are_refused() {
+    fn depths_outside_the_standard_are_refused() {
         assert!([0, 6, 7, 9, 255].into_iter().all(|depth| ReedSolomon::new(depth).is_none()));
     }
 }

@@ -1,52 +1,52 @@
-//! Arrays of numbers, little-endian. The loops compile to plain copies on little-endian machines.
+//! Little-endian arrays of numbers. The loops compile to plain copies on little-endian machines.
 
 use num_complex::Complex32;
 
 use crate::units::vector::Vec3;
 
 /// Appends `N * count` zero bytes and returns them.
-fn room<const N: usize>(out: &mut Vec<u8>, count: usize) -> &mut [[u8; N]] {
+fn append_zeros<const N: usize>(out: &mut Vec<u8>, count: usize) -> &mut [[u8; N]] {
     let start = out.len();
     out.resize(start + N * count, 0);
     out[start..].as_chunks_mut().0
 }
 
 pub(super) fn put_u32(values: &[u32], out: &mut Vec<u8>) {
-    for (bytes, value) in room::<4>(out, values.len()).iter_mut().zip(values) {
+    for (bytes, value) in append_zeros::<4>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
 pub(super) fn put_f32(values: &[f32], out: &mut Vec<u8>) {
-    for (bytes, value) in room::<4>(out, values.len()).iter_mut().zip(values) {
+    for (bytes, value) in append_zeros::<4>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
 pub(super) fn put_complex32(values: &[Complex32], out: &mut Vec<u8>) {
-    for (bytes, value) in room::<8>(out, values.len()).iter_mut().zip(values) {
+    for (bytes, value) in append_zeros::<8>(out, values.len()).iter_mut().zip(values) {
         bytes[..4].copy_from_slice(&value.re.to_le_bytes());
         bytes[4..].copy_from_slice(&value.im.to_le_bytes());
     }
 }
 
 pub(super) fn put_f64<'a>(values: impl ExactSizeIterator<Item = &'a f64>, out: &mut Vec<u8>) {
-    for (bytes, value) in room::<8>(out, values.len()).iter_mut().zip(values) {
+    for (bytes, value) in append_zeros::<8>(out, values.len()).iter_mut().zip(values) {
         *bytes = value.to_le_bytes();
     }
 }
 
 pub(super) fn put_vec3(values: &[Vec3], out: &mut Vec<u8>) {
-    for (bytes, value) in room::<24>(out, values.len()).iter_mut().zip(values) {
+    for (bytes, value) in append_zeros::<24>(out, values.len()).iter_mut().zip(values) {
         for (bytes, x) in bytes.as_chunks_mut().0.iter_mut().zip(value) {
             *bytes = x.to_le_bytes();
         }
     }
 }
 
-/// Bytes of a payload, from whose front arrays are taken one by one.
+/// Reader of the arrays of a payload, one after the other.
 ///
-/// The caller must have checked the total length; from a shorter payload an array comes out short.
+/// The caller must have checked the total length: from a shorter payload it returns a shorter array.
 pub(super) struct Arrays<'a>(pub(super) &'a [u8]);
 
 impl<'a> Arrays<'a> {

@@ -10,11 +10,11 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::{EphemerisSegment, Instrument};
 use crate::units::MissionTime;
 
-/// Minimum number of nodes of a segment: those of one interpolation.
+/// Minimum number of nodes of a segment, which one interpolation needs.
 pub const NODES_MIN: usize = 8;
-/// Maximum number of nodes: two months of one-minute nodes. (For 64 satellites the payload limit is reached earlier.)
+/// Maximum number of nodes of a segment: two months at one per minute. (With 64 satellites the payload limit is lower.)
 const NODES_MAX: usize = 100_000;
-/// A distance beyond any orbit about the Moon, m.
+/// Maximum coordinate, m: beyond any orbit about the Moon.
 const COORDINATE_M_MAX: f64 = 1e9;
 
 #[derive(Encode, Decode)]
@@ -58,16 +58,17 @@ pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<EphemerisS
 
 fn check(segment: &EphemerisSegment, instrument: &Instrument) -> Result<(), PayloadFault> {
     let satellites = usize::from(segment.satellites);
-    let same = segment.satellites == instrument.satellites;
-    require(same, "satellites of an ephemeris", satellites as f64, "as many as the instrument has")?;
+    let is_equal = segment.satellites == instrument.satellites;
+    require(is_equal, "satellites of an ephemeris", satellites as f64, "as many as the instrument has")?;
     require(segment.step_ticks > 0, "step_ticks", f64::from(segment.step_ticks), "positive")?;
     let nodes = segment.nodes();
     require_length("ephemeris positions", nodes * satellites, segment.positions_m.len())?;
     require((NODES_MIN..=NODES_MAX).contains(&nodes), "nodes", nodes as f64, "8 to 100000")?;
     require_time(segment.start)?;
     require_time(segment.end())?;
-    let sane = |x: &f64| x.abs() <= COORDINATE_M_MAX;
-    match segment.positions_m.as_flattened().iter().find(|x| !sane(x)) {
+    // A NaN is out of range too.
+    let is_in_range = |x: &f64| x.abs() <= COORDINATE_M_MAX;
+    match segment.positions_m.as_flattened().iter().find(|x| !is_in_range(x)) {
         None => Ok(()),
         Some(x) => require(false, "position (m)", *x, "at most 1e9 m from the Moon"),
     }

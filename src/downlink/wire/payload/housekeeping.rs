@@ -1,7 +1,7 @@
-//! The spacecraft's own counts.
+//! Housekeeping: the spacecraft's counts.
 //!
-//! Record: `time_ticks` i64, `sampled` u64, `dropped` u64. No arrays. The time of the last report of a mission is 2^32 s,
-//! the end of the range: see [`Housekeeping::FOREVER`].
+//! Record: `time_ticks` i64, `sampled` u64, `dropped` u64. No arrays. The last report of a mission has the time 2^32 s, the
+//! end of the range: see [`Housekeeping::FOREVER`].
 
 use bincode::{Decode, Encode};
 
@@ -9,7 +9,7 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::Housekeeping;
 use crate::units::MissionTime;
 
-/// Most visibilities that a report may claim: 2^48, a third of a million times those of 30 channels over 1.3 years.
+/// Maximum number of visibilities in a report: a third of a million times that of 30 channels over 1.3 years.
 const SAMPLED_MAX: u64 = 1 << 48;
 
 #[derive(Encode, Decode)]
@@ -36,10 +36,10 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<Housekeeping, PayloadFault> {
 
 fn check(counts: &Housekeeping) -> Result<(), PayloadFault> {
     require_time(counts.time)?;
-    let possible = counts.sampled <= SAMPLED_MAX;
-    require(possible, "sampled visibilities", counts.sampled as f64, "at most 2^48")?;
-    let good = counts.dropped <= counts.sampled;
-    require(good, "dropped visibilities", counts.dropped as f64, "no more than were sampled")
+    let is_possible = counts.sampled <= SAMPLED_MAX;
+    require(is_possible, "sampled visibilities", counts.sampled as f64, "at most 2^48")?;
+    let is_possible = counts.dropped <= counts.sampled;
+    require(is_possible, "dropped visibilities", counts.dropped as f64, "no more than were sampled")
 }
 
 #[cfg(test)]
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_report_is_sent_and_impossible_counts_are_refused() {
+    fn the_last_report_is_encoded_and_impossible_counts_are_refused() {
         let last = Housekeeping { time: Housekeeping::FOREVER, sampled: 9, dropped: 2 };
         let mut bytes = Vec::new();
         encode(&last, &mut bytes).unwrap();

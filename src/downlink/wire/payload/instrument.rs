@@ -1,9 +1,9 @@
 //! The instrument description.
 //!
-//! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8 (plus 128 if
-//! a simulation left thermal noise out),
-//! `seed` u64, `configuration_hash` u64, `channels` u16. Arrays: `frequency_hz` and `width_hz`, f64, one pair a channel.
-//! With a spectrometer, three more f64: its lowest frequency, the width of its channels (Hz), and their number.
+//! Record: `name` (u64 length, UTF-8), `epoch_tai_s` f64, `moon_radius_m` f64, `satellites` u8, `response` u8 (plus 128 for
+//! a simulation without thermal noise), `seed` u64, `configuration_hash` u64, `channels` u16. Array: `frequency_hz` and
+//! `width_hz`, f64, for each channel. A spectrometer adds three f64: its lowest frequency and the width of its channels
+//! (Hz), and their number.
 
 use bincode::{Decode, Encode};
 
@@ -13,11 +13,10 @@ use crate::frames::{Channel, Instrument, Spectrometer};
 use crate::units::MAX_SATELLITES;
 
 const NAME_BYTES_MAX: usize = 256;
-/// The whole band in channels of 8 kHz is 3738 of them.
+/// Maximum number of channels; the whole band has 3738 channels of 8 kHz.
 const CHANNELS_MAX: usize = 4096;
-/// Bytes of a spectrometer after the channels.
+/// Bytes of the spectrometer's numbers, which follow the channels.
 const SPECTROMETER_BYTES: usize = 24;
-/// Frequency range of a spectrometer, Hz.
 const SPECTRUM_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=1e9;
 /// The band of the mission, Hz.
 const FREQUENCY_HZ: std::ops::RangeInclusive<f64> = 0.1e6..=30e6;
@@ -59,25 +58,26 @@ pub(crate) fn encode(instrument: &Instrument, out: &mut Vec<u8>) -> Result<(), P
 pub(crate) fn decode(bytes: &[u8]) -> Result<Instrument, PayloadFault> {
     let (record, rest) = take_record::<InstrumentRecord>("instrument", bytes)?;
     let channels = usize::from(record.channels);
-    let more = if rest.len() == 16 * channels + SPECTROMETER_BYTES { SPECTROMETER_BYTES } else { 0 };
-    require_length("instrument channels", 16 * channels + more, rest.len())?;
+    let has_spectrometer = rest.len() == 16 * channels + SPECTROMETER_BYTES;
+    let spectrometer_bytes = if has_spectrometer { SPECTROMETER_BYTES } else { 0 };
+    require_length("instrument channels", 16 * channels + spectrometer_bytes, rest.len())?;
     let mut arrays = Arrays(rest);
-    let mut numbers = arrays.f64(2 * channels + more / 8);
+    let mut numbers = arrays.f64(2 * channels + spectrometer_bytes / 8);
     let channel = |_| Some(Channel { frequency_hz: numbers.next()?, width_hz: numbers.next()? });
     let channels: Vec<Channel> = (0..channels).map_while(channel).collect();
     let spectrometer = match [numbers.next(), numbers.next(), numbers.next()] {
         [Some(low_hz), Some(width_hz), Some(channels)] => {
-            let whole = channels.fract() == 0.0 && (1.0..=CHANNELS_MAX as f64).contains(&channels);
-            require(whole, "channels of the spectrometer", channels, "1 to 4096")?;
+            let is_count = channels.fract() == 0.0 && (1.0..=CHANNELS_MAX as f64).contains(&channels);
+            require(is_count, "channels of the spectrometer", channels, "1 to 4096")?;
             Some(Spectrometer { low_hz, width_hz, channels: channels as u16 })
         }
         _ => None,
     };
     let code = record.response;
-    let known = Instrument::response_of_code(code);
+    let decoded = Instrument::decode_response(code);
     let expected = "0 (isotropic) or 1 (dipole), plus 128 without thermal noise";
-    require(known.is_some(), "antenna response", f64::from(code), expected)?;
-    let (response, noiseless) = known.unwrap_or_default();
+    require(decoded.is_some(), "antenna response", f64::from(code), expected)?;
+    let (response, noiseless) = decoded.unwrap_or_default();
     let instrument = Instrument {
         name: record.name,
         epoch_tai_s: record.epoch_tai_s,
@@ -105,25 +105,25 @@ fn check(instrument: &Instrument) -> Result<(), PayloadFault> {
         "TAI seconds since 1958, before 2094",
     )?;
     require((1e3..=1e8).contains(&moon_radius_m), "moon_radius_m", moon_radius_m, "1e3 to 1e8 m")?;
-    let daughters = (2..=MAX_SATELLITES).contains(&usize::from(satellites));
-    require(daughters, "satellites", f64::from(satellites), "2 to 64")?;
+    let is_array = (2..=MAX_SATELLITES).contains(&usize::from(satellites));
+    require(is_array, "satellites", f64::from(satellites), "2 to 64")?;
     require((1..=CHANNELS_MAX).contains(&channels), "channels", channels as f64, "1 to 4096")?;
     for channel in &instrument.channels {
         let Channel { frequency_hz, width_hz } = *channel;
         require(FREQUENCY_HZ.contains(&frequency_hz), "frequency_hz", frequency_hz, "0.1e6 to 30e6")?;
-        let narrow = width_hz > 0.0 && width_hz < 2.0 * frequency_hz;
-        require(narrow, "width_hz", width_hz, "positive, less than twice the frequency")?;
+        let is_narrow = width_hz > 0.0 && width_hz < 2.0 * frequency_hz;
+        require(is_narrow, "width_hz", width_hz, "positive, less than twice the frequency")?;
     }
     instrument.spectrometer.map_or(Ok(()), |spectrometer| check_spectrometer(spectrometer, channels))
 }
 
-fn check_spectrometer(spectrometer: Spectrometer, before: usize) -> Result<(), PayloadFault> {
+fn check_spectrometer(spectrometer: Spectrometer, array_channels: usize) -> Result<(), PayloadFault> {
     let Spectrometer { low_hz, width_hz, channels } = spectrometer;
-    let all = before + usize::from(channels);
+    let total = array_channels + usize::from(channels);
     require(
-        channels > 0 && all <= CHANNELS_MAX,
+        channels > 0 && total <= CHANNELS_MAX,
         "channels with the spectrometer's",
-        all as f64,
+        total as f64,
         "up to 4096",
     )?;
     require(SPECTRUM_HZ.contains(&low_hz), "spectrometer's low_hz", low_hz, "0.1e6 to 1e9")?;
@@ -138,7 +138,7 @@ mod tests {
     use crate::frames::AntennaResponse;
 
     #[test]
-    fn a_spectrometer_comes_down_and_a_bad_one_is_refused() {
+    fn a_spectrometer_is_encoded_and_a_bad_one_is_refused() {
         let spectrometer = Some(Spectrometer { low_hz: 30e6, width_hz: 1e6, channels: 90 });
         let instrument = Instrument {
             name: "nine".to_owned(),
@@ -159,7 +159,7 @@ mod tests {
         let mut quiet_bytes = Vec::new();
         encode(&quiet, &mut quiet_bytes).unwrap();
         assert_eq!(decode(&quiet_bytes).unwrap(), quiet);
-        // Without the last numbers it is a description without a spectrometer.
+        // Without the last three numbers, the description has no spectrometer.
         let plain = Instrument { spectrometer: None, ..instrument.clone() };
         assert_eq!(decode(&bytes[..bytes.len() - SPECTROMETER_BYTES]).unwrap(), plain);
         assert!(decode(&bytes[..bytes.len() - 8]).is_err());

@@ -1,8 +1,8 @@
 //! Payloads of packets: a bincode-2 record, then raw little-endian arrays.
 //!
 //! Records are little-endian with fixed widths. Other languages read them as a struct of the fields in the order
-//! listed here. `decode` returns only values that meet every invariant the ground relies on; `encode` refuses what
-//! `decode` would refuse.
+//! listed in each module. `decode` returns only values that meet every invariant the ground relies on, and `encode`
+//! refuses all others.
 
 mod arrays;
 mod ephemeris;
@@ -32,7 +32,7 @@ const RECORD_BYTES_MAX: usize = 512;
 /// Range of the four bytes of seconds in a packet's time code; bounds every time in a payload.
 const TIME_S_MAX: i64 = 1 << 32;
 
-/// Why a payload was refused although its packet's checksum is right.
+/// Why a payload with a valid checksum was refused.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum PayloadFault {
@@ -75,9 +75,13 @@ pub enum PayloadFault {
     Order,
 }
 
-/// Returns a fault unless `good`.
-fn require(good: bool, what: &'static str, value: f64, expected: &'static str) -> Result<(), PayloadFault> {
-    if good { Ok(()) } else { Err(PayloadFault::Value { what, value, expected }) }
+fn require(
+    is_valid: bool,
+    what: &'static str,
+    value: f64,
+    expected: &'static str,
+) -> Result<(), PayloadFault> {
+    if is_valid { Ok(()) } else { Err(PayloadFault::Value { what, value, expected }) }
 }
 
 fn require_length(what: &'static str, expected: usize, found: usize) -> Result<(), PayloadFault> {
@@ -85,23 +89,21 @@ fn require_length(what: &'static str, expected: usize, found: usize) -> Result<(
     if expected == found { Ok(()) } else { Err(PayloadFault::Length { what, expected, found }) }
 }
 
-/// Requires a time within one range of the time code about the epoch, so that no sum of ticks overflows later.
+/// Requires a time at most the range of the time code before or after the epoch, so that no sum of ticks overflows later.
 fn require_time(time: MissionTime) -> Result<(), PayloadFault> {
-    let good = time.0.unsigned_abs() <= (TIME_S_MAX * TICKS_PER_SECOND) as u64;
-    require(good, "time (s)", time.seconds(), "within 136 years of the mission epoch")
+    let is_near = time.0.unsigned_abs() <= (TIME_S_MAX * TICKS_PER_SECOND) as u64;
+    require(is_near, "time (s)", time.seconds(), "within 136 years of the mission epoch")
 }
 
 fn config() -> Configuration<LittleEndian, Fixint, Limit<RECORD_BYTES_MAX>> {
     bincode::config::standard().with_fixed_int_encoding().with_limit::<RECORD_BYTES_MAX>()
 }
 
-/// Appends a record.
 fn put_record<R: Encode>(what: &'static str, record: R, out: &mut Vec<u8>) -> Result<(), PayloadFault> {
     bincode::encode_into_std_write(record, out, config()).map_err(|_| PayloadFault::Record { what })?;
     Ok(())
 }
 
-/// Splits a payload into its record and the rest.
 fn take_record<'a, R: Decode<()>>(
     what: &'static str,
     bytes: &'a [u8],

@@ -4,9 +4,9 @@
 //! each: `offset_ticks` u32, `duration_ticks` u32, value (re, im) f32 x 2, `weight` f32, `flags` u8.
 //!
 //! A pair of a satellite with itself (`i` = `j`) is an auto-correlation: the mean of |x|^2, with the weight n / P^2. A
-//! spectrometer is the satellite after the last, and its channels are numbered after the last channel.
+//! spectrometer has the satellite number and the channel numbers that follow the last ones.
 //!
-//! A long block is split over packets that can each be decoded alone, with the same record but for the count.
+//! A long block is divided among packets that can each be decoded alone. Their records differ only in the count.
 
 use std::ops::Range;
 
@@ -17,9 +17,7 @@ use super::{PayloadFault, put_record, require, require_length, require_time, tak
 use crate::frames::{Flags, Instrument, VisibilityBlock};
 use crate::units::{ChannelId, MissionTime, Pair};
 
-/// Bytes of the record.
 const RECORD_BYTES: usize = 16;
-/// Bytes of one visibility.
 pub(crate) const VISIBILITY_BYTES: usize = 21;
 
 #[derive(Encode, Decode)]
@@ -58,8 +56,8 @@ pub(crate) fn encode(
     Ok(())
 }
 
-/// The block of a payload without its bad visibilities, and their number: not finite, or of zero or negative weight
-/// or duration.
+/// Decodes a block; returns it without its bad visibilities, and their number. They are not finite, or their weight or
+/// duration is not positive.
 pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(VisibilityBlock, u64), PayloadFault> {
     let (record, rest) = take_record::<VisibilityRecord>("visibility", bytes)?;
     let count = record.count as usize;
@@ -76,22 +74,22 @@ pub(crate) fn decode(bytes: &[u8], instrument: &Instrument) -> Result<(Visibilit
         flags: arrays.u8(count).iter().map(|flags| Flags(*flags)).collect(),
     };
     check(&block, instrument)?;
-    let bad = if bad_values(&block) { drop_bad_values(&mut block) } else { 0 };
+    let bad = if has_bad_values(&block) { drop_bad_values(&mut block) } else { 0 };
     Ok((block, bad))
 }
 
-/// Number of visibilities that a payload claims, for the counters of refused payloads.
+/// Number of visibilities that a payload claims to hold, for the counters of refused payloads.
 pub(crate) fn count(bytes: &[u8]) -> u64 {
     take_record::<VisibilityRecord>("visibility", bytes)
         .map_or(0, |(record, rest)| u64::from(record.count).min((rest.len() / VISIBILITY_BYTES) as u64))
 }
 
-/// What a payload of visibilities claims to hold.
+/// Pair and time span that a payload of visibilities claims, without a check of its values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VisibilitiesOutline {
     /// The pair.
     pub pair: Pair,
-    /// First and last instant.
+    /// Start of the first and end of the last integration.
     pub span: [MissionTime; 2],
     /// Middle of the first integration, s since the epoch.
     pub middle_s: f64,
@@ -110,7 +108,7 @@ pub(crate) fn outline(bytes: &[u8]) -> Option<VisibilitiesOutline> {
     Some(VisibilitiesOutline {
         pair: Pair { i: record.i, j: record.j },
         span: [first, start.plus_ticks(end)],
-        // As a block has it, bit for bit.
+        // The same bits as a block's middle time.
         middle_s: start.seconds()
             + (f64::from(*offsets.first()?) + 0.5 * f64::from(*durations.first()?)) * 1e-6,
     })
@@ -120,11 +118,11 @@ pub(crate) fn outline(bytes: &[u8]) -> Option<VisibilitiesOutline> {
 pub(crate) fn check(block: &VisibilityBlock, instrument: &Instrument) -> Result<(), PayloadFault> {
     let Pair { i, j } = block.pair;
     require(i <= j, "trailing satellite of a pair", f64::from(j), "the leading one or after it")?;
-    let there = j < instrument.satellites || instrument.is_spectrum(block.pair);
-    require(there, "satellite of a pair", f64::from(j), "one of the instrument's")?;
+    let exists = j < instrument.satellites || instrument.is_spectrum(block.pair);
+    require(exists, "satellite of a pair", f64::from(j), "one of the instrument's")?;
     let channel = block.channel.0;
-    let known = instrument.channel_of(block.channel, block.pair).is_some();
-    require(known, "channel", f64::from(channel), "one of the instrument's")?;
+    let exists = instrument.channel_of(block.channel, block.pair).is_some();
+    require(exists, "channel", f64::from(channel), "one of the instrument's")?;
     require_time(block.start)?;
     for length in
         [block.offset_ticks.len(), block.duration_ticks.len(), block.weight.len(), block.flags.len()]
@@ -132,12 +130,12 @@ pub(crate) fn check(block: &VisibilityBlock, instrument: &Instrument) -> Result<
         require_length("visibility arrays", block.len(), length)?;
     }
     let twice_middle = |k: usize| 2 * u64::from(block.offset_ticks[k]) + u64::from(block.duration_ticks[k]);
-    let disorder = (1..block.len()).fold(false, |bad, k| bad | (twice_middle(k - 1) >= twice_middle(k)));
-    if disorder { Err(PayloadFault::Order) } else { Ok(()) }
+    let is_unordered = (1..block.len()).fold(false, |bad, k| bad | (twice_middle(k - 1) >= twice_middle(k)));
+    if is_unordered { Err(PayloadFault::Order) } else { Ok(()) }
 }
 
-/// Whether any visibility is bad. Branch-free, so that the usual answer costs one pass.
-fn bad_values(block: &VisibilityBlock) -> bool {
+/// Whether any visibility is bad. The loops have no branches, so they are vectorised.
+fn has_bad_values(block: &VisibilityBlock) -> bool {
     let durations = block.duration_ticks.iter().fold(false, |bad, ticks| bad | (*ticks == 0));
     let weights = block.weight.iter().fold(false, |bad, w| bad | !(*w > 0.0 && *w < f32::INFINITY));
     let values = block.value_k_sr.iter().fold(false, |bad, v| bad | !v.re.is_finite() | !v.im.is_finite());

@@ -1,4 +1,4 @@
-//! The maps that the server holds: the last of each channel, and a thinned choice of those before.
+//! Bounded cache of maps for the server: the last map of each channel, and a thinned selection of earlier ones.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
@@ -16,19 +16,18 @@ use crate::sky::spectra::auto_cl;
 use crate::sky::{Comparison, Frame, MapError, SkyMap};
 use crate::units::ChannelId;
 
-/// Most maps held of a channel.
 const MAPS_MAX: usize = 32;
 
-/// Most bytes of maps before the last of each channel, all channels together.
+/// Maximum size of all maps before the last of each channel, bytes.
 const EARLIER_BYTES_MAX: usize = 64 << 20;
 
-/// Most snapshots of a channel whose figures are held.
+/// Maximum number of snapshots of a channel whose figures are held.
 const FIGURES_MAX: usize = 512;
 
-/// Greatest nside of a map whose spectrum is taken for the page, where no truth has made the publisher take it.
+/// Maximum nside of a map whose spectrum is computed here, if there is no input sky, so that the publisher has not computed it.
 const SPECTRUM_NSIDE_MAX: usize = 64;
 
-/// Spectra of a map, K^2 by degree.
+/// Angular power spectra of a map, K^2, and its correlation with the input.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct SpectraOfMap {
     cl_map: Vec<f64>,
@@ -57,14 +56,15 @@ impl From<&Comparison> for SpectraOfMap {
     }
 }
 
-/// Pixels in RING order on ecliptic axes, K: little-endian 32-bit numbers, as its file rounds them.
+/// A map that can be served.
 #[derive(Debug)]
 pub(super) struct ShownMap {
+    /// Pixels in RING order and ecliptic coordinates, K: little-endian 32-bit floats, as in its file.
     pub(super) pixels: Bytes,
-    /// Header cards of its file; `None` for a companion, which has no file until the end.
+    /// Header cards of the map's file; `None` for the noise and input maps, whose files are written at the end.
     cards: Option<Vec<Card>>,
     title: String,
-    /// Drawn once, when somebody asks.
+    /// The picture, drawn on the first request.
     picture: OnceLock<Bytes>,
 }
 
@@ -79,7 +79,7 @@ impl ShownMap {
         numbers.iter().map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect()
     }
 
-    /// The map as a FITS file: the bytes of the publisher's file of the same map; `None` for a companion.
+    /// The map as a FITS file, identical to the publisher's; `None` for the noise and input maps.
     pub(super) fn fits(&self) -> Result<Option<Bytes>, String> {
         let Some(cards) = self.cards.clone() else { return Ok(None) };
         let map = SkyMap::new(Frame::Ecliptic, self.values()).map_err(|error| error.to_string())?;
@@ -88,7 +88,7 @@ impl ShownMap {
         Ok(Some(bytes.into()))
     }
 
-    /// The map as a picture. Takes a while, the first time.
+    /// The map as a picture, drawn on the first call.
     pub(super) fn png(&self) -> Result<Bytes, String> {
         if let Some(drawn) = self.picture.get() {
             return Ok(drawn.clone());
@@ -104,15 +104,15 @@ impl ShownMap {
     }
 }
 
-/// One snapshot's map.
 #[derive(Clone, Debug)]
 struct Snapshot {
     number: u32,
     map: Arc<ShownMap>,
 }
 
+/// Maps and figures of one channel.
 #[derive(Debug)]
-struct ChannelShelf {
+struct ChannelMaps {
     frequency_hz: f64,
     nside: usize,
     is_noiseless: bool,
@@ -125,40 +125,31 @@ struct ChannelShelf {
     input: Option<Arc<ShownMap>>,
     figures: Vec<SnapshotSummary>,
     spectra: Option<SpectraOfMap>,
-    /// When the last map was made.
     made: SystemTime,
 }
 
-/// A channel in the status.
+/// Status of a channel's maps.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct ChannelStatus {
-    /// Number of the channel.
     channel: u16,
-    /// Frequency, Hz.
     pub(super) frequency_hz: f64,
-    /// nside of its maps.
     nside: usize,
-    /// Whether its data hold no thermal noise.
     is_noiseless: bool,
     /// Whether the last map is from all data.
     is_final: bool,
     /// First and last mission time of the data, s.
     span_s: [f64; 2],
-    /// Numbers of the maps that are held, rising; the last is `latest`.
+    /// Numbers of the maps that are held, ascending; the last is `latest`.
     held: Vec<u32>,
-    /// Whether the true sky is known.
     has_input: bool,
-    /// Time since the last map was made, s.
     pub(super) age_s: f64,
-    /// Figures of the last map.
     pub(super) figures: Option<SnapshotSummary>,
-    /// RMS of the noise-only map, K.
     pub(super) noise_rms_k: f64,
     /// Regularisation and convergence of the last map.
     diagnostics: Diagnostics,
 }
 
-/// Figures of a channel's maps, and spectra of the last.
+/// Figures of a channel's maps, and spectra of the last map.
 #[derive(Debug, Serialize)]
 pub(super) struct ChannelFigures {
     number: Option<u32>,
@@ -166,7 +157,7 @@ pub(super) struct ChannelFigures {
     spectra: Option<SpectraOfMap>,
 }
 
-/// Which map of a channel.
+/// Choice of one map of a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum MapChoice {
     Number(u32),
@@ -176,12 +167,12 @@ pub(super) enum MapChoice {
 }
 
 impl MapChoice {
-    pub(super) fn read(text: &str) -> Option<Self> {
+    pub(super) fn parse(text: &str) -> Option<Self> {
         match text {
             "latest" => Some(Self::Latest),
             "noise" => Some(Self::Noise),
             "input" => Some(Self::Input),
-            // Digits alone: no sign, no leading zero, so that a map has one name.
+            // No sign and no leading zero, so that each map has one name.
             digits if digits.bytes().all(|digit| digit.is_ascii_digit()) && !digits.starts_with('0') => {
                 digits.parse().ok().map(Self::Number)
             }
@@ -190,26 +181,26 @@ impl MapChoice {
     }
 }
 
-/// The maps of all channels.
+/// Cache of the maps of all channels.
 #[derive(Debug, Default)]
-pub(super) struct Shelf(Mutex<BTreeMap<ChannelId, ChannelShelf>>);
+pub(super) struct MapCache(Mutex<BTreeMap<ChannelId, ChannelMaps>>);
 
-impl Shelf {
-    fn channels(&self) -> MutexGuard<'_, BTreeMap<ChannelId, ChannelShelf>> {
+impl MapCache {
+    fn channels(&self) -> MutexGuard<'_, BTreeMap<ChannelId, ChannelMaps>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Keeps a copy of a published map; returns its description.
+    /// Keeps a copy of a published map; returns a description for the log.
     pub(super) fn put(&self, published: PublishedMap<'_>) -> String {
         let PublishedMap { solution, figures, cards, comparison, input } = published;
         let index = usize::from(solution.channel.0);
         let frequency_hz = solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let days = (solution.span_s[1] - solution.span_s[0]) / crate::units::constants::DAY_S;
         let title = |what: &str| format!("{what} at {} MHz, {days:.1} days", frequency_hz / 1e6);
-        let companion = |values: &[f64], what| Arc::new(ShownMap::new(values, None, title(what)));
+        let without_file = |values: &[f64], what| Arc::new(ShownMap::new(values, None, title(what)));
         let map = Arc::new(ShownMap::new(&solution.map_k, Some(cards.to_vec()), title("Map")));
-        let noise = companion(&solution.noise_k, "Noise");
-        let said = format!(
+        let noise = without_file(&solution.noise_k, "Noise");
+        let description = format!(
             "map {} at {:.3} MHz: {:.1} days, {} visibilities",
             solution.number,
             frequency_hz / 1e6,
@@ -217,16 +208,17 @@ impl Shelf {
             solution.visibilities
         );
         let mut channels = self.channels();
-        let before = channels.remove(&solution.channel);
-        let (mut maps, mut all_figures, old_input) =
-            before.map_or((Vec::new(), Vec::new(), None), |shelf| (shelf.maps, shelf.figures, shelf.input));
+        let (mut maps, mut all_figures, old_input) = match channels.remove(&solution.channel) {
+            Some(before) => (before.maps, before.figures, before.input),
+            None => (Vec::new(), Vec::new(), None),
+        };
         maps.push(Snapshot { number: solution.number, map });
         thin(&mut maps, MAPS_MAX);
         all_figures.push(figures.clone());
         thin(&mut all_figures, FIGURES_MAX);
-        // The sky does not change.
-        let input = old_input.or_else(|| input.map(|input| companion(input.values(), "Input")));
-        let shelf = ChannelShelf {
+        // The input sky does not change.
+        let input = old_input.or_else(|| input.map(|input| without_file(input.values(), "Input")));
+        let channel = ChannelMaps {
             frequency_hz,
             nside: solution.nside,
             is_noiseless: solution.instrument.noiseless,
@@ -241,66 +233,65 @@ impl Shelf {
             spectra: comparison.map(SpectraOfMap::from),
             made: SystemTime::now(),
         };
-        channels.insert(solution.channel, shelf);
+        channels.insert(solution.channel, channel);
         thin_all(&mut channels);
-        said
+        description
     }
 
     /// A map; `None` if it is not held.
-    pub(super) fn map(&self, channel: ChannelId, which: MapChoice) -> Option<Arc<ShownMap>> {
+    pub(super) fn map(&self, channel: ChannelId, choice: MapChoice) -> Option<Arc<ShownMap>> {
         let channels = self.channels();
-        let shelf = channels.get(&channel)?;
-        match which {
-            MapChoice::Latest => shelf.maps.last().map(|snapshot| Arc::clone(&snapshot.map)),
+        let held_maps = channels.get(&channel)?;
+        match choice {
+            MapChoice::Latest => held_maps.maps.last().map(|snapshot| Arc::clone(&snapshot.map)),
             MapChoice::Number(number) => {
-                let found = shelf.maps.iter().find(|snapshot| snapshot.number == number);
+                let found = held_maps.maps.iter().find(|snapshot| snapshot.number == number);
                 found.map(|snapshot| Arc::clone(&snapshot.map))
             }
-            MapChoice::Noise => Some(Arc::clone(&shelf.noise)),
-            MapChoice::Input => shelf.input.clone(),
+            MapChoice::Noise => Some(Arc::clone(&held_maps.noise)),
+            MapChoice::Input => held_maps.input.clone(),
         }
     }
 
-    /// The channels in the status.
     pub(super) fn status(&self) -> Vec<ChannelStatus> {
-        let status = |(channel, shelf): (&ChannelId, &ChannelShelf)| ChannelStatus {
+        let status = |(channel, held_maps): (&ChannelId, &ChannelMaps)| ChannelStatus {
             channel: channel.0,
-            frequency_hz: shelf.frequency_hz,
-            nside: shelf.nside,
-            is_noiseless: shelf.is_noiseless,
-            is_final: shelf.is_final,
-            span_s: shelf.span_s,
-            held: shelf.maps.iter().map(|snapshot| snapshot.number).collect(),
-            has_input: shelf.input.is_some(),
-            age_s: shelf.made.elapsed().map_or(0.0, |age| age.as_secs_f64()),
-            figures: shelf.figures.last().cloned(),
-            noise_rms_k: shelf.noise_rms_k,
-            diagnostics: shelf.diagnostics,
+            frequency_hz: held_maps.frequency_hz,
+            nside: held_maps.nside,
+            is_noiseless: held_maps.is_noiseless,
+            is_final: held_maps.is_final,
+            span_s: held_maps.span_s,
+            held: held_maps.maps.iter().map(|snapshot| snapshot.number).collect(),
+            has_input: held_maps.input.is_some(),
+            age_s: held_maps.made.elapsed().map_or(0.0, |age| age.as_secs_f64()),
+            figures: held_maps.figures.last().cloned(),
+            noise_rms_k: held_maps.noise_rms_k,
+            diagnostics: held_maps.diagnostics,
         };
         self.channels().iter().map(status).collect()
     }
 
-    /// Figures of a channel, with spectra of its last map. Takes a while if there is no truth.
+    /// Figures of a channel, with spectra of its last map. Without an input sky, the first call computes the spectrum.
     pub(super) fn figures(&self, channel: ChannelId) -> Option<ChannelFigures> {
         let (figures, last, nside) = {
             let channels = self.channels();
-            let shelf = channels.get(&channel)?;
-            let last = shelf.maps.last().cloned();
+            let held_maps = channels.get(&channel)?;
+            let last = held_maps.maps.last().cloned();
             let figures = ChannelFigures {
                 number: last.as_ref().map(|snapshot| snapshot.number),
-                snapshots: shelf.figures.clone(),
-                spectra: shelf.spectra.clone(),
+                snapshots: held_maps.figures.clone(),
+                spectra: held_maps.spectra.clone(),
             };
-            (figures, last, shelf.nside)
+            (figures, last, held_maps.nside)
         };
         let Some(last) = last.filter(|_| figures.spectra.is_none() && nside <= SPECTRUM_NSIDE_MAX) else {
             return Some(figures);
         };
         let spectra = spectrum_of(&last.map, nside).ok();
-        if let Some(shelf) = self.channels().get_mut(&channel)
-            && shelf.maps.last().map(|snapshot| snapshot.number) == Some(last.number)
+        if let Some(held_maps) = self.channels().get_mut(&channel)
+            && held_maps.maps.last().map(|snapshot| snapshot.number) == Some(last.number)
         {
-            shelf.spectra.clone_from(&spectra);
+            held_maps.spectra.clone_from(&spectra);
         }
         Some(ChannelFigures { spectra, ..figures })
     }
@@ -316,31 +307,33 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|value| value * value).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// Removes every second entry of a list that is too long, but never the first and the last.
-fn thin<T>(list: &mut Vec<T>, most: usize) {
-    if list.len() > most {
-        let (mut place, last) = (0, list.len() - 1);
+/// Removes every second entry of a list longer than `length_max`, except the first and the last.
+fn thin<T>(list: &mut Vec<T>, length_max: usize) {
+    if list.len() > length_max {
+        let (mut index, last) = (0, list.len() - 1);
         list.retain(|_| {
-            place += 1;
-            (place - 1) % 2 == 0 || place - 1 == last
+            index += 1;
+            (index - 1) % 2 == 0 || index - 1 == last
         });
     }
 }
 
-/// Thins the longest lists until all earlier maps together are few enough.
-fn thin_all(channels: &mut BTreeMap<ChannelId, ChannelShelf>) {
-    let earlier = |shelf: &ChannelShelf| {
-        let before_last = &shelf.maps[..shelf.maps.len().saturating_sub(1)];
-        before_last.iter().map(|snapshot| snapshot.map.pixels.len()).sum::<usize>()
+/// Thins the channel with most bytes until all earlier maps are within [`EARLIER_BYTES_MAX`].
+fn thin_all(channels: &mut BTreeMap<ChannelId, ChannelMaps>) {
+    let earlier_bytes = |held_maps: &ChannelMaps| {
+        let earlier = &held_maps.maps[..held_maps.maps.len().saturating_sub(1)];
+        earlier.iter().map(|snapshot| snapshot.map.pixels.len()).sum::<usize>()
     };
-    while channels.values().map(earlier).sum::<usize>() > EARLIER_BYTES_MAX {
-        let Some(most) = channels.values_mut().max_by_key(|shelf| earlier(shelf)) else { return };
-        match most.maps.len() {
+    while channels.values().map(earlier_bytes).sum::<usize>() > EARLIER_BYTES_MAX {
+        let Some(largest) = channels.values_mut().max_by_key(|held_maps| earlier_bytes(held_maps)) else {
+            return;
+        };
+        match largest.maps.len() {
             0..=2 => {
-                let last = most.maps.pop();
-                most.maps = last.into_iter().collect();
+                let last = largest.maps.pop();
+                largest.maps = last.into_iter().collect();
             }
-            length => thin(&mut most.maps, length - 1),
+            length => thin(&mut largest.maps, length - 1),
         }
     }
 }
@@ -350,7 +343,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_thinned_list_goes_from_the_first_to_the_last() {
+    fn a_thinned_list_keeps_the_first_and_the_last() {
         let mut list = Vec::new();
         for number in 0..1000 {
             list.push(number);
@@ -362,10 +355,10 @@ mod tests {
 
     #[test]
     fn maps_have_one_name_each() {
-        assert_eq!(MapChoice::read("latest"), Some(MapChoice::Latest));
-        assert_eq!(MapChoice::read("7"), Some(MapChoice::Number(7)));
+        assert_eq!(MapChoice::parse("latest"), Some(MapChoice::Latest));
+        assert_eq!(MapChoice::parse("7"), Some(MapChoice::Number(7)));
         for text in ["", "0", "07", "+7", "-1", "7 ", "4294967296", "LATEST", "../7", "\u{664}"] {
-            assert_eq!(MapChoice::read(text), None, "{text}");
+            assert_eq!(MapChoice::parse(text), None, "{text}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The same figures for Prometheus, in the text format that it scrapes.
+//! Metrics for Prometheus: the status in the OpenMetrics text format.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -13,17 +13,16 @@ use prometheus_client::registry::{Registry, Unit};
 
 use super::console::Console;
 use super::status::{Phase, Status};
-use crate::downlink::Kind;
+use crate::downlink::PacketKind;
 use crate::downlink::transport::socket::ConnectionEnd;
-use crate::files::disk_room;
+use crate::files::disk_space;
 use crate::pipeline::MemoryLimit;
 use crate::runtime::{DurationCounts, StageProgress};
 use crate::units::Reason;
 
-/// Content type of the text.
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// All metrics as text.
+/// Writes all metrics as text.
 ///
 /// # Errors
 /// None in practice: writing to a string does not fail.
@@ -36,6 +35,7 @@ pub(super) fn scrape(console: &Arc<Console>) -> Result<String, fmt::Error> {
     Ok(out)
 }
 
+/// The state of a run at the time of a scrape.
 #[derive(Debug)]
 struct Scrape {
     folders: Vec<(&'static str, PathBuf)>,
@@ -43,17 +43,15 @@ struct Scrape {
     progress: Vec<StageProgress>,
 }
 
-/// Memory of this process, bytes; `None` where the system does not tell.
+/// Resident memory of this process, bytes; `None` if the system does not report it.
 fn resident_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
     line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Labels of a sample, and its value.
 type Sample<const N: usize, V> = ([(&'static str, String); N], V);
 
-/// Name and help of a metric, and its unit if it has one.
 struct MetricInfo(&'static str, &'static str, Option<Unit>);
 
 fn items() -> Option<Unit> {
@@ -90,7 +88,6 @@ fn gauge(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: f64) -> fmt:
     value.encode(out.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?)
 }
 
-/// A gauge, if it has a value.
 fn gauge_if(out: &mut DescriptorEncoder<'_>, about: MetricInfo, value: Option<f64>) -> fmt::Result {
     value.map_or(Ok(()), |value| gauge(out, about, value))
 }
@@ -129,7 +126,7 @@ impl Scrape {
         let uptime = MetricInfo("uptime", "Time since the server started", Some(Unit::Seconds));
         gauge(out, uptime, *up_s)?;
         let phases = Phase::ALL.map(|p| ([("phase", p.name().to_owned())], f64::from(u8::from(p == *phase))));
-        gauges(out, MetricInfo("run_phase", "1 for the phase in which the run is", None), phases)
+        gauges(out, MetricInfo("run_phase", "1 for the current phase of the run", None), phases)
     }
 
     fn stages(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
@@ -145,8 +142,11 @@ impl Scrape {
             capacity,
         )?;
         let busy = stages.iter().map(|s| (label(&s.name), s.busy));
-        let about =
-            MetricInfo("stage_busy", "Share of the last seconds in which a stage worked", Some(Unit::Ratios));
+        let about = MetricInfo(
+            "stage_busy",
+            "Fraction of the last seconds in which a stage worked",
+            Some(Unit::Ratios),
+        );
         gauges(out, about, busy)?;
         let received = stages.iter().map(|s| (label(&s.name), s.items_in));
         counters(out, MetricInfo("stage_received", "Items that a stage has taken", items()), received)?;
@@ -171,13 +171,13 @@ impl Scrape {
         &self,
         out: &mut DescriptorEncoder<'_>,
         MetricInfo(name, help, unit): MetricInfo,
-        of: impl Fn(&StageProgress) -> &DurationCounts,
+        durations_of: impl Fn(&StageProgress) -> &DurationCounts,
     ) -> fmt::Result {
         let mut metric = out.encode_descriptor(name, help, unit.as_ref(), MetricType::Histogram)?;
-        for stage in self.progress.iter().filter(|stage| of(stage).count() > 0) {
-            let durations = of(stage);
+        for stage in self.progress.iter().filter(|stage| durations_of(stage).count() > 0) {
+            let durations = durations_of(stage);
             let mut classes: Vec<(f64, u64)> = durations.classes().collect();
-            // Longer ones are in the last class, too.
+            // The last class also counts all longer durations.
             if let Some(last) = classes.last_mut() {
                 last.0 = f64::MAX;
             }
@@ -209,14 +209,14 @@ impl Scrape {
         gauge(out, MetricInfo("products_unwritten", about, None), unwritten)
     }
 
-    /// Gauges, not counters: what is retracted leaves the ledger.
+    /// Writes the ledger as gauges, not counters: retracted visibilities are subtracted.
     fn ledger(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let Some(ledger) = &self.status.ledger else { return Ok(()) };
         let visibilities = || Some(Unit::Other("visibilities".into()));
         let entry = |entry: &str, count: u64| ([("entry", entry.to_owned())], count as f64);
         let sampled = ledger.sampled.map(|(sampled, _)| entry("sampled", sampled));
         let entries = sampled.into_iter().chain([entry("accumulated", ledger.report.accumulated)]);
-        gauges(out, MetricInfo("ledger", "Visibilities by what became of them", visibilities()), entries)?;
+        gauges(out, MetricInfo("ledger", "Visibilities by outcome", visibilities()), entries)?;
         let left_out = ledger.report.left_out.iter().map(|(reason, &count)| {
             let stage = reason.lost_in().unwrap_or("");
             ([("reason", reason.text().to_owned()), ("lost_in", stage.to_owned())], count as f64)
@@ -224,7 +224,7 @@ impl Scrape {
         let about = "Visibilities flagged, or lost in a stage";
         gauges(out, MetricInfo("ledger_left_out", about, visibilities()), left_out)?;
         let about =
-            "Visibilities without an entry at the end of a run; zero unless the ledger does not close";
+            "Visibilities without an entry at the end of a run; not zero if the ledger does not balance";
         let unaccounted = ledger.sampled.map(|(_, rest)| rest as f64);
         gauge_if(out, MetricInfo("ledger_unaccounted", about, visibilities()), unaccounted)
     }
@@ -232,17 +232,18 @@ impl Scrape {
     fn reception(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let Some(reception) = &self.status.reception else { return Ok(()) };
         let packets = || Some(Unit::Other("packets".into()));
-        let kinds =
-            |of: &dyn Fn(Kind) -> u64| Kind::ALL.map(|kind| ([("kind", kind.to_string())], of(kind) as f64));
+        let kinds = |count: &dyn Fn(PacketKind) -> u64| {
+            PacketKind::ALL.map(|kind| ([("kind", kind.to_string())], count(kind) as f64))
+        };
         let sound = kinds(&|kind| reception.kind(kind).packets);
-        gauges(out, MetricInfo("reception", "Sound packets received, each once", packets()), sound)?;
+        gauges(out, MetricInfo("reception", "Valid packets received, without duplicates", packets()), sound)?;
         let missing = kinds(&|kind| reception.kind(kind).missing);
         let about = "Packets missing between those received";
         gauges(out, MetricInfo("reception_missing", about, packets()), missing)?;
         let damaged = kinds(&|kind| reception.kind(kind).damaged);
         gauges(out, MetricInfo("reception_damaged", "Packets with a bad checksum", packets()), damaged)?;
-        let again = kinds(&|kind| reception.kind(kind).duplicates);
-        gauges(out, MetricInfo("reception_duplicate", "Packets received before", packets()), again)
+        let duplicates = kinds(&|kind| reception.kind(kind).duplicates);
+        gauges(out, MetricInfo("reception_duplicate", "Duplicate packets", packets()), duplicates)
     }
 
     fn saving(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
@@ -262,17 +263,18 @@ impl Scrape {
         gauge_if(out, MetricInfo("checkpoint_age", about, Some(Unit::Seconds)), saving.checkpoint_s)
     }
 
-    /// Room on disks, and memory.
+    /// Writes free space of disks, and memory.
     fn machine(&self, out: &mut DescriptorEncoder<'_>) -> fmt::Result {
         let disks: Vec<_> =
-            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_room(path)?))).collect();
+            self.folders.iter().filter_map(|(name, path)| Some((*name, disk_space(path)?))).collect();
         let label = |name: &str| [("folder", name.to_owned())];
         let free = disks.iter().map(|(name, [free, _])| (label(name), *free as f64));
-        gauges(out, MetricInfo("disk_free", "Room on the disk of a folder", Some(Unit::Bytes)), free)?;
+        gauges(out, MetricInfo("disk_free", "Free space on the disk of a folder", Some(Unit::Bytes)), free)?;
         let size = disks.iter().map(|(name, [_, size])| (label(name), *size as f64));
         gauges(out, MetricInfo("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
         let available = MemoryLimit::of_machine().map(|limit| limit.bytes as f64);
-        let about = "Memory that this process can still have: of the machine, or below the limit of its control group";
+        let about =
+            "Memory available to this process: of the machine, or below the limit of its control group";
         gauge_if(out, MetricInfo("memory_available", about, Some(Unit::Bytes)), available)?;
         let resident = resident_bytes().map(|bytes| bytes as f64);
         gauge_if(out, MetricInfo("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)
@@ -291,10 +293,9 @@ impl Scrape {
         counter(out, MetricInfo("senders_read", "Read from senders", Some(Unit::Bytes)), listening.bytes)?;
         let about = "Read from senders and not taken by the ground yet";
         gauge(out, MetricInfo("senders_backlog", about, Some(Unit::Bytes)), listening.backlog_bytes as f64)?;
-        // Who has not been heard is silent since the ground began.
         let up_s = self.status.up_s;
         let silence_s = listening.silence_s.unwrap_or(up_s);
-        let about = "Time since the last sound packet from anyone, or since the ground began";
+        let about = "Time since the last valid packet from any sender, or since the server started";
         gauge(out, MetricInfo("senders_silence", about, Some(Unit::Seconds)), silence_s)?;
         if let Some(archive) = &listening.archive {
             gauge(
@@ -318,11 +319,10 @@ impl Scrape {
                 ("refused", datagrams.refused),
                 ("dropped", datagrams.dropped_by_system.unwrap_or(0)),
             ];
-            let about =
-                MetricInfo("datagrams", "Datagrams by what became of them; dropped by the system", None);
+            let about = MetricInfo("datagrams", "Datagrams by outcome; `dropped` by the system", None);
             counters(out, about, counts.map(|(end, count)| ([("end", end.to_owned())], count)))?;
         }
-        // From zero on: an increase from nothing to one is none for Prometheus.
+        // Export zeros: Prometheus computes increases only from an existing value.
         let ended = ConnectionEnd::ALL.iter().filter_map(|end| {
             let name = serde_json::to_value(end).ok()?.as_str()?.to_owned();
             Some(([("end", name)], report.ended.get(end).copied().unwrap_or(0)))
@@ -333,7 +333,7 @@ impl Scrape {
         counters(out, about, stations().map(|(label, counts)| (label, counts.bytes)))?;
         let silences = stations()
             .map(|(label, counts)| (label, counts.heard.map_or(up_s, |heard| heard.elapsed().as_secs_f64())));
-        let about = "Time since the last sound packet from a station, or since the ground began";
+        let about = "Time since the last valid packet from a station, or since the server started";
         let about = MetricInfo("station_silence", about, Some(Unit::Seconds));
         gauges(out, about, silences)?;
         let about = MetricInfo("station_connections", "Connections of a station that have ended", None);
@@ -375,10 +375,14 @@ impl Scrape {
                 MetricInfo("solver_iteration", "Iterations of the solution in progress", None),
                 solving.iteration as f64,
             )?;
-            gauge(out, MetricInfo("solver_residual", "Its residual", Some(Unit::Ratios)), solving.residual)?;
             gauge(
                 out,
-                MetricInfo("solver_target", "The residual at which it ends", Some(Unit::Ratios)),
+                MetricInfo("solver_residual", "Residual of the solution in progress", Some(Unit::Ratios)),
+                solving.residual,
+            )?;
+            gauge(
+                out,
+                MetricInfo("solver_target", "Residual at which the solution ends", Some(Unit::Ratios)),
                 solving.target,
             )?;
         }

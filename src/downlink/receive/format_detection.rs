@@ -1,16 +1,16 @@
-//! What a stream is that is no downlink, by its first bytes.
+//! Identifies streams that are not a downlink from their first bytes, for error messages.
 
 use crate::downlink::wire::cadu::{FrameHeader, IDLE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
 
-/// First bytes of a stream that are kept to name it.
+/// Number of leading bytes of a stream that are kept to identify its format.
 pub(super) const HEAD_BYTES: usize = 16 << 10;
 
-/// Lengths of transfer frames, with what stands around them.
+/// Plausible lengths of transfer frames, bytes, including sync marker and parity.
 const FRAME_BYTES: std::ops::RangeInclusive<usize> = 32..=2 * 2048;
-/// Frames that have to follow one another before they are taken for frames.
+/// Minimum number of consecutive frames or packets that identify a format.
 const FRAMES_MIN: usize = 3;
 
-/// Formats by what they begin with, and what is to be done with them.
+/// First bytes of formats, with the text for the message.
 const SIGNATURES: [(&[u8], &str); 17] = [
     (b"\x1f\x8b", "a gzip file: expand it first (gunzip)"),
     (b"\x28\xb5\x2f\xfd", "a zstd file: expand it first (unzstd)"),
@@ -26,13 +26,13 @@ const SIGNATURES: [(&[u8], &str); 17] = [
     (b"\x93NUMPY", "a numpy array"),
     (b"\x89PNG", "a PNG picture"),
     (b"%PDF", "a PDF document"),
-    (b"LNRSTA", "a checkpoint of a state: name its folder as a state"),
-    (b"\xd4\xc3\xb2\xa1", "a recording of a network (pcap)"),
-    (b"\x0a\x0d\x0d\x0a", "a recording of a network (pcapng)"),
+    (b"LNRSTA", "a checkpoint of a lunarray state: give its folder with --state"),
+    (b"\xd4\xc3\xb2\xa1", "a network capture (pcap)"),
+    (b"\x0a\x0d\x0d\x0a", "a network capture (pcapng)"),
 ];
 
-/// What a stream with these first bytes is, if it is known and no downlink.
-pub(super) fn name_of(head: &[u8]) -> Option<String> {
+/// Identifies a stream from its first bytes; `None` if they are not recognised.
+pub(super) fn identify(head: &[u8]) -> Option<String> {
     let by_signature = SIGNATURES.iter().find(|(signature, _)| head.starts_with(signature));
     if let Some((_, name)) = by_signature {
         return Some((*name).to_owned());
@@ -40,15 +40,18 @@ pub(super) fn name_of(head: &[u8]) -> Option<String> {
     if head.get(257..262) == Some(b"ustar") {
         return Some("a tar archive: unpack it first (tar -x)".to_owned());
     }
-    frames_of(head).or_else(|| marked_frames_of(head)).or_else(|| packets_of(head)).or_else(|| text_of(head))
+    identify_unsupported_frames(head)
+        .or_else(|| identify_unsupported_coding(head))
+        .or_else(|| identify_packets(head))
+        .or_else(|| identify_text(head))
 }
 
-/// Transfer frames that are not as the receiver expects them, although packets may be seen inside.
-pub(super) fn frames_of(head: &[u8]) -> Option<String> {
-    if let Some(bytes) = period(|at| head.get(at..)) {
+/// Identifies transfer frames that the receiver does not support: without sync markers, or not randomized.
+pub(super) fn identify_unsupported_frames(head: &[u8]) -> Option<String> {
+    if let Some(bytes) = frame_length(|at| head.get(at..)) {
         return Some(format!(
-            "AOS transfer frames of {bytes} bytes without sync markers: give the CADUs as they were received, or the packets that a \
-             frame processor takes out of them"
+            "AOS transfer frames of {bytes} bytes without sync markers: supply the CADUs as received, or the space packets \
+             extracted from the frames"
         ));
     }
     let (marked, bytes) = marker_period(head)?;
@@ -60,67 +63,68 @@ pub(super) fn frames_of(head: &[u8]) -> Option<String> {
     })
 }
 
-/// Frames behind sync markers that no code of the receiver fits.
-fn marked_frames_of(head: &[u8]) -> Option<String> {
+/// Identifies frames with sync markers in a coding that the receiver does not support.
+fn identify_unsupported_coding(head: &[u8]) -> Option<String> {
     let (marked, bytes) = marker_period(head)?;
-    let plain = |at: usize| {
+    let derandomized_start = |at: usize| {
         let block = marked.get(at + SYNC_MARKER_BYTES..)?;
         let mut start = block.get(..block.len().min(8))?.to_vec();
         randomize(&mut start);
         Some(start)
     };
-    let is_aos = (0..3).all(|k| plain(k * bytes).is_some_and(|start| FrameHeader::parse(&start).is_some()));
-    let of = if is_aos { "randomized AOS frames" } else { "frames of another kind or code" };
+    let is_aos_header = |start: Vec<u8>| FrameHeader::parse(&start).is_some();
+    let is_aos = (0..3).all(|k| derandomized_start(k * bytes).is_some_and(is_aos_header));
+    let frames = if is_aos { "randomized AOS frames" } else { "frames of another kind or coding" };
     Some(format!(
-        "{of} of {bytes} bytes with sync markers that are no CADUs as expected: blocks of 255 to 2040 bytes with Reed-Solomon \
-         (255, 223) parity, randomized"
+        "{frames} of {bytes} bytes with sync markers, but not the expected CADUs: randomized blocks of 255 to 2040 bytes with \
+         Reed-Solomon (255, 223) parity"
     ))
 }
 
-/// Distance of frames that begin at byte 0 and follow one another.
-fn period<'a>(at: impl Fn(usize) -> Option<&'a [u8]>) -> Option<usize> {
+/// Length of consecutive frames that begin at byte 0.
+fn frame_length<'a>(at: impl Fn(usize) -> Option<&'a [u8]>) -> Option<usize> {
     FrameHeader::parse(at(0)?)?;
     FRAME_BYTES.into_iter().find(|&bytes| is_chain(bytes, &at))
 }
 
-/// Whether headers at multiples of `bytes` are of one spacecraft, and count the frames of each virtual channel.
+/// Whether headers at multiples of `bytes` have one spacecraft identifier and consecutive counts in each virtual channel.
 fn is_chain<'a>(bytes: usize, at: impl Fn(usize) -> Option<&'a [u8]>) -> bool {
-    let mut newest: Vec<Option<u32>> = vec![None; 64];
-    let (mut spacecraft, mut counted, mut frames) = (None, 0, 0);
+    let mut last_counts: Vec<Option<u32>> = vec![None; 64];
+    let (mut spacecraft, mut consecutive, mut frames) = (None, 0, 0);
     while let Some(start) = at(frames * bytes).filter(|start| start.len() >= 8) {
         let Some(header) = FrameHeader::parse(start) else { return false };
         if *spacecraft.get_or_insert(header.spacecraft) != header.spacecraft {
             return false;
         }
-        let before = newest[usize::from(header.channel & 0x3F)].replace(header.count);
+        let before = last_counts[usize::from(header.channel & 0x3F)].replace(header.count);
         match before {
-            Some(before) if before + 1 == header.count => counted += 1,
+            Some(before) if before + 1 == header.count => consecutive += 1,
             Some(_) if header.channel != IDLE => return false,
             _ => {}
         }
         frames += 1;
     }
-    frames >= FRAMES_MIN && counted + 1 >= FRAMES_MIN
+    frames >= FRAMES_MIN && consecutive + 1 >= FRAMES_MIN
 }
 
-/// The stream from its first sync marker on, and the distance at which it repeats.
+/// The stream from its first sync marker on, and the distance between markers.
 fn marker_period(head: &[u8]) -> Option<(&[u8], usize)> {
     let marker = SYNC_MARKER.to_be_bytes();
     let marked = &head[head.windows(SYNC_MARKER_BYTES).position(|bytes| bytes == marker)?..];
     let is_marked = |at: usize| marked.get(at..at + SYNC_MARKER_BYTES) == Some(&marker[..]);
     let period = FRAME_BYTES.into_iter().find(|&bytes| {
-        let whole = (marked.len() / bytes).max(FRAMES_MIN);
-        (1..whole).all(|k| is_marked(k * bytes))
+        let frames = (marked.len() / bytes).max(FRAMES_MIN);
+        (1..frames).all(|k| is_marked(k * bytes))
     })?;
     Some((marked, period))
 }
 
-/// Space packets of other missions: headers whose lengths lead from one to the next.
-fn packets_of(head: &[u8]) -> Option<String> {
+/// Identifies space packets of other missions: headers whose lengths lead from one to the next.
+fn identify_packets(head: &[u8]) -> Option<String> {
     let (mut at, mut apids) = (0, Vec::new());
     while let Some(&[a, b, _, _, c, d]) = head.get(at..).and_then(<[u8]>::first_chunk) {
         let apid = u16::from_be_bytes([a, b]) & 0x7FF;
-        // Version 000, and no packet without a byte: zeros are none.
+        // The packet version must be 0. A header of zeros is rejected, as in a run of zeros.
         if a >> 5 != 0 || (apid == 0 && c == 0 && d == 0) {
             return None;
         }
@@ -137,8 +141,7 @@ fn packets_of(head: &[u8]) -> Option<String> {
     Some(format!("space packets of other APIDs: {}{more}", shown.join(", ")))
 }
 
-/// Text, by what it begins with.
-fn text_of(head: &[u8]) -> Option<String> {
+fn identify_text(head: &[u8]) -> Option<String> {
     let head = head.strip_prefix(b"\xef\xbb\xbf").unwrap_or(head);
     let is_text = |byte: &u8| matches!(byte, b'\t' | b'\n' | b'\r' | 0x20..=0x7e | 0x80..);
     if head.is_empty()
@@ -150,18 +153,17 @@ fn text_of(head: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(head);
     let text = text.trim_start();
     Some(match text {
-        _ if text.starts_with('<') => format!("an XML document (<{}>)", root_of(text)),
+        _ if text.starts_with('<') => format!("an XML document (<{}>)", root_element(text)),
         _ if text.starts_with("CCSDS_") => {
             let name = text.split(|c: char| c == '=' || c.is_whitespace()).next().unwrap_or_default();
-            format!("a CCSDS message ({name}), as array.oem takes them for orbits")
+            format!("a CCSDS message ({name}): orbit files (OEM) go into the key array.oem")
         }
         _ if text.starts_with(['{', '[']) => "JSON or TOML".to_owned(),
         _ => "a text file".to_owned(),
     })
 }
 
-/// Name of the first element of a document.
-fn root_of(text: &str) -> String {
+fn root_element(text: &str) -> String {
     let elements = text.split('<').skip(1).filter(|element| !element.starts_with(['?', '!']));
     let name = |element: &str| {
         element.chars().take_while(|c| c.is_alphanumeric() || "_-:".contains(*c)).take(40).collect()
@@ -187,33 +189,33 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_named_by_what_they_lack() {
+    fn unsupported_frames_are_identified() {
         let bare = frames(9, 1115).concat();
         assert!(
-            name_of(&bare).unwrap().starts_with("AOS transfer frames of 1115 bytes without sync markers")
+            identify(&bare).unwrap().starts_with("AOS transfer frames of 1115 bytes without sync markers")
         );
-        let marked = |of: fn(&mut [u8])| -> Vec<u8> {
+        let marked = |encode: fn(&mut [u8])| -> Vec<u8> {
             let block = |mut frame: Vec<u8>| {
-                of(&mut frame);
+                encode(&mut frame);
                 [&SYNC_MARKER.to_be_bytes()[..], &frame].concat()
             };
             frames(9, 1115).into_iter().flat_map(block).collect()
         };
-        let plain = name_of(&marked(|_| {})).unwrap();
+        let plain = identify(&marked(|_| {})).unwrap();
         assert!(plain.starts_with("CADUs of 1119 bytes whose blocks are not randomized"), "{plain}");
-        let no_parity = name_of(&marked(randomize)).unwrap();
+        let no_parity = identify(&marked(randomize)).unwrap();
         assert!(
             no_parity.starts_with("randomized AOS frames of 1119 bytes with sync markers"),
             "{no_parity}"
         );
-        // Frames that are randomized may be sound: they are no reason to refuse a stream.
-        assert_eq!(frames_of(&marked(randomize)), None);
+        // Randomized frames may be valid, so they are no reason to refuse a stream.
+        assert_eq!(identify_unsupported_frames(&marked(randomize)), None);
         // A stream may begin anywhere.
-        assert_eq!(name_of(&marked(|_| {})[500..]), Some(plain));
+        assert_eq!(identify(&marked(|_| {})[500..]), Some(plain));
     }
 
     #[test]
-    fn files_of_other_kinds_have_names() {
+    fn other_formats_are_identified() {
         let packet = |apid: u16, bytes: usize| {
             let mut packet = (0x0800 | apid).to_be_bytes().to_vec();
             packet.extend([0xC0, 0, 0, (bytes - 1) as u8]);
@@ -232,10 +234,10 @@ mod tests {
             (b"a,b,c\n1,2,3\n", "a text file"),
             (&packets, "space packets of other APIDs: 0x2a1, 0x2a2"),
         ] {
-            assert!(name_of(head).is_some_and(|found| found.contains(name)), "{name}: {:?}", name_of(head));
+            assert!(identify(head).is_some_and(|found| found.contains(name)), "{name}: {:?}", identify(head));
         }
         for unknown in [&[0; 600][..], &[0xFF; 600], b"", b"\x01"] {
-            assert_eq!(name_of(unknown), None);
+            assert_eq!(identify(unknown), None);
         }
     }
 }

@@ -1,69 +1,71 @@
-//! Bytes to packets, robust against any damage by a link or a disk.
+//! A receiver of packets from bytes with any damage by a link or a disk.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
 
 use super::sequence::{Arrival, Sequence};
 use crate::downlink::wire::cadu::framer::{IDLE_APID, PACKET_HEADER_BYTES as PRIMARY_HEADER_BYTES};
-use crate::downlink::wire::{HEADER_BYTES, Kind, PacketHeader, TRAILER_BYTES, packet_check, packet_holds};
+use crate::downlink::wire::{
+    HEADER_BYTES, PacketHeader, PacketKind, TRAILER_BYTES, has_valid_checksum, packet_checksum,
+};
 
-/// Bytes that [`PacketReceiver::fill_from`] reads at a time.
+/// Number of bytes that [`PacketReceiver::fill_from`] requests at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
-/// First byte of an idle packet of telemetry; that of a command has one bit more.
+/// First byte of an idle packet of telemetry; an idle command packet differs in one bit.
 const IDLE_FIRST_BYTE: u8 = (IDLE_APID >> 8) as u8;
 
-/// A sound packet: its checksums are right.
+/// A packet with valid checksums.
 #[derive(Clone, Copy, Debug)]
 pub struct Packet<'a> {
     /// Offset in the stream, bytes.
     pub offset: u64,
-    /// Its headers.
+    /// The headers.
     pub header: PacketHeader,
     /// The payload, without headers and checksum.
     pub payload: &'a [u8],
-    /// Its checksum, over headers and payload.
+    /// The packet checksum, over headers and payload.
     pub check: u32,
-    /// Whether it fills a gap reported earlier.
+    /// Whether the packet fills a gap that was reported earlier.
     pub late: bool,
 }
 
 impl Packet<'_> {
-    /// Appends it as it was sent. Parsed headers hold every bit of the originals.
+    /// Appends the packet as it was sent. Encoding parsed headers restores every bit.
     pub(crate) fn append_to(&self, out: &mut Vec<u8>) {
         let start = out.len();
         out.reserve(self.header.bytes.min(HEADER_BYTES + self.payload.len() + TRAILER_BYTES));
         out.extend_from_slice(&self.header.to_bytes());
         out.extend_from_slice(self.payload);
-        let check = packet_check(&out[start..]);
+        let check = packet_checksum(&out[start..]);
         out.extend_from_slice(&check);
     }
 }
 
-/// What a stream contains, in order. Events other than [`Event::Gap`] and [`Event::Restart`] cover each byte of the
-/// stream exactly once.
+/// An item of a stream, in order. Events other than [`Event::Gap`] and [`Event::Restart`] cover each byte of the stream
+/// exactly once.
 #[derive(Clone, Copy, Debug)]
 #[non_exhaustive]
 pub enum Event<'a> {
-    /// A sound packet.
+    /// A valid packet.
     Packet(Packet<'a>),
-    /// A sound packet received before.
+    /// A valid packet that was received before.
     Duplicate {
         /// Offset in the stream, bytes.
         offset: u64,
-        /// Its headers.
+        /// The headers.
         header: PacketHeader,
     },
-    /// A packet with sound headers and a bad packet checksum.
+    /// A packet with valid headers and an invalid packet checksum.
     Damaged {
         /// Offset in the stream, bytes.
         offset: u64,
-        /// Its headers.
+        /// The headers.
         header: PacketHeader,
-        /// Bytes skipped: the packet, or only its headers if no other packet follows where it should end.
+        /// Number of bytes skipped: the packet, or only its headers if no other packet follows it.
         bytes: u64,
     },
-    /// Packets of a kind are missing: counts from `expected` to just below that of the next packet.
+    /// Packets of a kind are missing, with counts from `expected` to just below the count of the next packet.
     Gap {
         /// Offset of the next packet, bytes.
         offset: u64,
@@ -78,10 +80,10 @@ pub enum Event<'a> {
         offset: u64,
         /// Headers of the next packet.
         header: PacketHeader,
-        /// The count that was due.
+        /// The count expected without a restart.
         expected: u64,
     },
-    /// Idle packets (APID 0x7FF), which fill a stream and say nothing.
+    /// An idle packet (APID 0x7FF), which fills a stream without data.
     Idle {
         /// Offset in the stream, bytes.
         offset: u64,
@@ -99,12 +101,12 @@ pub enum Event<'a> {
     Truncated {
         /// Offset of the packet, bytes.
         offset: u64,
-        /// Bytes of it in the stream.
+        /// Number of its bytes in the stream.
         bytes: u64,
     },
 }
 
-/// An event without its bytes. Except for gaps and restarts, handing it out consumes the bytes it covers.
+/// A queued event without its bytes. Returning it consumes the bytes it covers; gaps and restarts cover none.
 #[derive(Clone, Copy, Debug)]
 enum PendingEvent {
     Packet { header: PacketHeader, late: bool },
@@ -117,31 +119,29 @@ enum PendingEvent {
     Truncated { bytes: usize },
 }
 
-/// What begins at the first unconsumed byte.
+/// The result of examining the first unconsumed bytes.
 enum PacketMatch {
-    /// A sound packet.
-    Good(PacketHeader),
-    /// Sound headers of a damaged packet; bytes to skip.
-    Bad(PacketHeader, usize),
-    /// An idle packet, with its bytes.
+    /// A valid packet.
+    Valid(PacketHeader),
+    /// A damaged packet with valid headers, and the number of bytes to skip.
+    Damaged(PacketHeader, usize),
+    /// An idle packet of this number of bytes.
     Idle(usize),
-    /// Headers of a packet in which the stream ends.
-    Cut,
+    /// A packet in which the stream ends.
+    Truncated,
     /// More bytes are needed to decide.
-    Unknown,
+    Undecided,
     /// No downlink packet.
-    Nothing,
+    NoPacket,
 }
 
 /// Finds packets in a stream of bytes, given in chunks of any size.
 ///
-/// Push bytes, then take events until there are none. At the end call [`PacketReceiver::finish`] and take the rest.
-/// Used so, memory stays below the longest packet plus twice the longest chunk.
+/// Push bytes, then take events until there are none. At the end call [`PacketReceiver::finish`] and take the remaining
+/// events. Memory then stays below the longest packet plus twice the longest chunk.
 ///
-/// Idle packets (APID 0x7FF) between packets are passed over.
-///
-/// After damage it searches for the next sound headers. Time is linear in the stream: a packet checksum is computed
-/// once per sound headers, which noise yields once in 10^11 bytes and a forger at most once in 22.
+/// After damage it searches for the next valid headers. Time is linear in the stream: a packet checksum is computed only
+/// after valid headers, which occur once in 10^11 bytes of noise and at most once in 22 bytes of forged data.
 #[derive(Debug, Default)]
 pub struct PacketReceiver {
     buffer: Vec<u8>,
@@ -150,13 +150,13 @@ pub struct PacketReceiver {
     end: usize,
     /// Offset of `buffer[0]` in the stream.
     offset: u64,
-    /// Where the current run of garbage began.
+    /// Start of the current run of garbage.
     garbage_from: Option<u64>,
-    /// Where, near the end, headers of an incomplete packet were found.
-    cut_at: Option<u64>,
-    finished: bool,
+    /// Start of a packet in which the stream may end.
+    truncated_from: Option<u64>,
+    is_finished: bool,
     pending: VecDeque<PendingEvent>,
-    sequences: [Sequence; Kind::ALL.len()],
+    sequences: [Sequence; PacketKind::ALL.len()],
     /// Whether packet counts are left to the caller.
     unfiltered: bool,
 }
@@ -168,8 +168,8 @@ impl PacketReceiver {
         Self::default()
     }
 
-    /// A receiver that hands out every sound packet, duplicates too, and reports no gaps: for callers that keep a
-    /// received set of their own.
+    /// A receiver that returns every valid packet, including duplicates, and reports no gaps, for callers that keep their own
+    /// received set.
     #[must_use]
     pub fn unfiltered() -> Self {
         Self { unfiltered: true, ..Self::default() }
@@ -177,17 +177,17 @@ impl PacketReceiver {
 
     /// Takes the next bytes of the stream.
     pub fn push(&mut self, bytes: &[u8]) {
-        self.room(bytes.len()).copy_from_slice(bytes);
+        self.reserve(bytes.len()).copy_from_slice(bytes);
         self.end += bytes.len();
     }
 
     /// Takes the next bytes from a reader without an extra copy; returns their number, 0 at its end.
     ///
     /// # Errors
-    /// Those of the reader, except interruptions.
+    /// The errors of the reader, except interruptions.
     pub fn fill_from(&mut self, reader: &mut impl Read) -> io::Result<usize> {
         loop {
-            match reader.read(self.room(CHUNK_BYTES)) {
+            match reader.read(self.reserve(CHUNK_BYTES)) {
                 Ok(bytes) => {
                     self.end += bytes;
                     return Ok(bytes);
@@ -200,33 +200,31 @@ impl PacketReceiver {
 
     /// Ends the stream.
     pub fn finish(&mut self) {
-        self.finished = true;
+        self.is_finished = true;
     }
 
-    /// Whether the stream has ended.
     pub(super) fn is_finished(&self) -> bool {
-        self.finished
+        self.is_finished
     }
 
-    /// Whether the headers of a packet, sound or damaged, come next after garbage.
+    /// Whether the next events contain a packet, valid or damaged.
     pub(super) fn has_header(&mut self) -> bool {
         if self.pending.is_empty() {
-            self.look();
+            self.queue_next();
         }
-        let of_packet = |next: &PendingEvent| {
+        self.pending.iter().any(|event| {
             matches!(
-                next,
+                event,
                 PendingEvent::Packet { .. }
                     | PendingEvent::Duplicate(_)
                     | PendingEvent::Damaged(..)
                     | PendingEvent::Idle(_)
             )
-        };
-        self.pending.iter().any(of_packet)
+        })
     }
 
-    /// Restarts of the packet count of a kind, independent of the order of arrival.
-    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+    /// Number of restarts of the packet count of a kind, in any order of arrival.
+    pub(super) fn restarts(&self, kind: PacketKind) -> u64 {
         self.sequences[kind.index()].restarts()
     }
 
@@ -236,16 +234,16 @@ impl PacketReceiver {
         self.offset + self.end as u64
     }
 
-    /// Memory held for the stream, bytes.
+    /// Memory allocated for the stream, bytes.
     #[must_use]
-    pub fn held_bytes(&self) -> usize {
+    pub fn memory_bytes(&self) -> usize {
         self.buffer.capacity()
     }
 
     /// The next event; `None` until more bytes arrive, or at the end of the stream.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
         if self.pending.is_empty() {
-            self.look();
+            self.queue_next();
         }
         let next = self.pending.pop_front()?;
         let offset = self.offset + self.begin as u64;
@@ -279,8 +277,8 @@ impl PacketReceiver {
         })
     }
 
-    /// Space for `bytes` more bytes at the end of the buffer.
-    fn room(&mut self, bytes: usize) -> &mut [u8] {
+    /// Makes space for `bytes` more bytes at the end of the buffer, and returns it.
+    fn reserve(&mut self, bytes: usize) -> &mut [u8] {
         if self.end + bytes > self.buffer.len() {
             if self.begin > 0 {
                 self.buffer.copy_within(self.begin..self.end, 0);
@@ -296,83 +294,82 @@ impl PacketReceiver {
     }
 
     /// Advances to the next packet, if it is complete, and queues its events.
-    fn look(&mut self) {
+    fn queue_next(&mut self) {
         while self.begin < self.end {
-            match self.find() {
-                PacketMatch::Good(header) => return self.take_good(header),
-                PacketMatch::Bad(header, bytes) => return self.take_damaged(header, bytes),
+            match self.examine() {
+                PacketMatch::Valid(header) => return self.queue_valid(header),
+                PacketMatch::Damaged(header, bytes) => return self.queue_damaged(header, bytes),
                 PacketMatch::Idle(bytes) => return self.pending.push_back(PendingEvent::Idle(bytes)),
-                PacketMatch::Unknown => return,
-                PacketMatch::Cut => {
-                    self.cut_at.get_or_insert(self.offset + self.begin as u64);
-                    self.pass_garbage();
+                PacketMatch::Undecided => return,
+                PacketMatch::Truncated => {
+                    self.truncated_from.get_or_insert(self.offset + self.begin as u64);
+                    self.skip_garbage();
                 }
-                PacketMatch::Nothing => self.pass_garbage(),
+                PacketMatch::NoPacket => self.skip_garbage(),
             }
         }
-        if self.finished {
-            self.take_rest();
+        if self.is_finished {
+            self.queue_end();
         }
     }
 
-    /// Examines the beginning of the unconsumed bytes.
-    fn find(&self) -> PacketMatch {
+    fn examine(&self) -> PacketMatch {
         let rest = &self.buffer[self.begin..self.end];
-        // Idle packets have no checksum: they are taken for such only where a packet is due.
+        // Idle packets have no checksum, so they are accepted only directly after a packet.
         if self.garbage_from.is_none()
-            && let Some(idle) = self.find_idle(rest)
+            && let Some(idle) = self.examine_idle(rest)
         {
             return idle;
         }
         let Some(bytes) = rest.get(..HEADER_BYTES) else {
-            // Too short for headers: the beginning of a packet if it follows one and looks like one.
-            return match (self.finished, rest[0] == PacketHeader::FIRST_BYTE) {
-                (_, false) => PacketMatch::Nothing,
-                (false, true) => PacketMatch::Unknown,
-                (true, true) if self.garbage_from.is_none() => PacketMatch::Cut,
-                (true, true) => PacketMatch::Nothing,
+            // Too short for headers: a truncated packet if it directly follows another and its first byte fits.
+            return match (self.is_finished, rest[0] == PacketHeader::FIRST_BYTE) {
+                (_, false) => PacketMatch::NoPacket,
+                (false, true) => PacketMatch::Undecided,
+                (true, true) if self.garbage_from.is_none() => PacketMatch::Truncated,
+                (true, true) => PacketMatch::NoPacket,
             };
         };
-        let Some(header) = PacketHeader::parse(bytes) else { return PacketMatch::Nothing };
+        let Some(header) = PacketHeader::parse(bytes) else { return PacketMatch::NoPacket };
         let Some(packet) = rest.get(..header.bytes) else {
-            return if self.finished { PacketMatch::Cut } else { PacketMatch::Unknown };
+            return if self.is_finished { PacketMatch::Truncated } else { PacketMatch::Undecided };
         };
-        if packet_holds(packet) {
-            return PacketMatch::Good(header);
+        if has_valid_checksum(packet) {
+            return PacketMatch::Valid(header);
         }
         let after = &rest[header.bytes..];
-        if after.len() < HEADER_BYTES && !self.finished {
-            return PacketMatch::Unknown;
+        if after.len() < HEADER_BYTES && !self.is_finished {
+            return PacketMatch::Undecided;
         }
         let another_follows = match after.first() {
             None => true,
             Some(first) if after.len() < HEADER_BYTES => *first == PacketHeader::FIRST_BYTE,
             Some(_) => PacketHeader::parse(after).is_some(),
         };
-        PacketMatch::Bad(header, if another_follows { header.bytes } else { HEADER_BYTES })
+        PacketMatch::Damaged(header, if another_follows { header.bytes } else { HEADER_BYTES })
     }
 
-    /// An idle packet at the beginning of `rest`; another packet, or the end, must follow it.
-    fn find_idle(&self, rest: &[u8]) -> Option<PacketMatch> {
-        let begins = |bytes: &[u8]| matches!(bytes, [first, 0xFF, ..] if first & 0xEF == IDLE_FIRST_BYTE);
-        if !begins(rest) {
+    /// Examines an idle packet at the beginning of `rest`. It is accepted if another packet, or the end, follows it.
+    fn examine_idle(&self, rest: &[u8]) -> Option<PacketMatch> {
+        let is_idle = |bytes: &[u8]| matches!(bytes, [first, 0xFF, ..] if first & 0xEF == IDLE_FIRST_BYTE);
+        if !is_idle(rest) {
             return None;
         }
-        let undecided = if self.finished { PacketMatch::Cut } else { PacketMatch::Unknown };
+        let incomplete = if self.is_finished { PacketMatch::Truncated } else { PacketMatch::Undecided };
         let Some(&[.., high, low]) = rest.first_chunk::<PRIMARY_HEADER_BYTES>() else {
-            return Some(undecided);
+            return Some(incomplete);
         };
         let bytes = PRIMARY_HEADER_BYTES + 1 + usize::from(u16::from_be_bytes([high, low]));
-        let Some(after) = rest.get(bytes..) else { return Some(undecided) };
-        if after.len() < HEADER_BYTES && !self.finished {
-            return Some(PacketMatch::Unknown);
+        let Some(after) = rest.get(bytes..) else { return Some(incomplete) };
+        if after.len() < HEADER_BYTES && !self.is_finished {
+            return Some(PacketMatch::Undecided);
         }
-        let follows = after.is_empty() || begins(after) || PacketHeader::parse(after).is_some();
-        follows.then_some(PacketMatch::Idle(bytes))
+        let another_follows = after.is_empty() || is_idle(after) || PacketHeader::parse(after).is_some();
+        another_follows.then_some(PacketMatch::Idle(bytes))
     }
 
-    /// Skips one byte, then all up to the next that could begin a packet.
-    fn pass_garbage(&mut self) {
+    /// Skips bytes up to the next one that could begin a packet, at least one.
+    fn skip_garbage(&mut self) {
         self.garbage_from.get_or_insert(self.offset + self.begin as u64);
         self.begin += 1;
         let rest = &self.buffer[self.begin..self.end];
@@ -385,30 +382,30 @@ impl PacketReceiver {
         }
     }
 
-    fn take_good(&mut self, header: PacketHeader) {
+    fn queue_valid(&mut self, header: PacketHeader) {
         let arrival = match self.unfiltered {
             true => Arrival::InOrder,
             false => self.sequences[header.kind.index()].receive(header.count, header.time),
         };
-        self.announce(header, arrival);
+        self.queue_before(header, arrival);
         self.pending.push_back(match arrival {
             Arrival::Duplicate => PendingEvent::Duplicate(header),
             other => PendingEvent::Packet { header, late: other == Arrival::Late },
         });
     }
 
-    fn take_damaged(&mut self, header: PacketHeader, bytes: usize) {
+    fn queue_damaged(&mut self, header: PacketHeader, bytes: usize) {
         let arrival = match self.unfiltered {
             true => Arrival::InOrder,
-            false => self.sequences[header.kind.index()].pass_damaged(header.count, header.time),
+            false => self.sequences[header.kind.index()].receive_damaged(header.count, header.time),
         };
-        self.announce(header, arrival);
+        self.queue_before(header, arrival);
         self.pending.push_back(PendingEvent::Damaged(header, bytes));
     }
 
-    /// Queues what precedes a packet: garbage, a gap or a restart.
-    fn announce(&mut self, header: PacketHeader, arrival: Arrival) {
-        self.cut_at = None;
+    /// Queues the events that precede a packet: garbage, a gap or a restart.
+    fn queue_before(&mut self, header: PacketHeader, arrival: Arrival) {
+        self.truncated_from = None;
         self.end_garbage(self.offset + self.begin as u64);
         match arrival {
             Arrival::AfterGap { expected } => self.pending.push_back(PendingEvent::Gap { header, expected }),
@@ -419,13 +416,13 @@ impl PacketReceiver {
         }
     }
 
-    /// At the end of the stream, the rest is garbage, then perhaps the beginning of a packet.
-    fn take_rest(&mut self) {
+    /// Queues the events at the end of the stream: garbage, then the truncated packet, if there is one.
+    fn queue_end(&mut self) {
         let end = self.offset + self.end as u64;
-        let cut_at = self.cut_at.take().unwrap_or(end);
-        self.end_garbage(cut_at);
-        if cut_at < end {
-            let bytes = (end - cut_at) as usize;
+        let truncated_from = self.truncated_from.take().unwrap_or(end);
+        self.end_garbage(truncated_from);
+        if truncated_from < end {
+            let bytes = (end - truncated_from) as usize;
             self.begin = self.end - bytes;
             self.pending.push_back(PendingEvent::Truncated { bytes });
         }
@@ -440,7 +437,7 @@ mod tests {
     use crate::downlink::wire::{CucTime, FORMAT_VERSION, PACKET_BYTES_MAX, PacketSegment};
     use crate::units::{StreamKind, random_stream};
 
-    /// Bytes that a stream's events cover, and the most that the receiver held. It must have read all of it.
+    /// Number of bytes that a stream's events cover, and the maximum size of the buffer. Reads the whole stream.
     fn cover(stream: &mut impl Read) -> (u64, usize) {
         let mut receiver = PacketReceiver::new();
         let (mut covered, mut held) = (0, 0);
@@ -460,7 +457,7 @@ mod tests {
                 };
             }
             held = held.max(receiver.buffer.len());
-            if receiver.finished {
+            if receiver.is_finished {
                 assert_eq!(covered, receiver.bytes());
                 return (covered, held);
             }
@@ -487,12 +484,12 @@ mod tests {
     }
 
     #[test]
-    fn forged_headers_without_bodies_end_in_time() {
-        // Each announces the longest packet, so that each makes the receiver check 64 KiB.
+    fn forged_headers_without_payloads_take_linear_time_and_bounded_memory() {
+        // Each header claims the longest packet, so that the receiver computes a checksum of 64 KiB for each.
         let forged: Vec<u8> = (0..20_000)
             .flat_map(|count| {
                 PacketHeader {
-                    kind: Kind::Visibilities,
+                    kind: PacketKind::Visibilities,
                     segment: PacketSegment::Whole,
                     count: 2 * count,
                     time: CucTime(1),

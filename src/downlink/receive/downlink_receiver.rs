@@ -1,21 +1,21 @@
-//! Bytes to packets, for either format.
+//! A receiver of packets from a stream of either format.
 
 use std::io::{self, Read};
 
 use super::cadu::{CaduReceiver, FrameCounters};
-use super::foreign::{HEAD_BYTES, frames_of, name_of};
+use super::format_detection::{HEAD_BYTES, identify, identify_unsupported_frames};
 use super::{Event, PacketReceiver};
-use crate::downlink::wire::{Format, Kind};
+use crate::downlink::wire::{Format, PacketKind};
 
-/// Bytes that [`Intake::fill_from`] asks for at a time.
+/// Number of bytes that [`DownlinkReceiver::fill_from`] requests at a time.
 const CHUNK_BYTES: usize = 1 << 18;
 
-/// Finds packets in a stream of either format, given in chunks of any size.
+/// Finds packets in a stream of either format, given in chunks of any size. Used like a [`PacketReceiver`].
 ///
-/// Detects the format by content: by the first packet or coded frame, neither of which occurs in the other format by
-/// chance. Used like a [`PacketReceiver`]. In a coded stream, offsets of events count recovered packet bytes.
+/// Detects the format by the first packet or coded frame, neither of which occurs in the other format by chance. In a
+/// coded stream, offsets of events count recovered packet bytes.
 #[derive(Debug, Default)]
-pub struct Intake {
+pub struct DownlinkReceiver {
     format: Option<Format>,
     packets: PacketReceiver,
     frames: CaduReceiver,
@@ -23,18 +23,17 @@ pub struct Intake {
     chunk: Vec<u8>,
     recovered: Vec<u8>,
     unfiltered: bool,
-    /// The first bytes of the stream.
     head: Vec<u8>,
 }
 
-impl Intake {
-    /// An intake at the start of a stream.
+impl DownlinkReceiver {
+    /// A receiver at the start of a stream.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// An intake with a [`PacketReceiver::unfiltered`].
+    /// A receiver that returns every valid packet, see [`PacketReceiver::unfiltered`].
     #[must_use]
     pub fn unfiltered() -> Self {
         Self { unfiltered: true, packets: PacketReceiver::unfiltered(), ..Self::default() }
@@ -54,14 +53,14 @@ impl Intake {
         if self.format != Some(Format::Packets) {
             self.recovered.clear();
             self.frames.push(bytes, &mut self.recovered);
-            self.take_recovered();
+            self.forward_recovered();
         }
     }
 
     /// Takes the next bytes from a reader; returns their number, 0 at its end.
     ///
     /// # Errors
-    /// Those of the reader, except interruptions.
+    /// The errors of the reader, except interruptions.
     pub fn fill_from(&mut self, reader: &mut impl Read) -> io::Result<usize> {
         if self.format == Some(Format::Packets) {
             let bytes = self.packets.fill_from(reader)?;
@@ -88,14 +87,14 @@ impl Intake {
         if self.format != Some(Format::Packets) {
             self.recovered.clear();
             self.frames.finish(&mut self.recovered);
-            self.take_recovered();
+            self.forward_recovered();
         }
         self.packets.finish();
     }
 
     /// The next event; `None` until more bytes arrive, or at the end of the stream.
     pub fn next_event(&mut self) -> Option<Event<'_>> {
-        // Bytes can be called garbage only once the format is known, or at the end.
+        // Before the format is known, bytes without packets may still be frames.
         if self.format.is_none() && !self.packets.is_finished() {
             return None;
         }
@@ -108,38 +107,38 @@ impl Intake {
         self.bytes
     }
 
-    /// Memory held for the stream, bytes.
+    /// Memory allocated for the stream, bytes.
     #[must_use]
-    pub fn held_bytes(&self) -> usize {
+    pub fn memory_bytes(&self) -> usize {
         let chunks = self.chunk.capacity() + self.recovered.capacity();
-        self.packets.held_bytes() + self.frames.held_bytes() + chunks
+        self.packets.memory_bytes() + self.frames.memory_bytes() + chunks
     }
 
-    /// What the stream is, as far as its first bytes tell, if it is no downlink.
+    /// Identifies a stream that is not a downlink from its first bytes; `None` if they are not recognised.
     #[must_use]
     #[doc(hidden)]
-    pub fn foreign_name(&self) -> Option<String> {
-        name_of(&self.head)
+    pub fn foreign_format(&self) -> Option<String> {
+        identify(&self.head)
     }
 
-    /// Transfer frames of another kind, in which packets may be seen by chance: what they are.
+    /// Identifies transfer frames of an unsupported format, in which parts of packets may be found by chance.
     #[must_use]
-    pub(in crate::downlink) fn foreign_frames(&self) -> Option<String> {
-        frames_of(&self.head)
+    pub(in crate::downlink) fn unsupported_frames(&self) -> Option<String> {
+        identify_unsupported_frames(&self.head)
     }
 
-    /// Whether as much is held of the beginning as will be.
-    pub(super) fn has_whole_head(&self) -> bool {
+    /// Whether the first [`HEAD_BYTES`] bytes have been received.
+    pub(super) fn has_full_head(&self) -> bool {
         self.head.len() == HEAD_BYTES
     }
 
     fn keep_head(&mut self, bytes: &[u8]) {
-        let room = HEAD_BYTES - self.head.len();
-        self.head.extend_from_slice(&bytes[..room.min(bytes.len())]);
+        let missing = HEAD_BYTES - self.head.len();
+        self.head.extend_from_slice(&bytes[..missing.min(bytes.len())]);
     }
 
-    /// Restarts of the packet count of a kind, independent of the order of arrival.
-    pub(super) fn restarts(&self, kind: Kind) -> u64 {
+    /// Number of restarts of the packet count of a kind, in any order of arrival.
+    pub(super) fn restarts(&self, kind: PacketKind) -> u64 {
         self.packets.restarts(kind)
     }
 
@@ -155,8 +154,8 @@ impl Intake {
         (self.format == Some(Format::Cadu)).then(|| self.frames.counters())
     }
 
-    /// Passes recovered packets on. The first frame decides the format.
-    fn take_recovered(&mut self) {
+    /// Forwards recovered packets to the packet receiver. The first frame decides the format.
+    fn forward_recovered(&mut self) {
         if self.format.is_none() && self.frames.has_frame() {
             self.format = Some(Format::Cadu);
             self.packets = if self.unfiltered { PacketReceiver::unfiltered() } else { PacketReceiver::new() };

@@ -1,0 +1,166 @@
+//! Events of the instrument.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// An event of the instrument.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "kebab-case")]
+pub enum InstrumentEvent {
+    /// The clock of a daughter jumped.
+    ClockJump {
+        /// Pass in which the event happened, or the first one after it.
+        pass: u64,
+        /// Last time before the event and first time after it, s since the epoch.
+        between_s: [f64; 2],
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Change of the clock, ns.
+        change_ns: f64,
+    },
+    /// Phases of a daughter changed.
+    PhaseStep {
+        /// Pass in which the event happened, or the first one after it.
+        pass: u64,
+        /// Last time before the event and first time after it, s since the epoch.
+        between_s: [f64; 2],
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0, and phase changes, deg.
+        channels: Vec<(usize, f64)>,
+    },
+    /// Amplitudes of a daughter changed.
+    GainStep {
+        /// Pass in which the event happened, or the first one after it.
+        pass: u64,
+        /// Last time before the event and first time after it, s since the epoch.
+        between_s: [f64; 2],
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0, and factors of the amplitude.
+        channels: Vec<(usize, f64)>,
+    },
+    /// A daughter delivers only noise from this pass on.
+    Dead {
+        /// First pass of this state.
+        pass: u64,
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0.
+        channels: Vec<usize>,
+    },
+    /// Phases of a daughter drift within a pass.
+    Drift {
+        /// Pass.
+        pass: u64,
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0, and rms phase changes, deg.
+        channels: Vec<(usize, f64)>,
+    },
+    /// The model of the sky, or of the artificial signal, does not match the data.
+    WrongModel {
+        /// First pass of this state.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Fraction of the signal that no gains explain.
+        unexplained: f64,
+    },
+    /// A channel is disturbed.
+    Interference {
+        /// Pass.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Fraction of its visibilities that are outliers.
+        outliers: f64,
+    },
+    /// All channels are disturbed for a time.
+    Burst {
+        /// Pass.
+        pass: u64,
+        /// Start, s since the epoch.
+        from_s: f64,
+        /// End, s.
+        until_s: f64,
+    },
+}
+
+impl InstrumentEvent {
+    /// Pass in which the event happened, or the first one after it.
+    #[must_use]
+    pub fn pass(&self) -> u64 {
+        match self {
+            Self::ClockJump { pass, .. }
+            | Self::PhaseStep { pass, .. }
+            | Self::GainStep { pass, .. }
+            | Self::Dead { pass, .. }
+            | Self::Drift { pass, .. }
+            | Self::WrongModel { pass, .. }
+            | Self::Interference { pass, .. }
+            | Self::Burst { pass, .. } => *pass,
+        }
+    }
+}
+
+impl fmt::Display for InstrumentEvent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let list = |channels: &[(usize, f64)], unit: &str| {
+            let each =
+                channels.iter().map(|(channel, value)| format!("{value:.4}{unit} in channel {channel}"));
+            each.collect::<Vec<_>>().join(", ")
+        };
+        match self {
+            Self::ClockJump { pass, daughter, change_ns, between_s } => {
+                let time_suffix = time_suffix(between_s);
+                write!(
+                    f,
+                    "pass {pass}: the clock of daughter {daughter} jumped by {change_ns:.3} ns{time_suffix}"
+                )
+            }
+            Self::PhaseStep { pass, daughter, channels, between_s } => {
+                let (list, time_suffix) = (list(channels, " deg"), time_suffix(between_s));
+                write!(f, "pass {pass}: phases of daughter {daughter} changed by {list}{time_suffix}")
+            }
+            Self::GainStep { pass, daughter, channels, between_s } => {
+                let (factors, time_suffix) = (list(channels, ""), time_suffix(between_s));
+                write!(
+                    f,
+                    "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{time_suffix}"
+                )
+            }
+            Self::Dead { pass, daughter, channels } => {
+                let channels: Vec<String> = channels.iter().map(usize::to_string).collect();
+                write!(
+                    f,
+                    "pass {pass}: daughter {daughter} delivers noise in channels {}",
+                    channels.join(", ")
+                )
+            }
+            Self::Drift { pass, daughter, channels } => {
+                let list = list(channels, " deg");
+                write!(f, "pass {pass}: phases of daughter {daughter} drift within the pass by {list} rms")
+            }
+            Self::WrongModel { pass, channel, unexplained } => write!(
+                f,
+                "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal",
+                100.0 * unexplained
+            ),
+            Self::Interference { pass, channel, outliers } => write!(
+                f,
+                "pass {pass}: interference in channel {channel}, {:.1} % of its visibilities are outliers",
+                100.0 * outliers
+            ),
+            Self::Burst { pass, from_s, until_s } => {
+                write!(f, "pass {pass}: a burst in all channels from {from_s:.1} s to {until_s:.1} s")
+            }
+        }
+    }
+}
+
+/// Text with the time of an event, if it is known to 1 s.
+fn time_suffix([from_s, until_s]: &[f64; 2]) -> String {
+    if until_s - from_s > 1.0 { String::new() } else { format!(", at {:.1} s", 0.5 * (from_s + until_s)) }
+}

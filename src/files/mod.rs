@@ -1,0 +1,14 @@
+//! Atomic files: complete under their name or absent, and written by one process at a time. All code that writes files
+//! uses this module.
+
+mod access;
+mod atomic;
+mod folder_lock;
+mod protected;
+#[cfg(test)]
+mod tests;
+
+pub use access::{disk_space, is_at, read_at, read_folder, read_text, write_at};
+pub use atomic::{AtomicFile, IfUnfinished, growing_file, nameless_file, write_atomically};
+pub use folder_lock::FolderLock;
+pub use protected::{ProtectedInputs, require_replaceable};
