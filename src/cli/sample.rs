@@ -8,8 +8,10 @@ use serde::Serialize;
 use super::arguments::{StateMapArgs, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use super::progress::while_solving;
-use crate::imaging::{RegulariserChoice, Solution, SolveWatch};
+use crate::files::write_atomically;
+use crate::imaging::{RegulariserChoice, Sample, Samples, Solution, SolveWatch};
 use crate::pipeline::{sample_state, use_threads};
+use crate::products::{ErrorMap, own_power_csv, told_vector};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
 
@@ -19,8 +21,9 @@ const COUNT_MAX: u64 = 10_000;
 /// Draw maps that are as likely as the map of a state, given its data.
 ///
 /// They differ from the map by what the data leave open, noise and unseen scales alike: whatever is computed from each of them scatters
-/// by its error. Needs R from the data (map.regulariser = "data"). Leaves in the output folder, for each channel, the map, each sample and
-/// sigma.fits, their standard deviation around the map, pixel by pixel. No visibility is read again, and the state stays as it is.
+/// by its error. Needs R from the data (map.regulariser = "data"). Leaves in the output folder, for each channel, the map, each sample,
+/// sigma.fits, their standard deviation around the map, pixel by pixel, mask.fits and resolution.fits as beside maps, and spectrum.csv, the
+/// sky's own angular power with the interval that holds it with 68 % probability. No visibility is read again, and the state stays as it is.
 ///
 /// Example: lunarray sample state/ --count 100 --out samples/
 #[derive(Debug, Args)]
@@ -31,6 +34,10 @@ pub(super) struct SampleArgs {
     /// Number of samples.
     #[arg(long, value_name = "NUMBER", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=COUNT_MAX))]
     count: u64,
+    /// Draw the sky's angular power with each map (Gibbs sampling), in place of the most likely one: samples then scatter by what is not known
+    /// of it, too. Takes some four times as long.
+    #[arg(long)]
+    gibbs: bool,
     /// Output folder.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
@@ -49,6 +56,10 @@ struct SampledChannel {
     mean_k: f64,
     /// Standard deviation of the samples' means.
     mean_sigma_k: f64,
+    /// Dipole of the map along the ecliptic's x, y and z.
+    dipole_k: [f64; 3],
+    /// Standard deviation of the samples' dipoles.
+    dipole_sigma_k: [f64; 3],
     /// Root mean square of the pixels' standard deviations.
     sigma_rms_k: f64,
     folder: String,
@@ -59,17 +70,24 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {
         return Err(format!(
-            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.refine, \
-             map.matrix, or pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
+            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.refine, map.matrix, or \
+             pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
             args.state.display()
         )
         .into());
+    }
+    if args.gibbs && config.map.refine.is_on() {
+        return Err(
+            "--gibbs with map.refine: each turn would be a refined map; expected samples without --gibbs"
+                .into(),
+        );
     }
     use_threads(&config.runtime)?;
     let mut written = Vec::new();
     let mut take = |solution: Solution| written.push(write(args, &solution));
     let watch = SolveWatch::default();
-    while_solving(&watch, || sample_state(&args.state, &config, args.count as usize, &watch, &mut take))?;
+    let samples = Samples { count: args.count as usize, gibbs: args.gibbs };
+    while_solving(&watch, || sample_state(&args.state, &config, samples, &watch, &mut take))?;
     let mut all = Vec::new();
     for sampled in written {
         all.push(sampled?);
@@ -80,12 +98,13 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     }
     let line = |sampled: &SampledChannel| {
         format!(
-            "{:>8.3} MHz  {} samples in {}: mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms",
+            "{:>8.3} MHz  {} samples in {}: mean ({:.4e} +- {:.1e}) K, dipole {} K, pixels +- {:.2e} K rms",
             sampled.frequency_hz / 1e6,
             sampled.samples,
             sampled.folder,
             sampled.mean_k,
             sampled.mean_sigma_k,
+            told_vector(sampled.dipole_k, sampled.dipole_sigma_k),
             sampled.sigma_rms_k
         )
     };
@@ -111,24 +130,34 @@ fn write(
         .map_err(Box::<dyn std::error::Error + Send + Sync>::from)
     };
     save("map.fits", &solution.map_k)?;
-    let (count, pixels) = (errors.samples_k.len() as f64, solution.map_k.len() as f64);
-    let mut variance = vec![0.0; solution.map_k.len()];
-    let mut mean_variance = 0.0;
-    let mean_k = solution.map_k.iter().sum::<f64>() / pixels;
-    for (number, sample) in errors.samples_k.iter().enumerate() {
-        save(&format!("sample-{:04}.fits", number + 1), sample)?;
-        for ((sum, sample), map) in variance.iter_mut().zip(sample).zip(&solution.map_k) {
-            *sum += (sample - map).powi(2) / count;
-        }
-        mean_variance += (sample.iter().sum::<f64>() / pixels - mean_k).powi(2) / count;
+    for (number, sample) in errors.samples.iter().enumerate() {
+        save(&format!("sample-{:04}.fits", number + 1), &sample.map_k)?;
     }
-    let sigma_k: Vec<f64> = variance.iter().map(|variance| variance.sqrt()).collect();
-    save("sigma.fits", &sigma_k)?;
+    let pixels = solution.map_k.len() as f64;
+    let mean_of = |map_k: &[f64]| map_k.iter().sum::<f64>() / pixels;
+    let mean_k = mean_of(&solution.map_k);
+    let scatter = |of: &dyn Fn(&Sample) -> f64, around: f64| {
+        let squares = errors.samples.iter().map(|sample| (of(sample) - around).powi(2));
+        squares.sum::<f64>() / errors.samples.len() as f64
+    };
+    let of_pixel = |(pixel, around): (usize, &f64)| scatter(&|sample| sample.map_k[pixel], *around);
+    let variance: Vec<f64> = solution.map_k.iter().enumerate().map(of_pixel).collect();
+    save("sigma.fits", &variance.iter().map(|variance| variance.sqrt()).collect::<Vec<f64>>())?;
+    for map in ErrorMap::coverage(errors) {
+        map.write(&folder, &WriteOptions::default())?;
+    }
+    let spectrum = folder.join("spectrum.csv");
+    write_atomically(&spectrum, own_power_csv(&errors.samples).as_bytes())
+        .map_err(|error| format!("{}: {error}", spectrum.display()))?;
+    let dipole_k = errors.dipole_k;
+    let dipole_sigma_k = [0, 1, 2].map(|k| scatter(&|sample| sample.dipole_k[k], dipole_k[k]).sqrt());
     Ok(SampledChannel {
         frequency_hz,
-        samples: errors.samples_k.len(),
+        samples: errors.samples.len(),
         mean_k,
-        mean_sigma_k: mean_variance.sqrt(),
+        mean_sigma_k: scatter(&|sample| mean_of(&sample.map_k), mean_k).sqrt(),
+        dipole_k,
+        dipole_sigma_k,
         sigma_rms_k: (variance.iter().sum::<f64>() / pixels).sqrt(),
         folder: folder.display().to_string(),
     })

@@ -117,6 +117,10 @@ keys! {
         /// channel.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
+        /// Tables of the sky's C_l (K^2), one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the
+        /// map's degrees then counts as noise, by the baseline's length. Tables go on as they end.
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        expert beyond_files: Vec<PathBuf> = Vec::new();
         /// Ecliptic longitudes and latitudes of points whose effective beam is computed, such as `[[0.0, 90.0]]`.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         everyday beams_deg: Vec<[f64; 2]> = Vec::new();
@@ -356,8 +360,8 @@ impl MapConfig {
         checks.require(
             "regulariser",
             found,
-            is_identity || !self.holds_visibilities() || (is_by_degree && self.refine.is_on()),
-            "\"identity\", or no such key, with map.matrix = \"free\"; not \"data\" with map.refine",
+            is_identity || !self.is_matrix_free(),
+            "\"identity\", or no such key, with map.matrix = \"free\"",
         );
         checks.require(
             "regulariser",
@@ -418,6 +422,7 @@ impl MapConfig {
             channels_max: _,
             epsilon: _,
             regulariser: _,
+            beyond_files: _, // By their contents.
             beams_deg: _,
             prior_k: _,
             prior_files: _,
@@ -548,6 +553,7 @@ impl MapConfig {
             ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
             ("prior_files", files == 0 || files == channels, files),
             ("regulariser.file", [0, channels].contains(&tables), tables),
+            ("beyond_files", [0, channels].contains(&self.beyond_files.len()), self.beyond_files.len()),
         ] {
             let expected = format!("a single value, or a list of one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);

@@ -21,6 +21,9 @@ pub enum AccumulationError {
     /// A prior map cannot be used.
     #[error("map.prior_files: {0}")]
     Prior(#[from] crate::sky::fits::FitsError),
+    /// A table of the sky's power that cannot be used.
+    #[error("map.beyond_files: {0}")]
+    Beyond(String),
     /// A quantity of an engine's setup is out of range.
     #[error("invalid setup of an engine: {name} = {value}: expected {expected}")]
     Setup {

@@ -13,6 +13,7 @@
 mod antennas;
 #[doc(hidden)]
 pub mod anywhere;
+mod beyond;
 #[doc(hidden)]
 pub mod circle;
 mod config;
@@ -28,6 +29,7 @@ mod regulariser;
 mod solver;
 mod stage;
 
+pub(crate) use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
     HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,
@@ -47,7 +49,7 @@ pub use pixel::{
 };
 pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]
-pub use power::{SkyPower, Uncertainty};
+pub use power::{Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
 pub use solver::SolveError;

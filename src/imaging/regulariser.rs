@@ -7,7 +7,7 @@ use crate::imaging::circle::degrees;
 use crate::imaging::solver::SolveError;
 
 /// Maximum size of a table, bytes; a table up to the maximum degree is smaller.
-const FILE_BYTES_MAX: u64 = 1 << 20;
+pub(in crate::imaging) const POWER_FILE_BYTES_MAX: u64 = 1 << 20;
 
 /// The dependence of R on the degree.
 #[derive(Clone, Debug, PartialEq)]
@@ -73,8 +73,11 @@ impl Regulariser {
     /// The file cannot be read or is no such table, or a power is not positive.
     pub fn read(path: &Path) -> Result<Self, SolveError> {
         let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
-        let text = read_text(path, FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
-        parse_table(&text).map(Self::Wiener).map_err(failed)
+        let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
+        match parse_power(&text).map_err(failed)? {
+            (0, power_k2) => Ok(Self::Wiener(power_k2)),
+            (first, _) => Err(failed(format!("l = {first} first"))),
+        }
     }
 
     /// The diagonal of R for a solution up to `l_max`.
@@ -102,26 +105,32 @@ impl Regulariser {
     }
 }
 
-/// Parses a table to C_l, or says which line is wrong.
-fn parse_table(text: &str) -> Result<Vec<f64>, String> {
-    let mut power_k2 = Vec::new();
+/// Parses a table to its first degree and C_l from there on, or says which line is wrong.
+pub(in crate::imaging) fn parse_power(text: &str) -> Result<(usize, Vec<f64>), String> {
+    let (mut first, mut power_k2) = (0, Vec::new());
     for (number, line) in text.lines().enumerate() {
         let fields: Vec<&str> =
             line.split([',', ' ', '\t']).map(str::trim).filter(|field| !field.is_empty()).collect();
-        let is_header = number == 0 && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
+        let is_header =
+            power_k2.is_empty() && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
         if fields.is_empty() || is_header || line.starts_with('#') {
             continue;
         }
         let values = (fields.first().and_then(|l| l.parse::<usize>().ok()), fields.get(1));
         let power = values.1.and_then(|power| power.parse::<f64>().ok());
         match (values.0, power) {
-            (Some(l), Some(power)) if l == power_k2.len() && power > 0.0 && power.is_finite() => {
+            (Some(l), Some(power))
+                if (power_k2.is_empty() || l == first + power_k2.len())
+                    && power > 0.0
+                    && power.is_finite() =>
+            {
+                first = l - power_k2.len();
                 power_k2.push(power);
             }
             _ => return Err(format!("line {}: {}", number + 1, line.chars().take(60).collect::<String>())),
         }
     }
-    if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok(power_k2) }
+    if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok((first, power_k2)) }
 }
 
 #[cfg(test)]
@@ -141,8 +150,10 @@ mod tests {
 
     #[test]
     fn tables_are_parsed_or_the_bad_line_is_named() {
-        assert_eq!(parse_table("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok(vec![3e9, 2.5, 1.0]));
-        assert_eq!(parse_table("# from elsewhere\n0 1\n"), Ok(vec![1.0]));
+        assert_eq!(parse_power("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok((0, vec![3e9, 2.5, 1.0])));
+        assert_eq!(parse_power("# from elsewhere\n0 1\n"), Ok((0, vec![1.0])));
+        // As a map leaves it.
+        assert_eq!(parse_power("# C_l\nl,power_k2,low_k2\n2,4,3\n3,2,1\n"), Ok((2, vec![4.0, 2.0])));
         for (text, found) in [
             ("", "no degrees"),
             ("0,1\n2,1", "line 2: 2,1"),
@@ -151,8 +162,9 @@ mod tests {
             ("0,inf", "line 1: 0,inf"),
             ("0,1\n1", "line 2: 1"),
             ("0,1\none,1", "line 2: one,1"),
+            ("2,1\n4,1", "line 2: 4,1"),
         ] {
-            assert_eq!(parse_table(text), Err(found.to_owned()), "{text}");
+            assert_eq!(parse_power(text), Err(found.to_owned()), "{text}");
         }
         let gone = Regulariser::read(Path::new("no such table")).unwrap_err().to_string();
         assert!(gone.contains("no such table"), "{gone}");

@@ -6,6 +6,7 @@ use super::beam::EffectiveBeam;
 use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
+use super::error_maps::ErrorMap;
 use super::latitudes::latitude_errors;
 use super::pictures::{
     Bars, ColourScale, MapPanel, Palette, Picture, Sampling, Scaling, Sheet, View, draw_map, draw_sheet,
@@ -206,7 +207,7 @@ impl ChannelFolder {
         shown: &ShownMaps,
         comparison: Option<Comparison>,
     ) -> ChannelSummary {
-        let pixels = solution.map_k.len() as f64;
+        let (pixels, errors) = (solution.map_k.len() as f64, solution.uncertainty.as_ref());
         let beam = comparison.as_ref().map(|comparison| {
             let l_max = comparison.cl_map.len().saturating_sub(1);
             let smoothing = shown.processing.map_or(0.0, PostProcessing::fwhm_rad);
@@ -230,8 +231,10 @@ impl ChannelFolder {
             span_s: solution.span_s,
             visibilities: solution.visibilities,
             mean_k: solution.map_k.iter().sum::<f64>() / pixels,
-            mean_sigma_k: solution.uncertainty.as_ref().map(|errors| errors.mean_sigma_k),
-            sky_power: solution.uncertainty.as_ref().map(|errors| errors.power.clone()),
+            mean_sigma_k: errors.map(|errors| errors.mean_sigma_k),
+            dipole_k: errors.map(|errors| errors.dipole_k),
+            dipole_sigma_k: errors.map(|errors| errors.dipole_sigma_k),
+            sky_power: errors.map(|errors| errors.power.clone()),
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),
@@ -294,8 +297,12 @@ impl ChannelFolder {
             self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
         }
         if let Some(errors) = &origin.solution.uncertainty {
-            let sigma = SkyMap::new(Frame::Ecliptic, errors.sigma_k.clone())?;
-            self.write_map("sigma.fits", &sigma, None, origin)?;
+            for map in ErrorMap::all(errors) {
+                let what = map.file.trim_end_matches(".fits");
+                let cards = origin.provenance.cards(origin.solution, what, None);
+                self.file(map.file);
+                map.write(&self.root.join(&self.name), &WriteOptions { cards, ..WriteOptions::default() })?;
+            }
             let path = self.file("sky-power.csv");
             write_atomically(&path, errors.power.csv().as_bytes())
                 .map_err(|source| ProductsError::Write { path, source })?;

@@ -13,6 +13,7 @@ mod comparison_pictures;
 mod config;
 mod epsilons;
 mod error;
+mod error_maps;
 mod hips;
 mod latitudes;
 pub mod pictures;
@@ -42,6 +43,7 @@ pub use epsilons::{
 };
 #[doc(hidden)]
 pub use error::ProductsError;
+pub(crate) use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
 #[doc(hidden)]

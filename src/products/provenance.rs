@@ -87,6 +87,9 @@ impl Provenance {
         cards.push(Card::real("BASEMAX", limit_m, "[m] longest baseline used"));
         cards.push(Card::real("BPMAX", limit, "the same in units of b_p = wavelength / pixel"));
         let channel = usize::from(solution.channel.0);
+        if let Some(path) = map.beyond_files.get(channel) {
+            cards.push(Card::text("BEYOND", &file_name(path), "sky's power; above LMAX it counts as noise"));
+        }
         cards.push(Card::text("PRIOR", &self.prior(channel), "prior map"));
         cards
     }

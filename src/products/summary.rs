@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
+use super::error_maps::told_vector;
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
@@ -61,6 +62,12 @@ pub struct ChannelSummary {
     /// Posterior standard deviation of the mean, K; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mean_sigma_k: Option<f64>,
+    /// Dipole along the ecliptic's x, y and z, K; absent unless R is from the data.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dipole_k: Option<[f64; 3]>,
+    /// Posterior standard deviation of the dipole, K.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub dipole_sigma_k: Option<[f64; 3]>,
     /// Angular power of the sky, whose inverse is R, with its uncertainty; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sky_power: Option<SkyPower>,
@@ -153,6 +160,9 @@ impl fmt::Display for ChannelSummary {
             with_error(self.mean_k, self.mean_sigma_k),
             self.noise_rms_k
         )?;
+        if let (Some(dipole_k), Some(sigma_k)) = (self.dipole_k, self.dipole_sigma_k) {
+            write!(f, "\n             dipole along x, y, z {} K", told_vector(dipole_k, sigma_k))?;
+        }
         write!(f, "\n             {}", self.regulariser_text())?;
         if self.is_noise() {
             write!(

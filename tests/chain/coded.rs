@@ -160,7 +160,7 @@ fn a_followed_file_has_the_format_of_those_before_it_and_stays_the_same_file() {
     std::fs::write(&growing, &bytes[..bytes.len() / 4]).unwrap();
     let output = child.wait_with_output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
-    assert!(!output.status.success() && said.contains("cut short or replaced"), "{said}");
+    assert!(!output.status.success() && said.contains("truncated or replaced"), "{said}");
 }
 
 #[test]

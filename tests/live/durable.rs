@@ -5,7 +5,7 @@ use super::*;
 /// After the first checkpoint for senders, none within a test.
 const SELDOM: &str = "downlink.listen.held_every_s=1000000";
 
-/// A part of a downlink on its way: the sender asks for `held`, has sent everything, and reads the answers.
+/// A part of a downlink on its way: the sender requests `held`, has sent everything, and reads the answers.
 fn ask(ground: &Ground, bytes: &[u8]) -> BufReader<TcpStream> {
     let mut stream = ground.connect();
     // In pieces that divide the line and a packet.
@@ -157,7 +157,7 @@ fn without_checkpoints_nothing_is_said_to_be_held() {
     assert!(said.starts_with("closed ") && said.contains("--state"), "{said}");
     let send = ["simulate", place.pipeline(), "--send", &ground.url, "--held"];
     let said = complaint(&send);
-    assert!(said.contains("asks for `held`") && said.contains("--state"), "{said}");
+    assert!(said.contains("requests `held`") && said.contains("--state"), "{said}");
     ground.send(&bytes);
     let summary = ground.succeed();
     assert_eq!(summary["listening"]["ended"]["no-state"], 2);

@@ -4,6 +4,7 @@
 use faer::{Mat, Side};
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::Samples;
 use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, nominal_orbit};
 use lunarray::imaging::{
     HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
@@ -122,7 +123,8 @@ fn both_engines_make_the_same_map() {
     let by_harmonic = harmonic_sums(&blocks, 40, baseline_m_max);
     assert_eq!(by_pixel.counts().visibilities, by_harmonic.counts().visibilities);
     let pixel = solve_pixels(by_pixel, epsilon, None).unwrap();
-    let request = HarmonicRequest { epsilon, nside: NSIDE, rule: RULE, samples: 0, probes: 0 };
+    let request =
+        HarmonicRequest { epsilon, nside: NSIDE, rule: RULE, samples: Samples::default(), probes: 0 };
     let watch = SolveWatch::default();
     let harmonic = solve_harmonics(&by_harmonic, request, None, None, watch.named("test")).unwrap();
     assert!(harmonic.diagnostics.convergence.unwrap().converged);
@@ -197,7 +199,7 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         epsilon,
         nside: 8,
         rule: StoppingRule { residual_max: 1e-7, ..RULE },
-        samples: 0,
+        samples: Samples::default(),
         probes: 0,
     };
     let solved = solve_harmonics(&sums, request, None, None, watch.named("test")).unwrap();
@@ -272,7 +274,8 @@ fn solutions_start_warm_and_end_early() {
     let blocks = observe(&sky, 3e6, 1_500.0, 4_000);
     let most = blocks.len() * 19 / 20;
     let (early, late) = (harmonic_sums(&blocks[..most], 24, 1_500.0), harmonic_sums(&blocks, 24, 1_500.0));
-    let request = HarmonicRequest { epsilon: 1e-4, nside: 8, rule: RULE, samples: 0, probes: 0 };
+    let request =
+        HarmonicRequest { epsilon: 1e-4, nside: 8, rule: RULE, samples: Samples::default(), probes: 0 };
     let watch = SolveWatch::default();
     let first = solve_harmonics(&early, request, None, None, watch.named("test")).unwrap();
     let cold = solve_harmonics(&late, request, None, None, watch.named("test")).unwrap();
@@ -307,7 +310,8 @@ fn a_prior_fills_what_is_not_measured() {
     // Baselines of 10 wavelengths and more see little of a uniform sky.
     let blocks: Vec<_> = observe(&sky, 10e6, 3_000.0, 2_000);
     let sums = harmonic_sums(&blocks, 24, 3_000.0);
-    let request = HarmonicRequest { epsilon: 1e-3, nside: 8, rule: RULE, samples: 0, probes: 0 };
+    let request =
+        HarmonicRequest { epsilon: 1e-3, nside: 8, rule: RULE, samples: Samples::default(), probes: 0 };
     let prior = vec![level_k; 12 * 16 * 16];
     let watch = SolveWatch::default();
     let without = solve_harmonics(&sums, request, None, None, watch.named("test")).unwrap();

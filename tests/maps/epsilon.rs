@@ -8,6 +8,7 @@ use std::process::{Command, Stdio};
 
 use lunarray::array::ArrayConfig;
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
+use lunarray::imaging::Samples;
 use lunarray::imaging::{
     Fit, HarmonicRequest, PixelExtras, Regulariser, SolveWatch, StoppingRule, Traces, W_MAX_EXACT,
     effective_beam, harmonic_beams, largest_eigenvalue, solve_harmonics, solve_pixels_with,
@@ -146,8 +147,13 @@ fn fit_and_regulariser_of_harmonics_are_those_of_dense_rows() {
     let blocks = noisy(3e6, 300.0, 900, 2e4);
     let sums = harmonic_sums(&blocks, L_MAX, 300.0);
     let rule = StoppingRule { residual_max: 1e-7, iterations_max: 500 };
-    let request =
-        |epsilon: f64, probes: usize| HarmonicRequest { epsilon, nside: 8, rule, samples: 0, probes };
+    let request = |epsilon: f64, probes: usize| HarmonicRequest {
+        epsilon,
+        nside: 8,
+        rule,
+        samples: Samples::default(),
+        probes,
+    };
     let watch = SolveWatch::default();
     let plain = solve_harmonics(&sums, request(1e-3, 0), None, None, watch.named("test")).unwrap();
     let level = 1e-3 * plain.diagnostics.w_max.unwrap() / pixel_area_sr(8);
@@ -196,7 +202,7 @@ fn beams_of_points_are_columns_of_the_effective_beam() {
     // Harmonics: conjugate gradients against the Krylov space of a point.
     let sums = harmonic_sums(&blocks, 12, 1_500.0);
     let rule = StoppingRule { residual_max: 1e-7, iterations_max: 500 };
-    let request = HarmonicRequest { epsilon, nside: 8, rule, samples: 0, probes: 0 };
+    let request = HarmonicRequest { epsilon, nside: 8, rule, samples: Samples::default(), probes: 0 };
     let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value;
     let with = (&Regulariser::default(), w_max);
     let found = harmonic_beams(&sums, request, with, &[300], watch.named("test")).unwrap();

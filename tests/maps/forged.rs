@@ -6,6 +6,7 @@ use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{
     AntennaResponse, Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason,
 };
+use lunarray::imaging::Samples;
 use lunarray::imaging::anywhere::AssumedInstrument;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::{
@@ -154,7 +155,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             assumed: AssumedInstrument::default(),
             iteration_folder: None,
             trace_probes: 0,
-            samples: 0,
+            samples: Samples::default(),
             watch: SolveWatch::default(),
         };
         let mut maps = Outlet::collect();

@@ -2,21 +2,23 @@
 
 use crate::common;
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 use std::fs;
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use faer::linalg::solvers::Solve;
+use faer::linalg::solvers::{DenseSolveCore, Solve};
 use faer::{Mat, Side};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::Refusal;
+use lunarray::imaging::Samples;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::anywhere::RefineSteps;
 use lunarray::imaging::anywhere::Refinement;
 use lunarray::imaging::anywhere::solve_refined;
 use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, VisibilityArchive};
+use lunarray::imaging::circle::{coefficients, degrees};
 use lunarray::imaging::{
     HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule, solve_harmonics,
 };
@@ -29,6 +31,9 @@ use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;
 use lunarray::units::{ChannelId, Pair};
 use num_complex::Complex64;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+use rand_distr::{Distribution, StandardNormal};
 
 const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
 const WAVELENGTH_M: f64 = 30.0;
@@ -149,7 +154,7 @@ fn sums_of(mut archive: VisibilityArchive, blocks: &[PlacedVisibilities]) -> Ref
 
 fn request(nside: usize) -> HarmonicRequest {
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 300 };
-    HarmonicRequest { epsilon: EPSILON, nside, rule, samples: 0, probes: 0 }
+    HarmonicRequest { epsilon: EPSILON, nside, rule, samples: Samples::default(), probes: 0 }
 }
 
 /// From the beginning, and telling nobody.
@@ -212,7 +217,7 @@ fn seen_sky(wavelength_m: f64, at: &[TimedPair], l_max: usize) -> Vec<Complex64>
 }
 
 /// The solution of `(Bt N^-1 B + R) x = Bt N^-1 V` with the matrix in memory: of the same rows, which other tests hold against other code.
-fn dense_solution(sums: &RefinedSums, l_max: usize, w_max: f64) -> Vec<f64> {
+fn dense_solution(sums: &RefinedSums, l_max: usize, r: &dyn Fn(usize) -> f64) -> (Vec<f64>, Mat<f64>) {
     let unknowns = (l_max + 1) * (l_max + 1);
     let unit = |k: usize| {
         let x: Vec<f64> = (0..unknowns).map(|n| f64::from(u8::from(n == k))).collect();
@@ -230,9 +235,10 @@ fn dense_solution(sums: &RefinedSums, l_max: usize, w_max: f64) -> Vec<f64> {
     let b = Mat::from_fn(count, unknowns, |row, k| root(row) * part(columns[k][row / 2], row));
     let v = Mat::from_fn(count, 1, |row, _| root(row) * part(sums.data.value_k_sr[row / 2], row));
     let mut matrix = b.transpose() * &b;
-    (0..unknowns).for_each(|k| matrix[(k, k)] += EPSILON * w_max);
-    let solved = matrix.llt(Side::Lower).unwrap().solve(b.transpose() * &v);
-    (0..unknowns).map(|k| solved[(k, 0)]).collect()
+    degrees(l_max).enumerate().for_each(|(k, l)| matrix[(k, k)] += r(l));
+    let factor = matrix.llt(Side::Lower).unwrap();
+    let solved = factor.solve(b.transpose() * &v);
+    ((0..unknowns).map(|k| solved[(k, 0)]).collect(), factor.inverse())
 }
 
 /// Errors of the circle's map and of the refined one against the dense solution, without the mean.
@@ -240,7 +246,8 @@ fn errors_of(sums: &RefinedSums, nside: usize, l_max: usize, rule: RefineRule) -
     let watch = SolveWatch::default();
     let (found, refinement) = solve(sums, request(nside), rule, &watch).unwrap();
     let circle = solve_harmonics(&sums.circle, request(nside), None, None, watch.named("test")).unwrap();
-    let dense = dense_solution(sums, l_max, found.diagnostics.w_max.unwrap() / pixel_area_sr(nside));
+    let level = EPSILON * found.diagnostics.w_max.unwrap() / pixel_area_sr(nside);
+    let (dense, _) = dense_solution(sums, l_max, &|_| level);
     let error = |x: &[f64]| difference(&x[1..], &dense[1..]);
     ([error(&circle.unknowns[0]), error(&found.unknowns[0])], refinement)
 }
@@ -259,6 +266,59 @@ fn a_month_of_any_orbit_is_refined_to_the_dense_solution() {
         assert!(refinement.convergence.converged, "{refinement}");
         // A residual of 1e-5 in the norm of the inverse, times the root of W_max / R = 1e4 at most.
         assert!(error < 1e-3 && error < 0.01 * circle, "{error} {circle}");
+    }
+}
+
+/// R from the data: the map is the dense solution with the R that was found, its C_l that of the sky, and its errors hold.
+#[test]
+fn r_from_the_data_is_found_with_true_rows() {
+    for (altitude_m, cross, turn_rad) in [(1e3, 0.02, TAU), (60e3, 0.2, TAU), (60e3, 0.2, MONTH_RAD)] {
+        let at = geometry_over(altitude_m, cross, 75.0, 9, &BASELINES_M, turn_rad);
+        let mut stream = ChaCha8Rng::seed_from_u64(11);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
+        let power = |l: usize| 1e12 * (l as f64 + 1.0).powf(-2.7);
+        let x: Vec<f64> = degrees(L_MAX).map(|l| power(l).sqrt() * normal()).collect();
+        let truth = coefficients(&x, L_MAX);
+        let rows = rows(WAVELENGTH_M, L_MAX);
+        let mut values = rows.forward(&rows.plan(&at).unwrap(), &[truth]).remove(0);
+        for (value, at) in values.iter_mut().zip(&at) {
+            *value += Complex64::new(normal(), normal()) / weight(at).sqrt();
+        }
+        let sums = sums(L_MAX, &blocks(&at, &values, 1000));
+        let rule = RefineRule { passes_max: 30, residual_max: 1e-5 };
+        let steps = RefineSteps { start: None, save: &mut |_| {} };
+        let watch = SolveWatch::default();
+        let request = HarmonicRequest { samples: Samples { count: 40, gibbs: false }, ..request(NSIDE) };
+        let (found, refinement) =
+            solve_refined(&sums, request, (rule, &Regulariser::Data), None, steps, watch.named("test"))
+                .unwrap();
+        let errors = found.uncertainty.unwrap();
+        let factor = errors.power.noise_factor;
+        let r = |l: usize| factor * factor / errors.power.power_k2[l];
+        let (dense, inverse) = dense_solution(&sums, L_MAX, &r);
+        let off = difference(&found.unknowns[0][1..], &dense[1..]);
+        let ln: Vec<f64> = (2..=L_MAX)
+            .map(|l| (errors.power.power_k2[l] / power(l)).ln() / errors.power.sigma_ln[l].max(0.2))
+            .collect();
+        let count = found.map_k.len() as f64;
+        let traced: f64 =
+            (0..dense.len()).map(|k| inverse[(k, k)]).sum::<f64>() * factor * factor / (4.0 * PI);
+        let stated = errors.sigma_k.iter().map(|s| s * s).sum::<f64>() / count;
+        let drawn = errors.samples.iter().flat_map(|sample| sample.map_k.iter().zip(&found.map_k));
+        let drawn = drawn.map(|(a, b)| (a - b).powi(2)).sum::<f64>() / (40.0 * count);
+        let error: f64 =
+            found.unknowns[0].iter().zip(&x).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / (4.0 * PI);
+        let mean_sigma_k = factor * (inverse[(0, 0)] / (4.0 * PI)).sqrt();
+        eprintln!(
+            "+-{} km, {cross}, {turn_rad:.1}: off {off:.1e}, noise {factor:.3}, ln C_l {ln:.1?}, variance {traced:.2e}: stated {:.2}, drawn \
+             {:.2}, error {:.2}; mean {:.2}; {refinement}",
+            altitude_m / 1e3,
+            stated / traced,
+            drawn / traced,
+            error / traced,
+            errors.mean_sigma_k / mean_sigma_k,
+        );
+        assert!(refinement.convergence.converged, "{refinement}");
     }
 }
 

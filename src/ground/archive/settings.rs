@@ -15,6 +15,9 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
     if let Some(path) = &config.calibration.gains_file {
         settings.push(("calibration.gains_file".to_owned(), checksum(path)?));
     }
+    for (number, path) in config.map.beyond_files.iter().enumerate() {
+        settings.push((format!("map.beyond_files[{number}]"), checksum(path)?));
+    }
     if config.calibration.hook == CalibrationHook::Solve {
         // The JSON form of these values equals their TOML form.
         let keys = serde_json::to_value(&config.calibrate).unwrap_or_default();

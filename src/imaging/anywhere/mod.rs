@@ -10,6 +10,7 @@ mod segments;
 mod solve;
 mod subspace;
 mod sums;
+mod with_power;
 
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
 pub use archived::RefinedSetup;

@@ -23,9 +23,12 @@ use num_complex::Complex64;
 use super::refinement::{Refinement, chi_squares};
 use super::subspace::{Column, Subspace};
 use crate::imaging::anywhere::RefinedSums;
-use crate::imaging::circle::{HarmonicRequest, HarmonicSolution, W_MAX_TOLERANCE, lifted, prior_unknowns};
+use crate::imaging::circle::{
+    HarmonicRequest, HarmonicSolution, Posterior, W_MAX_TOLERANCE, lifted, prior_unknowns,
+};
 use crate::imaging::circle::{OrderFactors, coefficients, unknowns_of_gradient};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
+use crate::imaging::power::FoundPower;
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::{Convergence, StoppingRule, System};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from};
@@ -81,8 +84,8 @@ pub struct RefineSteps<'a> {
 /// Solves for the map and the noise-only map with the rows of the true positions.
 ///
 /// # Errors
-/// There is no data, the prior is no map, or R is from the data or from a table that ends before the map's degrees;
-/// [`SolveError::Interrupted`] before the end of the first iteration.
+/// There is no data, the prior is no map, or R is from a table that ends before the map's degrees; [`SolveError::Interrupted`] before the end of
+/// the first iteration.
 pub fn solve_refined(
     sums: &RefinedSums,
     request: HarmonicRequest,
@@ -91,54 +94,67 @@ pub fn solve_refined(
     steps: RefineSteps<'_>,
     watch: NamedWatch<'_>,
 ) -> Result<(HarmonicSolution, Refinement), SolveError> {
-    check_request(&sums.circle, request.epsilon)?;
+    let is_of_data = *regulariser == Regulariser::Data;
+    check_request(&sums.circle, if is_of_data { 1.0 } else { request.epsilon })?;
     let l_max = sums.circle.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
-    let blocks = sums.circle.order_blocks();
-    let LargestEigenvalue { value: w_max, iterations, .. } = {
-        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        let (start, report) = (lifted(&blocks, sums.circle.unknowns()), &mut |needs_step, step, change| {
-            task.report_step(needs_step, step, change)
-        });
-        largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
-    };
-    drop(blocks);
-    let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
+    let order_blocks = sums.circle.order_blocks();
     let mut circle_data = sums.circle.right_hand_side().to_vec();
     if let Some(prior) = &prior {
         subtract_prediction(&sums.circle, prior, &mut circle_data);
     }
-    let problem = RefinedProblem { sums, regularisation, inner: request.rule, rule, watch };
+    let inner = request.rule;
+    let mut problem = RefinedProblem { sums, regularisation: Diagonal::Uniform(0.0), inner, rule, watch };
     let right = problem.right(prior.as_deref());
+    let blocks = order_blocks.blocks();
+    let (refined, found, mut diagnostics) = if is_of_data {
+        let of = RightHandSides { of_rows: &right, of_circle: &circle_data, prior: prior.as_deref() };
+        let (refined, found) = problem.solve_with_power(&blocks, of, steps)?;
+        (refined, Some(found), Diagnostics::of_power(l_max, &[]))
+    } else {
+        let LargestEigenvalue { value: w_max, iterations, .. } = {
+            let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+            let start = lifted(&order_blocks, sums.circle.unknowns());
+            let report = &mut |wants, step, change| task.report_step(wants, step, change);
+            largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
+        };
+        problem.regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
+        let diagnostics = Diagnostics {
+            epsilon: Some(request.epsilon),
+            w_max: Some(w_max * pixel_area_sr(request.nside)),
+            w_max_iterations: iterations,
+            ..Diagnostics::of_power(l_max, &[])
+        };
+        (problem.solve(right.clone(), circle_data, steps)?, None, diagnostics)
+    };
     let RefinedColumns {
         columns: [map, noise],
         convergence: [map_convergence, noise_convergence],
         residuals,
         direct,
-    } = problem.solve(right, circle_data, steps)?;
-    let area_sr = pixel_area_sr(request.nside);
+    } = refined;
+    diagnostics.convergence = Some(map_convergence);
+    diagnostics.noise_convergence = Some(noise_convergence);
     let synthesise = |x: &[f64]| synthesis(&coefficients(x, l_max), request.nside).map_err(SolveError::from);
     let mut whole = map.x.clone();
     if let Some(prior) = prior {
         add(&mut whole, &prior);
     }
-    let diagnostics = Diagnostics {
-        epsilon: Some(request.epsilon),
-        w_max: Some(w_max * area_sr),
-        w_max_iterations: iterations,
-        l_max: Some(l_max),
-        convergence: Some(map_convergence),
-        noise_convergence: Some(noise_convergence),
-        traces: None,
-        traces_refused: None,
-        fit: None,
+    let errors = |found: &FoundPower| {
+        let posterior = Posterior {
+            sums: &sums.circle,
+            blocks: &blocks,
+            found,
+            right: &right[0],
+            solved: &map.x,
+            whole: &whole,
+            nside: request.nside,
+            rule: request.rule,
+            watch,
+        };
+        posterior.uncertainty(request.samples, &|x| problem.normal(x))
     };
-    let mut data_residuals = sums.data.value_k_sr.clone();
-    let predicted = sums.rows.forward(&sums.plan, &[coefficients(&whole, l_max)]);
-    data_residuals
-        .iter_mut()
-        .zip(predicted.iter().flatten())
-        .for_each(|(value, predicted)| *value -= predicted);
+    let uncertainty = found.as_ref().map(errors).transpose()?;
     let refinement = Refinement {
         convergence: map_convergence,
         residuals,
@@ -146,35 +162,45 @@ pub fn solve_refined(
         departures: sums.departures,
         rows_computed: sums.plan.computed() as u64,
         taken_as_instants: sums.plan.instants() as u64,
-        chi_square: chi_squares(sums, &data_residuals),
+        chi_square: chi_squares(sums, &problem.data_residuals(&whole)),
     };
     let solution = HarmonicSolution {
         map_k: synthesise(&whole)?,
         noise_k: synthesise(&noise.x)?,
         unknowns: [map.x, noise.x],
         diagnostics,
-        uncertainty: None,
+        uncertainty,
     };
     Ok((solution, refinement))
 }
 
 /// The true normal equations and the settings of their solution.
-struct RefinedProblem<'a> {
-    sums: &'a RefinedSums,
-    regularisation: Diagonal,
+pub(super) struct RefinedProblem<'a> {
+    pub(super) sums: &'a RefinedSums,
+    pub(super) regularisation: Diagonal,
     /// Iteration limit of inner solutions.
-    inner: StoppingRule,
-    rule: RefineRule,
-    watch: NamedWatch<'a>,
+    pub(super) inner: StoppingRule,
+    pub(super) rule: RefineRule,
+    pub(super) watch: NamedWatch<'a>,
+}
+
+/// Right-hand sides of a refined map.
+#[derive(Clone, Copy)]
+pub(super) struct RightHandSides<'a> {
+    /// Of the map and of the noise-only map, by true rows.
+    pub(super) of_rows: &'a [Vec<f64>; 2],
+    /// Of the map, by the circle's.
+    pub(super) of_circle: &'a [f64],
+    pub(super) prior: Option<&'a [f64]>,
 }
 
 /// The solutions for the map and the noise-only map, with their convergence.
-struct RefinedColumns {
-    columns: [Column; 2],
-    convergence: [Convergence; 2],
+pub(super) struct RefinedColumns {
+    pub(super) columns: [Column; 2],
+    pub(super) convergence: [Convergence; 2],
     /// Residual of the map after each iteration.
-    residuals: Vec<f64>,
-    direct: bool,
+    pub(super) residuals: Vec<f64>,
+    pub(super) direct: bool,
 }
 
 /// The circle's matrix plus a multiple of R.
@@ -184,7 +210,7 @@ struct CircleSystem {
 }
 
 impl RefinedProblem<'_> {
-    fn l_max(&self) -> usize {
+    pub(super) fn l_max(&self) -> usize {
         self.sums.circle.setup().l_max
     }
 
@@ -203,17 +229,25 @@ impl RefinedProblem<'_> {
         [(); 2].map(|()| gradients.next().as_ref().map(unknowns_of_gradient).unwrap_or_default())
     }
 
-    /// Products of the true matrix plus R with several vectors, for which rows are computed once.
-    fn products(&self, x: &[Vec<f64>]) -> Vec<Vec<f64>> {
+    /// Residuals of the data for these coefficients, K sr.
+    pub(super) fn data_residuals(&self, whole: &[f64]) -> Vec<Complex64> {
+        let RefinedSums { rows, plan, data, .. } = self.sums;
+        let seen = rows.forward(plan, &[coefficients(whole, self.l_max())]);
+        data.value_k_sr.iter().zip(seen.iter().flatten()).map(|(value, seen)| value - seen).collect()
+    }
+
+    /// Products of the true matrix with several vectors, for which rows are computed once.
+    fn normal(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {
         let RefinedSums { rows, plan, data, .. } = self.sums;
         let skies: Vec<_> = x.iter().map(|x| coefficients(x, self.l_max())).collect();
-        let products = rows.normal(plan, &skies, &data.weight);
-        let add_r = |(product, x): (_, &Vec<f64>)| {
-            let mut product = unknowns_of_gradient(product);
-            self.regularisation.add_product(x, &mut product);
-            product
-        };
-        products.iter().zip(x).map(add_r).collect()
+        rows.normal(plan, &skies, &data.weight).iter().map(unknowns_of_gradient).collect()
+    }
+
+    /// Products of the true matrix plus R with several vectors, for which rows are computed once.
+    fn products(&self, x: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let mut products = self.normal(&x.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        products.iter_mut().zip(x).for_each(|(product, x)| self.regularisation.add_product(x, product));
+        products
     }
 
     fn circle_system(&self, shift: f64) -> CircleSystem {
@@ -241,7 +275,7 @@ impl RefinedProblem<'_> {
     }
 
     /// Solves for two right-hand sides; `circle_data` is the first one computed with the circle's rows.
-    fn solve(
+    pub(super) fn solve(
         &self,
         right: [Vec<f64>; 2],
         circle_data: Vec<f64>,

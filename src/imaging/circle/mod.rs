@@ -30,6 +30,7 @@ mod noise_maps;
 mod noises;
 mod operator;
 mod parts;
+mod posterior;
 mod quanta;
 mod setup;
 mod sigma;
@@ -52,13 +53,15 @@ pub use grid::SPREAD_MULTIPLY_ADDS;
 pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
+pub use posterior::NOISES_TOGETHER;
+pub(super) use posterior::Posterior;
 pub use setup::{
     ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory,
     nominal_orbit, shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
-pub(super) use sigma::view_sigma_k;
-pub use solve::{HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, solve_harmonics, solve_regularised};
+pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k};
+pub use solve::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
 pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 

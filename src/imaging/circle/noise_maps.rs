@@ -1,6 +1,7 @@
 //! Noise-only maps of many realisations, which share everything but their right-hand sides.
 
-use super::solve::{HarmonicRequest, NOISES_TOGETHER, W_MAX_TOLERANCE, lifted, power_of_data};
+use super::posterior::NOISES_TOGETHER;
+use super::solve::{HarmonicRequest, W_MAX_TOLERANCE, lifted, power_of_data};
 use super::{HarmonicSums, coefficients};
 use crate::imaging::NormalSums;
 use crate::imaging::pixel::check_request;

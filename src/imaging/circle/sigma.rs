@@ -1,4 +1,4 @@
-//! The standard deviation of every pixel of a harmonic map.
+//! The standard deviation and the resolution of every pixel of a harmonic map, and the moments of degrees 0 and 1.
 //!
 //! The blocks that keep m couple no orders, so that a variance depends on the latitude alone. By degree it is scaled as draws say that the
 //! covariance of the true matrix is.
@@ -7,7 +7,8 @@ use faer::Mat;
 use rayon::prelude::*;
 
 use super::blocks::orders_of;
-use crate::imaging::power::{Block, Factors};
+use super::sums::degrees;
+use crate::imaging::power::{Block, Factors, Sample};
 use crate::sky::healpix::pixel_directions;
 
 /// Standard deviations, K, of the pixels of a map, HEALPix RING; `ratio` is that of traces, by degree.
@@ -18,6 +19,57 @@ pub(super) fn pixel_sigma_k(
     nside: usize,
 ) -> Vec<f64> {
     view_sigma_k(blocks, factors, &|_, l| ratio[l].sqrt(), &[], nside)
+}
+
+/// Root of the solid angle, degrees, for each coefficient that the data decide at the pixels of a map. Their density is
+/// `y.(1 - R^1/2 (A + R)^-1 R^1/2) y` of the harmonics y at a pixel, whose integral is the number of those that the data decide: with the
+/// blocks for A each degree counts by how many of it are decided in truth.
+pub(super) fn pixel_resolution_deg(
+    blocks: &[Block<'_>],
+    factors: &Factors<'_>,
+    (r, decided): (&[f64], &[f64]),
+    nside: usize,
+) -> Vec<f64> {
+    let share = |((l, trace), decided): ((usize, f64), &f64)| {
+        let by_blocks = (2 * l + 1) as f64 - r[l] * trace;
+        if by_blocks > 0.0 { (decided / by_blocks).min(1.0) } else { 1.0 }
+    };
+    let traces = factors.traces(r.len() - 1).into_iter().enumerate();
+    let shares: Vec<f64> = traces.zip(decided).map(share).collect();
+    let open = view_sigma_k(blocks, factors, &|_, l| (shares[l] * r[l]).sqrt(), &[], nside);
+    let most: f64 = shares.iter().enumerate().map(|(l, share)| (2 * l + 1) as f64 * share).sum();
+    open.iter().map(|open| resolution_deg(most, open * open)).collect()
+}
+
+/// Of a pixel at which `open` of the density of coefficients is not decided, where `most` over the whole sphere would be.
+pub(in crate::imaging) fn resolution_deg(most: f64, open: f64) -> f64 {
+    let sphere_sr = 4.0 * std::f64::consts::PI;
+    // One at least, the mean.
+    let decided = (most / sphere_sr - open).max(sphere_sr.recip());
+    decided.sqrt().recip().to_degrees()
+}
+
+/// Where the unknowns of the mean and of the dipole along x, y and z are, and what each is multiplied by for kelvins.
+pub(in crate::imaging) fn moments(l_max: usize) -> [(usize, f64); 4] {
+    let mean = (4.0 * std::f64::consts::PI).sqrt().recip();
+    let dipole = 3.0_f64.sqrt() * mean;
+    // Y_11 is negative at x > 0, and the unknowns are sqrt(2) times the real and imaginary part.
+    [(0, mean), (l_max + 1, -dipole), (l_max + 2, dipole), (1, dipole)]
+}
+
+/// Mean and dipole along x, y and z, K, of unknowns.
+pub(in crate::imaging) fn moments_k(unknowns: &[f64], l_max: usize) -> [f64; 4] {
+    moments(l_max).map(|(place, factor)| factor * unknowns.get(place).copied().unwrap_or(0.0))
+}
+
+/// A sample of these unknowns, whose map is known.
+pub(in crate::imaging) fn sample(unknowns: &[f64], l_max: usize, map_k: Vec<f64>) -> Sample {
+    let mut power_k2 = vec![0.0; l_max + 1];
+    for (l, x) in degrees(l_max).zip(unknowns) {
+        power_k2[l] += x * x / (2 * l + 1) as f64;
+    }
+    let [_, x, y, z] = moments_k(unknowns, l_max);
+    Sample { map_k, dipole_k: [x, y, z], power_k2 }
 }
 
 /// Standard deviations, K, of the pixels of a map that is a sum of several sets of unknowns of the same blocks: `weight(set, l)` times each,

@@ -1,12 +1,10 @@
 //! Solves the regularised normal equations over harmonic coefficients.
 
-use super::sigma::pixel_sigma_k;
+use super::posterior::Posterior;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
 use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
-use crate::imaging::power::{
-    Factors, FoundPower, PosteriorPrecision, PosteriorSample, PowerProblem, SAMPLE_TOLERANCE, Uncertainty,
-};
+use crate::imaging::power::{Factors, PowerProblem, Samples, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
 use crate::imaging::solver::FitInputs;
 use crate::imaging::solver::NamedWatch;
@@ -22,12 +20,6 @@ use crate::sky::healpix::{nside_of, pixel_area_sr};
 /// Relative change of W_max at which it has converged. It only scales R, and epsilon is never needed to a percent.
 pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
 
-/// Number of realisations or samples that are solved for together; each thread has a workspace for each.
-pub const NOISES_TOGETHER: usize = 4;
-
-/// Residual of the error of the mean: an error of an error.
-const BESIDE: f64 = 1e-3;
-
 /// Number of products with the blocks before the iteration for W_max.
 const POWER_STEPS: usize = 6;
 
@@ -41,7 +33,7 @@ pub struct HarmonicRequest {
     /// Stopping rule.
     pub rule: StoppingRule,
     /// Number of posterior samples; with R from the data.
-    pub samples: usize,
+    pub samples: Samples,
     /// Number of random probes for traces of covariances if the matrix is too large to store; 0 for no traces. Traces require a multiple of the
     /// identity as R.
     pub probes: usize,
@@ -208,43 +200,38 @@ fn solve_with_power(
         numbers: 2.0 * visibilities as f64,
     };
     let found = problem.solve(start.map(|[map, _]| map.as_slice()), rule, watch)?;
-    let factor = found.noise_factor();
-    let FoundPower { regularisation, solution, power, ratio } = found;
-    let factors = Factors::new(&blocks, &regularisation);
-    let regularisation = Diagonal::ByDegree(regularisation);
+    let factors = Factors::new(&blocks, &found.regularisation);
+    let regularisation = Diagonal::ByDegree(found.regularisation.clone());
     let precondition = |v: &mut [f64]| factors.solve(v);
-    let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
+    let system = System { sums, regularisation, precondition: &precondition };
     let noise = match start {
         Some([_, noise]) if noise.len() == right.len() => noise.clone(),
         _ => vec![0.0; right.len()],
     };
-    // The third column is that of the covariance for the monopole.
-    let mut monopole = vec![0.0; right.len()];
-    monopole[0] = 1.0;
-    let right_hand_sides = [&right, sums.noise_right_hand_side(), &monopole];
-    let mut columns = [solution, noise, vec![0.0; right.len()]];
-    let count = if watch.has_priority() { 3 } else { 2 };
-    let beside = StoppingRule { residual_max: rule.residual_max.max(BESIDE), ..rule };
+    let mut columns = [found.solution.clone(), noise];
     let convergence = {
-        let task = watch.start("map, noise map and error of the mean", rule.residual_max);
-        let rules = [rule, rule, beside];
-        system.solve(&right_hand_sides[..count], &mut columns[..count], &rules[..count], &task)
+        let task = watch.start("map and noise map", rule.residual_max);
+        system.solve(&[&right, sums.noise_right_hand_side()], &mut columns, &[rule, rule], &task)
     };
-    let [solved, noise, of_mean] = columns;
+    let [solved, noise] = columns;
     let mut whole = solved.clone();
     if let Some(prior) = prior {
         add(&mut whole, &prior);
     }
     let map = |x: &[f64]| synthesis(&coefficients(x, l_max), nside).map_err(SolveError::from);
-    let covariance = PosteriorPrecision { sums, regularisation: &regularisation, factors: &factors };
-    let mut uncertainty = None;
-    if watch.has_priority() {
-        let mut sigma_k = pixel_sigma_k(&blocks, &factors, &ratio, nside);
-        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
-        let mean_sigma_k = factor * (of_mean[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt();
-        let samples_k = samples_k(&covariance, samples, (&whole, factor), &map, watch)?;
-        uncertainty = Some(Uncertainty { sigma_k, mean_sigma_k, power, samples_k });
-    }
+    let posterior = Posterior {
+        sums,
+        blocks: &blocks,
+        found: &found,
+        right: &right,
+        solved: &solved,
+        whole: &whole,
+        nside,
+        rule,
+        watch,
+    };
+    let errors = || posterior.uncertainty(samples, &|x| sums.apply_all(x));
+    let uncertainty = watch.has_priority().then(errors).transpose()?;
     let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
         map_k: map(&whole)?,
@@ -253,30 +240,6 @@ fn solve_with_power(
         diagnostics,
         uncertainty,
     })
-}
-
-/// The map of coefficients, K.
-type Synthesis<'a> = &'a dyn Fn(&[f64]) -> Result<Vec<f64>, SolveError>;
-
-/// Maps as likely as the one of these coefficients, of data whose noise is larger by a factor.
-fn samples_k(
-    covariance: &PosteriorPrecision<'_>,
-    count: usize,
-    (whole, factor): (&[f64], f64),
-    map: Synthesis<'_>,
-    watch: NamedWatch<'_>,
-) -> Result<Vec<Vec<f64>>, SolveError> {
-    let mut samples_k = Vec::new();
-    let numbers: Vec<u64> = (0..count as u64).collect();
-    for which in numbers.chunks(NOISES_TOGETHER) {
-        let task = watch.start(&format!("samples from {} of {count}", which[0] + 1), SAMPLE_TOLERANCE);
-        for PosteriorSample { exact: mut sample, .. } in covariance.draw(which, SAMPLE_TOLERANCE, &task) {
-            sample.iter_mut().for_each(|value| *value *= factor);
-            add(&mut sample, whole);
-            samples_k.push(map(&sample)?);
-        }
-    }
-    Ok(samples_k)
 }
 
 /// A start vector near the eigenvectors of the largest eigenvalues: a random vector after several power iterations with the blocks of BtN^-1B,

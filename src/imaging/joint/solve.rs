@@ -314,7 +314,13 @@ impl<'a> Posterior<'a> {
             system.solve(&[sums.right_hand_side()], &mut columns, &[request.rule], &task)
         };
         let [solution] = columns;
-        let precision = PosteriorPrecision { sums, regularisation: &regularisation, factors: &factors };
+        let products = |x: &[&[f64]]| sums.apply_all(x);
+        let precision = PosteriorPrecision {
+            products: &products,
+            unknowns: count,
+            regularisation: &regularisation,
+            factors: &factors,
+        };
         let mut samples = Vec::new();
         let numbers: Vec<u64> = (0..request.samples as u64).collect();
         for sample_ids in numbers.chunks(NOISES_TOGETHER) {

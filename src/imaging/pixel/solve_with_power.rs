@@ -8,11 +8,11 @@ use faer::{Accum, Mat, Par};
 use super::solve::{
     Diagnostics, PixelSolution, PointBeam, check_request, point_response, subtract_prediction,
 };
-use crate::imaging::circle::{coefficients, degrees, unknowns};
-use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Uncertainty};
-use crate::imaging::solver::{NamedWatch, SolveError, add, dot};
+use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
+use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Samples, Uncertainty};
+use crate::imaging::solver::{NamedWatch, SolveError, add, dot, subtract};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
-use crate::sky::harmonics::Transform;
+use crate::sky::harmonics::{AnalysisOptions, Transform, analysis};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{StreamKind, random_stream};
 use rand_distr::{Distribution, StandardNormal};
@@ -21,6 +21,8 @@ use rand_distr::{Distribution, StandardNormal};
 pub const POWER_NSIDE_MAX: usize = 32;
 /// Degrees per nside, as for harmonic maps.
 const DEGREES_PER_NSIDE: f64 = 2.5;
+/// First number of the draws of Gibbs sampling: those of plain samples are below.
+const GIBBS: usize = 1 << 40;
 /// Rows of the matrix that are multiplied at once.
 const ROWS_AT_ONCE: usize = 512;
 
@@ -32,7 +34,7 @@ const ROWS_AT_ONCE: usize = 512;
 pub fn solve_pixels_with_power(
     sums: &PixelSums,
     prior_k: Option<&[f64]>,
-    samples: usize,
+    samples: Samples,
     beams: &[usize],
     watch: NamedWatch<'_>,
 ) -> Result<(PixelSolution, Uncertainty), SolveError> {
@@ -79,15 +81,13 @@ pub fn solve_pixels_with_power(
         numbers,
     };
     let found = problem.solve_blocks()?;
-    let factor = found.noise_factor();
-    let FoundPower { regularisation, solution, power, .. } = found;
-    let factors = Factors::new(&blocks, &regularisation);
+    let factors = Factors::new(&blocks, &found.regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
         let mut x = from_pixels(map)?;
         factors.solve(&mut x);
         to_pixels(&x)
     };
-    let mut map_k = to_pixels(&solution)?;
+    let mut map_k = to_pixels(&found.solution)?;
     if let Some(prior_k) = prior_k {
         add(&mut map_k, prior_k);
     }
@@ -96,38 +96,100 @@ pub fn solve_pixels_with_power(
         Ok(PointBeam { pixel, map_k: solved(&response.map_k)? })
     };
     let beams = beams.iter().map(point).collect::<Result<Vec<_>, SolveError>>()?;
-    let mut monopole = vec![0.0; degrees.len()];
-    monopole[0] = 1.0;
-    factors.solve(&mut monopole);
-    let sample = |which: usize| {
-        let mut sample = to_pixels(&draw(&factors, degrees.len(), factor, which))?;
-        add(&mut sample, &map_k);
-        Ok(sample)
+    let posterior = PixelPosterior {
+        blocks: &blocks,
+        found: &found,
+        factors: &factors,
+        right: &right,
+        map_k: &map_k,
+        harmonics,
+        to_pixels: &to_pixels,
     };
-    // A pixel holds the mean of a sky that has more than the degrees solved for.
-    let beyond_k2 = power.variance_beyond_k2(nside);
-    let uncertainty = Uncertainty {
-        sigma_k: factors
-            .quadratic_forms(0, harmonics.transpose().to_owned())
-            .into_iter()
-            .map(|variance| (factor * factor * variance + beyond_k2).sqrt())
-            .collect(),
-        mean_sigma_k: factor * (monopole[0].max(0.0) / (4.0 * std::f64::consts::PI)).sqrt(),
-        power,
-        samples_k: (0..samples).map(sample).collect::<Result<_, SolveError>>()?,
-    };
+    let uncertainty = posterior.uncertainty(nside, samples)?;
     let diagnostics = Diagnostics::of_power(l_max, &[]);
     let noise_k = solved(&sums.noise)?;
     Ok((PixelSolution { map_k, noise_k, beams, diagnostics }, uncertainty))
 }
 
-/// A draw from the posterior, its mean taken off.
-fn draw(factors: &Factors<'_>, count: usize, factor: f64, which: usize) -> Vec<f64> {
-    let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
-    let mut draw: Vec<f64> =
-        (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
-    factors.solve_upper(&mut draw);
-    draw
+/// The equations over harmonics, solved.
+struct PixelPosterior<'a> {
+    blocks: &'a [Block<'a>],
+    found: &'a FoundPower,
+    factors: &'a Factors<'a>,
+    /// Right-hand side, less what the prior map predicts.
+    right: &'a [f64],
+    /// The map, with its prior.
+    map_k: &'a [f64],
+    /// At pixels, a column each.
+    harmonics: Mat<f64>,
+    to_pixels: ToPixels<'a>,
+}
+
+impl PixelPosterior<'_> {
+    fn uncertainty(self, nside: usize, samples: Samples) -> Result<Uncertainty, SolveError> {
+        let FoundPower { regularisation, power, .. } = self.found;
+        let (factor, l_max, count) = (power.noise_factor, regularisation.len() - 1, self.right.len());
+        let of_moment = |(place, scale): (usize, f64)| {
+            let mut column = vec![0.0; count];
+            column[place] = 1.0;
+            self.factors.solve(&mut column);
+            factor * scale.abs() * column[place].max(0.0).sqrt()
+        };
+        let [mean_sigma_k, dipole_sigma_k @ ..] = moments(l_max).map(of_moment);
+        // The map's own, whatever the prior has beyond its degrees.
+        let whole = unknowns(&analysis(self.map_k, l_max, &AnalysisOptions::default())?.alm);
+        let [_, dipole_k @ ..] = moments_k(&whole, l_max);
+        let drawn = |which: usize| -> Result<Sample, SolveError> {
+            let mut drawn = if samples.gibbs { self.gibbs(which) } else { self.draw(self.factors, which) };
+            let mut map = (self.to_pixels)(&drawn)?;
+            add(&mut map, self.map_k);
+            add(&mut drawn, &whole);
+            Ok(sample(&drawn, l_max, map))
+        };
+        let samples = (0..samples.count).map(drawn).collect::<Result<_, SolveError>>()?;
+        // A pixel holds the mean of a sky that has more than the degrees solved for.
+        let beyond_k2 = power.variance_beyond_k2(nside);
+        let roots: Vec<f64> = degrees(l_max).map(|l| regularisation[l].sqrt()).collect();
+        let columns = self.harmonics.transpose();
+        let open = Mat::from_fn(count, self.map_k.len(), |row, pixel| roots[row] * columns[(row, pixel)]);
+        let open = self.factors.quadratic_forms(0, open);
+        let variances = self.factors.quadratic_forms(0, columns.to_owned());
+        Ok(Uncertainty {
+            sigma_k: variances.iter().map(|v| (factor * factor * v + beyond_k2).sqrt()).collect(),
+            resolution_deg: open.into_iter().map(|open| resolution_deg(count as f64, open)).collect(),
+            mean_sigma_k,
+            dipole_k,
+            dipole_sigma_k,
+            power: power.clone(),
+            samples,
+        })
+    }
+
+    /// A draw from the posterior with the R of these factors, its mean taken off.
+    fn draw(&self, factors: &Factors<'_>, which: usize) -> Vec<f64> {
+        let count = self.right.len();
+        let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
+        let factor = self.found.noise_factor();
+        let mut draw: Vec<f64> =
+            (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
+        factors.solve_upper(&mut draw);
+        draw
+    }
+
+    /// A draw whose R is drawn, too, the map taken off.
+    fn gibbs(&self, which: usize) -> Vec<f64> {
+        let mut turn = 0;
+        let mut sky = self.found.gibbs(which as u64, &mut |r| {
+            turn += 1;
+            let factors = Factors::new(self.blocks, r);
+            let mut sky = self.right.to_vec();
+            factors.solve(&mut sky);
+            add(&mut sky, &self.draw(&factors, GIBBS + 16 * which + turn));
+            sky
+        });
+        subtract(&mut sky, 1.0, &self.found.solution);
+        sky
+    }
 }
 
 /// Computes the values at pixels of coefficients.

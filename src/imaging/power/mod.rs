@@ -16,6 +16,7 @@
 //! s^2, it counts as noise: everything is done for data divided by s.
 
 mod blocks;
+mod gibbs;
 mod knots;
 mod rounds;
 mod samples;
@@ -124,29 +125,68 @@ pub struct Uncertainty {
     /// Posterior standard deviation of every pixel, K. Harmonic maps include errors up to their maximum degree, pixel maps also the sky's
     /// higher degrees.
     pub sigma_k: Vec<f64>,
+    /// Root of the solid angle for each coefficient that the data decide, by pixel, degrees: `sqrt(4 pi) / (l_max + 1)` rad of a map that
+    /// keeps all degrees up to l_max.
+    pub resolution_deg: Vec<f64>,
     /// Standard deviation of the mean, K.
     pub mean_sigma_k: f64,
+    /// Dipole along the ecliptic's x, y and z, K: the map has `mean + dipole . n` of degrees 0 and 1.
+    pub dipole_k: [f64; 3],
+    /// Standard deviations of the dipole, K.
+    pub dipole_sigma_k: [f64; 3],
     /// The sky's power, the inverse of R.
     pub power: SkyPower,
-    /// Posterior samples, K, if requested.
-    pub samples_k: Vec<Vec<f64>>,
+    /// Posterior samples, if requested.
+    pub samples: Vec<Sample>,
+}
+
+/// Draws from the posterior that are wanted beside a map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Samples {
+    /// Their number.
+    pub count: usize,
+    /// Whether the sky's power is drawn with each (Gibbs sampling), in place of that which was found.
+    pub gibbs: bool,
+}
+
+/// A map as likely as the map itself: a draw from the posterior.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sample {
+    /// The map, K.
+    pub map_k: Vec<f64>,
+    /// Its dipole along the ecliptic's x, y and z, K.
+    pub dipole_k: [f64; 3],
+    /// Its own angular power, K^2, from l = 0.
+    pub power_k2: Vec<f64>,
 }
 
 impl Uncertainty {
     /// Converts the errors to those of the map divided by `factor`.
     #[must_use]
     pub(super) fn divided_by(mut self, factor: f64) -> Self {
-        let samples = self.samples_k.iter_mut().flatten();
-        self.sigma_k.iter_mut().chain(samples).for_each(|value| *value /= factor);
+        let samples = self.samples.iter_mut();
+        let samples = samples.flat_map(|sample| sample.map_k.iter_mut().chain(&mut sample.dipole_k));
+        let dipole = self.dipole_k.iter_mut().chain(&mut self.dipole_sigma_k);
+        self.sigma_k.iter_mut().chain(samples).chain(dipole).for_each(|value| *value /= factor);
         self.mean_sigma_k /= factor;
-        self.power.power_k2.iter_mut().for_each(|power| *power /= factor * factor);
+        let powers = self.samples.iter_mut().flat_map(|sample| &mut sample.power_k2);
+        self.power.power_k2.iter_mut().chain(powers).for_each(|power| *power /= factor * factor);
         self
+    }
+
+    /// 1 for the pixels that the data measure, 0 for the others: those where they leave open more than half of the variance that R expects of
+    /// the sky's structure (l >= 2), so that the map shows the expectation more than the sky.
+    #[must_use]
+    pub fn mask(&self) -> Vec<f64> {
+        let of_degree = |(l, power): (usize, &f64)| (2 * l + 1) as f64 / (4.0 * PI) * power;
+        let expected: f64 = self.power.power_k2.iter().enumerate().skip(FREE).map(of_degree).sum();
+        self.sigma_k.iter().map(|sigma| f64::from(u8::from(sigma * sigma < 0.5 * expected))).collect()
     }
 }
 
 /// The state of the search for the maximum-likelihood power.
 #[derive(Clone, Debug)]
-pub(super) struct PowerFit {
+pub(in crate::imaging) struct PowerFit {
     knots: Knots,
     /// Parameters: ln C_l at the knots.
     theta: Vec<f64>,
@@ -183,7 +223,7 @@ impl PowerFit {
     }
 
     /// R by degree, K^-2.
-    pub(super) fn regularisation(&self) -> Vec<f64> {
+    pub(in crate::imaging) fn regularisation(&self) -> Vec<f64> {
         self.power.iter().map(|power| power.recip()).collect()
     }
 
@@ -256,12 +296,16 @@ impl PowerFit {
     }
 
     /// Maximum change of ln C_l at a knot.
-    pub(super) fn change(&self, from: &Self) -> f64 {
+    pub(in crate::imaging) fn change(&self, from: &Self) -> f64 {
         self.theta.iter().zip(&from.theta).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
     }
 
-    /// The estimate with its uncertainty; `traces` are those of `(A + R)^-1` by degree.
-    pub(super) fn estimate(&self, data: BlockData<'_>, traces: &[f64]) -> Result<SkyPower, SolveError> {
+    /// The estimate with its uncertainty, and the covariance of the parameters; `traces` are those of `(A + R)^-1` by degree.
+    pub(super) fn estimate(
+        &self,
+        data: BlockData<'_>,
+        traces: &[f64],
+    ) -> Result<(SkyPower, Mat<f64>), SolveError> {
         let (_, information) = self.derivatives(data).ok_or(SolveError::NoPower)?;
         let covariance = information.llt(Side::Lower).map_err(|_| SolveError::NoPower)?.inverse();
         let sigma = |l: usize| {
@@ -280,11 +324,12 @@ impl PowerFit {
         }
         let decided =
             (counts.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
-        Ok(SkyPower {
+        let power = SkyPower {
             power_k2: self.power.clone(),
             sigma_ln: (0..self.power.len()).map(sigma).collect(),
             decided: decided.collect(),
             noise_factor: 1.0,
-        })
+        };
+        Ok((power, covariance))
     }
 }

@@ -1,5 +1,7 @@
 //! Alternates between solutions and power estimates until both have converged.
 
+use faer::Mat;
+
 use super::blocks::{Block, Factors};
 use super::knots::FREE;
 use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
@@ -46,6 +48,12 @@ pub(in crate::imaging) struct FoundPower {
     pub(in crate::imaging) power: SkyPower,
     /// Ratio of the traces of `(A + R)^-1` to those of the preconditioner, by degree.
     pub(in crate::imaging) ratio: Vec<f64>,
+    /// The curve, with which further rounds begin.
+    pub(in crate::imaging) fit: PowerFit,
+    /// Covariance of its parameters.
+    pub(super) covariance: Mat<f64>,
+    /// Degree of each unknown.
+    pub(super) degrees: Vec<usize>,
 }
 
 impl FoundPower {
@@ -77,8 +85,16 @@ impl PowerProblem<'_> {
             factors.solve(&mut solution);
             let next = self.noise_factor(&solution, &regularisation);
             if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_TOLERANCE {
-                let power = fit.estimate(data, &factors.traces(l_max))?.scaled_from_divided_data(factor);
-                return Ok(FoundPower { regularisation, solution, power, ratio: vec![1.0; l_max + 1] });
+                let (power, covariance) = fit.estimate(data, &factors.traces(l_max))?;
+                return Ok(FoundPower {
+                    regularisation,
+                    solution,
+                    power: power.scaled_from_divided_data(factor),
+                    ratio: vec![1.0; l_max + 1],
+                    fit,
+                    covariance,
+                    degrees: self.degrees.to_vec(),
+                });
             }
             factor = next;
         }
@@ -133,30 +149,75 @@ impl PowerProblem<'_> {
                 let task = watch.start(&format!("map and the sky's power, round {round}"), rule.residual_max);
                 system.solve(&[self.right], &mut x, &[rule], &task);
             }
-            let traces = factors.traces(l_max);
-            let gradient_correction: Vec<f64> =
-                (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * traces[l]).collect();
             let before = factor;
             factor = self.noise_factor(&x[0], &r);
-            let mut right = fit.equivalent_data(self.blocks, &x[0], self.degrees);
-            right.iter_mut().for_each(|b| *b /= factor);
-            let data =
-                BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
-            let next = fit.maximised(data)?;
-            // A change of the noise factor also changes the power.
-            let change = next.change(&fit).max((factor / before).ln().abs());
-            fit = next;
+            let next = self.next(&fit, &x[0], (factor, &ratio))?;
+            // That of the noise is one of the power, too.
+            let change = next.fit.change(&fit).max((factor / before).ln().abs());
             let task = watch.start("the sky's power", tolerance);
             if !task.report_step(change > tolerance && round < ROUNDS_MAX, round, change) {
-                let factors = Factors::new(self.blocks, &fit.regularisation());
-                let mut traces = factors.traces(l_max);
-                traces.iter_mut().zip(&ratio).for_each(|(trace, ratio)| *trace *= ratio);
-                let power = fit.estimate(data, &traces)?.scaled_from_divided_data(factor);
-                let [solution] = x;
-                return Ok(FoundPower { regularisation: fit.regularisation(), solution, power, ratio });
+                return Ok(next);
             }
+            fit = next.fit;
         }
         Err(SolveError::NoPower)
+    }
+
+    /// The power of `fit`, of which `x` is the solution, with its uncertainty.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(in crate::imaging) fn estimated(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+    ) -> Result<FoundPower, SolveError> {
+        self.of_round(fit, x, (factor, ratio), &|_| Ok(fit.clone()))
+    }
+
+    /// The power that the solution `x` of `fit` makes most likely, of data whose noise is larger by a factor and with these ratios of traces.
+    ///
+    /// # Errors
+    /// Numbers that are not finite.
+    pub(in crate::imaging) fn next(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+    ) -> Result<FoundPower, SolveError> {
+        self.of_round(fit, x, (factor, ratio), &|data| fit.maximised(data))
+    }
+
+    fn of_round(
+        &self,
+        fit: &PowerFit,
+        x: &[f64],
+        (factor, ratio): (f64, &[f64]),
+        step: &dyn Fn(BlockData<'_>) -> Result<PowerFit, SolveError>,
+    ) -> Result<FoundPower, SolveError> {
+        let l_max = self.l_max();
+        let traces = |fit: &PowerFit| Factors::new(self.blocks, &fit.regularisation()).traces(l_max);
+        let (r, before) = (fit.regularisation(), traces(fit));
+        let gradient_correction: Vec<f64> =
+            (0..=l_max).map(|l| 0.5 * r[l] * (ratio[l] - 1.0) * before[l]).collect();
+        let mut right = fit.equivalent_data(self.blocks, x, self.degrees);
+        right.iter_mut().for_each(|b| *b /= factor);
+        let data =
+            BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
+        let fit = step(data)?;
+        let mut traces = traces(&fit);
+        traces.iter_mut().zip(ratio).for_each(|(trace, ratio)| *trace *= ratio);
+        let (power, covariance) = fit.estimate(data, &traces)?;
+        Ok(FoundPower {
+            regularisation: fit.regularisation(),
+            solution: x.to_vec(),
+            power: power.scaled_from_divided_data(factor),
+            ratio: ratio.to_vec(),
+            fit,
+            covariance,
+            degrees: self.degrees.to_vec(),
+        })
     }
 
     /// The stopping rule of an intermediate map: its solver error is a fraction of its posterior error, or as `rule` requires.
@@ -178,7 +239,7 @@ impl PowerProblem<'_> {
     }
 
     /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.
-    fn sampled_ratio(
+    pub(in crate::imaging) fn sampled_ratio(
         &self,
         regularisation: &Diagonal,
         factors: &Factors<'_>,
@@ -188,7 +249,9 @@ impl PowerProblem<'_> {
         let is_accurate = watch.all(last.iter().all(|ratio| ratio.ln().abs() < LN_RATIO_ACCURATE));
         let sample_ids = if is_accurate { &TRACE_SAMPLES[..1] } else { &TRACE_SAMPLES };
         let task = watch.start("samples for the sky's power", TRACE_TOLERANCE);
-        let precision = PosteriorPrecision { sums: self.sums, regularisation, factors };
+        let products = |x: &[&[f64]]| self.sums.apply_all(x);
+        let unknowns = self.right.len();
+        let precision = PosteriorPrecision { products: &products, unknowns, regularisation, factors };
         let samples = precision.draw(sample_ids, TRACE_TOLERANCE, &task);
         self.ratio(&samples, &factors.traces(self.l_max()))
     }

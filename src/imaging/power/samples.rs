@@ -9,9 +9,9 @@ use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
 use super::blocks::Factors;
+use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::SolveTask;
 use crate::imaging::solver::{dot, normalised, subtract};
-use crate::imaging::{NormalSums, regulariser::Diagonal};
 use crate::units::{StreamKind, random_stream};
 
 /// Relative change per Lanczos step at which a sample has converged; far below the scatter of samples.
@@ -32,7 +32,9 @@ pub(in crate::imaging) struct PosteriorSample {
 /// The posterior's precision matrix A + R with its preconditioner.
 #[derive(Clone, Copy)]
 pub(in crate::imaging) struct PosteriorPrecision<'a> {
-    pub(in crate::imaging) sums: &'a dyn NormalSums,
+    /// Products with the normal matrix.
+    pub(in crate::imaging) products: &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>,
+    pub(in crate::imaging) unknowns: usize,
     pub(in crate::imaging) regularisation: &'a Diagonal,
     pub(in crate::imaging) factors: &'a Factors<'a>,
 }
@@ -132,7 +134,7 @@ impl PosteriorPrecision<'_> {
             })
             .collect();
         let upper_slices: Vec<&[f64]> = upper.iter().map(Vec::as_slice).collect();
-        let mut products = self.sums.apply_all(&upper_slices);
+        let mut products = (self.products)(&upper_slices);
         for (product, vector) in products.iter_mut().zip(&upper) {
             self.regularisation.add_product(vector, product);
             self.factors.solve_lower(product);
@@ -148,7 +150,7 @@ impl PosteriorPrecision<'_> {
         tolerance: f64,
         task: &SolveTask<'_>,
     ) -> Vec<PosteriorSample> {
-        let unknowns = self.sums.unknowns();
+        let unknowns = self.unknowns;
         let normal_vector = |id: &u64| -> Vec<f64> {
             let mut stream = random_stream(SAMPLE_SEED, StreamKind::Probe, [unknowns as u64, *id]);
             (0..unknowns).map(|_| StandardNormal.sample(&mut stream)).collect()

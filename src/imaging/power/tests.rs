@@ -182,7 +182,13 @@ fn samples_have_the_covariance_of_the_posterior() {
     let factors = Factors::new(&blocks, &r);
     let sums = Dense { matrix: a, right: vec![0.0; ORDER] };
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
-    let precision = PosteriorPrecision { sums: &sums, regularisation: &regularisation, factors: &factors };
+    let products = |x: &[&[f64]]| sums.apply_all(x);
+    let precision = PosteriorPrecision {
+        products: &products,
+        unknowns: ORDER,
+        regularisation: &regularisation,
+        factors: &factors,
+    };
     let sample_ids: Vec<u64> = (0..DRAWS as u64).collect();
     let drawn = precision.draw(&sample_ids, SAMPLE_TOLERANCE, &watch.named("test").start("draws", 0.0));
     for i in 0..ORDER {

@@ -7,9 +7,11 @@ use std::sync::Arc;
 
 use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentFolder, VisibilityArchive};
+use crate::imaging::beyond::{BeyondNoise, read_power};
 use crate::imaging::circle::{
     HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, nominal_orbit,
 };
+use crate::imaging::solver::SolveError;
 use crate::imaging::{
     AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
     NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
@@ -182,6 +184,8 @@ pub struct Accumulator {
     part: Option<SumPart>,
     /// Seeds of the additional noise realisations.
     realisation_seeds: Vec<u64>,
+    /// The sky beyond the degrees of the maps, by channel, where it counts as noise.
+    beyond: BTreeMap<ChannelId, BeyondNoise>,
 }
 
 impl Accumulator {
@@ -201,6 +205,7 @@ impl Accumulator {
             ranks: Ranks::single(),
             part: None,
             realisation_seeds: Vec::new(),
+            beyond: BTreeMap::new(),
         }
     }
 
@@ -411,7 +416,7 @@ impl Accumulator {
     /// # Errors
     /// The channel holds nothing, or as [`NormalEngine::remove`].
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let short = within_baseline(placed, self.config.baseline_m_max(placed.frequency_hz));
+        let short = self.usable(placed)?;
         if short.is_empty() {
             return Ok(Added::default());
         }
@@ -502,13 +507,35 @@ impl Accumulator {
         Ok(Ok(state))
     }
 
+    /// The visibilities that a map uses, with the weights that it gives them.
+    fn usable(&mut self, placed: &PlacedVisibilities) -> Result<PlacedVisibilities, AccumulationError> {
+        let (config, channel) = (&self.config, placed.channel);
+        let baseline_m_max = config.baseline_m_max(placed.frequency_hz);
+        let mut short = within_baseline(placed, baseline_m_max);
+        let Some(path) = config.beyond_files.get(usize::from(channel.0)).filter(|_| !short.is_empty()) else {
+            return Ok(short);
+        };
+        if !self.beyond.contains_key(&channel) {
+            let instrument = self.instrument.as_ref().ok_or(AccumulationError::UnknownChannel(channel))?;
+            let failed = |error: SolveError| AccumulationError::Beyond(error.to_string());
+            let (first, power_k2) = read_power(path).map_err(failed)?;
+            let (hz, moon_m) = (placed.frequency_hz, instrument.moon_radius_m);
+            let beyond = BeyondNoise::new((first, &power_k2), config.degree(), hz, baseline_m_max, moon_m);
+            self.beyond.insert(channel, beyond);
+        }
+        if let Some(beyond) = self.beyond.get_mut(&channel) {
+            beyond.lower_weights(&mut short);
+        }
+        Ok(short)
+    }
+
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
         let is_in_group = self.group.as_ref().is_none_or(|group| group.contains(&placed.channel));
         if !is_in_group || !self.config.is_mapped(placed.channel) {
             self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
-        let short = within_baseline(placed, self.config.baseline_m_max(placed.frequency_hz));
+        let short = self.usable(placed)?;
         self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - short.len()) as u64);
         if short.is_empty() {
             // A channel without usable data gets no engine and no map.

@@ -13,7 +13,7 @@ use crate::imaging::circle::{
 use crate::imaging::pixel::{MatrixFreeSums, PixelExtras, PixelSolution, PixelSums, PointBeam};
 use crate::imaging::pixel::{solve_matrix_free, solve_pixels_with, solve_pixels_with_power};
 use crate::imaging::solver::NamedWatch;
-use crate::imaging::{Diagnostics, Regulariser, SolveError, SolveWatch, StoppingRule, Uncertainty};
+use crate::imaging::{Diagnostics, Regulariser, Samples, SolveError, SolveWatch, StoppingRule, Uncertainty};
 use crate::imaging::{NormalSums, Snapshot, SnapshotData, SumCounts};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::{pixel_area_sr, pixel_count, pixel_of};
@@ -94,7 +94,7 @@ pub struct SolverSetup {
     /// Random probes for the traces of a final map whose matrix is too large to store; 0 for no traces.
     pub trace_probes: usize,
     /// Number of posterior samples of a final map; with R from the data.
-    pub samples: usize,
+    pub samples: Samples,
     /// Receives progress and can interrupt a solution.
     pub watch: SolveWatch,
 }
@@ -192,14 +192,18 @@ impl Request<'_> {
         !self.watch.may_continue() && !self.is_final
     }
 
+    fn samples(&self) -> Samples {
+        if self.is_final { self.setup.samples } else { Samples::default() }
+    }
+
     fn harmonic_request(&self) -> HarmonicRequest {
-        let samples = self.if_final(self.setup.samples);
+        let samples = self.samples();
         let probes = self.if_final(self.setup.trace_probes);
         HarmonicRequest { epsilon: self.epsilon, nside: self.nside, rule: self.setup.rule, samples, probes }
     }
 
     fn pixels_with_power(&self, sums: &PixelSums) -> Result<Option<SolvedMap>, SolveError> {
-        let samples = self.if_final(self.setup.samples);
+        let samples = self.samples();
         let prior = self.prior.as_deref();
         match solve_pixels_with_power(sums, prior, samples, &self.beam_pixels, self.watch) {
             Err(SolveError::Interrupted) => Ok(None),
@@ -278,7 +282,7 @@ impl Request<'_> {
 
     /// Refines a map; `fingerprint` identifies the data, so that a saved solution of other data is not used.
     fn refined(&self, sums: &RefinedSums, fingerprint: &[i64]) -> Result<Option<SolvedMap>, SolveError> {
-        let request = HarmonicRequest { samples: 0, probes: 0, ..self.harmonic_request() };
+        let request = HarmonicRequest { probes: 0, ..self.harmonic_request() };
         let fingerprint = [fingerprint, &[self.epsilon.to_bits().cast_signed()]].concat();
         let file = self
             .setup
@@ -303,9 +307,9 @@ impl Request<'_> {
         if let Some(file) = file.filter(|_| self.watch.may_continue()) {
             file.remove();
         }
-        let HarmonicSolution { map_k, noise_k, diagnostics, .. } = solved;
+        let HarmonicSolution { map_k, noise_k, diagnostics, uncertainty, .. } = solved;
         let (beams, refinement) = (Vec::new(), Some(found));
-        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty: None }))
+        Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty }))
     }
 }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::plan::Plan;
 use super::problems::Problems;
 use super::sections::Config;
-use crate::imaging::Regulariser;
+use crate::imaging::{Regulariser, read_power};
 use crate::sky::fits::{
     FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
@@ -46,6 +46,9 @@ impl Plan {
             errors.filter(is_keyword).for_each(|problem| found.push(|| problem));
         }
         for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
+            found.push(|| problem);
+        }
+        for problem in self.config.map.beyond_files.iter().filter_map(|path| read_power(path).err()) {
             found.push(|| problem);
         }
         if let Some(problem) = self.sky_l_max_problem() {
@@ -106,7 +109,7 @@ impl Config {
     pub fn input_files(&self) -> Vec<PathBuf> {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
         let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
-        let maps = self.map.prior_files.iter().chain(self.map.power_files());
+        let maps = self.map.prior_files.iter().chain(self.map.power_files()).chain(&self.map.beyond_files);
         let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file).cloned();
         skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
     }

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex};
 use super::live_gains::GainsWriter;
 use crate::ground::{Ground, GroundConfig, GroundOutcome};
 use crate::imaging::MapConfig;
+use crate::imaging::Samples;
 use crate::imaging::anywhere::RefineRule;
 use crate::imaging::{
     Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
@@ -54,7 +55,7 @@ impl Config {
             assumed: map.assumed(),
             iteration_folder: None,
             trace_probes: map.trace_probes,
-            samples: 0,
+            samples: Samples::default(),
             watch,
         })
     }

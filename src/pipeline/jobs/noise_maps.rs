@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use crate::downlink::FileSource;
 use crate::ground::{Ground, WAIT_BYTES};
+use crate::imaging::Samples;
 use crate::imaging::circle::{NoiseSums, memory};
 use crate::imaging::{EngineKind, Snapshot, SnapshotData};
 use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
@@ -124,7 +125,8 @@ impl Sink for NoiseMapSolver {
         let setup = &self.setup;
         let index = usize::from(channel.0);
         let epsilon = setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
-        let request = HarmonicRequest { epsilon, nside, rule: setup.rule, samples: 0, probes: 0 };
+        let request =
+            HarmonicRequest { epsilon, nside, rule: setup.rule, samples: Samples::default(), probes: 0 };
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |channel| channel.frequency_hz);
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
         let maps = match solve_noises(&sums, request, &setup.regulariser(index), setup.watch.named(&name)) {

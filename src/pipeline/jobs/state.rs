@@ -5,7 +5,7 @@ use std::path::Path;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, solve_jointly};
 use crate::imaging::{REFINED, Regulariser, RegulariserChoice, SnapshotData, SolveError, StoppingRule};
-use crate::imaging::{Solution, SolveWatch, Solver, SolverSetup};
+use crate::imaging::{Samples, Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
@@ -58,6 +58,11 @@ fn require_files(
             "calibration.gains_file",
             "gains of",
             "--old-calibration FILE (recalibrate), --calibration FILE (replay) or --set calibration.gains_file=FILE (other commands)",
+        ),
+        (
+            "map.beyond_files",
+            "the sky's power beyond the maps' degrees, of",
+            "--set map.beyond_files=[FILE, ...]",
         ),
         (
             "calibrate.model_files",
@@ -152,11 +157,11 @@ pub fn solve_state(
 pub fn sample_state(
     folder: &Path,
     config: &Config,
-    count: usize,
+    samples: Samples,
     watch: &SolveWatch,
     found: &mut dyn FnMut(Solution),
 ) -> Result<(), PipelineError> {
-    let setup = SolverSetup { samples: count, ..config.solver(watch.clone())? };
+    let setup = SolverSetup { samples, ..config.solver(watch.clone())? };
     solve_sums(folder, config, setup, found)
 }
 

@@ -143,7 +143,14 @@ fn downlink_key(config: &Config) -> u64 {
 fn sums_key(case: &StudyCase) -> u64 {
     let config = &case.plan.config;
     let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
-    let sums = (map.sum_settings(), map.snapshot_every_s, &map.refine, &config.calibration, solver);
+    let sums = (
+        map.sum_settings(),
+        &map.beyond_files,
+        map.snapshot_every_s,
+        &map.refine,
+        &config.calibration,
+        solver,
+    );
     // Self-calibration depends on the settings of the solution, too.
     let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
     let text = serde_json::to_vec(&(sums, solution));

@@ -1,0 +1,170 @@
+//! Errors of a map over harmonics whose R is from the data, and draws from its posterior.
+
+use super::coefficients;
+use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
+use crate::imaging::NormalSums;
+use crate::imaging::power::{
+    Block, Factors, FoundPower, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE,
+};
+use crate::imaging::power::{Sample, Samples, Uncertainty};
+use crate::imaging::regulariser::Diagonal;
+use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, add, dot};
+use crate::sky::harmonics::synthesis;
+
+/// Realisations or samples that are solved for together: a thread has a workspace for each.
+pub const NOISES_TOGETHER: usize = 4;
+
+/// Residual of the errors of mean and dipole: they err by its square.
+const BESIDE: f64 = 0.1;
+
+/// First number of the draws of Gibbs sampling: those of plain samples are below.
+const GIBBS: u64 = 1 << 40;
+
+/// The equations of a map with R from the data, solved.
+pub(in crate::imaging) struct Posterior<'a> {
+    /// Equations on one circle.
+    pub(in crate::imaging) sums: &'a dyn NormalSums,
+    /// Blocks near their matrix.
+    pub(in crate::imaging) blocks: &'a [Block<'a>],
+    pub(in crate::imaging) found: &'a FoundPower,
+    /// Right-hand side, less what the prior map predicts.
+    pub(in crate::imaging) right: &'a [f64],
+    /// The solution, without its prior map.
+    pub(in crate::imaging) solved: &'a [f64],
+    /// With it.
+    pub(in crate::imaging) whole: &'a [f64],
+    pub(in crate::imaging) nside: usize,
+    pub(in crate::imaging) rule: StoppingRule,
+    pub(in crate::imaging) watch: NamedWatch<'a>,
+}
+
+/// Products of a normal matrix with several vectors.
+pub(in crate::imaging) type Products<'a> = &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>;
+
+impl Posterior<'_> {
+    fn l_max(&self) -> usize {
+        self.found.regularisation.len() - 1
+    }
+
+    /// Errors, with samples of the equations whose matrix makes `products`.
+    ///
+    /// # Errors
+    /// An nside or degree without a transform.
+    pub(in crate::imaging) fn uncertainty(
+        &self,
+        samples: Samples,
+        products: Products<'_>,
+    ) -> Result<Uncertainty, SolveError> {
+        let FoundPower { regularisation: r, power, ratio, .. } = self.found;
+        let (factor, nside) = (power.noise_factor, self.nside);
+        let factors = Factors::new(self.blocks, r);
+        let mut sigma_k = pixel_sigma_k(self.blocks, &factors, ratio, nside);
+        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
+        let [mean_sigma_k, dipole_sigma_k @ ..] = self.moments_sigma(&factors).map(|sigma| factor * sigma);
+        let [_, dipole_k @ ..] = moments_k(self.whole, self.l_max());
+        Ok(Uncertainty {
+            sigma_k,
+            resolution_deg: pixel_resolution_deg(self.blocks, &factors, (r, &power.decided), nside),
+            mean_sigma_k,
+            dipole_k,
+            dipole_sigma_k,
+            power: power.clone(),
+            samples: if samples.gibbs {
+                self.gibbs_samples(samples.count)?
+            } else {
+                self.samples(samples.count, &factors, products)?
+            },
+        })
+    }
+
+    /// Standard deviations of mean and dipole, K, for data of their noise: columns of the covariance.
+    fn moments_sigma(&self, factors: &Factors<'_>) -> [f64; 4] {
+        let unit = |(place, factor): (usize, f64)| {
+            let mut unit = vec![0.0; self.right.len()];
+            unit[place] = factor;
+            unit
+        };
+        let units = moments(self.l_max()).map(unit);
+        let mut columns = units.each_ref().map(|unit| vec![0.0; unit.len()]);
+        let rule = StoppingRule { residual_max: self.rule.residual_max.max(BESIDE), ..self.rule };
+        let system = System {
+            sums: self.sums,
+            regularisation: Diagonal::ByDegree(self.found.regularisation.clone()),
+            precondition: &|v| factors.solve(v),
+        };
+        let task = self.watch.start("errors of mean and dipole", rule.residual_max);
+        system.solve(&units.each_ref().map(Vec::as_slice), &mut columns, &[rule; 4], &task);
+        [0, 1, 2, 3].map(|k| dot(&units[k], &columns[k]).max(0.0).sqrt())
+    }
+
+    /// A sample that is `away` from the solution.
+    fn sample(&self, mut away: Vec<f64>) -> Result<Sample, SolveError> {
+        add(&mut away, self.whole);
+        let map_k = synthesis(&coefficients(&away, self.l_max()), self.nside)?;
+        Ok(sample(&away, self.l_max(), map_k))
+    }
+
+    /// Maps as likely as this one, C_l as it was found.
+    fn samples(
+        &self,
+        count: usize,
+        factors: &Factors<'_>,
+        products: Products<'_>,
+    ) -> Result<Vec<Sample>, SolveError> {
+        let regularisation = &Diagonal::ByDegree(self.found.regularisation.clone());
+        let covariance = PosteriorPrecision { products, unknowns: self.right.len(), regularisation, factors };
+        let mut samples = Vec::new();
+        let numbers: Vec<u64> = (0..count as u64).collect();
+        for which in numbers.chunks(NOISES_TOGETHER) {
+            let name = format!("samples from {} of {count}", which[0] + 1);
+            let task = self.watch.start(&name, SAMPLE_TOLERANCE);
+            for PosteriorSample { exact: mut drawn, .. } in covariance.draw(which, SAMPLE_TOLERANCE, &task) {
+                drawn.iter_mut().for_each(|value| *value *= self.found.noise_factor());
+                samples.push(self.sample(drawn)?);
+            }
+        }
+        Ok(samples)
+    }
+
+    /// Maps and powers as likely as those that were found.
+    fn gibbs_samples(&self, count: usize) -> Result<Vec<Sample>, SolveError> {
+        let mut samples = Vec::new();
+        for number in 0..count as u64 {
+            if !self.watch.may_continue() {
+                return Err(SolveError::Interrupted);
+            }
+            let mut turn = 0;
+            let name = format!("sample {} of {count}, with its power", number + 1);
+            let drawn = self.found.gibbs(number, &mut |r| {
+                turn += 1;
+                self.drawn_with(r, GIBBS + 16 * number + turn, &name)
+            });
+            let away = drawn.iter().zip(self.solved).map(|(drawn, solved)| drawn - solved).collect();
+            samples.push(self.sample(away)?);
+        }
+        Ok(samples)
+    }
+
+    /// Coefficients, less those of the prior, as likely as the data say with this R.
+    fn drawn_with(&self, r: &[f64], which: u64, name: &str) -> Vec<f64> {
+        let factors = &Factors::new(self.blocks, r);
+        let regularisation = Diagonal::ByDegree(r.to_vec());
+        let products = |x: &[&[f64]]| self.sums.apply_all(x);
+        let mut columns = [self.solved.to_vec()];
+        {
+            let (regularisation, precondition) = (regularisation.clone(), |v: &mut [f64]| factors.solve(v));
+            let system = System { sums: self.sums, regularisation, precondition: &precondition };
+            let task = self.watch.start(name, self.rule.residual_max);
+            system.solve(&[self.right], &mut columns, &[self.rule], &task);
+        }
+        let [mut sky] = columns;
+        let unknowns = self.right.len();
+        let covariance =
+            PosteriorPrecision { products: &products, unknowns, regularisation: &regularisation, factors };
+        let task = self.watch.start(name, SAMPLE_TOLERANCE);
+        for PosteriorSample { exact, .. } in covariance.draw(&[which], SAMPLE_TOLERANCE, &task) {
+            sky.iter_mut().zip(exact).for_each(|(sky, drawn)| *sky += self.found.noise_factor() * drawn);
+        }
+        sky
+    }
+}
