@@ -164,6 +164,14 @@ impl Config {
         checks.finish()
     }
 
+    /// Replaces `map.engine = "auto"` by what the orbits allow.
+    pub(super) fn choose_engine(&mut self) {
+        if self.map.engine == EngineKind::Auto {
+            let harmonic = self.array.is_circle() || self.map.refine.is_on();
+            self.map.engine = if harmonic { EngineKind::Harmonic } else { EngineKind::Pixel };
+        }
+    }
+
     /// Requires settings that are possible for satellites that do not share a circular orbit.
     fn check_orbits(&self, checks: &mut Checks) {
         if self.array.is_circle() {
@@ -177,7 +185,7 @@ impl Config {
             (
                 "map.engine",
                 "\"harmonic\"",
-                map.engine == EngineKind::Pixel || map.refine.is_on(),
+                map.engine != EngineKind::Harmonic || map.refine.is_on(),
                 "\"pixel\", or map.refine,",
             ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
