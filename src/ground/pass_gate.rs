@@ -21,7 +21,7 @@ const LATE: usize = 1;
 /// Called after each pass is closed.
 pub type PassObserver = Box<dyn FnMut(&SolvedGains) + Send>;
 
-/// State of a [`PassGate`] in a checkpoint.
+/// State of a `PassGate` in a checkpoint.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct PassGateState {
     pub(super) passes: Vec<ClosedPass>,
