@@ -110,7 +110,7 @@ pub(crate) fn run<'py>(
                     found.push(map)
                 }
             };
-            watched.maps.join(Box::new(MapTaker(take)));
+            watched.maps.add_viewer(Box::new(MapTaker(take)));
         })?;
         Ok(serde_json::to_string(&summary)?)
     };
@@ -190,7 +190,7 @@ impl NativeReplay {
             let summary = pipeline::replay(source, &config, ground, &out, &ended, &mut |watched| {
                 begun.begin(&watched, 0);
                 let (sender, ended) = (sender.clone(), ended.clone());
-                watched.maps.join(Box::new(MapTaker(move |map| {
+                watched.maps.add_viewer(Box::new(MapTaker(move |map| {
                     if sender.send(map).is_err() {
                         ended.cancel();
                     }
