@@ -82,7 +82,7 @@ fn what_more_costs(at: &[TimedPair], setup: RowsSetup, skies: &[Alm]) {
         let k = f64::from(satellite);
         let axis = unit(add(scale(0.1 * k, unit(r_m)), [0.1, -0.2, 1.0]));
         let axes_hat = [axis, unit(cross(axis, r_m))];
-        SatelliteAntenna { elements, axes_hat, distortion: distortion * (k + 1.0) }
+        SatelliteAntenna::new(elements, axes_hat, distortion * (k + 1.0))
     };
     let weight = vec![1.0; at.len()];
     let mut plain_s = Vec::new();

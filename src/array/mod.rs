@@ -5,6 +5,7 @@
 //! Coordinates are centred on the Moon, on ecliptic axes: x towards ecliptic longitude 0, z towards the north ecliptic
 //! pole.
 
+mod attitudes;
 mod baseline;
 mod bodies;
 mod config;
@@ -22,6 +23,8 @@ mod state;
 mod track;
 mod windows;
 
+#[doc(hidden)]
+pub use attitudes::Attitudes;
 #[doc(hidden)]
 pub use baseline::scaled_baseline;
 #[doc(hidden)]

@@ -17,11 +17,10 @@ pub fn track_offset_m(r_m: Vec3, normal_hat: Vec3, offset_m: [f64; 3]) -> Vec3 {
     add(add(parts[0], parts[1]), parts[2])
 }
 
-/// Axis of an antenna that is tilted from the orbit's normal by an angle (deg) towards the track and by another away
-/// from the Moon; and the perpendicular direction nearest to the track.
+/// Axis of an antenna that leans from the second of a body's axes, as those of [`track_axes`], by an angle (deg) towards the first, and by
+/// one towards the third; and the direction across it that is nearest to the first.
 #[must_use]
-pub fn tilted_axes(r_m: Vec3, normal_hat: Vec3, [along_deg, radial_deg]: [f64; 2]) -> [Vec3; 2] {
-    let [along, normal, up] = track_axes(r_m, normal_hat);
+pub fn tilted_axes([along, normal, up]: [Vec3; 3], [along_deg, radial_deg]: [f64; 2]) -> [Vec3; 2] {
     let [a, b] = [along_deg, radial_deg].map(|deg| deg.to_radians().tan());
     let axis = unit(add(normal, add(scale(a, along), scale(b, up))));
     [axis, unit(sub(along, scale(dot(along, axis), axis)))]

@@ -1,7 +1,7 @@
 //! Configuration of the daughters' antennas that a refined map assumes.
 
 use crate::imaging::anywhere::AssumedAntenna;
-use crate::response::PatternsByFrequency;
+use crate::response::{AntennaFiles, PatternsByFrequency};
 use crate::units::{Checks, keys};
 
 keys! {
@@ -16,6 +16,9 @@ keys! {
         /// Distortion by frequency, added to `pattern`, as instrument.pattern_by_frequency.
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
+        /// Attitudes and patterns by files, to which tilts are added.
+        #[serde(skip_serializing_if = "AntennaFiles::is_none")]
+        section files: AntennaFiles = AntennaFiles::default();
     }
 }
 
@@ -37,7 +40,7 @@ impl AntennasConfig {
         let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
         let lists = self.lists().into_iter().filter(|(_, values)| is_set(values)).map(|(key, _)| key);
         let by_frequency = (!self.pattern_by_frequency.is_ideal()).then_some("pattern_by_frequency");
-        lists.chain(by_frequency).collect()
+        lists.chain(by_frequency).chain(self.files.is_some().then_some("files")).collect()
     }
 
     /// Maximum degree of a pair's response as a polynomial in the direction, from two dipoles and two patterns.
@@ -45,7 +48,7 @@ impl AntennasConfig {
     pub fn degree(&self) -> usize {
         let is_set = |values: &[f64]| values.iter().any(|value| *value != 0.0);
         let has_patterns = is_set(&self.pattern) || !self.pattern_by_frequency.is_ideal();
-        2 * usize::from(!self.is_ideal()) + 4 * usize::from(has_patterns)
+        2 * usize::from(!self.is_ideal()) + self.files.degree().max(4 * usize::from(has_patterns))
     }
 
     /// The assumed antennas, without patterns by frequency; empty if all are ideal.
@@ -63,6 +66,9 @@ impl AntennasConfig {
     }
 
     pub(super) fn check(&self, checks: &mut Checks) {
+        let has_patterns =
+            !self.pattern_by_frequency.is_ideal() || self.pattern.iter().any(|value| *value != 0.0);
+        self.files.check("antennas.files", has_patterns, checks);
         self.pattern_by_frequency.check("antennas.pattern_by_frequency", None, checks);
         for (key, values) in self.lists() {
             let expected = format!("at most {}, one per daughter", u8::MAX);

@@ -13,6 +13,7 @@ use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
+use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::check_frequencies;
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::sky::{Frame, TEMPERATURE_K_MAX};
@@ -50,6 +51,8 @@ pub enum EngineKind {
     Pixel,
     /// Spherical harmonics: thousands of operations per visibility; needs satellites on one circular orbit.
     Harmonic,
+    /// The cheaper one that the array's orbits allow: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
+    Auto,
 }
 
 /// Storage of the pixel engine's matrix.
@@ -85,8 +88,8 @@ keys! {
         /// HEALPix nside of the maps: a power of two up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
-        /// Basis of the normal equations: "pixel", exact on any orbit, or "harmonic", far cheaper, for satellites on one circle
-        /// or with map.refine.
+        /// Basis of the normal equations: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or
+        /// with map.refine; or "auto", "harmonic" where the orbits allow it.
         everyday engine: EngineKind = EngineKind::Pixel;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;
@@ -213,7 +216,7 @@ impl MapConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
-        let is_large = self.engine == EngineKind::Pixel && self.nside > POWER_NSIDE_MAX;
+        let is_large = self.engine != EngineKind::Harmonic && self.nside > POWER_NSIDE_MAX;
         let is_identity = self.holds_visibilities() || self.epsilon.is_some() || is_large;
         let default = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
         self.regulariser.clone().unwrap_or(default)
@@ -240,7 +243,7 @@ impl MapConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn is_matrix_free(&self) -> bool {
-        self.engine == EngineKind::Pixel && self.matrix == MatrixKind::Free
+        self.engine != EngineKind::Harmonic && self.matrix == MatrixKind::Free
     }
 
     /// Whether individual visibilities are stored instead of sums.
@@ -258,8 +261,8 @@ impl MapConfig {
         let is_harmonic = self.engine == EngineKind::Harmonic;
         let nside_max = match self.engine {
             EngineKind::Harmonic => HARMONIC_ENGINE_NSIDE_MAX,
-            EngineKind::Pixel if self.is_matrix_free() => MATRIX_FREE_NSIDE_MAX,
-            EngineKind::Pixel => PIXEL_ENGINE_NSIDE_MAX,
+            _ if self.is_matrix_free() => MATRIX_FREE_NSIDE_MAX,
+            EngineKind::Pixel | EngineKind::Auto => PIXEL_ENGINE_NSIDE_MAX,
         };
         let good = is_valid_nside(self.nside) && self.nside <= nside_max;
         let expected = format!("a power of two from 1 to {nside_max} for this engine");
@@ -446,7 +449,7 @@ impl MapConfig {
             settings.push(("map.channels", format!("{channels:?}")));
         }
         match engine {
-            EngineKind::Pixel => {
+            EngineKind::Pixel | EngineKind::Auto => {
                 settings.push(("map.rows", format!("{rows:?}")));
                 if self.is_matrix_free() {
                     settings.push(("map.matrix", format!("{matrix:?}")));
@@ -464,16 +467,20 @@ impl MapConfig {
         settings
     }
 
-    /// The instrument that the rows of a refined map assume.
-    #[must_use]
+    /// What the rows of a refined map are made with.
+    ///
+    /// # Errors
+    /// Files of antennas that cannot be used.
     #[doc(hidden)]
-    pub fn assumed(&self) -> AssumedInstrument {
-        let AntennasConfig { pattern_by_frequency, .. } = &self.antennas;
-        AssumedInstrument {
+    pub fn assumed(&self) -> Result<AssumedInstrument, MeasuredAntennasError> {
+        let AntennasConfig { pattern_by_frequency, files, .. } = &self.antennas;
+        Ok(AssumedInstrument {
             smear_integrations: self.refine.smear_integrations,
             antennas: self.antennas.assumed(),
             patterns: pattern_by_frequency.clone(),
-        }
+            measured: MeasuredAntennas::read(files)?,
+            ..AssumedInstrument::default()
+        })
     }
 
     /// The longest baseline used at a frequency, m.
@@ -506,8 +513,9 @@ impl MapConfig {
         group: Option<&ChannelGroup>,
     ) -> Result<(), AccumulationError> {
         let each = match self.engine {
-            EngineKind::Pixel if !self.is_matrix_free() => PixelEngine::memory_bytes(self.nside),
-            EngineKind::Pixel | EngineKind::Harmonic => 0,
+            EngineKind::Harmonic => 0,
+            _ if self.is_matrix_free() => 0,
+            EngineKind::Pixel | EngineKind::Auto => PixelEngine::memory_bytes(self.nside),
         };
         let is_summed = |channel: &ChannelId| {
             self.is_mapped(*channel) && group.is_none_or(|group| group.contains(channel))
@@ -552,7 +560,7 @@ impl MapConfig {
             ("regulariser.file", [0, channels].contains(&tables), tables),
             ("beyond_files", [0, channels].contains(&self.beyond_files.len()), self.beyond_files.len()),
         ] {
-            let expected = format!("one value, or one for each of the {channels} channels");
+            let expected = format!("a single value, or a list of one for each of the {channels} channels");
             checks.require(key, format!("({found} values)"), fits, expected);
         }
         checks.finish()

@@ -129,7 +129,7 @@ impl EngineCost {
     pub(crate) fn estimate(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
             EngineKind::Pixel if map.is_matrix_free() => Self::matrix_free(map, data),
-            EngineKind::Pixel => Self::pixel(map),
+            EngineKind::Pixel | EngineKind::Auto => Self::pixel(map),
             EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
             EngineKind::Harmonic => Self::harmonic(map, data),
         }

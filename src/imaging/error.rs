@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
+use crate::response::MeasuredAntennasError;
 use crate::response::general::RowsRefusal;
 use crate::response::pixel::ResponseError;
 use crate::units::{ChannelId, Dimension, InvalidValue};
@@ -93,6 +94,9 @@ pub enum AccumulationError {
     /// The positions of a visibility have no row of B.
     #[error("a visibility has no row of the beam matrix: {0}")]
     Rows(RowsRefusal),
+    /// Antennas that files do not say.
+    #[error("map.antennas.files: {0}")]
+    Antennas(#[from] MeasuredAntennasError),
     /// Merged states hold more visibilities than the limit.
     #[error(
         "channel {channel} of the merged states holds {found} visibilities for refinement; expected at most \

@@ -306,7 +306,7 @@ impl SpacecraftConfig {
                 self.baseline_wavelengths_max.fits(channels),
             ),
         ] {
-            let expected = format!("one value, or one for each of the {channels} channels");
+            let expected = format!("a single value, or a list of one for each of the {channels} channels");
             checks.require(key, format!("({values} values)"), fits, expected);
         }
     }

@@ -80,7 +80,7 @@ impl ReceiverNoise {
 
 /// Checks that there is one value, or one for each channel, and that none is negative.
 pub(super) fn check_channels(key: &str, values: &PerChannel<f64>, channels: usize, checks: &mut Checks) {
-    let expected = format!("one value, or one for each of the {channels} channels");
+    let expected = format!("a single value, or a list of one for each of the {channels} channels");
     checks.require(key, format!("({} values)", values.values().len()), values.fits(channels), expected);
     checks.numbers(key, values.values(), |k_sr| k_sr >= 0.0, "K sr, not negative");
 }
@@ -148,7 +148,7 @@ mod tests {
             ("receiver_noise_k_sr = -1.0", "receiver_noise_k_sr = -1: expected K sr, not negative"),
             (
                 "receiver_noise_k_sr = []",
-                "receiver_noise_k_sr = (0 values): expected one value, or one for each of the 2",
+                "receiver_noise_k_sr = (0 values): expected a single value, or a list of one for each of the 2",
             ),
             (
                 "receiver_noise_k_sr = [1.0]",

@@ -66,7 +66,7 @@ impl Provenance {
             Card::text("ENGINE", engine_name(map.engine), "unknowns of the solution"),
         ];
         match map.engine {
-            EngineKind::Pixel => {
+            EngineKind::Pixel | EngineKind::Auto => {
                 let rows = format!("{:?}", map.rows).to_lowercase();
                 cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
                 if let Some(convergence) = solution.diagnostics.convergence {
@@ -187,7 +187,7 @@ fn antenna_name(response: AntennaResponse) -> &'static str {
 
 fn engine_name(engine: EngineKind) -> &'static str {
     match engine {
-        EngineKind::Pixel => "pixel",
+        EngineKind::Pixel | EngineKind::Auto => "pixel",
         EngineKind::Harmonic => "harmonic",
     }
 }

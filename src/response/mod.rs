@@ -10,21 +10,27 @@
 //! | [`general`] | rows of B over spherical harmonics, for satellites at any positions |
 //! | [`beacon`] | an artificial plane wave |
 //! | [`model`] | visibilities of a given sky, by any of these |
-//! | [`PatternsByFrequency`] | the change of antenna patterns with frequency |
+//! | [`PatternsByFrequency`], [`MeasuredAntennas`] | antenna patterns by frequency; attitudes and patterns by files |
 //!
 //! Uses [`crate::units`], [`crate::frames`], [`crate::sky`] and [`mod@crate::array`]. Simulation and mapping share this
 //! code, so that a bug would cancel out unseen: tests compare it with reference values made by other code.
 
+mod antenna_tables;
 #[doc(hidden)]
 pub mod beacon;
 #[doc(hidden)]
 pub mod general;
 #[doc(hidden)]
 pub mod harmonic;
+mod measured_antennas;
 #[doc(hidden)]
 pub mod model;
 mod patterns_by_frequency;
 pub mod pixel;
 
+#[doc(hidden)]
+pub use antenna_tables::{AntennaTables, FittedDipole, TableError};
+#[doc(hidden)]
+pub use measured_antennas::{AntennaFiles, AntennaOf, MeasuredAntennas, MeasuredAntennasError};
 #[doc(hidden)]
 pub use patterns_by_frequency::PatternsByFrequency;

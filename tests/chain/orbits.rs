@@ -7,7 +7,9 @@ use std::path::Path;
 use common::workplace::{Workplace, fail, json, maps, succeed};
 use lunarray::downlink::{Contents, DownlinkReader};
 use lunarray::frames::GroundFrame;
+use lunarray::pipeline::{ConfigSource, Plan};
 use lunarray::sky::fits::{ReadOptions, read_map_file};
+use lunarray::units::vector::{add, cross, dot, scale, sub, unit};
 
 /// A triple whose altitudes differ by tens of kilometres and whose planes are tilted against each other: a circle's rows
 /// would be of no use.
@@ -282,10 +284,11 @@ fn left_by_refinement(flown: &[&str], known: &[&[&str]]) -> Vec<f64> {
         assert_eq!(refinement["taken_as_instants"], 0, "{refinement}");
         let file = format!("{out}/3.000MHz/map.fits");
         let header = read_map_file(Path::new(&file), &ReadOptions::default()).unwrap().header;
-        let keys: Vec<&str> = more
+        let mut keys: Vec<&str> = more
             .iter()
-            .filter_map(|set| set.strip_prefix("map.antennas.")?.split_once('=').map(|(key, _)| key))
+            .filter_map(|set| set.strip_prefix("map.antennas.")?.split(['=', '.']).next())
             .collect();
+        keys.dedup();
         let expected = if keys.is_empty() { "ideal".to_owned() } else { keys.join(", ") };
         assert_eq!(header.text("ANTROWS"), Some(expected.as_str()));
         for (key, of) in [("PASSES", "iterations"), ("RESIDUAL", "residual")] {
@@ -330,6 +333,155 @@ fn three_dipoles_with_patterns_by_frequency_are_in_the_rows_of_a_refined_map() {
     assert!(list < 1e-4 * straight && list < 1e-4 * neither, "{left:?}");
     // 0.2 and -0.1 are not the interpolated numbers to the last bit.
     assert!((by_frequency / list - 1.0).abs() < 0.1, "{left:?}");
+}
+
+/// A CCSDS AEM of the satellites that the tilts above describe, in windows of the mission; `first` from 0 on.
+fn attitude_message(plan: &Plan, first: usize) -> String {
+    let [along_deg, radial_deg] = [[20.0_f64, 0.0, -15.0], [0.0, 10.0, 0.0]];
+    let mut text =
+        "CCSDS_AEM_VERS = 2.0\nCREATION_DATE = 2030-01-01T00:00:00\nORIGINATOR = TEST\n".to_owned();
+    let epoch = plan.instrument.epoch_tai_s;
+    for (satellite, window) in (first..3).flat_map(|n| plan.windows.iter().map(move |window| (n, window))) {
+        text += &format!(
+            "META_START\nOBJECT_NAME = D{satellite}\nOBJECT_ID = 2030-00{satellite}A\nREF_FRAME_A = ECLIPJ2000\nREF_FRAME_B = \
+             SC_BODY_1\nTIME_SYSTEM = TAI\nATTITUDE_TYPE = QUATERNION\nINTERPOLATION_METHOD = LAGRANGE\nINTERPOLATION_DEGREE = 5\n\
+             META_STOP\nDATA_START\n"
+        );
+        let (from_s, until_s) = (window.start.seconds().floor(), window.end.seconds().ceil() + 60.0);
+        let steps = ((until_s - from_s) / 60.0).ceil() as usize;
+        for k in 0..=steps {
+            let t_s = from_s + 60.0 * k as f64;
+            let (r, normal) = (plan.array.position_m(satellite, t_s), plan.array.normal_hat(satellite, t_s));
+            let up = unit(r);
+            let along = cross(normal, up);
+            let tan = |deg: f64| deg.to_radians().tan();
+            let lean = add(scale(tan(along_deg[satellite]), along), scale(tan(radial_deg[satellite]), up));
+            let z = unit(add(normal, lean));
+            let x = unit(sub(along, scale(dot(along, z), z)));
+            let [a, b, c, d] = quaternion([x, cross(z, x), z]);
+            // Whole seconds from an epoch on a whole second.
+            let date = date_tai(epoch + t_s);
+            text += &format!("{date} {a:.10} {b:.10} {c:.10} {d:.10}\n");
+        }
+        text += "DATA_STOP\n";
+    }
+    text
+}
+
+/// The quaternion, scalar last, of the matrix with these rows, which takes components on fixed axes to those on the rows' (504.0-B).
+fn quaternion(m: [[f64; 3]; 3]) -> [f64; 4] {
+    // The eigenvector of Shepperd's largest pivot.
+    let squares = [
+        1.0 + m[0][0] - m[1][1] - m[2][2],
+        1.0 - m[0][0] + m[1][1] - m[2][2],
+        1.0 - m[0][0] - m[1][1] + m[2][2],
+        1.0 + m[0][0] + m[1][1] + m[2][2],
+    ];
+    let [p01, p02, p12] = [m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]];
+    let [q0, q1, q2] = [m[1][2] - m[2][1], m[2][0] - m[0][2], m[0][1] - m[1][0]];
+    let rows = [
+        [squares[0], p01, p02, q0],
+        [p01, squares[1], p12, q1],
+        [p02, p12, squares[2], q2],
+        [q0, q1, q2, squares[3]],
+    ];
+    let largest = (0..4).max_by(|a, b| squares[*a].total_cmp(&squares[*b])).unwrap();
+    let length = rows[largest].iter().map(|x| x * x).sum::<f64>().sqrt();
+    rows[largest].map(|x| x / length)
+}
+
+/// A date such as 2030-031T12:00:00 on TAI.
+fn date_tai(tai_s: f64) -> String {
+    let second = tai_s.round() as i64;
+    let (mut day, of_day) = (second.div_euclid(86_400), second.rem_euclid(86_400));
+    let mut year = 1958;
+    while day >= 365 + i64::from(year % 4 == 0) {
+        day -= 365 + i64::from(year % 4 == 0);
+        year += 1;
+    }
+    format!("{year}-{:03}T{:02}:{:02}:{:02}", day + 1, of_day / 3600, of_day / 60 % 60, of_day % 60)
+}
+
+/// Fields of a dipole along z with a factor 1 + q P_2, each 5 deg, at two frequencies about the channel's.
+fn dipole_table(q: f64) -> String {
+    let mut text = "frequency_hz,theta_deg,phi_deg,e_theta_re,e_theta_im,e_phi_re,e_phi_im\n".to_owned();
+    for (hz, theta_deg, phi_deg) in [1e6, 5e6].into_iter().flat_map(|hz| {
+        (0..=180).step_by(5).flat_map(move |theta| (0..360).step_by(10).map(move |phi| (hz, theta, phi)))
+    }) {
+        let (sin, cos) = f64::from(theta_deg).to_radians().sin_cos();
+        // Gains are left to calibration: an amplitude and a phase of no matter.
+        let field = -2.5 * sin * (1.0 + q * (1.5 * cos * cos - 0.5));
+        text += &format!("{hz},{theta_deg},{phi_deg},{},{},0,0\n", 0.6 * field, 0.8 * field);
+    }
+    text
+}
+
+/// Attitudes by messages and patterns by tables are those that keys describe: what flies by one is known by the other.
+#[test]
+fn antennas_by_files_are_those_of_keys() {
+    let place = Workplace::new(&followers());
+    let source = ConfigSource { file: Some(place.pipeline.clone().into()), ..ConfigSource::default() };
+    let plan = Plan::new(source.load().unwrap()).unwrap();
+    let attitudes = place.file("all.aem", attitude_message(&plan, 0).as_bytes());
+    let tables: Vec<String> = [0.2, 0.0, -0.1]
+        .iter()
+        .enumerate()
+        .map(|(k, q)| place.file(&format!("{k}.csv"), dipole_table(*q).as_bytes()))
+        .collect();
+    let [attitudes, tables] = [vec![attitudes], tables].map(|paths| format!("{paths:?}"));
+    let antenna = "spacecraft.antenna=dipole-normal";
+    let known = [&KNOWN_TILTED[..], &[KNOWN_PATTERN, SMEARED]].concat();
+    let by_files =
+        [format!("map.antennas.files.attitudes={attitudes}"), format!("map.antennas.files.tables={tables}")];
+    let by_files = [&by_files[0], &by_files[1], SMEARED];
+    let flown = [&TILTED[..], &[antenna, "instrument.pattern.constant=[0.2, 0.0, -0.1]"]].concat();
+    let left = left_by_refinement(&flown, &[&known, &by_files, &[SMEARED]]);
+    eprintln!("flown by keys; left of the data known by keys, by files, not at all: {left:?}");
+    // Rows are in f32, and an iteration ends. Normals of orbits come from the data's positions, attitudes from messages: those leave less.
+    assert!(left[1] < left[0] && left[0] < 1e-4 * left[2], "{left:?}");
+
+    let flown = [
+        format!("instrument.antenna_files.attitudes={attitudes}"),
+        format!("instrument.antenna_files.tables={tables}"),
+    ];
+    let left = left_by_refinement(&[&flown[0], &flown[1], antenna], &[&known, &by_files, &[SMEARED]]);
+    eprintln!("flown by files; left of the data known by keys, by files, not at all: {left:?}");
+    assert!(left[1] < left[0] && left[0] < 1e-4 * left[2], "{left:?}");
+
+    // What files do not say is refused with their key.
+    let short = place.file("short.aem", attitude_message(&plan, 1).as_bytes());
+    for (set, expected) in [
+        (format!("attitudes=[{short:?}]"), "attitudes: 2 objects (2030-001A, 2030-002A); expected 3"),
+        (
+            format!(
+                "tables=[{:?}]",
+                place.file("far.csv", dipole_table(0.1).replace("\n1000000,", "\n4000000,").as_bytes())
+            ),
+            "expected 3000000 Hz, a channel, in between",
+        ),
+    ] {
+        let set = format!("instrument.antenna_files.{set}");
+        let out = place.path("refused.ccsds");
+        let said = fail(&[
+            "simulate",
+            &place.pipeline,
+            "-o",
+            &out,
+            "--set",
+            antenna,
+            "--set",
+            "map.engine=harmonic",
+            "--set",
+            "map.rows=average",
+            "--set",
+            "map.refine.passes_max=1",
+            "--set",
+            "spacecraft.model=general",
+            "--set",
+            &set,
+        ]);
+        assert!(said.contains("instrument.antenna_files: ") && said.contains(expected), "{said}");
+    }
 }
 
 /// Three dipoles see what an isotropic antenna sees, by three receivers: three times the weight, of which a receiver's noise costs half as

@@ -352,11 +352,8 @@ fn results_do_not_depend_on_threads() {
 fn antenna(elements: AntennaResponse, satellite: u8, time_s: f64) -> SatelliteAntenna {
     let k = f64::from(satellite) + 1e-4 * time_s;
     let axis_hat = unit([0.3 * k.sin(), -0.5 + 0.1 * k.cos(), 0.9]);
-    SatelliteAntenna {
-        elements,
-        axes_hat: [axis_hat, unit(cross(axis_hat, [0.2, k.cos(), k.sin()]))],
-        distortion: 0.02 * f64::from(satellite),
-    }
+    let axes_hat = [axis_hat, unit(cross(axis_hat, [0.2, k.cos(), k.sin()]))];
+    SatelliteAntenna::new(elements, axes_hat, 0.02 * f64::from(satellite))
 }
 
 fn antennas_of(elements: AntennaResponse, at: &TimedPair) -> [SatelliteAntenna; 2] {
@@ -496,7 +493,7 @@ fn adjoint_and_normal_products_of_averages_with_antennas_are_the_transposes() {
         GeneralRows::new(RowsSetup { polynomial_degree: 2, ..setup(L_MAX, AntennaResponse::Isotropic) });
     let response = |k: usize| {
         let [a, b] = antennas_of(AntennaResponse::DipoleNormal, &pairs[k]);
-        PairResponse::of_dipoles(a.axes_hat[0], b.axes_hat[0])
+        PairResponse::of_dipoles(a.axes[0], b.axes[0])
     };
     let duration_s = vec![14.0; pairs.len()];
     let plan = rows

@@ -174,7 +174,15 @@ fn tilted_dipoles_act_on_samples_as_on_visibilities() {
     let shared = std::sync::Arc::clone(&craft.array);
     let elements = AntennaResponse::DipoleNormal;
     let antennas: std::sync::Arc<dyn lunarray::response::model::AntennaPatterns> = std::sync::Arc::new(
-        lunarray::daughters::AntennaErrors::new(&drawn, shared, &[craft.window], elements).unwrap().at(1e6),
+        lunarray::daughters::AntennaErrors::new(
+            &drawn,
+            shared,
+            &[craft.window],
+            elements,
+            (Default::default(), 0.0),
+        )
+        .unwrap()
+        .at(1e6),
     );
     let moon_m = craft.array.moon_radius_m();
     craft.sky = Box::new(move |frequency_hz| {

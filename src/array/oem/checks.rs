@@ -1,7 +1,8 @@
 //! Checks of states: above the surface, bound to the Moon, and close enough to each other for their interpolation.
 
+use super::form::Fault;
 use super::interpolate::interpolated;
-use super::message::{Fault, OemSegment, Reading, TableMethod};
+use super::message::{OemSegment, Reading, TableMethod};
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::vector::{norm, sub};
 

@@ -1,6 +1,6 @@
 //! Messages as lines of text (KVN).
 
-use super::message::{Collector, Fault, Reading, short};
+use super::form::{Fault, Message, short};
 
 /// Where the reader is.
 #[derive(Clone, Copy, PartialEq)]
@@ -15,9 +15,11 @@ enum Place {
 ///
 /// # Errors
 /// The first thing that is wrong.
-pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
-    let (mut place, mut is_oem, mut last) = (Place::Header, false, 0);
-    let mut collector = Collector::default();
+pub(super) fn parse<M: Message>(bytes: &[u8]) -> Result<(M, usize), Fault> {
+    let (mut place, mut is_known, mut last) = (Place::Header, false, 0);
+    let mut message = M::default();
+    let keyword = format!("CCSDS_{}_VERS", M::NAME);
+    let first_line = || format!("{keyword} = {} on the first line", M::VERSIONS.join(" or "));
     for (line, content) in bytes.split(|byte| *byte == b'\n').enumerate().map(|(k, content)| (k + 1, content))
     {
         let content = String::from_utf8_lossy(content);
@@ -29,48 +31,51 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
         let fault = |expected: &str| Err(Fault::new(line, short(content), expected));
         match (place, content) {
             (Place::Header | Place::Data, "META_START") => {
-                if !is_oem {
-                    return fault("CCSDS_OEM_VERS = 2.0 on the first line");
+                if !is_known {
+                    return fault(&first_line());
                 }
-                collector.end_segment(line)?;
-                collector.begin_metadata();
+                message.end_segment(line)?;
+                message.begin_metadata();
                 place = Place::Metadata;
             }
             (Place::Metadata, "META_STOP") => {
-                collector.end_metadata(line)?;
+                message.end_metadata(line)?;
                 place = Place::Data;
             }
             (Place::Data, "COVARIANCE_START") => place = Place::Covariance,
             (Place::Covariance, "COVARIANCE_STOP") => place = Place::Data,
-            (Place::Covariance, _) => collector.covariances += usize::from(content.starts_with("EPOCH")),
+            (Place::Covariance, _) if content.starts_with("EPOCH") => message.covariance(),
+            (Place::Covariance, _) => {}
+            // Data of attitudes are marked.
+            (Place::Data, "DATA_START" | "DATA_STOP") if M::NAME == "AEM" => {}
             (Place::Header, _) => {
                 if let Some((key, version)) = content.split_once('=')
-                    && key.trim() == "CCSDS_OEM_VERS"
+                    && key.trim() == keyword
                 {
-                    is_oem = ["1.0", "2.0", "3.0"].contains(&version.trim());
+                    is_known = M::VERSIONS.contains(&version.trim());
                 }
-                if !is_oem {
-                    return fault("CCSDS_OEM_VERS = 1.0, 2.0 or 3.0 on the first line");
+                if !is_known {
+                    return fault(&first_line());
                 }
             }
             (Place::Metadata, _) => match content.split_once('=') {
-                Some((key, value)) => collector.set(key.trim(), value.trim(), line),
+                Some((key, value)) => message.set(key.trim(), value.trim(), line),
                 None => return fault("KEY = VALUE, or META_STOP"),
             },
             (Place::Data, _) if content.contains('=') => {
-                return fault("an epoch and six numbers, or META_START");
+                return fault(&format!("{}, or META_START", M::LINE));
             }
-            (Place::Data, _) => data_line(content, line, &mut collector)?,
+            (Place::Data, _) => data_line(content, line, &mut message)?,
         }
     }
     if place == Place::Metadata {
         return Err(Fault::new(last, "the end", "META_STOP, and states"));
     }
-    collector.finish(last)
+    Ok((message, last))
 }
 
-/// Adds a line `epoch x y z vx vy vz`, with or without an acceleration.
-fn data_line(content: &str, line: usize, collector: &mut Collector) -> Result<(), Fault> {
+/// Adds a line of data: an epoch and numbers.
+fn data_line<M: Message>(content: &str, line: usize, message: &mut M) -> Result<(), Fault> {
     let mut fields = content.split_whitespace();
     let epoch = fields.next().unwrap_or_default();
     let mut numbers = [f64::NAN; 9];
@@ -82,9 +87,8 @@ fn data_line(content: &str, line: usize, collector: &mut Collector) -> Result<()
         }
         count += 1;
     }
-    if !(count == 6 || count == 9) || numbers[..count].iter().any(|x| !x.is_finite()) {
-        let expected = "an epoch and six finite numbers: position in km, velocity in km/s";
-        return Err(Fault::new(line, short(content), expected));
+    if !M::COUNTS.contains(&count) || numbers[..count].iter().any(|x| !x.is_finite()) {
+        return Err(Fault::new(line, short(content), M::LINE));
     }
-    collector.state(epoch, &numbers[..count], line)
+    message.state(epoch, &numbers[..count], line)
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use super::form::{Fault, Message, short};
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::{Vec3, norm};
 
@@ -13,20 +14,6 @@ pub(super) const DEGREE_MAX: usize = 15;
 
 /// Most that a useable time may lie beyond the states, s: a rounded epoch.
 const ROUNDED_S: f64 = 1e-6;
-
-/// A fault of a file: its line, from 1, what was found, and what was expected there.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Fault {
-    pub(super) line: usize,
-    pub(super) found: String,
-    pub(super) expected: String,
-}
-
-impl Fault {
-    pub(super) fn new(line: usize, found: impl Into<String>, expected: impl Into<String>) -> Self {
-        Self { line, found: found.into(), expected: expected.into() }
-    }
-}
 
 /// How a file asks to be interpolated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,7 +74,7 @@ pub(super) struct Reading {
 
 /// Values of a segment's metadata, with their lines.
 #[derive(Debug, Default)]
-struct Metadata(BTreeMap<String, (String, usize)>);
+pub(in crate::array) struct Metadata(BTreeMap<String, (String, usize)>);
 
 /// Gathers a message as its form is read.
 #[derive(Debug, Default)]
@@ -99,8 +86,11 @@ pub(super) struct Collector {
     of_segment: Option<SegmentForm>,
     segments: Vec<OemSegment>,
     lines: Vec<Vec<u32>>,
-    pub(super) covariances: usize,
+    covariances: usize,
 }
+
+/// Useable times and the lines that give them.
+pub(in crate::array) type Useable = [Option<(Tai, usize)>; 2];
 
 /// How states are read.
 #[derive(Clone, Copy, Debug)]
@@ -108,16 +98,31 @@ struct SegmentForm {
     scale: TimeScale,
     /// Whether its axes are equatorial.
     turns: bool,
-    /// Useable times and the lines that give them.
-    useable: [Option<(Tai, usize)>; 2],
+    useable: Useable,
 }
 
-impl Collector {
-    pub(super) fn begin_metadata(&mut self) {
+impl Message for Collector {
+    const NAME: &'static str = "OEM";
+    const VERSIONS: &'static [&'static str] = &["2.0", "3.0", "1.0"];
+    const LINE: &'static str = "an epoch and six finite numbers: position in km, velocity in km/s";
+    const COUNTS: &'static [usize] = &[6, 9];
+    const STATE: &'static str = "stateVector";
+    const NUMBERS: &'static [&'static str] =
+        &["X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT", "X_DDOT", "Y_DDOT", "Z_DDOT"];
+
+    fn unit(number: usize) -> Option<&'static str> {
+        [Some("km"), Some("km/s"), None].get(number / 3).copied().flatten()
+    }
+
+    fn covariance(&mut self) {
+        self.covariances += 1;
+    }
+
+    fn begin_metadata(&mut self) {
         self.metadata = Metadata::default();
     }
 
-    pub(super) fn set(&mut self, key: &str, value: &str, line: usize) {
+    fn set(&mut self, key: &str, value: &str, line: usize) {
         // Others say what the data say, or nothing on which positions depend.
         const USED: [&str; 7] = [
             "CENTER_NAME",
@@ -128,26 +133,19 @@ impl Collector {
             "USEABLE_START_TIME",
             "USEABLE_STOP_TIME",
         ];
-        if USED.contains(&key) {
-            self.metadata.0.insert(key.to_owned(), (value.to_uppercase(), line));
-        }
+        self.metadata.set(&USED, key, value, line);
     }
 
     /// Begins a segment with the metadata that end in a line.
-    pub(super) fn end_metadata(&mut self, line: usize) -> Result<(), Fault> {
+    fn end_metadata(&mut self, line: usize) -> Result<(), Fault> {
         let metadata = std::mem::take(&mut self.metadata);
         metadata.require("CENTER_NAME", &["MOON"], "CENTER_NAME = MOON", line)?;
-        let frame = metadata.frame(line)?;
-        let expected = "TIME_SYSTEM = UTC, TAI, TT, TDB or GPS";
-        let (system, at) = metadata.value("TIME_SYSTEM", line);
-        let Some(scale) = TimeScale::from_name(system) else { return Err(Fault::new(at, system, expected)) };
+        let turns = metadata.is_equatorial("REF_FRAME", line)?;
+        let scale = metadata.scale(line)?;
         let (method, degree) = metadata.interpolation(line)?;
-        let useable = [
-            metadata.date("USEABLE_START_TIME", scale, line)?,
-            metadata.date("USEABLE_STOP_TIME", scale, line)?,
-        ];
+        let useable = metadata.useable(scale, line)?;
         self.scale.get_or_insert(scale);
-        self.of_segment = Some(SegmentForm { scale, turns: frame != "ECLIPJ2000", useable });
+        self.of_segment = Some(SegmentForm { scale, turns, useable });
         self.segments.push(OemSegment {
             method,
             degree,
@@ -161,25 +159,17 @@ impl Collector {
     }
 
     /// Adds a state of the latest segment, km and km/s.
-    pub(super) fn state(&mut self, epoch: &str, numbers: &[f64], line: usize) -> Result<(), Fault> {
+    fn state(&mut self, epoch: &str, numbers: &[f64], line: usize) -> Result<(), Fault> {
         let (Some(form), Some(segment), Some(lines)) =
             (self.of_segment, self.segments.last_mut(), self.lines.last_mut())
         else {
             return Err(Fault::new(line, short(epoch), "metadata before states"));
         };
-        let Some(time) = Tai::parse(epoch, form.scale) else {
-            let expected = format!(
-                "an epoch on {} such as 2030-01-31T12:00:00.000 or 2030-031T12:00:00; UTC from 1972 on, with a second 60 only \
-                 where there was a leap second",
-                form.scale
-            );
-            return Err(Fault::new(line, short(epoch), expected));
-        };
+        let time = read_epoch(epoch, form.scale, line)?;
         let Some([x, y, z, vx, vy, vz]) =
             numbers.first_chunk().filter(|six| six.iter().all(|x| x.is_finite()))
         else {
-            let expected = "an epoch and six finite numbers: position in km, velocity in km/s";
-            return Err(Fault::new(line, format!("{} numbers after {epoch}", numbers.len()), expected));
+            return Err(Fault::new(line, format!("{} numbers after {epoch}", numbers.len()), Self::LINE));
         };
         let zero = *self.zero.get_or_insert_with(|| time.floor_second());
         let time_s = time.since_s(zero);
@@ -204,7 +194,7 @@ impl Collector {
     }
 
     /// Ends the latest segment, if there is one.
-    pub(super) fn end_segment(&mut self, line: usize) -> Result<(), Fault> {
+    fn end_segment(&mut self, line: usize) -> Result<(), Fault> {
         let Some(form) = self.of_segment.take() else { return Ok(()) };
         let (Some(segment), Some(zero)) = (self.segments.last_mut(), self.zero) else {
             return Err(Fault::new(line, "0 states", ENOUGH));
@@ -215,36 +205,14 @@ impl Collector {
         if segment.time_s.len() < segment.points().max(2) {
             return Err(Fault::new(line, format!("{} states", segment.time_s.len()), ENOUGH));
         }
-        segment.useable_s = [first_s, last_s];
-        for (end, given) in form.useable.into_iter().enumerate() {
-            let Some((time, at)) = given else { continue };
-            let time_s = time.since_s(zero);
-            if !(first_s - ROUNDED_S..=last_s + ROUNDED_S).contains(&time_s) {
-                let ends = [first_s, last_s].map(|s| zero.plus_s(s).text(form.scale, 3));
-                let found = format!("a USEABLE time of {}", time.text(form.scale, 3));
-                return Err(Fault::new(
-                    at,
-                    found,
-                    format!("one among the states, {} to {}", ends[0], ends[1]),
-                ));
-            }
-            segment.useable_s[end] = time_s.clamp(first_s, last_s);
-        }
-        let [from_s, until_s] = segment.useable_s;
-        if from_s >= until_s {
-            let at = form.useable.iter().flatten().map(|(_, at)| *at).max().unwrap_or(line);
-            return Err(Fault::new(
-                at,
-                "useable times that end before they begin",
-                "USEABLE_START_TIME before USEABLE_STOP_TIME",
-            ));
-        }
+        segment.useable_s = useable_s(form.useable, (zero, form.scale), [first_s, last_s])?;
         Ok(())
     }
+}
 
-    /// The message that ends in a line.
-    pub(super) fn finish(mut self, line: usize) -> Result<Reading, Fault> {
-        self.end_segment(line)?;
+impl Collector {
+    /// The message, whose segments have ended, with its last line.
+    pub(super) fn finish(self, line: usize) -> Result<Reading, Fault> {
         let (Some(zero), Some(scale)) = (self.zero, self.scale) else {
             return Err(Fault::new(line, "the end", "a segment: metadata and states"));
         };
@@ -260,8 +228,28 @@ impl Collector {
 const ENOUGH: &str = "as many states in a segment as its interpolation needs";
 
 impl Metadata {
+    /// Takes a value, if its key is one of those that are used.
+    pub(in crate::array) fn set(&mut self, used: &[&str], key: &str, value: &str, line: usize) {
+        if used.contains(&key) {
+            self.0.insert(key.to_owned(), (value.to_uppercase(), line));
+        }
+    }
+
+    /// The scale of its dates.
+    pub(in crate::array) fn scale(&self, end: usize) -> Result<TimeScale, Fault> {
+        let (system, line) = self.value("TIME_SYSTEM", end);
+        let expected = "TIME_SYSTEM = UTC, TAI, TT, TDB or GPS";
+        TimeScale::from_name(system).ok_or_else(|| Fault::new(line, system, expected))
+    }
+
+    /// First and last useable time, if they are given.
+    pub(in crate::array) fn useable(&self, scale: TimeScale, end: usize) -> Result<Useable, Fault> {
+        let of = |key| self.date(key, scale, end);
+        Ok([of("USEABLE_START_TIME")?, of("USEABLE_STOP_TIME")?])
+    }
+
     /// The value of a key and its line; `nothing`, at the end of the metadata, if it is not given.
-    fn value(&self, key: &str, end: usize) -> (&str, usize) {
+    pub(in crate::array) fn value(&self, key: &str, end: usize) -> (&str, usize) {
         self.0.get(key).map_or(("nothing", end), |(value, line)| (value, *line))
     }
 
@@ -270,27 +258,25 @@ impl Metadata {
         if names.contains(&value) { Ok(()) } else { Err(Fault::new(line, value, expected)) }
     }
 
-    /// The name of the axes: those of J2000 of the equator, which ICRF's meet to 0.02 arc seconds (20 cm at the Moon's surface), or
-    /// of the ecliptic.
-    fn frame(&self, end: usize) -> Result<&str, Fault> {
-        let (frame, line) = self.value("REF_FRAME", end);
+    /// Whether the axes that a key names are those of the equator: of J2000, which ICRF's meet to 0.02 arc seconds (20 cm at the
+    /// Moon's surface). Else they are those of the ecliptic.
+    pub(in crate::array) fn is_equatorial(&self, key: &str, end: usize) -> Result<bool, Fault> {
+        let (frame, line) = self.value(key, end);
         let numbered = |name: &str| {
             frame
                 .strip_prefix(name)
                 .is_some_and(|rest| rest.len() < 3 && rest.bytes().all(|b| b.is_ascii_digit()))
         };
         if ["EME2000", "J2000", "ECLIPJ2000"].contains(&frame) || numbered("ICRF") || numbered("GCRF") {
-            return Ok(frame);
+            return Ok(frame != "ECLIPJ2000");
         }
-        let expected = match frame.starts_with("MOON") {
+        let why = match frame.starts_with("MOON") {
             true => {
-                "REF_FRAME = EME2000, J2000, ICRF, GCRF or ECLIPJ2000: axes fixed to the Moon are not read; convert the file"
+                "EME2000, J2000, ICRF, GCRF or ECLIPJ2000: axes fixed to the Moon are not read; convert the file"
             }
-            false => {
-                "REF_FRAME = EME2000, J2000, ICRF, ICRF1 to 3, GCRF or ECLIPJ2000: axes that do not turn"
-            }
+            false => "EME2000, J2000, ICRF, ICRF1 to 3, GCRF or ECLIPJ2000: axes that do not turn",
         };
-        Err(Fault::new(line, frame, expected))
+        Err(Fault::new(line, frame, format!("{key} = {why}")))
     }
 
     fn interpolation(&self, end: usize) -> Result<(TableMethod, usize), Fault> {
@@ -326,17 +312,44 @@ impl Metadata {
     }
 }
 
-/// The beginning of a line, for messages.
-pub(super) fn short(content: &str) -> String {
-    let mut text: String = content.chars().take(60).filter(|c| !c.is_control()).collect();
-    if text.len() < content.len() {
-        text.push_str("..");
+/// Reads the epoch of a state.
+pub(in crate::array) fn read_epoch(epoch: &str, scale: TimeScale, line: usize) -> Result<Tai, Fault> {
+    Tai::parse(epoch, scale).ok_or_else(|| {
+        let expected = format!(
+            "an epoch on {scale} such as 2030-01-31T12:00:00.000 or 2030-031T12:00:00; UTC from 1972 on, with a second 60 only \
+             where there was a leap second"
+        );
+        Fault::new(line, short(epoch), expected)
+    })
+}
+
+/// The interval in which a segment is to be used, s after `zero`, of one whose states go from `first_s` to `last_s`.
+pub(in crate::array) fn useable_s(
+    given: Useable,
+    (zero, scale): (Tai, TimeScale),
+    [first_s, last_s]: [f64; 2],
+) -> Result<[f64; 2], Fault> {
+    let mut useable_s = [first_s, last_s];
+    for (end, given) in given.into_iter().enumerate() {
+        let Some((time, at)) = given else { continue };
+        let time_s = time.since_s(zero);
+        if !(first_s - ROUNDED_S..=last_s + ROUNDED_S).contains(&time_s) {
+            let ends = [first_s, last_s].map(|s| zero.plus_s(s).text(scale, 3));
+            let found = format!("a USEABLE time of {}", time.text(scale, 3));
+            return Err(Fault::new(at, found, format!("one among the states, {} to {}", ends[0], ends[1])));
+        }
+        useable_s[end] = time_s.clamp(first_s, last_s);
     }
-    format!("{text:?}")
+    if useable_s[0] >= useable_s[1] {
+        let at = given.iter().flatten().map(|(_, at)| *at).max().unwrap_or_default();
+        let found = "useable times that end before they begin";
+        return Err(Fault::new(at, found, "USEABLE_START_TIME before USEABLE_STOP_TIME"));
+    }
+    Ok(useable_s)
 }
 
 /// From equatorial to ecliptic axes.
-fn turned(turns: bool, v: Vec3) -> Vec3 {
+pub(in crate::array) fn turned(turns: bool, v: Vec3) -> Vec3 {
     if !turns {
         return v;
     }

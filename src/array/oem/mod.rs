@@ -1,11 +1,15 @@
 //! Orbits from CCSDS Orbit Ephemeris Messages.
 
 mod checks;
+mod file;
+mod form;
 mod interpolate;
 mod kvn;
 mod message;
 mod orbit;
 mod xml;
 
-pub(super) use message::to_equatorial;
+pub(super) use file::{at_line, error, read_message};
+pub(super) use form::{Fault, Message, short};
+pub(super) use message::{Metadata, Useable, read_epoch, to_equatorial, turned, useable_s};
 pub(super) use orbit::{OrbitArc, TableOrbit, read};

@@ -1,16 +1,14 @@
 //! Orbits given by tables of positions and velocities.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use flate2::read::MultiGzDecoder;
 use rayon::prelude::*;
 
 use super::checks::check;
+use super::file::{at_line, error, read_message};
 use super::interpolate::interpolated;
-use super::message::{Fault, OemMessage, OemSegment, Reading, TableMethod};
-use super::{kvn, xml};
+use super::message::{Collector, OemMessage, OemSegment, Reading, TableMethod};
 use crate::array::config::ArrayError;
 use crate::array::state::SatelliteState;
 use crate::units::constants::MOON_GM_M3_S2;
@@ -54,9 +52,6 @@ impl OrbitArc {
     }
 }
 
-/// Largest file that is read, and largest content of a compressed one, bytes: ten years of states each minute.
-const FILE_BYTES_MAX: u64 = 1 << 30;
-
 /// Nearest that two satellites may be at any state of the first, m.
 const APART_M: f64 = 1.0;
 
@@ -74,10 +69,6 @@ pub(in crate::array) struct OemOrbits {
     pub(in crate::array) epoch: Tai,
     /// Content of the files that is not used.
     pub(in crate::array) notes: Vec<String>,
-}
-
-fn error(path: &Path, what: String) -> ArrayError {
-    ArrayError::Oem { path: path.to_owned(), what }
 }
 
 /// Reads the files of all satellites. The mission begins at `epoch`, a date in their time system, or with the last to begin.
@@ -163,33 +154,10 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
 }
 
 fn read_file(path: &Path, moon_radius_m: f64) -> Result<Reading, ArrayError> {
-    let of_io = |source: std::io::Error| error(path, source.to_string());
-    let size = std::fs::metadata(path).map_err(of_io)?.len();
-    let too_large = |size: u64| error(path, format!("{size} bytes; expected at most {FILE_BYTES_MAX}"));
-    if size > FILE_BYTES_MAX {
-        return Err(too_large(size));
-    }
-    let mut bytes = std::fs::read(path).map_err(of_io)?;
-    if bytes.starts_with(&[0x1f, 0x8b]) {
-        let mut content = Vec::new();
-        // A sum at the end says whether it is whole.
-        let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
-        unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
-        if content.len() as u64 > FILE_BYTES_MAX {
-            return Err(too_large(content.len() as u64));
-        }
-        bytes = content;
-    }
-    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
-        return Err(error(path, "UTF-16; expected ASCII or UTF-8".into()));
-    }
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
-    let is_xml = text.trim_ascii_start().starts_with(b"<");
-    let reading = if is_xml { xml::parse(text) } else { kvn::parse(text) };
+    let (collector, line) = read_message::<Collector>(path)?;
+    let reading = collector.finish(line);
     let reading = reading.and_then(|reading| check(&reading, moon_radius_m).map(|()| reading));
-    reading.map_err(|Fault { line, found, expected }| {
-        error(path, format!("line {line}: found {found}; expected {expected}"))
-    })
+    reading.map_err(|fault| at_line(path, fault))
 }
 
 /// A time, s since the epoch, at which two orbits meet, among the states of both.

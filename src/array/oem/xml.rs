@@ -3,10 +3,7 @@
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::message::{Collector, Fault, Reading, short};
-
-/// Values of a state, in their order.
-const STATE: [&str; 9] = ["X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT", "X_DDOT", "Y_DDOT", "Z_DDOT"];
+use super::form::{Fault, Message, short};
 
 /// Longest value that is kept, bytes: a number, a date or a name.
 const VALUE_BYTES_MAX: usize = 1 << 10;
@@ -22,12 +19,12 @@ struct State {
 ///
 /// # Errors
 /// The first thing that is wrong.
-pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
+pub(super) fn parse<M: Message>(bytes: &[u8]) -> Result<(M, usize), Fault> {
     // Bytes that are no text may stand where nothing is read: in comments and names.
     let text = String::from_utf8_lossy(bytes);
     let mut reader = Reader::from_str(&text);
     let mut lines = LineCount { bytes: text.as_bytes(), place: 0, line: 1 };
-    let mut elements = Elements::default();
+    let mut elements = Elements::<M>::default();
     loop {
         let event = reader.read_event();
         let line = lines.at(reader.buffer_position());
@@ -40,15 +37,15 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Reading, Fault> {
         }
     }
     match elements.depth {
-        0 => elements.collector.finish(lines.line),
+        0 => Ok((elements.message, lines.line)),
         _ => Err(Fault::new(lines.line, "the end", "the ends of all elements")),
     }
 }
 
 /// Elements as they come.
 #[derive(Default)]
-struct Elements {
-    collector: Collector,
+struct Elements<M> {
+    message: M,
     messages: usize,
     depth: usize,
     around: XmlContext,
@@ -57,31 +54,32 @@ struct Elements {
     value: String,
 }
 
-impl Elements {
+impl<M: Message> Elements<M> {
     fn start(&mut self, element: &BytesStart<'_>, line: usize) -> Result<(), Fault> {
         self.depth += 1;
         self.value.clear();
         match element.local_name().as_ref() {
-            "oem" => {
+            name if name.eq_ignore_ascii_case(M::NAME) => {
                 self.messages += 1;
                 if self.messages > 1 {
-                    return Err(Fault::new(line, "another oem", "one satellite a file"));
+                    return Err(Fault::new(line, format!("another {name}"), "one message a file"));
                 }
             }
             name if self.depth == 1 && name != "ndm" => {
-                return Err(Fault::new(line, format!("<{}>", short(name)), "<oem>, alone or in <ndm>"));
+                let expected = format!("<{}>, alone or in <ndm>", M::NAME.to_ascii_lowercase());
+                return Err(Fault::new(line, format!("<{}>", short(name)), expected));
             }
             "metadata" => {
-                self.collector.end_segment(line)?;
-                self.collector.begin_metadata();
+                self.message.end_segment(line)?;
+                self.message.begin_metadata();
                 self.around = XmlContext::Metadata;
             }
-            "stateVector" => (self.around, self.state) = (XmlContext::State, State::default()),
+            name if name == M::STATE => (self.around, self.state) = (XmlContext::State, State::default()),
             "covarianceMatrix" => {
-                self.collector.covariances += 1;
+                self.message.covariance();
                 self.around = XmlContext::Nothing;
             }
-            name if self.around == XmlContext::State => require_unit(element, name, line)?,
+            name if self.around == XmlContext::State => require_unit::<M>(element, name, line)?,
             _ => {}
         }
         Ok(())
@@ -98,15 +96,15 @@ impl Elements {
         let value = self.value.trim();
         match (self.around, name) {
             (_, "metadata") => {
-                self.collector.end_metadata(line)?;
+                self.message.end_metadata(line)?;
                 self.around = XmlContext::Nothing;
             }
-            (_, "stateVector") => {
-                self.state.add_to(&mut self.collector, line)?;
+            (_, name) if name == M::STATE => {
+                self.state.add_to(&mut self.message, line)?;
                 self.around = XmlContext::Nothing;
             }
-            (XmlContext::Metadata, _) => self.collector.set(name, value, line),
-            (XmlContext::State, _) => self.state.set(name, value, line)?,
+            (XmlContext::Metadata, _) => self.message.set(name, value, line),
+            (XmlContext::State, _) => self.state.set::<M>(name, value, line)?,
             (XmlContext::Nothing, _) => {}
         }
         self.value.clear();
@@ -124,10 +122,10 @@ enum XmlContext {
 }
 
 impl State {
-    fn set(&mut self, name: &str, value: &str, line: usize) -> Result<(), Fault> {
+    fn set<M: Message>(&mut self, name: &str, value: &str, line: usize) -> Result<(), Fault> {
         if name == "EPOCH" {
             value.clone_into(&mut self.epoch);
-        } else if let Some(place) = STATE.iter().position(|known| *known == name) {
+        } else if let Some(place) = M::NUMBERS.iter().position(|known| *known == name) {
             let Ok(number) = value.parse() else {
                 return Err(Fault::new(line, format!("{name} = {}", short(value)), "a number"));
             };
@@ -136,20 +134,17 @@ impl State {
         Ok(())
     }
 
-    fn add_to(&mut self, collector: &mut Collector, line: usize) -> Result<(), Fault> {
+    fn add_to<M: Message>(&mut self, message: &mut M, line: usize) -> Result<(), Fault> {
         let State { epoch, numbers } = std::mem::take(self);
         let numbers: Vec<f64> = numbers.into_iter().map_while(|number| number).collect();
-        collector.state(&epoch, &numbers, line)
+        message.named_state(&epoch, &numbers, line)
     }
 }
 
-/// Requires km and km/s, where a value of a state says its unit.
-fn require_unit(element: &BytesStart<'_>, name: &str, line: usize) -> Result<(), Fault> {
-    let expected = match STATE.iter().position(|known| *known == name) {
-        Some(0..3) => "km",
-        Some(3..6) => "km/s",
-        _ => return Ok(()),
-    };
+/// Requires the unit of a number of a state, where it says one.
+fn require_unit<M: Message>(element: &BytesStart<'_>, name: &str, line: usize) -> Result<(), Fault> {
+    let number = M::NUMBERS.iter().position(|known| *known == name);
+    let Some(expected) = number.and_then(M::unit) else { return Ok(()) };
     for attribute in element.attributes() {
         let attribute = attribute.map_err(|error| Fault::new(line, error.to_string(), "XML"))?;
         let unit = &attribute.value;

@@ -3,6 +3,7 @@
 use super::config::{AmplitudeScale, SolverConfig};
 use super::detect::SignalPresence;
 use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
+use super::fit::Unexplained;
 use super::robust_fit::RobustFit;
 use super::stability::Excess;
 
@@ -24,8 +25,7 @@ pub(super) struct GainAssessment<'a> {
     pub(super) config: &'a SolverConfig,
     pub(super) fitted: &'a RobustFit,
     pub(super) counts: &'a Counts,
-    /// Unexplained fraction of the signal; by channel, then daughter.
-    pub(super) unexplained: &'a [f64],
+    pub(super) unexplained: &'a Unexplained,
     pub(super) excess: &'a [Excess],
 }
 
@@ -73,9 +73,17 @@ impl GainAssessment<'_> {
         if self.config.amplitude_scale == AmplitudeScale::UnitMean {
             return 0.0;
         }
-        let mut parts = self.unexplained[c * n..(c + 1) * n].to_vec();
+        let mut parts = self.unexplained.of_gains[c * n..(c + 1) * n].to_vec();
         parts.sort_unstable_by(f64::total_cmp);
-        0.25 * parts.get(n / 2).copied().unwrap_or(0.0)
+        // All pairs together show what noise hides in those of most daughters.
+        0.25 * parts.get(n / 2).copied().unwrap_or(0.0).max(self.unexplained.of_channels[c])
+    }
+
+    /// Variance of a gain's logarithm due to errors of the model: those that are seen to last for the interval; if the daughter's
+    /// residuals show any, as much of them as noise may hide.
+    fn model_variance(&self, k: usize) -> f64 {
+        let Excess { model, model_unseen, model_whole, .. } = self.excess[k];
+        model.max(model_unseen.min(self.unexplained.of_gains[k] * model_whole))
     }
 
     fn daughter_estimate(&self, n: usize) -> DaughterEstimate {
@@ -114,10 +122,11 @@ impl GainAssessment<'_> {
         let k = c * layout.satellites + n;
         let (own_gain, excess) = (&self.fitted.own_gains[k], &self.excess[k]);
         let is_reference = n == layout.reference;
-        let reference_excess = if is_reference {
-            Excess::default()
+        let reference = c * layout.satellites + layout.reference;
+        let [reference_scatter, reference_model] = if is_reference {
+            [0.0; 2]
         } else {
-            self.excess[c * layout.satellites + layout.reference]
+            [self.excess[reference].scatter[1], self.model_variance(reference)]
         };
         // A daughter left out of the joint solution is assessed from its own data.
         let is_from_own_data = self.fitted.dropped_gains[k] && own_gain.presence != SignalPresence::NoData;
@@ -130,11 +139,9 @@ impl GainAssessment<'_> {
             (layout.gain(&newton.values, c, n), [sigma, self.phase_sigma(c, n)])
         };
         let relative = if is_reference { 0.0 } else { 1.0 };
-        let scatter = [excess.scatter[0], excess.scatter[1] + reference_excess.scatter[1]];
-        let model = [
-            excess.model + self.common_amplitude_variance(c),
-            relative * (excess.model + reference_excess.model),
-        ];
+        let scatter = [excess.scatter[0], excess.scatter[1] + reference_scatter];
+        let own_model = self.model_variance(k);
+        let model = [own_model + self.common_amplitude_variance(c), relative * (own_model + reference_model)];
         let noise = noise.map(phase_safe_sigma);
         let total = |axis: usize| (noise[axis].powi(2) + scatter[axis] + model[axis]).sqrt();
         let [visibilities, outliers] = self.counts.by_gain[k];
@@ -145,9 +152,11 @@ impl GainAssessment<'_> {
             phase_deg: gain.arg().to_degrees(),
             phase_sigma_deg: if is_reference { 0.0 } else { total(1).to_degrees() },
             phase_scatter_deg: excess.scatter[1].sqrt().to_degrees(),
-            unexplained: self.unexplained[k],
+            unexplained: self.unexplained.of_gains[k],
             visibilities,
             outliers,
+            data_s: self.counts.data_s[k],
+            noise_sigma: [noise[0], relative * noise[1]],
             state: self.state(
                 (c, n),
                 gain.norm(),
@@ -175,7 +184,7 @@ impl GainAssessment<'_> {
             _ if noise * noise > phase_variance_max => GainState::Uncertain,
             _ if noise * noise + scatter > phase_variance_max => GainState::Unstable,
             _ if noise * noise + scatter + model > phase_variance_max => GainState::PoorFit,
-            _ if self.unexplained[k] > config.unexplained_max => GainState::PoorFit,
+            _ if self.unexplained.of_gains[k] > config.unexplained_max => GainState::PoorFit,
             _ => GainState::Good,
         }
     }

@@ -72,7 +72,7 @@ keys! {
         everyday clock_sigma_ns: f64 = 0.0;
         /// Expected deviation of a position along each axis.
         everyday position_sigma_m: f64 = 0.0;
-        /// Solutions of equal length in a pass.
+        /// Solutions of equal length in a pass, smoothed as a random walk.
         expert solutions_per_pass: u32 = 1;
         /// Time without data after which a new pass begins.
         expert pass_gap_s: f64 = 900.0;

@@ -68,6 +68,11 @@ pub struct GainEstimate {
     pub visibilities: u64,
     /// Number of visibilities left out as outliers.
     pub outliers: u64,
+    /// First and last time of those used, s since the epoch: of what is before and after nothing is told.
+    pub data_s: [f64; 2],
+    /// Standard deviations by noise alone, of the amplitude's logarithm and of the phase (rad).
+    #[serde(skip)]
+    pub noise_sigma: [f64; 2],
     /// Quality state.
     pub state: GainState,
 }
@@ -114,6 +119,8 @@ pub(super) struct Counts {
     pub(super) used: u64,
     pub(super) out: u64,
     pub(super) by_gain: Vec<[u64; 2]>,
+    /// First and last time of those used, by channel and daughter.
+    pub(super) data_s: Vec<[f64; 2]>,
     /// Counts of all visibilities and of outliers, by channel and part of the interval.
     by_time: Vec<[[u64; 2]; TIME_PARTS]>,
 }
@@ -123,7 +130,8 @@ impl Counts {
         let layout: &ParameterLayout = &fitted.layout;
         let gains = layout.satellites * layout.frequencies_hz.len();
         let by_time = vec![[[0; 2]; TIME_PARTS]; layout.frequencies_hz.len()];
-        let mut counts = Self { used: 0, out: 0, by_gain: vec![[0; 2]; gains], by_time };
+        let (by_gain, data_s) = (vec![[0; 2]; gains], vec![[until_s, from_s]; gains]);
+        let mut counts = Self { used: 0, out: 0, by_gain, data_s, by_time };
         for (block, is_pair_used) in blocks.iter().zip(&fitted.is_pair_used) {
             let inside = (0..block.time_s.len()).filter(|&k| (from_s..until_s).contains(&block.time_s[k]));
             if !is_pair_used {
@@ -131,8 +139,10 @@ impl Counts {
                 let of = |n: u8| block.channel * layout.satellites + usize::from(n);
                 let left_out =
                     [of(block.pair.i), of(block.pair.j)].into_iter().filter(|k| fitted.dropped_gains[*k]);
-                let count = inside.count() as u64;
-                left_out.for_each(|k| counts.by_gain[k][0] += count);
+                for k in left_out {
+                    counts.by_gain[k][0] += inside.clone().count() as u64;
+                    counts.extend(k, inside.clone().map(|place| block.time_s[place]));
+                }
                 continue;
             }
             for k in inside.clone() {
@@ -141,6 +151,10 @@ impl Counts {
                 (*all, *out) = (*all + 1, *out + u64::from(block.is_out[k]));
             }
             let (out, used): (Vec<usize>, Vec<usize>) = inside.partition(|&k| block.is_out[k]);
+            for n in [block.pair.i, block.pair.j] {
+                let gain = block.channel * layout.satellites + usize::from(n);
+                counts.extend(gain, used.iter().map(|&place| block.time_s[place]));
+            }
             let (used, out) = (used.len() as u64, out.len() as u64);
             (counts.used, counts.out) = (counts.used + used, counts.out + out);
             for n in [block.pair.i, block.pair.j] {
@@ -149,6 +163,18 @@ impl Counts {
             }
         }
         counts
+            .data_s
+            .iter_mut()
+            .filter(|[first_s, last_s]| first_s > last_s)
+            .for_each(|none| *none = [from_s; 2]);
+        counts
+    }
+
+    fn extend(&mut self, gain: usize, times_s: impl Iterator<Item = f64>) {
+        let [first_s, last_s] = &mut self.data_s[gain];
+        for time_s in times_s {
+            (*first_s, *last_s) = (first_s.min(time_s), last_s.max(time_s));
+        }
     }
 
     pub(super) fn parts(&self) -> OutlierFractions {

@@ -14,6 +14,17 @@ use super::sums::ModelledBlock;
 /// Significance, in standard deviations of noise, of a residual.
 const SIGMAS: f64 = 3.0;
 
+/// Significance of the residual of all pairs of a channel together: what stays below turns amplitudes by no more than two deviations.
+const SIGMAS_OF_ALL: f64 = 2.0;
+
+/// Unexplained fractions of the signal.
+pub(super) struct Unexplained {
+    /// By channel, then daughter.
+    pub(super) of_gains: Vec<f64>,
+    /// Of all pairs of a channel, without those attributed to a daughter above the maximum.
+    pub(super) of_channels: Vec<f64>,
+}
+
 /// Residual signal of a pair in a channel, and the signal, in units of the variance of signal and noise together: so
 /// pairs of any strength count by the number of their visibilities.
 #[derive(Clone, Copy, Default)]
@@ -61,13 +72,13 @@ impl Residual {
         }
     }
 
-    /// Unexplained fraction of the signal; 0 if the residual may be noise.
-    fn fraction(&self) -> f64 {
-        if self.left > SIGMAS * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
+    /// Unexplained fraction of the signal; 0 if the residual may be noise of so many standard deviations.
+    fn fraction(&self, sigmas: f64) -> f64 {
+        if self.left > sigmas * self.variance.sqrt() { self.left / self.signal } else { 0.0 }
     }
 }
 
-/// Unexplained fraction of the signal of each daughter in each channel; by channel, then daughter. If the worst
+/// Unexplained fractions of the signal of each daughter in each channel, and of each channel. If the worst
 /// daughter of a channel is above `fraction_max`, its pairs are attributed to it, and the others are judged by the
 /// remaining pairs.
 pub(super) fn unexplained(
@@ -75,10 +86,11 @@ pub(super) fn unexplained(
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
     fraction_max: f64,
-) -> Vec<f64> {
+) -> Unexplained {
     let RobustFit { layout, newton, is_pair_used, .. } = fitted;
     let n = layout.satellites;
     let mut fractions = vec![0.0; n * layout.channels()];
+    let mut of_channels = vec![0.0; layout.channels()];
     for (channel, fractions) in fractions.chunks_mut(n.max(1)).enumerate() {
         let mut pairs: Vec<([usize; 2], Residual)> = blocks
             .iter()
@@ -92,7 +104,7 @@ pub(super) fn unexplained(
         loop {
             let fraction_of = |daughter: usize| {
                 let of_daughter = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
-                of_daughter.fold(Residual::default(), |sum, (_, left)| sum.plus(*left)).fraction()
+                of_daughter.fold(Residual::default(), |sum, (_, left)| sum.plus(*left)).fraction(SIGMAS)
             };
             let open: Vec<(usize, f64)> =
                 (0..n).filter(|k| fractions[*k] == 0.0).map(|k| (k, fraction_of(k))).collect();
@@ -105,11 +117,13 @@ pub(super) fn unexplained(
             let worst = worst.fold((0, 0.0), |worst, one| if one.1 > worst.1 { one } else { worst });
             if worst.1 <= fraction_max {
                 open.into_iter().for_each(|(k, fraction)| fractions[k] = fraction);
+                let all = pairs.iter().fold(Residual::default(), |sum, (_, left)| sum.plus(*left));
+                of_channels[channel] = all.fraction(SIGMAS_OF_ALL);
                 break;
             }
             fractions[worst.0] = worst.1;
             pairs.retain(|(pair, _)| !pair.contains(&worst.0));
         }
     }
-    fractions
+    Unexplained { of_gains: fractions, of_channels }
 }

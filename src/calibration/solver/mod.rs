@@ -55,6 +55,7 @@ mod robust;
 mod robust_fit;
 #[cfg(test)]
 mod scenario_tests;
+mod smooth;
 mod solution;
 mod stability;
 mod start;

@@ -3,6 +3,7 @@
 use super::config::{CalibrationMode, SolverConfig};
 use super::model::{KnownSignal, Offsets};
 use super::positions::{Search, modelled};
+use super::smooth::smooth;
 use super::solution::{PassData, PassSolution, solve_from, solve_pass_in_parts};
 use super::sums::ModelledBlock;
 use crate::array::{Ephemeris, orbit_normal_hat};
@@ -184,6 +185,7 @@ impl PassTask<'_> {
                 break;
             }
         }
+        smooth(&mut solutions);
         if let Some(search_result) = search_result {
             solutions
                 .iter_mut()

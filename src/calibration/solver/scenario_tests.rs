@@ -435,6 +435,53 @@ fn drifts_are_distinguished_from_jumps() {
     assert!(found.tally.good > found.tally.all * 3 / 4, "{:?}", found.tally);
 }
 
+/// A channel has data of the middle of a pass alone, and a gain drifts all the time: it is that of the times where it says that
+/// data are, not of the pass.
+#[test]
+fn gains_are_told_of_the_times_of_their_data() {
+    let of_data_s = [0.3 * SPAN_S[1], 0.6 * SPAN_S[1]];
+    let (mut compared, mut beyond) = (0, 0);
+    for seed in first_seed()..first_seed() + PASSES / 6 {
+        let gains = gains(seed);
+        // By 60 deg in a pass, one daughter.
+        let gain = |c: usize, n: usize, time_s: f64| {
+            let turned =
+                if n == 3 && c == 1 { (time_s / SPAN_S[1] - 0.45) * 60_f64.to_radians() } else { 0.0 };
+            gains[c][n] * Complex64::cis(turned)
+        };
+        let pass = plain(seed, &gain);
+        let mut blocks = pass.blocks();
+        for block in blocks.iter_mut().filter(|block| block.channel == 1) {
+            let first = block.time_s.partition_point(|time_s| *time_s < of_data_s[0]);
+            let count = block.time_s.partition_point(|time_s| *time_s <= of_data_s[1]) - first;
+            block.time_s = block.time_s[first..][..count].to_vec();
+            block.value_k_sr = block.value_k_sr[first..][..count].to_vec();
+            block.weight.truncate(count);
+            block.is_out.truncate(count);
+            block.model = block.model[first..][..count].to_vec();
+        }
+        for solution in pass.solve_blocks(seed, &SolverConfig::default(), &mut blocks) {
+            let found = solution.daughters[3].gains[1];
+            if found.state != GainState::Good {
+                continue;
+            }
+            let (reference, [first_s, last_s]) = (solution.reference as usize - 1, found.data_s);
+            assert!(of_data_s[0] <= first_s && first_s < last_s && last_s <= of_data_s[1], "{found:?}");
+            let off = |time_s: f64| {
+                let truth = gain(1, 3, time_s) * gain(1, reference, time_s).conj();
+                let relative = Complex64::cis(found.phase_deg.to_radians()) * truth.conj();
+                relative.arg().to_degrees().abs() / found.phase_sigma_deg
+            };
+            compared += 1;
+            let middle_s = 0.5 * (first_s + last_s);
+            assert!(off(middle_s) < 4.0, "{} {found:?}", off(middle_s));
+            beyond += usize::from(off(SPAN_S[1]) > 4.0);
+        }
+    }
+    eprintln!("{compared} good gains; at the end of the pass {beyond} are off by more than four deviations");
+    assert!(compared > 5 && beyond > 0);
+}
+
 #[test]
 fn a_weak_signal_is_uncertain() {
     let found = outcome("weak", |seed| {

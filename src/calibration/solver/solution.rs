@@ -7,7 +7,7 @@ use super::agree::is_contradicted;
 use super::assessment::GainAssessment;
 use super::config::SolverConfig;
 use super::estimates::{Counts, DaughterEstimate, GainState, OutlierFractions};
-use super::fit::unexplained;
+use super::fit::{Unexplained, unexplained};
 use super::robust_fit::{Interval, RobustFit};
 use super::stability::{Excess, jump_s};
 use super::sums::ModelledBlock;
@@ -185,7 +185,7 @@ struct CheckedFit {
     fitted: RobustFit,
     excess: Vec<Excess>,
     model_error: Vec<f64>,
-    unexplained: Vec<f64>,
+    unexplained: Unexplained,
     counts: Counts,
 }
 

@@ -47,8 +47,12 @@ pub(super) struct Residuals {
 pub(super) struct Excess {
     /// Variance of the change within the interval, of log amplitude and phase (rad).
     pub(super) scatter: [f64; 2],
-    /// Variance due to errors of the model, of either.
+    /// Variance due to errors of the model that are seen to last, of either.
     pub(super) model: f64,
+    /// The same by errors that noise may hide.
+    pub(super) model_unseen: f64,
+    /// The same by a model whose errors have the power of the signal.
+    pub(super) model_whole: f64,
 }
 
 /// Fraction of outliers in a part of the interval above which something other than a gain is disturbed.
@@ -185,14 +189,22 @@ impl Residuals {
                 // The excess of amplitude or phase. An error of the model lasts for the pass and differs between
                 // pairs.
                 let share = if sum > 0.0 { square / (sum * sum) } else { 0.0 };
-                excess[channel * self.satellites + daughter].model = 0.5 * most * share;
+                let excess = &mut excess[channel * self.satellites + daughter];
+                excess.model = 0.5 * most * share;
+                excess.model_unseen = 0.5 * self.model_error_fractions(channel, Some(daughter))[1] * share;
+                excess.model_whole = 0.5 * share;
             }
         }
         (excess, parts)
     }
 
-    /// Fraction of the signal, of all pairs or of one daughter's, that remains beyond noise.
+    /// Fraction of the signal, of all pairs or of one daughter's, that remains beyond noise; 0 where it may be noise.
     fn model_error_fraction(&self, channel: usize, daughter: Option<usize>) -> f64 {
+        self.model_error_fractions(channel, daughter)[0]
+    }
+
+    /// [`Self::model_error_fraction`], and as much as noise may hide.
+    fn model_error_fractions(&self, channel: usize, daughter: Option<usize>) -> [f64; 2] {
         let own: Vec<&PairResiduals> = self.pairs.iter().filter(|pair| pair.channel == channel).collect();
         let mut present = vec![false; self.satellites];
         own.iter().flat_map(|pair| pair.daughters).for_each(|n| present[n] = true);
@@ -213,10 +225,16 @@ impl Residuals {
             // The solution fits the gains, so residuals of noise have less than its variance.
             let degrees_of_freedom: f64 = (1.0 - (2.0 * gains - 1.0) / f64::max(all, 1.0)).max(0.0);
             let excess_power = square - count * degrees_of_freedom;
-            let is_significant = excess_power > SIGMAS * (2.0 * count).sqrt();
-            if is_significant && information > 0.0 { excess_power / information } else { 0.0 }
+            let noise = SIGMAS * (2.0 * count).sqrt();
+            if information > 0.0 {
+                let significant = if excess_power > noise { excess_power } else { 0.0 };
+                [significant / information, (excess_power + noise).max(0.0) / information]
+            } else {
+                [0.0; 2]
+            }
         };
-        MODEL_SCALES.into_iter().map(part).fold(0.0, f64::max)
+        let parts = MODEL_SCALES.map(part);
+        [0, 1].map(|k| parts.iter().map(|part| part[k]).fold(0.0, f64::max))
     }
 
     /// The daughter, with its channels, that has the largest jump of a gain rather than a drift. Gains of `drifting`

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use super::series::Series;
 use super::{InstrumentErrors, PassErrors};
-use crate::array::{Array, tilted_axes};
+use crate::array::{Array, tilted_axes, track_axes};
 use crate::frames::{AntennaResponse, ObservingWindow};
-use crate::response::PatternsByFrequency;
 use crate::response::model::AntennaPatterns;
 use crate::response::pixel::SatelliteAntenna;
+use crate::response::{AntennaOf, MeasuredAntennas, PatternsByFrequency};
 
 /// Antennas along the normal and the track of each daughter's own orbit.
 pub struct OrbitAntennas {
@@ -28,8 +28,7 @@ impl AntennaPatterns for OrbitAntennas {
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
         let number = usize::from(daughter);
         let (r_m, normal_hat) = (self.array.position_m(number, t_s), self.array.normal_hat(number, t_s));
-        let axes_hat = tilted_axes(r_m, normal_hat, [0.0; 2]);
-        SatelliteAntenna { elements: self.elements, axes_hat, distortion: 0.0 }
+        SatelliteAntenna::new(self.elements, tilted_axes(track_axes(r_m, normal_hat), [0.0; 2]), 0.0)
     }
 
     fn degree(&self) -> usize {
@@ -44,6 +43,8 @@ pub struct AntennaErrors {
     /// The daughters' patterns by frequency, without their errors.
     patterns: PatternsByFrequency,
     has_patterns: bool,
+    measured: MeasuredAntennas,
+    epoch_tai_s: f64,
     /// Start and end of each pass, s, and by daughter: tilt along the track, tilt away from the Moon, distortion.
     passes: Vec<([f64; 2], Vec<[Series; 3]>)>,
 }
@@ -55,13 +56,15 @@ pub struct ChannelAntennas {
 }
 
 impl AntennaErrors {
-    /// Creates the antennas with their errors in these windows; `None` if all are ideal.
+    /// The antennas that are measured, with their errors in these windows; `None` if all are ideal. Attitudes have dates, and the
+    /// mission its epoch, s of TAI since 1958.
     #[must_use]
     pub fn new(
         errors: &InstrumentErrors,
         array: Arc<Array>,
         windows: &[ObservingWindow],
         elements: AntennaResponse,
+        (measured, epoch_tai_s): (MeasuredAntennas, f64),
     ) -> Option<Arc<Self>> {
         let pass = |window: &ObservingWindow| {
             ([window.start.seconds(), window.end.seconds()], errors.antennas(*window))
@@ -71,7 +74,11 @@ impl AntennaErrors {
             Arc::new(Self {
                 array,
                 elements,
-                has_patterns: !errors.config.pattern.is_none() || !patterns.is_ideal(),
+                has_patterns: !errors.config.pattern.is_none()
+                    || !patterns.is_ideal()
+                    || measured.has_patterns(),
+                measured,
+                epoch_tai_s,
                 patterns,
                 passes: windows.iter().map(pass).collect(),
             })
@@ -100,15 +107,16 @@ impl AntennaErrors {
 
 impl AntennaPatterns for ChannelAntennas {
     fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
-        let AntennaErrors { array, elements, patterns, .. } = &*self.antennas;
+        let AntennaErrors { array, elements, patterns, measured, epoch_tai_s, .. } = &*self.antennas;
         let number = usize::from(daughter);
         let errors = self.antennas.pass(t_s).and_then(|daughters| daughters.get(number));
         let [along_deg, radial_deg, distortion] =
             errors.map_or([0.0; 3], |errors| errors.each_ref().map(|series| series.at(t_s)));
         let (r_m, normal_hat) = (array.position_m(number, t_s), array.normal_hat(number, t_s));
-        let axes_hat = tilted_axes(r_m, normal_hat, [along_deg, radial_deg]);
         let distortion = patterns.q(number, self.frequency_hz) + distortion;
-        SatelliteAntenna { elements: *elements, axes_hat, distortion }
+        let (satellite, tai_s, frequency_hz) = (number, epoch_tai_s + t_s, self.frequency_hz);
+        let of = AntennaOf { satellite, tai_s, frequency_hz, elements: *elements };
+        measured.antenna(of, track_axes(r_m, normal_hat), [along_deg, radial_deg], distortion)
     }
 
     fn degree(&self) -> usize {

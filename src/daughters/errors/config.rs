@@ -1,7 +1,7 @@
 //! Configuration of the instrument's errors.
 
-use crate::response::PatternsByFrequency;
 use crate::response::beacon::Beacon;
+use crate::response::{AntennaFiles, PatternsByFrequency};
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Minimum correlation time of a drift, s: some thousand nodes in a pass.
@@ -33,6 +33,9 @@ keys! {
         /// `[frequency_hz, q_1, q_2, ...]` with one q a daughter; linear between rows, constant beyond.
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
+        /// Attitudes and patterns of the antennas by files, to which tilts are added.
+        #[serde(skip_serializing_if = "AntennaFiles::is_none")]
+        section antenna_files: AntennaFiles = AntennaFiles::default();
         /// Allan deviation of every clock at 1 s, with white frequency noise.
         expert clock_allan_deviation: f64 = 0.0;
         /// Time within which steering brings clocks back: their noise is forgotten as exp(-|t| / this).
@@ -214,6 +217,7 @@ impl InstrumentConfig {
             || self.clock_allan_deviation > 0.0
             || self.beacon.k_sr > 0.0
             || !self.pattern_by_frequency.is_ideal()
+            || self.antenna_files.is_some()
     }
 
     /// Keeps the schedule of the beacon, without errors.
@@ -232,6 +236,7 @@ impl InstrumentConfig {
     #[must_use]
     pub fn has_own_antennas(&self) -> bool {
         !self.pattern_by_frequency.is_ideal()
+            || self.antenna_files.is_some()
             || [&self.tilt_along_deg, &self.tilt_radial_deg, &self.pattern]
                 .iter()
                 .any(|terms| !terms.is_none())
@@ -283,6 +288,8 @@ impl InstrumentConfig {
             terms.check(name, (satellites, "a daughter"), maxima_of(name), smooth, &mut checks);
         }
         self.pattern_by_frequency.check("pattern_by_frequency", Some(satellites), &mut checks);
+        let has_patterns = !(self.pattern.is_none() && self.pattern_by_frequency.is_ideal());
+        self.antenna_files.check("antenna_files", has_patterns, &mut checks);
         self.check_rest(&mut checks);
         let exists = |number: u32, count: usize| (1..=count).contains(&(number as usize));
         for (index, &daughter) in self.dead_daughters.iter().enumerate() {

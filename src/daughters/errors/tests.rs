@@ -7,6 +7,7 @@ use num_complex::Complex64;
 use super::*;
 use crate::array::ArrayConfig;
 use crate::frames::AntennaResponse;
+use crate::response::MeasuredAntennas;
 use crate::units::all_pairs;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{dot, sub, unit};
@@ -172,28 +173,31 @@ fn dipoles_are_tilted_by_the_configured_angles() {
     let errors = errors(config);
     let windows = [window(0), window(1), window(4)];
     let elements = AntennaResponse::DipoleNormal;
-    let antennas =
-        AntennaErrors::new(&errors, std::sync::Arc::clone(&array), &windows, elements).unwrap().at(1e7);
+    let nothing = || (MeasuredAntennas::default(), 0.0);
+    let antennas = AntennaErrors::new(&errors, std::sync::Arc::clone(&array), &windows, elements, nothing());
+    let antennas = antennas.unwrap().at(1e7);
     for window in windows {
         let (t_s, pass) = (window.start.seconds() + 1000.0, errors.pass(window));
         for n in 0..8_u8 {
             let found = crate::response::model::AntennaPatterns::antenna(&antennas, n, t_s);
             let [along_deg, radial_deg, distortion] = pass.antenna(n.into(), t_s);
             assert!(along_deg == 2.0 * f64::from(n) && distortion == 0.01 * f64::from(n));
-            assert!(found.elements == AntennaResponse::DipoleNormal && found.distortion == distortion);
-            // Seen along the radius the axis is tilted by one angle, seen along the track by the other.
+            assert!(found.elements == AntennaResponse::DipoleNormal);
+            // Along the axis P_2 is 1.
+            let along = found.forms.map_or(1.0, |forms| forms[0].value(found.axes[0]));
+            assert!((along - 1.0 - distortion).abs() < 1e-14);
+            // Seen along the radius the axis is off by one angle, seen along the track by the other.
             let (up, normal) = (unit(array.position_m(n.into(), t_s)), array.normal_hat(n.into(), t_s));
             let track = unit(array.state(n.into(), t_s).velocity_m_s);
-            let seen_deg =
-                |axis| dot(found.axes_hat[0], axis).atan2(dot(found.axes_hat[0], normal)).to_degrees();
-            // The velocity is along the track, except for precession and breathing, some 1e-4 of it.
+            let seen_deg = |axis| dot(found.axes[0], axis).atan2(dot(found.axes[0], normal)).to_degrees();
+            // The velocity is along the track but for precession and breathing, some 1e-4 of it.
             assert!((seen_deg(track) - along_deg).abs() < 0.02, "{n}: {}", seen_deg(track));
             assert!((seen_deg(up) - radial_deg).abs() < 1e-6, "{n}: {}", seen_deg(up));
         }
     }
     assert!(errors.pass(window(0)).antenna(3, 0.0)[1] != errors.pass(window(1)).antenna(3, 0.0)[1]);
     let straight = self::errors(InstrumentConfig { leak_k_sr: 1.0, ..Default::default() });
-    assert!(AntennaErrors::new(&straight, array, &windows, elements).is_none());
+    assert!(AntennaErrors::new(&straight, array, &windows, elements, nothing()).is_none());
 }
 
 #[test]

@@ -1,10 +1,9 @@
 //! Integration times and antenna responses that the rows of a refined map assume.
 
-use crate::array::{orbit_normal_hat, tilted_axes};
+use crate::array::{orbit_normal_hat, track_axes};
 use crate::frames::AntennaResponse;
-use crate::response::PatternsByFrequency;
 use crate::response::general::{PairResponse, TimedPair};
-use crate::response::pixel::SatelliteAntenna;
+use crate::response::{AntennaOf, MeasuredAntennas, MeasuredAntennasError, PatternsByFrequency};
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
 /// Maximum time between positions that define a satellite's orbital plane, s: a quarter of a low orbit.
@@ -42,56 +41,76 @@ pub struct AssumedInstrument {
     pub antennas: Vec<AssumedAntenna>,
     /// Distortions by frequency, added to those of `antennas`.
     pub patterns: PatternsByFrequency,
+    /// Attitudes and patterns by files.
+    pub measured: MeasuredAntennas,
+    /// Satellites that these are of.
+    pub satellites: usize,
+    /// The mission's epoch, TAI seconds since 1958, for the dates of files.
+    pub epoch_tai_s: f64,
 }
 
 /// Antennas of pairs whose response differs from that of the rows.
 #[derive(Clone, Debug)]
 pub(in crate::imaging) struct PairAntennas {
-    antennas: Vec<AssumedAntenna>,
-    patterns: PatternsByFrequency,
+    assumed: AssumedInstrument,
     frequency_hz: f64,
     elements: AntennaResponse,
 }
 
 impl AssumedInstrument {
-    /// The antennas of the pairs of sorted visibilities; `None` if the response of the rows holds for all.
+    /// Antennas of the pairs of sorted visibilities, where they differ from the response of the rows.
+    ///
+    /// # Errors
+    /// Files that do not have these satellites, this frequency, or these times.
     pub(in crate::imaging) fn antennas_of(
         &self,
         elements: AntennaResponse,
         frequency_hz: f64,
         at: &[TimedPair],
-    ) -> Option<PairAntennas> {
-        let (antennas, patterns) = (self.antennas.clone(), self.patterns.clone());
-        let found = PairAntennas { antennas, patterns, frequency_hz, elements };
-        let is_tilted = || self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
+    ) -> Result<Option<PairAntennas>, MeasuredAntennasError> {
+        let measured = &self.measured;
+        measured.require(self.satellites, elements, frequency_hz)?;
+        for at in at {
+            for daughter in [at.pair.i, at.pair.j] {
+                measured.require_attitude(daughter.into(), self.epoch_tai_s + at.time_s)?;
+            }
+        }
+        let found = PairAntennas { assumed: self.clone(), frequency_hz, elements };
+        let is_tilted =
+            || !measured.is_none() || self.antennas.iter().any(|antenna| antenna.tilt_deg != [0.0; 2]);
         let differs = match elements {
             AntennaResponse::Isotropic => false,
             AntennaResponse::DipoleNormal => is_tilted() || normals_leave_pair_planes(at),
             AntennaResponse::ThreeDipoles => is_tilted() || attitudes_differ(at),
         };
-        (found.is_distorted() || differs).then_some(found)
+        Ok((self.is_distorted() || differs).then_some(found))
+    }
+
+    fn is_distorted(&self) -> bool {
+        !self.patterns.is_ideal()
+            || self.measured.has_patterns()
+            || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
     }
 }
 
 impl PairAntennas {
-    fn is_distorted(&self) -> bool {
-        !self.patterns.is_ideal() || self.antennas.iter().any(|antenna| antenna.distortion != 0.0)
-    }
-
-    /// The degree of their responses as polynomials.
+    /// Degree of their responses, which are polynomials.
     pub(in crate::imaging) fn degree(&self) -> usize {
-        self.elements.degree() + 4 * usize::from(self.is_distorted())
+        self.elements.degree() + 4 * usize::from(self.assumed.is_distorted())
     }
 
     /// The response of the pair of visibility `k`.
     pub(in crate::imaging) fn response(&self, at: &[TimedPair], k: usize) -> PairResponse {
         let pair = &at[k];
         let [normal_i, normal_j] = normals(at, k);
+        let Self { assumed, frequency_hz, elements } = self;
+        let (frequency_hz, elements, tai_s) = (*frequency_hz, *elements, assumed.epoch_tai_s + pair.time_s);
         let antenna = |daughter: u8, r_m: Vec3, normal_hat: Vec3| {
-            let assumed = self.antennas.get(usize::from(daughter)).copied().unwrap_or_default();
-            let axes_hat = tilted_axes(r_m, normal_hat, assumed.tilt_deg);
-            let distortion = assumed.distortion + self.patterns.q(daughter.into(), self.frequency_hz);
-            SatelliteAntenna { elements: self.elements, axes_hat, distortion }
+            let satellite = usize::from(daughter);
+            let known = assumed.antennas.get(satellite).copied().unwrap_or_default();
+            let q = known.distortion + assumed.patterns.q(satellite, frequency_hz);
+            let of = AntennaOf { satellite, tai_s, frequency_hz, elements };
+            assumed.measured.antenna(of, track_axes(r_m, normal_hat), known.tilt_deg, q)
         };
         let a = antenna(pair.pair.i, pair.r_i_m, normal_i);
         let b = antenna(pair.pair.j, pair.r_j_m, normal_j);

@@ -30,7 +30,7 @@ pub(in crate::imaging) fn refined_sums(
     let VisibilityColumns { at, bands, data, duration_s } = VisibilityColumns::new(setup, held);
     let (orbit, departures) = nearest_circle(setup, &|k| at[k], at.len());
     let circle = circle_sums(setup, orbit, &at, &bands, &data)?;
-    let antennas = assumed.antennas_of(setup.response, setup.frequency_hz, &at);
+    let antennas = assumed.antennas_of(setup.response, setup.frequency_hz, &at)?;
     let rows = GeneralRows::new(RowsSetup {
         l_max: setup.l_max,
         wavelength_m: SPEED_OF_LIGHT_M_S / setup.frequency_hz,

@@ -347,7 +347,7 @@ impl Accumulator {
                     let archive = VisibilityArchive::restore(from, folder, refine.visibilities_max)?;
                     Engine::Archive(Box::new(archive))
                 }
-                EngineKind::Pixel => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
+                EngineKind::Pixel | EngineKind::Auto => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
                 EngineKind::Harmonic => {
                     Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
                 }
@@ -648,7 +648,7 @@ fn new_engine(
                 visibilities_max: config.refine.visibilities_max,
             })?)))
         }
-        EngineKind::Pixel => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
+        EngineKind::Pixel | EngineKind::Auto => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
             nside: config.nside,
             frequency_hz,
             method: config.rows,

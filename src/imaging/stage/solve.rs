@@ -339,6 +339,11 @@ impl Stage for Solver {
             return Ok(());
         }
         let beam_pixels = if is_final { setup.beam_pixels(nside) } else { Vec::new() };
+        let assumed = AssumedInstrument {
+            satellites: instrument.satellites.into(),
+            epoch_tai_s: instrument.epoch_tai_s,
+            ..setup.assumed.clone()
+        };
         let request = Request { setup, channel, nside, is_final, epsilon, prior, beam_pixels, watch };
         let regulariser = setup.regulariser(index);
         let solved = match data {
@@ -346,9 +351,7 @@ impl Stage for Solver {
             SnapshotData::Pixel(sums) => request.pixels(sums),
             SnapshotData::Harmonic(sums) => request.harmonics(&sums, regulariser, last),
             SnapshotData::MatrixFree(visibilities) => request.matrix_free(&visibilities.into_sums()?, last),
-            SnapshotData::Refined(archive) => {
-                request.refined(&archive.into_sums(&setup.assumed)?, &fingerprint)
-            }
+            SnapshotData::Refined(archive) => request.refined(&archive.into_sums(&assumed)?, &fingerprint),
         };
         let Some(solved) = solved? else { return Ok(()) };
         let SolvedMap { map_k, noise_k, diagnostics, beams, refinement, uncertainty } = solved;

@@ -6,6 +6,7 @@ use super::memory::MemoryLimit;
 use super::source::ConfigError;
 use crate::array::ArrayError;
 use crate::frames::{SampleReason, VisibilityReason};
+use crate::response::MeasuredAntennasError;
 use crate::runtime::{LedgerImbalance, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
@@ -20,6 +21,9 @@ pub enum PipelineError {
     /// An invalid array or orbit.
     #[error(transparent)]
     Array(#[from] ArrayError),
+    /// Files of antennas, which a section names.
+    #[error("{0}: {1}")]
+    Antennas(&'static str, MeasuredAntennasError),
     /// A map of the simulated sky or a prior map.
     #[error(transparent)]
     Map(#[from] MapError),

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use super::error::PipelineError;
 use super::plan::Plan;
 use super::problems::Problems;
 use super::sections::Config;
@@ -57,6 +58,12 @@ impl Plan {
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {
             found.push(|| problem);
         }
+        if let Err(problem) = self.antenna_errors() {
+            found.push(|| problem);
+        }
+        if let Err(error) = self.config.map.assumed() {
+            found.push(|| PipelineError::Antennas("map.antennas.files", error));
+        }
         if let Err(problem) = self.config.calibration.build(Path::new("")) {
             found.push(|| problem);
         }
@@ -110,7 +117,9 @@ impl Config {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
         let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
         let maps = self.map.prior_files.iter().chain(self.map.power_files()).chain(&self.map.beyond_files);
-        let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file).cloned();
+        let antennas = self.map.antennas.files.paths().chain(self.instrument.antenna_files.paths());
+        let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file);
+        let others = others.chain(antennas).cloned();
         skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
     }
 }

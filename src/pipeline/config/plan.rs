@@ -8,6 +8,7 @@ use crate::array::Array;
 use crate::daughters::{AntennaErrors, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
 use crate::mother::{Fidelity, Observer, Schedule};
+use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
@@ -105,11 +106,33 @@ impl Plan {
     }
 
     /// Errors of the daughters' antennas; `None` if all are ideal.
-    #[must_use]
+    ///
+    /// # Errors
+    /// Files of antennas that cannot be used, or that say nothing of a window or channel.
     #[doc(hidden)]
-    pub fn antenna_errors(&self) -> Option<Arc<AntennaErrors>> {
-        let (errors, elements) = (self.instrument_errors()?, self.instrument.response);
-        AntennaErrors::new(&errors, Arc::clone(&self.array), &self.windows, elements)
+    pub fn antenna_errors(&self) -> Result<Option<Arc<AntennaErrors>>, PipelineError> {
+        let Some(errors) = self.instrument_errors() else { return Ok(None) };
+        let Instrument { response, epoch_tai_s, .. } = self.instrument;
+        let measured = self.measured_antennas();
+        let measured =
+            measured.map_err(|error| PipelineError::Antennas("instrument.antenna_files", error))?;
+        let (array, measured) = (Arc::clone(&self.array), (measured, epoch_tai_s));
+        Ok(AntennaErrors::new(&errors, array, &self.windows, response, measured))
+    }
+
+    /// Antennas as the instrument's files say they are, in all channels and windows.
+    fn measured_antennas(&self) -> Result<MeasuredAntennas, MeasuredAntennasError> {
+        let Instrument { response, epoch_tai_s, .. } = self.instrument;
+        let measured = MeasuredAntennas::read(&self.config.instrument.antenna_files)?;
+        for channel in &self.instrument.channels {
+            measured.require(self.array.satellites(), response, channel.frequency_hz)?;
+        }
+        for satellite in 0..self.array.satellites() {
+            for end in self.windows.iter().flat_map(|window| [window.start, window.end]) {
+                measured.require_attitude(satellite, epoch_tai_s + end.seconds())?;
+            }
+        }
+        Ok(measured)
     }
 
     /// The true instrument errors of every pass as a table (CSV); `None` if there are none.

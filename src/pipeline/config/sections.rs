@@ -164,6 +164,14 @@ impl Config {
         checks.finish()
     }
 
+    /// Replaces `map.engine = "auto"` by what the orbits allow.
+    pub(super) fn choose_engine(&mut self) {
+        if self.map.engine == EngineKind::Auto {
+            let harmonic = self.array.is_circle() || self.map.refine.is_on();
+            self.map.engine = if harmonic { EngineKind::Harmonic } else { EngineKind::Pixel };
+        }
+    }
+
     /// Requires settings that are possible for satellites that do not share a circular orbit.
     fn check_orbits(&self, checks: &mut Checks) {
         if self.array.is_circle() {
@@ -177,7 +185,7 @@ impl Config {
             (
                 "map.engine",
                 "\"harmonic\"",
-                map.engine == EngineKind::Pixel || map.refine.is_on(),
+                map.engine != EngineKind::Harmonic || map.refine.is_on(),
                 "\"pixel\", or map.refine,",
             ),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
@@ -228,13 +236,14 @@ impl Config {
             ("spacecraft.moon_mirror", "\"sphere\"", is_flat, "\"flat\""),
         ] {
             let expected = format!(
-                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern or pattern_by_frequency"
+                "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern, pattern_by_frequency or antenna_files"
             );
             checks.require(key, value, good, expected);
         }
-        // The image in a flat mirror is seen from below, where an antenna with a radial tilt has another response.
-        let is_upright = spacecraft.moon_reflection == 0.0 || self.instrument.tilt_radial_deg.is_none();
-        let expected = "0 with instrument.tilt_radial_deg";
+        // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
+        let leans = !self.instrument.tilt_radial_deg.is_none() || self.instrument.antenna_files.is_some();
+        let is_upright = spacecraft.moon_reflection == 0.0 || !leans;
+        let expected = "0 with instrument.tilt_radial_deg or antenna_files";
         checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, is_upright, expected);
     }
 
@@ -289,12 +298,14 @@ impl Config {
         if let Some(added) = &mut sky.added {
             added.catalogue = added.catalogue.as_deref().map(content_checksum);
         }
+        let mut instrument = instrument.clone();
+        instrument.antenna_files = instrument.antenna_files.map_paths(|path| content_checksum(path));
         let daughters = HashedDaughters::new(daughters);
         // Without errors, the hash must equal that of versions before these sections existed.
         match (instrument.is_on(), navigation.is_on()) {
             (false, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft)),
-            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument)),
-            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, instrument, navigation)),
+            (true, false) => hash(&(name, seed, sky, &array, &daughters, spacecraft, &instrument)),
+            (_, true) => hash(&(name, seed, sky, &array, &daughters, spacecraft, &instrument, navigation)),
         }
     }
 
@@ -305,6 +316,7 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(content_checksum);
         map.prior_files = map.prior_files.iter().map(|path| content_checksum(path)).collect();
+        map.antennas.files = map.antennas.files.map_paths(|path| content_checksum(path));
         if let Some(RegulariserChoice::File(files)) = &mut map.regulariser {
             files.iter_mut().for_each(|path| *path = content_checksum(path));
         }

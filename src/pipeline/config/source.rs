@@ -208,6 +208,7 @@ impl ConfigSource {
         if partial.config.name.is_empty() {
             partial.config.name = self.default_name();
         }
+        partial.config.choose_engine();
         let problems = partial.all_problems(value_problems(&partial.config), override_problems);
         match problems.is_empty() {
             true => Ok(partial.config),
@@ -277,7 +278,7 @@ fn apply_override<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str,
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::imaging::MapConfig;
+    use crate::imaging::{EngineKind, MapConfig};
 
     fn with(overrides: &[&str]) -> Result<Config, ConfigError> {
         let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
@@ -287,6 +288,22 @@ mod tests {
     #[test]
     fn the_embedded_pipeline_is_valid() {
         assert!(ConfigSource::default().load().is_ok());
+    }
+
+    /// The default pipeline is for any orbits: its engine is one that they allow.
+    #[test]
+    fn the_embedded_pipeline_takes_any_orbits() {
+        let cases: [(&[&str], EngineKind); 4] = [
+            (&[], EngineKind::Harmonic),
+            (&["array.eccentricity=0.01"], EngineKind::Pixel),
+            (&["array.cross_track_ratio=0.1"], EngineKind::Pixel),
+            (&["array.eccentricity=0.01", "map.refine.passes_max=3"], EngineKind::Harmonic),
+        ];
+        for (overrides, engine) in cases {
+            let overrides = overrides.iter().map(|&text| text.to_owned()).collect();
+            let config = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap();
+            assert_eq!(config.map.engine, engine, "{config:?}");
+        }
     }
 
     #[test]

@@ -39,7 +39,7 @@ impl Config {
     /// Setup of the solver; `watch` reports its progress and ends it early.
     ///
     /// # Errors
-    /// Prior maps and power spectra that cannot be read.
+    /// Prior maps, power spectra and files of antennas that cannot be read.
     #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
@@ -52,7 +52,7 @@ impl Config {
             prior_maps: prior_maps(self)?,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
-            assumed: map.assumed(),
+            assumed: map.assumed().map_err(|error| PipelineError::Antennas("map.antennas.files", error))?,
             iteration_folder: None,
             trace_probes: map.trace_probes,
             samples: Samples::default(),

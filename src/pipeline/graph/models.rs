@@ -27,7 +27,7 @@ pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<Channe
     let nside = |(sky, default): (&Option<&SkyMap>, usize)| sky.map_or(default, SkyMap::nside);
     let nsides: Vec<usize> = skies.iter().zip(plan.sky_nsides()).map(nside).collect();
     nsides.iter().try_for_each(|&nside| SkyConfig::check_l_max(plan.config.sky.l_max, nside))?;
-    let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors());
+    let (mut rotations, antennas) = (HashMap::new(), plan.antenna_errors()?);
     let mut models = Vec::new();
     for ((choice, sky), schedule) in plan.model_plans(&nsides).iter().zip(skies).zip(&plan.schedules) {
         let antennas = antennas

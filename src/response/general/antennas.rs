@@ -11,7 +11,7 @@
 //! on time, so that rows of B are interpolated for isotropic antennas only, and antennas may rotate freely between visibilities.
 
 use crate::frames::AntennaResponse;
-use crate::response::pixel::SatelliteAntenna;
+use crate::response::pixel::{DirectionForm, SatelliteAntenna};
 use crate::sky::harmonics::{Alm, Component, times_direction, times_direction_transposed};
 use crate::units::vector::{Vec3, dot};
 
@@ -81,31 +81,47 @@ impl PairResponse {
         Self::quadratic(constant, &halves)
     }
 
-    /// The response times `1 + q P_2(n . axis)`.
+    /// A form of degree 2.
     #[must_use]
-    pub fn distorted(&self, axis_hat: Vec3, q: f64) -> Self {
-        // P_2 = 3/2 cos^2 - 1/2.
-        let scaled = axis_hat.map(|x| -1.5 * q * x);
-        self.times(&Self::quadratic(1.0 - 0.5 * q, &[[scaled, axis_hat]]))
+    pub fn of_form(DirectionForm(coefficients): DirectionForm) -> Self {
+        Self { degree: 2, coefficients: coefficients.to_vec() }
     }
 
     /// The response of the antennas of two satellites; elements count as isotropic unless both satellites have the same kind.
     #[must_use]
     pub fn of_antennas([a, b]: [&SatelliteAntenna; 2]) -> Self {
-        let ideal = match (a.elements, b.elements) {
-            (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => {
-                Self::of_dipoles(a.axes_hat[0], b.axes_hat[0])
-            }
-            (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => {
-                Self::of_triads(a.triad(), b.triad())
-            }
-            _ => Self::isotropic(),
+        let kind = match (a.elements, b.elements) {
+            (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => AntennaResponse::DipoleNormal,
+            (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => AntennaResponse::ThreeDipoles,
+            _ => AntennaResponse::Isotropic,
         };
-        let distort = |response: Self, antenna: &SatelliteAntenna| match antenna.distortion {
-            0.0 => response,
-            q => response.distorted(antenna.axes_hat[0], q),
+        let with = |of: Self, antenna: &SatelliteAntenna, k: usize| match antenna.forms {
+            None => of,
+            Some(forms) => of.times(&Self::of_form(forms[k])),
         };
-        distort(distort(ideal, a), b)
+        let all_alike =
+            [a, b].iter().all(|antenna| antenna.forms.is_none_or(|forms| forms[1..] == [forms[0]; 2]));
+        let ideal = match kind {
+            AntennaResponse::DipoleNormal => Self::of_dipoles(a.axes[0], b.axes[0]),
+            AntennaResponse::ThreeDipoles if all_alike => Self::of_triads(a.axes, b.axes),
+            AntennaResponse::ThreeDipoles => {
+                let halves = |k: usize| {
+                    let half = a.axes[k].map(|x| 0.5 * x);
+                    with(with(Self::of_dipoles(half, b.axes[k]), a, k), b, k)
+                };
+                return halves(0).plus(&halves(1)).plus(&halves(2));
+            }
+            AntennaResponse::Isotropic => Self::isotropic(),
+        };
+        with(with(ideal, a, 0), b, 0)
+    }
+
+    /// Their sum, of the higher degree.
+    fn plus(&self, other: &Self) -> Self {
+        let degree = self.degree.max(other.degree);
+        let mut coefficients = self.coefficients_of_degree(degree);
+        coefficients.iter_mut().zip(other.coefficients_of_degree(degree)).for_each(|(a, b)| *a += b);
+        Self { degree, coefficients }
     }
 
     /// The product with another response.
@@ -230,10 +246,8 @@ mod tests {
         for n in [[0.2, 0.3, -0.7], [1.0, 0.0, 0.0], [-0.4, 0.9, 0.1]].map(unit) {
             let dipoles = dot(across(d, n), across(e, n));
             assert!((PairResponse::of_dipoles(d, e).value(n) - dipoles).abs() < 1e-15);
-            let [a, b] = [(d, 0.2), (e, -0.1)].map(|(axis_hat, distortion)| SatelliteAntenna {
-                elements: AntennaResponse::DipoleNormal,
-                axes_hat: [axis_hat, unit(cross(axis_hat, n))],
-                distortion,
+            let [a, b] = [(d, 0.2), (e, -0.1)].map(|(axis_hat, q)| {
+                SatelliteAntenna::new(AntennaResponse::DipoleNormal, [axis_hat, unit(cross(axis_hat, n))], q)
             });
             let expected = dipoles * (1.0 + 0.2 * p_2(dot(d, n))) * (1.0 - 0.1 * p_2(dot(e, n)));
             let found = PairResponse::of_antennas([&a, &b]);

@@ -95,7 +95,7 @@ mod tests {
             let k = f64::from(daughter) + t_s * 1e-6;
             let axis_hat = unit([0.3 * k, -0.5 + 0.1 * k, 0.9]);
             let across = unit(cross(axis_hat, [0.7, 0.2 * k, 0.1]));
-            SatelliteAntenna { elements: self.elements, axes_hat: [axis_hat, across], distortion: 0.1 * k }
+            SatelliteAntenna::new(self.elements, [axis_hat, across], 0.1 * k)
         }
     }
 
@@ -132,24 +132,17 @@ mod tests {
                 let across = |axis: Vec3| sub(axis, scale(dot(axis, n_hat), n_hat));
                 let dipoles = |a: &SatelliteAntenna, b: &SatelliteAntenna| match elements {
                     AntennaResponse::Isotropic => 1.0,
-                    AntennaResponse::DipoleNormal => dot(across(a.axes_hat[0]), across(b.axes_hat[0])),
+                    AntennaResponse::DipoleNormal => dot(across(a.axes[0]), across(b.axes[0])),
                     // Sum over corresponding dipoles, whose mean is 2/3 for equal attitudes.
                     AntennaResponse::ThreeDipoles => {
-                        let third =
-                            |antenna: &SatelliteAntenna| cross(antenna.axes_hat[0], antenna.axes_hat[1]);
-                        let like: [[Vec3; 2]; 3] = [
-                            [a.axes_hat[0], b.axes_hat[0]],
-                            [a.axes_hat[1], b.axes_hat[1]],
-                            [third(a), third(b)],
-                        ];
-                        like.iter().map(|[d, e]| dot(across(*d), across(*e))).sum::<f64>() / 2.0
+                        a.axes.iter().zip(b.axes).map(|(d, e)| dot(across(*d), across(e))).sum::<f64>() / 2.0
                     }
                 };
                 let legendre = |axis: Vec3| (3.0 * dot(axis, n_hat).powi(2) - 1.0) / 2.0;
-                let factor = dipoles(&a, &b)
-                    * (1.0 + a.distortion * legendre(a.axes_hat[0]))
-                    * (1.0 + b.distortion * legendre(b.axes_hat[0]));
-                // The fringe is in single precision.
+                let q = |daughter: u8| 0.1 * (f64::from(daughter) + t_s * 1e-6);
+                let factor =
+                    dipoles(&a, &b) * (1.0 + q(i) * legendre(a.axes[0])) * (1.0 + q(j) * legendre(b.axes[0]));
+                // Single precision of the fringe.
                 assert!((found[0] - factor * ideal[0]).norm() < 2e-6 * ideal[0].norm(), "{i} {j}: {found:?}");
                 let mut power = [0.0];
                 let daughter = DaughterPosition {
@@ -159,8 +152,7 @@ mod tests {
                 };
                 model.predict_powers(&[daughter], &mut power).unwrap();
                 let own = dipoles(&a, &a);
-                let expected =
-                    1e4 * pixel_area_sr(NSIDE) * own * (1.0 + a.distortion * legendre(a.axes_hat[0])).powi(2);
+                let expected = 1e4 * pixel_area_sr(NSIDE) * own * (1.0 + q(i) * legendre(a.axes[0])).powi(2);
                 assert!((power[0] / expected - 1.0).abs() < 1e-6, "{} {expected}", power[0]);
             }
         }
@@ -173,7 +165,7 @@ mod tests {
             fn antenna(&self, daughter: u8, t_s: f64) -> SatelliteAntenna {
                 let axis_hat = self.0.normal_hat(daughter.into(), t_s);
                 let axes_hat = [axis_hat, unit(cross(axis_hat, [0.3, 0.5, 0.1]))];
-                SatelliteAntenna { elements: AntennaResponse::DipoleNormal, axes_hat, distortion: 0.0 }
+                SatelliteAntenna::new(AntennaResponse::DipoleNormal, axes_hat, 0.0)
             }
         }
         let array = Array::new(&ArrayConfig::default()).unwrap();

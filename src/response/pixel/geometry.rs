@@ -57,20 +57,56 @@ impl PairGeometry {
 /// Antenna of one satellite with individual attitude and pattern.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SatelliteAntenna {
-    /// Elements of the antenna: one dipole along the first axis, three dipoles along all axes, or isotropic.
+    /// What it consists of: one dipole along the first axis, or one along each.
     pub elements: AntennaResponse,
-    /// First and second axis, orthogonal unit vectors; the third is their cross product.
-    pub axes_hat: [Vec3; 2],
-    /// q in the factor `1 + q P_2(cos)` of the voltage pattern, with the angle from the first axis.
-    pub distortion: f64,
+    /// Its axes: unit vectors across each other, or the effective axes of dipoles that were measured.
+    pub axes: [Vec3; 3],
+    /// Factors of the dipoles' voltages by direction; without dipoles the first holds. `None` for 1.
+    pub forms: Option<[DirectionForm; 3]>,
 }
 
 impl SatelliteAntenna {
-    /// All three axes, along which three dipoles point.
+    /// The antenna with these axes, the third across both, and a factor `1 + q P_2(cos)` of its voltage with the angle from the first.
     #[must_use]
-    pub fn triad(&self) -> [Vec3; 3] {
-        let [a, b] = self.axes_hat;
-        [a, b, cross(a, b)]
+    pub fn new(elements: AntennaResponse, [a, b]: [Vec3; 2], q: f64) -> Self {
+        let forms = (q != 0.0).then(|| [DirectionForm::of_distortion(a, q); 3]);
+        Self { elements, axes: [a, b, cross(a, b)], forms }
+    }
+}
+
+/// A symmetric form of degree 2 in a direction of length 1: its coefficients of x x, x y, x z, y y, y z, z z.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DirectionForm(pub [f64; 6]);
+
+impl DirectionForm {
+    /// 1 in all directions.
+    pub const ONE: Self = Self([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]);
+
+    /// `n . F n` by a symmetric matrix on the axes of a body, which are given.
+    #[must_use]
+    pub fn of(matrix: [Vec3; 3], body: [Vec3; 3]) -> Self {
+        let at = |p: usize, q: usize| -> f64 {
+            let term = |(a, b): (usize, usize)| matrix[a][b] * body[a][p] * body[b][q];
+            (0..9).map(|k| term((k / 3, k % 3))).sum()
+        };
+        Self([at(0, 0), 2.0 * at(0, 1), 2.0 * at(0, 2), at(1, 1), 2.0 * at(1, 2), at(2, 2)])
+    }
+
+    /// `1 + q P_2(n . axis)`.
+    #[must_use]
+    pub fn of_distortion(axis_hat: Vec3, q: f64) -> Self {
+        let Self(one) = Self::ONE;
+        let [x, y, z] = axis_hat;
+        let squares = [x * x, 2.0 * x * y, 2.0 * x * z, y * y, 2.0 * y * z, z * z];
+        Self(std::array::from_fn(|k| (1.0 - 0.5 * q) * one[k] + 1.5 * q * squares[k]))
+    }
+
+    /// Its value in a direction.
+    #[inline(always)]
+    #[must_use]
+    pub fn value(&self, [x, y, z]: Vec3) -> f64 {
+        let Self([xx, xy, xz, yy, yz, zz]) = self;
+        x * (xx * x + xy * y + xz * z) + y * (yy * y + yz * z) + zz * z * z
     }
 }
 

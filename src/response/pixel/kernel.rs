@@ -3,7 +3,7 @@
 //! Kernels are plain loops over short buffers. `multiversion` compiles each of them for AVX-512, AVX2 and the baseline
 //! and selects one at run time.
 
-use super::{PairGeometry, SatelliteAntenna, SingleGeometry};
+use super::{DirectionForm, PairGeometry, SatelliteAntenna, SingleGeometry};
 use crate::frames::AntennaResponse;
 use crate::units::arithmetic::{fused, fused64};
 use crate::units::vector::{Vec3, dot, scale};
@@ -127,34 +127,53 @@ impl KernelGeometry {
                 values[k] *= fused::<FMA>(-along, along, 1.0);
             }
         }
-        if let Some([a, b]) = self.antennas {
-            let ([d, _], [e, _]) = (a.axes_hat, b.axes_hat);
-            let distorted = |q: f64, cos: f64| 1.0 + q * (1.5 * cos * cos - 0.5);
-            let patterns = |p: f64, q: f64| distorted(a.distortion, p) * distorted(b.distortion, q);
-            match (a.elements, b.elements) {
-                (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => {
-                    let common = dot(d, e);
-                    for k in 0..N {
-                        let [p, q] = [d, e].map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k]));
-                        values[k] *= ((common - p * q) * patterns(p, q)) as f32;
-                    }
-                }
-                (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => {
-                    let (d, e) = (a.triad(), b.triad());
-                    let common: f64 = (0..3).map(|axis| dot(d[axis], e[axis])).sum();
-                    for k in 0..N {
-                        let [p, q] = [d, e].map(|axes| axes.map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k])));
-                        let along = p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
-                        values[k] *= (0.5 * (common - along) * patterns(p[0], q[0])) as f32;
-                    }
-                }
-                _ => {
-                    for k in 0..N {
-                        let [p, q] = [d, e].map(|axis| dot64::<FMA>(axis, x[k], y[k], z[k]));
-                        values[k] *= patterns(p, q) as f32;
-                    }
-                }
+        if let Some([a, b]) = &self.antennas {
+            let pair = PairAntennas::new(a, b);
+            for k in 0..N {
+                values[k] *= pair.response::<FMA>(x[k], y[k], z[k]) as f32;
             }
+        }
+    }
+}
+
+/// Antennas of two satellites that differ.
+struct PairAntennas<'a> {
+    axes: [&'a [Vec3; 3]; 2],
+    /// Scalar products of like axes.
+    common: [f64; 3],
+    forms: [Option<&'a [DirectionForm; 3]>; 2],
+    dipoles: usize,
+}
+
+impl<'a> PairAntennas<'a> {
+    fn new(a: &'a SatelliteAntenna, b: &'a SatelliteAntenna) -> Self {
+        let dipoles = match (a.elements, b.elements) {
+            (AntennaResponse::DipoleNormal, AntennaResponse::DipoleNormal) => 1,
+            (AntennaResponse::ThreeDipoles, AntennaResponse::ThreeDipoles) => 3,
+            _ => 0,
+        };
+        let common = std::array::from_fn(|k| dot(a.axes[k], b.axes[k]));
+        Self { axes: [&a.axes, &b.axes], common, forms: [a.forms.as_ref(), b.forms.as_ref()], dipoles }
+    }
+
+    /// The sum over like dipoles, each with its factors.
+    #[inline(always)]
+    fn response<const FMA: bool>(&self, x: f64, y: f64, z: f64) -> f64 {
+        let factors = |k: usize| -> f64 {
+            let of =
+                |forms: Option<&[DirectionForm; 3]>| forms.map_or(1.0, |forms| forms[k].value([x, y, z]));
+            of(self.forms[0]) * of(self.forms[1])
+        };
+        let [p, q] = self.axes.map(|axes| axes.map(|axis| dot64::<FMA>(axis, x, y, z)));
+        let across = |k: usize| self.common[k] - p[k] * q[k];
+        match (self.dipoles, self.forms) {
+            (0, _) => factors(0),
+            (1, _) => across(0) * factors(0),
+            (_, [None, None]) => {
+                let along = p[0] * q[0] + p[1] * q[1] + p[2] * q[2];
+                0.5 * (self.common.iter().sum::<f64>() - along)
+            }
+            _ => 0.5 * (0..3).map(|k| across(k) * factors(k)).sum::<f64>(),
         }
     }
 }

@@ -39,7 +39,7 @@ pub use combs::{Comb, comb_sums};
 pub use directions::Directions;
 pub use geometry::PairGeometry;
 #[doc(hidden)]
-pub use geometry::{SatelliteAntenna, SingleGeometry};
+pub use geometry::{DirectionForm, SatelliteAntenna, SingleGeometry};
 #[doc(hidden)]
 pub use products::RowProducts;
 #[doc(hidden)]
