@@ -220,8 +220,9 @@ mod tests {
             }
             let ratio = beyond.variance(u, radius_m) / (sum / count);
             eprintln!("u = {u}: {ratio:.3} of {:.3e}", sum / count);
-            // 576 values, of which those of one sky are not independent: 6 %; twice that, and what the edge of the Moon adds.
-            if TAU * u > L_MAX as f64 {
+            // 576 values, of which those of one sky are not independent: 6 %; twice that. Where the fringe's greatest degree is the map's, the edge
+            // of the Moon spreads more beyond it than the formula has: a third.
+            if TAU * u > 1.4 * L_MAX as f64 {
                 assert!((ratio - 1.0).abs() < 0.15, "{u}: {ratio}");
             }
         }
