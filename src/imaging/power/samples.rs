@@ -29,11 +29,13 @@ pub(in crate::imaging) struct PosteriorSample {
     pub(in crate::imaging) preconditioner: Vec<f64>,
 }
 
+/// Products of the normal matrix with several vectors.
+pub(in crate::imaging) type Products<'a> = dyn Fn(&[&[f64]]) -> Vec<Vec<f64>> + 'a;
+
 /// The posterior's precision matrix A + R with its preconditioner.
 #[derive(Clone, Copy)]
 pub(in crate::imaging) struct PosteriorPrecision<'a> {
-    /// Products with the normal matrix.
-    pub(in crate::imaging) products: &'a dyn Fn(&[&[f64]]) -> Vec<Vec<f64>>,
+    pub(in crate::imaging) products: &'a Products<'a>,
     pub(in crate::imaging) unknowns: usize,
     pub(in crate::imaging) regularisation: &'a Diagonal,
     pub(in crate::imaging) factors: &'a Factors<'a>,
