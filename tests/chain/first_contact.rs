@@ -101,7 +101,7 @@ fn frequencies_and_lengths_are_told_with_units() {
         assert!(said.contains(part) && said.lines().all(|line| line.len() < 200), "{said}");
     }
     let said = fail(&["check", "--memory-max", "1kB"]);
-    assert!(said.contains("and 1000 bytes are available"), "{said}");
+    assert!(said.contains("but 1000 bytes are available"), "{said}");
 }
 
 #[test]

@@ -84,7 +84,9 @@ fn a_round_moon_shows_the_sky_smaller() {
         let model = format!("spacecraft.model={model}");
         let refused = fail(&["check", &place.pipeline, "--set", &model, "--set", sphere]);
         assert!(
-            refused.contains("spacecraft.moon_mirror = \"sphere\": expected spacecraft.model = \"direct\""),
+            refused.contains(
+                "spacecraft.moon_mirror = \"sphere\": expected \"flat\", or spacecraft.model = \"direct\""
+            ),
             "{refused}"
         );
     }

@@ -38,7 +38,7 @@ fn more_memory_than_there_is_is_refused_before_anything_starts() {
     let downlink = place.path("x.ccsds");
     for command in [vec!["check", &place.pipeline], vec!["run", &place.pipeline, "--out", &out]] {
         let said = fail(&[&command[..], &limited].concat());
-        for part in ["of memory are needed, and 8.00 GB are available", "--memory-max "] {
+        for part in ["of memory are needed, but 8.00 GB are available", "--memory-max "] {
             assert!(said.contains(part), "{command:?}: {said}");
         }
     }
