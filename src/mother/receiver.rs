@@ -171,7 +171,10 @@ mod tests {
                 "receiver_noise_k_sr = (1000000 Hz to 9000000 Hz): expected a table that covers channels_hz[1] = 10000000",
             ),
             ("receiver_knee_hz = -1.0", "receiver_knee_hz = -1: expected Hz, or 0"),
-            ("interference_floor_k_sr = [1.0]", "interference_floor_k_sr = (1 values): expected a single value"),
+            (
+                "interference_floor_k_sr = [1.0]",
+                "interference_floor_k_sr = (1 values): expected a single value",
+            ),
             ("interference_floor_k_sr = inf", "interference_floor_k_sr = inf: expected K sr, not negative"),
         ] {
             let found = problems_of(&format!("channels_hz = [5e6, 10e6]\n{line}"));
