@@ -183,13 +183,6 @@ fn text(report: &Report) -> String {
         100.0 * own_share
     )];
     for map in &report.maps {
-        let amplitude = map.agreement.and_then(|found| found.amplitude);
-        let scale = amplitude.filter(|found| found.disagrees()).map_or(String::new(), |found| {
-            format!(
-                "; its scale disagrees: {:.3} +- {:.3} of what the other channels' law gives (calibration?)",
-                found.ratio, found.sigma
-            )
-        });
         let agreement = map.agreement.map_or("between channels".to_owned(), |found| {
             format!(
                 "chi-square {:.4} alone, {:.4} together (strain {:.2})",
@@ -197,7 +190,7 @@ fn text(report: &Report) -> String {
             )
         });
         lines.push(format!(
-            "{:>8.3} MHz  mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms; {agreement}{scale}; {}",
+            "{:>8.3} MHz  mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms; {agreement}; {}",
             map.frequency_hz / 1e6,
             map.mean_k,
             map.mean_sigma_k,

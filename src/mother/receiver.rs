@@ -164,7 +164,7 @@ mod tests {
             ),
             (
                 "receiver_noise_k_sr = [[30e6, 1.0], [1e6, 2.0]]",
-                "receiver_noise_k_sr[1] = [1000000.0, 2.0]: expected a frequency above that of the point before, 30000000 Hz",
+                "receiver_noise_k_sr[1] = [1000000.0, 2.0]: expected a frequency above that of the preceding point, 30000000 Hz",
             ),
             (
                 "receiver_noise_k_sr = [[1e6, 2e4], [9e6, 1.0]]",

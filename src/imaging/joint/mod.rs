@@ -4,7 +4,6 @@
 //! between channels ([`Correlation`]), and solves for all channels together. It returns maps at every channel and at frequencies between
 //! them, and the spectral index of every pixel, each with errors. No visibility is read again.
 
-mod amplitude;
 mod prior;
 mod solve;
 mod spectrum;
@@ -12,7 +11,6 @@ mod sums;
 #[cfg(test)]
 mod tests;
 
-pub use amplitude::RelativeAmplitude;
 pub use prior::Correlation;
 pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::amplitude::{RelativeAmplitude, relative_amplitudes};
 use super::prior::{Correlation, FREE, Prior, View};
 use super::spectrum::{SpectralMaps, SpectrumFit};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
@@ -78,8 +77,6 @@ pub struct Agreement {
     /// Increase of chi-square from the first to the second, per coefficient that the channel's data determine: of order 1 if the joint map
     /// differs from the channel's own by no more than noise.
     pub strain: f64,
-    /// Amplitude of the channel's structure relative to the law of the other channels; `None` for fewer than five channels.
-    pub amplitude: Option<RelativeAmplitude>,
 }
 
 /// A joint solution.
@@ -102,9 +99,6 @@ struct SingleChannel {
     /// The data `(A x + R x) / s^2` with A from the blocks, for the evidence.
     right: Vec<f64>,
 }
-
-/// A degree is measured if the data determine this fraction of its coefficients.
-const MEASURED: f64 = 0.7;
 
 /// Solves for the maps of all channels together.
 ///
@@ -150,8 +144,7 @@ pub fn solve_jointly(
     }
     let noise_factors: Vec<f64> = singles.iter().map(|single| single.power.noise_factor).collect();
     let scale = singles.iter().map(SingleChannel::scale).collect();
-    let initial =
-        Prior::new(all_hz.clone(), scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
+    let initial = Prior::new(all_hz, scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let scaled = scaled_blocks(&initial, &blocks, &noise_factors);
     let watch = watch.named("all channels").with_priority(true);
     let rights: Vec<Vec<f64>> = singles.iter().map(|single| single.right.clone()).collect();
@@ -171,13 +164,11 @@ pub fn solve_jointly(
             own.or_else(|| channels.iter().find(|channel| channel.sums.setup().l_max == view.l_max));
         similar.map_or(1, |channel| channel.nside)
     };
-    let amplitudes = relative_amplitudes(&amplitudes(&all_hz, &singles));
     let mut maps = Vec::new();
     for (index, view) in views.iter().enumerate() {
         let mut map = posterior.map(view, nside_of(view))?;
         if index < prior.channels() {
-            let agreement = posterior.agreement(index, &singles[index], view);
-            map.agreement = Some(Agreement { amplitude: amplitudes[index], ..agreement });
+            map.agreement = Some(posterior.agreement(index, &singles[index], view));
         }
         maps.push(map);
     }
@@ -186,26 +177,6 @@ pub fn solve_jointly(
     maps.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     maps.dedup_by(|a, b| a.frequency_hz == b.frequency_hz);
     Ok(JointSolution { likeness, maps, spectra, convergence: posterior.convergence })
-}
-
-/// Frequency (Hz) and amplitude (K sr^(1/2)) of each channel's map, over the degrees that all channels measure. What the map lacks there is
-/// added by its expected power, so that a channel that determines less is not fainter.
-fn amplitudes(frequencies_hz: &[f64], singles: &[SingleChannel]) -> Vec<(f64, f64)> {
-    let l_max = singles.iter().map(|single| single.power.power_k2.len() - 1).min().unwrap_or(0);
-    let is_measured = |l: usize| {
-        let determined = |single: &SingleChannel| single.power.decided[l] > MEASURED * (2 * l + 1) as f64;
-        l >= FREE && singles.iter().all(determined)
-    };
-    let measured: Vec<bool> = (0..=l_max).map(is_measured).collect();
-    let power = |single: &SingleChannel| -> f64 {
-        let is_used = |l: usize| measured.get(l) == Some(&true);
-        let coefficients = degrees(single.power.power_k2.len() - 1).zip(&single.solution);
-        let seen: f64 = coefficients.filter(|(l, _)| is_used(*l)).map(|(_, x)| x * x).sum();
-        let missing =
-            |l: usize| ((2 * l + 1) as f64 - single.power.decided[l]).max(0.0) * single.power.power_k2[l];
-        seen + (0..=l_max).filter(|l| is_used(*l)).map(missing).sum::<f64>()
-    };
-    frequencies_hz.iter().zip(singles).map(|(hz, single)| (*hz, power(single).sqrt())).collect()
 }
 
 impl SingleChannel {
@@ -434,7 +405,6 @@ impl<'a> Posterior<'a> {
             chi_square_alone: before / numbers,
             chi_square: after / numbers,
             strain: (after - before) / (factor * decided.max(1.0)),
-            amplitude: None,
         }
     }
 
