@@ -124,7 +124,8 @@ pub(super) struct ReplayArgs {
     #[arg(long, value_name = "LIST", value_parser = channel_list)]
     channels: Option<ChannelList>,
     /// Map the channels in groups and read the files once per group: as many channels at a time as memory allows (auto), or this
-    /// many. The result is identical to mapping all channels together. To resume after an interruption, repeat the command.
+    /// many. Maps and ledger are identical to those of mapping all channels together. To
+    /// resume after an interruption, repeat the command.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["live", "pace", "state"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]
     groups: Option<GroupSize>,

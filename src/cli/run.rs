@@ -37,7 +37,7 @@ pub(super) struct RunArgs {
     /// Print the summary as one JSON object instead of tables.
     #[arg(long)]
     json: bool,
-    /// Simulate and map the channels in groups: as many at a time as memory allows (auto), or this many. The products are identical to
+    /// Simulate and map the channels in groups: as many at a time as memory allows (auto), or this many. The maps are identical to
     /// those of all channels together. To resume after an interruption, repeat the command.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with_all = ["mpi", "events"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]

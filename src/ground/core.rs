@@ -197,7 +197,7 @@ impl Ground {
             self.close_pass(which);
         }
         if let Some(gate) = &mut self.gate
-            && !gate.note(&block)
+            && !gate.register(&block)
             && is_new
         {
             gate.count_late(&block);
@@ -207,10 +207,10 @@ impl Ground {
     /// Registers packets that were held before the instrument was known, or in an earlier session.
     fn note_all_held(&mut self) {
         let Self { collector, gate: Some(gate), .. } = self else { return };
-        if !gate.must_note_held || collector.instrument().is_none() {
+        if !gate.must_register_held || collector.instrument().is_none() {
             return;
         }
-        gate.must_note_held = false;
+        gate.must_register_held = false;
         let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
         held.iter()
             .filter(|header| header.kind == PacketKind::Visibilities)

@@ -47,15 +47,15 @@ pub(super) struct PassGate {
     /// Midpoints of the first and the last integration, by [`NEWEST`] and [`LATE`].
     open: [Option<[f64; 2]>; 2],
     observer: Option<PassObserver>,
-    /// Whether all held visibilities have to be passed to [`PassGate::note`] first.
-    pub(super) must_note_held: bool,
+    /// Whether all held visibilities have to be passed to [`PassGate::register`] first.
+    pub(super) must_register_held: bool,
 }
 
 impl PassGate {
     pub(super) fn new(solver: PassSolver) -> Self {
         let gap_s = solver.config().pass_gap_s;
         let gains = SolvedGains::new(gap_s);
-        Self { solver, gains, gap_s, open: [None; 2], observer: None, must_note_held: true }
+        Self { solver, gains, gap_s, open: [None; 2], observer: None, must_register_held: true }
     }
 
     /// The table of solved gains, which clones share.
@@ -68,7 +68,7 @@ impl PassGate {
     }
 
     pub(super) fn describe(&mut self, instrument: &Instrument) -> Result<(), CalibrationError> {
-        self.must_note_held = true;
+        self.must_register_held = true;
         check_frequencies(&self.solver.config().model_files, &instrument.frequencies_hz())?;
         self.gains.describe(instrument);
         self.solver.describe(instrument, MODEL_FILES_KEY)
@@ -108,7 +108,7 @@ impl PassGate {
         })
     }
 
-    /// The open pass that this block of another pass ends.
+    /// Index of the open pass that ends because this block belongs to another pass.
     pub(super) fn ended_by(&self, block: &VisibilityBlock) -> Option<usize> {
         let block_span_s = span_s(block)?;
         let [_, until_s] = self.open[NEWEST]?;
@@ -127,7 +127,7 @@ impl PassGate {
     }
 
     /// Registers a held block, and returns whether it is in an open pass. The pass that it ends must have been closed before.
-    pub(super) fn note(&mut self, block: &VisibilityBlock) -> bool {
+    pub(super) fn register(&mut self, block: &VisibilityBlock) -> bool {
         let Some(block_span_s) = span_s(block) else { return false };
         let distance_s = self.gains.distance_to_pass_s(block_span_s[0]);
         let index = if distance_s == Some(0.0) {

@@ -50,8 +50,8 @@ pub struct Integrator {
 pub struct ChannelModel {
     /// Preferred number of visibilities per call.
     pub batch: usize,
-    /// The model; `None` for a channel that another process or group simulates. Batches count all channels, so that a
-    /// channel has the same bits whichever others are simulated with it.
+    /// The model; `None` for a channel that another process or group simulates. Batches count all channels, so that the
+    /// results of a channel are bit-identical whichever others are simulated with it.
     pub model: Option<Box<dyn VisibilityModel>>,
 }
 
@@ -384,7 +384,7 @@ impl Integrator {
                     }
                 }
                 let samples = noise_model.samples(width_hz, dt_s);
-                // The last integration may be shorter than one sample, which has no power.
+                // The last integration may be too short for an independent sample: no power is estimated for it.
                 if samples < 1.0 {
                     continue;
                 }

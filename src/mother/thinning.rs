@@ -3,7 +3,7 @@
 /// Selection of the windows that are observed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WindowThinning {
-    /// Every n-th window. Aliases with any period of which n windows are nearly a multiple.
+    /// Every n-th window. Aliases with any period that nearly divides the duration of n windows.
     EveryNth(u64),
     /// One window of each block of n, at a pseudo-random position derived from the block's number, so that it aliases
     /// with no period.
@@ -41,7 +41,7 @@ fn hash_below(number: u64, bound: u64) -> u64 {
 }
 
 /// Strides of windows and of integrations that together keep one visibility in `thin`. Many windows with few
-/// integrations each cover the periods better than few complete windows.
+/// integrations each cover the orbital, monthly and precession periods better than few complete windows.
 #[must_use]
 pub fn strides(thin: u64) -> (u64, u64) {
     let windows = thin.max(1).isqrt();

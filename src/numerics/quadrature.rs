@@ -127,7 +127,7 @@ fn legendre(n: usize, x: f64) -> (f64, f64) {
     (value, n as f64 * (before - x * value) / (1.0 - x * x))
 }
 
-/// QuadratureRules of increasing size, each at most a sixteenth or 16 points larger than the one before.
+/// Rules of increasing size, each at most a sixteenth or 16 points larger than the one before.
 #[derive(Clone, Debug)]
 pub(crate) struct QuadratureRules(Vec<GaussLegendre>);
 

@@ -1,6 +1,6 @@
 //! Chooses epsilon by four rules, from runs that differ only in epsilon.
 //!
-//! Let A be the normal matrix, `H = A (A + R)^-1`, n the number of real data, and `rho^2 = |V - B T|^2` in units of their noise:
+//! epsilon scales the regularisation R. Let A be the normal matrix, `H = A (A + R)^-1`, n the number of real-valued data, and `rho^2 = |V - B T|^2` in units of their noise:
 //!
 //! - crossing: thermal-noise variance equals regularisation bias, `Tr Sigma_n = T^2 Tr Sigma_s` (the paper, Fig. 15);
 //! - generalised cross-validation: the minimum of `n rho^2 / (n - Tr H)^2` (Golub, Heath & Wahba 1979, Technometrics 21, 215). Takes
@@ -68,7 +68,7 @@ pub struct EpsilonChoices {
     pub run_label: String,
     /// Frequency of the channel, Hz.
     pub frequency_hz: f64,
-    /// Number of real data, n.
+    /// Number of real-valued data, n.
     #[serde(rename = "numbers")]
     pub real_data: u64,
     /// `V'N^-1V / n`, which is 1 plus the square of the signal-to-noise ratio.
@@ -181,8 +181,8 @@ fn choose_minimum(
         };
     };
     let bound = scores.iter().map(|(_, value, error)| value + error).fold(f64::INFINITY, f64::min);
-    let reached = scores.iter().filter(|(_, value, error)| value - error <= bound).map(|s| s.0);
-    let range = reached.fold([f64::INFINITY, 0.0], |[low, high], e| [e.min(low), e.max(high)]);
+    let not_excluded = scores.iter().filter(|(_, value, error)| value - error <= bound).map(|s| s.0);
+    let range = not_excluded.fold([f64::INFINITY, 0.0], |[low, high], e| [e.min(low), e.max(high)]);
     let is_all = range[0] <= scores[0].0 && range[1] >= scores[scores.len() - 1].0;
     if is_all || (is_positive && values[at] <= 0.0) {
         let note = "the error bars exclude none of the computed epsilons: the signal-to-noise ratio is too high for the precision of the sums";

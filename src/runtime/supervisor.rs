@@ -20,7 +20,7 @@ struct FirstFailure {
 }
 
 impl FirstFailure {
-    /// Records an error, unless it is not the first, and halts the run.
+    /// Records the first error (later ones are ignored) and halts the run.
     fn record(&self, error: RuntimeError) {
         self.first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         self.halt.fail();
@@ -39,10 +39,10 @@ struct WorkerEnd {
 
 const CANCEL_POLL: Duration = Duration::from_millis(50);
 
-/// Time that stages have to end after a cancelled run is cut short, before they are abandoned.
+/// Time allowed for stages to end after a cancelled run is cut short, before they are abandoned.
 const ABANDON_AFTER: Duration = Duration::from_millis(300);
 
-/// Fraction of the grace period after which the input of the kept stages is cut off. The rest is for these and later stages.
+/// Fraction of the grace period after which the input of the stages that must finish is cut off. The rest is for these and later stages.
 const INPUT_FRACTION: f64 = 0.3;
 
 /// A thread that was started, and its timings after its end.

@@ -323,7 +323,7 @@ async fn readyz(State(page): State<PageState>) -> Response {
     match page.console.phase() {
         Phase::Running if listening.is_some_and(is_unwritten) => refusal(
             StatusCode::SERVICE_UNAVAILABLE,
-            "the raw archive cannot be written: no data are accepted",
+            "the raw archive cannot be written: no data are acknowledged",
         ),
         Phase::Running => answer("text/plain; charset=utf-8", "running\n"),
         phase => refusal(StatusCode::SERVICE_UNAVAILABLE, phase.name()),

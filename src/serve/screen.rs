@@ -204,12 +204,14 @@ impl Screen {
         let ledger = &self.status["ledger"];
         let phase = as_text(&self.status["phase"]);
         let is_over = phase == "ended" || phase == "failed";
-        // Null until the end of the run.
-        let unaccounted = ledger["unaccounted"].as_f64().unwrap_or(0.0);
-        let (balance, style) = match (is_over, unaccounted == 0.0) {
-            (true, true) => ("balanced".to_owned(), GOOD),
-            (true, false) => (format!("imbalance: {} unaccounted", group_digits(unaccounted)), BAD),
-            (false, _) => ("not final while running".to_owned(), QUIET),
+        // Null until the end of the run, and in one that failed.
+        let (balance, style) = match ledger["unaccounted"].as_f64() {
+            Some(0.0) if is_over => ("balanced".to_owned(), GOOD),
+            Some(unaccounted) if is_over => {
+                (format!("imbalance: {} unaccounted", group_digits(unaccounted)), BAD)
+            }
+            None if is_over => ("balance unknown: the run failed".to_owned(), QUIET),
+            _ => ("not final while running".to_owned(), QUIET),
         };
         let entry = |name: String, value: &Value| {
             Line::from(format!("{:>digits$}  {name}", format_within(as_number(value), digits)))
@@ -478,6 +480,12 @@ mod tests {
         let mut disconnected = running();
         disconnected.disconnected_because = Some("refused".into());
         assert!(drawn(&disconnected, 120, 30).contains("not connected (refused); showing the last state"));
+        let mut failed = running();
+        failed.status["phase"] = json!("failed");
+        failed.status["ledger"]["unaccounted"] = json!(null);
+        let text = drawn(&failed, 100, 46);
+        assert!(text.contains("balance unknown: the run failed") && !text.contains("balanced"), "{text}");
+
         let mut unbalanced = running();
         unbalanced.status["phase"] = json!("ended");
         unbalanced.status["ledger"]["unaccounted"] = json!(17);

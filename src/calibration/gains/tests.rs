@@ -81,7 +81,7 @@ proptest! {
         let report = gains.apply(&mut measured).unwrap();
         prop_assert_eq!(report, CalibrationReport { kept: truth.len(), unusable_gain: 0 });
         for k in 0..truth.len() {
-            // One multiplication and constant_gains division of complex numbers: some units in the last place.
+            // One multiplication and one division of complex numbers: some units in the last place.
             let (found, expected) = (measured.value_k_sr[k], truth.value_k_sr[k]);
             prop_assert!((found - expected).norm() < 1e-14 * expected.norm());
             prop_assert!((measured.weight[k] / truth.weight[k] - 1.0).abs() < 1e-14);

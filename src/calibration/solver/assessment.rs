@@ -13,9 +13,9 @@ use super::stability::Excess;
 /// the phase error of a gain exceeds the Cramer-Rao bound.
 const COVERAGE_SIGMAS: f64 = 4.0;
 
-/// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too. It keeps
-/// fewer than one error in ten thousand beyond [`COVERAGE_SIGMAS`] of them (Gaussian errors exceed 4 deviations 0.6 times in
-/// ten thousand, 4.4 deviations 0.1 times).
+/// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too.
+/// With it fewer than 1e-4 of the errors exceed [`COVERAGE_SIGMAS`] stated deviations: Gaussian errors exceed 4 deviations with
+/// a probability of 0.6e-4, 4.4 deviations with 0.1e-4.
 pub(super) const SIGMA_MARGIN: f64 = 1.1;
 
 /// Signal-to-noise ratio at which a daughter counts as detected in several channels together, none of which suffices
@@ -32,11 +32,11 @@ pub(super) struct GainAssessment<'a> {
 }
 
 /// Enlarges a standard deviation (rad) so that it covers the non-Gaussian phase error of a weak gain.
-pub(super) fn phase_safe_sigma(sigma: f64) -> f64 {
+pub(super) fn sigma_with_coverage(sigma: f64) -> f64 {
     (SIGMA_MARGIN * sigma).max((COVERAGE_SIGMAS * sigma).min(1.0).asin() / COVERAGE_SIGMAS)
 }
 
-/// The standard deviation that [`phase_safe_sigma`] enlarges to this one; the largest, if there are several.
+/// The standard deviation that [`sigma_with_coverage`] enlarges to this one; the largest, if there are several.
 pub(super) fn bare_sigma(safe: f64) -> f64 {
     let (bare, angle) = (safe / SIGMA_MARGIN, COVERAGE_SIGMAS * safe);
     if angle < FRAC_PI_2 { bare.min(angle.sin() / COVERAGE_SIGMAS) } else { bare }
@@ -77,21 +77,21 @@ impl GainAssessment<'_> {
     /// Variance of the log amplitude common to all daughters of a channel: the flux scale of a model is assumed as
     /// uncertain as its shape. The factor is 1/4 as an amplitude is the square root of a visibility's.
     fn common_amplitude_variance(&self, c: usize) -> f64 {
-        let n = self.fitted.layout.satellites;
+        let satellites = self.fitted.layout.satellites;
         if self.config.amplitude_scale == AmplitudeScale::UnitMean {
             return 0.0;
         }
-        let mut parts = self.unexplained.of_gains[c * n..(c + 1) * n].to_vec();
-        parts.sort_unstable_by(f64::total_cmp);
-        // All pairs together show what noise hides in those of most daughters.
-        0.25 * parts.get(n / 2).copied().unwrap_or(0.0).max(self.unexplained.of_channels[c])
+        let mut fractions = self.unexplained.by_gain[c * satellites..(c + 1) * satellites].to_vec();
+        fractions.sort_unstable_by(f64::total_cmp);
+        // Errors below the noise of single daughters may be significant in the sum over all pairs.
+        0.25 * fractions.get(satellites / 2).copied().unwrap_or(0.0).max(self.unexplained.by_channel[c])
     }
 
-    /// Variance of a gain's logarithm due to errors of the model: those that are seen to last for the interval; if the daughter's
-    /// residuals show any, as much of them as noise may hide.
+    /// Variance of a gain's logarithm due to errors of the model: the persistent error that was detected; if the daughter's residuals
+    /// show unexplained power, also the part below the noise, limited by that power.
     fn model_variance(&self, k: usize) -> f64 {
-        let Excess { model, model_unseen, model_whole, .. } = self.excess[k];
-        model.max(model_unseen.min(self.unexplained.of_gains[k] * model_whole))
+        let Excess { model, model_below_noise, model_full_power, .. } = self.excess[k];
+        model.max(model_below_noise.min(self.unexplained.by_gain[k] * model_full_power))
     }
 
     fn daughter_estimate(&self, n: usize) -> DaughterEstimate {
@@ -150,7 +150,7 @@ impl GainAssessment<'_> {
         let scatter = [excess.scatter[0], excess.scatter[1] + reference_scatter];
         let own_model = self.model_variance(k);
         let model = [own_model + self.common_amplitude_variance(c), relative * (own_model + reference_model)];
-        let noise = noise.map(phase_safe_sigma);
+        let noise = noise.map(sigma_with_coverage);
         let total = |axis: usize| (noise[axis].powi(2) + scatter[axis] + model[axis]).sqrt();
         let [visibilities, outliers] = self.counts.by_gain[k];
         GainEstimate {
@@ -160,7 +160,7 @@ impl GainAssessment<'_> {
             phase_deg: gain.arg().to_degrees(),
             phase_sigma_deg: if is_reference { 0.0 } else { total(1).to_degrees() },
             phase_scatter_deg: excess.scatter[1].sqrt().to_degrees(),
-            unexplained: self.unexplained.of_gains[k],
+            unexplained: self.unexplained.by_gain[k],
             visibilities,
             outliers,
             data_s: self.counts.data_s[k],
@@ -192,7 +192,7 @@ impl GainAssessment<'_> {
             _ if noise * noise > phase_variance_max => GainState::Uncertain,
             _ if noise * noise + scatter > phase_variance_max => GainState::Unstable,
             _ if noise * noise + scatter + model > phase_variance_max => GainState::PoorFit,
-            _ if self.unexplained.of_gains[k] > config.unexplained_max => GainState::PoorFit,
+            _ if self.unexplained.by_gain[k] > config.unexplained_max => GainState::PoorFit,
             _ => GainState::Good,
         }
     }
@@ -222,7 +222,7 @@ mod tests {
         // In unit noise the phase of a vector of length a is beyond an angle p with a probability of at most erfc(a
         // sin p / sqrt 2), the Gaussian one of four deviations if a sin p is 4.
         for a in [5.0_f64, 7.0, 10.0, 30.0] {
-            let p = 4.0 * phase_safe_sigma(a.recip());
+            let p = 4.0 * sigma_with_coverage(a.recip());
             assert!(a * p.sin() >= 4.0 - 1e-9, "{a}: {p}");
             // It is at most a fifth above the bound.
             assert!(p * a / 4.0 < 1.2, "{a}: {p}");

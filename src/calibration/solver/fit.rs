@@ -20,9 +20,9 @@ const SIGMAS_OF_ALL: f64 = 2.0;
 /// Unexplained fractions of the signal.
 pub(super) struct Unexplained {
     /// By channel, then daughter.
-    pub(super) of_gains: Vec<f64>,
+    pub(super) by_gain: Vec<f64>,
     /// Of all pairs of a channel, without those attributed to a daughter above the maximum.
-    pub(super) of_channels: Vec<f64>,
+    pub(super) by_channel: Vec<f64>,
 }
 
 /// Residual signal of a pair in a channel, and the signal, in units of the variance of signal and noise together: so
@@ -90,7 +90,7 @@ pub(super) fn unexplained(
     let RobustFit { layout, newton, is_pair_used, .. } = fitted;
     let n = layout.satellites;
     let mut fractions = vec![0.0; n * layout.channels()];
-    let mut of_channels = vec![0.0; layout.channels()];
+    let mut by_channel = vec![0.0; layout.channels()];
     for (channel, fractions) in fractions.chunks_mut(n.max(1)).enumerate() {
         let mut pairs: Vec<([usize; 2], Residual)> = blocks
             .iter()
@@ -118,12 +118,12 @@ pub(super) fn unexplained(
             if worst.1 <= fraction_max {
                 open.into_iter().for_each(|(k, fraction)| fractions[k] = fraction);
                 let all = pairs.iter().fold(Residual::default(), |sum, (_, left)| sum.plus(*left));
-                of_channels[channel] = all.fraction(SIGMAS_OF_ALL);
+                by_channel[channel] = all.fraction(SIGMAS_OF_ALL);
                 break;
             }
             fractions[worst.0] = worst.1;
             pairs.retain(|(pair, _)| !pair.contains(&worst.0));
         }
     }
-    Unexplained { of_gains: fractions, of_channels }
+    Unexplained { by_gain: fractions, by_channel }
 }

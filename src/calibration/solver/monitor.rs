@@ -19,7 +19,7 @@ use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
 use super::solution::PassSolution;
 
-/// Threshold of a step, in standard deviations; these are at least the usual scatter from pass to pass.
+/// Threshold of a step, in standard deviations, which are raised to at least the scatter from pass to pass (see `inflate_sigmas`).
 const JUMP_SIGMAS: f64 = 6.0;
 /// Smallest change of a log amplitude, or of a phase (rad), that is reported.
 const CHANGE_MIN: f64 = 0.01;
@@ -53,12 +53,12 @@ struct ChannelChange {
 #[must_use]
 pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
     let mut changes = changes_between(solutions);
-    widen(&mut changes, |change| &mut change.phases);
-    widen(&mut changes, |change| &mut change.amplitudes);
+    inflate_sigmas(&mut changes, |change| &mut change.phases);
+    inflate_sigmas(&mut changes, |change| &mut change.amplitudes);
     for (index, solution) in solutions.iter().enumerate().skip(1) {
-        let mut of_solution: Vec<&mut Change> =
+        let mut solution_changes: Vec<&mut Change> =
             changes.iter_mut().filter(|change| change.solution == index).collect();
-        attribute_to_reference(&mut of_solution, solution.reference as usize - 1);
+        attribute_to_reference(&mut solution_changes, solution.reference as usize - 1);
     }
     let mut events = Vec::new();
     for (index, solution) in solutions.iter().enumerate() {
@@ -110,7 +110,7 @@ fn changes_between(solutions: &[PassSolution]) -> Vec<Change> {
 }
 
 /// Raises standard deviations to the usual scatter of the daughter and channel from pass to pass.
-fn widen(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut Vec<ChannelChange>) {
+fn inflate_sigmas(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut Vec<ChannelChange>) {
     let mut sizes: std::collections::BTreeMap<(usize, usize), Vec<f64>> = Default::default();
     for change in &mut *changes {
         let daughter = change.daughter;
@@ -236,7 +236,7 @@ const DRIFT_FRACTION: f64 = 0.92;
 /// Smallest unexplained fraction of the signal that is reported.
 const UNEXPLAINED_MIN: f64 = 0.01;
 
-/// Adds events that follow from the state of a solution's gains: when a state begins, and drifts.
+/// Adds events that follow from the state of a solution's gains: onsets of states (dead, wrong model), and drifts.
 fn add_state_events(
     before: Option<&PassSolution>,
     solution: &PassSolution,
@@ -255,8 +255,8 @@ fn add_state_events(
         if !dead.is_empty() {
             events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
         }
-        // A drift is reported only if it dominates the variance of the phase: noise alone can contribute a fraction
-        // of 0.9.
+        // A drift is reported only if it dominates the variance of the phase: with noise alone the estimated scatter can reach 0.9
+        // of it.
         let is_drifting = |gain: &GainEstimate| {
             let sigma_deg = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
             gain.phase_scatter_deg > DRIFT_MIN_DEG

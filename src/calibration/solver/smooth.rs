@@ -8,7 +8,7 @@
 
 use std::f64::consts::{PI, TAU};
 
-use super::assessment::{SIGMA_MARGIN, bare_sigma, phase_safe_sigma};
+use super::assessment::{SIGMA_MARGIN, bare_sigma, sigma_with_coverage};
 use super::config::{AmplitudeScale, SolverConfig};
 use super::estimates::{GainEstimate, GainState};
 use super::solution::PassSolution;
@@ -82,7 +82,7 @@ fn measured(gain: &GainEstimate, part: usize, prior: f64) -> Option<Measured> {
     is_measured.then(|| Measured {
         time_s: 0.5 * (gain.data_s[0] + gain.data_s[1]),
         value: value * known / information,
-        variance: phase_safe_sigma(information.sqrt().recip()).powi(2),
+        variance: sigma_with_coverage(information.sqrt().recip()).powi(2),
     })
 }
 
@@ -282,7 +282,7 @@ mod tests {
                 for (axis, s) in prior.into_iter().enumerate() {
                     let v = sigma * sigma;
                     found[axis] = (truth[axis] + sigma * normal()) * s / (s + v);
-                    noise_sigma[axis] = phase_safe_sigma((1.0 / v + 1.0 / s).recip().sqrt());
+                    noise_sigma[axis] = sigma_with_coverage((1.0 / v + 1.0 / s).recip().sqrt());
                 }
                 vec![good(300.0 * f64::from(k), found, noise_sigma)]
             };
@@ -321,7 +321,7 @@ mod tests {
                 truths.push(truth);
                 let mut noisy = |sigma: [f64; 2], truth: [f64; 2]| {
                     let found = [0, 1].map(|axis| truth[axis] + sigma[axis] * normal());
-                    good(300.0 * k as f64, found, sigma.map(phase_safe_sigma))
+                    good(300.0 * k as f64, found, sigma.map(sigma_with_coverage))
                 };
                 let mut found = vec![noisy([sigma, 0.0], [0.0; 2]), noisy([sigma; 2], truth)];
                 if k == dead {

@@ -50,9 +50,9 @@ pub(super) struct Excess {
     /// Variance due to errors of the model that are seen to last, of either.
     pub(super) model: f64,
     /// The same by errors that noise may hide.
-    pub(super) model_unseen: f64,
+    pub(super) model_below_noise: f64,
     /// The same by a model whose errors have the power of the signal.
-    pub(super) model_whole: f64,
+    pub(super) model_full_power: f64,
 }
 
 /// Fraction of outliers in a part of the interval above which something other than a gain is disturbed.
@@ -191,8 +191,9 @@ impl Residuals {
                 let share = if sum > 0.0 { square / (sum * sum) } else { 0.0 };
                 let excess = &mut excess[channel * self.satellites + daughter];
                 excess.model = 0.5 * most * share;
-                excess.model_unseen = 0.5 * self.model_error_fractions(channel, Some(daughter))[1] * share;
-                excess.model_whole = 0.5 * share;
+                excess.model_below_noise =
+                    0.5 * self.model_error_fractions(channel, Some(daughter))[1] * share;
+                excess.model_full_power = 0.5 * share;
             }
         }
         (excess, parts)

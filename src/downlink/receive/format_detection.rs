@@ -26,7 +26,10 @@ const SIGNATURES: [(&[u8], &str); 17] = [
     (b"\x93NUMPY", "a numpy array"),
     (b"\x89PNG", "a PNG picture"),
     (b"%PDF", "a PDF document"),
-    (b"LNRSTA", "a checkpoint of a lunarray state: give its folder with --state"),
+    (
+        b"LNRSTA",
+        "a checkpoint of a lunarray state: give the folder of the state to a command that takes states",
+    ),
     (b"\xd4\xc3\xb2\xa1", "a network capture (pcap)"),
     (b"\x0a\x0d\x0d\x0a", "a network capture (pcapng)"),
 ];
@@ -156,7 +159,7 @@ fn identify_text(head: &[u8]) -> Option<String> {
         _ if text.starts_with('<') => format!("an XML document (<{}>)", root_element(text)),
         _ if text.starts_with("CCSDS_") => {
             let name = text.split(|c: char| c == '=' || c.is_whitespace()).next().unwrap_or_default();
-            format!("a CCSDS message ({name}): orbit files (OEM) go into the key array.oem")
+            format!("a CCSDS message ({name}): orbit files (OEM) are given with the key array.oem")
         }
         _ if text.starts_with(['{', '[']) => "JSON or TOML".to_owned(),
         _ => "a text file".to_owned(),

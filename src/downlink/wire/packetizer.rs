@@ -18,7 +18,7 @@ const REPEATED_SEGMENTS_MAX: usize = 8;
 
 /// Encodes ground frames as packets.
 ///
-/// A visibility block becomes packets that can part_bytes be decoded alone, so that a lost one costs only its own
+/// A visibility block becomes packets that can each be decoded alone, so that a lost one costs only its own
 /// visibilities. Other payloads are segmented if they exceed a packet. The instrument description and the latest
 /// ephemeris segments are repeated at intervals.
 #[derive(Debug)]

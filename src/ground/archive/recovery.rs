@@ -45,8 +45,8 @@ impl Ground {
 
     /// Stores received packets in the raw archive from now on; returns `None` if there is no state.
     ///
-    /// The raw archive is in the folder `elsewhere` if that is given. It has at most `bytes_max` bytes, except packets that no
-    /// checkpoint has.
+    /// The raw archive is in the folder `elsewhere` if that is given. It has at most `bytes_max` bytes, except packets that are
+    /// not in all checkpoints.
     ///
     /// # Errors
     /// A folder that cannot be used; a state whose raw archive is in another folder.

@@ -114,7 +114,7 @@ impl GriddedVisibility {
             || holds(self.data_first[0], &grids.data, grids.data_points())
     }
 
-    /// The weight times the products of the u kernel at `node` (from the first node of the visibility) and at each node from there up.
+    /// Weight times `kernel_u[node]` times `kernel_u[k]` for each k from `node` on. Nodes are counted from the visibility's first node.
     fn node_products(&self, node: usize) -> [f32; NODES] {
         let mut products = [0.0; NODES];
         for (product, other) in products.iter_mut().zip(&self.u[node..NODES]) {
@@ -194,7 +194,7 @@ pub(super) struct GriddedNoise {
 }
 
 impl GriddedNoise {
-    /// Computes kernels and terms from pairs of noise realisations in (K sr)^-1.
+    /// Computes kernels and terms from pairs of noise realisations times the square root of the weight, (K sr)^-1.
     pub(super) fn new(
         grids: &Grids,
         quanta: Quanta,
@@ -334,7 +334,7 @@ fn kernel_bounds(kernel: &[f32; LANES]) -> [u16; LANES] {
     kernel.map(|value| (value.abs() * 1.0625 * (1 << BOUND_FRACTION_BITS) as f32) as u16 + 1)
 }
 
-/// For each alpha an upper bound of what a group adds to one sum, in units of the largest shift, including rounding of terms.
+/// For each alpha an upper bound of what a group adds to one sum, in units of 2^(largest shift) quanta, including rounding of terms.
 ///
 /// Nothing overflows 32 bits: a product is at most 2^21 x 2^8 x 1.125, and the sum at most 2^22 per term of the group.
 #[inline(always)]
@@ -368,7 +368,7 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
         let mut alpha = first;
         let bounds = bounds(terms);
         let shift = rows.shifts.iter().fold(0, |largest, shift| *shift.max(&largest));
-        for (lane, bound) in bounds.iter().enumerate().take(rows.kernel_width) {
+        for (kernel_index, bound) in bounds.iter().enumerate().take(rows.kernel_width) {
             let here = alpha;
             alpha = if alpha + 1 == points { 0 } else { alpha + 1 };
             if !rows.share.holds(here / ALPHAS) {
@@ -377,7 +377,7 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
             let Some(row) = rows.rows.get_mut(here) else { return };
             row.make_room(u64::from(*bound) << shift, rows.direction, K * rows.stride);
             for k in 0..rows.rows_used {
-                let multiples = multiples(simd, terms, lane, k);
+                let multiples = multiples(simd, terms, kernel_index, k);
                 let start = k * rows.stride + gamma;
                 match &mut row.integers {
                     Integers::Narrow(sums) => add_lanes(sums, start, &multiples, |sum, multiple| {
@@ -397,12 +397,19 @@ impl<const K: usize> WithSimd for SpreadRows<'_, K> {
 ///
 /// Uses explicit SIMD vectors, because the compiler would vectorise over visibilities and need gathers.
 #[inline(always)]
-fn multiples<S: Simd, const K: usize>(simd: S, terms: &[Term<'_, K>], lane: usize, k: usize) -> [u32; LANES] {
+fn multiples<S: Simd, const K: usize>(
+    simd: S,
+    terms: &[Term<'_, K>],
+    kernel_index: usize,
+    k: usize,
+) -> [u32; LANES] {
+    // Adding BIAS rounds a float to an integer in the low bits of its mantissa: the bit patterns are added, and the sum of the biases is
+    // taken off at the start.
     let mut multiples = [biases(terms.len()).wrapping_neg().cast_unsigned(); LANES];
     let (sums, _) = S::as_mut_simd_u32s(&mut multiples);
     let bias = simd.splat_f32s(BIAS);
     for term in terms {
-        let factor = simd.splat_f32s(term.values[k] * term.kernel_alpha[lane]);
+        let factor = simd.splat_f32s(term.values[k] * term.kernel_alpha[kernel_index]);
         for (sum, kernel_gamma) in sums.iter_mut().zip(S::as_simd_f32s(term.kernel_gamma).0) {
             let biased = simd.mul_add_f32s(factor, *kernel_gamma, bias);
             *sum = simd.add_u32s(*sum, simd.transmute_u32s_f32s(biased));

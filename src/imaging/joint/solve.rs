@@ -408,7 +408,7 @@ impl<'a> Posterior<'a> {
         }
     }
 
-    /// SpectrumFit at the resolution of the coarsest channel.
+    /// Spectra at the resolution of the coarsest channel.
     fn spectra(&self, views: &[View], nside: usize) -> Result<SpectralMaps, SolveError> {
         let l_max = views.iter().map(|view| view.l_max).min().unwrap_or(0);
         let views: Vec<View> = views.iter().map(|view| view.clone().truncated(l_max)).collect();

@@ -1,14 +1,16 @@
 //! Fringe patterns of satellite pairs in spherical harmonics: the whole-sky pattern minus that of the cap occulted by the Moon.
 //!
 //! With the pair's mean nadir as the pole, the occulted cap consists of complete rings, whose Fourier coefficients are Bessel
-//! functions. The exception is the zone between the class's limb and the pair's (see `limb_zone.rs`):
+//! functions. Pairs with nearly the same limb form a class, which shares its rings and tables. The exception is the zone between the limb
+//! of the class and that of the pair (see `limb_zone.rs`):
 //!
 //! ```text
 //! q_{l m} = sum_rings w lambda_{l m}(theta) 2 pi (-1)^m J_m(2 pi u cos(p) sin theta) exp(2 pi i u sin(p) cos theta)
 //!         + (-i)^m sum_j a_{j l m} c_{j m},
 //! ```
 //!
-//! with p the pitch of the baseline. The pattern is mirror-symmetric in the plane of the pair, so that
+//! with p the pitch of the baseline, w the quadrature weight of a ring, lambda the normalised Legendre functions, a their series in the
+//! limb zone, and c the Fourier coefficients of the zone's moments. The pattern is mirror-symmetric in the plane of the pair, so that
 //! `q_{l,-m} = q_{l m}`, and a quarter turn takes the pole to the normal of the plane (see `turns.rs`):
 //!
 //! ```text
@@ -56,7 +58,8 @@ pub(super) struct CapClass {
     rings: Vec<Ring>,
     /// Number of leading rings on which Legendre functions are not negligible, by m.
     rings_by_order: Vec<usize>,
-    /// By m, for l = m, m + 1, .. a row: the series in the limb zone, then the weighted functions on these rings.
+    /// For each m one row per l >= m: the series coefficients in the limb zone, then the weighted Legendre functions on the first
+    /// `rings_by_order[m]` rings.
     legendre: Vec<Vec<Value>>,
     response: AntennaResponse,
 }
@@ -89,7 +92,7 @@ impl CapClass {
         let limb_zone = LimbZone::new(setup, limb_rad, class.width_rad, class.u_max);
         let functions = Legendre::new(l_max, rings.iter().map(|ring| (ring.cos, ring.sin)));
         let angles = limb_zone.angles_rad();
-        let near = Legendre::new(l_max, angles.iter().map(|theta| (theta.cos(), theta.sin())));
+        let limb_zone_legendre = Legendre::new(l_max, angles.iter().map(|theta| (theta.cos(), theta.sin())));
         let ones = vec![1.0; angles.len()];
         let rings_by_order: Vec<usize> =
             (0..=l_max).map(|m| rings.partition_point(|ring| ring.order_max >= m)).collect();
@@ -98,7 +101,7 @@ impl CapClass {
             .map(|m| {
                 let (terms, count) = (limb_zone.terms, rings_by_order[m]);
                 let inner = functions.rows::<Value>(m, &weights[..count]);
-                let outer = near.rows::<f64>(m, &ones);
+                let outer = limb_zone_legendre.rows::<f64>(m, &ones);
                 let mut rows = vec![0.0; (l_max + 1 - m) * (terms + count)];
                 for (k, row) in rows.chunks_exact_mut(terms + count).enumerate() {
                     limb_zone.series(&outer[k * terms..(k + 1) * terms], &mut row[..terms]);
@@ -156,9 +159,9 @@ impl CapClass {
         let (mut horizontal, mut vertical) = ([0.0; LANES], [0.0; LANES]);
         let filled = nodes.iter().chain(std::iter::repeat(last)).take(LANES);
         for (k, node) in filled.enumerate() {
-            let wave = TAU * node.view.baseline_m / wavelength_m;
+            let two_pi_u = TAU * node.view.baseline_m / wavelength_m;
             let (sin, cos) = node.view.pitch_rad().sin_cos();
-            (horizontal[k], vertical[k]) = (wave * cos, wave * sin);
+            (horizontal[k], vertical[k]) = (two_pi_u * cos, two_pi_u * sin);
         }
         // The response of dipoles couples m to m - 2 and m + 2.
         let extra_orders = match self.response {
@@ -244,7 +247,7 @@ fn write_ring(
     out: &mut [Value],
     stride: usize,
 ) {
-    let quarter = 0.25 * ring.sin * ring.sin;
+    let quarter_sin2 = 0.25 * ring.sin * ring.sin;
     for m in 0..=ring.order_max {
         let sign = if m.is_multiple_of(2) { 1.0 } else { -1.0 };
         let out = &mut out[m * stride..m * stride + COMPLEX_LANES];
@@ -254,7 +257,7 @@ fn write_ring(
             if dipole {
                 // 1 - sin^2(theta) sin^2(psi); J_{-m} = (-1)^m J_m.
                 let j_minus_2 = if m == 1 { -orders[1][k] } else { orders[m.abs_diff(2)][k] };
-                value = (1.0 - 2.0 * quarter) * value - quarter * (orders[m + 2][k] + j_minus_2);
+                value = (1.0 - 2.0 * quarter_sin2) * value - quarter_sin2 * (orders[m + 2][k] + j_minus_2);
             }
             re[k] = (sign * value * phases[0][k]) as Value;
             im[k] = (sign * value * phases[1][k]) as Value;

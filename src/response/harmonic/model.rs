@@ -1,4 +1,4 @@
-//! Visibilities of a band-limited sky for any states of pairs on one orbit.
+//! Visibilities of a band-limited sky for pairs at any orbital position and baseline length on one circular orbit.
 
 use rustfft::{Fft, FftPlanner};
 use std::f64::consts::TAU;
@@ -15,16 +15,17 @@ use crate::numerics::chebyshev;
 use crate::numerics::fft_length;
 use crate::sky::harmonics::Alm;
 
-/// Nodes per wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1, so that a kernel of six nodes
+/// Nodes per wavelength of u: 2.25 times the Nyquist density of the band |n_y| <= 1 (n_y is the direction cosine along the baseline), so that a kernel of six nodes
 /// suffices.
 const NODES_PER_WAVELENGTH: f64 = 4.5;
-/// Number of alphas of the grid for which the sky is rotated together.
+/// Number of grid values of alpha, the longitude of the node, for which the sky is rotated together.
 pub(super) const ALPHA_BLOCK: usize = 64;
 /// Maximum number of blocks of alphas that are kept and that a batch uses.
 pub(super) const BLOCKS_KEPT: usize = 4;
+/// Number of Chebyshev terms of a series between nodes.
 pub(super) const TERMS: usize = 8;
 
-/// Factor by which the error in alpha may exceed the tolerance at the highest order m, which few coefficients have.
+/// Factor by which the interpolation error along alpha may exceed the tolerance at the highest order m, which few coefficients have.
 pub(super) const ALPHA_TOLERANCE: f64 = 3.0;
 
 /// Parameters of a model.
@@ -38,7 +39,7 @@ pub struct ModelSettings {
     pub u_max: f64,
     /// Ratio of bandwidth to frequency; each visibility is a mean over the channel. 0 for one frequency.
     pub fractional_bandwidth: f64,
-    /// Maximum error at the end of the band, relative to the rms visibility.
+    /// Maximum error at the band edge |n_y| = 1, relative to the rms visibility.
     pub tolerance: f64,
 }
 
@@ -161,7 +162,7 @@ impl HarmonicModel {
             count: (settings.u_max / step).ceil() as usize + 2 * margin + BLOCK_NODES,
         };
         let table = PatternTable::new(settings.geometry, l_max, grid);
-        // The fringe exp(-2 pi i u n_y) has |f| = |n_y| / density. The kernel's transform is divided out, and the
+        // The fringe exp(-2 pi i u n_y) has a spatial frequency of |n_y| / density cycles per node. The kernel's transform is divided out, and the
         // mean over the channel multiplies by a sinc.
         let patterns = FilteredPatterns::new(
             table,

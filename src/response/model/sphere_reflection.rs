@@ -203,7 +203,7 @@ mod tests {
         5.0 * REFLECTIVITY * pixel_area_sr(NSIDE) * 0.05 * 47_000.0_f64.sqrt()
     }
 
-    /// Error from pixels on the limb (30 K), values_per_pair counted or not at random.
+    /// Error from pixels on the limb (30 K), each counted or not at random.
     fn limb_error_k_sr() -> f64 {
         REFLECTIVITY * pixel_area_sr(NSIDE) * 30.0 * (3.07 * NSIDE as f64).sqrt()
     }

@@ -162,7 +162,7 @@ fn a_slow_sink_bounds_what_is_in_flight() {
     assert_eq!(alive.load(Ordering::SeqCst), 0);
     let alive_max = alive_max.load(Ordering::SeqCst);
     let bound = CAPACITIES.iter().sum::<usize>() + STAGES;
-    assert!(alive_max <= bound, "{alive_max} in flight, expected at alive_max {bound}");
+    assert!(alive_max <= bound, "{alive_max} in flight, expected at most {bound}");
     // The queues were full, as the source is faster.
     assert!(alive_max > CAPACITIES[1], "{alive_max}");
 }

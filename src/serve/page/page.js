@@ -229,7 +229,7 @@ function showLedger(ledger, phase) {
     return part;
   }));
   const isKnown = isOver && rest !== null;
-  const verdict = isKnown ? (rest === 0 ? ["good", "✔ balanced"] : ["bad", "✖ not balanced"]) : ["", isOver ? "not balanced: the run failed" : "not final while running"];
+  const verdict = isKnown ? (rest === 0 ? ["good", "✔ balanced"] : ["bad", "✖ not balanced"]) : ["", isOver ? "balance unknown: the run failed" : "not final while running"];
   $("verdict").className = `verdict ${verdict[0]}`; $("verdict").textContent = verdict[1];
   bar.className = `ledgerbar ${isKnown ? (rest === 0 ? "closed" : "open") : ""}`;
   bar.setAttribute("aria-label", parts.map(([, name, count]) => `${name} ${count}`).join(", "));
@@ -258,7 +258,7 @@ function showReception(status) {
 function showSaving(saving, listening, products) {
   const archive = listening?.archive, said = [];
   const say = (isBad, text) => said.push(make("span", isBad ? { class: "bad" } : {}, text));
-  if (archive?.unwritten) say(true, `▲ no data are accepted: the raw archive cannot be written: ${archive.unwritten}`);
+  if (archive?.unwritten) say(true, `▲ no data are acknowledged: the raw archive cannot be written: ${archive.unwritten}`);
   if (saving?.unsaved) say(true, `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}`);
   if (products?.unwritten) say(true, `▲ maps are not written: ${products.unwritten}`);
   if (saving && !saving.unsaved) {
