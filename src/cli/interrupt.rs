@@ -7,6 +7,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
 use super::output::{Completion, print_notes};
+use crate::files::remove_unfinished;
 use crate::runtime::Cancel;
 
 /// Signals that cancel a run.
@@ -18,6 +19,23 @@ const SIGNALS: [i32; 2] = [SIGINT, SIGTERM];
 
 /// Exit code of a command that a signal ended, minus the number of the signal; a convention of shells.
 const SHELL_BASE: i32 = 128;
+
+/// Whether an [`Interrupt`] handles signals.
+static ARMED: AtomicBool = AtomicBool::new(false);
+
+/// Makes signals remove the files that are being written before they end the process, in commands without an [`Interrupt`], and
+/// before that is armed. Without it, or if it fails, they end the process at once.
+pub(super) fn remove_files_on_signal() {
+    let ignored = ignored_signals();
+    let handled = SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0);
+    let Ok(mut signals) = signal_hook::iterator::Signals::new(handled) else { return };
+    std::thread::spawn(move || {
+        for signal in signals.forever().filter(|_| !ARMED.load(Ordering::Relaxed)) {
+            remove_unfinished();
+            let _ = signal_hook::low_level::emulate_default_handler(signal);
+        }
+    });
+}
 
 /// Cancels a run on the first signal.
 #[derive(Debug, Default)]
@@ -39,6 +57,7 @@ impl Interrupt {
     ///
     /// Everything happens in the signal handler, so that a blocked thread cannot delay it.
     fn arm(&self) -> std::io::Result<()> {
+        ARMED.store(true, Ordering::Relaxed);
         let ignored = ignored_signals();
         for signal in SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0) {
             // The order matters: at the first signal, the shutdown must find the flag unset.

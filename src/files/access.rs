@@ -83,6 +83,16 @@ pub(super) fn is_same(_: &Metadata, _: &Metadata) -> bool {
     true
 }
 
+/// Whether two paths are names of one place: the same name in the same folder, by whatever way.
+pub fn is_same_name(one: &Path, other: &Path) -> bool {
+    let place = |path: &Path| {
+        let folder = folder_of(path).unwrap_or(Path::new("."));
+        let folder = fs::canonicalize(folder).or_else(|_| std::path::absolute(folder)).ok()?;
+        Some(folder.join(path.file_name()?))
+    };
+    place(one).is_some_and(|found| place(other) == Some(found))
+}
+
 /// The folder in `path`; `None` for a bare file name.
 pub(super) fn folder_of(path: &Path) -> Option<&Path> {
     path.parent().filter(|folder| !folder.as_os_str().is_empty())

@@ -8,7 +8,9 @@ mod protected;
 #[cfg(test)]
 mod tests;
 
-pub use access::{disk_space, is_at, read_at, read_folder, read_text, write_at};
-pub use atomic::{AtomicFile, IfUnfinished, growing_file, nameless_file, write_atomically};
+pub use access::{disk_space, is_at, is_same_name, read_at, read_folder, read_text, write_at};
+pub use atomic::{
+    AtomicFile, IfUnfinished, growing_file, nameless_file, remove_unfinished, write_atomically,
+};
 pub use folder_lock::FolderLock;
 pub use protected::{ProtectedInputs, require_replaceable};
