@@ -328,6 +328,14 @@ fn all_errors_come_at_once() {
 }
 
 #[test]
+fn maps_are_read_of_regular_files() {
+    for file in ["/dev/zero", "/dev/null", "/tmp"] {
+        let told = complaint(&["compare", file, file]);
+        assert!(told.contains(file) && told.contains("not a regular file"), "{told}");
+    }
+}
+
+#[test]
 fn check_lists_problems_as_json() {
     for (args, count) in [
         (&["--set", "map.nside=7", "--set", "map.epsilon=2"][..], 2),

@@ -131,14 +131,22 @@ pub(super) fn read_frequency(path: &Path) -> Result<Option<f64>, FitsError> {
     read_headers(path, |header, _| frequency_hz(header, 1 + usize::from(is_explicit(header)?)))
 }
 
+/// Opens a file; gives its length, bytes. A pipe would be waited for, and a device has no length.
+fn open(path: &Path) -> Result<(File, u64), FitsProblem> {
+    let found = std::fs::metadata(path).map_err(FitsProblem::io("open"))?;
+    match found.is_file() {
+        true => Ok((File::open(path).map_err(FitsProblem::io("open"))?, found.len())),
+        false => Err(FitsProblem::NotAFile),
+    }
+}
+
 /// Applies `read` to the headers of a file's first map.
 fn read_headers<T>(
     path: &Path,
     read: impl FnOnce(&Header, &TableLayout) -> Result<T, FitsProblem>,
 ) -> Result<T, FitsError> {
     let from_file = || {
-        let file = File::open(path).map_err(FitsProblem::io("open"))?;
-        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        let (file, length) = open(path)?;
         let mut reader = BufReader::new(file);
         check_start(&mut reader, length)?;
         let (header, start) = find_table(&mut reader, length)?;
@@ -153,8 +161,7 @@ fn read_headers<T>(
 /// [`FitsError`] with the file and its problem.
 pub fn read_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
     let read = || {
-        let file = File::open(path).map_err(FitsProblem::io("open"))?;
-        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        let (file, length) = open(path)?;
         read_map_from(&mut BufReader::new(file), length, options)
     };
     read().map_err(|problem| FitsError::new(path, problem))
