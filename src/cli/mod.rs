@@ -210,6 +210,7 @@ fn is_system_error(error: &(dyn std::error::Error + 'static)) -> bool {
 /// SIGTERM is the regular end of a ground segment that listens or follows: 0.
 #[must_use]
 pub fn main() -> ExitCode {
+    #[cfg(unix)]
     interrupt::remove_files_on_signal();
     ExitCode::from(run_command(std::env::args_os()))
 }
