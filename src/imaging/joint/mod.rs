@@ -2,15 +2,20 @@
 //!
 //! The structure of the sky changes slowly with frequency. [`solve_jointly`] takes the sums of each channel, estimates the correlation
 //! between channels ([`Correlation`]), and solves for all channels together. It returns maps at every channel and at frequencies between
-//! them, and the spectral index of every pixel, each with errors. No visibility is read again.
+//! them, and the spectral index of every pixel, each with errors. Total powers of the daughters, if there are any, take part as rows beside the
+//! visibilities (`powers`). No visibility is read again.
 
+mod disc;
+mod powers;
 mod prior;
+mod rounds;
 mod solve;
 mod spectrum;
 mod sums;
 #[cfg(test)]
 mod tests;
 
+pub use powers::{PowerAgreement, PowerPriors, PowerSample};
 pub use prior::Correlation;
 pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
+use super::powers::{PowerAgreement, PowerPriors, PowerRows, PowerSample};
 use super::prior::{Correlation, FREE, Prior, View};
+use super::rounds::Equations;
 use super::spectrum::{SpectralMaps, SpectrumFit};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
 use crate::imaging::circle::{HarmonicSums, NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
@@ -39,6 +41,8 @@ pub struct JointChannel {
     pub nside: usize,
     /// Normal equations over harmonics.
     pub sums: Box<HarmonicSums>,
+    /// Total powers of its daughters, by daughter and time.
+    pub powers: Vec<PowerSample>,
 }
 
 /// Parameters of a joint solution.
@@ -50,6 +54,8 @@ pub struct JointRequest {
     pub samples: usize,
     /// Further frequencies between the channels at which maps are made, Hz.
     pub at_hz: Vec<f64>,
+    /// Priors of the total powers; `None` to leave them out.
+    pub powers: Option<PowerPriors>,
 }
 
 /// A map at one frequency.
@@ -65,6 +71,8 @@ pub struct JointMap {
     pub mean_sigma_k: f64,
     /// Agreement of the channel's data with the joint map; `None` between channels.
     pub agreement: Option<Agreement>,
+    /// The total powers in the fit of the channel; `None` if there are none.
+    pub powers: Option<PowerAgreement>,
 }
 
 /// Agreement of a channel's data with the joint map.
@@ -82,12 +90,12 @@ pub struct Agreement {
 /// A joint solution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointSolution {
-    /// Correlation between channels.
-    pub likeness: Correlation,
+    /// Correlation between channels; `None` for one alone.
+    pub likeness: Option<Correlation>,
     /// Maps at all frequencies, in increasing order.
     pub maps: Vec<JointMap>,
-    /// Spectral index and curvature of every pixel.
-    pub spectra: SpectralMaps,
+    /// Spectral index and curvature of every pixel; `None` for a channel alone.
+    pub spectra: Option<SpectralMaps>,
     /// Convergence of the iteration.
     pub convergence: Convergence,
 }
@@ -106,7 +114,7 @@ struct SingleChannel {
 /// and the correlation between channels from all blocks together, by maximum evidence.
 ///
 /// # Errors
-/// There are fewer than two channels, two of one frequency, or no data; or a frequency is outside the range of the channels.
+/// There is no data, or one channel without total powers, or two of one frequency; or a frequency is outside the range of the channels.
 pub fn solve_jointly(
     mut channels: Vec<JointChannel>,
     request: &JointRequest,
@@ -121,7 +129,8 @@ pub fn solve_jointly(
     let all_hz = frequencies_hz.clone();
     frequencies_hz.sort_by(f64::total_cmp);
     frequencies_hz.dedup();
-    if frequencies_hz.len() < 2 || frequencies_hz.len() < channels.len() {
+    let has_powers = request.powers.is_some() && channels.iter().any(|channel| !channel.powers.is_empty());
+    if frequencies_hz.len() < if has_powers { 1 } else { 2 } || frequencies_hz.len() < channels.len() {
         return Err(SolveError::FewChannels { channels: channels.len(), frequencies: frequencies_hz.len() });
     }
     // Checked before minutes of work.
@@ -145,14 +154,21 @@ pub fn solve_jointly(
     let noise_factors: Vec<f64> = singles.iter().map(|single| single.power.noise_factor).collect();
     let scale = singles.iter().map(SingleChannel::scale).collect();
     let initial = Prior::new(all_hz, scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
-    let scaled = scaled_blocks(&initial, &blocks, &noise_factors);
     let watch = watch.named("all channels").with_priority(true);
-    let rights: Vec<Vec<f64>> = singles.iter().map(|single| single.right.clone()).collect();
-    let likeness = most_likely(&initial, &scaled, &rights, watch)?;
-    let prior = initial.with_correlation(likeness)?;
-    let channels_sums = sums.iter().map(|sums| *sums as &(dyn NormalSums + Sync)).collect();
-    let joint = JointSums::new(&prior, channels_sums, noise_factors);
-    let posterior = Posterior::new(&joint, &scaled, request, watch)?;
+    let likeness = if channels.len() > 1 {
+        let scaled = scaled_blocks(&initial, &blocks, &noise_factors, &[]);
+        let rights: Vec<Vec<f64>> = singles.iter().map(|single| single.right.clone()).collect();
+        Some(most_likely(&initial, &scaled, &rights, watch)?)
+    } else {
+        None
+    };
+    let prior = initial.with_correlation(likeness.unwrap_or(initial.likeness))?;
+    let rows = power_rows(&channels, &singles, request)?;
+    let sums: Vec<&(dyn NormalSums + Sync)> =
+        sums.iter().map(|sums| *sums as &(dyn NormalSums + Sync)).collect();
+    let equations = Equations { prior: &prior, sums: &sums, blocks: &blocks, noise_factors: &noise_factors };
+    let (joint, scaled, start) = equations.with_powers(&rows, request, watch)?;
+    let posterior = Posterior::new(&joint, &scaled, request, start.as_deref(), watch)?;
     let mut views = (0..prior.channels()).map(|channel| prior.view_of(channel)).collect::<Vec<View>>();
     for &at_hz in &request.at_hz {
         views.push(prior.view_at(at_hz)?);
@@ -169,14 +185,36 @@ pub fn solve_jointly(
         let mut map = posterior.map(view, nside_of(view))?;
         if index < prior.channels() {
             map.agreement = Some(posterior.agreement(index, &singles[index], view));
+            map.powers = posterior.agreement_of_powers(index, view);
         }
         maps.push(map);
     }
     let nside = channels.iter().map(|channel| channel.nside).min().unwrap_or(1);
-    let spectra = posterior.spectra(&views[..prior.channels()], nside)?;
+    let spectra =
+        if channels.len() > 1 { Some(posterior.spectra(&views[..prior.channels()], nside)?) } else { None };
     maps.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
     maps.dedup_by(|a, b| a.frequency_hz == b.frequency_hz);
     Ok(JointSolution { likeness, maps, spectra, convergence: posterior.convergence })
+}
+
+/// The rows of total powers of each channel; `None` if it has none.
+fn power_rows(
+    channels: &[JointChannel],
+    singles: &[SingleChannel],
+    request: &JointRequest,
+) -> Result<Vec<Option<PowerRows>>, SolveError> {
+    let Some(priors) = &request.powers else { return Ok(channels.iter().map(|_| None).collect()) };
+    let constants = &priors.constant_k_sr;
+    if constants.len() != 1 && constants.len() != channels.len() {
+        return Err(SolveError::PowerConstants { found: constants.len(), channels: channels.len() });
+    }
+    let of_channel = |(channel, single): (&JointChannel, &SingleChannel)| {
+        let below = channels.iter().filter(|other| other.frequency_hz < channel.frequency_hz).count();
+        let constant_k_sr = constants[below.min(constants.len() - 1)];
+        let moon_radius_m = channel.sums.setup().moon_radius_m;
+        PowerRows::new(&channel.powers, moon_radius_m, &single.power, priors, constant_k_sr)
+    };
+    Ok(channels.iter().zip(singles).map(of_channel).collect())
 }
 
 impl SingleChannel {
@@ -275,6 +313,7 @@ impl<'a> Posterior<'a> {
         sums: &'a JointSums<'a>,
         scaled: &[ScaledBlocks],
         request: &JointRequest,
+        start: Option<&[f64]>,
         watch: NamedWatch<'_>,
     ) -> Result<Self, SolveError> {
         let blocks = joint_blocks(sums.prior, scaled);
@@ -284,7 +323,7 @@ impl<'a> Posterior<'a> {
         let regularisation = Diagonal::Uniform(1.0);
         let precondition = |v: &mut [f64]| factors.solve(v);
         let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };
-        let mut columns = [vec![0.0; count]];
+        let mut columns = [start.map_or_else(|| vec![0.0; count], <[f64]>::to_vec)];
         let convergence = {
             let task = watch.start("maps", request.rule.residual_max);
             system.solve(&[sums.right_hand_side()], &mut columns, &[request.rule], &task)
@@ -387,7 +426,18 @@ impl<'a> Posterior<'a> {
             .map(|number| (mean_of(&self.sample(view, number)) - mean_of(&sky)).powi(2))
             .sum();
         let mean_sigma_k = (variance / self.samples.len().max(1) as f64).sqrt();
-        Ok(JointMap { frequency_hz: view.frequency_hz, map_k, sigma_k, mean_sigma_k, agreement: None })
+        Ok(JointMap {
+            frequency_hz: view.frequency_hz,
+            map_k,
+            sigma_k,
+            mean_sigma_k,
+            agreement: None,
+            powers: None,
+        })
+    }
+
+    fn agreement_of_powers(&self, channel: usize, view: &View) -> Option<PowerAgreement> {
+        Some(self.sums.powers(channel)?.agreement(&self.coefficients(view, &self.solution)))
     }
 
     fn agreement(&self, channel: usize, single: &SingleChannel, view: &View) -> Agreement {
