@@ -6,16 +6,17 @@
 //! visibilities (`powers`). No visibility is read again.
 
 mod disc;
+mod posterior;
 mod powers;
 mod prior;
-mod rounds;
 mod solve;
 mod spectrum;
 mod sums;
 #[cfg(test)]
 mod tests;
 
+pub use posterior::{Agreement, JointMap, JointRequest};
 pub use powers::{PowerAgreement, PowerPriors, PowerSample};
 pub use prior::Correlation;
-pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
+pub use solve::{JointChannel, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

@@ -23,6 +23,8 @@ use crate::units::vector::{Vec3, add, dot, norm, scale, unit};
 
 /// Powers farther apart than this are of two passes, s.
 const GAP_S: f64 = 600.0;
+/// The longest pass, about an orbit, s.
+const PASS_S: f64 = 8000.0;
 /// Motion of the Moon over which powers are averaged, in units of 1 / l_max: the highest degree loses `0.7^2 / 24`, 2 %.
 const AVERAGED_RAD_L: f64 = 0.7;
 /// The longest such motion.
@@ -299,12 +301,17 @@ fn averaged(samples: &[PowerSample], cos_turn: f64) -> (Vec<Average>, Vec<Range<
     };
     let (mut averages, mut passes) = (Vec::<Average>::new(), Vec::<Range<usize>>::new());
     let mut before: Option<&PowerSample> = None;
+    let mut start_s = 0.0;
     for sample in samples.iter().filter(is_good) {
         let direction = unit(sample.r_m);
         let is_of_pass = |before: &PowerSample| {
-            before.daughter == sample.daughter && sample.time_s - before.time_s < GAP_S
+            let is_near = sample.time_s - before.time_s < GAP_S && sample.time_s - start_s < PASS_S;
+            before.daughter == sample.daughter && is_near
         };
         let goes_on = before.is_some_and(is_of_pass);
+        if !goes_on {
+            start_s = sample.time_s;
+        }
         let is_near = averages.last().is_some_and(|average| dot(average.start, direction) > cos_turn);
         if !(goes_on && is_near) {
             averages.push(Average { start: direction, ..Average::default() });
