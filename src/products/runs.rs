@@ -109,7 +109,7 @@ pub struct FitFigures {
     pub solution_k2: f64,
 }
 
-/// Traces of the covariances (the paper, Sect. 4).
+/// Traces of the covariances (the paper, Sect. 5.1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TraceFigures {
     /// Trace of the noise covariance, Tr Sigma_n, K^2.
