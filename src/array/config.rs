@@ -117,7 +117,7 @@ pub enum ArrayError {
     /// A value of the configuration is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
-    /// An orbit file cannot be used.
+    /// A file of orbits or attitudes cannot be used.
     #[error("{}: {what}", path.display())]
     Oem {
         /// The file.

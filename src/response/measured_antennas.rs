@@ -10,7 +10,7 @@ use crate::array::{ArrayError, Attitudes, tilted_axes};
 use crate::frames::AntennaResponse;
 use crate::response::pixel::SatelliteAntenna;
 use crate::units::vector::{Vec3, cross, scale};
-use crate::units::{Checks, keys};
+use crate::units::{Checks, echo, keys};
 
 keys! {
     /// Files of antennas.
@@ -21,7 +21,7 @@ keys! {
         /// Patterns: tables (CSV) of gain or fields by frequency and direction on the body's axes, one for all daughters or one
         /// each.
         expert tables: Vec<PathBuf> = Vec::new();
-        /// Maximum part of a table that the fit of an effective axis and a form of degree 2 may leave, rms over directions.
+        /// Maximum part of a table, up to 0.5, that the fit of an effective axis and a form of degree 2 may leave, rms over directions.
         expert table_error_max: f64 = 0.02;
     }
 }
@@ -57,10 +57,10 @@ impl AntennaFiles {
         Self { attitudes: all(&self.attitudes), tables: all(&self.tables), ..self.clone() }
     }
 
-    /// Requires an error that a fit can have, and no other pattern beside tables.
+    /// Requires an error that a fit of a dipole can have, and no other pattern beside tables.
     pub fn check(&self, key: &str, has_patterns: bool, checks: &mut Checks) {
         let (error, name) = (self.table_error_max, format!("{key}.table_error_max"));
-        checks.number(name, error, error > 0.0 && error <= 1.0, "above 0, at most 1");
+        checks.number(name, error, error > 0.0 && error <= 0.5, "above 0, at most 0.5");
         let expected = "none beside pattern or pattern_by_frequency: a table has the whole pattern";
         let (name, found) = (format!("{key}.tables"), format!("({} files)", self.tables.len()));
         checks.require(name, found, self.tables.is_empty() || !has_patterns, expected);
@@ -139,7 +139,7 @@ impl MeasuredAntennas {
         if let Some(attitudes) = &self.attitudes
             && attitudes.objects().len() != satellites
         {
-            let names: Vec<&str> = attitudes.objects().take(20).collect();
+            let names: Vec<String> = attitudes.objects().take(20).map(echo).collect();
             return other(format!(
                 "attitudes: {} objects ({}); expected {satellites}, one a daughter in the order in which they appear",
                 attitudes.objects().len(),
@@ -172,20 +172,18 @@ impl MeasuredAntennas {
         ))
     }
 
-    /// Requires that an attitude is known.
+    /// Requires that an attitude is known from one time to another.
     ///
     /// # Errors
     /// That it is not.
-    pub fn require_attitude(&self, satellite: usize, tai_s: f64) -> Result<(), MeasuredAntennasError> {
+    pub fn require_attitude(&self, satellite: usize, tai_s: [f64; 2]) -> Result<(), MeasuredAntennasError> {
         let Some(attitudes) = &self.attitudes else { return Ok(()) };
-        if attitudes.is_known(satellite, tai_s) {
-            return Ok(());
-        }
+        let Some(unknown_s) = attitudes.first_unknown_s(satellite, tai_s) else { return Ok(()) };
         let spans = attitudes.known_utc(satellite);
         Err(MeasuredAntennasError::Other(format!(
             "attitudes: nothing of daughter {} at {} UTC; expected attitudes whenever it measures, and they go from {spans}",
             satellite + 1,
-            crate::units::time_scales::utc_text(tai_s)
+            crate::units::time_scales::utc_text(unknown_s)
         )))
     }
 

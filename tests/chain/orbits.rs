@@ -368,6 +368,21 @@ fn attitude_message(plan: &Plan, first: usize) -> String {
     text
 }
 
+/// The same message, whose first daughter has nothing for three minutes within the first window: it is known at both ends of it.
+fn with_a_gap(plan: &Plan) -> String {
+    let text = attitude_message(plan, 0);
+    let end = text.find("DATA_STOP\n").unwrap() + "DATA_STOP\n".len();
+    let (first, rest) = text.split_at(end);
+    let (header, segment) = first.split_at(first.find("META_START").unwrap());
+    let window = &plan.windows[0];
+    assert!(window.end.seconds() - window.start.seconds() > 400.0);
+    let begin_s = plan.instrument.epoch_tai_s + window.start.seconds().floor();
+    let used = |key: &str, after_s: f64| {
+        segment.replace("META_STOP", &format!("{key} = {}\nMETA_STOP", date_tai(begin_s + after_s)))
+    };
+    [header, &used("USEABLE_STOP_TIME", 120.0), &used("USEABLE_START_TIME", 300.0), rest].concat()
+}
+
 /// The quaternion, scalar last, of the matrix with these rows, which takes components on fixed axes to those on the rows' (504.0-B).
 fn quaternion(m: [[f64; 3]; 3]) -> [f64; 4] {
     // The eigenvector of Shepperd's largest pivot.
@@ -450,8 +465,10 @@ fn antennas_by_files_are_those_of_keys() {
 
     // What files do not say is refused with their key.
     let short = place.file("short.aem", attitude_message(&plan, 1).as_bytes());
+    let gap = place.file("gap.aem", with_a_gap(&plan).as_bytes());
     for (set, expected) in [
         (format!("attitudes=[{short:?}]"), "attitudes: 2 objects (2030-001A, 2030-002A); expected 3"),
+        (format!("attitudes=[{gap:?}]"), "attitudes: nothing of daughter 1 at "),
         (
             format!(
                 "tables=[{:?}]",

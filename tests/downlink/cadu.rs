@@ -130,6 +130,22 @@ fn sound_frames_among_spoilt_ones_are_all_found() {
 }
 
 #[test]
+fn a_first_frame_with_corrected_octets_needs_no_other_frame_after_it() {
+    let frames = mission(1, 1_000);
+    for interleave in INTERLEAVES {
+        let mut coded = transmit(&frames, &config(interleave));
+        let cadu = 4 + 255 * interleave;
+        // A wrong bit of the marker and as many wrong octets as the code corrects in a codeword; the next frame is lost.
+        coded[1] ^= 0x10;
+        coded[4..].iter_mut().step_by(interleave).take(16).for_each(|octet| *octet ^= 0x21);
+        random_stream(14, StreamKind::Probe, [0, 0]).fill_bytes(&mut coded[cadu..2 * cadu]);
+        let account = receive(&coded, 1_000).1;
+        assert_eq!(account.frames + 1, (coded.len() / cadu) as u64, "{interleave}: {account:?}");
+        assert_eq!(account.bytes_corrected, 16, "{interleave}");
+    }
+}
+
+#[test]
 fn damaged_markers_cost_nothing_in_lock() {
     let frames = mission(1, 2_000);
     let sent = transmit(&frames, &DownlinkConfig::default());

@@ -48,7 +48,10 @@ class Browser:
             self.port = self.port_of_driver()
             window = "--window-size={},{}".format(*size)
             arguments = [*OPTIONS, *more, window, f"--user-data-dir={self.folder.name}"]
+            # Painting without a graphics card takes longer than the usual 30 s where all processors are busy.
+            timeouts = {"script": int(1000 * PATIENCE_S)}
             capabilities = {
+                "timeouts": timeouts,
                 "goog:chromeOptions": {"args": arguments, "binary": shutil.which("chromium")},
                 "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
             }

@@ -195,6 +195,8 @@ class Page:
         try:
             wait_until(what, is_right)
         except AssertionError as error:
+            if not seen:
+                raise
             wrong = np.flatnonzero(seen[0] > 2)[:9]
             what += f": pixels {pixels[wrong]} are {seen[1][wrong].tolist()}"
             raise AssertionError(f"{what}, expected {colours.palette[colours.index(values[pixels[wrong]])].tolist()}") from error

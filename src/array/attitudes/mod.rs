@@ -5,6 +5,7 @@ mod rotation;
 #[cfg(test)]
 mod tests;
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -12,6 +13,7 @@ use aem::{AttitudeSegment, Collector};
 
 use super::config::ArrayError;
 use super::oem::{at_line, error, read_message};
+use crate::units::echo;
 use crate::units::time_scales::utc_text;
 use crate::units::vector::Vec3;
 
@@ -39,22 +41,24 @@ impl Attitudes {
     /// A file that cannot be used; segments of one object that are to be used at the same time.
     pub fn read(paths: &[PathBuf]) -> Result<Self, ArrayError> {
         let mut satellites: Vec<SatelliteAttitude> = Vec::new();
+        let mut places = BTreeMap::new();
         for path in paths {
             let (collector, line) = read_message::<Collector>(path)?;
             for (object, segment) in collector.finish(line).map_err(|fault| at_line(path, fault))? {
-                let place = satellites.iter().position(|known| known.object == object);
-                let place = place.unwrap_or_else(|| {
-                    satellites.push(SatelliteAttitude { object, segments: Vec::new() });
+                let place = *places.entry(object).or_insert_with_key(|object| {
+                    satellites.push(SatelliteAttitude { object: object.clone(), segments: Vec::new() });
                     satellites.len() - 1
                 });
-                let SatelliteAttitude { object, segments } = &mut satellites[place];
-                segments.push(segment);
+                satellites[place].segments.push(segment);
+            }
+            for SatelliteAttitude { object, segments } in &mut satellites {
                 segments.sort_by(|a, b| a.useable_s[0].total_cmp(&b.useable_s[0]));
                 let overlap = segments.windows(2).find(|pair| pair[0].useable_s[1] > pair[1].useable_s[0]);
                 if let Some([before, after]) = overlap {
                     let what = format!(
-                        "segments of {object} overlap by {:.3} s; expected segments of an object, in all files, without overlaps: \
+                        "segments of {} overlap by {:.3} s; expected segments of an object, in all files, without overlaps: \
                          USEABLE_START_TIME and USEABLE_STOP_TIME say when each is to be used",
+                        echo(object),
                         before.useable_s[1] - after.useable_s[0]
                     );
                     return Err(error(path, what));
@@ -78,10 +82,23 @@ impl Attitudes {
         Some(segment.axes(tai_s.clamp(from_s, until_s)))
     }
 
-    /// Whether the attitude at a time is known, to a second: time tags err, and dates are rounded.
+    /// The first time from one to another (TAI seconds since 1958) at which the attitude is unknown, to a second: time tags err, and
+    /// dates are rounded.
     #[must_use]
-    pub fn is_known(&self, satellite: usize, tai_s: f64) -> bool {
-        self.nearest(satellite, tai_s).is_some_and(|segment| segment.beyond_s(tai_s) <= BEYOND_S)
+    pub fn first_unknown_s(&self, satellite: usize, [from_s, until_s]: [f64; 2]) -> Option<f64> {
+        let segments = self.satellites.get(satellite).map_or(&[][..], |satellite| &satellite.segments);
+        let first = segments.partition_point(|segment| segment.useable_s[1] + BEYOND_S < from_s);
+        let mut unknown_s = from_s;
+        for segment in &segments[first..] {
+            if segment.useable_s[0] - BEYOND_S > unknown_s {
+                break;
+            }
+            unknown_s = segment.useable_s[1] + BEYOND_S;
+            if unknown_s >= until_s {
+                return None;
+            }
+        }
+        Some(unknown_s)
     }
 
     fn nearest(&self, satellite: usize, tai_s: f64) -> Option<&AttitudeSegment> {

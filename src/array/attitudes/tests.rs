@@ -135,7 +135,7 @@ fn objects_are_satellites_and_know_their_times() {
     let at = |satellite, date: &str| found.body_axes(satellite, tai_s(date));
     assert_axes(at(0, "2030-01-31T12:00:25"), BETWEEN);
     assert_axes(at(0, "2030-01-31T12:30:25"), BETWEEN);
-    let known = |satellite, date: &str| found.is_known(satellite, tai_s(date));
+    let known = |satellite, date: &str| found.first_unknown_s(satellite, [tai_s(date); 2]).is_none();
     for (satellite, date) in [
         (0, "2030-01-31T11:59:58"),
         (0, "2030-01-31T12:15:00"),
@@ -146,6 +146,20 @@ fn objects_are_satellites_and_know_their_times() {
     }
     // A time tag's error beyond the ends is allowed.
     assert!(known(0, "2030-01-31T12:01:00.9") && !known(0, "2030-01-31T12:01:01.1"));
+    // Both ends of an interval may be known, and what is between them not: from the end of the first segment on.
+    let first_unknown = |satellite, from: &str, until: &str| {
+        let [from, until] = [from, until].map(|time| tai_s(&format!("2030-01-31T{time}")));
+        found.first_unknown_s(satellite, [from, until])
+    };
+    assert_eq!(first_unknown(0, "12:00:10", "12:30:25"), Some(tai_s("2030-01-31T12:01:01")));
+    assert_eq!(first_unknown(0, "12:02:00", "12:30:25"), Some(tai_s("2030-01-31T12:02:00")));
+    assert_eq!(first_unknown(0, "12:30:10", "12:40:00"), Some(tai_s("2030-01-31T12:31:01")));
+    assert_eq!(first_unknown(0, "12:30:10", "12:30:50"), None);
+    // A segment that begins where another ends leaves no gap.
+    let next = SEGMENT.replace("T12:01:00", "T12:02:00").replace("T12:00:00", "T12:01:00");
+    let whole = read(&[kvn(&format!("{next}{SEGMENT}"))]).unwrap();
+    let [from, until] = ["2030-01-31T12:00:10", "2030-01-31T12:01:50"].map(tai_s);
+    assert_eq!(whole.first_unknown_s(0, [from, until]), None);
     let said = found.known_utc(0);
     assert!(
         said.starts_with("2030-01-31T11:59:23.000") && said.ends_with("2030-01-31T12:30:23.000"),
@@ -191,6 +205,11 @@ fn what_is_no_attitude_is_told_by_line() {
         assert!(SEGMENT.contains(from), "{from}");
         kvn(&SEGMENT.replace(from, to))
     };
+    let long = "X".repeat(10_000);
+    for text in [changed("EME2000", &long), kvn(&format!("{SEGMENT}{SEGMENT}").replace("2030-001A", &long))] {
+        let said = read(&[text]).unwrap_err();
+        assert!(said.contains("XXX... (10000 bytes)") && said.len() < 700, "{said}");
+    }
     for (text, expected) in [
         (
             kvn(SEGMENT).replace("AEM_VERS = 1.0", "AEM_VERS = 7.0"),

@@ -1,5 +1,6 @@
 //! Files of messages, KVN or XML, also compressed.
 
+use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -24,19 +25,21 @@ pub(in crate::array) fn at_line(path: &Path, Fault { line, found, expected }: Fa
 /// Reads a message, KVN or XML, also compressed by gzip, to the end of its last segment; gives its last line, too.
 pub(in crate::array) fn read_message<M: Message>(path: &Path) -> Result<(M, usize), ArrayError> {
     let of_io = |source: std::io::Error| error(path, source.to_string());
-    let size = std::fs::metadata(path).map_err(of_io)?.len();
-    let too_large = |size: u64| error(path, format!("{size} bytes; expected at most {FILE_BYTES_MAX}"));
-    if size > FILE_BYTES_MAX {
-        return Err(too_large(size));
+    let mut bytes = Vec::new();
+    // A pipe has no size before it is read.
+    let file = File::open(path).map_err(of_io)?;
+    file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(of_io)?;
+    let too_large = || error(path, format!("it is too long; expected at most {FILE_BYTES_MAX} bytes"));
+    if bytes.len() as u64 > FILE_BYTES_MAX {
+        return Err(too_large());
     }
-    let mut bytes = std::fs::read(path).map_err(of_io)?;
     if bytes.starts_with(&[0x1f, 0x8b]) {
         let mut content = Vec::new();
         // A sum at the end says whether it is whole.
         let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
         unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
         if content.len() as u64 > FILE_BYTES_MAX {
-            return Err(too_large(content.len() as u64));
+            return Err(too_large());
         }
         bytes = content;
     }

@@ -1,5 +1,10 @@
 //! What messages of the kinds that are read have in common, whatever form they are written in.
 
+use crate::units::shortened;
+
+/// Longest value of a file that a message repeats, characters.
+const FOUND_CHARS_MAX: usize = 200;
+
 /// A fault of a file: its line, from 1, what was found, and what was expected there.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(in crate::array) struct Fault {
@@ -10,7 +15,7 @@ pub(in crate::array) struct Fault {
 
 impl Fault {
     pub(in crate::array) fn new(line: usize, found: impl Into<String>, expected: impl Into<String>) -> Self {
-        Self { line, found: found.into(), expected: expected.into() }
+        Self { line, found: shortened(&found.into(), FOUND_CHARS_MAX), expected: expected.into() }
     }
 }
 

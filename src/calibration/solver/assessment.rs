@@ -1,5 +1,7 @@
 //! Reported uncertainty and quality state of each gain, from noise, excess scatter of residuals and model errors.
 
+use std::f64::consts::FRAC_PI_2;
+
 use super::config::{AmplitudeScale, SolverConfig};
 use super::detect::SignalPresence;
 use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
@@ -14,7 +16,7 @@ const COVERAGE_SIGMAS: f64 = 4.0;
 /// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too.
 /// With it fewer than 1e-4 of the errors exceed [`COVERAGE_SIGMAS`] stated deviations: Gaussian errors exceed 4 deviations with
 /// a probability of 0.6e-4, 4.4 deviations with 0.1e-4.
-const SIGMA_MARGIN: f64 = 1.1;
+pub(super) const SIGMA_MARGIN: f64 = 1.1;
 
 /// Signal-to-noise ratio at which a daughter counts as detected in several channels together, none of which suffices
 /// alone.
@@ -30,8 +32,14 @@ pub(super) struct GainAssessment<'a> {
 }
 
 /// Enlarges a standard deviation (rad) so that it covers the non-Gaussian phase error of a weak gain.
-fn sigma_with_coverage(sigma: f64) -> f64 {
+pub(super) fn sigma_with_coverage(sigma: f64) -> f64 {
     (SIGMA_MARGIN * sigma).max((COVERAGE_SIGMAS * sigma).min(1.0).asin() / COVERAGE_SIGMAS)
+}
+
+/// The standard deviation that [`sigma_with_coverage`] enlarges to this one; the largest, if there are several.
+pub(super) fn bare_sigma(safe: f64) -> f64 {
+    let (bare, angle) = (safe / SIGMA_MARGIN, COVERAGE_SIGMAS * safe);
+    if angle < FRAC_PI_2 { bare.min(angle.sin() / COVERAGE_SIGMAS) } else { bare }
 }
 
 impl GainAssessment<'_> {
@@ -218,6 +226,7 @@ mod tests {
             assert!(a * p.sin() >= 4.0 - 1e-9, "{a}: {p}");
             // It is at most a fifth above the bound.
             assert!(p * a / 4.0 < 1.2, "{a}: {p}");
+            assert!((bare_sigma(0.25 * p) * a - 1.0).abs() < 1e-12, "{a}: {p}");
         }
     }
 }

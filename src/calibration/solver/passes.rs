@@ -185,7 +185,7 @@ impl PassTask<'_> {
                 break;
             }
         }
-        smooth(&mut solutions);
+        smooth(&mut solutions, config);
         if let Some(search_result) = search_result {
             solutions
                 .iter_mut()

@@ -228,7 +228,8 @@ fn all_invalid_values_of_the_section_are_reported() {
         phase_deg = { constant = [1.0], pass_rms = -1.0, drift_time_s = 1.0 }\n\
         tilt_along_deg = { constant_rms = 60.0 }\npattern = { step_rms = 1.0 }\nclock_allan_deviation = 1.0\n\
         clock_steering_s = 1.0\nleak_depth_deg = 0.0\nleak_k_sr = -1.0\n\
-        beacon = { k_sr = -1.0, direction_deg = [0.0, 91.0] }";
+        beacon = { k_sr = -1.0, direction_deg = [0.0, 91.0] }\n\
+        antenna_files = { table_error_max = 1.0 }";
     let config: InstrumentConfig = toml::from_str(text).unwrap();
     let keys: Vec<String> = config.problems(8, 3, false).into_iter().map(|problem| problem.key).collect();
     let expected = [
@@ -237,6 +238,7 @@ fn all_invalid_values_of_the_section_are_reported() {
         "phase_deg.drift_time_s",
         "tilt_along_deg.constant_rms",
         "pattern.step_rms",
+        "antenna_files.table_error_max",
         "tilt_along_deg",
         "clock_allan_deviation",
         "clock_steering_s",

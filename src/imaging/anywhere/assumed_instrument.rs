@@ -72,7 +72,7 @@ impl AssumedInstrument {
         measured.require(self.satellites, elements, frequency_hz)?;
         for at in at {
             for daughter in [at.pair.i, at.pair.j] {
-                measured.require_attitude(daughter.into(), self.epoch_tai_s + at.time_s)?;
+                measured.require_attitude(daughter.into(), [self.epoch_tai_s + at.time_s; 2])?;
             }
         }
         let found = PairAntennas { assumed: self.clone(), frequency_hz, elements };

@@ -128,8 +128,9 @@ impl Plan {
             measured.require(self.array.satellites(), response, channel.frequency_hz)?;
         }
         for satellite in 0..self.array.satellites() {
-            for end in self.windows.iter().flat_map(|window| [window.start, window.end]) {
-                measured.require_attitude(satellite, epoch_tai_s + end.seconds())?;
+            for window in &self.windows {
+                let ends_s = [window.start, window.end].map(|end| epoch_tai_s + end.seconds());
+                measured.require_attitude(satellite, ends_s)?;
             }
         }
         Ok(measured)

@@ -58,7 +58,7 @@ enum FrameMatch {
 /// - *Search*: examines each bit at which a marker begins (at most 3 wrong bits, upright or inverted), and each bit at
 ///   which a frame is expected.
 /// - *Check*: accepts a place if a correctable block follows. While the interleave is unknown, the header must also be
-///   valid with at most two faults, or another frame must follow.
+///   valid, or another frame must follow.
 /// - *Lock*: frames follow one another. A bad marker is ignored if its block can be corrected, and a bad block if another
 ///   marker follows. Otherwise the search resumes at this frame or, if the frame before may have lost bits, shortly before.
 ///
@@ -275,7 +275,7 @@ impl CaduReceiver {
         for code in INTERLEAVES.into_iter().filter_map(ReedSolomon::new) {
             let place = self.place(at, Some(code), polarity, at_end);
             let FrameMatch::Frame(found) = place else { continue };
-            if found.faults <= UNAMBIGUOUS_FAULTS_MAX && self.header().is_some() && !self.is_constant() {
+            if self.header().is_some() && !self.is_constant() {
                 return place;
             }
             // A block of equal octets, or nearly so, is a codeword at every depth, so another frame must follow.
