@@ -82,7 +82,7 @@ def watches_stations(page, served, downlink, pictures):
     def says_the_rate():
         found = re.search(r"· (\S+) (.?)B/s", cards(page)["malargue"])
         # The page takes the bytes of two messages and the time between them, here the time since the station began.
-        return found and abs(float(found.group(1)) * SIZES[found.group(2)] / station.rate() - 1) < 0.25
+        return found and station.sent and abs(float(found.group(1)) * SIZES[found.group(2)] / station.rate() - 1) < 0.25
 
     wait_until("the station's rate", says_the_rate)
     ends.set()
