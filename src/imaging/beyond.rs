@@ -8,7 +8,8 @@
 //! N_b = 1/2 sum_{l > l_max} (2 l + 1) 4 pi j_l(2 pi u)^2 C_l (1 - h),   cos(pi h) = cos(rho) / sin(theta),   sin(theta) = min(1, l / 2 pi u)
 //! ```
 //!
-//! with rho the Moon's radius as seen. A weight w becomes `w / (1 + w N_b)`: a sum of a visibility's own numbers alone, in whatever order it comes.
+//! with rho the Moon's radius as seen. It holds where 2 pi u lies beyond l_max; near it the edge of the Moon adds about a third. A weight w becomes
+//! `w / (1 + w N_b)`: a sum of a visibility's own numbers alone, in whatever order it comes.
 
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -47,13 +48,11 @@ pub(in crate::imaging) struct BeyondNoise {
 /// # Errors
 /// A file that cannot be read or is no such table, or has less than two degrees.
 pub(crate) fn read_power(path: &Path) -> Result<(usize, Vec<f64>), SolveError> {
-    let failed = |found: String| SolveError::Power { path: path.to_owned(), found };
+    let failed = |found: String| SolveError::BeyondPower { path: path.to_owned(), found };
     let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
     let (first, power_k2) = parse_power(&text).map_err(failed)?;
     if power_k2.len() < 2 {
-        return Err(failed(
-            "one degree: expected two or more, the last of which tell how it goes on".to_owned(),
-        ));
+        return Err(failed("one degree, which does not tell how it goes on".to_owned()));
     }
     Ok((first, power_k2))
 }
@@ -96,8 +95,10 @@ impl BeyondNoise {
         for k in 0..placed.len() {
             let u = norm(sub(placed.r_i_m[k], placed.r_j_m[k])) / self.wavelength_m;
             let variance = self.variance(u, norm(placed.r_i_m[k]));
-            let weight = &mut placed.weight[k];
-            *weight /= 1.0 + *weight * variance;
+            // Others are refused as they are.
+            if let Some(weight) = placed.weight.get_mut(k).filter(|weight| **weight > 0.0) {
+                *weight /= 1.0 + *weight * variance;
+            }
         }
     }
 
@@ -185,7 +186,9 @@ mod tests {
         let wavelength_m = 30.0;
         let mut beyond =
             BeyondNoise::new((0, &power), L_MAX, SPEED_OF_LIGHT_M_S / wavelength_m, 300.0, MOON_RADIUS_M);
-        for u in [1.0, 2.0, 3.0, 5.0, 8.0] {
+        let lengths = [1.0, 2.0, 3.0, 5.0, 8.0];
+        let mut seen = Vec::new();
+        for u in lengths {
             let (mut sum, mut count) = (0.0, 0.0);
             for place in 0..24 {
                 // Pairs that follow one another, at places all over the sky.
@@ -218,13 +221,16 @@ mod tests {
                     count += 1.0;
                 }
             }
-            let ratio = beyond.variance(u, radius_m) / (sum / count);
-            // 576 values, of which those of one sky are not independent: 6 %; twice that. Where the fringe's greatest degree is the map's, the edge
-            // of the Moon spreads more beyond it than the formula has: a third.
-            if TAU * u > 1.4 * L_MAX as f64 {
-                assert!((ratio - 1.0).abs() < 0.15, "{u}: {ratio}");
-            }
+            seen.push(sum / count);
         }
+        let ratios: Vec<f64> =
+            lengths.iter().zip(&seen).map(|(u, v)| beyond.variance(*u, radius_m) / v).collect();
+        // 576 values, of which those of one sky are not independent: 6 %; twice that.
+        assert!(ratios[2..].iter().all(|ratio| (ratio - 1.0).abs() < 0.15), "{ratios:?}");
+        // The formula's limit, as documented: where 2 pi u = 12.6 the Moon's edge adds a third.
+        assert!((ratios[1] - 0.75).abs() < 0.15, "{ratios:?}");
+        // Below, it has nothing where there is hardly anything.
+        assert!(ratios[0] < 0.01 && seen[0] < 0.03 * seen[2], "{ratios:?} {seen:?}");
     }
 
     #[test]
@@ -237,10 +243,10 @@ mod tests {
         assert_eq!(power_at(2, &power, 1), power[0]);
         let mut beyond = BeyondNoise::new((2, &power), 10, SPEED_OF_LIGHT_M_S, 20.0, MOON_RADIUS_M);
         let mut placed = PlacedVisibilities {
-            r_i_m: vec![[MOON_RADIUS_M + 3e5, 0.0, 0.0]; 2],
-            r_j_m: vec![[MOON_RADIUS_M + 3e5, 0.5, 0.0], [MOON_RADIUS_M + 3e5, 10.0, 0.0]],
-            weight: vec![1e4; 2],
-            time_s: vec![0.0; 2],
+            r_i_m: vec![[MOON_RADIUS_M + 3e5, 0.0, 0.0]; 3],
+            r_j_m: [0.5, 10.0, 10.0].map(|u| [MOON_RADIUS_M + 3e5, u, 0.0]).to_vec(),
+            weight: vec![1e4, 1e4, -1e4],
+            time_s: vec![0.0; 3],
             ..PlacedVisibilities::default()
         };
         beyond.lower_weights(&mut placed);
@@ -249,5 +255,7 @@ mod tests {
         let variance = beyond.variance(10.0, MOON_RADIUS_M + 3e5);
         assert!((placed.weight[1] - 1.0 / (1e-4 + variance)).abs() < 1e-6 * placed.weight[1]);
         assert!(placed.weight[1] < 0.9e4);
+        // One that is not positive is refused later, and so stays as it is.
+        assert_eq!(placed.weight[2], -1e4);
     }
 }

@@ -51,7 +51,7 @@ pub enum EngineKind {
     Pixel,
     /// Spherical harmonics: thousands of operations per visibility; needs satellites on one circular orbit.
     Harmonic,
-    /// The cheaper one that the array's orbits allow: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
+    /// The cheaper one that the orbits of `[array]` allow: replaced by it when a pipeline is read, and otherwise the same as [`Self::Pixel`].
     Auto,
 }
 
@@ -89,7 +89,7 @@ keys! {
         /// "harmonic").
         everyday nside: usize = 16;
         /// Basis of the normal equations: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or
-        /// with map.refine; or "auto", "harmonic" where the orbits allow it.
+        /// with map.refine; or "auto", "harmonic" where the array's orbits allow it, whatever those of the data.
         everyday engine: EngineKind = EngineKind::Pixel;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;
@@ -272,6 +272,9 @@ impl MapConfig {
         let longest = self.baseline_bp_max;
         let expected = "above 0 and at most 1e12, in units of b_p";
         checks.number("baseline_bp_max", longest, longest > 0.0 && longest <= 1e12, expected);
+        // What is beyond is tabulated up to this length, with all degrees that it reaches.
+        let is_tabulated = self.beyond_files.is_empty() || longest <= 100.0;
+        checks.number("baseline_bp_max", longest, is_tabulated, "at most 100 with map.beyond_files");
         checks.numbers("epsilon", self.epsilon().values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
         let is_temperature = |k| (0.0..=TEMPERATURE_K_MAX).contains(&k);
         checks.numbers("prior_k", self.prior_k.values(), is_temperature, "0 to 1e16 K");
@@ -438,6 +441,7 @@ impl MapConfig {
             antennas: _,
             refine,
         } = self;
+        let engine = if *engine == EngineKind::Auto { EngineKind::Pixel } else { *engine };
         let mut settings = vec![
             ("map.nside", nside.to_string()),
             ("map.engine", format!("{engine:?}")),
@@ -544,7 +548,6 @@ impl MapConfig {
     #[doc(hidden)]
     pub fn mismatches(&self, channels: usize) -> Vec<InvalidValue> {
         let epsilon = self.epsilon();
-        let (files, tables) = (self.prior_files.len(), self.power_files().len());
         let mut checks = Checks::new("map");
         let expected =
             format!("at least the {channels} channels of the instrument, each of which needs memory");
@@ -553,16 +556,66 @@ impl MapConfig {
             let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
             checks.require(format!("channels[{index}]"), channel, usize::from(channel) < channels, expected);
         }
-        for (key, fits, found) in [
-            ("epsilon", epsilon.fits(channels), epsilon.values().len()),
-            ("prior_k", self.prior_k.fits(channels), self.prior_k.values().len()),
-            ("prior_files", files == 0 || files == channels, files),
-            ("regulariser.file", [0, channels].contains(&tables), tables),
-            ("beyond_files", [0, channels].contains(&self.beyond_files.len()), self.beyond_files.len()),
-        ] {
+        for (key, values) in [("epsilon", &epsilon), ("prior_k", &self.prior_k)] {
             let expected = format!("a single value, or a list of one for each of the {channels} channels");
-            checks.require(key, format!("({found} values)"), fits, expected);
+            checks.require(
+                key,
+                format!("({} values)", values.values().len()),
+                values.fits(channels),
+                expected,
+            );
+        }
+        for (key, files) in [
+            ("prior_files", self.prior_files.len()),
+            ("regulariser.file", self.power_files().len()),
+            ("beyond_files", self.beyond_files.len()),
+        ] {
+            let expected = format!("one file for each of the {channels} channels");
+            checks.require(key, format!("({files} files)"), files == 0 || files == channels, expected);
         }
         checks.finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_of_auto_are_those_of_pixels() {
+        let settings = |engine: EngineKind| MapConfig { engine, ..MapConfig::default() }.sum_settings();
+        assert_eq!(settings(EngineKind::Auto), settings(EngineKind::Pixel));
+    }
+
+    #[test]
+    fn files_are_one_a_channel() {
+        let files = vec![PathBuf::from("one"); 2];
+        for (key, map) in [
+            ("prior_files", MapConfig { prior_files: files.clone(), ..MapConfig::default() }),
+            ("beyond_files", MapConfig { beyond_files: files.clone(), ..MapConfig::default() }),
+            (
+                "regulariser.file",
+                MapConfig {
+                    regulariser: Some(RegulariserChoice::File(files.clone())),
+                    ..MapConfig::default()
+                },
+            ),
+        ] {
+            assert_eq!(map.mismatches(2), vec![]);
+            let [found] = &map.mismatches(3)[..] else { panic!("{key}") };
+            let expected = format!("map.{key} = (2 files): expected one file for each of the 3 channels");
+            assert_eq!(found.to_string(), expected);
+        }
+    }
+
+    #[test]
+    fn what_is_beyond_ends_with_the_baselines() {
+        for (files, baseline_bp_max, good) in [(0, 1e9, true), (1, 100.0, true), (1, 101.0, false)] {
+            let beyond_files = vec![PathBuf::from("one"); files];
+            let map = MapConfig { beyond_files, baseline_bp_max, ..MapConfig::default() };
+            let found: Vec<String> = map.problems().iter().map(ToString::to_string).collect();
+            assert!(found.is_empty() == good, "{found:?}");
+            assert!(found.iter().all(|problem| problem.contains("at most 100 with map.beyond_files")));
+        }
     }
 }

@@ -9,7 +9,7 @@ use super::rates::{
     REFINED_ITERATIONS, ROW_S, TRANSFORM_MULTIPLY_ADDS_PER_S, VISIBILITIES_PER_ROW, cores,
 };
 use crate::imaging::anywhere::REFINED_VISIBILITY_BYTES;
-use crate::imaging::{EngineKind, MapConfig, PixelEngine};
+use crate::imaging::{EngineKind, MapConfig, PixelEngine, RegulariserChoice};
 use crate::response::general::row_tables_bytes;
 use crate::response::pixel::{PixelMethod, RowProducts};
 use crate::sky::healpix::pixel_count;
@@ -19,8 +19,10 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 /// long together as one (benches/harmonic).
 const APPLICATIONS: f64 = 65.0;
 
-/// Maps that are solved together: a map and its noise map.
-const SOLVED_TOGETHER: usize = 2;
+/// Columns that are solved together: a map and its noise map, or, with R from the data, the errors of mean and dipole.
+fn solved_together(map: &MapConfig) -> usize {
+    if map.regulariser() == RegulariserChoice::Data { 4 } else { 2 }
+}
 
 /// Products for W_max over pixels, from a random start vector.
 const W_MAX_PRODUCTS: f64 = 30.0;
@@ -128,7 +130,7 @@ impl EngineCost {
     /// Estimates the cost of a channel's engine.
     pub(crate) fn estimate(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
-            EngineKind::Pixel if map.is_matrix_free() => Self::matrix_free(map, data),
+            EngineKind::Pixel | EngineKind::Auto if map.is_matrix_free() => Self::matrix_free(map, data),
             EngineKind::Pixel | EngineKind::Auto => Self::pixel(map),
             EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
             EngineKind::Harmonic => Self::harmonic(map, data),
@@ -174,7 +176,7 @@ impl EngineCost {
             // An intermediate map is solved from a copy.
             copy_bytes: held,
             copies_final: false,
-            other_bytes: RowProducts::memory_bytes(map.nside, SOLVED_TOGETHER, threads) as f64
+            other_bytes: RowProducts::memory_bytes(map.nside, solved_together(map), threads) as f64
                 + 8.0 * pixels * BASIS_VECTORS[0],
             visibility_s: 0.0,
             solution_s: elements * element_s / cores(),
@@ -232,7 +234,7 @@ impl EngineCost {
     fn harmonic(map: &MapConfig, ChannelData { frequency_hz, windows, .. }: ChannelData) -> Self {
         let l_max = map.degree();
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
-        let memory = memory(l_max, u_max, rayon::current_num_threads(), SOLVED_TOGETHER);
+        let memory = memory(l_max, u_max, rayon::current_num_threads(), solved_together(map));
         let size = application_size(l_max, u_max);
         let points = size.points as f64;
         // A complex transform takes 5 n log2(n) operations, and a multiply-add is two.
@@ -265,6 +267,23 @@ impl EngineCost {
 mod tests {
     use super::*;
     use crate::imaging::MatrixKind;
+
+    #[test]
+    fn auto_costs_what_pixels_do_and_r_from_the_data_takes_more_memory() {
+        let data = ChannelData { frequency_hz: 1e7, visibilities: 25_000.0, windows: 100.0 };
+        let free = |engine: EngineKind| {
+            let map = MapConfig { engine, matrix: MatrixKind::Free, ..MapConfig::default() };
+            EngineCost::estimate(&map, data)
+        };
+        assert_eq!(free(EngineKind::Auto), free(EngineKind::Pixel));
+        let harmonic = |regulariser: RegulariserChoice| {
+            let regulariser = Some(regulariser);
+            let map = MapConfig { engine: EngineKind::Harmonic, regulariser, ..MapConfig::default() };
+            EngineCost::estimate(&map, data)
+        };
+        let [two, four] = [RegulariserChoice::Identity, RegulariserChoice::Data].map(harmonic);
+        assert!(four.other_bytes > two.other_bytes, "{four:?} {two:?}");
+    }
 
     #[test]
     fn matrix_free_cost_is_products_times_rows_times_pixels() {

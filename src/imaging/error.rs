@@ -23,7 +23,7 @@ pub enum AccumulationError {
     #[error("map.prior_files: {0}")]
     Prior(#[from] crate::sky::fits::FitsError),
     /// A table of the sky's power that cannot be used.
-    #[error("map.beyond_files: {0}")]
+    #[error("{0}")]
     Beyond(String),
     /// A quantity of an engine's setup is out of range.
     #[error("invalid setup of an engine: {name} = {value}: expected {expected}")]

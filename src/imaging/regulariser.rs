@@ -9,6 +9,9 @@ use crate::imaging::solver::SolveError;
 /// Maximum size of a table, bytes; a table up to the maximum degree is smaller.
 pub(in crate::imaging) const POWER_FILE_BYTES_MAX: u64 = 1 << 20;
 
+/// Maximum degree of a table, far beyond that of any map or baseline.
+const DEGREE_MAX: usize = 1 << 20;
+
 /// The dependence of R on the degree.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Regulariser {
@@ -121,6 +124,7 @@ pub(in crate::imaging) fn parse_power(text: &str) -> Result<(usize, Vec<f64>), S
         match (values.0, power) {
             (Some(l), Some(power))
                 if (power_k2.is_empty() || l == first + power_k2.len())
+                    && l <= DEGREE_MAX
                     && power > 0.0
                     && power.is_finite() =>
             {
@@ -163,6 +167,8 @@ mod tests {
             ("0,1\n1", "line 2: 1"),
             ("0,1\none,1", "line 2: one,1"),
             ("2,1\n4,1", "line 2: 4,1"),
+            // A degree after which there is no other number.
+            ("18446744073709551615,1\n", "line 1: 18446744073709551615,1"),
         ] {
             assert_eq!(parse_power(text), Err(found.to_owned()), "{text}");
         }

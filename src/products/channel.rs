@@ -6,7 +6,7 @@ use super::beam::EffectiveBeam;
 use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
 use super::error::ProductsError;
-use super::error_maps::ErrorMap;
+use super::error_maps::{ErrorMap, limits};
 use super::latitudes::latitude_errors;
 use super::pictures::{
     Bars, ColourScale, MapPanel, Palette, Picture, Sampling, Scaling, Sheet, View, draw_map, draw_sheet,
@@ -19,7 +19,7 @@ use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
 use crate::files::{disk_space, write_atomically};
 use crate::imaging::Solution;
-use crate::sky::fits::{WriteOptions, write_map};
+use crate::sky::fits::{Card, WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::units::constants::DAY_S;
@@ -299,7 +299,11 @@ impl ChannelFolder {
         if let Some(errors) = &origin.solution.uncertainty {
             for map in ErrorMap::all(errors) {
                 let what = map.file.trim_end_matches(".fits");
-                let cards = origin.provenance.cards(origin.solution, what, None);
+                let mut cards = origin.provenance.cards(origin.solution, what, None);
+                if map.file != "resolution.fits" {
+                    let Solution { diagnostics, refinement, .. } = origin.solution;
+                    cards.push(Card::text("ERRORS", limits(diagnostics, refinement.as_ref()), ""));
+                }
                 self.file(map.file);
                 map.write(&self.root.join(&self.name), &WriteOptions { cards, ..WriteOptions::default() })?;
             }

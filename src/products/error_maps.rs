@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use crate::imaging::{Sample, Uncertainty};
+use crate::imaging::anywhere::Refinement;
+use crate::imaging::{Diagnostics, Sample, Uncertainty};
 use crate::sky::Frame;
 use crate::sky::fits::{Column, FitsError, WriteOptions, write_columns};
 
@@ -42,6 +43,16 @@ impl ErrorMap {
     pub(crate) fn write(&self, folder: &Path, options: &WriteOptions) -> Result<(), FitsError> {
         let column = Column { name: self.column, unit: self.unit, values: &self.values };
         write_columns(&folder.join(self.file), Frame::Ecliptic, &[column], options)
+    }
+}
+
+/// What the standard deviation of a map's pixels has and what it has not; the mask follows it. At most 68 characters, which a header's line holds.
+pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>) -> &'static str {
+    // Sums over pixels are solved without iterations.
+    match (refinement, diagnostics.convergence) {
+        (Some(_), _) => "to l_max, nearest circle's matrix; off it use lunarray sample",
+        (None, Some(_)) => "to l_max, phases as if evenly seen; few data: lunarray sample",
+        (None, None) => "matrix of the data, and the sky's degrees beyond the map's",
     }
 }
 

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::beam::EffectiveBeam;
 use super::config::PostProcessing;
-use super::error_maps::told_vector;
+use super::error_maps::{limits, told_vector};
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
@@ -143,8 +143,9 @@ impl ChannelSummary {
         let all = power.decided.len().pow(2);
         format!(
             "regularised by the power spectrum of the data (map.regulariser = \"data\"): {decided:.0} of {all} harmonics \
-            measured, residuals {:.2} times the noise; uncertainty of pixels in sigma.fits",
-            power.noise_factor
+            measured, residuals {:.2} times the noise; uncertainty of pixels in sigma.fits ({})",
+            power.noise_factor,
+            limits(&self.diagnostics, self.refinement.as_ref())
         )
     }
 }

@@ -119,6 +119,36 @@ fn positions_within_the_moon_make_no_engine_and_end_nothing() {
     }
 }
 
+/// An instrument that replaces another has its own frequency: what is beyond its map is that of its baselines in wavelengths.
+#[test]
+fn what_is_beyond_follows_the_instrument() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("power.csv");
+    let table: String = (0..60).map(|l| format!("{l},{}\n", 1e12 / f64::from(l + 1).powi(2))).collect();
+    std::fs::write(&path, table).unwrap();
+    let at = |frequency_hz: f64| {
+        let channels = vec![Channel { frequency_hz, width_hz: 8e3 }];
+        let block = PlacedVisibilities { frequency_hz, ..block(1e-9) };
+        [PlacedFrame::Instrument(Instrument { channels, ..instrument() }), PlacedFrame::Visibilities(block)]
+    };
+    let weight = |frames: Vec<PlacedFrame>| {
+        let map = MapConfig {
+            nside: 1,
+            baseline_bp_max: 100.0,
+            beyond_files: vec![path.clone()],
+            ..MapConfig::default()
+        };
+        let mut accumulator = Accumulator::new(map, Ledger::new());
+        let mut out = Outlet::collect();
+        frames.into_iter().for_each(|frame| accumulator.step(frame, &mut out).unwrap());
+        accumulator.finish(&mut out).unwrap();
+        out.into_vec().pop().unwrap().data.counts().weight
+    };
+    let [first, alone] = [3e6, 6e6].map(|frequency_hz| weight(at(frequency_hz).into()));
+    assert!(first != alone && alone < 40e-9, "{first} {alone}");
+    assert_eq!(weight([at(3e6), at(6e6)].concat()), alone);
+}
+
 /// Weights that rounding leaves nothing of: counted, and a matrix of zeros.
 #[test]
 fn a_snapshot_that_determines_no_map_waits_for_more() {

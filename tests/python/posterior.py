@@ -56,6 +56,7 @@ inverse = np.linalg.inv(normal + np.diag(r))
 nside = channel["nside"]
 y = harmonics(nside)[0]
 sigma = factor * np.sqrt(np.einsum("pi,ij,pj->p", y, inverse, y, optimize=True))
+own = sigma
 if asked["beyond"]:
     # A power law through the last two degrees, averaged over discs of a pixel's area.
     slope = np.log(power[l_max] / power[l_max - 1]) / np.log((l_max + 1) / l_max)
@@ -88,7 +89,7 @@ print(
         {
             "map": (np.std(found - y @ solved) / sigma.mean()).item(),
             "sigma": (read("sigma") / sigma).tolist(),
-            "sampled": ((sampled / sigma) ** 2).tolist(),
+            "sampled": ((sampled / own) ** 2).tolist(),
             "resolution": (read("resolution") / resolution).tolist(),
             "mask": (read("mask") == (sigma**2 < 0.5 * expected)).mean().item(),
             "measured": (sigma**2 < 0.5 * expected).mean().item(),

@@ -77,7 +77,8 @@ impl Posterior<'_> {
         })
     }
 
-    /// Standard deviations of mean and dipole, K, for data of their noise: columns of the covariance.
+    /// Standard deviations of mean and dipole, K, for data of their noise: columns of the covariance, or of the blocks' where no time is left for
+    /// a step.
     fn moments_sigma(&self, factors: &Factors<'_>) -> [f64; 4] {
         let unit = |(place, factor): (usize, f64)| {
             let mut unit = vec![0.0; self.right.len()];
@@ -94,6 +95,12 @@ impl Posterior<'_> {
         };
         let task = self.watch.start("errors of mean and dipole", rule.residual_max);
         system.solve(&units.each_ref().map(Vec::as_slice), &mut columns, &[rule; 4], &task);
+        for (column, unit) in columns.iter_mut().zip(&units) {
+            if column.iter().all(|x| *x == 0.0) {
+                column.clone_from(unit);
+                factors.solve(column);
+            }
+        }
         [0, 1, 2, 3].map(|k| dot(&units[k], &columns[k]).max(0.0).sqrt())
     }
 

@@ -97,10 +97,11 @@ impl LanczosSampler {
         }
     }
 
-    /// `K^(-1/2)` times the start vector.
+    /// `K^(-1/2)` times the start vector; before the first step K counts as the identity.
     fn sample(&self) -> Vec<f64> {
         let mut sum = vec![0.0; self.basis[0].len()];
-        for (vector, factor) in self.basis.iter().zip(&self.coefficients) {
+        let coefficients = if self.coefficients.is_empty() { &[1.0][..] } else { &self.coefficients };
+        for (vector, factor) in self.basis.iter().zip(coefficients) {
             sum.iter_mut().zip(vector).for_each(|(sum, x)| *sum += self.start_norm * factor * x);
         }
         sum
@@ -189,5 +190,20 @@ impl PosteriorPrecision<'_> {
                 preconditioner: upper(start),
             })
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sample_without_a_step_is_that_of_the_preconditioner() {
+        let sample = LanczosSampler::new(vec![3.0, -4.0], SAMPLE_TOLERANCE).sample();
+        // But for the rounding of a normalised vector.
+        assert!(
+            sample.iter().zip([3.0, -4.0]).all(|(found, start)| (found - start).abs() < 1e-14),
+            "{sample:?}"
+        );
     }
 }

@@ -46,6 +46,17 @@ pub enum SolveError {
         /// What was found.
         found: String,
     },
+    /// A table of the power beyond the degrees of a map is invalid.
+    #[error(
+        "map.beyond_files: {}: {found}; expected a table of l and C_l in K^2 of two or more degrees without gaps, all above 0",
+        path.display()
+    )]
+    BeyondPower {
+        /// Its path.
+        path: std::path::PathBuf,
+        /// What was found.
+        found: String,
+    },
     /// A table of angular power ends before the map's maximum degree.
     #[error("map.regulariser.file: {found} degrees; expected {expected}, up to the greatest of the map")]
     PowerLength {

@@ -5,144 +5,18 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::frames::{Channel, Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
-use crate::imaging::anywhere::{ArchiveSegment, RefinedSetup, SegmentFolder, VisibilityArchive};
+use super::engine::{Engine, NewOrRefused, new_engine};
+use super::snapshot::{Snapshot, SnapshotData};
+use crate::frames::{Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
+use crate::imaging::anywhere::{ArchiveSegment, SegmentFolder};
 use crate::imaging::beyond::{BeyondNoise, read_power};
-use crate::imaging::circle::{
-    HarmonicEngine, HarmonicSetup, HarmonicSums, NoiseSums, SumPart, nominal_orbit,
-};
+use crate::imaging::circle::{NoiseSums, SumPart};
 use crate::imaging::solver::SolveError;
-use crate::imaging::{
-    AccumulationError, Added, ChannelGroup, EngineKind, MapConfig, MatrixFreeVisibilities, NormalEngine,
-    NormalSums, PixelEngine, PixelSetup, PixelSums, SumCounts, automatic_weight_max,
-};
+use crate::imaging::{AccumulationError, Added, ChannelGroup, MapConfig};
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
-
-/// A copy of the sums of one channel, to be solved while more data arrives.
-pub struct Snapshot {
-    /// Instrument.
-    pub instrument: Arc<Instrument>,
-    /// Channel.
-    pub channel: ChannelId,
-    /// Number of the snapshot in its channel, from 1.
-    pub number: u32,
-    /// Whether it holds all data.
-    pub is_final: bool,
-    /// Mission times of its first and last data, s.
-    pub span_s: [f64; 2],
-    /// nside of its map.
-    pub nside: usize,
-    /// Its data.
-    pub data: SnapshotData,
-}
-
-/// The data of a snapshot: accumulated normal equations, or individual visibilities.
-pub enum SnapshotData {
-    /// Normal equations over pixels.
-    Pixel(PixelSums),
-    /// Normal equations over spherical harmonics.
-    Harmonic(Box<HarmonicSums>),
-    /// Individual visibilities, for iterative refinement.
-    Refined(Box<VisibilityArchive>),
-    /// Individual visibilities, for a pixel map solved without storing the matrix.
-    MatrixFree(Box<MatrixFreeVisibilities>),
-}
-
-impl SnapshotData {
-    fn with_noise_realisations(self, realisations: Option<NoiseSums>) -> Self {
-        match (self, realisations) {
-            (Self::Harmonic(sums), Some(realisations)) => {
-                Self::Harmonic(Box::new(sums.with_noise_realisations(realisations)))
-            }
-            (other, _) => other,
-        }
-    }
-
-    /// Number and weight of its visibilities.
-    #[must_use]
-    pub fn counts(&self) -> SumCounts {
-        match self {
-            Self::Pixel(sums) => sums.counts(),
-            Self::Harmonic(sums) => sums.counts(),
-            Self::Refined(archive) => archive.counts(),
-            Self::MatrixFree(visibilities) => visibilities.counts(),
-        }
-    }
-}
-
-/// The engine of one channel: pixel sums, harmonic sums, or stored visibilities.
-enum Engine {
-    Pixel(Box<PixelEngine>),
-    Harmonic(Box<HarmonicEngine>),
-    Archive(Box<VisibilityArchive>),
-}
-
-impl Engine {
-    /// Restricts the engine to this rank's share. Only the harmonic engine divides its sums; the others hold everything on every rank.
-    fn with_ranks(self, ranks: &Ranks) -> Self {
-        match self {
-            Self::Harmonic(engine) => Self::Harmonic(Box::new(engine.with_ranks(ranks))),
-            other => other,
-        }
-    }
-
-    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        match self {
-            Self::Pixel(engine) => engine.add(placed),
-            Self::Harmonic(engine) => engine.add(placed),
-            Self::Archive(archive) => archive.add(placed),
-        }
-    }
-
-    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        match self {
-            Self::Pixel(engine) => engine.remove(placed),
-            Self::Harmonic(engine) => engine.remove(placed),
-            Self::Archive(archive) => archive.remove(placed),
-        }
-    }
-
-    /// Whether it holds no visibility.
-    fn is_empty(&self) -> bool {
-        let counts = match self {
-            Self::Pixel(engine) => engine.counts(),
-            Self::Harmonic(engine) => engine.counts(),
-            Self::Archive(archive) => archive.counts(),
-        };
-        counts.visibilities == 0
-    }
-
-    /// Copies the data for a snapshot. For refinement these are the harmonic sums on the nearest circular orbit.
-    fn snapshot_data(&mut self, config: &MapConfig) -> Result<SnapshotData, AccumulationError> {
-        Ok(match self {
-            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, archive.copy()),
-            Self::Pixel(engine) => SnapshotData::Pixel(engine.sums()),
-            Self::Harmonic(engine) => SnapshotData::Harmonic(Box::new(engine.sums())),
-            Self::Archive(archive) => SnapshotData::Harmonic(Box::new(archive.circle_sums()?)),
-        })
-    }
-
-    fn into_final_data(self, config: &MapConfig) -> SnapshotData {
-        match self {
-            Self::Archive(archive) if config.is_matrix_free() => matrix_free(config, *archive),
-            Self::Pixel(engine) => SnapshotData::Pixel(engine.into_sums()),
-            Self::Harmonic(engine) => SnapshotData::Harmonic(Box::new(engine.into_sums())),
-            Self::Archive(archive) => SnapshotData::Refined(archive),
-        }
-    }
-}
-
-/// Wraps stored visibilities for the matrix-free pixel solver.
-fn matrix_free(config: &MapConfig, archive: VisibilityArchive) -> SnapshotData {
-    SnapshotData::MatrixFree(Box::new(MatrixFreeVisibilities {
-        nside: config.nside,
-        method: config.rows,
-        archive,
-    }))
-}
 
 /// Checkpoint state of an accumulator, except its engines, time spans and ledger, which are saved separately.
 ///
@@ -283,11 +157,7 @@ impl Accumulator {
         segments: SegmentFolder<'_>,
     ) -> Result<(), AccumulationError> {
         for state in self.channels.iter_mut().flatten() {
-            match &mut state.engine {
-                Engine::Pixel(engine) => engine.checkpoint(out)?,
-                Engine::Harmonic(engine) => engine.checkpoint(out)?,
-                Engine::Archive(archive) => archive.checkpoint(out, segments)?,
-            }
+            state.engine.checkpoint(out, segments)?;
         }
         Ok(())
     }
@@ -335,23 +205,13 @@ impl Accumulator {
         folder: Option<&Path>,
         part: RankShare,
     ) -> Result<Self, AccumulationError> {
-        let refine = self.config.refine;
         let mut channels = Vec::new();
         for has_engine in state.channels {
             if !has_engine {
                 channels.push(None);
                 continue;
             }
-            let engine = match self.config.engine {
-                _ if self.config.holds_visibilities() => {
-                    let archive = VisibilityArchive::restore(from, folder, refine.visibilities_max)?;
-                    Engine::Archive(Box::new(archive))
-                }
-                EngineKind::Pixel | EngineKind::Auto => Engine::Pixel(Box::new(PixelEngine::restore(from)?)),
-                EngineKind::Harmonic => {
-                    Engine::Harmonic(Box::new(HarmonicEngine::restore_part(from, part, &self.ranks)?))
-                }
-            };
+            let engine = Engine::restore(&self.config, from, folder, (part, &self.ranks))?;
             channels.push(Some(ChannelState { engine, realisations: None, span_s: NO_SPAN_S, snapshots: 0 }));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
@@ -395,12 +255,7 @@ impl Accumulator {
                 (_, None) => {}
                 (None, theirs) => *slot = theirs,
                 (Some(ours), Some(theirs)) => {
-                    match (&mut ours.engine, theirs.engine) {
-                        (Engine::Pixel(ours), Engine::Pixel(theirs)) => ours.merge(*theirs)?,
-                        (Engine::Harmonic(ours), Engine::Harmonic(theirs)) => ours.merge(*theirs)?,
-                        (Engine::Archive(ours), Engine::Archive(theirs)) => ours.merge(*theirs)?,
-                        _ => return Err(AccumulationError::Mismatch { what: "kinds" }),
-                    }
+                    ours.engine.merge(theirs.engine)?;
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
                     ours.span_s = [first.min(from), last.max(to)];
                 }
@@ -471,6 +326,7 @@ impl Accumulator {
         self.config.check_priors(&instrument)?;
         self.config.require_memory(channels, self.memory_max_bytes, self.group.as_ref())?;
         self.channels = (0..channels).map(|_| None).collect();
+        self.beyond.clear();
         self.instrument = Some(Arc::new(instrument));
         Ok(())
     }
@@ -614,89 +470,12 @@ impl Accumulator {
     }
 }
 
-/// A value, or why it could not be created from the first data of its channel.
-type NewOrRefused<T> = Result<T, VisibilityReason>;
-
-/// Creates an engine for the channel of `placed`, its first data; refuses positions that determine no usable orbit.
-fn new_engine(
-    config: &MapConfig,
-    instrument: &Instrument,
-    placed: &PlacedVisibilities,
-) -> Result<NewOrRefused<Engine>, AccumulationError> {
-    let Some(&Channel { frequency_hz, width_hz }) = instrument.channels.get(usize::from(placed.channel.0))
-    else {
-        return Err(AccumulationError::UnknownChannel(placed.channel));
-    };
-    let (moon_radius_m, response) = (instrument.moon_radius_m, instrument.response);
-    let weight_max = match config.weight_max {
-        0.0 => automatic_weight_max(frequency_hz, width_hz),
-        weight_max => weight_max,
-    };
-    Ok(match config.engine {
-        _ if config.holds_visibilities() => {
-            Ok(Engine::Archive(Box::new(VisibilityArchive::new(RefinedSetup {
-                channel: placed.channel,
-                // A pixel map has no l_max.
-                l_max: if config.is_matrix_free() { 0 } else { config.degree() },
-                frequency_hz,
-                baseline_m_max: config.baseline_m_max(frequency_hz),
-                moon_radius_m,
-                response,
-                companion_seed: config.companion_seed,
-                weight_max,
-                limits: config.limits,
-                visibilities_max: config.refine.visibilities_max,
-            })?)))
-        }
-        EngineKind::Pixel | EngineKind::Auto => Ok(Engine::Pixel(Box::new(PixelEngine::new(PixelSetup {
-            nside: config.nside,
-            frequency_hz,
-            method: config.rows,
-            moon_radius_m,
-            response,
-            companion_seed: config.companion_seed,
-            weight_max,
-        })?))),
-        EngineKind::Harmonic => match nominal_orbit(placed, config.limits) {
-            // Positions are untrusted: an orbit inside the Moon, or smaller than the longest baseline, is refused. Later data may still
-            // create the engine.
-            Some(orbit) if orbit.radius_m <= moon_radius_m.max(config.baseline_m_max(frequency_hz)) => {
-                Err(VisibilityReason::OffAltitude)
-            }
-            Some(orbit) => Ok(Engine::Harmonic(Box::new(HarmonicEngine::new(HarmonicSetup {
-                l_max: config.degree(),
-                frequency_hz,
-                baseline_m_max: config.baseline_m_max(frequency_hz),
-                moon_radius_m,
-                response,
-                orbit,
-                companion_seed: config.companion_seed,
-                weight_max,
-            })?))),
-            None => Err(VisibilityReason::NoDirection),
-        },
-    })
-}
-
 /// The visibilities whose baselines are shorter than `baseline_m_max`.
 fn within_baseline(placed: &PlacedVisibilities, baseline_m_max: f64) -> PlacedVisibilities {
+    let mut short = placed.without_visibilities();
     let is_short = |k: &usize| norm(sub(placed.r_i_m[*k], placed.r_j_m[*k])) < baseline_m_max;
-    let kept: Vec<usize> = (0..placed.len()).filter(is_short).collect();
-    fn pick<T: Copy>(from: &[T], kept: &[usize]) -> Vec<T> {
-        kept.iter().map(|&k| from[k]).collect()
-    }
-    PlacedVisibilities {
-        channel: placed.channel,
-        band: placed.band,
-        frequency_hz: placed.frequency_hz,
-        pair: placed.pair,
-        time_s: pick(&placed.time_s, &kept),
-        r_i_m: pick(&placed.r_i_m, &kept),
-        r_j_m: pick(&placed.r_j_m, &kept),
-        value_k_sr: pick(&placed.value_k_sr, &kept),
-        weight: pick(&placed.weight, &kept),
-        duration_s: if placed.duration_s.is_empty() { Vec::new() } else { pick(&placed.duration_s, &kept) },
-    }
+    (0..placed.len()).filter(is_short).for_each(|k| short.push_from(placed, k));
+    short
 }
 
 impl Stage for Accumulator {

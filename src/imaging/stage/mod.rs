@@ -1,7 +1,10 @@
 //! The two pipeline stages that make maps: one accumulates the sums of each channel, the other solves them.
 
 mod accumulate;
+mod engine;
+mod snapshot;
 mod solve;
 
-pub use accumulate::{Accumulator, AccumulatorState, Snapshot, SnapshotData};
+pub use accumulate::{Accumulator, AccumulatorState};
+pub use snapshot::{Snapshot, SnapshotData};
 pub use solve::{Solution, Solver, SolverSetup};

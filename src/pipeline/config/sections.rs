@@ -316,6 +316,7 @@ impl Config {
         let (mut calibration, mut map) = (self.calibration.clone(), self.map.clone());
         calibration.gains_file = calibration.gains_file.as_deref().map(content_checksum);
         map.prior_files = map.prior_files.iter().map(|path| content_checksum(path)).collect();
+        map.beyond_files = map.beyond_files.iter().map(|path| content_checksum(path)).collect();
         map.antennas.files = map.antennas.files.map_paths(|path| content_checksum(path));
         if let Some(RegulariserChoice::File(files)) = &mut map.regulariser {
             files.iter_mut().for_each(|path| *path = content_checksum(path));
@@ -435,11 +436,14 @@ mod tests {
         let path = |name: &str| folder.path().join(name).display().to_string();
         let hashes = |name: &str| {
             let sky = format!("sky.file={:?}", path(name));
-            let (prior, gains) = (format!("map.prior_files=[{:?}]", path(name)), path("gains"));
+            let [prior, beyond] =
+                ["prior_files", "beyond_files"].map(|key| format!("map.{key}=[{:?}]", path(name)));
+            let gains = path("gains");
             let sky = with(&[&sky]).unwrap();
             let prior = with(&[&prior]).unwrap();
+            let beyond = with(&[&beyond]).unwrap();
             let gains = with(&[&format!("calibration.gains_file={gains:?}")]).unwrap();
-            [sky.space_hash(), prior.ground_hash(), gains.ground_hash()]
+            [sky.space_hash(), prior.ground_hash(), beyond.ground_hash(), gains.ground_hash()]
         };
         for (name, text) in [("one", "a"), ("same", "a"), ("other", "b"), ("gains", "c")] {
             std::fs::write(path(name), text).unwrap();
@@ -447,9 +451,9 @@ mod tests {
         let first = hashes("one");
         assert_eq!(first, hashes("same"));
         let other = hashes("other");
-        assert!(first[0] != other[0] && first[1] != other[1] && first[2] == other[2]);
+        assert!((0..3).all(|k| first[k] != other[k]) && first[3] == other[3]);
         std::fs::write(path("gains"), "d").unwrap();
-        assert_ne!(first[2], hashes("one")[2]);
+        assert_ne!(first[3], hashes("one")[3]);
         // Missing files: the hash contains the path.
         assert_ne!(hashes("none"), hashes("neither"));
     }

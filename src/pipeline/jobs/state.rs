@@ -150,7 +150,7 @@ pub fn solve_state(
     Ok(())
 }
 
-/// Maps every channel of a state, with `count` samples from the posterior; R is estimated from the data. The state is unchanged.
+/// Maps every channel of a state, with `samples` from the posterior; R is estimated from the data. The state is unchanged.
 ///
 /// # Errors
 /// As [`solve_state`].

@@ -1,16 +1,20 @@
 mod coverage;
 mod shared;
 
+use std::time::Duration;
+
 use num_complex::Complex64;
 
 use super::*;
 use crate::array::{Array, ArrayConfig};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::exact::noise::companion_noise;
-use crate::imaging::{NormalEngine, NormalSums};
+use crate::imaging::regulariser::Regulariser;
+use crate::imaging::{NormalEngine, NormalSums, Samples, SolveWatch, StoppingRule, Uncertainty};
 use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
 };
+use crate::runtime::Cancel;
 use crate::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use crate::units::vector::{norm, sub};
 use crate::units::{Pair, all_pairs};
@@ -71,6 +75,44 @@ fn engine(blocks: &[PlacedVisibilities]) -> HarmonicEngine {
         assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
     }
     engine
+}
+
+/// Where no time is left for a step, mean and dipole have the errors of the blocks, and samples scatter by them.
+#[test]
+fn errors_without_a_step_are_those_of_the_blocks() {
+    let sums = engine(&blocks(0, 20)).into_sums();
+    let request = HarmonicRequest {
+        epsilon: 1.0,
+        nside: 8,
+        rule: StoppingRule { residual_max: 1e-4, iterations_max: 300 },
+        samples: Samples { count: 2, gibbs: false },
+        probes: 0,
+    };
+    let errors = |watch: &SolveWatch| {
+        let found =
+            solve_regularised(&sums, request, &Regulariser::Data, None, None, watch.named("test")).unwrap();
+        (found.diagnostics.convergence.unwrap().iterations, found.map_k, found.uncertainty.unwrap())
+    };
+    let (_, _, solved) = errors(&SolveWatch::default());
+    let cancel = Cancel::new();
+    cancel.cancel();
+    let (steps, map_k, hurried) = errors(&SolveWatch::new(cancel).with_grace(Duration::ZERO));
+    assert_eq!(steps, 0);
+    let all = |errors: &Uncertainty| {
+        let [x, y, z] = errors.dipole_sigma_k;
+        [errors.mean_sigma_k, x, y, z]
+    };
+    for (hurried, solved) in all(&hurried).iter().zip(all(&solved)) {
+        // Blocks take phases as evenly seen, which those of 20 orbits are not: errors too small by up to a third, and R is that of one round.
+        assert!((0.5..1.5).contains(&(hurried / solved)), "{hurried} {solved}");
+    }
+    // Of one sky, which scatters by its few strongest coefficients.
+    let sum = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>();
+    for sample in &hurried.samples {
+        let scatter = sum(&mut sample.map_k.iter().zip(&map_k).map(|(a, b)| a - b));
+        let stated = sum(&mut hurried.sigma_k.iter().copied());
+        assert!((0.5..2.0).contains(&(scatter / stated)), "{scatter} {stated}");
+    }
 }
 
 /// A vector of pseudo-random unknowns.
