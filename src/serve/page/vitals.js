@@ -31,7 +31,7 @@ function cardsOf(status, geometry, past, heardAt) {
   }
   if (listening) cards.push([listening.silence_s === null ? "warn" : "", "last packet", [listening.silence_s === null ? "none yet" : ago(listening.silence_s + past)], "From any sender"]);
   if (saving) {
-    const unsaved = saving.unsaved_bytes ? `${prefixed(saving.unsaved_bytes)}B since then` : "";
+    const unsaved = saving.unsaved_bytes ? `${prefixed(saving.unsaved_bytes)}B not saved yet` : "";
     cards.push(["", "last checkpoint", [saving.checkpoint_s === undefined ? "none in this session" : ago(saving.checkpoint_s + past), unsaved], `${number.format(saving.written)} checkpoints written in this session`]);
   }
   if (reception) {
