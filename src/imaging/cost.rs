@@ -17,7 +17,7 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Iterations of a harmonic solution whose windows cover the planes of the orbit: for W_max, the map and its noise map each (`lunarray run`
 /// of the quicklook with `map.epsilon = 1e-4`: 9 to 16, 11 to 13 and 10 to 13).
-const ITERATIONS: f64 = 12.0;
+const ITERATIONS: f64 = 11.0;
 
 /// Number of windows below which iterations grow, and the power of the fraction by which they do: 24 with 50 windows, 75 to 183 with 17.
 const WINDOWS_COVERED: f64 = 90.0;
@@ -31,7 +31,7 @@ const FREE_ITERATIONS: f64 = 2.0;
 
 /// Products of a final map with R from the data in units of those with a given R: rounds for the sky's power, its errors and their samples.
 /// Intermediate maps take about as many as with a given R.
-const DATA_PRODUCTS: f64 = 2.3;
+const DATA_PRODUCTS: f64 = 2.0;
 
 /// Multiply-adds of a dense solution with R from the data in units of the cube of the number of pixels, and full matrices that it holds.
 const DATA_CUBES: f64 = 1.0;

@@ -13,8 +13,8 @@ pub(crate) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
 pub(crate) const CENTRE_ELEMENT_S: f64 = 2.2e-9;
 
 /// Time per row element averaged over pixels, s, times nside: the blocks at the Moon's limb are a share of all pixels that falls with nside.
-/// With AVX-512, 64 ns at nside 8, 24 to 30 ns at 16, 14 ns at 32 and 5.6 ns at 64.
-pub(crate) const AVERAGE_ELEMENT_S: f64 = 4.5e-7;
+/// With AVX-512 on a busy machine, 64 ns at nside 8, 24 to 30 ns at 16, 14 ns at 32 and 5.6 ns at 64.
+pub(crate) const AVERAGE_ELEMENT_S: f64 = 4e-7;
 
 /// Time per row element averaged child by child in f64 (256 sines), s; not measured.
 pub(crate) const EXACT_ELEMENT_S: f64 = 1e-5;
