@@ -62,7 +62,8 @@ impl Screen {
         let height = usize::from(height);
         let reception = RECEPTION_WIDTH.min((width / 2).max(RECEPTION_WIDTH_MIN)).min(width);
         let mut ledger = self.ledger_lines(usize::from(width - reception).saturating_sub(2));
-        let ledger_max = (height / 2).max(KINDS.len() + 2);
+        // Title, keys, one stage, one channel, and frames take 13 lines.
+        let ledger_max = height.saturating_sub(13).max(KINDS.len() + 2);
         if ledger.len() > ledger_max {
             let more = format!("and {} more lines", ledger.len() + 1 - ledger_max);
             ledger.truncate(ledger_max - 1);
@@ -588,8 +589,8 @@ mod tests {
         let reasons: serde_json::Map<String, Value> =
             (0..30).map(|k| (format!("reason {k:02}"), json!(k))).collect();
         screen.status["ledger"]["flagged"] = json!(reasons);
-        // 34 lines, of which 12 have room, the last for this.
-        assert!(drawn(&screen, 80, 24).contains("and 23 more lines"));
+        // 34 lines, of which 11 have room, the last for this.
+        assert!(drawn(&screen, 80, 24).contains("and 24 more lines"));
         assert!(drawn(&screen, 80, 80).contains("29  flagged: reason 29"));
     }
 }
