@@ -21,7 +21,7 @@ const ITERATIONS: f64 = 11.0;
 
 /// Number of windows below which iterations grow, and the power of the fraction by which they do: 24 with 50 windows, 75 to 183 with 17.
 const WINDOWS_COVERED: f64 = 90.0;
-const COVERAGE_EXPONENT: f64 = 1.3;
+const COVERAGE_EXPONENT: f64 = 1.4;
 
 /// Maximum number of iterations of a solution from few windows, which determine few harmonics.
 const ITERATIONS_FEW: f64 = 180.0;

@@ -22,6 +22,8 @@ const QUEUED_VISIBILITY_BYTES: f64 = 200.0;
 
 /// Memory of the program, queues and pictures, bytes.
 const BASE_BYTES: f64 = 5e7;
+/// The part of it that pictures take.
+const PICTURE_BYTES: f64 = 2e7;
 
 /// Processor time of a program's start and plan, and of a generated sky up to nside 64, by channel, s.
 const START_S: f64 = 0.15;
@@ -177,8 +179,9 @@ impl Plan {
             .collect();
         let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
-        let memory_bytes =
-            memory_bytes(simulation_memory_bytes, &engines, solutions) + self.known_sky_bytes();
+        let memory_bytes = memory_bytes(simulation_memory_bytes, &engines, solutions)
+            + self.known_sky_bytes()
+            - if self.config.products.pictures { 0.0 } else { PICTURE_BYTES };
         let sampling_s = self.sampling_s();
         let simulating_s: f64 =
             sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
