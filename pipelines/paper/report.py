@@ -226,53 +226,52 @@ def latitudes(name):
     return table(["case", "mean, K", *head], rows)
 
 
-def thinned():
-    """Traces at nside 8 by thinning, Tr Sigma_n scaled to all data; the crossing is of straight lines between the two epsilons."""
-    study = load("fig15-nside8/study.json")
-    if study is None:
-        return missing("lunarray study pipelines/paper/fig15-nside8.toml")
-    found = {}
-    for case in study["cases"]:
+def thinned(name, nside, visibilities_all):
+    """Rows of traces by thinning, Tr Sigma_n scaled to all data; the crossing is on straight lines in logarithms."""
+    study, found, rows = load(f"{name}/study.json"), {}, []
+    for case in (study or {}).get("cases", []):
         channel = case["figures"]["channels"][0]
         thin = int(case["figures"]["name"].split("thin = ")[1].split(",")[0])
-        mean = math.sqrt(channel["power"]["input_k2"][0] / (4 * math.pi))
+        t2 = channel["power"]["input_k2"][0] / (4 * math.pi)
         traces = channel["diagnostics"]["traces"]
-        n, s = traces["sigma_n_k2"]["value"] / thin, traces["sigma_s"]["value"]
-        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, math.log(n / (mean**2 * s))))
-    rows = []
-    for thin, ((e, n, s, above), (e2, n2, s2, above2)) in found.items():
-        crossing = e * (e2 / e) ** (above / (above - above2)) if above > 0 > above2 else None
-        name = "all data" if thin == 1 else f"one in {thin}"
-        rows.append([name, show(n), f"{s:.4f}", show(n2), f"{s2:.2f}", show(crossing, "{:.1e}")])
-    return table(["nside 8", "Tr Sigma_n, K², at 1e-4", "Tr Sigma_s", "at 2e-3", "Tr Sigma_s", "crossing"], rows)
+        n, s = traces["sigma_n_k2"]["value"] * channel["visibilities"] / visibilities_all, traces["sigma_s"]["value"]
+        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, math.log(n / (t2 * s)), t2 * s))
+    for thin, points in found.items():
+        crossing = None
+        for (e, *_, above, _), (e2, *_, above2, _) in zip(points, points[1:]):
+            if above > 0 > above2:
+                crossing = e * (e2 / e) ** (above / (above - above2))
+        data = "all" if thin == 1 else f"one in {thin}"
+        for e, n, s, _, ts in points:
+            rows.append([f"{nside}, {data}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.1e}")])
+    return rows
+
+
+def pixel_traces():
+    rows = thinned("fig15-nside8", 8, 569_208) + thinned("fig15-pixels", 16, 2_034_350)
+    return table(["nside, data", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing"], rows)
 
 
 # Ecliptic longitude and latitude of the paper's patches.
 PATCHES = ("120,0", "120,30", "120,60")
 
 
-def patch_command(mhz, k):
-    maps = [f"out/noise-free-{mhz}mhz/{mhz}.000MHz/input-smooth.fits", f"out/noise-free-{mhz}mhz/{mhz}.000MHz/map-smooth.fits",
-            f"out/paper-{mhz}mhz/{mhz}.000MHz/map-smooth.fits"]
-    return (f"lunarray cutout {' '.join(maps)} --frame ecliptic --centre {PATCHES[k]} --subtract-fwhm 5 "
-            f"--out out/patch-{mhz}-{k + 1}.png --json > out/patch-{mhz}-{k + 1}.json")
+def patch_command(k):
+    folder = "out/data-10mhz/10.000MHz"
+    return (f"lunarray cutout {folder}/input.fits {folder}/map.fits --frame ecliptic --centre {PATCHES[k]} --subtract-fwhm 5 "
+            f"--out out/patch-10-{k + 1}.png --json > out/patch-10-{k + 1}.json")
 
 
 def patches():
     rows, shown = [], ""
-    for mhz in ("10", "3"):
-        for k, centre in enumerate(PATCHES):
-            found = load(f"patch-{mhz}-{k + 1}.json")
-            if found is None:
-                continue
-            truth, *ours = found["pieces"]
-            rows.append([mhz, centre, show(truth["rms_k"]), *[f"{show(o['rms_k'])}, {o['correlation']:.3f}" for o in ours]])
-            shown += picture(f"patch-{mhz}-{k + 1}.png", f"paper-patch-{mhz}-{k + 1}.png",
-                             f"{mhz} MHz, {centre}")
-    if not rows:
-        return missing(patch_command("10", 0))
-    head = ["MHz", "centre, ecliptic deg", "rms of the input, K", "map without noise: rms, K, and correlation", "with noise"]
-    return table(head, rows) + shown
+    for k, centre in enumerate(PATCHES):
+        found = load(f"patch-10-{k + 1}.json")
+        if found is None:
+            return missing(patch_command(k))
+        truth, ours = found["pieces"]
+        rows.append([centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.3f}"])
+        shown += picture(f"patch-10-{k + 1}.png", f"paper-patch-10-{k + 1}.png", centre)
+    return table(["centre, ecliptic deg", "rms of the input, K", "of the map, K", "correlation"], rows) + shown
 
 
 def maps():
@@ -341,26 +340,6 @@ def traces(name="fig15-traces"):
             where = "nowhere in this range" if crossing[key] is None else f"at epsilon {crossing[key]:.2e}"
             text += f"\nTr Sigma_n = {what} Tr Sigma_s {where}.\n"
     return text
-
-
-def epsilon_rules(*names):
-    """What the rules choose, of each study that was made with traces."""
-    rows = []
-    for name in names:
-        study = load(f"{name}/study.json")
-        for found in (study or {}).get("epsilons", []):
-            def told(rule):
-                choice = found[rule]
-                if choice["epsilon"] is None:
-                    return "none in this range"
-                low, high = choice["open"] or (choice["epsilon"],) * 2
-                return f"{choice['epsilon']:.1e}" + (f" ({low:.0e} to {high:.0e} open)" if low < high else "")
-            rows.append([f"`{name}`", f"{found['numbers']:,}", f"{found['power_a_number']:.3g}",
-                         *[told(rule) for rule in ("crossing", "cross_validation", "risk", "l_curve")]])
-    if not rows:
-        return ""
-    head = ["study", "n", "V'N^-1V / n", "crossing for T²", "cross-validation", "predictive risk", "L-curve"]
-    return "\n### epsilon by four rules\n\n" + table(head, rows)
 
 
 def point_beams(name):
@@ -458,9 +437,9 @@ def main():
         ("Fig. 11: a prior of 5 degrees", study.format("fig11-prior"),
          correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
         ("Fig. 12: a wrong prior", study.format("fig12-wrong-prior"), latitudes("fig12-wrong-prior")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command('10', 0)}` and so on", patches()),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command(0)}` and so on", patches()),
         ("Fig. 15: traces against epsilon", study.format("fig15-pixels"),
-         traces("fig15-pixels") + "\n" + thinned() + "\n" + traces() + epsilon_rules("fig15-traces", "fig15-pixels")),
+         pixel_traces() + "\n" + traces()),
         ("Fig. 16: rows at centres and averaged, rho_l without noise", study.format("fig16-17-rows"), rows_of_b("rho", "no noise")),
         ("At nside 32", study.format("fig16-nside32"), correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
         ("At nside 64", study.format("fig16-nside64"),

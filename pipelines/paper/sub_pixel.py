@@ -2,11 +2,11 @@
 """The appendix's N_b and Sigma_b by its formulas, N_b = sum over l, m of conj(Delta b) Delta b' C_l, in numpy and healpy.
 
     lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits
-    python3 pipelines/paper/sub_pixel.py matrix 16 out/sky-10mhz.fits
-    python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits [BASELINES]
+    python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits
+    python3 pipelines/paper/sub_pixel.py map 8 out/sky-10mhz.fits [BASELINES]
 
 Delta b is a fringe over pixels 16 times as fine less the model's row, by pixel centres and averaged; C_l is the sky's own. `matrix` takes
-800 instants of one window of the pair whose length is nearest b_p there, and draws the correlations as out/sub-pixel-matrix.png; `map` takes
+800 instants of one window of the pair whose length is nearest b_p there, and draws the matrices on one scale as out/sub-pixel-matrix.png; `map` takes
 random instants of all pairs with b < 2 b_p, and R = 1e-4 W_max I. Beside the formulas stand the residuals V - B T of the sky itself.
 """
 
@@ -113,8 +113,8 @@ def matrix(sky):
         text = [", ".join(f"{x:.2f}" for x in values) for values in (formula, simulated)]
         amplitudes = [np.sqrt(x / power) for x in (diagonal.mean(), (found**2).mean())]
         print(f"| {name} | {amplitudes[0]:.3f} | {amplitudes[1]:.3f} | {text[0]} | {text[1]} | {np.abs(np.tril(correlation, -1)).sum() / (INSTANTS * (2 * INSTANTS - 1)):.3f} |")
-        panels.append(correlation.reshape(400, 4, 400, 4).mean((1, 3)))
-    write_png("out/sub-pixel-matrix.png", np.hstack([panels[0], np.zeros((400, 8)), panels[1]]))
+        panels.append(n_b.reshape(400, 4, 400, 4).mean((1, 3)))
+    write_png("out/sub-pixel-matrix.png", np.hstack([panels[0], np.zeros((400, 8)), panels[1]]) / np.abs(panels[0]).max())
 
 
 def error_map(sky, wanted):
