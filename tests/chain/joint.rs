@@ -116,7 +116,7 @@ fn map_with(state: &str, change: &dyn Fn(&mut [PowerSample])) -> JointMap {
     change(&mut channels[0].powers);
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: vec![0.0] };
     let rule = StoppingRule { residual_max: 1e-4, iterations_max: 300 };
-    let request = JointRequest { rule, samples: 16, at_hz: Vec::new(), powers: Some(priors) };
+    let request = JointRequest { rule, samples: 8, at_hz: Vec::new(), powers: Some(priors) };
     solve_jointly(channels, &request, &SolveWatch::default()).unwrap().maps.remove(0)
 }
 
@@ -127,7 +127,7 @@ fn powers_with_unknown_gains_see_the_largest_scales_and_the_mean() {
     let file = place.simulate("all.ccsds", &[]);
     let (state, alone, joint) = (place.path("state"), place.path("alone"), place.path("joint"));
     succeed(&["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", &alone]);
-    let report = json(&["joint", &state, "--out", &joint]);
+    let report = json(&["joint", &state, "--count", "8", "--out", &joint]);
     let found = &report["maps"][0];
     assert!(report["likeness"].is_null() && report["spectra"].is_null(), "{report}");
     // 42 of every 120th of some 5000 windows, with a pass of each daughter.
