@@ -312,6 +312,7 @@ fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
         (-1e17, "pixel 7 with -1e17 K"),
         (1e307, "pixel 7 with 1e307 K"),
         (0.0, "the mean of the pixels is 0e0 K"),
+        (1e-199, "the mean of the pixels is 3.1"),
     ];
     for (value, words) in refusals {
         let refused = read(value, false).unwrap_err();

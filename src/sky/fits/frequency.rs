@@ -11,6 +11,9 @@ use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map_file};
 use crate::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use crate::units::{Dimension, echo};
 
+/// Least mean of a sky of which something can be known, K.
+const MEAN_K_MIN: f64 = 1e-16;
+
 /// Channel for which a sky is read.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SkyChannel {
@@ -113,7 +116,7 @@ pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
     ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), ..ReadOptions::default() }
 }
 
-/// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean above 0 unless the sky may be dark.
+/// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean 1e-16 or more unless the sky may be dark.
 ///
 /// FREQ, or the name of the column, states the frequency of a map. A map of another frequency is refused, or scaled by
 /// a power law, as `config` says. A map that states no frequency is used unchanged if it serves only this channel, and cannot be scaled.
@@ -124,14 +127,14 @@ pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
 pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let map = read_at(path, channel, config)?;
     match mean_k(path, &map)? {
-        value if value <= 0.0 && !channel.is_dark_accepted => {
+        value if value < MEAN_K_MIN && !channel.is_dark_accepted => {
             Err(FitsError::new(path, MapError::Dark { value }.into()))
         }
         _ => Ok(map),
     }
 }
 
-/// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean above 0. When the channel
+/// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean 1e-16 or more. When the channel
 /// is known, [`check_frequency`] compares the frequency.
 ///
 /// # Errors
@@ -139,7 +142,7 @@ pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result
 pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
     let map = read_temperatures(path, options)?.map;
     match mean_k(path, &map)? {
-        value if value <= 0.0 => Err(FitsError::new(path, MapError::NothingKnown { value }.into())),
+        value if value < MEAN_K_MIN => Err(FitsError::new(path, MapError::NothingKnown { value }.into())),
         _ => Ok(map),
     }
 }
