@@ -127,16 +127,13 @@ impl Residuals {
         series
     }
 
-    /// Subtracts the change of a daughter's gain from its pairs, in `scale` parts, and in no fewer than those in which
-    /// errors of the model are sought.
-    fn subtract_change(&mut self, channel: usize, daughter: usize, series: &Series, scale: usize) {
-        let parts_per_group = PARTS / scale.max(MODEL_SCALES[1]);
-        let change: Vec<Complex64> = series.chunks(parts_per_group).map(mean).collect();
+    /// Subtracts the change of a daughter's gain from its pairs, in all parts: what stays would be found in others.
+    fn subtract_change(&mut self, channel: usize, daughter: usize, series: &Series) {
         let has_daughter =
             |pair: &&mut PairResiduals| pair.channel == channel && pair.daughters.contains(&daughter);
         for pair in self.pairs.iter_mut().filter(has_daughter) {
-            for part in 0..PARTS {
-                let change = change[part / parts_per_group];
+            for (part, (score, information)) in series.iter().enumerate() {
+                let change = if *information > 0.0 { score / information } else { Complex64::ZERO };
                 let change = if pair.daughters[0] == daughter { change } else { change.conj() };
                 pair.score[part] -= pair.information[part] * change;
             }
@@ -152,7 +149,7 @@ impl Residuals {
             while let Some((at, scatter)) = self.most_variable(channel, &open, suspects) {
                 let daughter = open.remove(at);
                 let series = self.series(channel, daughter);
-                self.subtract_change(channel, daughter, &series, scatter.scale);
+                self.subtract_change(channel, daughter, &series);
                 found.push((channel, daughter, scatter));
             }
         }
@@ -259,7 +256,7 @@ impl Residuals {
         for channel in 0..self.channels {
             let model_error = unchanged.model_error_fraction(channel, |_| true);
             let mut open: Vec<usize> = (0..self.satellites).collect();
-            while let Some((at, scatter)) = self.most_variable(channel, &open, &suspects) {
+            while let Some((at, _)) = self.most_variable(channel, &open, &suspects) {
                 let daughter = open.remove(at);
                 let series = self.series(channel, daughter);
                 let variance = 0.5 * model_error * self.share_of_pair_errors(channel, daughter);
@@ -269,7 +266,7 @@ impl Residuals {
                     found.push((daughter, channel, jump));
                     break;
                 }
-                self.subtract_change(channel, daughter, &series, scatter.scale);
+                self.subtract_change(channel, daughter, &series);
             }
         }
         let (daughter, ..) = *found.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
@@ -285,11 +282,6 @@ impl PairResiduals {
     }
 }
 
-fn mean(parts: &[(Complex64, f64)]) -> Complex64 {
-    let (score, information) = total(parts);
-    if information > 0.0 { score / information } else { Complex64::ZERO }
-}
-
 fn total(parts: &[(Complex64, f64)]) -> (Complex64, f64) {
     parts.iter().fold((Complex64::ZERO, 0.0), |(a, b), (score, information)| (a + score, b + information))
 }
@@ -299,8 +291,6 @@ fn total(parts: &[(Complex64, f64)]) -> (Complex64, f64) {
 pub(super) struct Scatter {
     /// Significance in standard deviations of noise.
     pub(super) significance: f64,
-    /// Number of parts at which the change is most significant.
-    scale: usize,
     /// Variance of the change beyond noise, of amplitude and phase.
     pub(super) variance: [f64; 2],
 }
@@ -312,7 +302,7 @@ impl Scatter {
 
     /// Computes the scatter; changes count from a significance of `least`.
     fn of(series: &Series, least: f64) -> Self {
-        let mut scatter = Self { scale: PARTS, ..Self::default() };
+        let mut scatter = Self::default();
         let (sum, information) = total(series);
         if information <= 0.0 {
             return scatter;
@@ -337,9 +327,7 @@ impl Scatter {
                 if significance > least + if scale > 8 { 1.0 } else { 0.0 } {
                     scatter.variance[axis] = scatter.variance[axis].max(excess / information);
                 }
-                if significance > scatter.significance {
-                    (scatter.significance, scatter.scale) = (significance, scale);
-                }
+                scatter.significance = scatter.significance.max(significance);
             }
         }
         scatter
