@@ -337,6 +337,9 @@ impl ModelErrors {
 /// Cost of each free parameter of an explanation, as a chi-square.
 const PARAMETER_COST: f64 = 9.0;
 
+/// Cost of a delay beyond half a turn of the highest frequency: there are many, of which one may fit any step.
+const TURN_COST: f64 = 6.0;
+
 /// Clock jump that explains the changes of the phases better than steps of those channels that jump, ns.
 fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let gains = &solution.daughters[change.daughter].gains;
@@ -353,12 +356,10 @@ fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let square = |phase: &ChannelChange, expected: f64| -> f64 {
         (wrapped(phase.change - expected) / phase.sigma.max(1e-4)).powi(2)
     };
-    // Beyond half a turn of the highest frequency there are many delays, of which one may fit any step.
     let cost = |delay_s: f64| -> f64 {
         let expected = |phase: &ChannelChange| -TAU * hz(phase.channel) * delay_s;
         let chi_square: f64 = change.phases.iter().map(|phase| square(phase, expected(phase))).sum();
-        let parameters = if (delay_s * highest).abs() > 0.5 { 2.0 } else { 1.0 };
-        chi_square + PARAMETER_COST * parameters
+        chi_square + PARAMETER_COST + if (delay_s * highest).abs() > 0.5 { TURN_COST } else { 0.0 }
     };
     let of_channel =
         |phase: &ChannelChange| if is_jump(&phase) { PARAMETER_COST } else { square(phase, 0.0) };
