@@ -1,23 +1,20 @@
 #!/usr/bin/env python3
 """Prints the tables of docs/paper.md from the results of the studies of this folder; the words of that page are written by hand.
 
-Run from the top of the checkout after the runs and studies that the page names; needs Python, and healpy for the uniformity of noise:
+Run from the top of the checkout after the runs and studies that the page names; needs Python with Pillow, and healpy for noise maps:
 
     python3 pipelines/paper/report.py
 
-Pictures that the page shows are copied beside it, into docs/.
+Pictures that the page shows go beside it, into docs/, in 128 colours and at most 1,200 pixels wide.
 """
 
 import json
 import math
-import shutil
 from pathlib import Path
 
 OUT = Path("out")
 BOLTZMANN = 1.380649e-23
 LIGHT = 299792458.0
-# Larger pictures stay where they are.
-PICTURE_BYTES_MAX = 700_000
 
 
 def load(name):
@@ -41,9 +38,12 @@ def show(x, form="{:.2e}"):
 def picture(path, name, what):
     if not (OUT / path).exists():
         return ""
-    if (OUT / path).stat().st_size > PICTURE_BYTES_MAX:
-        return ""
-    shutil.copyfile(OUT / path, Path("docs") / name)
+    from PIL import Image
+
+    image = Image.open(OUT / path).convert("RGB")
+    image.thumbnail((1200, 1200), Image.Resampling.LANCZOS)
+    few = image.quantize(128, method=Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    few.save(Path("docs") / name, optimize=True)
     return f"\n![{what}]({name})\n"
 
 
@@ -62,19 +62,25 @@ def figure(name, text, command=None, what=""):
     return text(numbers) + picture(f"figures/{name}.png", f"paper-{name}.png", what or name)
 
 
+SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits --sources out/sources-10mhz.csv"
+DIFFUSE = ("lunarray sky pipelines/paper-10mhz.toml --set sky.generated.point_sources=false --freq-hz 10e6 --nside 256 "
+           "--out out/diffuse-10mhz.fits")
+CUTOUT = "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"
+FULL_SKY = ("lunarray run pipelines/paper-10mhz.toml --set spacecraft.duration_s=30000 --set products.frame=ecliptic "
+            "--set products.smooth_fwhm_deg=1.3 --out out/full-sky")
+
+
 def full_sky():
-    return picture("sky-10mhz.png", "paper-sky.png", "the sky at 10 MHz") or missing(SKY)
-
-
-SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits --sources out/sources.csv"
-CUTOUT = "lunarray cutout out/sky-10mhz.fits --centre 30,40 --subtract-fwhm 5 --out out/patch.png"
+    return picture("full-sky/10.000MHz/input.png", "paper-sky.png", "the sky at 10 MHz") or missing(FULL_SKY)
 
 
 def counts():
-    path = OUT / "sources.csv"
-    if not path.exists():
-        return missing(SKY)
-    fluxes = [float(line.split(",")[2]) for line in path.read_text().splitlines()[1:]]
+    fluxes = {}
+    for mhz in (3, 10, 30):
+        path = OUT / f"sources-{mhz}mhz.csv"
+        if not path.exists():
+            return missing(SKY.replace("10mhz", f"{mhz}mhz").replace("10e6", f"{mhz}e6"))
+        fluxes[mhz] = [float(line.split(",")[3]) for line in path.read_text().splitlines()[1:]]
     # Franzen et al. 2019: log10(S^2.5 dN/dS) = sum a_k (log10 S)^k, integrated in ln S by the midpoint rule.
     a = [3.52, 0.307, -0.388, -0.0404, 0.0351, 0.00600]
 
@@ -86,21 +92,35 @@ def counts():
             total += s * 10 ** (sum(c * x**n for n, c in enumerate(a)) - 2.5 * x) * step
         return 4 * math.pi * total
 
-    rows = [
-        [f"{s:g}", f"{sum(flux > s for flux in fluxes):,}", f"{expected(s):,.0f}"] for s in (4.36, 6, 10, 20, 40)
-    ]
-    return table(["S at 154 MHz, Jy", "N(>S) of the sky", "Franzen et al. (2019)"], rows) + picture(
-        "patch.png", "paper-patch.png", "20 x 20 degrees without scales above 5 degrees"
-    )
+    rows = []
+    for s in (4.36, 10, 20, 40):
+        row = [f"{s:g}", f"{expected(s):,.0f}"]
+        for mhz, found in fluxes.items():
+            limit = s * (154 / mhz) ** 0.8
+            row.append(f"{sum(flux > limit for flux in found):,} above {limit:,.0f} Jy")
+        rows.append(row)
+    head = ["S at 154 MHz, Jy", "N(>S), Franzen et al. (2019)", "ours at 3 MHz", "at 10 MHz", "at 30 MHz"]
+    return table(head, rows) + picture("patch.png", "paper-patch.png", "the diffuse sky of 20 x 20 degrees")
 
 
 def spacing(n):
-    curves = [curve for curve in n["curves"] if curve["first_ratio"] in (2, 6, 10)]
+    curves = n["curves"]
     rows = [
         [str(r), *[show(curve["q0"][curve["ratio"].index(r)], "{:.4f}") for curve in curves]] for r in (2, 3, 4, 6, 10)
     ]
     head = ["R", *[f"R_2 = {curve['first_ratio']:g}" for curve in curves]]
     return table(head, rows) + f"\nq0 = {n['q0']:.5f} for R = 3, R_2 = 6.\n"
+
+
+def breathings(n):
+    """Pair hours per metre between lengths, for several breathings."""
+    edges, rows = [bin["from_m"] for bin in n["bins"]], []
+    ends = [min(range(len(edges)), key=lambda k: abs(edges[k] - m)) for m in (100, 315, 500, 1000, 3000, 10000, 30000)]
+    for low, high in zip(ends, ends[1:]):
+        width_h = 3600 * (edges[high] - edges[low])
+        rows.append([f"{edges[low]:,.0f} to {edges[high]:,.0f}",
+                     *[f"{sum(b['pair_s'][low:high]) / width_h:.2f}" for b in n["breathings"]]])
+    return table(["length, m", *[f"R_2 = {b['first_ratio']:g}, R = {b['ratio']:g}" for b in n["breathings"]]], rows)
 
 
 def pair_time(n):
@@ -110,13 +130,11 @@ def pair_time(n):
         f"{n['shortest_m']:.0f} m to {n['longest_m'] / 1e3:.1f} km.\n\n"
     )
     rows = [
-        ["visibilities, all baselines", f"{channel['visibilities_all']:.3e}", "1.9e9 (independent, for a third of the time; windows are 31 %: 1.75e9, less what sees the Earth)"],
-        [f"b < {channel['limit_m']:.0f} m = 2 b_p", f"{channel['visibilities']:.3e}", "2.60e7 (independent)"],
-        ["pairs within it", str(channel["pairs"]), "9 (independent)"],
-        ["pair hours within it", f"{channel['pair_s'] / 3600:,.0f}", "-"],
+        ["visibilities, all baselines", f"{channel['visibilities_all']:.3e}", "1.9e9 (independent, for a third of the time in place of 31 %)"],
+        [f"b < {channel['limit_m']:.0f} m = 2 b_p", f"{channel['visibilities']:.3e}, {channel['pairs']} pairs", "2.60e7, 9 pairs (independent)"],
         ["time in which lambda / 8 cuts integrations", f"{100 * channel['cut_by_motion']:.1f} %", "99.3 % (independent); > 99 % (Sect. 3.3)"],
     ]
-    return text + table(["10 MHz, nside 64", "ours", "by others"], rows)
+    return text + table(["10 MHz, nside 64", "ours", "by others"], rows) + "\nPair hours per metre:\n\n" + breathings(n)
 
 
 def uvw(n):
@@ -183,6 +201,17 @@ def sub_pixel(n):
     return table(head, rows)
 
 
+def powers():
+    """Auto-correlations with a Moon that reflects, over those without."""
+    means = {}
+    for case in ("no-reflection", "flat-mirror", "sphere"):
+        found = load(f"fig6-power/case-{case}/autos.json")
+        if found is None:
+            return missing("lunarray study pipelines/paper/fig6-power.toml")
+        means[case] = sum(auto["mean_k_sr"] for auto in found) / len(found)
+    return "".join(f"{case}: {100 * (mean / means['no-reflection'] - 1):+.2f} %\n" for case, mean in means.items()) + "\n"
+
+
 def latitudes(name):
     study = load(f"{name}/study.json")
     if study is None:
@@ -197,43 +226,52 @@ def latitudes(name):
     return table(["case", "mean, K", *head], rows)
 
 
-def basis():
-    """Why the traces of the study do not cross: measured once, by three independent ways at nside 8."""
-    rows = [
-        ["numpy, dense, pixels, mean of Cane (1979)", "2.81e+09", "0.0146", "1.24e+09", "2.02e+09", "1.82", "1.55e+11", "1.6e-4"],
-        ["our pixel engine, every 40th window", "6.11e+09", "0.0410", "5.93e+09", "3.97e+09", "3.69", "5.34e+11", "1.0e-4"],
-        ["our harmonic engine, the same data", "2.00e+10", "16.9", "2.44e+12", "2.38e+09", "32.2", "4.66e+12", "none above 1e-4"],
-    ]
-    head = ["nside 8, 10 MHz", "Tr Sigma_n, K², at 1e-4", "Tr Sigma_s", "T² Tr Sigma_s, K²", "at 2e-3", "Tr Sigma_s",
-            "T² Tr Sigma_s, K²", "crossing"]
-    return table(head, rows)
+def thinned(name, nside, visibilities_all):
+    """Rows of traces by thinning, Tr Sigma_n scaled to all data; the crossing is on straight lines in logarithms."""
+    study, found, rows = load(f"{name}/study.json"), {}, []
+    for case in (study or {}).get("cases", []):
+        channel = case["figures"]["channels"][0]
+        thin = int(case["figures"]["name"].split("thin = ")[1].split(",")[0])
+        t2 = channel["power"]["input_k2"][0] / (4 * math.pi)
+        traces = channel["diagnostics"]["traces"]
+        n, s = traces["sigma_n_k2"]["value"] * channel["visibilities"] / visibilities_all, traces["sigma_s"]["value"]
+        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, math.log(n / (t2 * s)), t2 * s))
+    for thin, points in found.items():
+        crossing = None
+        for (e, *_, above, _), (e2, *_, above2, _) in zip(points, points[1:]):
+            if above > 0 > above2:
+                crossing = e * (e2 / e) ** (above / (above - above2))
+        data = "all" if thin == 1 else f"one in {thin}"
+        for e, n, s, _, ts in points:
+            rows.append([f"{nside}, {data}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.1e}")])
+    return rows
 
 
-# Galactic longitude and latitude of the centres of three patches: near the pole, at middle latitudes, near the plane's anticentre.
-PATCHES = ("30,60", "100,-40", "200,20")
+def pixel_traces():
+    rows = thinned("fig15-nside8", 8, 569_208) + thinned("fig15-pixels", 16, 2_034_350)
+    return table(["nside, data", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing"], rows)
 
 
-def patch_command(mhz, k):
-    folder = f"out/paper-{mhz}mhz/{mhz}.000MHz"
-    return (f"lunarray cutout {folder}/input-smooth.fits {folder}/map-smooth.fits --centre {PATCHES[k]} --subtract-fwhm 5 "
-            f"--out out/patch-{mhz}-{k + 1}.png --json > out/patch-{mhz}-{k + 1}.json")
+# Ecliptic longitude and latitude of the paper's patches.
+PATCHES = ("120,0", "120,30", "120,60")
+
+
+def patch_command(k):
+    folder = "out/data-10mhz/10.000MHz"
+    return (f"lunarray cutout {folder}/input.fits {folder}/map.fits --frame ecliptic --centre {PATCHES[k]} --subtract-fwhm 5 "
+            f"--out out/patch-10-{k + 1}.png --json > out/patch-10-{k + 1}.json")
 
 
 def patches():
     rows, shown = [], ""
-    for mhz in ("10", "3"):
-        for k, centre in enumerate(PATCHES):
-            found = load(f"patch-{mhz}-{k + 1}.json")
-            if found is None:
-                continue
-            truth, ours = found["pieces"]
-            rows.append([mhz, centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.4f}"])
-            shown += picture(f"patch-{mhz}-{k + 1}.png", f"paper-patch-{mhz}-{k + 1}.png",
-                             f"{mhz} MHz, {centre}")
-    if not rows:
-        return missing(patch_command("10", 0))
-    head = ["MHz", "centre, Galactic deg", "rms of the input, K", "of the map, K", "correlation"]
-    return table(head, rows) + shown
+    for k, centre in enumerate(PATCHES):
+        found = load(f"patch-10-{k + 1}.json")
+        if found is None:
+            return missing(patch_command(k))
+        truth, ours = found["pieces"]
+        rows.append([centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.3f}"])
+        shown += picture(f"patch-10-{k + 1}.png", f"paper-patch-10-{k + 1}.png", centre)
+    return table(["centre, ecliptic deg", "rms of the input, K", "of the map, K", "correlation"], rows) + shown
 
 
 def maps():
@@ -304,26 +342,6 @@ def traces(name="fig15-traces"):
     return text
 
 
-def epsilon_rules(*names):
-    """What the rules choose, of each study that was made with traces."""
-    rows = []
-    for name in names:
-        study = load(f"{name}/study.json")
-        for found in (study or {}).get("epsilons", []):
-            def told(rule):
-                choice = found[rule]
-                if choice["epsilon"] is None:
-                    return "none in this range"
-                low, high = choice["open"] or (choice["epsilon"],) * 2
-                return f"{choice['epsilon']:.1e}" + (f" ({low:.0e} to {high:.0e} open)" if low < high else "")
-            rows.append([f"`{name}`", f"{found['numbers']:,}", f"{found['power_a_number']:.3g}",
-                         *[told(rule) for rule in ("crossing", "cross_validation", "risk", "l_curve")]])
-    if not rows:
-        return ""
-    head = ["study", "n", "V'N^-1V / n", "crossing for T²", "cross-validation", "predictive risk", "L-curve"]
-    return "\n### epsilon by four rules\n\n" + table(head, rows)
-
-
 def point_beams(name):
     study = load(f"{name}/study.json")
     if study is None:
@@ -344,15 +362,16 @@ def point_beams(name):
     return table(head, rows)
 
 
-def correlation(name, ls, head):
+def correlation(name, ls, head, key="rho"):
     study = load(f"{name}/study.json")
     if study is None:
         return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
-        rows.append([case["figures"]["name"], f"{channel['visibilities']:,}", *[at(channel["rho"], l) for l in ls]])
-    return table([head, "visibilities", *[f"rho_{l}" for l in ls]], rows)
+        rows.append([case["figures"]["name"], f"{channel['visibilities']:,}", *[at(channel[key], l) for l in ls]])
+    name = {"rho": "rho", "snr": "SNR"}[key]
+    return table([head, "visibilities", *[f"{name}_{l}" for l in ls]], rows)
 
 
 def rows_of_b(key, wanted):
@@ -372,92 +391,68 @@ def rows_of_b(key, wanted):
     return table(["rows, limit", "visibilities", *[f"{name}_{l}" for l in ls]], rows)
 
 
-def sensitivity(name="fig19-sensitivity", nside=16):
-    study = load(f"{name}/study.json")
+def sensitivity():
+    """Fig. 19: noise maps after post-processing, less scales above 10 degrees, of one visibility in `thin`."""
+    study = load("fig19-sensitivity/study.json")
     if study is None:
-        return missing(f"lunarray study pipelines/paper/{name}.toml")
-    rows = []
-    # Pixels as beams, where the beam is not known.
-    pixel = 4 * math.pi / (12 * nside * nside)
+        return missing("lunarray study pipelines/paper/fig19-sensitivity.toml")
+    import healpy
+    import numpy as np
+
+    thin, rows = 16, []
     for case in study["cases"]:
-        channel = case["figures"]["channels"][0]
-        frequency, noise = channel["frequency_hz"], channel["noise_rms_k"]
-        beam = channel.get("beam") or {}
-        jansky = 5 * 2 * BOLTZMANN * noise * (frequency / LIGHT) ** 2 / 1e-26
-        rows.append([
-            f"{frequency / 1e6:g}", f"{channel['visibilities']:,}", show(noise), show(jansky * pixel),
-            show(beam.get("fwhm_deg"), "{:.2f}"),
-            show(None if beam.get("area_sr") is None else jansky * beam["area_sr"]),
-        ])
-    head = ["MHz", "visibilities", "noise, K rms", "5 sigma, Jy a pixel", "beam, deg", "5 sigma, Jy a beam"]
+        folder = OUT / "fig19-sensitivity" / case["folder"]
+        channel = json.loads((folder / "summary.json").read_text())["channels"][0]
+        mhz = channel["frequency_hz"] / 1e6
+        noise = healpy.read_map(folder / f"{mhz:.3f}MHz/noise-smooth.fits", dtype=float)
+        small = noise - healpy.smoothing(noise, fwhm=math.radians(10), iter=1)
+        sine = healpy.pix2vec(healpy.get_nside(noise), np.arange(noise.size))[2]
+        area = channel["beam"]["area_sr"]
+        # Noise falls as the root of the number of visibilities.
+        jansky = 5 * 2 * BOLTZMANN * (channel["frequency_hz"] / LIGHT) ** 2 / 1e-26 * area / math.sqrt(thin)
+        rows.append([f"{mhz:g}", show(small.std() / math.sqrt(thin)), f"{channel['beam']['fwhm_deg']:.2f}", show(area),
+                     *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise)]])
+    head = ["MHz", "noise, K rms", "beam, deg", "beam, sr", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales"]
     return table(head, rows)
-
-
-def pair_sensitivity():
-    """Fig. 19 from the radiometer equation alone: 2 k T_sys nu^2 / c^2 / sqrt(2 dnu t), t the pair-time within 2 b_p.
-
-    From `lunarray figure pair-time pipelines/paper-10mhz.toml` with the study's channels, every 4th window, into
-    out/figures-nside16 and -nside64, with map.nside and spacecraft.baseline_wavelengths_max 31.3 and 125.1.
-    """
-    found = [load(f"figures-nside{nside}/pair-time.json") for nside in (16, 64)]
-    if None in found:
-        return ""
-    rows = []
-    small, large = ({c["frequency_hz"]: c for c in n["channels"]} for n in found)
-    # Mean sky of Cane (1979), seen by 76 % of the sphere.
-    def sky(f):
-        tau = 5 * (f / 1e6) ** -2.1
-        i = 2.48e-20 * (f / 1e6) ** -0.52 * (1 - math.exp(-tau)) / tau + 1.06e-20 * (f / 1e6) ** -0.80 * math.exp(-tau)
-        return i * LIGHT**2 / (2 * BOLTZMANN * f**2)
-    for f in sorted(small):
-        if round(f / 1e6) not in (1, 3, 5, 10, 20, 30):
-            continue
-        power = sky(f) * 4 * math.pi * 0.761
-        def sigma(c):
-            # Every fourth window.
-            return 5 * 2 * BOLTZMANN * power * (f / LIGHT) ** 2 / math.sqrt(2 * 8000 * 4 * c["pair_s"]) / 1e-26
-        rows.append([f"{f / 1e6:g}", f"{4 * small[f]['pair_s'] / 3600:,.0f}", f"{4 * large[f]['pair_s'] / 3600:,.0f}",
-                     show(sigma(small[f]), "{:.1f}"), show(sigma(large[f]), "{:.1f}")])
-    head = ["MHz", "pair hours, nside 16", "nside 64", "5 sigma, Jy, nside 16", "nside 64"]
-    # By the paper's formula in numpy, nside 8, epsilon 1e-3 (`dense.py 8 MHZ 6000`): 299, 433 and 1,126 Jy a pixel at 5, 10 and 30 MHz.
-    return "\nThe radiometer equation alone:\n\n" + table(head, rows)
 
 
 def main():
     study = "`lunarray study pipelines/paper/{}.toml`"
     parts = [
-        ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, `{CUTOUT}`", counts()),
-        ("Fig. 2: the full sky", "", full_sky()),
+        ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, 3 and 30 MHz alike; `{DIFFUSE}`, `{CUTOUT}`", counts()),
+        ("Fig. 2: the full sky", f"`{FULL_SKY}`", full_sky()),
         ("Fig. 3: q0 against R and R_2", f"`{FIGURE.format('spacing')}`", figure("spacing", spacing)),
         ("Fig. 4: time by baseline length", f"`{FIGURE.format('pair-time')}`", figure("pair-time", pair_time)),
         ("Time by direction (Sect. 4.4)", "", coverage()),
         ("Fig. 5: density of u, v, w", f"`{FIGURE.format('uvw')}`", figure("uvw", uvw)),
-        ("Fig. 6: the sky reflected by the Moon", study.format("fig6-reflection"), latitudes("fig6-reflection")),
-        ("Fig. 7: a row of B", f"`{FIGURE.format('rows')}`", figure("rows", beam_row)),
+        ("Fig. 6: the sky reflected by the Moon", study.format("fig6-reflection"), powers() + latitudes("fig6-reflection")),
+        ("Fig. 7: a row of B", f"`{FIGURE.format('rows')} --pair 5-6 --at 4.1736d`", figure("rows", beam_row)),
         ("Fig. 8: waterfalls of one pair",
-         f"`{FIGURE.format('waterfall')}`, with `--set map.nside=8 --set spacecraft.baseline_wavelengths_max=15.7`",
+         f"`{FIGURE.format('waterfall')} --pair 1-4 --at 6.65d`",
          figure("waterfall", waterfall)),
         ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
          "`lunarray run pipelines/paper-10mhz.toml`, `lunarray run pipelines/paper-3mhz.toml`", maps()),
+        ("By basis and R", study.format("fig9-basis"), latitudes("fig9-basis")),
         ("Is the noise uniform?", "", uniformity()),
         ("Fig. 11: a prior of 5 degrees", study.format("fig11-prior"),
          correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
         ("Fig. 12: a wrong prior", study.format("fig12-wrong-prior"), latitudes("fig12-wrong-prior")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command('10', 0)}` and so on", patches()),
-        ("Fig. 15: traces against epsilon", study.format("fig15-traces"), traces() + "\n" + basis()),
-        ("In pixels, nside 16", study.format("fig15-pixels"), traces("fig15-pixels") + epsilon_rules("fig15-traces", "fig15-pixels")),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command(0)}` and so on", patches()),
+        ("Fig. 15: traces against epsilon", study.format("fig15-pixels"),
+         pixel_traces() + "\n" + traces()),
         ("Fig. 16: rows at centres and averaged, rho_l without noise", study.format("fig16-17-rows"), rows_of_b("rho", "no noise")),
         ("At nside 32", study.format("fig16-nside32"), correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
         ("At nside 64", study.format("fig16-nside64"),
          correlation("fig16-nside64", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows")),
         ("Fig. 17: the same, SNR_l with thermal noise", study.format("fig16-17-rows"), rows_of_b("snr", "thermal noise")),
-        ("Fig. 18: rho_l without noise for epsilon from 1e-9 to 1", study.format("fig18-epsilon"),
+        ("Fig. 18: rho_l without noise, and SNR_l, for epsilon from 1e-9 to 1", study.format("fig18-epsilon"),
          correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
-        ("Fig. 19: sensitivity against frequency", study.format("fig19-sensitivity"), sensitivity() + pair_sensitivity()),
-        ("Fig. 19 at nside 64", study.format("fig19-nside64"), sensitivity("fig19-nside64", 64)),
+        ("Fig. 18: SNR_l", study.format("fig18-snr"), correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
+        ("Fig. 19: sensitivity against frequency", study.format("fig19-sensitivity"), sensitivity()),
         ("FWHM after post-processing", study.format("beams"), point_beams("beams")),
         ("FWHM at nside 64", study.format("beams-nside64"), point_beams("beams-nside64")),
-        ("Appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`", figure("sub-pixel", sub_pixel)),
+        ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`; the formulas: `sub_pixel.py`",
+         figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")),
     ]
     for title, command, text in parts:
         print(f"## {title}\n\n{command}\n\n{text}" if command else f"## {title}\n\n{text}")

@@ -11,6 +11,7 @@ import numpy as np
 
 from ._native import Error
 from ._uvh5 import ECLIPTIC_TO_ICRS
+from ._write import needed
 
 #: Columns that are written beside the gains, with their units.
 BESIDE = {
@@ -104,8 +105,7 @@ def to_uvcal(downlink, solutions):
 
 def write_calh5(downlink, path, solutions):
     """Writes a file; see ``Downlink.write_calh5``."""
-    import h5py
-
+    h5py = needed("h5py", "uvh5")
     made, table = to_uvcal(downlink, solutions)
     made.write_calh5(path, clobber=True, run_check=False)
     with h5py.File(path, "a") as file:

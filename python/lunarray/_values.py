@@ -117,6 +117,8 @@ def _is_time(value: Any) -> bool:
 def _since(time: Any, epoch_tai_s: float | None, what: str) -> NDArray[np.float64]:
     if epoch_tai_s is None:
         raise Error(f"{what} is a date, and these positions are given without an epoch: expected seconds of their times")
+    if time.scale in ("local", "ut1"):
+        raise Error(f"{what} is a time of scale {time.scale!r}, which the tables here do not tie to TAI: expected utc, tai, tt, tdb, tcb or tcg")
     tai = time.tai
     if np.any(getattr(tai, "mask", False)):
         raise Error(f"{what}: times are masked: expected values for all")

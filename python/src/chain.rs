@@ -10,7 +10,8 @@ use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
 use lunarray::imaging::SolveWatch;
 use lunarray::pipeline::{
-    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunHandles, Segment, use_threads,
+    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunHandles, Segment, SettingsOrigin,
+    use_threads,
 };
 use lunarray::runtime::{Cancel, Metrics};
 use pyo3::exceptions::PyUserWarning;
@@ -34,13 +35,17 @@ pub(crate) fn ground_config(
     overrides: Vec<String>,
     state: Option<&Path>,
     files: &[PathBuf],
+    notes: &mut Vec<String>,
 ) -> Result<Config, Failure> {
     let source = ConfigSource { file, overrides, seed: None };
     let source = match state {
         Some(folder) => source.with_state_settings(folder)?,
         None => source,
     };
-    let (source, _) = source.with_downlink_settings(files);
+    let (source, origin) = source.with_downlink_settings(files);
+    if let (SettingsOrigin::NotUsed(why), None) = (origin, state) {
+        notes.push(why);
+    }
     Ok(source.load_ground()?)
 }
 
@@ -131,7 +136,7 @@ pub(crate) fn solve_state(
     let cancel = Cancel::new();
     let watch = SolveWatch::new(cancel.clone());
     let found = wait(py, &cancel, move || {
-        let config = ground_config(map, overrides, Some(&folder), &[])?;
+        let config = ground_config(map, overrides, Some(&folder), &[], &mut Vec::new())?;
         use_threads(&config.runtime)?;
         let mut found = Vec::new();
         pipeline::solve_state(&folder, &config, &epsilons, &watch, &mut |solution| {
@@ -163,6 +168,7 @@ impl NativeReplay {
     #[new]
     #[pyo3(signature = (files, out, map=None, overrides=Vec::new(), state=None, progress=None))]
     fn new(
+        py: Python<'_>,
         files: Vec<PathBuf>,
         out: PathBuf,
         map: Option<PathBuf>,
@@ -173,7 +179,9 @@ impl NativeReplay {
         require_threads()?;
         // A state that is to be made takes the settings given; one that is there may be used without naming them again.
         let known = state.as_deref().filter(|folder| Ground::settings_in(folder).is_ok());
-        let config = ground_config(map, overrides, known, &files).map_err(exception)?;
+        let mut notes = Vec::new();
+        let config = ground_config(map, overrides, known, &files, &mut notes).map_err(exception)?;
+        warn(py, notes)?;
         let (sender, receiver) = sync_channel(1);
         let cancel = Cancel::new();
         let ended = cancel.clone();

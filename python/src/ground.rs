@@ -62,7 +62,7 @@ impl NativeGround {
     fn new(map: Option<PathBuf>, overrides: Vec<String>, state: Option<PathBuf>) -> PyResult<Self> {
         let open = || -> Result<Segment, Failure> {
             let known = state.as_deref().filter(|folder| Ground::settings_in(folder).is_ok());
-            let config = ground_config(map, overrides, known, &[])?;
+            let config = ground_config(map, overrides, known, &[], &mut Vec::new())?;
             use_threads(&config.runtime)?;
             let settings = config.ground(WAIT_BYTES);
             let ground = match &state {

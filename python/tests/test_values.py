@@ -54,6 +54,9 @@ def test_times_of_astropy_are_since_the_epoch():
     given = lunarray.Array.from_positions(np.arange(9) * u.min, places, moon_radius_m=1737.1 * u.km)
     np.testing.assert_allclose(given.positions(90 * u.s), array.positions(90.0), atol=1e-2, rtol=0)
     assert given.moon_radius_m == pytest.approx(1_737_100.0)
+    for scale in ("local", "ut1"):
+        with pytest.raises(lunarray.Error, match=f"scale '{scale}'"):
+            array.positions(Time("2027-01-02", scale=scale))
     with pytest.raises(lunarray.Error, match="without an epoch"):
         given.positions(times[0])
     with pytest.raises(lunarray.Error, match="expected a time at which positions are known"):

@@ -81,7 +81,7 @@ keys! {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Spacing {
-    /// The distance to the preceding daughter (the paper, Sect. 2): more daughters lie between the third and the
+    /// The distance to the preceding daughter (the paper, Sect. 3.1): more daughters lie between the third and the
     /// last.
     #[default]
     Steps,
@@ -90,7 +90,7 @@ pub enum Spacing {
 }
 
 keys! {
-    /// Contraction and expansion of the formation along the track (the paper, Sect. 2).
+    /// Contraction and expansion of the formation along the track (the paper, Sect. 3.1).
     pub struct BreathingConfig {
         /// Period of contraction and expansion.
         expert period_s: f64 = 14.0 * DAY_S;

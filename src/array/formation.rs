@@ -3,7 +3,7 @@
 use super::config::{ArrayConfig, ArrayError, Spacing};
 
 /// Maximum arcs by which the daughters trail daughter 1, and their breathing: the arcs shrink linearly to `s_n / R_n`
-/// in half a period, and grow back (the paper, Sect. 2).
+/// in half a period, and grow back (the paper, Sect. 3.1).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Formation {
     /// Progression of the arcs, if they follow one.
@@ -13,7 +13,7 @@ pub struct Formation {
     period_s: f64,
 }
 
-/// Arcs `s_1 = 0`, `s_n = a_offset + a0 q0^(n-2)` for n >= 2 (the paper, Sect. 2).
+/// Arcs `s_1 = 0`, `s_n = a_offset + a0 q0^(n-2)` for n >= 2 (the paper, Sect. 3.1).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progression {
     /// Ratio q0 of successive steps.

@@ -288,7 +288,7 @@ impl Array {
     /// State of daughter `n` (from 0) at `t_s`.
     ///
     /// On the circle, `r = R [cos O cos f - sin O sin f cos i, sin O cos f + cos O sin f cos i, sin f sin i]`
-    /// with `f = phi - s_n / R` (the paper, Sect. 2).
+    /// with `f = phi - s_n / R` (the paper, Sect. 3.1).
     #[must_use]
     pub fn state(&self, n: usize, t_s: f64) -> SatelliteState {
         let Some(formation) = &self.formation else { return self.own[n].state(t_s) };

@@ -120,7 +120,7 @@ fn compare_runs(args: &CompareArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let plot = args.plot.clone().unwrap_or_else(|| "compare.png".into());
-    draw_runs("", &all)?.write(&plot)?;
+    draw_runs("", &all, std::slice::from_ref(&all))?.write(&plot)?;
     if !args.json {
         print_text(&format!("{}", plot.display()))?;
     }

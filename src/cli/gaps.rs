@@ -125,6 +125,7 @@ fn table(gaps: &Gaps, gaps_max: usize) -> String {
         text.push_str(&largest_losses(gap));
         text.push('\n');
     }
+    text.push_str("What missing packets held is estimated from the windows around them, and may be of another channel or pair.\n");
     if gaps.gaps.len() > gaps_max {
         let _ = writeln!(text, "and {} more (see --most and --json)", gaps.gaps.len() - gaps_max);
     }

@@ -1,7 +1,7 @@
 //! `lunarray replay`: run the ground segment on downlink files or live senders.
 
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -33,7 +33,7 @@ use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
-    RunSummary, channel_groups, replay, replay_in_groups, use_threads,
+    RunSummary, SettingsOrigin, channel_groups, replay, replay_in_groups, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -266,6 +266,7 @@ impl ReplayArgs {
                 false => source.with_state_settings(folder),
             }
         });
+        let has_state = self.state.as_deref().is_some_and(Path::exists);
         let source = match with_state {
             Some(Err(error @ GroundError::FilesOfState { .. })) => return Err(error),
             // A state that cannot be read is reported when it is opened.
@@ -273,9 +274,14 @@ impl ReplayArgs {
             Some(Ok(source)) => source,
         };
         let (source, origin) = source.with_downlink_settings(&self.files);
-        if let Some(origin) = origin.filter(|_| job.is_first()) {
-            let fields = json!({ "from": origin });
-            say("settings", &fields, format_args!("settings of the maps: those of {origin}"));
+        match origin {
+            SettingsOrigin::Run(origin) if job.is_first() => {
+                let fields = json!({ "from": origin });
+                say("settings", &fields, format_args!("settings of the maps: those of {origin}"));
+            }
+            // A state has its own.
+            SettingsOrigin::NotUsed(why) if job.is_first() && !has_state => print_notes([why]),
+            _ => {}
         }
         Ok(source)
     }

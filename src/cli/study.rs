@@ -14,7 +14,7 @@ use crate::files::ProtectedInputs;
 use crate::pipeline::{
     INTEGRATE, MemoryLimit, READ, Segment, Study, StudyStep, StudySummary, run_study, use_threads,
 };
-use crate::products::{EpsilonChoice, EpsilonChoices};
+use crate::products::{Crossing, EpsilonChoice, EpsilonChoices};
 
 /// Run a pipeline at every combination of some settings, and show the results side by side.
 ///
@@ -175,18 +175,32 @@ fn table(summary: &StudySummary) -> String {
         ));
     }
     lines.extend(power_lines(summary));
-    for crossing in &summary.crossings {
-        let value =
-            |epsilon: Option<f64>| epsilon.map_or_else(|| "not within".to_owned(), |e| format!("{e:.2e}"));
-        lines.push(format!(
-            "traces at {:.3} MHz cross at epsilon {} (Tr Sigma_n = T² Tr Sigma_s, T the mean of the input; {} with T)",
-            crossing.frequency_hz / 1e6,
-            value(crossing.epsilon),
-            value(crossing.epsilon_first_power)
-        ));
-    }
+    lines.extend(summary.crossings.iter().map(crossing_line));
     lines.extend(summary.epsilons.iter().flat_map(epsilon_lines));
     lines.join("\n")
+}
+
+/// Where the two traces of a group cross.
+fn crossing_line(crossing: &Crossing) -> String {
+    let of = match crossing.run_label.as_str() {
+        "" => String::new(),
+        label => format!("{label}, "),
+    };
+    let name = format!(
+        "{of}{:.3} MHz: Tr Sigma_n and T² Tr Sigma_s, T the mean of the input,",
+        crossing.frequency_hz / 1e6
+    );
+    let first = match crossing.epsilon_first_power {
+        Some(epsilon) => format!("; with T in place of T² at {epsilon:.2e}"),
+        None => String::new(),
+    };
+    let [from, to] = crossing.epsilon_tried;
+    match crossing.epsilon {
+        Some(epsilon) => format!("{name} cross at epsilon {epsilon:.2e}{first}"),
+        None => format!(
+            "{name} do not cross between epsilon {from:.1e} and {to:.1e}{first}: add smaller or larger ones"
+        ),
+    }
 }
 
 /// Lines on the choice of epsilon, one for each rule.

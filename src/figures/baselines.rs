@@ -123,6 +123,8 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
             );
         }
     }
+    // Positions are exact to less than a millimetre; what is smaller is rounding.
+    let whole_mm = |value_m: f64| (value_m * 1e3).round() / 1e3;
     let shown = || pairs.iter().enumerate().filter(|(_, pair)| pair.i == 0).take(CURVES_MAX);
     let curves = |value: &dyn Fn(&Extremes) -> f64| -> Vec<Curve> {
         let points = |k: usize| windows.iter().map(|window| (window.day, value(&window.pairs[k]))).collect();
@@ -149,15 +151,19 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     };
     let plots = [
         plot("longest in each window", axis("baseline (m)", true), curves(&|pair| pair.length_m[1])),
-        plot("largest cross-track component", axis("m", false), curves(&|pair| pair.across_m)),
-        plot("largest difference of orbital radii", axis("m", false), curves(&|pair| pair.radial_m)),
+        plot("largest cross-track component", axis("m", false), curves(&|pair| whole_mm(pair.across_m))),
+        plot(
+            "largest difference of orbital radii",
+            axis("m", false),
+            curves(&|pair| whole_mm(pair.radial_m)),
+        ),
         plot(
             "altitudes of all satellites",
             axis("altitude (km)", false),
             vec![altitude(0, "lowest"), altitude(1, "highest")],
         ),
     ];
-    let title = format!("Baselines of {} satellites", plan.array.satellites());
+    let title = format!("Baselines of {} satellites, {} windows", plan.array.satellites(), windows.len());
     let picture = draw_plots(&title, &plots, 2)?;
     Ok(FigureParts::new(&numbers, csv, picture))
 }

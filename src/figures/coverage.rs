@@ -1,4 +1,4 @@
-//! Coverage by direction: observing time of pairs, visibilities and projected baselines (the paper, Sect. 3.3).
+//! Coverage by direction: observing time of pairs, visibilities and projected baselines (the paper, Sect. 4.4).
 
 use std::f64::consts::FRAC_PI_2;
 use std::fmt::Write;

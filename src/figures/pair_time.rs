@@ -1,13 +1,14 @@
-//! Observing time of pairs by baseline length, and the number of visibilities (the paper, Fig. 4).
+//! Observing time of pairs by baseline length for several breathings, and the number of visibilities (the paper, Sect. 3.1 and Fig. 4).
 
 use std::fmt::Write;
+use std::sync::Arc;
 
 use serde::Serialize;
 
 use super::error::FigureError;
 use super::exposure::{TimeSample, gather, limit_m};
 use super::output::FigureParts;
-use crate::array::integration_time_s;
+use crate::array::{Array, integration_time_s};
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 use crate::units::all_pairs;
@@ -19,6 +20,8 @@ const FIRST_M: f64 = 50.0;
 const PER_DECADE: f64 = 20.0;
 /// Number of bins, up to 500 km.
 const BINS: usize = 80;
+/// Ratios R_2 and R of other breathings to compare with; of the first no baseline lies between 300 m and 500 m.
+const BREATHINGS: [[f64; 2]; 4] = [[3.0, 3.0], [6.0, 3.0], [9.0, 3.0], [6.0, 6.0]];
 /// Time step, s. Lengths change slowly, by millimetres per second.
 const STEP_S: f64 = 60.0;
 
@@ -32,6 +35,8 @@ struct PairTimeNumbers {
     shortest_m: f64,
     longest_m: f64,
     bins: Vec<LengthBin>,
+    /// Other breathings of the same formation; empty for an array that has none.
+    breathings: Vec<BreathingTime>,
     channels: Vec<ChannelTime>,
 }
 
@@ -40,6 +45,14 @@ struct LengthBin {
     from_m: f64,
     to_m: f64,
     pair_s: f64,
+}
+
+#[derive(Serialize)]
+struct BreathingTime {
+    first_ratio: f64,
+    ratio: f64,
+    /// Observing time by length, as in `bins`, s.
+    pair_s: Vec<f64>,
 }
 
 #[derive(Serialize)]
@@ -153,16 +166,30 @@ fn edge_m(bin: usize) -> f64 {
     FIRST_M * 10f64.powf(bin as f64 / PER_DECADE)
 }
 
+/// Counts over the mission, of as many channels as there are limits.
+fn count(plan: &Plan, limits_m: &[f64]) -> Counts {
+    let pairs = all_pairs(plan.array.satellites()).len();
+    let empty = || Counts::new(limits_m.len(), pairs);
+    gather(plan, STEP_S, empty, |counts, sample| counts.add(plan, limits_m, sample), Counts::merge)
+}
+
+/// Observing time with other breathings; none for an array that has no progression.
+fn breathings(plan: &Plan) -> Result<Vec<BreathingTime>, FigureError> {
+    if !plan.config.array.arcs_m.is_empty() || plan.array.formation().is_none() {
+        return Ok(Vec::new());
+    }
+    let time = |[first_ratio, ratio]: [f64; 2]| {
+        let mut config = plan.config.array.clone();
+        (config.breathing.first_ratio, config.breathing.ratio) = (first_ratio, ratio);
+        let plan = Plan { array: Arc::new(Array::new(&config)?), ..plan.clone() };
+        Ok(BreathingTime { first_ratio, ratio, pair_s: count(&plan, &[]).bins_s })
+    };
+    BREATHINGS.into_iter().map(time).collect()
+}
+
 pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
     let limits_m: Vec<f64> = (0..plan.schedules.len()).map(|channel| limit_m(plan, channel)).collect();
-    let pairs = all_pairs(plan.array.satellites()).len();
-    let counts = gather(
-        plan,
-        STEP_S,
-        || Counts::new(limits_m.len(), pairs),
-        |counts, sample| counts.add(plan, &limits_m, sample),
-        Counts::merge,
-    );
+    let counts = count(plan, &limits_m);
     let bin = |(k, &pair_s): (usize, &f64)| LengthBin { from_m: edge_m(k), to_m: edge_m(k + 1), pair_s };
     let all_s = counts.pair_s;
     let channel = |((counts, schedule), &limit_m): ((ChannelCounts, _), &f64)| {
@@ -186,6 +213,7 @@ pub(super) fn make(plan: &Plan) -> Result<FigureParts, FigureError> {
         shortest_m: counts.range_m[0],
         longest_m: counts.range_m[1],
         bins: counts.bins_s.iter().enumerate().map(bin).collect(),
+        breathings: breathings(plan)?,
         channels: counts.channels.into_iter().zip(&plan.schedules).zip(&limits_m).map(channel).collect(),
     };
     let picture = draw_plots("", &plots(&numbers), 1)?;
@@ -220,11 +248,16 @@ fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
             |(k, bin): (usize, &LengthBin)| [(bin.from_m, value(k, bin)), (bin.to_m, value(k, bin))];
         numbers.bins.iter().enumerate().flat_map(corners).collect::<Vec<_>>()
     };
-    let density = |_: usize, bin: &LengthBin| {
-        // The last bin ends with the longest baseline.
-        bin.pair_s / 3600.0 / (bin.to_m.min(numbers.longest_m) - bin.from_m)
-    };
+    // The last bin ends with the longest baseline.
+    let density =
+        |pair_s: f64, bin: &LengthBin| pair_s / 3600.0 / (bin.to_m.min(numbers.longest_m) - bin.from_m);
     let curve = |label: String, points| Curve { label, points, dashed: false };
+    let mut densities = vec![curve("this array".to_owned(), steps(&|_, bin| density(bin.pair_s, bin)))];
+    densities.extend(numbers.breathings.iter().map(|breathing| Curve {
+        label: format!("R_{{2}} = {}, R = {}", breathing.first_ratio, breathing.ratio),
+        points: steps(&|k, bin| density(breathing.pair_s[k], bin)),
+        dashed: true,
+    }));
     let by_channel = numbers.channels.iter().map(|channel| {
         let label = format!("{} MHz", channel.frequency_hz / 1e6);
         curve(label, steps(&|k, _| channel.visibilities_by_length[k]))
@@ -234,7 +267,7 @@ fn plots(numbers: &PairTimeNumbers) -> [Plot; 2] {
             title: format!("Observing time of all pairs, {} windows", numbers.windows),
             x: x.clone(),
             y: Axis { label: "pair hours per metre".to_owned(), log: true, limits: None },
-            curves: vec![curve(String::new(), steps(&density))],
+            curves: densities,
             levels: Vec::new(),
         },
         Plot {

@@ -1,4 +1,4 @@
-//! A row of the beam matrix, at pixel centres and averaged over pixels (the paper, Fig. 7).
+//! A row of the beam matrix, at pixel centres and averaged over pixels (the paper, Fig. 7, which is without the Moon, as the picture here).
 
 use std::fmt::Write;
 
@@ -85,14 +85,18 @@ impl PairMoment {
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
     let moment = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
-    let row = |method: PixelMethod| -> Result<[Vec<f64>; 2], FigureError> {
+    let row = |method: PixelMethod, moon_radius_m: f64| -> Result<[Vec<f64>; 2], FigureError> {
         let maker = RowMaker::new(nside, method)?;
-        maker.prepare(&moment.geometry);
+        let geometry = PairGeometry { moon_radius_m, ..moment.geometry };
+        maker.prepare(&geometry);
         let (mut re, mut im) = (vec![0.0_f64; maker.pixels()], vec![0.0_f64; maker.pixels()]);
-        maker.fill(&moment.geometry, 1.0, &mut re, &mut im);
+        maker.fill(&geometry, 1.0, &mut re, &mut im);
         Ok([re, im])
     };
-    let (centre, average) = (row(PixelMethod::Centre)?, row(PixelMethod::Average)?);
+    let rows = |moon_radius_m: f64| -> Result<[[Vec<f64>; 2]; 2], FigureError> {
+        Ok([row(PixelMethod::Centre, moon_radius_m)?, row(PixelMethod::Average, moon_radius_m)?])
+    };
+    let [centre, average] = rows(moment.geometry.moon_radius_m)?;
     let square = |[re, im]: &[Vec<f64>; 2], k: usize| re[k] * re[k] + im[k] * im[k];
     let pixels = centre[0].len();
     let seen: Vec<usize> = (0..pixels).filter(|&k| square(&centre, k) > 0.0).collect();
@@ -118,29 +122,25 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
             centre[0][k], centre[1][k], average[0][k], average[1][k]
         );
     }
-    let picture = draw(&numbers, [&centre, &average])?;
+    let picture = draw(&numbers, &rows(0.0)?)?;
     Ok(FigureParts::new(&numbers, csv, picture))
 }
 
 fn draw(
     numbers: &RowNumbers,
-    rows: [&[Vec<f64>; 2]; 2],
+    rows: &[[Vec<f64>; 2]; 2],
 ) -> Result<crate::products::pictures::Picture, FigureError> {
     let scale = ColourScale::new(-1.0, 1.0, Scaling::Linear, Palette::Diverging)?;
-    let panel = |(values, caption): (&'_ Vec<f64>, &str)| (values.clone(), caption.to_owned());
-    let drawn = [
-        panel((&rows[0][0], "at pixel centres, real part")),
-        panel((&rows[1][0], "averaged over pixels, real part")),
-        panel((&rows[0][1], "at pixel centres, imaginary part")),
-        panel((&rows[1][1], "averaged over pixels, imaginary part")),
-    ];
-    let panels: Vec<MapPanel<'_>> = drawn
-        .iter()
-        .map(|(values, caption)| MapPanel { values, caption: caption.clone(), scale, unit: String::new() })
-        .collect();
+    let panel = |row: usize, caption: &str| MapPanel {
+        values: &rows[row][0],
+        caption: caption.to_owned(),
+        scale,
+        unit: String::new(),
+    };
+    let panels = [panel(0, "at pixel centres"), panel(1, "averaged over pixels")];
     let sheet = Sheet {
         title: format!(
-            "A row of B: pair {}, {:.0} m = {:.2} b_{{p}}, {} MHz, nside {}",
+            "A row of B without the Moon, real part: pair {}, {:.0} m = {:.2} b_{{p}}, {} MHz, nside {}",
             numbers.pair,
             numbers.length_m,
             numbers.length_bp,

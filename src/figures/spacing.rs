@@ -1,4 +1,4 @@
-//! The step ratio q0 of the formation against the ratios R and R_2 of its breathing (the paper, Sect. 2 and Fig. 3).
+//! The step ratio q0 of the formation against the ratios R and R_2 of its breathing (the paper, Sect. 3.1 and Fig. 3).
 
 use std::fmt::Write;
 
@@ -10,8 +10,8 @@ use crate::array::Progression;
 use crate::pipeline::Plan;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
 
-/// Values of R_2, one for each curve.
-const FIRST_RATIOS: [f64; 5] = [2.0, 4.0, 6.0, 8.0, 10.0];
+/// Values of R_2, one for each curve: the paper's.
+const FIRST_RATIOS: [f64; 3] = [3.0, 6.0, 9.0];
 /// Number of values of R, from 1 to 10.
 const RATIO_STEPS: usize = 91;
 

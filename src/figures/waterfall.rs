@@ -12,7 +12,7 @@ use super::output::FigureParts;
 use super::request::FigureRequest;
 use super::rows::PairMoment;
 use crate::pipeline::Plan;
-use crate::products::pictures::{Axis, ColourScale, Palette, Raster, Scaling, draw_rasters};
+use crate::products::pictures::{Axis, ColourScale, Raster, draw_rasters};
 use crate::response::pixel::{CHILDREN, Comb, Directions, PairGeometry, PixelMethod, RowMaker, comb_sums};
 use crate::sky::generated::generate;
 use crate::sky::healpix::pixel_area_sr;
@@ -172,13 +172,13 @@ fn draw(
     cells: &[Cell],
 ) -> Result<crate::products::pictures::Picture, FigureError> {
     // Rows of the picture are times, columns frequencies.
-    let amplitude = |k: usize| cells.iter().map(|cell| cell.values[k].norm()).collect::<Vec<f64>>();
+    let real_part = |k: usize| cells.iter().map(|cell| cell.values[k].re).collect::<Vec<f64>>();
     let drawn = [
-        (format!("nside {}", numbers.nside_fine), amplitude(0)),
-        (format!("nside {}, averaged", numbers.nside), amplitude(1)),
-        (format!("nside {}, at centres", numbers.nside), amplitude(2)),
+        (format!("nside {}", numbers.nside_fine), real_part(0)),
+        (format!("nside {}, averaged", numbers.nside), real_part(1)),
+        (format!("nside {}, at centres", numbers.nside), real_part(2)),
     ];
-    let scale = ColourScale::robust(&drawn[0].1, Scaling::Log, Palette::default());
+    let scale = ColourScale::symmetric(&drawn[0].1);
     let minutes = (numbers.window_s[1] - numbers.window_s[0]) / 60.0;
     let rasters: Vec<Raster<'_>> = drawn
         .iter()
@@ -200,5 +200,5 @@ fn draw(
             unit: "K sr".to_owned(),
         })
         .collect();
-    Ok(draw_rasters(&format!("Visibilities of pair {}", numbers.pair), &rasters, 3)?)
+    Ok(draw_rasters(&format!("Visibilities of pair {}, real part", numbers.pair), &rasters, 3)?)
 }

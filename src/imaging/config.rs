@@ -489,7 +489,7 @@ impl MapConfig {
 
     /// The longest baseline used at a frequency, m.
     ///
-    /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4).
+    /// b_p = wavelength / sqrt(4 pi / N_pix) is the baseline that a pixel just resolves (the paper, Sect. 4.2).
     #[must_use]
     #[doc(hidden)]
     pub fn baseline_m_max(&self, frequency_hz: f64) -> f64 {

@@ -1,6 +1,6 @@
 //! Maps from visibilities: normal equations, accumulated as data arrive, and their regularised solution
 //! `T = (BtN^-1B + R)^-1 BtN^-1 (V - B T_p) + T_p`. R is `1 / C_l` with the sky's angular power C_l estimated from the data ([`SkyPower`]);
-//! or `epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4); or another [`Regulariser`].
+//! or `epsilon W_max I`, W_max the largest eigenvalue of `BtN^-1B` (the paper, Sect. 4.1); or another [`Regulariser`].
 //!
 //! Each map method has a folder with its sums and their solution. `pixel` forms the matrix over pixels, or computes its rows again for each
 //! product. [`circle`] applies the matrix to spherical harmonics, for satellites on one circular orbit; [`anywhere`] refines its maps with

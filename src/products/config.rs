@@ -25,7 +25,7 @@ keys! {
 }
 
 /// Processing of maps before they are compared and drawn. Pixels are split, and smoothed with a Gaussian beam (the paper,
-/// Sect. 4: nside 64 to 256, FWHM 1 deg).
+/// Sect. 4.2: nside 64 to 256, FWHM 1 deg).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct PostProcessing {
     /// Number of parts into which the side of a pixel is split.

@@ -109,7 +109,7 @@ pub struct FitFigures {
     pub solution_k2: f64,
 }
 
-/// Traces of the covariances (the paper, Sect. 4).
+/// Traces of the covariances (the paper, Sect. 5.1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TraceFigures {
     /// Trace of the noise covariance, Tr Sigma_n, K^2.
@@ -214,11 +214,13 @@ impl RunFigures {
 /// The epsilon at which thermal-noise variance equals regularisation bias, for runs that differ only in epsilon (the paper, Fig. 15).
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Crossing {
-    /// Label of the first run.
+    /// What the labels of the runs have in common.
     #[serde(rename = "of")]
     pub run_label: String,
     /// Frequency of the channel, Hz.
     pub frequency_hz: f64,
+    /// The smallest and the largest epsilon of the runs.
+    pub epsilon_tried: [f64; 2],
     /// epsilon at which Tr Sigma_n = T^2 Tr Sigma_s, with T the mean of the input.
     pub epsilon: Option<f64>,
     /// epsilon at which Tr Sigma_n in K^2 and T Tr Sigma_s in K are numerically equal.
@@ -229,30 +231,42 @@ pub struct Crossing {
 #[must_use]
 pub fn crossings(groups: &[Vec<&RunFigures>]) -> Vec<Crossing> {
     let mut found = Vec::new();
-    for group in groups.iter().filter(|group| group.len() > 1) {
-        for (k, first) in group[0].channels.iter().enumerate() {
-            let mut points: Vec<[f64; 4]> = group
-                .iter()
-                .filter_map(|run| {
-                    let channel = run.channels.get(k)?;
-                    let traces = channel.diagnostics.traces.as_ref()?;
-                    let (n, s) = (traces.sigma_n_k2.value, traces.sigma_s.value);
-                    Some([channel.diagnostics.epsilon?, n, s, channel.input_mean_k()?])
-                })
-                .collect();
-            points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    for group in groups {
+        for (k, first) in group.first().map_or(&[][..], |run| &run.channels).iter().enumerate() {
+            let points = trace_points(group, k);
             if points.len() < 2 {
                 continue;
             }
             found.push(Crossing {
-                run_label: group[0].label.clone(),
+                run_label: common_label(group),
                 frequency_hz: first.frequency_hz,
+                epsilon_tried: [points[0][0], points[points.len() - 1][0]],
                 epsilon: crossing(&points, 2),
                 epsilon_first_power: crossing(&points, 1),
             });
         }
     }
     found
+}
+
+/// epsilon, Tr Sigma_n (K^2), Tr Sigma_s and the mean of the input (K) of a channel in each of `group`, in order of epsilon.
+pub(super) fn trace_points(group: &[&RunFigures], channel: usize) -> Vec<[f64; 4]> {
+    let point = |run: &&RunFigures| {
+        let channel = run.channels.get(channel)?;
+        let traces = channel.diagnostics.traces.as_ref()?;
+        let (n, s) = (traces.sigma_n_k2.value, traces.sigma_s.value);
+        Some([channel.diagnostics.epsilon?, n, s, channel.input_mean_k()?])
+    };
+    let mut points: Vec<[f64; 4]> = group.iter().filter_map(point).collect();
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    points
+}
+
+/// What the labels of all of `group` have in common: the settings besides epsilon.
+pub(super) fn common_label(group: &[&RunFigures]) -> String {
+    let Some((first, others)) = group.split_first() else { return String::new() };
+    let is_common = |part: &&str| others.iter().all(|run| run.label.split(", ").any(|other| other == *part));
+    first.label.split(", ").filter(is_common).collect::<Vec<_>>().join(", ")
 }
 
 /// The epsilon at which `n = mean^power s`, by linear interpolation of logarithms.
@@ -348,10 +362,10 @@ pub fn spectra_csv(runs: &[&RunFigures]) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
 
-    fn run(label: &str, epsilon: f64, n: f64, s: f64) -> RunFigures {
+    pub(in crate::products) fn run(label: &str, epsilon: f64, n: f64, s: f64) -> RunFigures {
         let estimate = |value| EstimateFigures { value, error: None };
         let traces = TraceFigures { sigma_n_k2: estimate(n), sigma_s: estimate(s), measured: None };
         // A mean of 10 K.
@@ -401,6 +415,15 @@ mod tests {
         // Traces that do not cross give no epsilon.
         let none = crossings(&[runs[..2].iter().collect()]);
         assert_eq!((none[0].epsilon, none[0].epsilon_first_power), (None, None));
+        assert_eq!(none[0].epsilon_tried, [1e-3, 1e-2]);
+    }
+
+    #[test]
+    fn groups_are_named_by_what_their_runs_have_in_common() {
+        let labels = ["receiver_noise = 0, epsilon = 1e-6", "receiver_noise = 0, epsilon = 1e-4"];
+        let runs = labels.map(|label| run(label, 1e-6, 1.0, 1.0));
+        assert_eq!(common_label(&[&runs[0], &runs[1]]), "receiver_noise = 0");
+        assert_eq!(common_label(&[&runs[1]]), labels[1]);
     }
 
     #[test]
@@ -419,7 +442,7 @@ mod tests {
             let fields = |line: usize| text.lines().nth(line).unwrap().replace(", ", " ").split(',').count();
             assert_eq!(fields(0), fields(1), "{text}");
         }
-        assert!(crate::products::draw_runs("runs", &all).is_ok());
+        assert!(crate::products::draw_runs("runs", &all, &[]).is_ok());
     }
     #[test]
     fn power_kept_is_relative_to_the_ideal_map() {

@@ -27,7 +27,7 @@ pub fn auto_cl(alm: &Alm) -> Vec<f64> {
 
 /// Ratio of a cross-power spectrum to the geometric mean of two power spectra at each degree; NaN where a spectrum is zero.
 ///
-/// With the spectra of both maps it is rho_l, with those of the input and of a noise map SNR_l (the paper, Sect. 4).
+/// With the spectra of both maps it is rho_l, with those of the input and of a noise map SNR_l (the paper, Sect. 5.2).
 #[must_use]
 #[doc(hidden)]
 pub fn normalised(cross: &[f64], one: &[f64], other: &[f64]) -> Vec<f64> {

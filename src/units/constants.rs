@@ -6,7 +6,7 @@ pub const SPEED_OF_LIGHT_M_S: f64 = 299_792_458.0;
 /// Boltzmann constant, J/K (SI, exact).
 pub const BOLTZMANN_J_K: f64 = 1.380_649e-23;
 
-/// Mean radius of the Moon, m (IAU 2015; the paper, Sect. 2).
+/// Mean radius of the Moon, m (IAU 2015; the paper, Sect. 3.2).
 pub const MOON_RADIUS_M: f64 = 1_737_100.0;
 /// GM of the Moon, m^3/s^2 (DE440).
 pub const MOON_GM_M3_S2: f64 = 4.902_800_118e12;

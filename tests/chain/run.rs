@@ -320,6 +320,12 @@ fn a_replay_that_is_told_nothing_gives_the_maps_of_the_run() {
         .unwrap();
     let (defaults, said) = replay("defaults", &copied, &[]);
     assert!(!said.contains("settings of the maps"), "{said}");
+    assert!(said.contains(&format!("the settings in {elsewhere}/pipeline.toml are not used")), "{said}");
+    assert!(said.contains("its seed or its mission is not the downlink's"), "{said}");
+    std::fs::write(format!("{elsewhere}/pipeline.toml"), changed.replacen("seed = 7", "seed = [", 1))
+        .unwrap();
+    let (_, said) = replay("unreadable", &copied, &[]);
+    assert!(said.contains("are not used, as it cannot be loaded"), "{said}");
     // nside 16 by default.
     assert!(first(&defaults).len() > first(&maps).len());
 

@@ -1,6 +1,6 @@
 //! Normal equations over pixels: `BtN^-1B` itself, element by element.
 //!
-//! Real and imaginary parts of a visibility are separate rows of B (the paper, Sect. 4). Adding a visibility takes
+//! Real and imaginary parts of a visibility are separate rows of B (the paper, Sect. 3.2). Adding a visibility takes
 //! 2 N_pix^2 multiply-adds, of which symmetry saves half. With M the smallest power of four not below `weight_max`, terms
 //! of the matrix are rounded to `2^-42 M` times the square of a pixel's area, and those of the right-hand sides to
 //! `2^-31 sqrt(M)` times the area; there is room for a total weight of `2^21 M`.

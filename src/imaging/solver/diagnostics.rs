@@ -33,7 +33,7 @@ impl Spectrum {
         epsilon * self.eigenvalues.last().copied().unwrap_or(0.0)
     }
 
-    /// Trace of the thermal covariance, `sum W / (W + eps)^2`, K^2 (the paper, Sect. 4).
+    /// Trace of the thermal covariance, `sum W / (W + eps)^2`, K^2 (the paper, Sect. 5.1).
     #[must_use]
     pub fn trace_sigma_n(&self, epsilon: f64) -> f64 {
         let eps = self.regularisation(epsilon);

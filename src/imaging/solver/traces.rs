@@ -1,4 +1,4 @@
-//! Traces of the covariances of a map (thermal noise and imperfection; the paper, Sect. 4) and of the data's resolution matrix, with errors.
+//! Traces of the covariances of a map (thermal noise and imperfection; the paper, Sect. 5.1) and of the data's resolution matrix, with errors.
 //!
 //! If the matrix can be stored, its eigenvalues give the traces. Otherwise random probes do (Hutchinson): the trace of f(A) is the mean of
 //! `v.f(A)v` over vectors v of random signs, and k Lanczos steps from v bound each term. For `g1 = 1 / (x + eps)` and
@@ -47,7 +47,7 @@ impl std::ops::Div<f64> for Estimate {
     }
 }
 
-/// Traces of the thermal covariance, the imperfection (the paper, Sect. 4) and the resolution matrix.
+/// Traces of the thermal covariance, the imperfection (the paper, Sect. 5.1) and the resolution matrix.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
 pub struct Traces {
     /// `sum W / (W + eps)^2`, K^2.

@@ -17,6 +17,7 @@ mod sections;
 mod source;
 
 pub(super) use downlink_settings::SETTINGS;
+pub use downlink_settings::SettingsOrigin;
 pub use effects::NoEffect;
 pub use error::PipelineError;
 pub use memory::{MemoryLimit, MemorySource};

@@ -56,6 +56,9 @@ pub struct StudySummary {
     pub cancelled: bool,
     /// The finished cases.
     pub cases: Vec<CaseSummary>,
+    /// The cases, by number, that differ only in `map.epsilon`.
+    #[serde(skip)]
+    pub epsilon_groups: Vec<Vec<usize>>,
     /// Values of `map.epsilon` where the two traces cross, for cases that differ only in `map.epsilon`.
     pub crossings: Vec<Crossing>,
     /// Choices of `map.epsilon` by several rules, for the same cases, if at least three have traces.
@@ -310,16 +313,27 @@ fn summarise(study: &Study, out: &Path, cancelled: bool) -> Result<StudySummary,
         let (folder, realisations) = (case.folder(), 1 + case.noise_seeds.len());
         cases.push(CaseSummary { folder, overrides: case.overrides.clone(), realisations, figures });
     }
-    let groups: Vec<Vec<&RunFigures>> = groups
-        .into_iter()
-        .map(|(_, members)| members.into_iter().map(|k| &cases[k].figures).collect())
-        .collect();
+    let epsilon_groups: Vec<Vec<usize>> = groups.into_iter().map(|(_, members)| members).collect();
+    let groups = figures_of_groups(&cases, &epsilon_groups);
     let (crossings, epsilons) = (crossings(&groups), epsilon_choices(&groups));
     compare_with_ideal(&done, &mut cases);
     let products = SpreadProducts { covariance_at_deg: &study.covariance_at_deg, folder: out };
     let spreads =
         if study.realisations > 1 { spreads(&families(study, &cases), products)? } else { Vec::new() };
-    Ok(StudySummary { name: study.name.clone(), cancelled, cases, crossings, epsilons, spreads })
+    Ok(StudySummary {
+        name: study.name.clone(),
+        cancelled,
+        cases,
+        epsilon_groups,
+        crossings,
+        epsilons,
+        spreads,
+    })
+}
+
+/// Figures of groups of cases.
+fn figures_of_groups<'a>(cases: &'a [CaseSummary], groups: &[Vec<usize>]) -> Vec<Vec<&'a RunFigures>> {
+    groups.iter().map(|members| members.iter().map(|&k| &cases[k].figures).collect()).collect()
 }
 
 /// Compares each case of a study of instrument errors with the case that has no errors and is not calibrated.
@@ -382,7 +396,8 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
         let path = out.join(name);
         write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
     }
-    let picture = draw_runs(&summary.name, &runs).map_err(ProductsError::from)?;
+    let groups = figures_of_groups(&summary.cases, &summary.epsilon_groups);
+    let picture = draw_runs(&summary.name, &runs, &groups).map_err(ProductsError::from)?;
     for name in ["study.png", "study.svg"] {
         picture.write(&out.join(name)).map_err(ProductsError::from)?;
     }

@@ -118,8 +118,10 @@ impl Range {
             let factor = (high / low).powf(margin).max(if margin > 0.0 || high <= low { 1.1 } else { 1.0 });
             return Self { low: low / factor, high: high * factor, log: true };
         }
-        let span = if high > low { high - low } else { low.abs().max(1.0) };
-        let margin = if high > low { margin } else { 0.1 };
+        // Less than this share is rounding of one value.
+        let varies = high - low > 1e-9 * high.abs().max(low.abs());
+        let span = if varies { high - low } else { low.abs().max(1.0) };
+        let margin = if varies { margin } else { 0.1 };
         Self { low: low - margin * span, high: high + margin * span, log: false }
     }
 
@@ -360,6 +362,15 @@ mod tests {
         for (k, one) in strokes.iter().enumerate() {
             assert!(strokes[..k].iter().all(|other| other != one), "{k}");
         }
+    }
+
+    #[test]
+    fn rounding_of_one_value_is_not_spread_over_an_axis() {
+        let axis = Axis::default();
+        let range = Range::new(&axis, [200.0, 200.0 + 3e-11].into_iter(), 0.06);
+        assert!(range.low < 190.0 && range.high > 210.0, "{range:?}");
+        let range = Range::new(&axis, [200.0, 200.001].into_iter(), 0.0);
+        assert_eq!((range.low, range.high), (200.0, 200.001));
     }
 
     #[test]

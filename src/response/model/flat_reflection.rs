@@ -8,7 +8,7 @@ use crate::response::pixel::Comb;
 /// Adds the reflection of the sky in a flat Moon with constant power reflectivity to a sky model.
 ///
 /// A reflected wave arrives at least `2 h / c` after the direct one, 2 ms for 300 km: sixteen times the coherence time of a
-/// channel of 8 kHz, so that the two do not interfere (the paper, Sect. 5). The image therefore adds as a second, weaker sky.
+/// channel of 8 kHz, so that the two do not interfere (the paper, Sect. 3.4). The image therefore adds as a second, weaker sky.
 /// The mirror is the horizontal plane at the pair's mid-point. It maps a direction n to `n - 2 (n . z) z`, and as the baseline is
 /// horizontal there, the image has the fringe of n itself. Only the sky above the horizontal is reflected: the image is the
 /// reflectivity times the visibility that a Moon as large as the orbit would leave.
