@@ -146,10 +146,14 @@ fn powers_with_unknown_gains_see_the_largest_scales_and_the_mean() {
     let mean = map.map_k.iter().sum::<f64>() / map.map_k.len() as f64;
     assert!((mean - truth).abs() < 4.0 * map.mean_sigma_k, "{mean} {} {truth}", map.mean_sigma_k);
     let perturbed = all_rho(&perturbed, &sky);
-    for l in 2..=16 {
-        assert!(perturbed[l] > with_powers[l] - 0.01, "{l}: {} {}", perturbed[l], with_powers[l]);
-        assert!(with_powers[l] > before[l] - 0.01, "{l}: {} {}", with_powers[l], before[l]);
-    }
+    let mean = |rho: &[f64], l: std::ops::RangeInclusive<usize>| {
+        let count = l.clone().count() as f64;
+        rho[l].iter().sum::<f64>() / count
+    };
+    // Powers see what baselines of some wavelengths hardly do.
+    assert!(mean(&with_powers, 3..=8) > mean(&before, 3..=8) + 0.05, "{with_powers:?} {before:?}");
+    assert!((2..=16).all(|l| with_powers[l] > before[l] - 0.02), "{with_powers:?} {before:?}");
+    assert!(mean(&perturbed, 2..=16) > mean(&with_powers, 2..=16) - 0.01, "{perturbed:?} {with_powers:?}");
     let said = fail(&["joint", &state, "--no-powers", "--out", &place.path("none")]);
     assert!(said.contains("or one with total powers"), "{said}");
 }

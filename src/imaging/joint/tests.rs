@@ -194,7 +194,7 @@ fn compare(
         for i in 0..41 {
             let ratio = found[(i, i)] / covariance[(i, i)];
             // Rows of pixels have errors of some 1e-3 sr at the limb, and the largest have few sr.
-            assert!((ratio - 1.0).abs() < 0.05, "{i}: {ratio}");
+            assert!((ratio - 1.0).abs() < 0.1, "{i}: {ratio}");
         }
         return Vec::new();
     }
