@@ -77,8 +77,8 @@ keys! {
         /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, instead of the formation. Their dates fix the mission's
         /// epoch and the Earth's position.
         everyday oem: Vec<PathBuf> = Vec::new();
-        /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first
-        /// usable times.
+        /// Epoch of the mission, in UTC if it ends with Z, else in the files' time system, such as 2030-01-31T12:00:00; empty for
+        /// the latest of their first usable times.
         #[only_with("array.oem")]
         expert oem_epoch: String = String::new();
         /// Numerical integration in the Moon's field (GRGM900C), from the formation at the epoch or from array.kepler. Periods,

@@ -10,7 +10,9 @@ use super::output::{CommandError, CommandResult, Completion, print_json_line, pr
 use super::progress::while_solving;
 use crate::files::write_atomically;
 use crate::imaging::SolveWatch;
-use crate::imaging::joint::{Agreement, Correlation, JointMap, JointRequest, JointSolution, SpectralMaps};
+use crate::imaging::joint::{
+    Agreement, Correlation, JointMap, JointRequest, JointSolution, PowerAgreement, PowerPriors, SpectralMaps,
+};
 use crate::pipeline::{solve_states_jointly, use_threads};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, View, draw_map};
 use crate::sky::Frame;
@@ -20,11 +22,14 @@ use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
 /// Maximum number of posterior samples, which are in memory for every channel.
 const COUNT_MAX: u64 = 1_000;
 
-/// Make maps of several channels together, each with what its neighbours see.
+/// Make maps of several channels together, each with what its neighbours see, and with the daughters' total powers.
 ///
 /// The sky's structure changes slowly with frequency. The data say how alike the channels are, and R follows from it: scales that
 /// one frequency hardly sees come from those that see them. Takes the sums of one state or of several, whose nside may differ; no
 /// visibility is read again, and the states stay as they are.
+///
+/// Where a state has total powers (spacecraft.auto_powers = true), they are in the fit: as the Moon's disc moves over the sky they see its
+/// largest scales, and its mean. Gain, offset and slope of each are free in every pass of every daughter. With powers one channel suffices.
 ///
 /// Leaves in the output folder for each channel, and each frequency of --at, map.fits (temperature and standard deviation, K) and a picture;
 /// spectra.fits (spectral index, curvature, and their standard deviations); and joint.json: means with errors, how alike the channels are,
@@ -42,6 +47,15 @@ pub(super) struct JointArgs {
     /// Draws from which errors of means and spectra are taken.
     #[arg(long, value_name = "NUMBER", default_value_t = 16, value_parser = clap::value_parser!(u64).range(2..=COUNT_MAX))]
     count: u64,
+    /// Leave out the total powers.
+    #[arg(long)]
+    no_powers: bool,
+    /// Standard deviations of gain, offset and slope of a power over a pass, percent of the power.
+    #[arg(long, value_name = "GAIN,OFFSET,SLOPE", default_value = "10,1,1", value_parser = power_priors)]
+    power_priors: [f64; 3],
+    /// What the powers have beside the sky, receiver noise and the Moon's emission: one value, or one for each channel in order of frequency.
+    #[arg(long, value_name = "K_SR", default_value = "0", value_delimiter = ',')]
+    power_constant_k_sr: Vec<f64>,
     /// Output folder.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
@@ -52,15 +66,28 @@ pub(super) struct JointArgs {
     json: bool,
 }
 
+/// Standard deviations of gain, offset and slope, percent.
+fn power_priors(text: &str) -> Result<[f64; 3], String> {
+    let numbers: Result<Vec<f64>, _> = text.split(',').map(|number| number.trim().parse()).collect();
+    let found = numbers.ok().and_then(|numbers| <[f64; 3]>::try_from(numbers).ok());
+    let found = found.filter(|numbers| numbers.iter().all(|percent| (0.0..=1000.0).contains(percent)));
+    found.ok_or_else(|| {
+        "expected three percentages of 0 to 1000, of gain, offset and slope, such as 10,1,1".into()
+    })
+}
+
 #[derive(Serialize)]
 struct Report {
-    /// Correlation of the channels.
-    likeness: Correlation,
+    /// Correlation of the channels; `None` for one alone.
+    likeness: Option<Correlation>,
+    /// Priors of the total powers; `None` if no channel has any, or they are left out.
+    power_priors: Option<PowerPriors>,
     iterations: usize,
     residual: f64,
     converged: bool,
     maps: Vec<MapReport>,
-    spectra: String,
+    /// `None` for a channel alone.
+    spectra: Option<String>,
 }
 
 #[derive(Serialize)]
@@ -73,6 +100,16 @@ struct MapReport {
     sigma_rms_k: f64,
     /// `None` between channels.
     agreement: Option<Agreement>,
+    /// `None` without total powers.
+    powers: Option<PowerAgreement>,
+}
+
+impl JointArgs {
+    fn priors(&self) -> Option<PowerPriors> {
+        let [gain, offset, slope] = self.power_priors.map(|percent| percent / 100.0);
+        let constant_k_sr = self.power_constant_k_sr.clone();
+        (!self.no_powers).then_some(PowerPriors { gain, offset, slope, constant_k_sr })
+    }
 }
 
 pub(super) fn execute(args: &JointArgs) -> CommandResult {
@@ -85,10 +122,15 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     }
     // An unwritable folder is reported before minutes of work.
     std::fs::create_dir_all(&args.out).map_err(|error| format!("{}: {error}", args.out.display()))?;
-    let request = |rule| JointRequest { rule, samples: args.count as usize, at_hz: args.at.clone() };
+    let request = |rule| JointRequest {
+        rule,
+        samples: args.count as usize,
+        at_hz: args.at.clone(),
+        powers: args.priors(),
+    };
     let watch = SolveWatch::default();
     let solved = while_solving(&watch, || solve_states_jointly(&states, &request, &watch))?;
-    let report = write(&args.out, &solved)?;
+    let report = write(&args.out, &solved, args.priors())?;
     if args.json {
         print_json_line(&report)?;
     } else {
@@ -97,22 +139,24 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-fn write(out: &Path, solved: &JointSolution) -> Result<Report, CommandError> {
+fn write(out: &Path, solved: &JointSolution, priors: Option<PowerPriors>) -> Result<Report, CommandError> {
+    let power_priors = priors.filter(|_| solved.maps.iter().any(|map| map.powers.is_some()));
     let mut maps = Vec::new();
     for map in &solved.maps {
         let folder = out.join(format!("{:.3}MHz", map.frequency_hz / 1e6));
         std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        maps.push(write_map(&folder, map, solved.convergence.converged)?);
+        maps.push(write_map(&folder, map, power_priors.as_ref(), solved.convergence.converged)?);
     }
     let spectra = out.join("spectra.fits");
-    write_spectra(&spectra, &solved.spectra)?;
+    solved.spectra.iter().try_for_each(|spectral| write_spectra(&spectra, spectral))?;
     let report = Report {
         likeness: solved.likeness,
+        power_priors,
         iterations: solved.convergence.iterations,
         residual: solved.convergence.residual,
         converged: solved.convergence.converged,
         maps,
-        spectra: spectra.display().to_string(),
+        spectra: solved.spectra.is_some().then(|| spectra.display().to_string()),
     };
     let path = out.join("joint.json");
     write_atomically(&path, &serde_json::to_vec_pretty(&report)?)
@@ -120,16 +164,32 @@ fn write(out: &Path, solved: &JointSolution) -> Result<Report, CommandError> {
     Ok(report)
 }
 
-fn write_map(folder: &Path, map: &JointMap, converged: bool) -> Result<MapReport, CommandError> {
+fn write_map(
+    folder: &Path,
+    map: &JointMap,
+    priors: Option<&PowerPriors>,
+    converged: bool,
+) -> Result<MapReport, CommandError> {
     let columns = [
         Column { name: "TEMPERATURE", unit: "K", values: &map.map_k },
         Column { name: "SIGMA", unit: "K", values: &map.sigma_k },
     ];
-    let cards = vec![
+    let mut cards = vec![
         Card::real("FREQ", map.frequency_hz, "Hz"),
-        Card::text("WHAT", "joint map of several channels", "posterior mean and standard deviation"),
+        Card::text("WHAT", "joint map", "posterior mean and standard deviation"),
         Card::logical("CONVERGD", converged, "the iteration reached map.residual_max"),
+        Card::logical("POWERS", map.powers.is_some(), "total powers are in the fit"),
     ];
+    if let Some((found, priors)) = map.powers.zip(priors) {
+        cards.extend([
+            Card::integer("PWROWS", found.rows as i64, "averages of total powers"),
+            Card::integer("PWPASSES", found.passes as i64, "passes of daughters, each with its own gain"),
+            Card::real("PWCHISQ", found.chi_square, "reduced chi-square of the total powers"),
+            Card::real("PWGAIN", priors.gain, "prior standard deviation of gains"),
+            Card::real("PWOFFSET", priors.offset, "prior of offsets, of the mean power"),
+            Card::real("PWSLOPE", priors.slope, "prior of slopes over a pass, of the mean power"),
+        ]);
+    }
     let options = WriteOptions { cards, ..WriteOptions::default() };
     write_columns(&folder.join("map.fits"), Frame::Ecliptic, &columns, &options)?;
     let pixels = map.map_k.len() as f64;
@@ -151,6 +211,7 @@ fn write_map(folder: &Path, map: &JointMap, converged: bool) -> Result<MapReport
         mean_sigma_k: map.mean_sigma_k,
         sigma_rms_k: (map.sigma_k.iter().map(|sigma| sigma * sigma).sum::<f64>() / pixels).sqrt(),
         agreement: map.agreement,
+        powers: map.powers,
     })
 }
 
@@ -177,11 +238,19 @@ fn write_spectra(path: &Path, found: &SpectralMaps) -> Result<(), CommandError> 
 }
 
 fn text(report: &Report) -> String {
-    let Correlation { length, own_share } = report.likeness;
-    let mut lines = vec![format!(
-        "channels stay alike over {length:.2} e-foldings of frequency; {:.2} % of the power is each channel's own",
-        100.0 * own_share
-    )];
+    let mut lines = Vec::new();
+    if let Some(Correlation { length, own_share }) = report.likeness {
+        lines.push(format!(
+            "channels stay alike over {length:.2} e-foldings of frequency; {:.2} % of the power is each channel's own",
+            100.0 * own_share
+        ));
+    }
+    if let Some(PowerPriors { gain, offset, slope, .. }) = &report.power_priors {
+        let [gain, offset, slope] = [gain, offset, slope].map(|fraction| 100.0 * fraction);
+        lines.push(format!(
+            "total powers: in every pass of a daughter gain, offset and slope are free within {gain}, {offset} and {slope} %"
+        ));
+    }
     for map in &report.maps {
         let agreement = map.agreement.map_or("between channels".to_owned(), |found| {
             format!(
@@ -189,8 +258,11 @@ fn text(report: &Report) -> String {
                 found.chi_square_alone, found.chi_square, found.strain
             )
         });
+        let powers = map.powers.map_or(String::new(), |PowerAgreement { rows, passes, chi_square }| {
+            format!("; {rows} rows of total powers in {passes} passes, chi-square {chi_square:.4}")
+        });
         lines.push(format!(
-            "{:>8.3} MHz  mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms; {agreement}; {}",
+            "{:>8.3} MHz  mean ({:.4e} +- {:.1e}) K, pixels +- {:.2e} K rms; {agreement}{powers}; {}",
             map.frequency_hz / 1e6,
             map.mean_k,
             map.mean_sigma_k,
@@ -198,7 +270,7 @@ fn text(report: &Report) -> String {
             map.folder
         ));
     }
-    lines.push(format!("spectral index and curvature: {}", report.spectra));
+    lines.extend(report.spectra.iter().map(|path| format!("spectral index and curvature: {path}")));
     if !report.converged {
         lines.push(format!(
             "not converged: residual {:.1e} after {} products",

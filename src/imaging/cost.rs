@@ -15,23 +15,48 @@ use crate::response::pixel::{PixelMethod, RowProducts};
 use crate::sky::healpix::pixel_count;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
-/// Products with BtN^-1B in one harmonic solution: some 15 for W_max, and 25 each for the map and the noise map, which take nearly twice as
-/// long together as one (benches/harmonic).
-const APPLICATIONS: f64 = 65.0;
+/// Iterations of a harmonic solution whose windows cover the planes of the orbit: for W_max, the map and its noise map each (`lunarray run`
+/// of the quicklook with `map.epsilon = 1e-4`: 9 to 16, 11 to 13 and 10 to 13).
+const ITERATIONS: f64 = 11.0;
+
+/// Number of windows below which iterations grow, and the power of the fraction by which they do: 24 with 50 windows, 75 to 183 with 17.
+const WINDOWS_COVERED: f64 = 90.0;
+const COVERAGE_EXPONENT: f64 = 1.4;
+
+/// Maximum number of iterations of a solution from few windows, which determine few harmonics.
+const ITERATIONS_FEW: f64 = 180.0;
+
+/// Iterations without a matrix in units of those of the harmonic engine, whose preconditioner they lack (55 to 90 with 31 windows).
+const FREE_ITERATIONS: f64 = 2.0;
+
+/// Products of a final map with R from the data in units of those with a given R: rounds for the sky's power, its errors and their samples.
+/// Intermediate maps take about as many as with a given R.
+const DATA_PRODUCTS: f64 = 2.0;
+
+/// Multiply-adds of a dense solution with R from the data in units of the cube of the number of pixels, and full matrices that it holds.
+const DATA_CUBES: f64 = 1.0;
+const DATA_MATRICES: f64 = 4.0;
 
 /// Columns that are solved together: a map and its noise map, or, with R from the data, the errors of mean and dipole.
 fn solved_together(map: &MapConfig) -> usize {
     if map.regulariser() == RegulariserChoice::Data { 4 } else { 2 }
 }
 
-/// Products for W_max over pixels, from a random start vector.
-const W_MAX_PRODUCTS: f64 = 30.0;
+/// Products for W_max over pixels, from a random start vector (14 to 31).
+const W_MAX_PRODUCTS: f64 = 20.0;
+
+/// Maps with products of their own in each iteration: the map and its noise map.
+const SOLVED: f64 = 2.0;
 
 /// Products with BtN^-1B for one random probe of the traces (at most 300): a guess for epsilon = 1e-4, not measured.
 const PROBE_APPLICATIONS: f64 = 40.0;
 
-/// Alphas that the weights of one observation window reach: the width of their kernel, and the drift of the plane.
-const WINDOW_ALPHAS: f64 = 16.0;
+/// Alphas that the weights of one observation window reach, of those that no other has reached: 2.5 to 7.5, from the peak memory of 17 to 121
+/// windows at nside 8, 16 and 32.
+const WINDOW_ALPHAS: f64 = 4.5;
+
+/// Maximum number of intermediate maps whose products are counted one by one.
+const MAPS_COUNTED: u64 = 100;
 
 /// Memory of a visibility while the circle's sums for a refinement are made, bytes: position, data, noise.
 const SUMMED_VISIBILITY_BYTES: f64 = 120.0;
@@ -43,6 +68,15 @@ const BASIS_VECTORS: [f64; 2] = [60.0, 120.0];
 /// weights, and copying from and to the matrix products (benches/harmonic).
 const TRANSFORMS_PER_LINE: f64 = 4.0;
 
+/// Time of an element of a row of B, s.
+fn element_s(map: &MapConfig) -> f64 {
+    match map.rows {
+        PixelMethod::Centre => CENTRE_ELEMENT_S,
+        PixelMethod::Average => AVERAGE_ELEMENT_S / map.nside as f64,
+        PixelMethod::AverageExact => EXACT_ELEMENT_S,
+    }
+}
+
 /// The cost of one channel's engine.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(crate) struct EngineCost {
@@ -50,18 +84,17 @@ pub(crate) struct EngineCost {
     pub(crate) sums_bytes: f64,
     /// Memory of a floating-point copy of the sums, from which a map is solved, bytes.
     pub(crate) copy_bytes: f64,
-    /// Whether the final map is solved from a copy as well, not in the memory of the sums.
-    pub(crate) copies_final: bool,
     /// Memory of tables and workspace, bytes.
     pub(crate) other_bytes: f64,
     /// Estimated time per visibility, s.
     pub(crate) visibility_s: f64,
-    /// Estimated time per solution, s.
-    pub(crate) solution_s: f64,
-    /// Estimated time of the random probes of the final solution, s.
-    pub(crate) probes_s: f64,
+    /// Estimated time of all solutions, with the random probes and beams of the final one, s.
+    pub(crate) solving_s: f64,
     pub(crate) visibility_multiply_adds: f64,
-    pub(crate) solution_multiply_adds: f64,
+    /// Multiply-adds of all solutions.
+    pub(crate) solving_multiply_adds: f64,
+    /// Number of products with the normal matrix in all solutions; 0 for a factorisation.
+    pub(crate) products: f64,
 }
 
 /// The data of a channel as planned, before its sums exist.
@@ -72,6 +105,25 @@ pub(crate) struct ChannelData {
     pub(crate) visibilities: f64,
     /// Number of observation windows.
     pub(crate) windows: f64,
+    /// Number of maps: intermediate ones and the final one.
+    pub(crate) solutions: u64,
+    /// Range of the angle between nadir and limb over the mission, rad.
+    pub(crate) limb_range_rad: f64,
+}
+
+/// Usual number of iterations of a map from this many windows.
+fn iterations(windows: f64) -> f64 {
+    let grown = (WINDOWS_COVERED / windows.max(1.0)).max(1.0).powf(COVERAGE_EXPONENT);
+    (ITERATIONS * grown).min(ITERATIONS_FEW)
+}
+
+/// Sum over all intermediate maps, and the value of the final one, of a cost by the fraction of the data that a map has.
+fn over_maps(data: ChannelData, cost: impl Fn(f64) -> f64) -> [f64; 2] {
+    let intermediate = data.solutions.saturating_sub(1);
+    let counted = intermediate.min(MAPS_COUNTED);
+    let at = |k: u64| cost(k as f64 / (counted + 1) as f64);
+    let mean = (1..=counted).map(at).sum::<f64>() / counted.max(1) as f64;
+    [intermediate as f64 * mean, cost(1.0)]
 }
 
 impl EngineCost {
@@ -83,8 +135,7 @@ impl EngineCost {
             sums_bytes: share * self.sums_bytes,
             copy_bytes: share * self.copy_bytes,
             visibility_s: share * self.visibility_s,
-            solution_s: share * self.solution_s,
-            probes_s: share * self.probes_s,
+            solving_s: share * self.solving_s,
             ..self
         }
     }
@@ -102,7 +153,6 @@ impl EngineCost {
         Self {
             sums_bytes: (part * self.sums_bytes).max(solving_bytes),
             copy_bytes: 0.0,
-            copies_final: false,
             other_bytes: 0.0,
             ..self
         }
@@ -122,52 +172,53 @@ impl EngineCost {
         counts.into_iter().find(|&parts| needed(self.in_parts(parts, map)) <= limit_bytes)
     }
 
-    /// Bytes that a rank sends to the others in one solution.
-    pub(crate) fn reduced_bytes(map: &MapConfig) -> f64 {
-        APPLICATIONS * shared_size(map.degree()).product_bytes as f64
+    /// Bytes that a rank sends to the others in all solutions.
+    pub(crate) fn reduced_bytes(&self, map: &MapConfig) -> f64 {
+        self.products * shared_size(map.degree()).product_bytes as f64
     }
 
     /// Estimates the cost of a channel's engine.
     pub(crate) fn estimate(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
             EngineKind::Pixel | EngineKind::Auto if map.is_matrix_free() => Self::matrix_free(map, data),
-            EngineKind::Pixel | EngineKind::Auto => Self::pixel(map),
+            EngineKind::Pixel | EngineKind::Auto => Self::pixel(map, data.solutions),
             EngineKind::Harmonic if map.refine.is_on() => Self::refined(map, data),
             EngineKind::Harmonic => Self::harmonic(map, data),
         }
     }
 
-    fn pixel(map: &MapConfig) -> Self {
+    fn pixel(map: &MapConfig, solutions: u64) -> Self {
         let nside = map.nside;
         let pixels = pixel_count(nside) as f64;
         // Two real rows of B per visibility, and half of a symmetric matrix.
         let visibility_multiply_adds = pixels * pixels;
-        let solution_multiply_adds = pixels.powi(3) / 6.0;
+        let from_data = f64::from(u8::from(map.regulariser() == RegulariserChoice::Data));
+        let [factorised, inverted] = [pixels.powi(3) / 6.0, from_data * DATA_CUBES * pixels.powi(3)];
+        let solution_s = factorised / CHOLESKY_MULTIPLY_ADDS_PER_S + inverted / RANK_K_MULTIPLY_ADDS_PER_S;
         Self {
             sums_bytes: PixelEngine::memory_bytes(nside) as f64,
             copy_bytes: PixelEngine::memory_bytes(nside) as f64,
-            copies_final: false,
-            other_bytes: 0.0,
-            visibility_s: visibility_multiply_adds / (RANK_K_MULTIPLY_ADDS_PER_S * cores()),
-            solution_s: solution_multiply_adds / (CHOLESKY_MULTIPLY_ADDS_PER_S * cores()),
+            other_bytes: from_data * DATA_MATRICES * 8.0 * pixels.powi(2),
+            visibility_s: (visibility_multiply_adds / RANK_K_MULTIPLY_ADDS_PER_S + pixels * element_s(map))
+                / cores(),
             // Factorised sums have no traces.
-            probes_s: 0.0,
+            solving_s: solutions as f64 * solution_s / cores(),
             visibility_multiply_adds,
-            solution_multiply_adds,
+            solving_multiply_adds: solutions as f64 * (factorised + inverted),
+            products: 0.0,
         }
     }
 
-    /// Stored visibilities and the maximum number of matrix products, each of which computes a row per visibility for the map and its noise map
-    /// together.
+    /// Stored visibilities and matrix products, each of which computes a row per visibility for the map and its noise map together.
     fn matrix_free(map: &MapConfig, data: ChannelData) -> Self {
         let pixels = pixel_count(map.nside) as f64;
         let visibilities = data.visibilities.min(map.refine.visibilities_max as f64);
-        let element_s = match map.rows {
-            PixelMethod::Centre => CENTRE_ELEMENT_S,
-            PixelMethod::Average => AVERAGE_ELEMENT_S,
-            PixelMethod::AverageExact => EXACT_ELEMENT_S,
+        // The time of a product is proportional to the data that there are.
+        let of_map = |fraction: f64| {
+            let iterations = FREE_ITERATIONS * iterations(fraction * data.windows);
+            fraction * (W_MAX_PRODUCTS + iterations.min(map.iterations_max as f64))
         };
-        let products = W_MAX_PRODUCTS + map.iterations_max as f64;
+        let products: f64 = over_maps(data, of_map).iter().sum();
         let elements = products * visibilities * pixels;
         let threads = rayon::current_num_threads();
         let held = visibilities * REFINED_VISIBILITY_BYTES as f64;
@@ -175,22 +226,23 @@ impl EngineCost {
             sums_bytes: held,
             // An intermediate map is solved from a copy.
             copy_bytes: held,
-            copies_final: false,
             other_bytes: RowProducts::memory_bytes(map.nside, solved_together(map), threads) as f64
                 + 8.0 * pixels * BASIS_VECTORS[0],
             visibility_s: 0.0,
-            solution_s: elements * element_s / cores(),
-            probes_s: 0.0,
+            solving_s: elements * element_s(map) / cores(),
             visibility_multiply_adds: 0.0,
             // Real and imaginary parts, two vectors, forward and back.
-            solution_multiply_adds: 8.0 * elements,
+            solving_multiply_adds: 8.0 * elements,
+            products,
         }
     }
 
     /// The circle's sums, solved once per iteration; visibilities in memory; and tables of the true rows.
     fn refined(map: &MapConfig, data: ChannelData) -> Self {
-        let ChannelData { frequency_hz, visibilities, .. } = data;
+        let ChannelData { frequency_hz, visibilities, limb_range_rad, .. } = data;
         let circle = Self::harmonic(map, data);
+        // Intermediate maps are solved on the nearest circle.
+        let circle_final = Self::harmonic(map, ChannelData { solutions: 1, ..data });
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let stored = visibilities.min(map.refine.visibilities_max as f64);
         let held = stored * REFINED_VISIBILITY_BYTES as f64;
@@ -207,31 +259,30 @@ impl EngineCost {
         let iteration_s = visibilities * (row_s / VISIBILITIES_PER_ROW + interpolation_s) / cores();
         let coefficients = if degree > 0 { 4.0 * skies } else { 0.0 };
         let held = held + visibilities * coefficients;
-        let rows = row_tables_bytes(map.degree(), u_max, rayon::current_num_threads(), degree) as f64;
+        let rows = row_tables_bytes(map.degree(), u_max, limb_range_rad, rayon::current_num_threads(), degree)
+            as f64;
         // Intermediate maps are solved from circle sums and a copy of them.
         let has_snapshots = map.snapshot_every_s > 0.0;
         let snapshot_bytes = if has_snapshots { circle.sums_bytes + circle.copy_bytes } else { 0.0 };
         Self {
             sums_bytes: held,
             copy_bytes: 0.0,
-            copies_final: true,
             other_bytes: circle.other_bytes
                 + circle.sums_bytes
                 + while_summed.max(0.0)
                 + rows
                 + snapshot_bytes,
             // Each iteration takes a product and an inner solution, for the map and its noise map.
-            solution_s: (iterations + 1.0) * (INNER_SOLUTION_FRACTION * circle.solution_s + iteration_s)
+            solving_s: circle.solving_s - circle_final.solving_s
+                + (iterations + 1.0) * (INNER_SOLUTION_FRACTION * circle_final.solving_s + iteration_s)
                 + visibilities * circle.visibility_s,
             visibility_s: if has_snapshots { circle.visibility_s } else { 0.0 },
-            solution_multiply_adds: (iterations + 1.0)
-                * INNER_SOLUTION_FRACTION
-                * circle.solution_multiply_adds,
             ..circle
         }
     }
 
-    fn harmonic(map: &MapConfig, ChannelData { frequency_hz, windows, .. }: ChannelData) -> Self {
+    fn harmonic(map: &MapConfig, data: ChannelData) -> Self {
+        let ChannelData { frequency_hz, windows, .. } = data;
         let l_max = map.degree();
         let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
         let memory = memory(l_max, u_max, rayon::current_num_threads(), solved_together(map));
@@ -240,25 +291,31 @@ impl EngineCost {
         // A complex transform takes 5 n log2(n) operations, and a multiply-add is two.
         let transform_multiply_adds = 2.5 * points * points.log2();
         let application_multiply_adds = size.lines as f64 * TRANSFORMS_PER_LINE * transform_multiply_adds;
-        // All pairs of a window share a plane, so its weights reach few alphas; the others take no memory.
-        let reached = (WINDOW_ALPHAS * windows / points).min(1.0);
+        // All pairs of a window share a plane, so its weights reach few alphas, and some twice; the others take no memory.
+        let reached = 1.0 - (-WINDOW_ALPHAS * windows / points).exp();
         let application_s = application_multiply_adds / (TRANSFORM_MULTIPLY_ADDS_PER_S * cores());
+        let of_map = |fraction: f64| {
+            ITERATIONS + SOLVED * iterations(fraction * windows).min(map.iterations_max as f64)
+        };
+        let [intermediate, last] = over_maps(data, of_map);
+        let from_data = map.regulariser() == RegulariserChoice::Data;
+        let products = intermediate
+            + if from_data { DATA_PRODUCTS } else { 1.0 } * last
+            + map.trace_probes as f64 * PROBE_APPLICATIONS
+            // A beam takes half as many as the map and its noise map.
+            + 0.5 * last * map.beams_deg.len() as f64;
         let vector_bytes = 8.0 * ((l_max + 1) as f64).powi(2);
         let vectors = BASIS_VECTORS[usize::from(map.trace_probes > 0)];
         Self {
             sums_bytes: memory.sums as f64 * reached,
+            // The final map is solved in the memory of the sums, whose integers are freed node by node.
             copy_bytes: memory.sums as f64 * reached,
-            // Integers are freed node by node, in pieces too small to be returned to the system.
-            copies_final: true,
             other_bytes: (memory.tables + memory.workspace) as f64 + vectors * vector_bytes,
             visibility_s: 1.0 / (HARMONIC_VISIBILITIES_PER_S * cores()),
-            solution_s: APPLICATIONS * application_s,
-            // A beam takes half the time of the map and its noise map.
-            probes_s: (map.trace_probes as f64 * PROBE_APPLICATIONS
-                + 0.5 * APPLICATIONS * map.beams_deg.len() as f64)
-                * application_s,
+            solving_s: products * application_s,
             visibility_multiply_adds: SPREAD_MULTIPLY_ADDS,
-            solution_multiply_adds: APPLICATIONS * size.matrix_multiply_adds,
+            solving_multiply_adds: products * size.matrix_multiply_adds,
+            products,
         }
     }
 }
@@ -268,38 +325,92 @@ mod tests {
     use super::*;
     use crate::imaging::MatrixKind;
 
+    /// Data that cover the orbit's planes, without intermediate maps.
+    const DATA: ChannelData = ChannelData {
+        frequency_hz: 1e7,
+        visibilities: 25_000.0,
+        windows: 200.0,
+        solutions: 1,
+        limb_range_rad: 0.05,
+    };
+
+    fn harmonic(regulariser: RegulariserChoice) -> MapConfig {
+        MapConfig { engine: EngineKind::Harmonic, regulariser: Some(regulariser), ..MapConfig::default() }
+    }
+
     #[test]
-    fn auto_costs_what_pixels_do_and_r_from_the_data_takes_more_memory() {
-        let data = ChannelData { frequency_hz: 1e7, visibilities: 25_000.0, windows: 100.0 };
+    fn auto_costs_what_pixels_do_and_r_from_the_data_takes_more_of_all() {
         let free = |engine: EngineKind| {
             let map = MapConfig { engine, matrix: MatrixKind::Free, ..MapConfig::default() };
-            EngineCost::estimate(&map, data)
+            EngineCost::estimate(&map, DATA)
         };
         assert_eq!(free(EngineKind::Auto), free(EngineKind::Pixel));
-        let harmonic = |regulariser: RegulariserChoice| {
-            let regulariser = Some(regulariser);
-            let map = MapConfig { engine: EngineKind::Harmonic, regulariser, ..MapConfig::default() };
-            EngineCost::estimate(&map, data)
-        };
-        let [two, four] = [RegulariserChoice::Identity, RegulariserChoice::Data].map(harmonic);
-        assert!(four.other_bytes > two.other_bytes, "{four:?} {two:?}");
+        let dense = |regulariser| MapConfig { engine: EngineKind::Pixel, ..harmonic(regulariser) };
+        for map in [harmonic, dense] {
+            let [given, from_data] = [RegulariserChoice::Identity, RegulariserChoice::Data]
+                .map(|regulariser| EngineCost::estimate(&map(regulariser), DATA));
+            assert!(from_data.other_bytes > given.other_bytes, "{from_data:?} {given:?}");
+            assert!(from_data.solving_s > given.solving_s, "{from_data:?} {given:?}");
+        }
     }
 
     #[test]
     fn matrix_free_cost_is_products_times_rows_times_pixels() {
-        let data = ChannelData { frequency_hz: 1e7, visibilities: 25_000.0, windows: 100.0 };
         let cost = |nside, iterations_max, rows| {
             let map =
                 MapConfig { nside, rows, matrix: MatrixKind::Free, iterations_max, ..MapConfig::default() };
-            EngineCost::estimate(&map, data)
+            EngineCost::estimate(&map, DATA)
         };
-        let (few, many) = (cost(64, 70, PixelMethod::Centre), cost(64, 170, PixelMethod::Centre));
-        // With those for W_max, twice as many products take twice the time.
-        assert!((many.solution_s / few.solution_s - 2.0).abs() < 1e-9);
-        assert!((few.solution_s / cost(32, 70, PixelMethod::Centre).solution_s - 4.0).abs() < 1e-9);
-        assert!(cost(64, 70, PixelMethod::Average).solution_s > few.solution_s);
+        let (few, many) = (cost(64, 1, PixelMethod::Centre), cost(64, 22, PixelMethod::Centre));
+        // With the 20 for W_max, twice as many products take twice the time.
+        assert!((many.solving_s / few.solving_s - 2.0).abs() < 1e-9);
+        assert!((few.solving_s / cost(32, 1, PixelMethod::Centre).solving_s - 4.0).abs() < 1e-9);
+        assert!(cost(64, 1, PixelMethod::Average).solving_s > few.solving_s);
         // 9.7 GB of matrix (`PIXEL_ENGINE_NSIDE_MAX`) against 400 bytes per visibility.
-        let stored = EngineCost::estimate(&MapConfig { nside: 64, ..MapConfig::default() }, data);
+        let stored = EngineCost::estimate(&MapConfig { nside: 64, ..MapConfig::default() }, DATA);
         assert!(stored.sums_bytes > 9e9 && few.sums_bytes < 2e7 && few.other_bytes < 1e9);
+    }
+
+    #[test]
+    fn snapshots_cost_as_much_as_their_data_need() {
+        let of = |map: &MapConfig, windows, solutions| {
+            EngineCost::estimate(map, ChannelData { windows, solutions, ..DATA })
+        };
+        let map = harmonic(RegulariserChoice::Identity);
+        let [one, six] = [1, 6].map(|solutions| of(&map, 200.0, solutions).solving_s);
+        // The first two have fewer windows than cover the planes, and take more iterations; none of them is free.
+        assert!(six > 6.0 * one, "{six} {one}");
+        assert!(of(&map, 17.0, 1).solving_s > of(&map, 200.0, 1).solving_s);
+        // Without a matrix, a map of half the data takes half the time of a product.
+        let free = MapConfig { matrix: MatrixKind::Free, iterations_max: 1, ..MapConfig::default() };
+        let [one, two] = [1, 2].map(|solutions| of(&free, 1e6, solutions).solving_s);
+        assert!((two / one - 1.5).abs() < 1e-9);
+    }
+
+    #[test]
+    fn only_the_final_map_is_refined() {
+        let mut map = harmonic(RegulariserChoice::Identity);
+        let of = |map: &MapConfig, solutions| {
+            EngineCost::estimate(map, ChannelData { solutions, ..DATA }).solving_s
+        };
+        let on_circle = of(&map, 6) - of(&map, 1);
+        map.refine.passes_max = 3;
+        let [one, six] = [1, 6].map(|solutions| of(&map, solutions));
+        assert!(((six - one) / on_circle - 1.0).abs() < 1e-9, "{six} {one} {on_circle}");
+        assert!(one > of(&harmonic(RegulariserChoice::Identity), 1));
+    }
+
+    #[test]
+    fn memory_follows_windows_and_limbs() {
+        let mut map = harmonic(RegulariserChoice::Identity);
+        let of = |map: &MapConfig, data| EngineCost::estimate(map, data);
+        let [few, many, all] =
+            [10.0, 100.0, f64::INFINITY].map(|windows| of(&map, ChannelData { windows, ..DATA }).sums_bytes);
+        assert!(few < 0.5 * many && many < all, "{few} {many} {all}");
+        // A circular orbit has limbs at one angle, an ellipse needs tables for many.
+        map.refine.passes_max = 3;
+        let [circle, ellipse] =
+            [0.0, 0.5].map(|limb_range_rad| of(&map, ChannelData { limb_range_rad, ..DATA }).other_bytes);
+        assert!(circle < ellipse, "{circle} {ellipse}");
     }
 }

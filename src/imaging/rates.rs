@@ -1,8 +1,8 @@
 //! Measured rates of one core, from which times are estimated.
 //!
-//! They are the figures of the table of speeds in `docs/evidence.md`, halved where those are for both cores, from a virtual machine with 2
-//! cores of an AMD EPYC without AVX-512. On other machines estimates are off by some factor, but still show which part takes longest, and
-//! whether it takes minutes or days.
+//! They are processor times from virtual machines with 2 cores: of an AMD EPYC without AVX-512 where nothing else is said (the table of speeds
+//! in `docs/evidence.md`), of an Intel Xeon with it for rows over pixels and numbers of iterations. On other machines estimates are off by
+//! some factor, but still show which part takes longest, and whether it takes minutes or days.
 
 /// Multiply-adds per second of the pixel engine's rank-k updates, rows of B included (`lunarray run` of the embedded
 /// quicklook with pixel maps).
@@ -12,8 +12,9 @@ pub(crate) const RANK_K_MULTIPLY_ADDS_PER_S: f64 = 1.0e10;
 /// with AVX-512 (first case of `pipelines/paper/fig16-nside64.toml`, processor time), and assumed to be twice that without.
 pub(crate) const CENTRE_ELEMENT_S: f64 = 2.2e-9;
 
-/// Time per row element averaged over pixels, s, as above; 5.6 ns with AVX-512 on a busy machine.
-pub(crate) const AVERAGE_ELEMENT_S: f64 = 6e-9;
+/// Time per row element averaged over pixels, s, times nside: the blocks at the Moon's limb are a share of all pixels that falls with nside.
+/// With AVX-512 on a busy machine, 64 ns at nside 8, 24 to 30 ns at 16, 14 ns at 32 and 5.6 ns at 64.
+pub(crate) const AVERAGE_ELEMENT_S: f64 = 4e-7;
 
 /// Time per row element averaged child by child in f64 (256 sines), s; not measured.
 pub(crate) const EXACT_ELEMENT_S: f64 = 1e-5;

@@ -11,10 +11,13 @@ use super::event_log::EventLog;
 use super::geometry::Geometry;
 use super::map_cache::MapCache;
 use super::stage_rates::{RateMeter, whole_run_rates};
-use super::status::{LedgerStatus, ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of};
+use super::status::{
+    LedgerStatus, ListenerStatus, Phase, SolverStatus, Status, VisitorStatus, stages_of, unix_s,
+};
 use super::subject::Subject;
 use crate::array::EarthModel;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
+use crate::downlink::transport::socket::StationCounts;
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
 use crate::imaging::Solving;
 use crate::pipeline::RunHandles;
@@ -118,12 +121,11 @@ impl Console {
     }
 
     fn log_event(&self, is_bad: bool, text: impl Into<String>) {
-        self.log.push(self.up_s(), is_bad, text.into());
+        self.log.push(is_bad, text.into());
     }
 
     pub(super) fn set_run(&self, handles: &RunHandles) {
-        let viewer =
-            PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log), started: self.started };
+        let viewer = PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log) };
         handles.maps.add_viewer(Box::new(viewer));
         if let Some(ground) = &handles.ground {
             ground.live_view.open();
@@ -219,7 +221,13 @@ impl Console {
         let listening = handles.and_then(|handles| handles.listening.as_ref()).map(|listening| {
             let mut report = listening.report();
             report.senders.listed.truncate(SENDERS_SHOWN);
+            let silence_s = |counts: &StationCounts| Some(counts.heard?.elapsed().as_secs_f64());
             ListenerStatus {
+                station_silence_s: report
+                    .stations
+                    .iter()
+                    .map(|(name, of)| (name.clone(), silence_s(of)))
+                    .collect(),
                 open: listening.status.open(),
                 bytes: listening.status.bytes(),
                 backlog_bytes: listening.status.backlog_bytes(),
@@ -246,6 +254,7 @@ impl Console {
             phase,
             error: end.as_ref().and_then(|end| end.error.clone()),
             cancelled: end.is_some_and(|end| end.cancelled),
+            unix_s: unix_s(),
             up_s,
             elapsed_s,
             stages: stages_of(&progress, &rates),
@@ -337,12 +346,11 @@ fn failure_change(what: &str, before: &Option<String>, now: &Option<String>) -> 
 struct PageViewer {
     maps: Arc<MapCache>,
     log: Arc<EventLog>,
-    started: Instant,
 }
 
 impl MapViewer for PageViewer {
     fn view(&self, map: PublishedMap<'_>) {
         let description = self.maps.put(map);
-        self.log.push(self.started.elapsed().as_secs_f64(), false, description);
+        self.log.push(false, description);
     }
 }

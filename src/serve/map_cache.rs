@@ -7,6 +7,7 @@ use std::time::SystemTime;
 use axum::body::Bytes;
 use serde::Serialize;
 
+use super::screen_text::group_digits;
 use crate::imaging::Diagnostics;
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, Sheet, View, draw_sheet};
 use crate::products::{PublishedMap, SnapshotSummary};
@@ -27,7 +28,7 @@ const FIGURES_MAX: usize = 512;
 /// Maximum nside of a map whose spectrum is computed here, if there is no input sky, so that the publisher has not computed it.
 const SPECTRUM_NSIDE_MAX: usize = 64;
 
-/// Angular power spectra of a map, K^2, and its correlation with the input.
+/// Angular power spectra of a map and of its noise, K^2, and the map's correlation with the input.
 #[derive(Clone, Debug, Default, Serialize)]
 pub(super) struct SpectraOfMap {
     cl_map: Vec<f64>,
@@ -61,17 +62,18 @@ impl From<&Comparison> for SpectraOfMap {
 pub(super) struct ShownMap {
     /// Pixels in RING order and ecliptic coordinates, K: little-endian 32-bit floats, as in its file.
     pub(super) pixels: Bytes,
-    /// Header cards of the map's file; `None` for the noise and input maps, whose files are written at the end.
+    /// Header cards of the map's file; `None` for maps whose files are written at the end.
     cards: Option<Vec<Card>>,
     title: String,
+    unit: &'static str,
     /// The picture, drawn on the first request.
     picture: OnceLock<Bytes>,
 }
 
 impl ShownMap {
-    fn new(values: &[f64], cards: Option<Vec<Card>>, title: String) -> Self {
+    fn new(values: &[f64], cards: Option<Vec<Card>>, title: String, unit: &'static str) -> Self {
         let pixels: Vec<u8> = values.iter().flat_map(|&value| (value as f32).to_le_bytes()).collect();
-        Self { pixels: pixels.into(), cards, title, picture: OnceLock::new() }
+        Self { pixels: pixels.into(), cards, title, unit, picture: OnceLock::new() }
     }
 
     fn values(&self) -> Vec<f64> {
@@ -79,7 +81,7 @@ impl ShownMap {
         numbers.iter().map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect()
     }
 
-    /// The map as a FITS file, identical to the publisher's; `None` for the noise and input maps.
+    /// The map as a FITS file, identical to the publisher's; `None` for maps without cards.
     pub(super) fn fits(&self) -> Result<Option<Bytes>, String> {
         let Some(cards) = self.cards.clone() else { return Ok(None) };
         let map = SkyMap::new(Frame::Ecliptic, self.values()).map_err(|error| error.to_string())?;
@@ -94,8 +96,9 @@ impl ShownMap {
             return Ok(drawn.clone());
         }
         let values = self.values();
-        let scale = ColourScale::robust(&values, Scaling::Log, Palette::default());
-        let panel = MapPanel { values: &values, caption: String::new(), scale, unit: "K".to_owned() };
+        let scaling = if self.unit == "K" { Scaling::Log } else { Scaling::Linear };
+        let scale = ColourScale::robust(&values, scaling, Palette::default());
+        let panel = MapPanel { values: &values, caption: String::new(), scale, unit: self.unit.to_owned() };
         let view = View { sampling: Sampling::Interpolated, ..View::default() };
         let sheet = Sheet { title: self.title.clone(), width_px: 800, view, ..Sheet::default() };
         let picture = draw_sheet(&[panel], &sheet).map_err(|error| error.to_string())?;
@@ -116,11 +119,14 @@ struct ChannelMaps {
     frequency_hz: f64,
     nside: usize,
     is_noiseless: bool,
+    epoch_tai_s: f64,
     is_final: bool,
     span_s: [f64; 2],
     diagnostics: Diagnostics,
     maps: Vec<Snapshot>,
     noise: Arc<ShownMap>,
+    /// Standard deviation (K), mask and resolution (degrees) of the last map; empty if R is not from the data.
+    errors: Vec<Arc<ShownMap>>,
     noise_rms_k: f64,
     input: Option<Arc<ShownMap>>,
     figures: Vec<SnapshotSummary>,
@@ -135,6 +141,7 @@ pub(super) struct ChannelStatus {
     pub(super) frequency_hz: f64,
     nside: usize,
     is_noiseless: bool,
+    epoch_tai_s: f64,
     /// Whether the last map is from all data.
     is_final: bool,
     /// First and last mission time of the data, s.
@@ -142,6 +149,8 @@ pub(super) struct ChannelStatus {
     /// Numbers of the maps that are held, ascending; the last is `latest`.
     held: Vec<u32>,
     has_input: bool,
+    /// Whether `sigma`, `mask` and `resolution` of the last map are held.
+    has_errors: bool,
     pub(super) age_s: f64,
     pub(super) figures: Option<SnapshotSummary>,
     pub(super) noise_rms_k: f64,
@@ -164,7 +173,12 @@ pub(super) enum MapChoice {
     Latest,
     Noise,
     Input,
+    /// Standard deviation, mask or resolution of the last map, by index.
+    Error(usize),
 }
+
+/// Names and units of the maps that tell how well the last map is known.
+const ERRORS: [(&str, &str); 3] = [("sigma", "K"), ("mask", ""), ("resolution", "deg")];
 
 impl MapChoice {
     pub(super) fn parse(text: &str) -> Option<Self> {
@@ -176,7 +190,7 @@ impl MapChoice {
             digits if digits.bytes().all(|digit| digit.is_ascii_digit()) && !digits.starts_with('0') => {
                 digits.parse().ok().map(Self::Number)
             }
-            _ => None,
+            other => ERRORS.iter().position(|(name, _)| *name == other).map(Self::Error),
         }
     }
 }
@@ -197,15 +211,23 @@ impl MapCache {
         let frequency_hz = solution.instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
         let days = (solution.span_s[1] - solution.span_s[0]) / crate::units::constants::DAY_S;
         let title = |what: &str| format!("{what} at {} MHz, {days:.1} days", frequency_hz / 1e6);
-        let without_file = |values: &[f64], what| Arc::new(ShownMap::new(values, None, title(what)));
-        let map = Arc::new(ShownMap::new(&solution.map_k, Some(cards.to_vec()), title("Map")));
-        let noise = without_file(&solution.noise_k, "Noise");
+        let without_cards =
+            |values: &[f64], what, unit| Arc::new(ShownMap::new(values, None, title(what), unit));
+        let map = Arc::new(ShownMap::new(&solution.map_k, Some(cards.to_vec()), title("Map"), "K"));
+        let noise = without_cards(&solution.noise_k, "Noise", "K");
+        let errors = solution.uncertainty.as_ref().map_or_else(Vec::new, |errors| {
+            let maps = [&errors.sigma_k, &errors.mask(), &errors.resolution_deg];
+            maps.into_iter()
+                .zip(ERRORS)
+                .map(|(values, (what, unit))| without_cards(values, what, unit))
+                .collect()
+        });
         let description = format!(
             "map {} at {:.3} MHz: {:.1} days, {} visibilities",
             solution.number,
             frequency_hz / 1e6,
             days,
-            solution.visibilities
+            group_digits(solution.visibilities as f64)
         );
         let mut channels = self.channels();
         let (mut maps, mut all_figures, old_input) = match channels.remove(&solution.channel) {
@@ -217,16 +239,18 @@ impl MapCache {
         all_figures.push(figures.clone());
         thin(&mut all_figures, FIGURES_MAX);
         // The input sky does not change.
-        let input = old_input.or_else(|| input.map(|input| without_file(input.values(), "Input")));
+        let input = old_input.or_else(|| input.map(|input| without_cards(input.values(), "Input", "K")));
         let channel = ChannelMaps {
             frequency_hz,
             nside: solution.nside,
             is_noiseless: solution.instrument.noiseless,
+            epoch_tai_s: solution.instrument.epoch_tai_s,
             is_final: solution.is_final_map(),
             span_s: solution.span_s,
             diagnostics: solution.diagnostics,
             maps,
             noise,
+            errors,
             noise_rms_k: rms(&solution.noise_k),
             input,
             figures: all_figures,
@@ -250,6 +274,7 @@ impl MapCache {
             }
             MapChoice::Noise => Some(Arc::clone(&held_maps.noise)),
             MapChoice::Input => held_maps.input.clone(),
+            MapChoice::Error(index) => held_maps.errors.get(index).cloned(),
         }
     }
 
@@ -259,10 +284,12 @@ impl MapCache {
             frequency_hz: held_maps.frequency_hz,
             nside: held_maps.nside,
             is_noiseless: held_maps.is_noiseless,
+            epoch_tai_s: held_maps.epoch_tai_s,
             is_final: held_maps.is_final,
             span_s: held_maps.span_s,
             held: held_maps.maps.iter().map(|snapshot| snapshot.number).collect(),
             has_input: held_maps.input.is_some(),
+            has_errors: !held_maps.errors.is_empty(),
             age_s: held_maps.made.elapsed().map_or(0.0, |age| age.as_secs_f64()),
             figures: held_maps.figures.last().cloned(),
             noise_rms_k: held_maps.noise_rms_k,
@@ -273,7 +300,7 @@ impl MapCache {
 
     /// Figures of a channel, with spectra of its last map. Without an input sky, the first call computes the spectrum.
     pub(super) fn figures(&self, channel: ChannelId) -> Option<ChannelFigures> {
-        let (figures, last, nside) = {
+        let (figures, last, noise, nside) = {
             let channels = self.channels();
             let held_maps = channels.get(&channel)?;
             let last = held_maps.maps.last().cloned();
@@ -282,12 +309,13 @@ impl MapCache {
                 snapshots: held_maps.figures.clone(),
                 spectra: held_maps.spectra.clone(),
             };
-            (figures, last, held_maps.nside)
+            let noise = (!held_maps.is_noiseless).then(|| Arc::clone(&held_maps.noise));
+            (figures, last, noise, held_maps.nside)
         };
         let Some(last) = last.filter(|_| figures.spectra.is_none() && nside <= SPECTRUM_NSIDE_MAX) else {
             return Some(figures);
         };
-        let spectra = spectrum_of(&last.map, nside).ok();
+        let spectra = spectra_of(&last.map, noise.as_deref(), nside).ok();
         if let Some(held_maps) = self.channels().get_mut(&channel)
             && held_maps.maps.last().map(|snapshot| snapshot.number) == Some(last.number)
         {
@@ -297,10 +325,13 @@ impl MapCache {
     }
 }
 
-fn spectrum_of(map: &ShownMap, nside: usize) -> Result<SpectraOfMap, MapError> {
-    let map = SkyMap::new(Frame::Ecliptic, map.values())?;
-    let alm = map.harmonics(3 * nside - 1, &AnalysisOptions::default())?;
-    Ok(SpectraOfMap { cl_map: auto_cl(&alm), ..SpectraOfMap::default() })
+fn spectra_of(map: &ShownMap, noise: Option<&ShownMap>, nside: usize) -> Result<SpectraOfMap, MapError> {
+    let spectrum = |map: &ShownMap| {
+        let map = SkyMap::new(Frame::Ecliptic, map.values())?;
+        Ok::<_, MapError>(auto_cl(&map.harmonics(3 * nside - 1, &AnalysisOptions::default())?))
+    };
+    let cl_noise = noise.map(spectrum).transpose()?;
+    Ok(SpectraOfMap { cl_map: spectrum(map)?, cl_noise, ..SpectraOfMap::default() })
 }
 
 fn rms(values: &[f64]) -> f64 {

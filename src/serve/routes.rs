@@ -64,6 +64,7 @@ pub(super) fn router(page: PageState) -> Router {
         .route("/sky.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/sky.js"))))
         .route("/array.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/array.js"))))
         .route("/passes.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/passes.js"))))
+        .route("/vitals.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/vitals.js"))))
         .route("/tools.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/tools.js"))))
         .route("/page.json", get(page_constants))
         .route("/favicon.svg", get(|| asset("image/svg+xml", include_str!("page/favicon.svg"))))
@@ -211,8 +212,8 @@ fn parse_channel(text: &str) -> Option<ChannelId> {
 fn no_map() -> Response {
     refusal(
         StatusCode::NOT_FOUND,
-        "no such map is held; expected /api/maps/CHANNEL/N.f32, .fits or .png with N latest, noise, input, or a number from \
-         `held` of /api/status",
+        "no such map is held; expected /api/maps/CHANNEL/N.f32, .fits or .png with N latest, noise, input, sigma, mask, \
+         resolution, or a number from `held` of /api/status",
     )
 }
 
@@ -245,7 +246,9 @@ async fn map(State(page): State<PageState>, Path((channel, file)): Path<(String,
     let content_type = if kind == "fits" { "application/fits" } else { "image/png" };
     match run_slow(&page, move || encode(&map)).await {
         Ok(Ok(Some(bytes))) => answer(content_type, bytes),
-        Ok(Ok(None)) => refusal(StatusCode::NOT_FOUND, "noise and input are served as .f32 and .png"),
+        Ok(Ok(None)) => {
+            refusal(StatusCode::NOT_FOUND, "only maps of the sky are served as .fits; expected .f32 or .png")
+        }
         Ok(Err(error)) => refusal(StatusCode::INTERNAL_SERVER_ERROR, &error),
         Err(refusal) => refusal,
     }

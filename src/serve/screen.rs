@@ -24,6 +24,9 @@ const RECEPTION_WIDTH: u16 = 58;
 /// Minimum width of the packets panel, characters, with five for each count.
 const RECEPTION_WIDTH_MIN: u16 = 40;
 
+/// Maximum number of channels in the panel of maps.
+const CHANNELS_MAX: usize = 8;
+
 /// A stage below this fraction of the time is never highlighted as the busiest.
 const BUSY_MIN: f64 = 0.02;
 
@@ -55,15 +58,28 @@ impl Screen {
     /// Draws all panels.
     pub fn draw(&self, frame: &mut Frame<'_>) {
         let status = &self.status;
-        let stages = list(&status["stages"]).len();
-        let width = frame.area().width;
+        let Rect { width, height, .. } = frame.area();
+        let height = usize::from(height);
         let reception = RECEPTION_WIDTH.min((width / 2).max(RECEPTION_WIDTH_MIN)).min(width);
-        let ledger = self.ledger_lines(usize::from(width - reception).saturating_sub(2));
+        let mut ledger = self.ledger_lines(usize::from(width - reception).saturating_sub(2));
+        // Title, keys, one stage, one channel, and frames take 13 lines.
+        let ledger_max = height.saturating_sub(13).max(KINDS.len() + 2);
+        if ledger.len() > ledger_max {
+            let more = format!("and {} more lines", ledger.len() + 1 - ledger_max);
+            ledger.truncate(ledger_max - 1);
+            ledger.push(Line::styled(more, QUIET));
+        }
         let has_ground = !status["reception"].is_null();
         let ground = if has_ground { 2 + (KINDS.len() + 2).max(ledger.len()) } else { 0 };
+        // In a low terminal, stages and channels share what is left; at least one of each is shown.
+        let left = height.saturating_sub(2 + ground);
+        let frame_of_stages = 3 + usize::from(!status["solving"].is_null());
         let channels = list(&status["channels"]).len();
-        let maps = if channels > 0 { 3 + channels.min(8) } else { 0 };
-        let rows = [1, stages + 3 + usize::from(!status["solving"].is_null()), ground, maps];
+        let channels_shown = channels.min(CHANNELS_MAX).min(left.saturating_sub(4 + frame_of_stages).max(1));
+        let maps = if channels > 0 { 3 + channels_shown } else { 0 };
+        let stages = list(&status["stages"]).len();
+        let stages_shown = stages.min(left.saturating_sub(maps + frame_of_stages).max(1));
+        let rows = [1, stages_shown + frame_of_stages, ground, maps];
         let rows = rows.map(|rows| Constraint::Length(u16::try_from(rows).unwrap_or(u16::MAX)));
         let [title, chain, ground, maps, curve, keys] =
             Layout::vertical(rows.into_iter().chain([Constraint::Min(0), Constraint::Length(1)]))
@@ -129,7 +145,15 @@ impl Screen {
         let stages = list(&self.status["stages"]);
         let running = stages.iter().filter(|stage| stage["ended"] != true);
         let busiest = running.map(|stage| as_number(&stage["busy"])).fold(BUSY_MIN, f64::max);
-        let rows = stages.iter().map(|stage| {
+        let has_solver = u16::from(!self.status["solving"].is_null());
+        let block = Block::bordered();
+        let inner = block.inner(area);
+        let shown = busiest_of(stages, usize::from(inner.height.saturating_sub(1 + has_solver)));
+        let title = match shown.len() == stages.len() {
+            true => " Stages ".to_owned(),
+            false => format!(" Stages: the {} busiest of {} ", shown.len(), stages.len()),
+        };
+        let rows = shown.into_iter().map(|stage| {
             let queue = &stage["queue"];
             let (depth, capacity) = (as_number(&queue["depth"]), as_number(&queue["capacity"]).max(1.0));
             let bar = match queue.is_null() {
@@ -137,7 +161,7 @@ impl Screen {
                 false => Cell::from(format!("{} {depth:.0}/{capacity:.0}", bar(depth / capacity, BAR_WIDTH)))
                     .style(if depth >= capacity { BUSY } else { GOOD }),
             };
-            let unit = as_text(&stage["unit"]);
+            let unit = as_text(&stage["unit"]).replace("visibilities", "vis").replace("bytes", "B");
             let rate = match unit.is_empty() {
                 true => format!("{} items", format_integer(&stage["items_out"])),
                 false => format!("{}{unit}/s", with_prefix(as_number(&stage["units_per_s"]))),
@@ -162,21 +186,16 @@ impl Screen {
             ];
             (cells.to_vec(), style)
         });
-        let widths = [12, BAR_WIDTH as u16 + 12, 0, 10, 10, 6].map(|width| match width {
+        let widths = [12, BAR_WIDTH as u16 + 12, 0, 10, 11, 6].map(|width| match width {
             0 => Constraint::Fill(1),
             width => Constraint::Length(width),
         });
         let head = ["stage", "input queue", "rate", "step p99", "latency p99", "busy"];
-        let block = Block::bordered().title(" Stages ");
-        let inner = block.inner(area);
         let is_shown = |column: &usize| inner.width >= NARROW || ![3, 4].contains(column);
         let table = table_of(&head, rows.collect(), &widths, is_shown);
-        frame.render_widget(block, area);
-        let [table_area, solver] = Layout::vertical([
-            Constraint::Fill(1),
-            Constraint::Length(u16::from(!self.status["solving"].is_null())),
-        ])
-        .areas(inner);
+        frame.render_widget(block.title(title), area);
+        let [table_area, solver] =
+            Layout::vertical([Constraint::Fill(1), Constraint::Length(has_solver)]).areas(inner);
         frame.render_widget(table, table_area);
         frame.render_widget(self.solver(usize::from(solver.width)), solver);
     }
@@ -288,12 +307,13 @@ impl Screen {
 
     fn draw_maps(&self, frame: &mut Frame<'_>, area: Rect) {
         let channels = list(&self.status["channels"]);
-        let first = self.channel_index.saturating_sub(7).min(channels.len().saturating_sub(1));
+        let shown = usize::from(area.height.saturating_sub(3));
+        let first = (self.channel_index + 1).saturating_sub(shown).min(channels.len().saturating_sub(1));
         let rows = channels.iter().enumerate().skip(first).map(|(index, channel)| {
             let figures = &channel["figures"];
             let name = match channel["is_final"] == true {
                 true => "final".to_owned(),
-                false => format!("snapshot {}", format_integer(&figures["number"])),
+                false => format!("snapshot {}", format_within(as_number(&figures["number"]), 6)),
             };
             let span = &channel["span_s"];
             let days = (as_number(&span[1]) - as_number(&span[0])) / DAY_S;
@@ -311,7 +331,7 @@ impl Screen {
             (cells.map(Cell::from).to_vec(), if index == self.channel_index { HEAD } else { Style::new() })
         });
         let head = ["", "ch", "MHz", "map", "days", "visibilities", "noise, K", "error", "rho"];
-        let lengths = [1_u16, 4, 8, 13, 8, 15, 10, 9, 9];
+        let lengths = [1_u16, 5, 8, 15, 8, 15, 10, 9, 9];
         // Columns 8, 7, 3 and 4 are left out, in this order, if the width is too small.
         let mut left_out = Vec::new();
         let mut needed = lengths.iter().map(|length| length + 1).sum::<u16>() + 1;
@@ -323,7 +343,11 @@ impl Screen {
         }
         let widths = lengths.map(Constraint::Length);
         let table = table_of(&head, rows.collect(), &widths, |column| !left_out.contains(column));
-        frame.render_widget(table.block(Block::bordered().title(" Maps ")), area);
+        let title = match channels.len() > shown {
+            true => format!(" Maps of {shown} of {} channels ", channels.len()),
+            false => " Maps ".to_owned(),
+        };
+        frame.render_widget(table.block(Block::bordered().title(title)), area);
     }
 
     fn draw_curve(&self, frame: &mut Frame<'_>, area: Rect) {
@@ -370,6 +394,16 @@ impl Screen {
             .block(block);
         frame.render_widget(chart, area);
     }
+}
+
+/// The busiest stages, at most `count`, running ones first, in the order of the data's path.
+fn busiest_of(stages: &[Value], count: usize) -> Vec<&Value> {
+    let mut order: Vec<usize> = (0..stages.len()).collect();
+    let idle = |k: &usize| (stages[*k]["ended"] == true, -as_number(&stages[*k]["busy"]));
+    order.sort_by(|a, b| idle(a).partial_cmp(&idle(b)).unwrap_or(std::cmp::Ordering::Equal));
+    order.truncate(count);
+    order.sort_unstable();
+    order.into_iter().map(|k| &stages[k]).collect()
 }
 
 /// Makes a table of the columns for which `is_shown` is true.
@@ -435,7 +469,7 @@ mod tests {
         for words in [
             "lunarray small\\u{1b}[2J \u{b7} ground \u{b7} running \u{b7} 1:02:05 \u{b7} 127.0.0.1:8080",
             "\u{2588}\u{2588}\u{2588}\u{2588}\u{2588}\u{2591}\u{2591}\u{2591}\u{2591}\u{2591} 4/8",
-            "2.5 Mbytes/s",
+            "2.5 MB/s",
             "2.5 ms",
             "90 %",
             // A residual of 1e-3 is half of the way from 1 to 1e-6, in the logarithm.
@@ -447,8 +481,8 @@ mod tests {
             "3.000",
             "snapshot 3",
             "1,000,000",
-            "1.50e6",
-            "0.250",
+            "1.500e6",
+            "0.25 ",
             "rho_l",
             "q quit",
         ] {
@@ -523,10 +557,40 @@ mod tests {
             let number = of_ledger.trim_start_matches('\u{2502}').split_whitespace().next().unwrap();
             assert!(["98,765,432,109,876", "98.8T", "99T"].contains(&number), "{number} at {width}:\n{text}");
             if let Some(map) = text.lines().find(|line| line.contains("   3.000 ")) {
-                assert!(map.contains(" 98.8T ") && map.contains("1.50e6"), "{width}:\n{text}");
+                assert!(map.contains(" 98.8T ") && map.contains("1.500e6"), "{width}:\n{text}");
             }
             assert!(text.contains("running \u{b7} 1:02:05"), "{width}:\n{text}");
             assert!(text.contains("residual 1.0e-3 of 1e-6"), "{width}:\n{text}");
         }
+    }
+
+    #[test]
+    fn a_low_terminal_shows_the_busiest_stages_and_whole_rows() {
+        let mut screen = running();
+        let stages =
+            [("observe", 0.0, true), ("integrate", 0.3, false), ("store", 0.1, false), ("send", 0.2, false)];
+        let stage = |(name, busy, ended): (&str, f64, bool)| {
+            let mut stage = screen.status["stages"][0].clone();
+            (stage["name"], stage["busy"], stage["ended"]) = (json!(name), json!(busy), json!(ended));
+            stage
+        };
+        let stages: Vec<Value> = (0..2).flat_map(|_| stages).map(stage).collect();
+        screen.status["stages"] = json!(stages);
+        let channel = screen.status["channels"][0].clone();
+        screen.status["channels"] = json!(vec![channel; 5]);
+        for width in [60, 80] {
+            let text = drawn(&screen, width, 24);
+            let rows = |words: &str| text.lines().filter(|line| line.contains(words)).count();
+            assert_eq!([rows("observe"), rows("integrate"), rows("   3.000 ")], [0, 2, 5], "{text}");
+            assert!(text.contains("the 2 busiest of 8") && text.contains("residual 1.0e-3"), "{text}");
+            assert!(text.contains("89  flagged") && text.contains("q quit"), "{text}");
+        }
+        // A long ledger says how much of it is missing.
+        let reasons: serde_json::Map<String, Value> =
+            (0..30).map(|k| (format!("reason {k:02}"), json!(k))).collect();
+        screen.status["ledger"]["flagged"] = json!(reasons);
+        // 34 lines, of which 11 have room, the last for this.
+        assert!(drawn(&screen, 80, 24).contains("and 24 more lines"));
+        assert!(drawn(&screen, 80, 80).contains("29  flagged: reason 29"));
     }
 }

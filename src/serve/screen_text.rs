@@ -51,12 +51,21 @@ pub(super) fn format_within(number: f64, characters: usize) -> String {
     fitting.unwrap_or_else(|| "#".repeat(characters))
 }
 
-/// Formats a JSON number with a few digits; a dash if it is absent.
+/// Formats a JSON number with four digits, as the page does; a dash if it is absent.
 pub(super) fn format_short(value: &Value) -> String {
     match value.as_f64() {
         None => "\u{2013}".to_owned(),
-        Some(v) if v != 0.0 && !(1e-2..1e5).contains(&v.abs()) => format!("{v:.2e}"),
-        Some(v) => format!("{v:.3}"),
+        Some(0.0) => "0".to_owned(),
+        Some(v) if !(1e-2..1e5).contains(&v.abs()) => format!("{v:.3e}"),
+        Some(v) => {
+            let decimals = (3 - v.abs().log10().floor() as i32).max(0) as usize;
+            let text = format!("{v:.decimals$}");
+            if text.contains('.') {
+                text.trim_end_matches('0').trim_end_matches('.').to_owned()
+            } else {
+                text
+            }
+        }
     }
 }
 
@@ -105,6 +114,10 @@ mod tests {
         assert_eq!(
             [0.0, 999.0, 1000.0, 1234567.0, -1234.0].map(group_digits),
             ["0", "999", "1,000", "1,234,567", "-1,234"]
+        );
+        assert_eq!(
+            [0.0, 0.25, 12.5, 20_725.495, 1.5e6, -0.001].map(|v| format_short(&v.into())),
+            ["0", "0.25", "12.5", "20725", "1.500e6", "-1.000e-3"]
         );
         assert_eq!([0.0, 61.0, 36_061.0].map(clock), ["0:00", "1:01", "10:01:01"]);
         assert_eq!([2e-6, 0.0025, 3.0].map(duration), ["2 \u{b5}s", "2.5 ms", "3.00 s"]);

@@ -1,5 +1,8 @@
 //! The status of a run for `/api/status`. It uses the terms of `summary.json` where they exist.
 
+use std::collections::BTreeMap;
+use std::time::{SystemTime, UNIX_EPOCH};
+
 use serde::Serialize;
 
 use super::map_cache::ChannelStatus;
@@ -12,6 +15,11 @@ use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
 use crate::products::ProductsReport;
 use crate::runtime::{LedgerReport, StageProgress, TimingSummary};
+
+/// Now, in seconds since 1970-01-01 UTC.
+pub(super) fn unix_s() -> f64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |since| since.as_secs_f64())
+}
 
 /// Phase of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
@@ -136,6 +144,8 @@ pub(super) struct ListenerStatus {
     pub(super) backlog_bytes: u64,
     /// Time since the last valid packet from any sender, s; null before the first of this session.
     pub(super) silence_s: Option<f64>,
+    /// Time since the last valid packet from each station, s; null before the first of this session.
+    pub(super) station_silence_s: BTreeMap<String, Option<f64>>,
     pub(super) archive: Option<ArchiveReport>,
     /// Counters of connections, datagrams and stations.
     pub(super) report: ListenReport,
@@ -162,6 +172,8 @@ pub(super) struct Status {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) error: Option<String>,
     pub(super) cancelled: bool,
+    /// Time of this status, seconds since 1970-01-01 UTC.
+    pub(super) unix_s: f64,
     pub(super) up_s: f64,
     /// Time from the server's start to the end of the run, or until now, s.
     pub(super) elapsed_s: f64,

@@ -1,5 +1,12 @@
 //! Maps of several channels together, from a state to files, against the sky that was put in.
 
+use std::path::Path;
+
+use lunarray::imaging::joint::{JointMap, JointRequest, PowerPriors, PowerSample, solve_jointly};
+use lunarray::imaging::{SolveWatch, StoppingRule};
+use lunarray::pipeline::{ConfigSource, joint_channels};
+use lunarray::sky::fits::{WriteOptions, write_map};
+use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
 
 use crate::common::workplace::{Workplace, fail, json, succeed};
@@ -22,11 +29,19 @@ snapshot_every_s = 0.0
 pictures = false
 "#;
 
+fn all_rho(map: &str, sky: &str) -> Vec<f64> {
+    let compared = json(&["compare", map, sky]);
+    compared["rho"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
+}
+
 /// Mean rho_l of l = 6 to 10, which 10 MHz alone sees least.
 fn rho(map: &str, sky: &str) -> f64 {
-    let compared = json(&["compare", map, sky]);
-    let rho: Vec<f64> = compared["rho"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
-    rho[6..=10].iter().sum::<f64>() / 5.0
+    all_rho(map, sky)[6..=10].iter().sum::<f64>() / 5.0
+}
+
+fn mean_of(map: &str) -> f64 {
+    let monopole = json(&["compare", map, map])["cl_map"][0].as_f64().unwrap();
+    (monopole / (4.0 * std::f64::consts::PI)).sqrt()
 }
 
 #[test]
@@ -56,8 +71,7 @@ fn channels_see_together_what_one_misses() {
             assert!(map["agreement"].is_null());
         }
         // The error of the mean is of its size: within five of them, and below a tenth.
-        let truth = json(&["compare", &sky, &sky])["cl_map"][0].as_f64().unwrap();
-        let truth = (truth / (4.0 * std::f64::consts::PI)).sqrt();
+        let truth = mean_of(&sky);
         let [mean, sigma] = ["mean_k", "mean_sigma_k"].map(|key| map[key].as_f64().unwrap());
         assert!((mean - truth).abs() < 5.0 * sigma && sigma < 0.1 * truth, "{name}: {mean} {sigma} {truth}");
     }
@@ -71,4 +85,75 @@ fn channels_see_together_what_one_misses() {
     let header = std::fs::read(format!("{short}/10.000MHz/map.fits")).unwrap();
     let header = String::from_utf8_lossy(&header[..8640]).into_owned();
     assert!(header.contains("CONVERGD=                    F"), "{header}");
+}
+
+/// Gains of 10 %, and offsets and slopes of 1 % of the power, each for every pass of a daughter; evenly spread numbers of unit variance.
+fn perturb(powers: &mut [PowerSample]) {
+    let mut step = 0.0;
+    let mut number = || {
+        step = (step + 0.618_033_988_749_895) % 1.0;
+        12.0_f64.sqrt() * (step - 0.5)
+    };
+    let goes_on = |a: &PowerSample, b: &PowerSample| a.daughter == b.daughter && b.time_s - a.time_s < 600.0;
+    for pass in powers.chunk_by_mut(goes_on) {
+        let [gain, offset, slope] = [1.0 + 0.1 * number(), 0.01 * number(), 0.01 * number()];
+        let mean = pass.iter().map(|one| one.power_k_sr).sum::<f64>() / pass.len() as f64;
+        let [start, end] = [pass[0].time_s, pass[pass.len() - 1].time_s];
+        for one in pass {
+            let before = one.power_k_sr;
+            let time = (one.time_s - 0.5 * (start + end)) / (end - start);
+            one.power_k_sr = gain * before + mean * (offset + slope * time);
+            one.sigma_k_sr *= one.power_k_sr / before;
+        }
+    }
+}
+
+/// The map of one channel with powers that are first changed.
+fn map_with(state: &str, change: &dyn Fn(&mut [PowerSample])) -> JointMap {
+    let folder = Path::new(state);
+    let config = ConfigSource::default().with_state_settings(folder).unwrap().load_ground().unwrap();
+    let mut channels = joint_channels(&[(folder, config)], true).unwrap();
+    change(&mut channels[0].powers);
+    let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: vec![0.0] };
+    let rule = StoppingRule { residual_max: 1e-4, iterations_max: 300 };
+    let request = JointRequest { rule, samples: 8, at_hz: Vec::new(), powers: Some(priors) };
+    solve_jointly(channels, &request, &SolveWatch::default()).unwrap().maps.remove(0)
+}
+
+#[test]
+fn powers_with_unknown_gains_see_the_largest_scales_and_the_mean() {
+    let one = "channels_hz = [10.0e6]\nauto_powers = true\nauto_integration_s = 30.0";
+    let place = Workplace::new(&PIPELINE.replace("channels_hz = [5.0e6, 7.0e6, 10.0e6]", one));
+    let file = place.simulate("all.ccsds", &[]);
+    let (state, alone, joint) = (place.path("state"), place.path("alone"), place.path("joint"));
+    succeed(&["replay", &file, "--map", &place.pipeline, "--state", &state, "--out", &alone]);
+    let report = json(&["joint", &state, "--count", "8", "--out", &joint]);
+    let found = &report["maps"][0];
+    assert!(report["likeness"].is_null() && report["spectra"].is_null(), "{report}");
+    // 42 of every 120th of some 5000 windows, with a pass of each daughter.
+    assert_eq!(found["powers"]["passes"].as_u64().unwrap() % 8, 0, "{found}");
+    let sky = place.path("sky.fits");
+    succeed(&["sky", &place.pipeline, "--freq-hz", "1e7", "--nside", "8", "--out", &sky]);
+    let truth = mean_of(&sky);
+    let [mean, sigma] = ["mean_k", "mean_sigma_k"].map(|key| found[key].as_f64().unwrap());
+    assert!((mean - truth).abs() < 4.0 * sigma && sigma < 0.01 * truth, "{mean} {sigma} {truth}");
+    let with_powers = all_rho(&format!("{joint}/10.000MHz/map.fits"), &sky);
+    let before = all_rho(&format!("{alone}/10.000MHz/map.fits"), &sky);
+    let map = map_with(&state, &perturb);
+    let perturbed = place.path("perturbed.fits");
+    let written = SkyMap::new(Frame::Ecliptic, map.map_k.clone()).unwrap();
+    write_map(Path::new(&perturbed), &written, &WriteOptions::default()).unwrap();
+    let mean = map.map_k.iter().sum::<f64>() / map.map_k.len() as f64;
+    assert!((mean - truth).abs() < 4.0 * map.mean_sigma_k, "{mean} {} {truth}", map.mean_sigma_k);
+    let perturbed = all_rho(&perturbed, &sky);
+    let mean = |rho: &[f64], l: std::ops::RangeInclusive<usize>| {
+        let count = l.clone().count() as f64;
+        rho[l].iter().sum::<f64>() / count
+    };
+    // Powers see what baselines of some wavelengths hardly do.
+    assert!(mean(&with_powers, 3..=8) > mean(&before, 3..=8) + 0.05, "{with_powers:?} {before:?}");
+    assert!((2..=16).all(|l| with_powers[l] > before[l] - 0.02), "{with_powers:?} {before:?}");
+    assert!(mean(&perturbed, 2..=16) > mean(&with_powers, 2..=16) - 0.01, "{perturbed:?} {with_powers:?}");
+    let said = fail(&["joint", &state, "--no-powers", "--out", &place.path("none")]);
+    assert!(said.contains("or one with total powers"), "{said}");
 }

@@ -41,6 +41,17 @@ fn a_browser_shows_what_the_interface_and_the_files_say() {
     drive(&python, "page.py", &[place.pipeline(), &file, &place.path(""), pictures.to_str().unwrap()]);
 }
 
+#[test]
+#[ignore = "needs LUNARRAY_PYTHON and chromium"]
+fn a_browser_shows_what_a_ground_waits_for_and_its_stations() {
+    let python = python();
+    require_browser();
+    let place = Place::new();
+    let file = place.downlink("packets");
+    let pictures = pictures();
+    drive(&python, "page_ground.py", &[place.pipeline(), &file, &place.path(""), pictures.to_str().unwrap()]);
+}
+
 /// A mission of 1.3 years, of which every tenth window is kept, in half a minute; LUNARRAY_PAGE_S and LUNARRAY_PAGE_WINDOWS say
 /// otherwise, 600 and 2 for a long look.
 #[test]

@@ -38,6 +38,9 @@ fn a_ground_takes_packets_of_its_stations_alone_and_tells_them_apart() {
     let listening = &summary["listening"];
     let counts = |name: &str, key: &str| listening["stations"][name][key].as_u64().unwrap();
     assert_eq!([counts("malargue", "connections"), counts("urumqi", "connections")], [2, 1]);
+    // The half that urumqi sent ends within a packet; nobody's connection broke.
+    assert_eq!([counts("malargue", "faults"), counts("urumqi", "faults")], [0, 1]);
+    assert_eq!([counts("malargue", "broken"), counts("urumqi", "broken")], [0, 0]);
     // With the lines before the packets.
     let opening = "token 0123456789abcdef0123456789abcdef\n".len();
     let whole = 2 * (bytes.len() + opening) + "answer held\n".len();

@@ -397,6 +397,9 @@ def shows_a_run(page, served, out, pictures):
     held = status["channels"][0]["held"]
     assert len(held) > 1, held
 
+    page.wait_for_text("#which", "final map")
+    page.wait_for_text("#vitals", "newest data")
+    shows_times_and_flags(page, served)
     # Final map, on all axes and as a globe.
     final, source = read(out / "3.000MHz/map.fits"), read(out / "3.000MHz/input.fits")
     first = read(out / f"3.000MHz/snapshot-{held[0]:03}.fits")
@@ -502,11 +505,18 @@ def shows_a_run(page, served, out, pictures):
     browser.press("d")
     page.assert_sky("difference", final - before, Colours.symmetric(palettes["difference"], final - before))
     browser.press("d")
+    # Both frames have names, each with its own picture, and the input's scale.
+    names = "window.names = {}; new MutationObserver(() => { const name = shown.textContent, low = document.getElementById('low').textContent; (names[name] ??= []).push(low); }).observe(shown, { childList: true })"
+    browser.js(names)
     browser.press("b")
     of_input = Colours.robust(inferno, source)
     page.assert_sky("blink: input", source, of_input)
     page.assert_sky("blink: map", final, of_input)
     page.assert_sky("blink: input again", source, of_input)
+    number = held[-1]
+    expected = {f"map {number} · blinks with input sky, on one scale", f"input sky · blinks with map {number}, on one scale"}
+    assert set(browser.js("return Object.keys(names)")) == expected, browser.js("return names")
+    assert abs(float(page.text("#low").split()[0]) / of_input.low - 1) < 1e-3, page.text("#low")
     browser.press("b")
     page.assert_sky("no blink", final, Colours.robust(inferno, final))
     browser.press("2")
@@ -526,6 +536,59 @@ def shows_a_run(page, served, out, pictures):
     wait_until("the keys closed", lambda: not browser.js("return document.getElementById('keys').open"))
 
 
+def utc(epoch_tai_s, time_s):
+    """A mission time as a date: 1958 and TAI, less the 37 s by which UTC is behind."""
+    return datetime(1958, 1, 1) + timedelta(seconds=epoch_tai_s + time_s - 37)
+
+
+def shows_times_and_flags(page, served):
+    """Dates and ages are the interface's, each flag has a colour of its own, and labels can be read on the brightest pixels."""
+    status, geometry, browser = served.status(), served.json("/api/geometry"), page.browser
+    channel = status["channels"][0]
+    until = utc(channel["epoch_tai_s"], channel["figures"]["until_s"])
+    assert f"until {until:%Y-%m-%d %H:%M} UTC (day {channel['figures']['until_s'] / 86400:.1f})" in page.text("#which"), page.text("#which")
+    cards = dict(browser.js("return [...document.querySelectorAll('#vitals li')].map((card) => [...card.children].map((part) => part.textContent))"))
+    assert cards["newest data"] == f"{utc(geometry['epoch_tai_s'], geometry['time_s']):%Y-%m-%d %H:%M} UTC", cards
+    assert cards["packets"] == "0 missing · 0 damaged", cards
+    newest = min(status["channels"], key=lambda c: c["age_s"])
+    age = re.fullmatch(r"(\d+) s ago · (\S+) MHz", cards["newest map"])
+    assert float(age.group(2)) == newest["frequency_hz"] / 1e6 and 0 <= newest["age_s"] - float(age.group(1)) < 10, (cards, newest)
+    # The last event, by the server's clock.
+    event = datetime.strptime(browser.js("return document.querySelector('#log time').title"), "%Y-%m-%d %H:%M:%S UTC")
+    ended_s = served.status()["unix_s"] - (status["up_s"] - status["elapsed_s"])
+    assert abs((event - datetime(1970, 1, 1)).total_seconds() - ended_s) < 10, (event, ended_s)
+    colours = browser.js("return [...document.querySelectorAll('#ledgerkeys .flagged')].map((key) => getComputedStyle(key).backgroundColor)")
+    bar = browser.js("return [...document.querySelectorAll('#ledgerbar .flagged')].map((part) => getComputedStyle(part).backgroundColor)")
+    assert len(colours) == len(status["ledger"]["flagged"]) == len(set(colours)) > 1 and bar == colours, (colours, bar)
+    # The label at 0 degrees: its fill and its rim differ by more than the 7:1 that WCAG asks of small text (white on black has 21).
+    width, height = page.size()
+    box = browser.js("return [...document.getElementById('over').getContext('2d').getImageData(...arguments).data]", width // 2 - 12, height // 2 - 16, 24, 14)
+    pixels = np.array(box).reshape(-1, 4)
+    solid = pixels[pixels[:, 3] > 250][:, :3].max(axis=1)
+    assert (solid > 250).sum() > 10 and (solid < 5).sum() > 20, np.bincount(solid)
+
+
+def plays_in_a_kiosk(page, served, pictures):
+    """The sky fills the window and plays from the first map to the newest, on the newest's scale."""
+    browser, held = page.browser, served.status()["channels"][0]["held"]
+    browser.js("window.kiosk = []; new MutationObserver(() => kiosk.push([shown.textContent, document.getElementById('low').textContent])).observe(shown, { childList: true })")
+    before = page.text("#low")
+    browser.press("k")
+    wait_until("the last frame", lambda: any(f"map {held[-1]}" == name for name, _ in browser.js("return kiosk")[1:]))
+    frames = browser.js("return kiosk")
+    numbers = [name for name, _ in frames]
+    assert [name for k, name in enumerate(numbers) if numbers.index(name) == k][: len(held)] == [f"map {number}" for number in held], numbers
+    assert page.text("#low") == before and len({low for _, low in frames[1:]}) == 1, frames
+    stage, window = page.box("#stage"), browser.js("return [innerWidth, innerHeight]")
+    assert stage[2] > 0.95 * window[0] and stage[3] > 0.7 * window[1], (stage, window)
+    caption = page.text("#caption")
+    assert all(words in caption for words in ["small", "3 MHz", page.text("#which"), "ended", "UTC", "live"]), caption
+    browser.screenshot(pictures / "page-kiosk.png")
+    browser.press("k")
+    page.wait_for_text("#which", "final map")
+    assert page.box("#stage")[3] < 0.8 * window[1]
+
+
 def shows_parts_of_the_mission(page, served):
     """The keys choose bins of the time line, one after the other; their texts tell of all packets."""
     browser, line = page.browser, served.json("/api/passes")
@@ -538,11 +601,8 @@ def shows_parts_of_the_mission(page, served):
     browser.press("\ue010")  # End.
     assert f"visibilities {received[-1]:,} received" in page.text("#passestext"), page.text("#passestext")
     assert "final map" in page.text("#which"), "the sky has its keys for itself"
-    # As a date: 1958 and TAI, less the 37 s by which UTC is behind.
-    browser.js("const s = document.getElementById('clock'); s.value = 'utc'; s.dispatchEvent(new Event('change'))")
-    begin = datetime(1958, 1, 1) + timedelta(seconds=line["epoch_tai_s"] + line["start_s"] + (len(received) - 1) * line["bin_s"] - 37)
+    begin = utc(line["epoch_tai_s"], line["start_s"] + (len(received) - 1) * line["bin_s"])
     assert page.text("#passestext").startswith(f"{begin:%Y-%m-%d %H:%M} UTC to "), page.text("#passestext")
-    browser.js("const s = document.getElementById('clock'); s.value = 'days'; s.dispatchEvent(new Event('change'))")
     browser.press("Escape")
     assert page.text("#passestext").startswith("whole mission: ")
     browser.js("document.activeElement.blur()")
@@ -604,11 +664,48 @@ def follows_a_replay(page, replay, out, lost, pictures):
     final = read(out / "3.000MHz/map.fits")
     page.assert_sky("map of the replay", final, Colours.robust(page.palettes["inferno"], final))
     page.wait_for_text("#log", "the run is complete")
+    shows_errors_and_noise(page, replay, out)
     panels.assert_passes()
     panels.assert_orbit()
     panels.assert_uvw(0, page.palettes["inferno"])
     copies_what_is_missing(page, lost)
     page.browser.screenshot(pictures / "page-replay.png")
+
+
+def shows_errors_and_noise(page, replay, out):
+    """How well the map is known, and without a truth the noise floor and how far the map is above it."""
+    browser, final = page.browser, read(out / "3.000MHz/map.fits")
+    show = "const s = document.getElementById('show'); s.value = arguments[0]; s.dispatchEvent(new Event('change'))"
+    assert page.text("#figures").count("from the data") == 1, page.text("#figures")
+    options = browser.js("return [...document.getElementById('show').options].filter((o) => !o.disabled).map((o) => o.value)")
+    assert options == ["map", "difference", "noise", "sigma", "mask", "resolution", "hits"], options
+    browser.js(show, "sigma")
+    page.wait_for_text("#shown", "standard deviation σ of map")
+    sigma = read(out / "3.000MHz/sigma.fits")
+    page.assert_sky("sigma", sigma, Colours.robust(page.palettes["inferno"], sigma))
+    for name, unit in [("mask", ""), ("resolution", "°")]:
+        browser.js(show, name)
+        page.wait_for_text("#shown", name)
+        page.wait_for_text("#high", f"{unit}, linear")
+        served = np.frombuffer(urllib.request.urlopen(f"{replay.url}/api/maps/0/{name}.f32").read(), "<f4")
+        assert np.array_equal(served, read(out / f"3.000MHz/{name}.fits").astype("<f4")), name
+    browser.js(show, "map")
+    spectra = replay.json("/api/figures/0")["spectra"]
+    assert "rho" not in spectra and "snr" not in spectra, spectra.keys()
+    noise = read(out / "3.000MHz/noise.fits")
+    # healpy's with as many iterations of its quadrature; files have 32 bits.
+    for cl, values in [("cl_noise", noise), ("cl_map", final)]:
+        expected = healpy.anafast(values, lmax=11, iter=3, use_pixel_weights=False)
+        assert np.allclose(spectra[cl][1:9], expected[1:9], rtol=0.02), (cl, spectra[cl], expected)
+    # The curve: points where the ratio is.
+    browser.js("document.querySelector('[data-curve=snr]').click()")
+    ratio = np.log10(np.array(spectra["cl_map"][1:]) / np.array(spectra["cl_noise"][1:]))
+    width, height = page.box("#curve")[2:]
+    x = 52 + np.arange(len(ratio)) / (len(ratio) - 1) * (width - 62)
+    y = height - 30 - (ratio - ratio.min()) / (ratio.max() - ratio.min()) * (height - 54)
+    panels = Panels(page, replay)
+    wait_until("the ratio's curve", lambda: panels.pixels("curve", zip(x[1:-1], y[1:-1], strict=True)) == [panels.colour("--cool")] * (len(ratio) - 2))
+    browser.js("document.querySelector('[data-curve=growth]').click()")
 
 
 def main():
@@ -629,6 +726,7 @@ def main():
         browser.get(served.url)
         assert browser.js("return !!document.getElementById('gl').getContext('webgl2')"), "no WebGL2"
         shows_a_run(page, served, folder / "run", pictures)
+        plays_in_a_kiosk(page, served, pictures)
         fits_a_phone(page, pictures)
         page.listen()
         assert not [entry for entry in page.console if entry["level"] == "SEVERE"], page.console
@@ -638,7 +736,12 @@ def main():
         page.wait_for_text("#link", "not connected")
         page.listen()
         lost = without_some(Path(downlink), folder / "cut.packets")
-        replay = [lunarray, "replay", str(folder / "cut.packets"), "--map", pipeline, "--out", str(folder / "replay")]
+        # With R from the data, which tells how well the map is known.
+        text = Path(pipeline).read_text()
+        from_data = folder / "from-data.toml"
+        from_data.write_text(text.replace("epsilon = 1e-4\n", ""))
+        assert from_data.read_text() != text
+        replay = [lunarray, "replay", str(folder / "cut.packets"), "--map", str(from_data), "--out", str(folder / "replay")]
         with Served(*replay, "--step", "pass", "--serve-after", port=served.port) as replay:
             follows_a_replay(page, replay, folder / "replay", lost, pictures)
             without_webgl(replay, folder / "replay", page.palettes)

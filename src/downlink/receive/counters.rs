@@ -229,6 +229,15 @@ impl ReceptionCounters {
         }
     }
 
+    /// Number of faults in a stream: damaged packets, runs of bytes that belong to no packet, a truncated end, uncorrectable frames
+    /// and losses of synchronisation.
+    pub(crate) fn faults(&self) -> u64 {
+        let damaged: u64 = PacketKind::ALL.into_iter().map(|kind| self.kind(kind).damaged).sum();
+        let of_frames =
+            self.frames.as_ref().map_or(0, |frames| frames.frames_uncorrectable + frames.sync_losses);
+        damaged + self.garbage_stretches + u64::from(self.bytes_truncated > 0) + of_frames
+    }
+
     /// Adds a stream's counters of garbage, damage, truncation and frames, but not of valid packets.
     pub(crate) fn add_stream(&mut self, other: &Self) {
         self.bytes += other.bytes_garbage + other.bytes_truncated + other.bytes_damaged;

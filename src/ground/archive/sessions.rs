@@ -8,10 +8,12 @@ use super::folder::{StateFolder, checkpoints};
 use super::open_archive::OpenArchive;
 use super::recovery::{kept_settings, packets_folder, require_saved};
 use super::store::Archive;
+use crate::frames::AutoPower;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
+use crate::units::vector::Vec3;
 
 impl Ground {
     /// A ground stage that resumes from the newest checkpoint in `folder`, or starts a new archive there.
@@ -142,6 +144,18 @@ impl Ground {
     /// As [`Ground::open`]; a folder without a checkpoint.
     #[doc(hidden)]
     pub fn sums_in(folder: &Path, config: &GroundConfig) -> Result<Vec<Snapshot>, GroundError> {
+        Ok(Self::sums_and_powers_in(folder, config)?.0)
+    }
+
+    /// The sums as of [`Ground::sums_in`], and the daughters' total powers with their positions where the ephemeris has them.
+    ///
+    /// # Errors
+    /// As [`Ground::sums_in`].
+    #[doc(hidden)]
+    pub fn sums_and_powers_in(
+        folder: &Path,
+        config: &GroundConfig,
+    ) -> Result<(Vec<Snapshot>, Vec<(AutoPower, Vec3)>), GroundError> {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
         }
@@ -151,7 +165,12 @@ impl Ground {
         ground.advance(&mut out)?;
         ground.flush(&mut out)?;
         ground.accumulator.finish(&mut out)?;
-        Ok(out.into_vec())
+        let ephemeris = ground.calibrator.ephemeris();
+        let place = |power: AutoPower| {
+            Some((power, ephemeris.position_at(power.time_s, usize::from(power.daughter))?))
+        };
+        let powers = ground.calibrator.auto_powers().into_iter().filter_map(place).collect();
+        Ok((out.into_vec(), powers))
     }
 
     /// Number of packets of visibilities in the archive.

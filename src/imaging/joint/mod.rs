@@ -2,8 +2,12 @@
 //!
 //! The structure of the sky changes slowly with frequency. [`solve_jointly`] takes the sums of each channel, estimates the correlation
 //! between channels ([`Correlation`]), and solves for all channels together. It returns maps at every channel and at frequencies between
-//! them, and the spectral index of every pixel, each with errors. No visibility is read again.
+//! them, and the spectral index of every pixel, each with errors. Total powers of the daughters, if there are any, take part as rows beside the
+//! visibilities (`powers`). No visibility is read again.
 
+mod disc;
+mod posterior;
+mod powers;
 mod prior;
 mod solve;
 mod spectrum;
@@ -11,6 +15,8 @@ mod sums;
 #[cfg(test)]
 mod tests;
 
+pub use posterior::{Agreement, JointMap, JointRequest};
+pub use powers::{PowerAgreement, PowerPriors, PowerSample};
 pub use prior::Correlation;
-pub use solve::{Agreement, JointChannel, JointMap, JointRequest, JointSolution, solve_jointly};
+pub use solve::{JointChannel, JointSolution, solve_jointly};
 pub use spectrum::SpectralMaps;

@@ -5,8 +5,10 @@ use std::borrow::Cow;
 use faer::Mat;
 use rayon::prelude::*;
 
+use super::powers::WeightedRows;
 use super::prior::{Prior, index_of};
 use crate::imaging::power::Block;
+use crate::imaging::solver::add;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
 /// The sums of all channels. Residuals of a channel in excess of its noise count as noise.
@@ -15,6 +17,8 @@ pub(super) struct JointSums<'a> {
     pub(super) channels: Vec<&'a (dyn NormalSums + Sync)>,
     /// Noise factor s of each channel; weights are divided by s^2.
     pub(super) noise_factors: Vec<f64>,
+    /// Total powers of each channel, `None` if there are none.
+    powers: Vec<Option<WeightedRows<'a>>>,
     right: Vec<f64>,
     noise_right: Vec<f64>,
 }
@@ -34,7 +38,23 @@ impl<'a> JointSums<'a> {
         let right = transposed(&|sums| sums.right_hand_side().to_vec(), 2);
         // The noise is s times as large.
         let noise_right = transposed(&|sums| sums.noise_right_hand_side().to_vec(), 1);
-        Self { prior, channels, noise_factors, right, noise_right }
+        let powers = channels.iter().map(|_| None).collect();
+        Self { prior, channels, noise_factors, powers, right, noise_right }
+    }
+
+    /// Adds the total powers of each channel.
+    pub(super) fn with_powers(mut self, powers: Vec<Option<WeightedRows<'a>>>) -> Self {
+        let right = |(powers, sums): (&Option<WeightedRows<'a>>, &&(dyn NormalSums + Sync))| {
+            powers.as_ref().map_or_else(|| vec![0.0; sums.unknowns()], WeightedRows::right_hand_side)
+        };
+        let rights: Vec<Vec<f64>> = powers.iter().zip(&self.channels).map(right).collect();
+        add(&mut self.right, &self.prior.transposed(&rights));
+        Self { powers, ..self }
+    }
+
+    /// The total powers of a channel.
+    pub(super) fn powers(&self, channel: usize) -> Option<&WeightedRows<'a>> {
+        self.powers.get(channel)?.as_ref()
     }
 }
 
@@ -55,8 +75,13 @@ impl NormalSums for JointSums<'_> {
         let mut products: Vec<Vec<Vec<f64>>> = vec![Vec::new(); x.len()];
         for (channel, (sums, factor)) in self.channels.iter().zip(&self.noise_factors).enumerate() {
             let channel_skies: Vec<&[f64]> = skies.iter().map(|skies| skies[channel].as_slice()).collect();
-            for (product, all) in sums.apply_all(&channel_skies).into_iter().zip(&mut products) {
-                all.push(product.into_iter().map(|y| y / factor.powi(2)).collect());
+            let channel_products = sums.apply_all(&channel_skies).into_iter().zip(channel_skies);
+            for ((mut product, sky), all) in channel_products.zip(&mut products) {
+                product.iter_mut().for_each(|y| *y /= factor.powi(2));
+                if let Some(powers) = &self.powers[channel] {
+                    add(&mut product, &powers.product(sky));
+                }
+                all.push(product);
             }
         }
         products.iter().map(|products| self.prior.transposed(products)).collect()
@@ -106,19 +131,23 @@ pub(super) struct ScaledBlocks {
     of_channel: Vec<Mat<f64>>,
 }
 
-/// Scales the blocks of all channels; `blocks` holds those of each channel.
+/// Scales the blocks of all channels; `blocks` holds those of each channel, `powers` those of its total powers.
 pub(super) fn scaled_blocks(
     prior: &Prior,
     blocks: &[Vec<Block<'_>>],
     noise_factors: &[f64],
+    powers: &[Option<Vec<Mat<f64>>>],
 ) -> Vec<ScaledBlocks> {
     let scaled = |(index, (m, parity)): (usize, (usize, usize))| {
         // A block has the same index in all channels that have it.
         let of_channel = (0..prior.channels_with_degree(m + parity)).map(|channel| {
-            let block = &blocks[channel][index_in(prior.l_max[channel], m, parity)];
-            let scale = |k: usize| prior.scale[channel][block.degrees[k]] / noise_factors[channel];
+            let at = index_in(prior.l_max[channel], m, parity);
+            let block = &blocks[channel][at];
+            let powers = powers.get(channel).and_then(|powers| Some(&powers.as_ref()?[at]));
+            let scale = |k: usize| prior.scale[channel][block.degrees[k]];
             Mat::from_fn(block.degrees.len(), block.degrees.len(), |i, j| {
-                scale(i) * block.matrix[(i, j)] * scale(j)
+                let of_visibilities = block.matrix[(i, j)] / noise_factors[channel].powi(2);
+                scale(i) * (of_visibilities + powers.map_or(0.0, |powers| powers[(i, j)])) * scale(j)
             })
         });
         debug_assert_eq!(index_in(prior.l_max[0], m, parity), index);
@@ -211,7 +240,7 @@ mod tests {
             orders(l_max).map(of_order).collect()
         };
         let blocks: Vec<Vec<Block<'_>>> = (0..3).map(of).collect();
-        let joint = joint_blocks(&prior, &scaled_blocks(&prior, &blocks, &factors));
+        let joint = joint_blocks(&prior, &scaled_blocks(&prior, &blocks, &factors, &[]));
         let (_, count) = prior.offsets();
         let u: Vec<f64> = (0..count).map(|k| (0.9 * k as f64).sin()).collect();
         let products: Vec<Vec<f64>> = prior

@@ -80,18 +80,24 @@ impl SkyPower {
 
     /// Variance of pixel means from the sky beyond these degrees, K^2, with the curve extrapolated.
     pub(super) fn variance_beyond_k2(&self, nside: usize) -> f64 {
-        let [.., before, last] = self.power_k2[..] else { return 0.0 };
         let first = self.power_k2.len();
-        let fall = (last / before).ln() / (first as f64 / (first - 1) as f64).ln();
         let term = |l: usize| {
+            let power_k2 = self.continued_k2(l);
             let l = l as f64;
-            let power_k2 = last * ((l + 1.0) / first as f64).powf(fall);
             // The window of a disc of a pixel's area, 2 J_1(x) / x with x = 2 l / sqrt(N_pix): ln w_l^2 = -x^2 / 4 - x^4 / 192 - ..
             let q = l * l / pixel_count(nside) as f64;
             (2.0 * l + 1.0) / (4.0 * PI) * power_k2 * (-q - q * q / 12.0).exp()
         };
         // w_l^2 falls to a hundredth at 8 nside.
         (first..=8 * nside).map(term).sum()
+    }
+
+    /// C_l of a degree beyond the last, K^2, with the curve extrapolated.
+    pub(super) fn continued_k2(&self, l: usize) -> f64 {
+        let [.., before, last] = self.power_k2[..] else { return 0.0 };
+        let first = self.power_k2.len();
+        let fall = (last / before).ln() / (first as f64 / (first - 1) as f64).ln();
+        last * ((l + 1) as f64 / first as f64).powf(fall)
     }
 
     /// Converts an estimate from data divided by `factor`.

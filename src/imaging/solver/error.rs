@@ -73,7 +73,8 @@ pub enum SolveError {
     NoPower,
     /// There are too few channels for a joint map, or two of one frequency.
     #[error(
-        "a joint map of {channels} channels at {frequencies} frequencies; expected two or more, each at its own frequency"
+        "a joint map of {channels} channels at {frequencies} frequencies; expected two or more, each at its own frequency, or one with total \
+         powers (spacecraft.auto_powers = true)"
     )]
     FewChannels {
         /// Number of channels.
@@ -91,6 +92,25 @@ pub enum SolveError {
         frequency_hz: f64,
         /// Lowest and highest frequency of the channels, Hz.
         ends_hz: [f64; 2],
+    },
+    /// There are constants of total powers for another number of channels.
+    #[error(
+        "{found} constants of the total powers for {channels} channels; expected one, or one for each channel in order of frequency"
+    )]
+    PowerConstants {
+        /// Number of constants.
+        found: usize,
+        /// Number of channels.
+        channels: usize,
+    },
+    /// Total powers of antennas with a pattern.
+    #[error(
+        "{:.3} MHz: total powers of dipoles; expected isotropic antennas or three dipoles, as a pattern is not in the powers' rows: \
+         --no-powers leaves them out", frequency_hz / 1e6
+    )]
+    PowersOfDipoles {
+        /// Frequency, Hz.
+        frequency_hz: f64,
     },
     /// A state does not hold harmonic sums, which joint maps need.
     #[error(

@@ -13,6 +13,7 @@ use crate::pipeline::config::{Expected, MemoryLimit, PipelineError, Plan};
 use crate::response::model::{ModelKind, ModelPlan};
 use crate::sky::healpix::pixel_count;
 use crate::units::ChannelId;
+use crate::units::vector::norm;
 
 /// Maximum number of visibilities that wait for a batch of the model.
 const QUEUED_VISIBILITIES_MAX: f64 = 1e6;
@@ -21,6 +22,12 @@ const QUEUED_VISIBILITY_BYTES: f64 = 200.0;
 
 /// Memory of the program, queues and pictures, bytes.
 const BASE_BYTES: f64 = 5e7;
+/// The part of it that pictures take.
+const PICTURE_BYTES: f64 = 2e7;
+
+/// Processor time of a program's start and plan, and of a generated sky up to nside 64, by channel, s.
+const START_S: f64 = 0.15;
+const SKY_S: f64 = 0.27;
 
 /// Memory of a snapshot's record in the summary, bytes.
 const SNAPSHOT_RECORD_BYTES: f64 = 500.0;
@@ -47,8 +54,8 @@ pub struct ChannelCost {
     pub simulation_general_s: f64,
     /// Multiply-adds of the normal equations.
     pub accumulation_multiply_adds: f64,
-    /// Multiply-adds of one solution.
-    pub solution_multiply_adds: f64,
+    /// Multiply-adds of all solutions.
+    pub solving_multiply_adds: f64,
     /// Estimated time of accumulation and of all solutions, s.
     pub mapping_s: f64,
 }
@@ -134,13 +141,13 @@ impl Plan {
         let instants = if self.config.spacecraft.smear_integrations { AVERAGE_INSTANTS } else { 1.0 };
         let expected = self.visibilities();
         let frequencies = &self.config.spacecraft.channels_hz;
+        let sent: f64 = expected.iter().map(|e| e.sent).sum();
+        let solutions = self.solutions(sent);
+        let (windows, limb_range_rad) = (self.windows.len() as f64, self.limb_range_rad());
         let engine = |(channel, (&frequency_hz, expected)): (usize, (&f64, &Expected))| {
             let is_mapped = map.is_mapped(ChannelId(channel as u16));
-            let data = ChannelData {
-                frequency_hz,
-                visibilities: expected.mapped,
-                windows: self.windows.len() as f64,
-            };
+            let visibilities = expected.mapped;
+            let data = ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad };
             if is_mapped {
                 EngineCost::estimate(map, data).with_ranks(ranks, map)
             } else {
@@ -148,8 +155,6 @@ impl Plan {
             }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
-        let sent: f64 = expected.iter().map(|e| e.sent).sum();
-        let solutions = self.solutions(sent);
         let channels: Vec<ChannelCost> = frequencies
             .iter()
             .zip(&expected)
@@ -168,20 +173,21 @@ impl Plan {
                 ],
                 simulation_general_s: instants * simulation.general_fringes * expected.sent / fringes_per_s,
                 accumulation_multiply_adds: expected.mapped * engine.visibility_multiply_adds,
-                solution_multiply_adds: engine.solution_multiply_adds,
-                mapping_s: engine.visibility_s * expected.mapped
-                    + solutions as f64 * engine.solution_s
-                    + engine.probes_s,
+                solving_multiply_adds: engine.solving_multiply_adds,
+                mapping_s: engine.visibility_s * expected.mapped + engine.solving_s,
             })
             .collect();
         let simulation_memory_bytes = self.simulation_bytes(sent, &nsides)
             + channels.iter().map(|channel| channel.simulation.bytes).sum::<f64>();
-        let memory_bytes =
-            memory_bytes(simulation_memory_bytes, &engines, solutions) + self.known_sky_bytes();
+        let memory_bytes = memory_bytes(simulation_memory_bytes, &engines, solutions)
+            + self.known_sky_bytes()
+            - if self.config.products.pictures { 0.0 } else { PICTURE_BYTES };
         let sampling_s = self.sampling_s();
         let simulating_s: f64 =
             sampling_s.unwrap_or_else(|| channels.iter().map(ChannelCost::simulation_s).sum());
-        let predicted_s = simulating_s + channels.iter().map(|channel| channel.mapping_s).sum::<f64>();
+        let starting_s = (START_S + self.generated_skies() as f64 * SKY_S) / cores();
+        let predicted_s =
+            starting_s + simulating_s + channels.iter().map(|channel| channel.mapping_s).sum::<f64>();
         Cost {
             channels,
             windows: self.windows.len(),
@@ -198,12 +204,29 @@ impl Plan {
             ninth_bits_per_s: self.ninth_bits_per_s(),
             ranks: (ranks > 1).then(|| RankCost {
                 ranks,
-                reduced_bytes: solutions as f64 * engines.len() as f64 * EngineCost::reduced_bytes(map),
+                reduced_bytes: engines.iter().map(|engine| engine.reduced_bytes(map)).sum(),
                 nodes: None,
             }),
             sampling_s,
             predicted_s,
         }
+    }
+
+    /// Number of skies that are generated, not read.
+    fn generated_skies(&self) -> usize {
+        if self.config.sky.file.is_none() { self.config.spacecraft.channels_hz.len() } else { 0 }
+    }
+
+    /// Range of the angle between nadir and limb of daughter 1 in the observing windows, rad.
+    fn limb_range_rad(&self) -> f64 {
+        const WINDOWS_SEEN: usize = 64;
+        let limb_rad =
+            |t_s: f64| (self.array.moon_radius_m() / norm(self.array.position_m(0, t_s))).min(1.0).asin();
+        let seen = self.windows.iter().step_by(self.windows.len().div_ceil(WINDOWS_SEEN).max(1));
+        let limbs = seen.flat_map(|window| [window.start, window.end].map(|time| limb_rad(time.seconds())));
+        let (low, high) =
+            limbs.fold((f64::INFINITY, 0.0_f64), |(low, high), limb| (low.min(limb), high.max(limb)));
+        (high - low).max(0.0)
     }
 
     fn observing_s(&self) -> f64 {
@@ -281,14 +304,10 @@ pub(in crate::pipeline) fn memory_bytes(
     let sums = engines.iter().map(|engine| engine.sums_bytes).sum::<f64>()
         + solutions as f64 * engines.len() as f64 * SNAPSHOT_RECORD_BYTES;
     let copy = largest(|engine| engine.copy_bytes);
-    // One copy is made, one waits in the queue, and one is in the solver.
-    let solving = |copies: usize| match copies {
-        0 => 0.0,
-        copies => copies.min(3) as f64 * copy + largest(|engine| engine.other_bytes),
-    };
-    let accumulating = simulation_bytes + sums + solving(if solutions > 1 { 3 } else { 0 });
-    let final_copies = if engines.iter().any(|engine| engine.copies_final) { engines.len() } else { 0 };
-    accumulating.max(sums + solving(final_copies)) + BASE_BYTES
+    let solver = largest(|engine| engine.other_bytes);
+    // One copy is made, one waits in the queue, and one is in the solver. The final map is solved in the memory of the sums.
+    let intermediate = if solutions > 1 { 3.0 * copy + solver } else { 0.0 };
+    (simulation_bytes + sums + intermediate).max(sums + solver) + BASE_BYTES
 }
 
 impl Cost {
@@ -363,7 +382,7 @@ impl fmt::Display for Cost {
                 channel.visibilities_sent,
                 channel.visibilities_mapped,
                 channel.baseline_m_max,
-                channel.accumulation_multiply_adds + channel.solution_multiply_adds * self.solutions as f64
+                channel.accumulation_multiply_adds + channel.solving_multiply_adds
             )?;
         }
         writeln!(f)?;
@@ -410,9 +429,11 @@ impl fmt::Display for Cost {
         if let Some(rate) = self.ninth_bits_per_s {
             writeln!(f, "ninth daughter   {:.3} kbit/s of spectra while observing", rate / 1e3)?;
         }
+        let digits = usize::from(self.predicted_s < 10.0);
         write!(
             f,
-            "estimated time   {:.0} s, at rates measured on 2 cores of an AMD EPYC, with {} cores",
+            "estimated time   {:.digits$} s if nothing else runs on {} cores, from processor times measured on virtual machines (AMD \
+             EPYC; Intel Xeon with AVX-512): others differ by some factor",
             self.predicted_s,
             cores()
         )

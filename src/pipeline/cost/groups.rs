@@ -140,8 +140,12 @@ pub(in crate::pipeline) fn complete_costs(
 ) -> BTreeMap<ChannelId, EngineCost> {
     let channels = (0..).map(ChannelId).zip(&instrument.channels);
     let cost = |frequency_hz: f64| {
-        let visibilities = map.refine.visibilities_max as f64;
-        EngineCost::estimate(map, ChannelData { frequency_hz, visibilities, windows: f64::INFINITY })
+        let (visibilities, solutions) = (map.refine.visibilities_max as f64, memory_solutions(map));
+        let (windows, limb_range_rad) = (f64::INFINITY, f64::INFINITY);
+        EngineCost::estimate(
+            map,
+            ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad },
+        )
     };
     channels
         .filter(|(channel, _)| map.is_mapped(*channel))

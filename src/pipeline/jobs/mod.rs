@@ -21,6 +21,6 @@ pub use groups::{GroupWatcher, channel_groups, replay_in_groups, run_in_groups};
 pub use mission::Mission;
 pub use realisations::{PowerSpread, RealisationSpread};
 pub use simulation_groups::{MERGE, simulate_in_groups};
-pub use state::{sample_state, solve_state, solve_states_jointly};
+pub use state::{joint_channels, sample_state, solve_state, solve_states_jointly};
 pub use study::{StudyStep, StudySummary, StudyWatcher, run_study};
 pub use study_file::{Study, StudyCase, StudyError};

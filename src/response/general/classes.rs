@@ -42,9 +42,11 @@ fn limb_bytes(l_max: usize, u_max: f64, cap_rad: f64) -> f64 {
     4.0 * 0.75 * rings * 0.5 * ((l_max + 2) as f64).powi(2)
 }
 
-/// Maximum memory of all tables, bytes: [`CLASSES_BYTES`], or two limbs of a hemisphere if that is more.
-pub(super) fn tables_bytes(l_max: usize, u_max: f64) -> f64 {
-    CLASSES_BYTES.max(2.0 * limb_bytes(l_max, u_max, FRAC_PI_2))
+/// Maximum memory of the tables of limbs in a range of angles, bytes: at most [`CLASSES_BYTES`], or two limbs if that is more.
+pub(super) fn tables_bytes(l_max: usize, u_max: f64, limb_range_rad: f64) -> f64 {
+    let limb = limb_bytes(l_max, u_max, FRAC_PI_2);
+    let classes = (limb_range_rad * (l_max + 1) as f64 / CLASS_WIDTH).ceil().clamp(1.0, CLASSES_MAX);
+    (classes * limb).min(CLASSES_BYTES.max(2.0 * limb))
 }
 
 /// Classes by limb and baseline length.

@@ -464,9 +464,15 @@ fn add_gradients(sums: &mut [Alm], part: &[Alm]) {
 }
 
 /// Memory of rows up to `l_max` and `u_max` wavelengths without the visibilities, bytes: Legendre functions by class, and the buffers
-/// of each thread. A response of some degree multiplies the number of skies by the number of its monomials.
+/// of each thread. The angle between nadir and limb has a range of `limb_range_rad`. A response of some degree multiplies the number of skies by the number of its monomials.
 #[must_use]
-pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize, polynomial_degree: usize) -> u64 {
+pub fn row_tables_bytes(
+    l_max: usize,
+    u_max: f64,
+    limb_range_rad: f64,
+    threads: usize,
+    polynomial_degree: usize,
+) -> u64 {
     let products = SkyProducts::new(polynomial_degree).count() as f64;
     let l_max = l_max + polynomial_degree;
     let coefficients = 0.25 * ((l_max + 2) as f64).powi(2);
@@ -476,6 +482,6 @@ pub fn row_tables_bytes(l_max: usize, u_max: f64, threads: usize, polynomial_deg
     let group =
         1.5 * GROUP_NODES as f64 * (4.0 * 16.0 * (2 * l_max + 1) as f64 * products + 16.0 * coefficients);
     let batch = BATCH as f64 * 80.0 * coefficients + batch_bytes(l_max, u_max, BATCH);
-    let classes = tables_bytes(l_max, u_max);
+    let classes = tables_bytes(l_max, u_max, limb_range_rad);
     (classes + 4.0 * turns + gradients + threads as f64 * (group + batch)) as u64
 }

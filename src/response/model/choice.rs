@@ -159,7 +159,8 @@ impl ModelPlan {
             ModelKind::Harmonic => harmonic_bytes,
             ModelKind::General => {
                 let threads = rayon::current_num_threads();
-                row_tables_bytes(l_max, u_max, threads, 0) as f64 + POSITION_BYTES * general::BATCH as f64
+                row_tables_bytes(l_max, u_max, f64::INFINITY, threads, 0) as f64
+                    + POSITION_BYTES * general::BATCH as f64
             }
         };
         Self {

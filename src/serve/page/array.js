@@ -102,7 +102,7 @@ export function tellOrbit(geometry) {
   const hidden = satellites.filter((s) => s.earth_is_hidden).length, count = satellites.length;
   const sight = !earth_hat ? "the configuration does not say where the Earth is" : hidden === count ? `Earth hidden from all ${count}` : `Earth hidden from ${hidden} of ${count}`;
   const high = (length(satellites[0].position_m) - moon_radius_m) / 1e3;
-  $("orbittext").textContent = `Latest data: day ${(time_s / 86400).toFixed(2)}, ${utc(epoch_tai_s, time_s)} UTC. ${sight}; ${high.toFixed(0)} km above the mean surface. Below: distances from daughter 1.`;
+  $("orbittext").textContent = `Latest data: ${utc(epoch_tai_s, time_s)} UTC (day ${(time_s / 86400).toFixed(2)}). ${sight}; ${high.toFixed(0)} km above the mean surface. Below: distances from daughter 1.`;
 }
 
 /** Counts of a plane, including the baselines of opposite sign. */
@@ -143,7 +143,7 @@ export function limitsOf(powers) {
 }
 
 /** Draws powers: rows are daughters, columns the times with data. */
-export function drawPowers(canvas, waterfall, colours) {
+export function drawPowers(canvas, waterfall, colours, epochTaiS) {
   const at = brush(canvas);
   if (!at || !waterfall) return;
   const { c, width } = at, { times_s: times, powers_k_sr: powers, time_s: wide } = waterfall;
@@ -160,8 +160,7 @@ export function drawPowers(canvas, waterfall, colours) {
   });
   c.fillStyle = css("--quiet"); c.textBaseline = "middle"; c.textAlign = "right";
   for (let daughter = 0; daughter < rows; daughter++) if (lane > 9 || daughter % 4 === 0) c.fillText(`daughter ${daughter + 1}`, left - 6, (daughter + 0.5) * lane);
-  const day = (t) => `day ${(t / 86400).toFixed(2)}`;
-  c.textBaseline = "alphabetic"; c.textAlign = "left"; c.fillText(day(times[0]), left, 146);
-  c.textAlign = "right"; c.fillText(day(times.at(-1) + wide), width - 4, 146);
+  c.textBaseline = "alphabetic"; c.textAlign = "left"; c.fillText(utc(epochTaiS, times[0]), left, 146);
+  c.textAlign = "right"; c.fillText(`${utc(epochTaiS, times.at(-1) + wide)} UTC`, width - 4, 146);
   $("powerstext").textContent = `Means of ${short(wide)} s, one column each; times without any are left out. From ${short(low)} to ${short(high)} K sr.`;
 }

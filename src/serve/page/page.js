@@ -2,32 +2,26 @@
 import { Sky, isSeen, rmsNear } from "/sky.js";
 import { Passes } from "/passes.js";
 import { drawOrbit, drawPowers, drawUvw, tellOrbit } from "/array.js";
-import { $, copyText, css, learnLeaps, make, nice, number, short, stored, ticks } from "/tools.js";
+import { $, clock, copyText, css, dateOf, days, learnLeaps, make, nice, number, prefixed, short, stored, ticks, utc } from "/tools.js";
+import { showVitals, waitingFor } from "/vitals.js";
 
 const HELD_BYTES = 96e6, SAMPLE = 65536;
-const BLINK_MS = 700, PLAY_MS = 450;
+const BLINK_MS = 700, PLAY_MS = 450, KIOSK_MS = 1200, KIOSK_LAST = 5;
+/** Maps of the newest data only. */
+const OF_NEWEST = { noise: "noise alone", sigma: "standard deviation σ", mask: "mask", resolution: "resolution", hits: "visibilities by direction" };
 const state = {
-  status: null, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
+  status: null, config: null, kiosk: false, lasted: 0, channel: 0, number: null, follows: true, figures: new Map(), curve: "growth",
   maps: new Map(), blink: false, blinkOn: false, playing: false, gapsAt: 0, gapsSeen: 0,
   arrayAt: 0, arrayKnown: null, fetching: false, geometry: null, density: null, powers: null, noise: null,
 };
 let sky, passes;
 
-const prefixed = (v) => {
-  for (const [size, name] of [[1e9, " G"], [1e6, " M"], [1e3, " k"]]) if (v >= size) return (v / size).toPrecision(3) + name;
-  return v === 0 ? "0 " : v >= 100 ? v.toFixed(0) + " " : v.toPrecision(3) + " ";
-};
 const duration = (s) => {
   if (!(s > 0)) return "0";
   if (s >= 1) return `${s.toPrecision(3)} s`;
   if (s >= 1e-3) return `${(s * 1e3).toPrecision(3)} ms`;
   return `${(s * 1e6).toPrecision(3)} µs`;
 };
-const clock = (s) => {
-  const [h, m, r] = [Math.floor(s / 3600), Math.floor(s / 60) % 60, Math.floor(s) % 60];
-  return (h ? `${h}:` : "") + `${String(m).padStart(h ? 2 : 1, "0")}:${String(r).padStart(2, "0")}`;
-};
-const days = (s) => `${(s / 86400).toFixed(1)} d`;
 const channelNow = () => state.status?.channels.find((c) => c.channel === state.channel);
 
 // ---- Maps ----
@@ -45,8 +39,8 @@ async function fetchMap(name) {
   const bytes = new DataView(await answer.arrayBuffer());
   const values = new Float32Array(bytes.byteLength / 4);
   for (let k = 0; k < values.length; k++) values[k] = bytes.getFloat32(4 * k, true);
-  // The noise map changes with each snapshot, so it is not cached.
-  if (name !== "noise") state.maps.set(key, values);
+  // Maps of the newest data change with each snapshot, so they are not cached.
+  if (!OF_NEWEST[name]) state.maps.set(key, values);
   const bytesHeld = () => [...state.maps.values()].reduce((sum, map) => sum + map.byteLength, 0);
   while (state.maps.size > 2 && bytesHeld() > HELD_BYTES) state.maps.delete(state.maps.keys().next().value);
   return values;
@@ -69,37 +63,44 @@ async function showSky() {
   if (show === "difference") second = before === undefined ? null : String(before);
   if (show === "input") first = "input";
   if (show === "error") second = "input";
-  if (show === "noise" || show === "hits") first = show;
-  if (state.blink && state.blinkOn) [first, second] = [channel.has_input ? "input" : String(before ?? state.number), null];
+  if (OF_NEWEST[show]) first = show;
+  const other = channel.has_input ? "input" : before === undefined ? null : String(before);
+  if (state.blink && state.blinkOn && other) first = other;
   const [a, b] = await Promise.all([fetchMap(first), second === null ? null : fetchMap(second)]);
   if (turn !== drawing) return;
-  if (!a) return; // The server has removed the map; the next status lists the maps that it holds.
+  if (!a || (second !== null && !b)) return; // The server has removed the map; the next status lists the maps that it holds.
   $("waiting").hidden = true;
-  const isDifference = show === "difference" || show === "error";
-  sky.show(a, isDifference ? (b ?? a) : null);
-  sky.isDifference = isDifference;
-  await limits(a, isDifference ? b : null, turn);
-  if (turn === drawing) draw();
+  // Without a map before it there is no difference to show, but the map.
+  sky.isDifference = b !== null;
+  sky.show(a, b);
+  const named = (name) => (name === "input" ? "input sky" : OF_NEWEST[name] ?? `map ${name}`);
+  const blinks = state.blink ? (other ? ` · blinks with ${named(first === other ? String(state.number) : other)}, on one scale` : " · nothing to blink with yet") : "";
+  const missing = show === "difference" && !second ? ", the first: no difference yet" : "";
+  const newest = OF_NEWEST[show] && show !== "hits" ? ` of map ${held.at(-1)}` : "";
+  // Two frames, and all frames of a sequence, have the scale of one.
+  const common = state.blink && other ? other : state.kiosk || state.playing ? String(held.at(-1)) : null;
+  limits((common && !OF_NEWEST[show] && !b && await fetchMap(common)) || a, b);
+  if (turn !== drawing) return;
+  $("shown").textContent = `${named(first)}${second ? ` − ${named(second)}` : ""}${newest}${missing}${blinks}`;
+  draw();
 }
 
-const isShowingHits = () => $("show").value === "hits" && !(state.blink && state.blinkOn);
-const unit = () => isShowingHits() ? "visibilities" : "K";
+const unit = () => ({ hits: "visibilities", mask: "", resolution: "°" })[$("show").value] ?? "K";
 const quantile = (sorted, q) => sorted[Math.min(sorted.length - 1, Math.max(0, Math.round(q * (sorted.length - 1))))];
-async function limits(a, b) {
-  const look = sky.look, isDifference = sky.isDifference, isNoise = $("show").value === "noise", isHits = isShowingHits();
+function limits(a, b) {
+  const look = sky.look, show = $("show").value, isDifference = sky.isDifference, isNoise = show === "noise", isPlain = ["hits", "mask", "resolution"].includes(show);
   look.smooth = $("smooth").checked; look.marks = $("marks").checked;
-  look.palette = isDifference || isNoise ? "difference" : isHits ? "viridis" : $("palette").value;
-  look.scale = isDifference || isNoise || isHits ? "linear" : $("scale").value;
+  look.palette = isDifference || isNoise ? "difference" : isPlain ? "viridis" : $("palette").value;
+  look.scale = isDifference || isNoise || isPlain ? "linear" : $("scale").value;
   if ($("fixed").checked) {
     const [low, high] = [Number($("from").value), Number($("to").value)];
     if (low < high && (look.scale !== "log" || low > 0)) { look.low = low; look.high = high; return; }
   }
-  // Limits as in the program's pictures: from 0.5 % to 99.5 %, or symmetric. While blinking, those of the input.
-  let values = a;
-  if (state.blink && !isDifference) values = (channelNow()?.has_input && await fetchMap("input")) || a;
+  // Limits as in the program's pictures: from 0.5 % to 99.5 %, or symmetric; a mask is 0 or 1.
+  if (show === "mask") { look.low = 0; look.high = 1; return; }
   // Quantiles of a large map are taken over a subset of its pixels.
   let used = [];
-  for (let k = 0, step = Math.ceil(values.length / SAMPLE); k < values.length; k += step) used.push(b ? values[k] - b[k] : values[k]);
+  for (let k = 0, step = Math.ceil(a.length / SAMPLE); k < a.length; k += step) used.push(b ? a[k] - b[k] : a[k]);
   used = used.filter(isSeen);
   if (isDifference || isNoise) {
     const sizes = Float64Array.from(used, Math.abs).sort();
@@ -110,7 +111,7 @@ async function limits(a, b) {
     look.low = quantile(sorted, 0.005) ?? 1; look.high = quantile(sorted, 0.995) ?? 2;
     if (!(look.high > look.low * (1 + 1e-9))) { look.low = look.low / 1.2 - (look.scale === "log" ? 0 : 1); look.high = look.high * 1.2 + 1e-9; }
   }
-  $("from").value = look.low.toPrecision(4); $("to").value = look.high.toPrecision(4);
+  $("from").value = short(look.low); $("to").value = short(look.high);
 }
 
 function draw() {
@@ -122,7 +123,7 @@ function draw() {
   const image = c.createImageData(256, 1);
   for (let k = 0; k < 256; k++) image.data.set([colours[3 * k], colours[3 * k + 1], colours[3 * k + 2], 255], 4 * k);
   c.putImageData(image, 0, 0);
-  $("low").textContent = `${short(look.low)} ${unit()}`; $("high").textContent = `${short(look.high)} ${unit()}, ${look.scale}`;
+  $("low").textContent = `${short(look.low)} ${unit()}`; $("high").textContent = `${short(look.high)} ${unit()}, ${look.scale}`; caption();
 }
 
 function chooseNumber(held, place) {
@@ -140,7 +141,8 @@ function syncSlider() {
   const snapshots = state.figures.get(state.channel)?.snapshots ?? [];
   const figures = snapshots.find((s) => s.number === state.number) ?? (place === held.length - 1 ? channel.figures : null);
   const isFinal = channel.is_final && place === held.length - 1;
-  $("which").textContent = `${isFinal ? "final map" : `snapshot ${state.number}`}${figures ? `, until day ${(figures.until_s / 86400).toFixed(1)}` : ""}`;
+  $("which").textContent = `${isFinal ? "final map" : `snapshot ${state.number}`}${figures ? `, until ${utc(channel.epoch_tai_s, figures.until_s)} UTC (day ${(figures.until_s / 86400).toFixed(1)})` : ""}`;
+  caption();
   const file = `/api/maps/${state.channel}/${state.number}`;
   $("fits").href = `${file}.fits`; $("png").href = `${file}.png`;
   $("fits").download = `channel-${state.channel}-${state.number}.fits`;
@@ -209,6 +211,10 @@ function showSolver(solving) {
   $("solving").textContent = `${solving.what}: iteration ${solving.iteration}, residual ${solving.residual.toExponential(1)} of ${solving.target.toExponential(0)}${left}`;
 }
 
+/** Numbers of the reasons' colours, which each keeps while the page is open. */
+const reasons = [], REASON_COLOURS = 8;
+const reasonOf = (name) => { if (!/^(flagged|lost)/.test(name)) return 0; if (!reasons.includes(name)) reasons.push(name); return reasons.indexOf(name) % REASON_COLOURS; };
+
 function showLedger(ledger, phase) {
   const panel = document.querySelector(".ledger");
   panel.hidden = !ledger;
@@ -221,10 +227,11 @@ function showLedger(ledger, phase) {
   const isOver = phase === "ended" || phase === "failed";
   const rest = ledger.unaccounted;
   if (rest > 0) parts.push(["pending", isOver ? "unaccounted" : "on their way", rest]);
+  const colour = (node, name) => { node.style.setProperty("--of", `var(--flag${reasonOf(name)})`); return node; };
   const total = Math.max(1, sum(parts.map(([, , count]) => count)));
   const bar = $("ledgerbar");
   bar.replaceChildren(...parts.filter(([, , count]) => count > 0).map(([kind, name, count]) => {
-    const part = make("i", { class: kind, title: `${name}: ${number.format(count)}` });
+    const part = colour(make("i", { class: kind, title: `${name}: ${number.format(count)}` }), name);
     part.style.width = `${100 * count / total}%`;
     return part;
   }));
@@ -234,11 +241,11 @@ function showLedger(ledger, phase) {
   bar.className = `ledgerbar ${isKnown ? (rest === 0 ? "closed" : "open") : ""}`;
   bar.setAttribute("aria-label", parts.map(([, name, count]) => `${name} ${count}`).join(", "));
   const rows = [["", "sampled", ledger.sampled ?? "known at the end"], ...parts];
-  $("ledgerkeys").replaceChildren(...rows.map(([kind, name, count]) => make("li", {}, make("i", { class: kind }), make("span", {}, name), make("b", {}, typeof count === "string" ? count : number.format(count)))));
+  $("ledgerkeys").replaceChildren(...rows.map(([kind, name, count]) => make("li", {}, colour(make("i", { class: kind }), name), make("span", {}, name), make("b", {}, typeof count === "string" ? count : number.format(count)))));
 }
 
 function showReception(status) {
-  const { reception, listening, saving } = status;
+  const { reception, listening } = status;
   document.querySelector(".reception").hidden = !reception;
   if (!reception) return;
   const head = make("tr", {}, ...["packets", "received", "missing", "damaged", "duplicates"].map((name) => make("th", { scope: "col" }, name)));
@@ -249,26 +256,7 @@ function showReception(status) {
     return make("tr", {}, make("td", {}, kind), cell(k.packets), cell(k.missing, true), cell(k.damaged, true), cell(k.duplicates));
   }));
   const ends = listening ? Object.entries(listening.report.ended).map(([end, count]) => `${end} ${count}`).join(", ") : "";
-  const stations = Object.entries(listening?.report.stations ?? {}).map(([name, counts]) => `${name} ${prefixed(counts.bytes)}B`).join(", ");
-  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B queued${ends ? `; ended: ${ends}` : ""}${stations ? `; stations: ${stations}` : ""}` : `${prefixed(reception.bytes)}B received`;
-  showSaving(saving, listening, status.products);
-}
-
-/** Shows what is saved on disk; failures come first. */
-function showSaving(saving, listening, products) {
-  const archive = listening?.archive, said = [];
-  const say = (isBad, text) => said.push(make("span", isBad ? { class: "bad" } : {}, text));
-  if (archive?.unwritten) say(true, `▲ no data are acknowledged: the raw archive cannot be written: ${archive.unwritten}`);
-  if (saving?.unsaved) say(true, `▲ state not saved, ${saving.failed} attempt${saving.failed === 1 ? "" : "s"} failed: ${saving.unsaved}`);
-  if (products?.unwritten) say(true, `▲ maps are not written: ${products.unwritten}`);
-  if (saving && !saving.unsaved) {
-    const since = saving.checkpoint_s === undefined ? "none in this session" : `the last ${clock(saving.checkpoint_s)} ago`;
-    say(false, `${number.format(saving.written)} checkpoints, ${since}`);
-  }
-  if (saving?.unsaved_bytes) say(false, `${prefixed(saving.unsaved_bytes)}B in no checkpoint yet, since ${clock(saving.unsaved_s)}`);
-  if (archive) say(false, `${prefixed(archive.bytes)}B in the raw archive`);
-  if (listening && listening.silence_s !== null) say(false, `last packet ${clock(listening.silence_s)} ago`);
-  $("saving").replaceChildren(...said.flatMap((part, k) => (k ? [" · ", part] : [part])));
+  $("senders").textContent = listening ? `${listening.open} senders connected, ${number.format(listening.report.connections)} accepted, ${number.format(listening.report.refused)} refused; ${prefixed(listening.bytes)}B read, ${prefixed(listening.backlog_bytes)}B queued${ends ? `; ended: ${ends}` : ""}${listening.archive ? `; ${prefixed(listening.archive.bytes)}B in the raw archive` : ""}` : `${prefixed(reception.bytes)}B received`;
 }
 
 function showFigures() {
@@ -280,7 +268,8 @@ function showFigures() {
   add("nside", String(channel.nside)); add("noise rms", `${short(channel.noise_rms_k)} K`);
   if (figures.rms_error_over_rms_truth !== undefined) add("rms error / rms sky", short(figures.rms_error_over_rms_truth));
   if (figures.rho_mean !== undefined) add("mean ρ, ℓ ≤ 2 nside", short(figures.rho_mean));
-  add("ε", channel.diagnostics.epsilon.toExponential(0));
+  const { epsilon } = channel.diagnostics;
+  add(epsilon === undefined ? "regulariser" : "ε", epsilon === undefined ? "from the data" : short(epsilon));
   $("figures").replaceChildren(...list);
 }
 
@@ -298,9 +287,11 @@ function drawCurve() {
   const when = (key, of = (v) => v) => snapshots.filter((s) => s[key] !== undefined).map((s) => [s.until_s / 86400, of(s[key])]);
   const plots = {
     rho: { x: "degree ℓ", low: 0, high: 1.05, lines: [["map", byDegree(spectra?.rho)], ["its noise subtracted", byDegree(spectra?.rho_noise_subtracted)]] },
-    cl: { x: "degree ℓ", y: "K²", log: true, lines: [["map", byDegree(spectra?.cl_map)], ["input", byDegree(spectra?.cl_truth)], ["noise", byDegree(spectra?.cl_noise)]] },
-    snr: { x: "degree ℓ", log: true, lines: [["SNR", byDegree(spectra?.snr)]] },
-    growth: { x: "mission time, days", low: 0, lines: [["rms error / rms sky", when("rms_error_over_rms_truth")], ["mean ρ", when("rho_mean")]] },
+    cl: { x: "degree ℓ", y: "K²", log: true, lines: [["map", byDegree(spectra?.cl_map)], ["input", byDegree(spectra?.cl_truth)], ["noise floor", byDegree(spectra?.cl_noise)]] },
+    // Without a truth, noise and sky together are told from noise alone.
+    snr: { x: "degree ℓ", log: true, lines: [["SNR against the input", byDegree(spectra?.snr)],
+      ["Cℓ of the map / Cℓ of its noise", spectra?.snr || !spectra?.cl_noise ? [] : byDegree(spectra.cl_map.map((v, l) => v / spectra.cl_noise[l]))]] },
+    growth: { x: "UTC", low: 0, when: channel?.epoch_tai_s, lines: [["rms error / rms sky", when("rms_error_over_rms_truth")], ["mean ρ", when("rho_mean")]] },
   };
   const plot = plots[state.curve];
   if (state.curve === "growth" && plot.lines.every(([, points]) => points.length === 0)) {
@@ -311,7 +302,8 @@ function drawCurve() {
   c.font = "11px system-ui, sans-serif"; c.fillStyle = css("--quiet");
   if (!all.length) {
     c.textAlign = "center";
-    c.fillText(channel ? "needs the input sky, which only a simulation has" : "curves begin with the first map", box.width / 2, box.height / 2);
+    const without = state.curve === "rho" ? "needs the input sky, which only a simulation has" : state.curve === "snr" && channel?.is_noiseless ? "the data are without noise" : "without the input sky, spectra are computed up to nside 64";
+    c.fillText(channel ? without : "curves begin with the first map", box.width / 2, box.height / 2);
     return;
   }
   const t = plot.log ? Math.log10 : (v) => v;
@@ -330,9 +322,10 @@ function drawCurve() {
     c.fillText(plot.log ? `1e${v}` : short(v), left - 6, y);
   }
   c.textAlign = "center"; c.textBaseline = "alphabetic";
-  for (const v of ticks(x0, x1, nice(x1 - x0, 5))) {
+  const step = nice(x1 - x0, plot.when === undefined ? 5 : 3);
+  for (const v of ticks(x0, x1, step)) {
     c.beginPath(); c.moveTo(px(v), top); c.lineTo(px(v), top + h); c.stroke();
-    c.fillText(short(v), px(v), top + h + 14);
+    c.fillText(plot.when === undefined ? short(v) : utc(plot.when, v * 86400).slice(0, step < 1 ? 16 : 10), px(v), top + h + 14);
   }
   c.fillText(plot.x, left + w / 2, top + h + 27);
   if (plot.y) { c.textAlign = "left"; c.fillText(plot.y, 4, 12); }
@@ -361,7 +354,7 @@ async function fetchGaps() {
   const { gaps, restarts } = await answer.json();
   const rows = gaps.slice(0, 50);
   const head = make("tr", {}, ...["APID", "from", "to", "lost, h", "gain, %"].map((name) => make("th", { scope: "col" }, name)));
-  $("gaps").replaceChildren(head, ...rows.map((gap) => make("tr", {}, make("td", {}, `0x${gap.apid.toString(16)}`), make("td", {}, String(gap.from)), make("td", {}, String(gap.to)), make("td", {}, (gap.integration_s / 3600).toFixed(3)), make("td", {}, (100 * gap.gain).toFixed(4)))));
+  $("gaps").replaceChildren(head, ...rows.map((gap) => make("tr", {}, make("td", {}, `0x${gap.apid.toString(16)}`), make("td", {}, String(gap.from)), make("td", {}, String(gap.to)), make("td", {}, short(gap.integration_s / 3600)), make("td", {}, short(100 * gap.gain)))));
   $("gaps").hidden = rows.length === 0;
   $("gapsnote").textContent = (gaps.length ? `${gaps.length} gaps, most valuable first, as of the last checkpoint` : "No packets are missing between those received, as of the last checkpoint.") + (restarts?.length ? `; ${restarts.length} restarts of the counts` : "");
   $("copy").onclick = () => copyText(gaps.map((gap) => `0x${gap.apid.toString(16)} ${gap.from} ${gap.to}`).join("\n"));
@@ -395,7 +388,7 @@ function drawArray() {
   $("powersbox").hidden = !state.powers;
   if (!sky) return;
   const colours = sky.palettes[$("palette").value];
-  drawUvw($("uvw"), state.density, colours); drawPowers($("powers"), state.powers, colours);
+  drawUvw($("uvw"), state.density, colours); drawPowers($("powers"), state.powers, colours, state.geometry?.epoch_tai_s ?? NaN);
 }
 
 function redraw() { draw(); drawCurve(); passes.draw(); drawArray(); }
@@ -409,7 +402,7 @@ function update(status) {
   const phase = $("phase");
   phase.textContent = status.phase === "ended" && status.cancelled ? "ended early" : status.phase; phase.className = `chip ${status.phase}`;
   phase.title = status.error ?? "";
-  $("elapsed").textContent = clock(status.elapsed_s);
+  $("elapsed").textContent = `for ${clock(status.elapsed_s)}`;
   showStages(status.stages); showSolver(status.solving); showLedger(status.ledger, status.phase); showReception(status);
   showChannels(status.channels);
   $("gapspanel").hidden = !status.has_state;
@@ -421,9 +414,11 @@ function update(status) {
   const sections = document.querySelectorAll(".sky, .quality, .passes, .orbit, .uvw");
   for (const section of sections) section.hidden = status.segment === "space";
   const channel = channelNow() ?? status.channels[0];
-  if (!channel) return;
+  if (!channel) { $("waiting").textContent = waitingFor(status, state.config); return; }
   state.channel = channel.channel;
-  for (const option of $("show").options) if (["input", "error"].includes(option.value)) option.hidden = option.disabled = !channel.has_input;
+  const has = { input: channel.has_input, error: channel.has_input, sigma: channel.has_errors, mask: channel.has_errors, resolution: channel.has_errors };
+  for (const option of $("show").options) option.hidden = option.disabled = has[option.value] === false;
+  if ($("show").selectedOptions[0].disabled) choose("map");
   const latest = channel.held.at(-1), isNew = !channel.held.includes(state.number);
   const news = `${channel.channel}/${latest}/${channel.is_final}`;
   if (state.follows || isNew) {
@@ -438,9 +433,19 @@ function update(status) {
 /** Shows whether the page is connected, the age of its data if not, and whether another run has started. */
 function stale(is) {
   document.body.classList.toggle("stale", is);
-  const began = state.began ? ` · another run since ${state.began.toISOString().slice(0, 19)}Z` : "";
+  const began = state.began ? ` · another run since ${dateOf(state.began)} UTC` : "";
   const age = state.heardAt ? clock((Date.now() - state.heardAt) / 1000) : null;
   $("link").textContent = is ? `▲ not connected: ${age === null ? "nothing is known" : `what is shown is ${age} old`}` : `● live${began}`;
+}
+
+/** Seconds since 1970 by the server's clock. */
+const now = () => state.status.unix_s + (Date.now() - state.heardAt) / 1000;
+function tick() {
+  if (document.body.classList.contains("stale")) stale(true);
+  if (!state.status) return;
+  $("utc").textContent = `${dateOf(now())} UTC`;
+  showVitals(state.status, state.geometry, state.heardAt);
+  caption();
 }
 
 
@@ -448,22 +453,23 @@ function listen() {
   const source = new EventSource("/events");
   source.addEventListener("open", () => { stale(false); });
   source.addEventListener("error", () => stale(true));
-  setInterval(() => { if (document.body.classList.contains("stale")) stale(true); }, 1000);
+  setInterval(tick, 1000);
   source.addEventListener("status", (event) => {
     const status = JSON.parse(event.data);
     // Another run has started: cached data are of the old one.
     if (state.status && status.up_s < state.status.up_s - 1) {
-      state.began = new Date(Date.now() - 1000 * status.up_s);
+      state.began = status.unix_s - status.up_s;
       state.maps.clear(); state.figures.clear(); state.number = null; state.news = null; state.arrayKnown = null; $("log").replaceChildren();
     }
     state.heardAt = Date.now();
     stale(false);
     update(status);
+    tick();
   });
   source.addEventListener("log", (event) => {
     const entry = JSON.parse(event.data), log = $("log");
     if ([...log.children].some((item) => item.dataset.id === String(entry.id))) return;
-    const item = make("li", {}, make("time", {}, clock(entry.elapsed_s)), make("span", entry.is_bad ? { class: "bad" } : {}, entry.text));
+    const item = make("li", {}, make("time", { title: `${dateOf(entry.unix_s)} UTC` }, dateOf(entry.unix_s).slice(5)), make("span", entry.is_bad ? { class: "bad" } : {}, entry.text));
     item.dataset.id = entry.id;
     log.prepend(item);
     while (log.children.length > 256) log.lastChild.remove();
@@ -496,22 +502,56 @@ function setView(change) {
 }
 function press(button, on) { button.setAttribute("aria-pressed", String(on)); }
 function play(on) { state.playing = on; press($("play"), on); $("play").textContent = on ? "❚❚" : "▶"; if (on) { const held = channelNow()?.held; if (held && state.number === held.at(-1)) chooseNumber(held, 0); } }
-function blink(on) { state.blink = on; state.blinkOn = false; press($("blink"), on); showSky(); }
+function blink(on) { if (on) $("show").value = "map"; state.blink = on; state.blinkOn = false; press($("blink"), on); showSky(); }
+function choose(show) { $("show").value = show; if (state.blink) blink(false); else showSky(); }
+
+/** Fills the window, or the screen, with the sky, which plays from the first map to the newest, channel after channel. */
+function kiosk(on) {
+  if (on) choose("map");
+  state.kiosk = on; state.lasted = 0; play(false);
+  document.body.classList.toggle("kiosk", on);
+  // Browsers refuse the screen without a gesture; it then fills the window.
+  if (on && navigator.userActivation?.isActive) document.documentElement.requestFullscreen?.().catch(() => {});
+  if (!on && document.fullscreenElement) document.exitFullscreen();
+  const held = channelNow()?.held;
+  if (held) chooseNumber(held, on ? 0 : held.length - 1);
+  redraw();
+}
+function kioskStep() {
+  const channels = state.status?.channels ?? [], held = channelNow()?.held ?? [], at = held.indexOf(state.number);
+  if (!state.kiosk || document.hidden || !held.length) return;
+  if (at < held.length - 1) return chooseNumber(held, at + 1);
+  if (++state.lasted < KIOSK_LAST) return;
+  state.lasted = 0;
+  const next = channels[(channels.findIndex((c) => c.channel === state.channel) + 1) % channels.length];
+  chooseChannel(next.channel); chooseNumber(next.held, 0);
+}
+/** What the kiosk shows, and how old it is. */
+function caption() {
+  const { status } = state, channel = channelNow();
+  if (!state.kiosk || !status) return;
+  const what = channel ? `${channel.frequency_hz / 1e6} MHz · ${$("which").textContent}` : "";
+  $("caption").replaceChildren(make("b", {}, status.name), make("span", {}, what), make("span", {}, `${status.phase} · ${$("utc").textContent} · ${$("link").textContent}`));
+}
 function step(by) { const held = channelNow()?.held; if (held) chooseNumber(held, Math.min(held.length - 1, Math.max(0, held.indexOf(state.number) + by))); }
 function cycle(select) { const options = [...select.options].filter((o) => !o.disabled); select.value = options[(options.findIndex((o) => o.value === select.value) + 1) % options.length].value; select.dispatchEvent(new Event("change")); }
 function theme(name) { document.documentElement.dataset.theme = name; stored("theme", name); redraw(); }
 
 function controls() {
   setInterval(() => { if (state.playing) { const held = channelNow()?.held ?? [], at = held.indexOf(state.number); if (at < 0 || at >= held.length - 1) play(false); else chooseNumber(held, at + 1); } }, PLAY_MS);
+  setInterval(kioskStep, KIOSK_MS);
   setInterval(() => { if (state.blink && !document.hidden) { state.blinkOn = !state.blinkOn; showSky(); } }, BLINK_MS);
   $("play").addEventListener("click", () => play(!state.playing));
   $("blink").addEventListener("click", () => blink(!state.blink));
   $("slider").addEventListener("input", () => { play(false); chooseNumber(channelNow()?.held ?? [], Number($("slider").value)); });
-  for (const id of ["show", "scale", "palette", "smooth", "marks", "from", "to"]) $(id).addEventListener("change", () => { if (["scale", "palette"].includes(id)) stored(id, $(id).value); if (id === "palette") drawArray(); showSky(); });
+  $("show").addEventListener("change", () => choose($("show").value));
+  for (const id of ["scale", "palette", "smooth", "marks", "from", "to"]) $(id).addEventListener("change", () => { if (["scale", "palette"].includes(id)) stored(id, $(id).value); if (id === "palette") drawArray(); showSky(); });
   $("fixed").addEventListener("change", () => { for (const id of ["from", "to"]) $(id).disabled = !$("fixed").checked; showSky(); });
   for (const id of ["projection", "frame"]) $(id).addEventListener("change", () => setView({ [id]: $(id).value }));
   for (const tab of $("curves").children) tab.addEventListener("click", () => { state.curve = tab.dataset.curve; for (const other of $("curves").children) other.setAttribute("aria-selected", String(other === tab)); drawCurve(); });
   $("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
+  $("kiosk").addEventListener("click", () => kiosk(true));
+  addEventListener("fullscreenchange", () => { if (state.kiosk && !document.fullscreenElement) kiosk(false); });
   $("help").addEventListener("click", () => $("keys").showModal());
   const stage = $("stage");
   let drag = null;
@@ -535,8 +575,8 @@ function controls() {
     const keys = {
       ArrowLeft: () => step(-1), ArrowRight: () => step(1), " ": () => play(!state.playing), "0": () => setView({ lon: 0, lat: 0 }),
       p: () => cycle($("projection")), f: () => cycle($("frame")), s: () => cycle($("scale")), c: () => cycle($("palette")),
-      d: () => { $("show").value = $("show").value === "difference" ? "map" : "difference"; showSky(); },
-      b: () => blink(!state.blink), t: () => $("theme").click(), "?": () => $("keys").showModal(),
+      d: () => choose($("show").value === "difference" ? "map" : "difference"),
+      b: () => blink(!state.blink), k: () => kiosk(!state.kiosk), Escape: () => state.kiosk && kiosk(false), t: () => $("theme").click(), "?": () => $("keys").showModal(),
     };
     if (event.shiftKey && turns[event.key]) setView(turns[event.key]);
     else if (/^[1-9]$/.test(event.key)) { const channel = state.status?.channels[Number(event.key) - 1]; if (channel) chooseChannel(channel.channel); }
@@ -559,5 +599,7 @@ async function begin() {
   controls();
   drawCurve();
   listen();
+  if (location.hash === "#kiosk") kiosk(true);
+  state.config = await fetchOf("/api/config");
 }
 begin();

@@ -8,7 +8,7 @@ const ORDER = Object.keys(NAMES);
 export class Passes {
   constructor(canvas) {
     this.canvas = canvas; this.line = null; this.chosen = null; this.begun = null;
-    this.clock = stored("clock") === "utc" ? "utc" : "days";
+    this.clock = stored("clock") === "days" ? "days" : "utc";
     $("clock").value = this.clock;
     $("clock").addEventListener("change", () => { this.clock = $("clock").value; stored("clock", this.clock); this.draw(); this.tell(); });
     $("allpasses").addEventListener("click", () => this.choose(null));

@@ -335,17 +335,18 @@ export class Sky {
     const steps = (from, to, step) => Array.from({ length: Math.round((to - from) / step) + 1 }, (_, k) => from + k * step);
     for (const lon of steps(0, 330, 30)) line(steps(-90, 90, 2).map((lat) => [lon, lat]));
     for (const lat of steps(-60, 60, 30)) line(steps(0, 360, 2).map((lon) => [lon, lat]));
-    c.font = `${11 * this.ratio}px system-ui, sans-serif`; c.fillStyle = "rgba(255,255,255,.85)"; c.textAlign = "center";
-    c.shadowColor = "#000"; c.shadowBlur = 3 * this.ratio;
+    // White on a dark rim: readable on any colour of the maps.
+    c.font = `600 ${11 * this.ratio}px system-ui, sans-serif`; c.fillStyle = "#fff"; c.textAlign = "center";
+    c.strokeStyle = "#000"; c.lineWidth = 3 * this.ratio; c.lineJoin = "round";
+    const write = (text, x, y) => { c.strokeText(text, x, y); c.fillText(text, x, y); };
     for (const lon of steps(0, 300, 60)) {
       const at = this.project(lon, 0), off = at && Math.abs(at[0] - width / 2) / half[0];
-      if (at && off < 0.93) c.fillText(`${lon}°`, at[0], at[1] - 3 * this.ratio);
+      if (at && off < 0.93) write(`${lon}°`, at[0], at[1] - 3 * this.ratio);
     }
     for (const lat of [-60, -30, 30, 60]) {
       const at = this.project(this.view.lon, lat);
-      if (at) c.fillText(`${lat > 0 ? "+" : "−"}${Math.abs(lat)}°`, at[0] + 16 * this.ratio, at[1] - 3 * this.ratio);
+      if (at) write(`${lat > 0 ? "+" : "−"}${Math.abs(lat)}°`, at[0] + 16 * this.ratio, at[1] - 3 * this.ratio);
     }
-    c.shadowBlur = 0;
   }
 }
 

@@ -6,9 +6,23 @@ export const number = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 export const short = (v) => {
   if (v === null || v === undefined || !Number.isFinite(v)) return "–";
   const a = Math.abs(v);
-  if (a !== 0 && (a >= 1e5 || a < 1e-2)) return v.toExponential(2).replace("e+", "e");
-  return String(Number(v.toPrecision(a >= 1000 ? 5 : 4)));
+  if (a !== 0 && (a >= 1e5 || a < 1e-2)) return v.toExponential(3).replace("e+", "e");
+  return String(Number(v.toPrecision(a >= 1e4 ? 5 : 4)));
 };
+export const prefixed = (v) => {
+  for (const [size, name] of [[1e9, " G"], [1e6, " M"], [1e3, " k"]]) if (v >= size) return (v / size).toPrecision(3) + name;
+  return v === 0 ? "0 " : v >= 100 ? v.toFixed(0) + " " : v.toPrecision(3) + " ";
+};
+/** Hours, minutes and seconds. */
+export const clock = (s) => {
+  const [h, m, r] = [Math.floor(s / 3600), Math.floor(s / 60) % 60, Math.floor(s) % 60];
+  return (h ? `${h}:` : "") + `${String(m).padStart(h ? 2 : 1, "0")}:${String(r).padStart(2, "0")}`;
+};
+/** An age. */
+export const ago = (s) => `${s < 60 ? `${Math.floor(s)} s` : s < 86400 ? clock(s) : days(s)} ago`;
+export const days = (s) => `${(s / 86400).toFixed(1)} d`;
+/** Date and time, UTC, of seconds since 1970. */
+export const dateOf = (unixS) => { const date = new Date(unixS * 1000); return Number.isNaN(date.getTime()) ? "–" : date.toISOString().slice(0, 19).replace("T", " "); };
 
 export const make = (tag, attributes = {}, ...children) => {
   const node = document.createElement(tag);
@@ -55,6 +69,5 @@ export const learnLeaps = (rows) => { leaps = rows; };
 /** Date and time, UTC, of a mission time. */
 export const utc = (epochTaiS, timeS) => {
   const tai = epochTaiS + timeS - TO_1970_S;
-  const date = new Date((tai - leaps.reduce((behind, [from, s]) => (from <= tai ? s : behind), 10)) * 1000);
-  return Number.isNaN(date.getTime()) ? "–" : date.toISOString().slice(0, 16).replace("T", " ");
+  return dateOf(tai - leaps.reduce((behind, [from, s]) => (from <= tai ? s : behind), 10)).slice(0, 16);
 };

@@ -48,9 +48,6 @@ pub enum FitsProblem {
         /// Error of the operating system.
         source: io::Error,
     },
-    /// A pipe, a device or a folder.
-    #[error("not a regular file; expected one, as a map is read at several places")]
-    NotAFile,
     /// The file is empty.
     #[error("the file is empty; expected a FITS file with a HEALPix map")]
     Empty,

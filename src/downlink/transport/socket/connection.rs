@@ -41,6 +41,8 @@ struct ConnectionState {
     ticket: Result<Option<Ticket>, String>,
     /// When the last bytes arrived.
     arrived: Instant,
+    /// Number of faults in the stream that are counted for its station.
+    faults: u64,
 }
 
 /// The slot of a connection, which is released when this is dropped.
@@ -100,6 +102,9 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         ticket = state.ticket;
         station = preamble.station().map(str::to_owned);
         counters = state.receiver.stream_counters();
+        if let Some(station) = &station {
+            shared.listening.write().record_bytes(station, 0, counters.faults() - state.faults, false);
+        }
         status.done.fetch_add(u64::from(state.receiver.has_valid()), Ordering::Relaxed);
     }
     let synced = sync(ticket, &shared).await;
@@ -154,6 +159,7 @@ async fn exchange(
         mark: 0,
         ticket: Ok(None),
         arrived: Instant::now(),
+        faults: 0,
     };
     // Time without a valid packet or frame, without the time in which the connection waited for the ground.
     let mut silence = Duration::ZERO;
@@ -175,7 +181,9 @@ async fn exchange(
         state = returned;
         let Activity { has_valid, has_new } = activity.unwrap_or_default();
         if let Some(station) = state.receiver.preamble().station() {
-            shared.listening.write().record_bytes(station, read as u64, has_valid);
+            let faults = state.receiver.stream_counters().faults();
+            shared.listening.write().record_bytes(station, read as u64, faults - state.faults, has_valid);
+            state.faults = faults;
         }
         if has_valid {
             silence = Duration::ZERO;

@@ -83,6 +83,13 @@ impl ConnectionEnd {
     ];
 }
 
+impl ConnectionEnd {
+    /// Whether neither the sender nor its connection is to blame.
+    fn is_regular(self) -> bool {
+        matches!(self, Self::Whole | Self::Stopped | Self::GaveWay)
+    }
+}
+
 impl fmt::Display for ConnectionEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -189,6 +196,10 @@ impl fmt::Display for ListenNote<'_> {
 pub struct StationCounts {
     /// Number of its connections that have ended.
     pub connections: u64,
+    /// Those among them that ended otherwise than by the sender, by the end of the run, or for another sender's place.
+    pub broken: u64,
+    /// Number of faults in its streams: see [`ReceptionCounters::faults`].
+    pub faults: u64,
     /// Number of bytes read, including those of open connections.
     pub bytes: u64,
     /// Number of valid packets that ended connections have forwarded to the ground.
@@ -260,13 +271,14 @@ impl ListenReport {
         self.stations.extend(names.map(|name| (name.to_owned(), StationCounts::default())));
     }
 
-    /// Counts bytes from a station; `has_valid` if there was a valid packet or frame among them.
-    pub(super) fn record_bytes(&mut self, station: &str, bytes: u64, has_valid: bool) {
+    /// Counts bytes from a station and faults among them; `has_valid` if there was a valid packet or frame, too.
+    pub(super) fn record_bytes(&mut self, station: &str, bytes: u64, faults: u64, has_valid: bool) {
         if !self.stations.contains_key(station) {
             self.stations.insert(station.to_owned(), StationCounts::default());
         }
         if let Some(counts) = self.stations.get_mut(station) {
             counts.bytes += bytes;
+            counts.faults += faults;
             counts.heard = if has_valid { Some(Instant::now()) } else { counts.heard };
         }
     }
@@ -278,6 +290,7 @@ impl ListenReport {
         if let Some(counts) = report.station.as_ref().and_then(|name| self.stations.get_mut(name)) {
             counts.connections += 1;
             counts.packets += report.packets;
+            counts.broken += u64::from(!report.ended.is_regular());
         }
         *self.ended.entry(report.ended).or_default() += 1;
         self.senders.push(report);

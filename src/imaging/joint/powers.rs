@@ -1,0 +1,377 @@
+//! Total powers of the daughters as rows beside the visibilities of a channel.
+//!
+//! ```text
+//! P(t) = (1 + g) (Int T (1 - M) dn + constant) + (o + s t) <P> + n,   t from -1/2 to 1/2 over the pass.
+//! ```
+//!
+//! Gain g, offset o and slope s are free in every pass of every daughter, with Gaussian priors, and are marginalised: with the columns C of
+//! the three, in units of their priors, N^-1 becomes `N^-1 - N^-1 C (C'N^-1 C + I)^-1 C'N^-1`. The column of the gain is the power itself.
+//! It is taken from the measured power at first and then from the map, in rounds. The gain stays part of the noise in all of them: fitted as a
+//! number it would make the sky too bright by the square of its prior.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use faer::{Mat, Side};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::disc::{Disc, Discs, visible_sr};
+use crate::imaging::SkyPower;
+use crate::numerics::legendre::Legendre;
+use crate::units::vector::{Vec3, add, dot, norm, scale, unit};
+
+/// Powers farther apart than this are of two passes, s.
+const GAP_S: f64 = 600.0;
+/// The longest pass, about an orbit, s.
+const PASS_S: f64 = 8000.0;
+/// Motion of the Moon over which powers are averaged, in units of 1 / l_max: the highest degree loses `0.7^2 / 24`, 2 %.
+const AVERAGED_RAD_L: f64 = 0.7;
+/// The longest such motion.
+const AVERAGED_DEG_MAX: f64 = 2.0;
+/// Highest degree of the blocks that precondition; powers have little of higher ones.
+const BLOCK_DEGREES: usize = 48;
+/// Free numbers of a pass.
+const NUISANCES: usize = 3;
+
+/// A total power of a daughter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PowerSample {
+    /// Number of the daughter, from 0.
+    pub daughter: u8,
+    /// Middle of the integration, s.
+    pub time_s: f64,
+    /// Position relative to the Moon, ecliptic, m.
+    pub r_m: Vec3,
+    /// Power, K sr.
+    pub power_k_sr: f64,
+    /// Standard deviation of its noise, K sr.
+    pub sigma_k_sr: f64,
+}
+
+/// Standard deviations of what is free in every pass of every daughter, and what the powers have beside the sky.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PowerPriors {
+    /// Gain of the power, as a fraction.
+    pub gain: f64,
+    /// Offset, as a fraction of the mean power of the pass.
+    pub offset: f64,
+    /// Change of the offset from the start to the end of the pass, as a fraction of the same.
+    pub slope: f64,
+    /// Receiver noise and the Moon's own emission, K sr: one value, or one for each channel in order of frequency.
+    pub constant_k_sr: Vec<f64>,
+}
+
+/// How the powers of a channel take part in its map.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PowerAgreement {
+    /// Rows, each an average of consecutive integrations.
+    pub rows: usize,
+    /// Passes of the daughters, each with a gain, an offset and a slope of its own.
+    pub passes: usize,
+    /// Reduced chi-square of the powers with the map; what exceeds 1 counts as noise.
+    pub chi_square: f64,
+}
+
+/// The powers of a channel.
+pub(super) struct PowerRows {
+    l_max: usize,
+    discs: Vec<Disc>,
+    operator: Discs,
+    power_k_sr: Vec<f64>,
+    /// Number of independent samples in each row.
+    samples: Vec<f64>,
+    /// Time from -1/2 to 1/2 over the pass.
+    time: Vec<f64>,
+    passes: Vec<Range<usize>>,
+    priors: [f64; NUISANCES],
+    constant_k_sr: f64,
+    /// Variance of what the sky has beyond l_max, (K sr)^2, times the number of rows that share it.
+    beyond: Vec<f64>,
+}
+
+/// The rows with their marginalised weights.
+pub(super) struct WeightedRows<'a> {
+    rows: &'a PowerRows,
+    /// Factor of the variances beyond noise and priors.
+    noise: f64,
+    weights: Vec<f64>,
+    /// G of `N^-1 - G G'` in each pass.
+    columns: Vec<[f64; NUISANCES]>,
+}
+
+/// An average of consecutive powers: sums weighted by the numbers of samples.
+#[derive(Clone, Copy, Default)]
+struct Average {
+    samples: f64,
+    power: f64,
+    time: f64,
+    radius: f64,
+    position: Vec3,
+    start: Vec3,
+}
+
+impl Average {
+    fn add(&mut self, sample: &PowerSample) {
+        let count = (sample.power_k_sr / sample.sigma_k_sr).powi(2);
+        self.samples += count;
+        self.power += count * sample.power_k_sr;
+        self.time += count * sample.time_s;
+        self.radius += count * norm(sample.r_m);
+        self.position = add(self.position, scale(count, sample.r_m));
+    }
+}
+
+impl PowerRows {
+    /// Averages the powers of a channel, which are by daughter and time; `None` if there are none.
+    pub(super) fn new(
+        samples: &[PowerSample],
+        moon_radius_m: f64,
+        sky: &SkyPower,
+        priors: &PowerPriors,
+        constant_k_sr: f64,
+    ) -> Option<Self> {
+        let l_max = sky.power_k2.len() - 1;
+        let turn_rad = (AVERAGED_RAD_L / l_max.max(1) as f64).min(AVERAGED_DEG_MAX.to_radians());
+        let (averages, passes) = averaged(samples, turn_rad.cos());
+        let disc = |average: &Average| Disc {
+            direction: unit(scale(-1.0, average.position)),
+            cos_radius: (1.0 - (moon_radius_m * average.samples / average.radius).powi(2)).max(0.0).sqrt(),
+        };
+        let discs: Vec<Disc> = averages.iter().map(disc).collect();
+        let middle = discs.get(discs.len() / 2)?;
+        let variance = variance_beyond(sky, middle.cos_radius);
+        let times: Vec<f64> = averages.iter().map(|average| average.time / average.samples).collect();
+        let time = passes.iter().flat_map(|pass| {
+            let [first, last] = [times[pass.start], times[pass.end - 1]];
+            let length = if last > first { last - first } else { 1.0 };
+            times[pass.clone()].iter().map(move |t| (t - 0.5 * (first + last)) / length)
+        });
+        Some(Self {
+            l_max,
+            operator: Discs::new(l_max, &discs),
+            time: time.collect(),
+            beyond: sharing(&discs, l_max).into_iter().map(|rows| rows * variance).collect(),
+            discs,
+            power_k_sr: averages.iter().map(|average| average.power / average.samples).collect(),
+            samples: averages.iter().map(|average| average.samples).collect(),
+            passes,
+            priors: [priors.gain, priors.offset, priors.slope],
+            constant_k_sr,
+        })
+    }
+
+    pub(super) fn measured(&self) -> Vec<f64> {
+        self.power_k_sr.clone()
+    }
+
+    /// The powers that a map of these unknowns has.
+    pub(super) fn model(&self, x: &[f64]) -> Vec<f64> {
+        self.operator.powers(x).into_iter().map(|power| power + self.constant_k_sr).collect()
+    }
+
+    /// Marginalises gains, offsets and slopes for powers near `model`. `noise` multiplies the variance of what is left.
+    pub(super) fn weighted(&self, model: &[f64], noise: f64) -> WeightedRows<'_> {
+        let variance = |((power, samples), beyond): ((&f64, &f64), &f64)| power * power / samples + beyond;
+        let weights: Vec<f64> = model
+            .iter()
+            .zip(&self.samples)
+            .zip(&self.beyond)
+            .map(|row| (noise * variance(row)).recip())
+            .collect();
+        let columns = self.passes.par_iter().flat_map_iter(|pass| {
+            let mean = self.power_k_sr[pass.clone()].iter().sum::<f64>() / pass.len() as f64;
+            let free: Vec<[f64; NUISANCES]> = pass
+                .clone()
+                .map(|row| {
+                    let [gain, offset, slope] = self.priors;
+                    [gain * model[row], offset * mean, slope * mean * self.time[row]]
+                })
+                .collect();
+            projection(&free, &weights[pass.clone()])
+        });
+        WeightedRows { rows: self, noise, columns: columns.collect(), weights }
+    }
+}
+
+impl WeightedRows<'_> {
+    /// Multiplies a vector of rows by the marginalised weights.
+    fn weigh(&self, rows: &[f64]) -> Vec<f64> {
+        let of_pass = |pass: &Range<usize>| {
+            let mut sums = [0.0; NUISANCES];
+            for row in pass.clone() {
+                sums.iter_mut().zip(self.columns[row]).for_each(|(sum, g)| *sum += g * rows[row]);
+            }
+            let free =
+                move |row: usize| self.columns[row].iter().zip(sums).map(|(g, sum)| g * sum).sum::<f64>();
+            pass.clone().map(move |row| self.weights[row] * rows[row] - free(row))
+        };
+        self.rows.passes.iter().flat_map(of_pass).collect()
+    }
+
+    /// Multiplies a map's unknowns by the normal matrix of the powers.
+    pub(super) fn product(&self, x: &[f64]) -> Vec<f64> {
+        self.rows.operator.transposed(&self.weigh(&self.rows.operator.powers(x)))
+    }
+
+    fn sky_k_sr(&self) -> Vec<f64> {
+        self.rows.power_k_sr.iter().map(|power| power - self.rows.constant_k_sr).collect()
+    }
+
+    pub(super) fn right_hand_side(&self) -> Vec<f64> {
+        self.rows.operator.transposed(&self.weigh(&self.sky_k_sr()))
+    }
+
+    /// Agreement of the powers with a map.
+    pub(super) fn agreement(&self, x: &[f64]) -> PowerAgreement {
+        let sky = self.rows.operator.powers(x);
+        let residuals: Vec<f64> = self.sky_k_sr().iter().zip(sky).map(|(a, b)| a - b).collect();
+        let square: f64 = residuals.iter().zip(self.weigh(&residuals)).map(|(a, b)| a * b).sum();
+        let rows = residuals.len();
+        PowerAgreement { rows, passes: self.rows.passes.len(), chi_square: self.noise * square / rows as f64 }
+    }
+
+    /// The blocks of the normal matrix, averaged over turns about the pole, by order and parity as those of the visibilities.
+    pub(super) fn blocks(&self) -> Vec<Mat<f64>> {
+        let l_max = self.rows.l_max;
+        let highest = l_max.min(BLOCK_DEGREES);
+        let points: Vec<(f64, f64)> = self.rows.discs.iter().map(|disc| cos_sin(disc.direction)).collect();
+        let turns: Vec<f64> =
+            self.rows.discs.iter().map(|disc| disc.direction[1].atan2(disc.direction[0])).collect();
+        let middle = self.rows.discs.len() / 2;
+        let visible = visible_sr(highest, self.rows.discs[middle].cos_radius);
+        let legendre = Legendre::new(highest, points.into_iter());
+        let ones = vec![1.0; turns.len()];
+        let of_order = |m: usize| -> [Mat<f64>; 2] {
+            let lambda = if m <= highest { legendre.rows::<f64>(m, &ones) } else { Vec::new() };
+            let of_parity = |parity: usize| {
+                let size = (l_max + 2).saturating_sub(m + parity) / 2;
+                let mut block = Mat::<f64>::zeros(size, size);
+                if m <= highest {
+                    let degrees: Vec<usize> = (m + parity..=highest).step_by(2).collect();
+                    let rows = |l: &usize| &lambda[(l - m) * turns.len()..][..turns.len()];
+                    let found = self.block(&degrees.iter().map(rows).collect::<Vec<_>>(), m, &turns);
+                    for (j, l) in degrees.iter().enumerate() {
+                        for (i, k) in degrees.iter().enumerate() {
+                            block[(i, j)] = visible[*k] * found[(i, j)] * visible[*l];
+                        }
+                    }
+                }
+                block
+            };
+            [0, 1].map(of_parity)
+        };
+        let orders: Vec<[Mat<f64>; 2]> = (0..=l_max).into_par_iter().map(of_order).collect();
+        orders.into_iter().flatten().filter(|block| block.nrows() > 0).collect()
+    }
+
+    /// `Y (N^-1 - G G') Y'` of harmonics at the discs, averaged over turns.
+    fn block(&self, lambda: &[&[f64]], m: usize, turns: &[f64]) -> Mat<f64> {
+        let count = lambda.len();
+        let weighted = Mat::from_fn(turns.len(), count, |row, k| self.weights[row].sqrt() * lambda[k][row]);
+        let mut block = weighted.transpose() * &weighted;
+        let mut free = Mat::<f64>::zeros(2 * NUISANCES * self.rows.passes.len(), count);
+        for (number, pass) in self.rows.passes.iter().enumerate() {
+            for row in pass.clone() {
+                let (sin, cos) = (m as f64 * turns[row]).sin_cos();
+                for (which, g) in self.columns[row].iter().enumerate() {
+                    let at = 2 * (NUISANCES * number + which);
+                    for (k, lambda) in lambda.iter().enumerate() {
+                        free[(at, k)] += g * cos * lambda[row];
+                        free[(at + 1, k)] += g * sin * lambda[row];
+                    }
+                }
+            }
+        }
+        block -= free.transpose() * &free;
+        block
+    }
+}
+
+fn cos_sin([x, y, z]: Vec3) -> (f64, f64) {
+    // Not at a pole, where Legendre functions have no logarithm.
+    (z, x.hypot(y).max(1e-12))
+}
+
+/// Averages powers while the Moon turns by less than an angle. Returns the averages, and those of each pass of each daughter.
+fn averaged(samples: &[PowerSample], cos_turn: f64) -> (Vec<Average>, Vec<Range<usize>>) {
+    let is_good = |sample: &&PowerSample| {
+        let positive = sample.power_k_sr > 0.0 && sample.sigma_k_sr > 0.0;
+        positive && sample.power_k_sr.is_finite() && sample.sigma_k_sr.is_finite() && norm(sample.r_m) > 0.0
+    };
+    let (mut averages, mut passes) = (Vec::<Average>::new(), Vec::<Range<usize>>::new());
+    let mut before: Option<&PowerSample> = None;
+    let mut start_s = 0.0;
+    for sample in samples.iter().filter(is_good) {
+        let direction = unit(sample.r_m);
+        let is_of_pass = |before: &PowerSample| {
+            let is_near = sample.time_s - before.time_s < GAP_S && sample.time_s - start_s < PASS_S;
+            before.daughter == sample.daughter && is_near
+        };
+        let goes_on = before.is_some_and(is_of_pass);
+        if !goes_on {
+            start_s = sample.time_s;
+        }
+        let is_near = averages.last().is_some_and(|average| dot(average.start, direction) > cos_turn);
+        if !(goes_on && is_near) {
+            averages.push(Average { start: direction, ..Average::default() });
+            match passes.last_mut() {
+                Some(pass) if goes_on => pass.end = averages.len(),
+                _ => passes.push(averages.len() - 1..averages.len()),
+            }
+        }
+        if let Some(average) = averages.last_mut() {
+            average.add(sample);
+        }
+        before = Some(sample);
+    }
+    (averages, passes)
+}
+
+/// The columns G of `N^-1 - G G' = N^-1 - N^-1 C (C'N^-1 C + I)^-1 C'N^-1`, row by row.
+fn projection(free: &[[f64; NUISANCES]], weights: &[f64]) -> Vec<[f64; NUISANCES]> {
+    let mut matrix = Mat::<f64>::identity(NUISANCES, NUISANCES);
+    for (c, w) in free.iter().zip(weights) {
+        for i in 0..NUISANCES {
+            for j in 0..NUISANCES {
+                matrix[(i, j)] += c[i] * w * c[j];
+            }
+        }
+    }
+    // Its eigenvalues are at least 1, so that only numbers that are not finite have no factor.
+    let Ok(factor) = matrix.llt(Side::Lower) else { return vec![[0.0; NUISANCES]; free.len()] };
+    let lower = factor.L();
+    let of_row = |(c, w): (&[f64; NUISANCES], &f64)| {
+        let mut g = [0.0; NUISANCES];
+        for i in 0..NUISANCES {
+            let known: f64 = (0..i).map(|j| lower[(i, j)] * g[j]).sum();
+            g[i] = (w * c[i] - known) / lower[(i, i)];
+        }
+        g
+    };
+    free.iter().zip(weights).map(of_row).collect()
+}
+
+/// Variance of a power from what the sky has beyond l_max, with C_l continued as it ends.
+fn variance_beyond(sky: &SkyPower, cos_radius: f64) -> f64 {
+    let first = sky.power_k2.len();
+    let visible = visible_sr(4 * first, cos_radius);
+    let term = |l: usize| {
+        (2 * l + 1) as f64 / (4.0 * std::f64::consts::PI) * sky.continued_k2(l) * visible[l].powi(2)
+    };
+    (first..=4 * first).map(term).sum()
+}
+
+/// For each disc the number of those that see the same structure beyond l_max: those in its cell of half a wavelength of that degree.
+fn sharing(discs: &[Disc], l_max: usize) -> Vec<f64> {
+    let step = std::f64::consts::PI / (l_max + 1) as f64;
+    let cell = |disc: &Disc| {
+        let [x, y, z] = disc.direction;
+        let ring = (z.clamp(-1.0, 1.0).acos() / step) as i64;
+        let circumference = ((ring as f64 + 0.5) * step).sin();
+        (ring, (y.atan2(x) * circumference / step).floor() as i64)
+    };
+    let mut counts: BTreeMap<(i64, i64), f64> = BTreeMap::new();
+    discs.iter().for_each(|disc| *counts.entry(cell(disc)).or_default() += 1.0);
+    discs.iter().map(|disc| counts[&cell(disc)]).collect()
+}
