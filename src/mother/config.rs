@@ -374,7 +374,7 @@ impl SpacecraftConfig {
         check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
         let loudest = self.receiver_k_sr().into_iter().fold(0.0, f64::max);
         let expected = "at most 1e10 K sr with receiver_knee_hz and interference_floor_k_sr: beyond, nothing of the sky is left";
-        checks.number("receiver_noise_k_sr", loudest, !(loudest > RECEIVER_K_SR_MAX), expected);
+        checks.number("receiver_noise_k_sr", loudest, loudest <= RECEIVER_K_SR_MAX, expected);
     }
 
     /// Rule of the integration time.
