@@ -28,34 +28,47 @@ keys! {
         /// Number of daughters on the circle.
         everyday satellites: usize = 8;
         /// Altitude of the circular orbit, or of the semi-major axis.
+        #[only_with("no array.kepler and no array.oem")]
         everyday altitude_m: f64 = 300e3;
         /// Radius of the Moon.
         expert moon_radius_m: f64 = MOON_RADIUS_M;
         /// Inclination to the ecliptic.
+        #[only_with("no array.kepler and no array.oem")]
         everyday inclination_deg: f64 = 30.0;
         /// Orbital period.
+        #[only_with("no array.kepler and no array.oem")]
         expert orbital_period_s: f64 = 8_248.68;
         /// Period of the precession of the node.
+        #[only_with("no array.kepler and no array.oem")]
         expert precession_period_s: f64 = 1.3 * YEAR_S;
         /// Sense of the precession: "regress" or "advance".
+        #[only_with("no array.kepler and no array.oem")]
         expert node_motion: NodeMotion = NodeMotion::Regress;
         /// Orbital phase of daughter 1 at the epoch.
+        #[only_with("no array.kepler and no array.oem")]
         expert orbital_phase_deg: f64 = 0.0;
         /// Longitude of the ascending node at the epoch.
+        #[only_with("no array.kepler and no array.oem")]
         expert node_longitude_deg: f64 = 0.0;
         /// Eccentricity of the formation's orbit.
+        #[only_with("no array.kepler and no array.oem")]
         everyday eccentricity: f64 = 0.0;
         /// Argument of the periapsis at the epoch.
+        #[only_with("no array.kepler and no array.oem")]
         expert periapsis_deg: f64 = 0.0;
         /// Rate of the argument of the periapsis.
+        #[only_with("no array.kepler and no array.oem")]
         expert periapsis_rate_deg_per_day: f64 = 0.0;
         /// Maximum distance of each daughter from daughter 1 across the track, over that along it: their orbital planes differ by
         /// this.
+        #[only_with("no array.kepler and no array.oem")]
         expert cross_track_ratio: f64 = 0.0;
         /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except along
         /// `oem` files.
+        #[only_with("no array.oem")]
         expert earth_longitude_deg: f64 = 0.0;
         /// Maximum arcs by which daughters 2, 3, ... trail daughter 1, ascending; empty for those of `breathing`.
+        #[only_with("no array.kepler and no array.oem")]
         expert arcs_m: Vec<f64> = Vec::new();
         /// Kepler orbits, one a satellite, instead of the formation: `{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01,
         /// inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 }` at the epoch, on
@@ -64,8 +77,8 @@ keys! {
         /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, instead of the formation. Their dates fix the mission's
         /// epoch and the Earth's position.
         everyday oem: Vec<PathBuf> = Vec::new();
-        /// Epoch of the mission in the files' time system, such as 2030-01-31T12:00:00; empty for the latest of their first
-        /// usable times.
+        /// Epoch of the mission, in UTC if it ends with Z, else in the files' time system, such as 2030-01-31T12:00:00; empty for
+        /// the latest of their first usable times.
         #[only_with("array.oem")]
         expert oem_epoch: String = String::new();
         /// Numerical integration in the Moon's field (GRGM900C), from the formation at the epoch or from array.kepler. Periods,
@@ -73,6 +86,7 @@ keys! {
         #[serde(skip_serializing_if = "PropagateConfig::is_default")]
         section propagate: PropagateConfig = PropagateConfig::default();
         /// Contraction and expansion of the formation.
+        #[only_with("no array.kepler and no array.oem")]
         section breathing: BreathingConfig = BreathingConfig::default();
     }
 }
@@ -215,7 +229,7 @@ impl ArrayConfig {
         !self.has_own_orbits() && self.eccentricity == 0.0 && self.cross_track_ratio == 0.0
     }
 
-    /// Checks the keys of dates, which orbit files replace.
+    /// Checks the date of the epoch.
     fn check_dates(&self, checks: &mut Checks) {
         let epoch = &self.oem_epoch;
         // Whether a second 60 exists depends on the files' time system.
@@ -223,12 +237,6 @@ impl ArrayConfig {
         let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
         let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
         checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
-        let idle = epoch.is_empty() || !self.oem.is_empty();
-        let expected = "nothing without array.oem: it is a date of its files";
-        checks.require("oem_epoch", format_args!("{epoch:?}"), idle, expected);
-        let idle = self.oem.is_empty() || self.earth_longitude_deg == 0.0;
-        let expected = "nothing with array.oem: the dates of the files say where the Earth is";
-        checks.number("earth_longitude_deg", self.earth_longitude_deg, idle, expected);
     }
 
     /// Checks the Moon, the circular orbit and its breathing.
@@ -280,10 +288,6 @@ impl ArrayConfig {
         let (rate, ratio) = (self.periapsis_rate_deg_per_day, self.cross_track_ratio);
         checks.number("periapsis_rate_deg_per_day", rate, rate.abs() <= 10.0, "-10 to 10 degrees a day");
         checks.number("cross_track_ratio", ratio, ratio.abs() <= 1.0, "-1 to 1");
-        let shaped = eccentricity != 0.0 || ratio != 0.0;
-        let shape = format_args!("{eccentricity}, array.cross_track_ratio = {ratio}");
-        let one = !shaped || self.kepler.is_empty() && self.oem.is_empty();
-        checks.require("eccentricity", shape, one, "0 and 0 where array.kepler or array.oem is given");
     }
 
     /// Checks the arcs between satellites.
@@ -302,16 +306,15 @@ impl ArrayConfig {
 
     /// Checks orbits given for each satellite, by elements or in files.
     fn check_own_orbits(&self, checks: &mut Checks) {
-        let (arcs, orbits, files) = (self.arcs_m.len(), self.kepler.len(), self.oem.len());
+        let (orbits, files) = (self.kepler.len(), self.oem.len());
         let given = format_args!("({orbits} orbits)");
         let fits = orbits == 0 || orbits == self.satellites;
         checks.require("kepler", given, fits, "one for each satellite, or none");
-        checks.require("kepler", given, orbits == 0 || arcs == 0, "none where array.arcs_m is given");
         let given = format_args!("({files} files)");
         let fits = files == 0 || files == self.satellites;
         checks.require("oem", given, fits, "one for each satellite, or none");
-        let one = files == 0 || (orbits == 0 && arcs == 0);
-        checks.require("oem", given, one, "none where array.kepler or array.arcs_m is given");
+        let one = files == 0 || orbits == 0;
+        checks.require("oem", given, one, "none where array.kepler is given");
         let one = files == 0 || !self.propagate.is_on();
         checks.require("oem", given, one, "none where array.propagate.days is given");
     }

@@ -358,13 +358,6 @@ mod tests {
         refused(|c| c.eccentricity = f64::NAN, "array.eccentricity = NaN");
         refused(|c| c.eccentricity = 0.2, "array.eccentricity = 0.2: expected a periapsis above the surface");
         refused(|c| c.cross_track_ratio = 2.0, "array.cross_track_ratio = 2");
-        refused(
-            |c| {
-                c.eccentricity = 0.01;
-                c.kepler = vec![ELEMENTS; 8];
-            },
-            "0 and 0 where array.kepler",
-        );
     }
 
     fn config(kepler: Vec<KeplerElements>) -> ArrayConfig {

@@ -89,6 +89,16 @@ pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     })
 }
 
+/// Parser of a picture to write, as PNG or SVG by its extension. Another extension is likely the name of another file.
+pub(super) fn picture_path() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(|path| {
+        let is_picture = path.extension().is_some_and(|extension| {
+            ["png", "svg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+        });
+        if is_picture { Ok(path) } else { Err("expected a name that ends in .png or .svg") }
+    })
+}
+
 pub(super) fn is_standard(path: &Path) -> bool {
     path.as_os_str() == STANDARD
 }

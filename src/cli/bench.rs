@@ -7,7 +7,11 @@ use clap::Args;
 use super::arguments::input_path;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use crate::bench::{BENCH_STAGES, BenchSettings, Comparison, bench_config};
+use crate::files::read_text;
 use crate::pipeline::{ConfigSource, Plan, use_threads};
+
+/// Largest file of earlier measurements that is read, bytes.
+const BASELINE_BYTES_MAX: u64 = 1 << 24;
 
 /// Measure the speed of each stage of sample fidelity, and of the chain from samples to received visibilities.
 ///
@@ -70,8 +74,8 @@ pub(super) fn execute(args: &BenchArgs) -> CommandResult {
 }
 
 fn read_baseline(path: &Path) -> Result<(&Path, serde_json::Value), CommandError> {
-    let text =
-        std::fs::read_to_string(path).map_err(|error| format!("{}: cannot read: {error}", path.display()))?;
+    let text = read_text(path, BASELINE_BYTES_MAX)
+        .map_err(|error| format!("{}: cannot read: {error}", path.display()))?;
     let expected = "expected what `lunarray bench --json` prints";
     let value =
         serde_json::from_str(&text).map_err(|error| format!("{}: {error}; {expected}", path.display()))?;

@@ -87,19 +87,23 @@ pub(super) fn execute(args: &CalibrateArgs) -> CommandResult {
 fn summary_text(summary: &CalibrateSummary, args: &CalibrateArgs) -> String {
     let mut lines = vec![summary.to_string()];
     for round in &summary.rounds {
-        let number = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.4}"));
-        lines.push(format!(
-            "round {}: chi-square {:.4}, held out {}, change of gains {}",
-            round.round,
-            round.chi_square,
-            number(round.chi_square_held_out),
-            number(round.change_rms)
-        ));
+        // Without rounds there is one solution.
+        let mut line =
+            if summary.rounds.len() > 1 { format!("round {}: ", round.round) } else { String::new() };
+        line += &format!("chi-square {:.4}", round.chi_square);
+        for (name, value) in [("held out", round.chi_square_held_out), ("change of gains", round.change_rms)]
+        {
+            line += &value.map_or_else(String::new, |value| format!(", {name} {value:.4}"));
+        }
+        lines.push(line);
     }
     for (channel, sigmas) in summary.phase_sigma_deg.iter().enumerate() {
-        let sigmas: Vec<String> = sigmas.iter().map(|sigma| format!("{sigma:.2}")).collect();
+        let sigmas: Vec<String> = sigmas
+            .iter()
+            .map(|sigma| sigma.map_or_else(|| "-".to_owned(), |sigma| format!("{sigma:.2}")))
+            .collect();
         lines.push(format!(
-            "channel {}: phases known to {} deg (median, by daughter)",
+            "channel {}: phases known to {} deg (median by daughter, - without a good gain)",
             channel,
             sigmas.join(", ")
         ));

@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::arguments::{PipelineArgs, group_size};
 use super::output::{
-    CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
+    CommandError, CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
 };
 use crate::array::EarthModel;
 use crate::pipeline::{ConfigError, Cost, GroupSize, Plan, RunGroups, Segment, sky_notes};
@@ -29,7 +29,7 @@ pub(super) struct CheckArgs {
     /// As a run in groups of channels (run --groups): prints the groups, and fails only if a channel alone needs too much memory.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, conflicts_with = "ranks")]
     groups: Option<GroupSize>,
-    /// Print one JSON object instead of a table.
+    /// Print one JSON object instead of a table; of a pipeline with problems, their list.
     #[arg(long)]
     json: bool,
 }
@@ -49,8 +49,36 @@ struct CheckReport<'a> {
     files: &'a [String],
 }
 
+/// The JSON output of a pipeline with problems, which are on standard error, too.
+#[derive(Serialize)]
+struct ProblemReport {
+    problems: Vec<String>,
+    /// Number of all problems; of many, only the first are listed.
+    count: usize,
+}
+
+impl ProblemReport {
+    fn of(error: &CommandError) -> Self {
+        match error.downcast_ref::<ConfigError>() {
+            Some(ConfigError::Values { problems, .. }) => {
+                Self { problems: problems.iter().map(ToString::to_string).collect(), count: problems.len() }
+            }
+            _ => Self { problems: vec![error.to_string()], count: 1 },
+        }
+    }
+}
+
 pub(super) fn execute(args: &CheckArgs) -> CommandResult {
-    let source = args.pipeline.source();
+    let checked = checked(args);
+    if let (true, Err(error)) = (args.json, &checked) {
+        print_json_line(&ProblemReport::of(error))?;
+    }
+    let (plan, cost) = checked?;
+    report(args, &plan, &cost)
+}
+
+/// The plan of a pipeline without problems, and its cost.
+fn checked(args: &CheckArgs) -> Result<(Plan, Cost), CommandError> {
     let config = args.pipeline.load()?;
     print_config_notes(&config);
     let plan = Plan::new(config)?;
@@ -58,13 +86,18 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     print_notes(plan.thinning_notes());
     let problems = plan.file_problems();
     if !problems.is_empty() {
-        return Err(Box::new(ConfigError::Values { origin: source.origin(), problems }));
+        return Err(Box::new(ConfigError::Values { origin: args.pipeline.source().origin(), problems }));
     }
     let ranks = usize::from(args.ranks);
     plan.config.require_shareable(ranks)?;
     print_notes(sky_notes(&plan)?);
     let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;
+    Ok((plan, cost))
+}
+
+fn report(args: &CheckArgs, plan: &Plan, cost: &Cost) -> CommandResult {
+    let source = args.pipeline.source();
     let files = plan.file_descriptions();
     let limit = args.pipeline.memory_limit();
     let groups = args.groups.map(|size| plan.run_groups(size, limit)).transpose();
@@ -72,7 +105,7 @@ pub(super) fn execute(args: &CheckArgs) -> CommandResult {
     let epoch_utc = &utc_text(plan.instrument.epoch_tai_s);
     let earth = EarthModel::of(&plan.config.array).to_string();
     if args.json {
-        print_json_line(&CheckReport { cost: &cost, epoch_utc, earth, groups: found, files: &files })?;
+        print_json_line(&CheckReport { cost, epoch_utc, earth, groups: found, files: &files })?;
     } else {
         let files: String = files.iter().map(|line| format!("{line}\n")).collect();
         let mission = format!("epoch {epoch_utc} UTC; the Earth is {earth}");

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::arguments::MapFileArgs;
+use super::arguments::{MapFileArgs, picture_path};
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::files::ProtectedInputs;
 use crate::products::{RunFigures, draw_comparison, draw_relative_error, draw_runs, runs_csv};
@@ -42,7 +42,7 @@ pub(super) struct CompareArgs {
     l_max: Option<usize>,
     /// Picture of the curves (PNG, or SVG if its name ends so); MAP-spectra.png, or compare.png of runs, if not given; none with --json. The picture
     /// of the relative error goes beside it, with -error before the extension.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = picture_path())]
     plot: Option<PathBuf>,
     /// Draw no pictures.
     #[arg(long, conflicts_with = "plot")]

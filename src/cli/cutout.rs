@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 
-use super::arguments::output_path;
-use super::output::{CommandResult, Completion, print_json_line, print_text};
+use super::arguments::picture_path;
+use super::output::{CommandResult, Completion, cannot_write, print_json_line, print_text};
 use crate::files::{ProtectedInputs, write_atomically};
 use crate::products::pictures::{ColourScale, Palette, Patch, Scaling, draw_patches};
 use crate::sky::fits::{ReadOptions, read_whole_map};
@@ -44,7 +44,7 @@ pub(super) struct CutoutArgs {
     #[arg(long, value_name = "DEG")]
     subtract_fwhm: Option<f64>,
     /// Picture (PNG, or SVG if its name ends so); the table goes beside it with the extension .csv.
-    #[arg(short, long, value_name = "FILE.png", value_parser = output_path())]
+    #[arg(short, long, value_name = "FILE.png", value_parser = picture_path())]
     out: PathBuf,
     /// Print one JSON object: mean and rms of each piece, and their correlation with the first.
     #[arg(long)]
@@ -137,8 +137,7 @@ pub(super) fn execute(args: &CutoutArgs) -> CommandResult {
         args.subtract_fwhm.map_or_else(String::new, |fwhm| format!("scales above {fwhm} deg subtracted"));
     draw_patches(&title, &patches, 3)?.write(&args.out)?;
     let csv = args.out.with_extension("csv");
-    write_atomically(&csv, table(&cutout, &pieces).as_bytes())
-        .map_err(|error| format!("cannot write {}: {error}", csv.display()))?;
+    write_atomically(&csv, table(&cutout, &pieces).as_bytes()).map_err(cannot_write(&csv))?;
     let report = CutoutReport {
         pieces: args
             .maps

@@ -14,10 +14,10 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::log::{Level, is_json, note, say, say_entry};
-use super::output::{CommandError, json_text, print_notes};
+use super::output::{CommandError, cannot_write, json_text, print_notes};
 use crate::calibration::solver::InstrumentEvent;
 use crate::downlink::ReceptionCounters;
-use crate::files::growing_file;
+use crate::files::{ProtectedInputs, growing_file, is_same_name};
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
 use crate::pipeline::{Config, RunHandles};
@@ -47,23 +47,38 @@ impl EventsArgs {
         self.events.as_deref() == Some(Path::new("-"))
     }
 
-    /// Opens the output, if it is requested, and writes the first line.
-    pub(super) fn start(&self, config: &Config, segment: &'static str) -> Result<Events, CommandError> {
-        let Some(path) = &self.events else { return Ok(Events { writer: None }) };
+    /// Opens the output, if it is requested, and writes the first line. `outputs` are the main files of the command, which it must
+    /// not name.
+    pub(super) fn start(
+        &self,
+        config: &Config,
+        segment: &'static str,
+        outputs: &[PathBuf],
+    ) -> Result<Events, CommandError> {
+        let Some(path) = &self.events else {
+            return Ok(Events { writer: None, _file: ProtectedInputs::default() });
+        };
+        if outputs.iter().any(|output| is_same_name(output, path)) {
+            let path = path.display();
+            return Err(format!(
+                "--events {path}: the command writes another output there; expected another name"
+            )
+            .into());
+        }
         let out: Box<dyn Write + Send> = match self.take_stdout() {
             true => Box::new(std::io::stdout()),
-            false => {
-                let file = growing_file(path);
-                Box::new(file.map_err(|error| format!("cannot write events to {}: {error}", path.display()))?)
-            }
+            false => Box::new(growing_file(path).map_err(cannot_write(path))?),
         };
-        Ok(Events { writer: Some(EventWriter::start(out, config.name.clone(), segment)) })
+        let writer = Some(EventWriter::start(out, config.name.clone(), segment));
+        Ok(Events { writer, _file: ProtectedInputs::of([path]) })
     }
 }
 
 /// The output of events of a command, if it is requested.
 pub(super) struct Events {
     writer: Option<EventWriter>,
+    /// No product takes the place of the file.
+    _file: ProtectedInputs,
 }
 
 impl Events {

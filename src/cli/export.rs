@@ -8,8 +8,8 @@ use clap::{Args, Subcommand, ValueEnum};
 use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
 use super::log::system_utc_text;
 use super::output::{
-    CommandError, CommandResult, Completion, print_config_notes, print_json_line, print_notes, print_text,
-    stdout_error,
+    CommandError, CommandResult, Completion, cannot_write, print_config_notes, print_json_line, print_notes,
+    print_text, stdout_error,
 };
 use crate::array::{Array, OemExport};
 use crate::files::{ProtectedInputs, write_atomically};
@@ -350,5 +350,5 @@ fn written_at(path: &Path) -> String {
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), CommandError> {
-    write_atomically(path, bytes).map_err(|error| format!("cannot write {}: {error}", path.display()).into())
+    write_atomically(path, bytes).map_err(cannot_write(path))
 }

@@ -9,7 +9,10 @@ use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{DownlinkError, Event, PacketKind};
-use crate::files::{AtomicFile, IfUnfinished};
+use crate::files::{AtomicFile, IfUnfinished, read_text};
+
+/// Largest file of ranges that is read, bytes: a million lines.
+const RANGES_BYTES_MAX: u64 = 1 << 24;
 
 /// Cut the packets of given counts out of downlink files.
 ///
@@ -46,7 +49,7 @@ pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
     let name = args.ranges.display();
     let text = match args.ranges.as_os_str() == "-" {
         true => std::io::read_to_string(std::io::stdin()),
-        false => std::fs::read_to_string(&args.ranges),
+        false => read_text(&args.ranges, RANGES_BYTES_MAX),
     };
     let text = text.map_err(|error| format!("{name}: cannot read: {error}"))?;
     let ranges = parse(&text).map_err(|reason| format!("{name}: {reason}"))?;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::input_path;
+use super::arguments::{input_path, picture_path};
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::downlink::PacketKind;
 use crate::files::ProtectedInputs;
@@ -33,8 +33,8 @@ pub(super) struct GapsArgs {
     /// with 0, also if any visibilities or positions are missing.
     #[arg(long, value_name = "any|PERCENT", value_parser = fail_if)]
     fail_if: Option<FailIf>,
-    /// Write a picture (PNG) of integration time over mission time, channel by channel.
-    #[arg(long, value_name = "FILE.png")]
+    /// Write a picture (PNG, or SVG if its name ends so) of integration time over mission time, channel by channel.
+    #[arg(long, value_name = "FILE.png", value_parser = picture_path())]
     picture: Option<PathBuf>,
     /// Print one JSON object instead of tables.
     #[arg(long)]

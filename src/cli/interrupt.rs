@@ -1,12 +1,14 @@
 //! Ctrl-C and other signals: the first cancels a run, the second ends the process.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use signal_hook::consts::{SIGINT, SIGTERM};
 use signal_hook::flag;
 
 use super::output::{Completion, print_notes};
+#[cfg(unix)]
+use crate::files::remove_unfinished;
 use crate::runtime::Cancel;
 
 /// Signals that cancel a run.
@@ -18,6 +20,30 @@ const SIGNALS: [i32; 2] = [SIGINT, SIGTERM];
 
 /// Exit code of a command that a signal ended, minus the number of the signal; a convention of shells.
 const SHELL_BASE: i32 = 128;
+
+/// What an armed [`Interrupt`] sets at a signal: the run to cancel, and the signal's number.
+static ARMED: OnceLock<(Cancel, Arc<AtomicUsize>)> = OnceLock::new();
+
+/// Makes signals remove the files that are being written before they end the process, in commands without an [`Interrupt`], and
+/// before that is armed. Without it, or if it fails, they end the process at once.
+#[cfg(unix)]
+pub(super) fn remove_files_on_signal() {
+    let ignored = ignored_signals();
+    let handled = SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0);
+    let Ok(mut signals) = signal_hook::iterator::Signals::new(handled) else { return };
+    std::thread::spawn(move || {
+        for signal in signals.forever() {
+            if let Some((cancel, number)) = ARMED.get() {
+                // The signal may have come just before the handlers were installed.
+                number.store(signal.unsigned_abs() as usize, Ordering::Relaxed);
+                cancel.cancel();
+                continue;
+            }
+            remove_unfinished();
+            let _ = signal_hook::low_level::emulate_default_handler(signal);
+        }
+    });
+}
 
 /// Cancels a run on the first signal.
 #[derive(Debug, Default)]
@@ -39,6 +65,7 @@ impl Interrupt {
     ///
     /// Everything happens in the signal handler, so that a blocked thread cannot delay it.
     fn arm(&self) -> std::io::Result<()> {
+        let _ = ARMED.set((self.cancel.clone(), Arc::clone(&self.signal)));
         let ignored = ignored_signals();
         for signal in SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0) {
             // The order matters: at the first signal, the shutdown must find the flag unset.

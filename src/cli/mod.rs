@@ -75,7 +75,8 @@ use crate::units::InvalidValue;
 ///
 /// A file of - is standard input where a pipeline or a downlink is read: cat pass.cadu | lunarray inspect -
 ///
-/// Exit codes: 0 done; 1 failed; 2 wrong usage; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, with what was
+/// Exit codes: 0 done; 1 failed; 2 wrong usage or an unusable configuration; 3 a failure of the system (disk, socket, lock,
+/// memory), after which the same command may succeed; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, with what was
 /// received saved if there is a state. 0 also for `replay --listen` and `--follow` that SIGTERM ends.
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
@@ -172,7 +173,12 @@ fn is_configuration_error(error: &(dyn std::error::Error + 'static)) -> bool {
         PipelineError::Ground(error) => is_ground_configuration(error),
         _ => false,
     });
+    // The program's own refusal of a name, as that of an output that is an input.
+    let is_refused_name = |error: &std::io::Error| {
+        error.kind() == std::io::ErrorKind::InvalidInput && error.raw_os_error().is_none()
+    };
     is_pipeline_configuration
+        || error.downcast_ref::<std::io::Error>().is_some_and(is_refused_name)
         || error.is::<ConfigError>()
         || error.is::<InvalidValue>()
         || error.downcast_ref::<GroundError>().is_some_and(is_ground_configuration)
@@ -204,6 +210,8 @@ fn is_system_error(error: &(dyn std::error::Error + 'static)) -> bool {
 /// SIGTERM is the regular end of a ground segment that listens or follows: 0.
 #[must_use]
 pub fn main() -> ExitCode {
+    #[cfg(unix)]
+    interrupt::remove_files_on_signal();
     ExitCode::from(run_command(std::env::args_os()))
 }
 

@@ -1,6 +1,7 @@
 //! Output and completion of commands.
 
 use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
@@ -28,6 +29,19 @@ impl Completion {
             _ => Ok(self),
         }
     }
+}
+
+/// Makes the error of a file that cannot be written. It keeps the system's error, which decides the exit code.
+pub(super) fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> CommandError {
+    move |source| WriteError { path: path.to_owned(), source }.into()
+}
+
+/// A file that cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {}: {source}", path.display())]
+struct WriteError {
+    path: PathBuf,
+    source: std::io::Error,
 }
 
 /// Whether the reader of standard output has closed it, as `head` does.

@@ -11,7 +11,7 @@ use super::output::{CommandError, CommandResult, Completion, print_json_line, pr
 use crate::array::Array;
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
-use crate::sky::fits::read_whole_map;
+use crate::sky::fits::{MapFile, ReadOptions, read_whole_map_file};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{Dimension, Pair, echo};
 
@@ -26,7 +26,7 @@ use crate::units::{Dimension, Pair, echo};
 /// Example: lunarray predict --sky sky.fits --at 2h --pair 1-2 --freq-hz 10e6
 #[derive(Debug, Args)]
 pub(super) struct PredictArgs {
-    /// HEALPix map, K (FITS).
+    /// HEALPix map, K (FITS), of the frequency of the visibilities if it states one.
     #[arg(long, value_name = "MAP.fits")]
     sky: PathBuf,
     #[command(flatten)]
@@ -68,12 +68,14 @@ struct Prediction {
 pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let config = args.array.source().load()?;
     let array = Array::new(&config.array)?;
-    let map = read_whole_map(&args.sky, &args.maps.options())?;
+    let options = ReadOptions { frequency_hz: args.freq_hz, ..args.maps.options() };
+    let MapFile { map, frequency_hz: map_hz, .. } = read_whole_map_file(&args.sky, &options)?;
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
     let print_prediction = |query: VisibilityQuery| -> Result<(), CommandError> {
         check(&array, query)?;
         let VisibilityQuery { t_s, pair, freq_hz } = query;
+        args.require_frequency(map_hz, freq_hz)?;
         let geometry = PairGeometry {
             r_i_m: array.position_m(pair.i.into(), t_s),
             r_j_m: array.position_m(pair.j.into(), t_s),
@@ -112,6 +114,17 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         }
     }
     Ok(Completion::Done)
+}
+
+impl PredictArgs {
+    /// Requires that the map is of the frequency of a visibility, if it states one.
+    fn require_frequency(&self, map_hz: Option<f64>, freq_hz: f64) -> Result<(), String> {
+        let Some(map_hz) = map_hz.filter(|map_hz| (map_hz - freq_hz).abs() > 1e-6 * freq_hz) else {
+            return Ok(());
+        };
+        let [found, wanted] = [map_hz, freq_hz].map(|hz| Dimension::Frequency.show(hz));
+        Err(format!("freq_hz = {wanted}: expected {found}, the frequency of {} (FREQ)", self.sky.display()))
+    }
 }
 
 fn parse(line: &str) -> Result<VisibilityQuery, String> {

@@ -28,12 +28,12 @@ use crate::downlink::transport::socket::{
     HeldAnswers, ListenLimits, ListenNote, ListenUrl, SocketSource, Stations,
 };
 use crate::downlink::{FileSource, Pace, PacedSource, Steps};
-use crate::files::ProtectedInputs;
+use crate::files::{ProtectedInputs, is_same_name};
 use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
     Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
-    RunSummary, SettingsOrigin, channel_groups, replay, replay_in_groups, use_threads,
+    RunSummary, SettingsOrigin, channel_groups, main_products, replay, replay_in_groups, use_threads,
 };
 
 /// Capacity of the hold buffer when listening without a state, bytes.
@@ -183,6 +183,7 @@ pub(super) fn execute(args: &ReplayArgs) -> CommandResult {
 }
 
 fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
+    args.check_folders()?;
     let mut overrides = args.overrides.clone();
     if let Some(every_s) = args.snapshot_every {
         overrides.push(format!("map.snapshot_every_s={every_s:?}"));
@@ -218,7 +219,7 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
     let saving = ground.outcome().saving;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&config, "ground", args.state.as_deref(), Some(&args.out))?;
-    let events = args.events.start(&config, "ground")?;
+    let events = args.events.start(&config, "ground", &main_products(&config, &args.out))?;
     let session = Session { args, config: &config, job, interrupt: &interrupt, page: &page, events: &events };
     let result = match args.listens() {
         true => session.receive_from_senders(ground),
@@ -257,6 +258,24 @@ fn work(args: &ReplayArgs, job: &Job) -> CommandResult {
 }
 
 impl ReplayArgs {
+    /// Refuses a state that does not exist although there is nothing to make it from, and one folder for state and products.
+    fn check_folders(&self) -> Result<(), CommandError> {
+        let Some(state) = &self.state else { return Ok(()) };
+        let path = state.display();
+        if is_same_name(state, &self.out) {
+            return Err(
+                format!("--state {path}: it is also the folder of --out; expected two folders").into()
+            );
+        }
+        if self.files.is_empty() && !self.listens() && !Ground::is_state(state)? {
+            return Err(format!(
+                "--state {path}: no such state, and no files; expected the folder of a state, or downlink files to make one from"
+            )
+            .into());
+        }
+        Ok(())
+    }
+
     /// Adds the settings of the state, or else of the downlink, if there is no map file.
     fn with_known_settings(&self, source: ConfigSource, job: &Job) -> Result<ConfigSource, GroundError> {
         let with_state = self.state.as_deref().map(|folder| {
@@ -317,7 +336,7 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     let groups = channel_groups(&args.files, config, size, args.memory_limit())?;
     let interrupt = Interrupt::default();
     let cancel = interrupt.cancel();
-    let events = args.events.start(config, "ground")?;
+    let events = args.events.start(config, "ground", &main_products(config, &args.out))?;
     let mut parts = Parts::new(groups.iter().map(|group| group.channels.len() as f64));
     let mut progress = None;
     let result = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |step, handles| {

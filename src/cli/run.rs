@@ -15,8 +15,8 @@ use super::output::{
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::pipeline::{
-    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, run_in_groups, run_with_ranks,
-    sky_notes, use_threads,
+    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, main_products, run_in_groups,
+    run_with_ranks, sky_notes, use_threads,
 };
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
@@ -79,7 +79,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
     cost.require_memory(Segment::Whole, job.memory_limit(args.pipeline.memory_limit()))?;
     let interrupt = Interrupt::default();
     let page = args.serve.start(&plan.config, "whole", None, None)?;
-    let events = args.events.start(&plan.config, "whole")?;
+    let events = args.events.start(&plan.config, "whole", &main_products(&plan.config, &out))?;
     let mut progress = None;
     let windows = plan.progress_windows();
     let result = run_with_ranks(job.ranks(), &plan, &out, interrupt.cancel(), &mut |handles| {

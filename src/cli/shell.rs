@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Command};
 use clap_complete::Shell;
 
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
+use super::output::{CommandError, CommandResult, Completion, cannot_write, print_json_line, print_text};
 use crate::files::write_atomically;
 
 /// Name of the program.
@@ -61,8 +61,7 @@ pub(super) fn man(args: &ManArgs, mut command: Command) -> CommandResult {
     let mut files = Vec::new();
     for (name, text) in pages {
         let path = args.out.join(name);
-        write_atomically(&path, &text)
-            .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+        write_atomically(&path, &text).map_err(cannot_write(&path))?;
         files.push(path);
     }
     if args.json {

@@ -98,7 +98,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
         SendOptions { connect_s: args.connect_s, bytes_per_s: args.bytes_per_s, held: args.held, token };
     let socket = args.send.as_ref().map(|url| SocketSink::new(url, options, cancel)).transpose()?;
     let confirmed = socket.as_ref().map(SocketSink::confirmed);
-    let events = args.events.start(&plan.config, "space")?;
+    let events = args.events.start(&plan.config, "space", args.out.as_slice())?;
     let mut progress = None;
     let windows = plan.progress_windows();
     let file = args.out.clone().filter(|_| !to_standard_output);

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::arguments::{MapFileArgs, band_text, frequency_hz, output_path};
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
-use crate::files::{ProtectedInputs, write_atomically};
+use super::output::{CommandError, CommandResult, Completion, cannot_write, print_json_line, print_text};
+use crate::files::{ProtectedInputs, is_same_name, write_atomically};
 use crate::mother::{BAND_HZ, NINTH_BAND_HZ};
 use crate::pipeline::{Config, ConfigSource};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Scaling, View, draw_map};
@@ -73,6 +73,18 @@ pub(super) struct SkyArgs {
 }
 
 pub(super) fn execute(args: &SkyArgs) -> CommandResult {
+    let picture = (!args.no_picture).then(|| args.out.with_extension("png"));
+    let mut others = [(&args.out, picture.as_ref()), (&args.out, args.sources.as_ref())].to_vec();
+    others.extend(picture.iter().map(|picture| (picture, args.sources.as_ref())));
+    let is_twice =
+        |(one, other): &(&PathBuf, Option<&PathBuf>)| other.is_some_and(|other| is_same_name(one, other));
+    if let Some((path, _)) = others.into_iter().find(is_twice) {
+        let path = path.display();
+        return Err(format!(
+            "{path}: two of map, picture and --sources would be written there; expected different names"
+        )
+        .into());
+    }
     let SkyArgs { nside, seed, .. } = *args;
     let _inputs = ProtectedInputs::of(args.pipeline.iter().chain(&args.like));
     if let (Some(path), Some(correlation)) = (&args.like, args.correlation) {
@@ -203,7 +215,6 @@ fn write_sources(path: &Path, config: &GeneratedSky, freq_hz: f64, seed: u64) ->
         let _ =
             writeln!(csv, "{longitude:.6},{latitude:.6},{:.6},{:.6}", source.flux_154mhz_jy, source.flux_jy);
     }
-    write_atomically(path, csv.as_bytes())
-        .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+    write_atomically(path, csv.as_bytes()).map_err(cannot_write(path))?;
     Ok(sources.len())
 }

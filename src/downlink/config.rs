@@ -30,7 +30,8 @@ keys! {
         expert spacecraft_id: u8 = 0x4C;
         /// Idle "cadu" frames at the start of each pass: the ground needs one to synchronise.
         expert idle_frames: u32 = 2;
-        /// Maximum rate of the link including coding; 0 for no limit. What exceeds the passes stays on board.
+        /// Maximum rate of the link including coding; 0 for no limit. What exceeds a pass stays on board for later ones; the last
+        /// pass sends everything that is left.
         everyday rate_bits_per_s_max: f64 = 0.0;
         /// Faults between spacecraft and ground. A list of them is written beside the file.
         section link: LinkConfig = LinkConfig::default();
@@ -53,7 +54,8 @@ impl DownlinkConfig {
         checks.require("interleave", interleave, INTERLEAVES.contains(&interleave), "1, 2, 3, 4, 5 or 8");
         checks.require("idle_frames", self.idle_frames, self.idle_frames <= IDLE_FRAMES_MAX, "at most 1000");
         let rate = self.rate_bits_per_s_max;
-        checks.number("rate_bits_per_s_max", rate, rate >= 0.0, "bits per second, or 0 for no limit");
+        let expected = "at least 1 bit per second, or 0 for no limit";
+        checks.number("rate_bits_per_s_max", rate, rate == 0.0 || rate >= 1.0, expected);
         let mut problems = checks.finish();
         problems.extend(self.link.problems(self.format));
         problems

@@ -117,12 +117,6 @@ pub enum DownlinkError {
         /// The file.
         path: PathBuf,
     },
-    /// Input and output are the same file.
-    #[error("{}: input and output are the same file; expected another output file", path.display())]
-    SameFile {
-        /// The file.
-        path: PathBuf,
-    },
     /// The file contains no downlink packet.
     #[error(
         "{}: no downlink in {bytes} bytes: {}; expected CCSDS space packets with APIDs 0x101 to \

@@ -22,13 +22,40 @@ pub fn read_folder(folder: &Path) -> io::Result<fs::ReadDir> {
 /// # Errors
 /// The system's error; [`io::ErrorKind::FileTooLarge`] for a longer text; [`io::ErrorKind::InvalidData`] if it is not UTF-8.
 pub fn read_text(path: &Path, bytes_max: u64) -> io::Result<String> {
+    let bytes = read_bounded(File::open(path)?, bytes_max)?;
+    String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+}
+
+/// Reads a file of at most `bytes_max` bytes that is read several times in a run, and so is no pipe or device.
+///
+/// # Errors
+/// As [`open_file`]; [`io::ErrorKind::FileTooLarge`] for a longer file.
+pub fn read_file(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
+    read_bounded(open_file(path)?, bytes_max)
+}
+
+/// Opens a file for reading. A pipe would be waited for, and a device may be endless.
+///
+/// # Errors
+/// The system's error; [`io::ErrorKind::InvalidInput`] for a folder, a pipe or a device.
+pub fn open_file(path: &Path) -> io::Result<File> {
+    if fs::metadata(path)?.is_file() {
+        return File::open(path);
+    }
+    Err(io::Error::new(
+        io::ErrorKind::InvalidInput,
+        "not a regular file, but a folder, a pipe or a device; expected a file",
+    ))
+}
+
+fn read_bounded(source: impl Read, bytes_max: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    File::open(path)?.take(bytes_max.saturating_add(1)).read_to_end(&mut bytes)?;
+    source.take(bytes_max.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > bytes_max {
         let reason = format!("it is too long; expected at most {bytes_max} bytes");
         return Err(io::Error::new(io::ErrorKind::FileTooLarge, reason));
     }
-    String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+    Ok(bytes)
 }
 
 /// Reads bytes at an offset of a file, which several threads may do at a time.
@@ -81,6 +108,16 @@ pub(super) fn is_same(a: &Metadata, b: &Metadata) -> bool {
 #[cfg(not(unix))]
 pub(super) fn is_same(_: &Metadata, _: &Metadata) -> bool {
     true
+}
+
+/// Whether two paths are names of one place: the same name in the same folder, by whatever way.
+pub fn is_same_name(one: &Path, other: &Path) -> bool {
+    let place = |path: &Path| {
+        let folder = folder_of(path).unwrap_or(Path::new("."));
+        let folder = fs::canonicalize(folder).or_else(|_| std::path::absolute(folder)).ok()?;
+        Some(folder.join(path.file_name()?))
+    };
+    place(one).is_some_and(|found| place(other) == Some(found))
 }
 
 /// The folder in `path`; `None` for a bare file name.

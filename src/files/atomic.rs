@@ -1,10 +1,12 @@
 //! Files with a temporary name until they are complete.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs::{self, File, TryLockError};
 use std::hash::{BuildHasher, RandomState};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use super::access::{folder_of, is_at, read_folder};
@@ -22,6 +24,16 @@ const NAMES_MAX: usize = 100;
 const RIVAL_POLL: Duration = Duration::from_millis(20);
 
 const RIVAL_POLLS_MAX: usize = 50;
+
+/// Files that this process is writing.
+static UNFINISHED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+
+/// Removes the files that this process is writing, before a signal ends it.
+pub fn remove_unfinished() {
+    for path in &*UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner) {
+        let _ = fs::remove_file(path);
+    }
+}
 
 /// What happens to a file that is dropped before it is finished.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +72,7 @@ impl AtomicFile {
             fs::create_dir_all(folder)?;
         }
         let (partial_path, file) = create_partial(path)?;
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).insert(partial_path.clone());
         let partial = Self {
             path: path.to_owned(),
             partial_path,
@@ -142,6 +155,7 @@ impl Write for AtomicFile {
 
 impl Drop for AtomicFile {
     fn drop(&mut self) {
+        UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.partial_path);
         if self.file.is_none() {
             return;
         }

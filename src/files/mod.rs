@@ -4,11 +4,17 @@
 mod access;
 mod atomic;
 mod folder_lock;
+mod form;
 mod protected;
 #[cfg(test)]
 mod tests;
 
-pub use access::{disk_space, is_at, read_at, read_folder, read_text, write_at};
-pub use atomic::{AtomicFile, IfUnfinished, growing_file, nameless_file, write_atomically};
+pub use access::{
+    disk_space, is_at, is_same_name, open_file, read_at, read_file, read_folder, read_text, write_at,
+};
+pub use atomic::{
+    AtomicFile, IfUnfinished, growing_file, nameless_file, remove_unfinished, write_atomically,
+};
 pub use folder_lock::FolderLock;
+pub use form::{form_of, text_of};
 pub use protected::{ProtectedInputs, require_replaceable};

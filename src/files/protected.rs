@@ -6,7 +6,7 @@ use std::io;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
-/// Protects the files that a command reads: this process does not replace them while this value exists.
+/// Protects files that a command reads or writes as they grow: this process does not replace them while this value exists.
 #[derive(Debug, Default)]
 pub struct ProtectedInputs(Vec<FileKey>);
 
@@ -16,7 +16,7 @@ type FileKey = (u64, u64);
 #[cfg(not(unix))]
 type FileKey = std::path::PathBuf;
 
-/// The protected inputs, with the number of values that protect each.
+/// The protected files, with the number of values that protect each.
 static PROTECTED: Mutex<BTreeMap<FileKey, usize>> = Mutex::new(BTreeMap::new());
 
 impl ProtectedInputs {
@@ -55,14 +55,15 @@ fn key_of(path: &Path) -> Option<FileKey> {
 /// Requires that a file may be written at `path` and replace a file there. All code that writes files calls this.
 ///
 /// # Errors
-/// [`io::ErrorKind::InvalidInput`] for an input of a command in this process, under any of its names, for a symbolic link, and
-/// for anything that is not a regular file.
+/// [`io::ErrorKind::InvalidInput`] for a file that a command in this process has protected, under any of its names, for a symbolic
+/// link, and for anything that is not a regular file.
 pub fn require_replaceable(path: &Path) -> io::Result<()> {
     let refuse = |reason: String| Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
     let protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
     if key_of(path).is_some_and(|key| protected.contains_key(&key)) {
         return refuse(
-            "it is read as an input, which would be overwritten; expected another name".to_owned(),
+            "it is read as an input, or holds another output of this command, which would be overwritten; expected another name"
+                .to_owned(),
         );
     }
     match fs::symlink_metadata(path) {

@@ -171,8 +171,13 @@ fn inputs_and_links_are_not_replaced() {
 #[test]
 fn what_never_ends_is_not_read() {
     assert_eq!(read_text(Path::new("/dev/zero"), 1000).unwrap_err().kind(), io::ErrorKind::FileTooLarge);
+    for none in ["/dev/zero", "/dev", "/nowhere"] {
+        let kind = read_file(Path::new(none), 1000).unwrap_err().kind();
+        assert_eq!(kind == io::ErrorKind::InvalidInput, none.starts_with("/dev"), "{none}");
+    }
     let file = tempfile::NamedTempFile::new().unwrap();
     fs::write(file.path(), "text").unwrap();
+    assert_eq!(read_file(file.path(), 4).unwrap(), b"text");
     assert_eq!(read_text(file.path(), 4).unwrap(), "text");
     assert!(read_text(file.path(), 3).is_err());
 }

@@ -270,12 +270,15 @@ impl MapConfig {
         let channels = self.channels_max;
         checks.require("channels_max", channels, (1..=4096).contains(&channels), "1 to 4096");
         let longest = self.baseline_bp_max;
-        let expected = "above 0 and at most 1e12, in units of b_p";
-        checks.number("baseline_bp_max", longest, longest > 0.0 && longest <= 1e12, expected);
+        // The shortest baselines of any array are longer than the lower bound.
+        let expected = "1e-6 to 1e12, in units of b_p";
+        checks.number("baseline_bp_max", longest, (1e-6..=1e12).contains(&longest), expected);
         // What is beyond is tabulated up to this length, with all degrees that it reaches.
         let is_tabulated = self.beyond_files.is_empty() || longest <= 100.0;
         checks.number("baseline_bp_max", longest, is_tabulated, "at most 100 with map.beyond_files");
-        checks.numbers("epsilon", self.epsilon().values(), |e| e > 0.0 && e <= 1.0, "above 0 and at most 1");
+        // Less is lost in the rounding of the normal matrix.
+        let expected = "1e-16 to 1";
+        checks.numbers("epsilon", self.epsilon().values(), |e| (1e-16..=1.0).contains(&e), expected);
         let is_temperature = |k| (0.0..=TEMPERATURE_K_MAX).contains(&k);
         checks.numbers("prior_k", self.prior_k.values(), is_temperature, "0 to 1e16 K");
         let fwhm = self.prior_fwhm_deg;
@@ -554,7 +557,9 @@ impl MapConfig {
         checks.require("channels_max", self.channels_max, channels <= self.channels_max, expected);
         for (index, &channel) in self.channels.iter().enumerate() {
             let expected = format!("a channel of the instrument, 0 to {}", channels.saturating_sub(1));
-            checks.require(format!("channels[{index}]"), channel, usize::from(channel) < channels, expected);
+            let key = format!("channels[{index}]");
+            checks.require(&key, channel, usize::from(channel) < channels, expected);
+            checks.require(key, channel, !self.channels[..index].contains(&channel), "every channel once");
         }
         for (key, values) in [("epsilon", &epsilon), ("prior_k", &self.prior_k)] {
             let expected = format!("a single value, or a list of one for each of the {channels} channels");
@@ -606,6 +611,20 @@ mod tests {
             let expected = format!("map.{key} = (2 files): expected one file for each of the 3 channels");
             assert_eq!(found.to_string(), expected);
         }
+    }
+
+    #[test]
+    fn values_with_which_no_map_is_possible_are_refused() {
+        for (map, expected) in [
+            (MapConfig { epsilon: Some(PerChannel::All(1e-320)), ..MapConfig::default() }, "map.epsilon"),
+            (MapConfig { baseline_bp_max: 1e-300, ..MapConfig::default() }, "map.baseline_bp_max"),
+        ] {
+            let found: Vec<String> = map.problems().iter().map(ToString::to_string).collect();
+            assert!(found.len() == 1 && found[0].starts_with(expected), "{found:?}");
+        }
+        let map = MapConfig { channels: vec![1, 0, 1], ..MapConfig::default() };
+        let [found] = &map.mismatches(2)[..] else { panic!() };
+        assert_eq!(found.to_string(), "map.channels[2] = 1: expected every channel once");
     }
 
     #[test]

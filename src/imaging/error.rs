@@ -7,7 +7,7 @@ use thiserror::Error;
 use crate::response::MeasuredAntennasError;
 use crate::response::general::RowsRefusal;
 use crate::response::pixel::ResponseError;
-use crate::units::{ChannelId, Dimension, InvalidValue};
+use crate::units::{ChannelId, Dimension, InvalidValue, bytes_text};
 
 /// Why visibilities could not be accumulated.
 #[derive(Debug, Error)]
@@ -54,9 +54,9 @@ pub enum AccumulationError {
     ChannelSettings(#[from] InvalidValue),
     /// The sums of an instrument would exceed the memory limit.
     #[error(
-        "the sums of the downlink's {channels} channels take at least {:.1} GB: expected at most {:.1} GB; lower \
+        "the sums of the downlink's {channels} channels take at least {}: expected at most {}; lower \
          map.nside, map some channels at a time (--groups auto), or state another limit, as in --memory-max {}GB",
-        *needed_bytes as f64 / 1e9, *limit_bytes as f64 / 1e9, needed_bytes.div_ceil(1_000_000_000)
+        bytes_text(*needed_bytes as f64), bytes_text(*limit_bytes as f64), needed_bytes.div_ceil(1_000_000_000)
     )]
     Memory {
         /// Channels of the instrument.

@@ -24,6 +24,9 @@ pub const BAND_HZ: [f64; 2] = [0.1e6, 30e6];
 /// in which the array moves by some degrees; the cost grows with the third power of that time.
 const SAMPLES_WIDTH_HZ_MIN: f64 = 500.0;
 
+/// Maximum power that a receiver adds, K sr: a hundred times that of the brightest sky, at the low end of the band.
+const RECEIVER_K_SR_MAX: f64 = 1e10;
+
 /// Missions with the default keep their hash.
 #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
 fn is_one(number: &u64) -> bool {
@@ -369,6 +372,9 @@ impl SpacecraftConfig {
         checks.number("receiver_knee_hz", knee, knee >= 0.0, "Hz, or 0 for no 1/f noise");
         let floor = &self.interference_floor_k_sr;
         check_channels("interference_floor_k_sr", floor, self.channels_hz.len(), checks);
+        let loudest = self.receiver_k_sr().into_iter().fold(0.0, f64::max);
+        let expected = "at most 1e10 K sr with receiver_knee_hz and interference_floor_k_sr: beyond, nothing of the sky is left";
+        checks.number("receiver_noise_k_sr", loudest, !(loudest > RECEIVER_K_SR_MAX), expected);
     }
 
     /// Rule of the integration time.

@@ -170,6 +170,12 @@ mod tests {
                 "receiver_noise_k_sr = [[1e6, 2e4], [9e6, 1.0]]",
                 "receiver_noise_k_sr = (1000000 Hz to 9000000 Hz): expected a table that covers channels_hz[1] = 10000000",
             ),
+            ("receiver_noise_k_sr = 1e16", "receiver_noise_k_sr = 1e16: expected at most 1e10 K sr"),
+            (
+                "receiver_noise_k_sr = 1e3\nreceiver_knee_hz = 1e300",
+                "receiver_noise_k_sr = 2e296: expected at most 1e10 K sr",
+            ),
+            ("interference_floor_k_sr = 1e11", "receiver_noise_k_sr = 100000000000: expected at most"),
             ("receiver_knee_hz = -1.0", "receiver_knee_hz = -1: expected Hz, or 0"),
             (
                 "interference_floor_k_sr = [1.0]",

@@ -7,12 +7,20 @@ use thiserror::Error;
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 
+/// What to do about a folder that cannot be written. A refused name says itself what was expected.
+fn folder_hint(source: &std::io::Error) -> &'static str {
+    match source.kind() {
+        std::io::ErrorKind::InvalidInput => "",
+        _ => "; expected a writable folder (choose one with --out)",
+    }
+}
+
 /// Errors of products.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProductsError {
     /// A file or folder that cannot be written.
-    #[error("cannot write {}: {source}; expected a writable folder (choose one with --out)", path.display())]
+    #[error("cannot write {}: {source}{}", path.display(), folder_hint(source))]
     Write {
         /// Path of the file or folder.
         path: PathBuf,

@@ -109,9 +109,12 @@ impl Hips {
         let begins = |path: &Path, start: &str| {
             path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(start))
         };
-        let is_ours = existing.iter().any(|path| begins(path, UNFINISHED));
+        let is_mark = |path: &&PathBuf| begins(path, UNFINISHED);
+        let is_ours = existing.iter().any(|path| is_mark(&path));
+        // The lock removes the beginning of `properties`.
+        let is_left = |path: &&PathBuf| is_mark(path) || (is_ours && begins(path, ".properties."));
         let (tiles, others): (Vec<&PathBuf>, Vec<&PathBuf>) =
-            existing.iter().filter(|path| !begins(path, UNFINISHED)).partition(|path| begins(path, "Norder"));
+            existing.iter().filter(|path| !is_left(path)).partition(|path| begins(path, "Norder"));
         if !others.is_empty() || (!tiles.is_empty() && !is_ours) {
             return Err(ProductsError::NotEmpty { path: folder.to_owned() });
         }

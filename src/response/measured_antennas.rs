@@ -60,7 +60,9 @@ impl AntennaFiles {
     /// Requires an error that a fit of a dipole can have, and no other pattern beside tables.
     pub fn check(&self, key: &str, has_patterns: bool, checks: &mut Checks) {
         let (error, name) = (self.table_error_max, format!("{key}.table_error_max"));
-        checks.number(name, error, error > 0.0 && error <= 0.5, "above 0, at most 0.5");
+        checks.number(&name, error, error > 0.0 && error <= 0.5, "above 0, at most 0.5");
+        let is_used = !self.tables.is_empty() || error == Self::default().table_error_max;
+        checks.number(name, error, is_used, "no such key without tables");
         let expected = "none beside pattern or pattern_by_frequency: a table has the whole pattern";
         let (name, found) = (format!("{key}.tables"), format!("({} files)", self.tables.len()));
         checks.require(name, found, self.tables.is_empty() || !has_patterns, expected);

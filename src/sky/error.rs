@@ -68,7 +68,7 @@ pub enum MapError {
     },
     /// A sky without power, with receivers without noise.
     #[error(
-        "the mean of the pixels is {value:e} K: without power visibilities have no weight; expected a mean above 0 K, or \
+        "the mean of the pixels is {value:e} K: without power visibilities have no weight; expected a mean of 1e-16 K or more, or \
          spacecraft.receiver_noise_k_sr above 0"
     )]
     Dark {
@@ -77,7 +77,7 @@ pub enum MapError {
     },
     /// A sky without power, with which nothing can be calibrated.
     #[error(
-        "the mean of the pixels is {value:e} K, a sky of which nothing can be known; expected a mean above 0 K, to calibrate with"
+        "the mean of the pixels is {value:e} K, a sky of which nothing can be known; expected a mean of 1e-16 K or more, to calibrate with"
     )]
     NothingKnown {
         /// Mean of the pixels, K.

@@ -37,7 +37,7 @@ pub use keys::{Key, Level};
 #[doc(hidden)]
 pub use per_channel::PerChannel;
 #[doc(hidden)]
-pub use quantity::Dimension;
+pub use quantity::{Dimension, bytes_text};
 #[doc(hidden)]
 pub use random::{StreamKind, random_stream};
 #[doc(hidden)]

@@ -117,6 +117,16 @@ impl Dimension {
     }
 }
 
+/// A number of bytes as text, in the unit that suits it.
+#[must_use]
+pub fn bytes_text(bytes: f64) -> String {
+    match bytes {
+        1e8.. => format!("{:.2} GB", bytes / 1e9),
+        1e5.. => format!("{:.1} MB", bytes / 1e6),
+        _ => format!("{bytes:.0} bytes"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

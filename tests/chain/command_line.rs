@@ -241,6 +241,28 @@ fn test_sky(n: [f64; 3]) -> f64 {
 }
 
 #[test]
+fn predict_takes_only_a_map_of_its_frequency() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("sky.fits");
+    let map = lunarray::sky::SkyMap::new(lunarray::sky::Frame::Ecliptic, vec![1e5; 12]).unwrap();
+    let cards = vec![lunarray::sky::fits::Card::real("FREQ", 3e6, "[Hz]")];
+    write_map(&file, &map, &WriteOptions { cards, ..WriteOptions::default() }).unwrap();
+    let sky = ["predict", "--sky", file.to_str().unwrap()];
+    let at = |freq: &'static str| [&sky[..], &["--at", "0", "--pair", "1-2", "--freq-hz", freq]].concat();
+    said(&at("3MHz"));
+    let told = complaint(&at("10MHz"));
+    assert!(
+        told.contains("10 MHz") && told.contains("expected 3 MHz") && told.contains("sky.fits"),
+        "{told}"
+    );
+    let rows = "t_s,i,j,freq_hz\n0,1,2,3e6\n0,1,2,1e7\n";
+    let output = lunarray().args(sky).write_stdin(rows).output().unwrap();
+    let told = String::from_utf8(output.stderr).unwrap();
+    assert!(!output.status.success() && told.contains("expected 3 MHz"), "{told}");
+    assert_eq!(String::from_utf8(output.stdout).unwrap().lines().count(), 1);
+}
+
+#[test]
 #[ignore = "needs LUNARRAY_SHARED"]
 fn predict_agrees_with_independent_values() {
     let path = common::shared("reference/visibilities_nside64.json");
@@ -302,6 +324,33 @@ fn all_errors_come_at_once() {
     let complaint = complaint(&["check", &write(folder.path(), "bad.toml", text)]);
     for part in ["channels_hz[0]", "duration_s", "map.nside", "map.epsilon"] {
         assert!(complaint.contains(part), "`{part}` is not in: {complaint}");
+    }
+}
+
+#[test]
+fn maps_are_read_of_regular_files() {
+    for file in ["/dev/zero", "/dev/null", "/tmp"] {
+        let told = complaint(&["compare", file, file]);
+        assert!(told.contains(file) && told.contains("not a regular file"), "{told}");
+    }
+}
+
+#[test]
+fn check_lists_problems_as_json() {
+    for (args, count) in [
+        (&["--set", "map.nside=7", "--set", "map.epsilon=2"][..], 2),
+        (&["--set", "map.nsied=8"], 1),
+        (&["/nowhere/pipeline.toml"], 1),
+    ] {
+        let output = lunarray().args([&["check", "--json"], args].concat()).output().unwrap();
+        assert_eq!(output.status.code(), Some(2), "{args:?}");
+        let found: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let problems: Vec<&str> =
+            found["problems"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
+        assert!(problems.len() == count && found["count"] == count, "{found}");
+        // The same as the text has.
+        let told = String::from_utf8(output.stderr).unwrap();
+        assert!(problems.iter().all(|problem| told.contains(problem)), "{told}\n{found}");
     }
 }
 

@@ -104,16 +104,20 @@ fn outputs_never_replace_inputs() {
     let map = place.path("map.fits");
     succeed(&["sky", &pipeline, "--freq-hz", "3e6", "--nside", "8", "--out", &map, "--no-picture"]);
     let words = "read as an input";
+    let [picture, drawn] = ["of-file.png", "of-map.png"].map(|name| place.path(name));
+    std::fs::hard_link(&file, &picture).unwrap();
+    std::fs::hard_link(&map, &drawn).unwrap();
+    spares(&file, &["gaps", &file, "--picture", &picture], words);
     for name in [&file, &second] {
         spares(&file, &["export", "visibilities", &file, "--out", name], words);
-        spares(&file, &["gaps", &file, "--picture", name], words);
         spares(&file, &["replay", &file, "--map", &pipeline, "--out", &out, "--events", name], words);
     }
     spares(&file, &["corrupt", &file, "--out", &second, "--frame-loss", "0.1"], words);
     spares(&pipeline, &["simulate", &pipeline, "--out", &pipeline], words);
     spares(&pipeline, &["run", &pipeline, "--out", &out, "--events", &pipeline], words);
     spares(&map, &["export", "alm", &map, "--out", &map], words);
-    spares(&map, &["cutout", &map, "--centre", "0,0", "--out", &map], words);
+    spares(&map, &["cutout", &map, "--centre", "0,0", "--out", &drawn], words);
+    spares(&file, &["corrupt", &file, "--out", &file, "--frame-loss", "0.1"], words);
     spares(&map, &["sky", "--like", &map, "--correlation", "0.5", "--out", &map], words);
     // The user's own file in the folder of the products: before anything is computed.
     let folder = place.path("");
@@ -129,6 +133,93 @@ fn outputs_never_replace_inputs() {
     let prior = format!("{out}/3.000MHz/map.fits");
     let set = format!("map.prior_files=[{prior:?}, {:?}]", format!("{out}/10.000MHz/map.fits"));
     spares(&prior, &["replay", &file, "--map", &pipeline, "--out", &out, "--set", &set], "would replace it");
+}
+
+#[test]
+fn a_refused_name_is_wrong_usage() {
+    let place = Workplace::new(SMALL);
+    let (pipeline, out) = (place.pipeline.clone(), place.path("out"));
+    let file = place.simulate("small.ccsds", &[]);
+    let second = place.path("second.ccsds");
+    std::fs::hard_link(&file, &second).unwrap();
+    for args in [
+        &["corrupt", &file, "--out", &file][..],
+        &["corrupt", &file, "--out", &second],
+        &["export", "visibilities", &file, "--out", &file],
+        &["replay", &file, "--map", &pipeline, "--out", &out, "--events", &file],
+        &["simulate", &pipeline, "--out", &pipeline],
+    ] {
+        let ended = output(start(args));
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert_eq!(ended.status.code(), Some(2), "{args:?}: {said}");
+        assert_eq!(said.matches("; expected").count(), 1, "{said}");
+    }
+    // A folder that the system cannot make is a failure of the system, whatever was to be written.
+    let below = format!("{file}/below");
+    for args in [
+        &["export", "visibilities", &file, "--out", &below][..],
+        &["export", "orbits", "--set", "spacecraft.duration_s=100", "--out", &below],
+        &["man", "--out", &below],
+    ] {
+        let ended = output(start(args));
+        assert_eq!(ended.status.code(), Some(3), "{args:?}: {}", String::from_utf8_lossy(&ended.stderr));
+    }
+}
+
+#[test]
+fn a_signal_leaves_no_file_that_was_being_written() {
+    let place = Workplace::new(SMALL);
+    let (ranges, out) = (place.file("ranges.txt", b"0x103 0 5\n"), place.path("again.ccsds"));
+    // It waits for its input, which does not end.
+    let mut command = Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
+    command.args(["extract", "-", "--ranges", &ranges, "--out", &out]);
+    let mut child = command.stdin(std::process::Stdio::piped()).spawn().unwrap();
+    let folder = place.path("");
+    wait_until("the beginning of a file", || !hidden(Path::new(&folder)).is_empty());
+    signal(&child, "INT");
+    assert_eq!(std::os::unix::process::ExitStatusExt::signal(&end(&mut child).0), Some(2));
+    assert!(hidden(Path::new(&folder)).is_empty() && !Path::new(&out).exists());
+}
+
+#[test]
+fn pictures_have_the_names_of_pictures() {
+    let place = Workplace::new(SMALL);
+    let file = place.simulate("small.ccsds", &[]);
+    let pipeline = place.pipeline.clone();
+    spares(&pipeline, &["gaps", &file, "--picture", &pipeline], ".png or .svg");
+    let map = place.path("map.fits");
+    let sky = ["sky", &pipeline, "--freq-hz", "3e6", "--nside", "8", "--out"];
+    succeed(&[&sky[..], &[&map, "--no-picture"]].concat());
+    let text = place.path("m.txt");
+    assert!(fail(&["cutout", &map, "--centre", "0,0", "--out", &text]).contains(".png or .svg"));
+    assert!(fail(&["compare", &map, &map, "--plot", &text]).contains(".png or .svg"));
+    assert!(!Path::new(&text).exists());
+    // A map under the name of its picture, and a table under that of the map.
+    let (picture, table) = (place.path("sky.png"), place.path("sky.fits"));
+    assert!(fail(&[&sky[..], &[&picture]].concat()).contains("different names"));
+    assert!(fail(&[&sky[..], &[&table, "--sources", &table]].concat()).contains("different names"));
+    assert!(!Path::new(&picture).exists() && !Path::new(&table).exists());
+}
+
+#[test]
+fn no_output_takes_the_place_of_another() {
+    let place = Workplace::new(SMALL);
+    let (pipeline, out, sent) = (place.pipeline.clone(), place.path("out"), place.path("sent.ccsds"));
+    std::fs::create_dir(&out).unwrap();
+    let summary = place.file("out/summary.json", b"of an earlier run");
+    for name in ["summary.json", "downlink.ccsds", "pipeline.toml"] {
+        let run = ["run", &pipeline, "--out", &out, "--events", &format!("{out}/../out/{name}")];
+        assert!(fail(&run).contains("another output"), "{name}");
+    }
+    assert_eq!(std::fs::read(summary).unwrap(), b"of an earlier run");
+    assert!(fail(&["simulate", &pipeline, "--out", &sent, "--events", &sent]).contains("another output"));
+    assert!(!Path::new(&sent).exists());
+    // Of a name that the command finds out later.
+    let truth = format!("{sent}.truth.json");
+    let set = ["--set", "downlink.link.frame_loss=0.1"];
+    let said = fail(&[&["simulate", &pipeline, "--out", &sent, "--events", &truth], &set[..]].concat());
+    assert!(said.contains("another output") && said.contains("truth.json"), "{said}");
+    assert!(std::fs::read_to_string(truth).unwrap().contains("\"failed\""));
 }
 
 #[test]

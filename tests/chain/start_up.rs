@@ -60,10 +60,12 @@ fn more_memory_than_there_is_is_refused_before_anything_starts() {
     let least_bytes = 1e9 * least.unwrap_or_else(|| panic!("{said}")).parse::<f64>().unwrap();
     // Two matrices, and blocks of rows that wait.
     assert!((2.0..2.2).contains(&(least_bytes / matrix)), "{said}");
-    for part in ["expected at most 8.0 GB", "--groups auto", "--memory-max "] {
+    for part in ["expected at most 8.00 GB", "--groups auto", "--memory-max "] {
         assert!(said.contains(part), "{said}");
     }
     assert!(!std::path::Path::new(&out).join("summary.json").exists());
+    let said = fail(&["replay", &downlink, "--map", &place.pipeline, "--out", &out, "--memory-max", "1kB"]);
+    assert!(said.contains("MB: expected at most 1000 bytes"), "{said}");
     assert!(fail(&["check", "--memory-max", "much"]).contains("expected a size"));
 }
 

@@ -4,9 +4,10 @@
 use std::path::Path;
 use std::time::Duration;
 
+use lunarray::downlink::DownlinkError;
 use lunarray::ground::{Ground as Core, WAIT_BYTES};
-use lunarray::pipeline::ConfigSource;
-use lunarray::runtime::{Cancel, Outlet, Stage};
+use lunarray::pipeline::{ConfigSource, GroundSource, replay};
+use lunarray::runtime::{Cancel, Flow, Outlet, Source, Stage};
 
 use super::common::process::{end, output, signal, start, wait_until};
 use super::{ENGINES, Ground, checkpoints};
@@ -52,6 +53,45 @@ fn what_arrives_after_an_interrupt_is_held_and_added_by_the_next_session() {
             assert!(place.bytes(&name("cut")) == place.bytes(&name("whole")), "{engine} {wait_bytes}");
         }
     }
+}
+
+/// A source whose end is read before the run is cancelled, which the ground sees before it adds anything.
+struct CancelledAtEnd {
+    bytes: Vec<u8>,
+    cancel: Cancel,
+}
+
+impl Source for CancelledAtEnd {
+    type Out = Vec<u8>;
+    type Error = DownlinkError;
+
+    fn next(&mut self, out: &mut Outlet<Vec<u8>>) -> Result<Flow, DownlinkError> {
+        self.cancel.cancel();
+        out.push(std::mem::take(&mut self.bytes));
+        Ok(Flow::Done)
+    }
+}
+
+impl GroundSource for CancelledAtEnd {}
+
+#[test]
+fn an_interrupt_after_the_last_byte_was_read_is_one() {
+    let place = Ground::new();
+    let bytes = std::fs::read(place.downlink()).unwrap();
+    let source = ConfigSource { file: Some(place.pipeline.clone().into()), ..ConfigSource::default() };
+    let config = source.load_ground().unwrap();
+    let session = |bytes: &[u8], cancel: Cancel| {
+        let ground = core(&place, "state", WAIT_BYTES, &cancel);
+        let source = CancelledAtEnd { bytes: bytes.to_vec(), cancel: cancel.clone() };
+        replay(source, &config, ground, Path::new(&place.path("out")), &cancel, &mut |_| {})
+    };
+    let summary = session(&bytes, Cancel::new()).unwrap();
+    assert!(summary.cancelled && summary.channels.is_empty());
+    let sampled = summary.ledger.sampled;
+    assert!(sampled > 0 && summary.ledger.accumulated == 0);
+    let next = place.replay("state", &[], &["--wait-bytes", &WAIT_BYTES.to_string()]);
+    assert_eq!((&next["cancelled"], &next["ledger"]["sampled"]), (&false.into(), &sampled.into()));
+    assert!(next["ledger"]["accumulated"].as_u64() > Some(0));
 }
 
 #[test]
@@ -163,4 +203,22 @@ fn a_failure_says_by_its_code_of_which_sort_it_is() {
     // The system: a folder that cannot be made, as a file is in its place.
     place.file("file", b"x");
     assert_eq!(code("file/state", &[&file], &[]), Some(3));
+}
+
+#[test]
+fn a_state_that_is_nowhere_is_not_made_of_nothing() {
+    let place = Ground::new();
+    let said = String::from_utf8(place.output("nosuch", &[], &[]).stderr).unwrap();
+    assert!(said.contains("no such state") && said.contains("nosuch"), "{said}");
+    assert!(!Path::new(&place.path("nosuch")).exists());
+    let (file, both) = (place.downlink(), place.path("both"));
+    let said = super::common::workplace::fail(&[
+        "replay",
+        &file,
+        "--state",
+        &both,
+        "--out",
+        &format!("{both}/../both"),
+    ]);
+    assert!(said.contains("two folders") && !Path::new(&both).exists(), "{said}");
 }

@@ -155,6 +155,27 @@ fn what_waits_goes_and_what_others_need_stays() {
 }
 
 #[test]
+fn a_file_of_another_mission_takes_nothing_out() {
+    let place = Ground::new();
+    let file = place.downlink();
+    // The same seed, and a channel in common: packets of that are equal.
+    let other = place.simulate("other.ccsds", &["--set", "spacecraft.channels_hz=[3e6, 12e6]"]);
+    let ours: std::collections::BTreeSet<Vec<u8>> = packets(&file).into_iter().collect();
+    let is_common = |packet: &&Vec<u8>| identity(packet).0 == VISIBILITIES && ours.contains(*packet);
+    assert!(packets(&other).iter().filter(is_common).count() > 10);
+    place.replay("state", &[&file], &[]);
+    let before = place.bytes("state");
+    let state = place.path("state");
+    for files in [&[&other][..], &[&file, &other]] {
+        let files: Vec<&str> = files.iter().map(|file| file.as_str()).collect();
+        let args = [&["retract"], &files[..], &["--state", &state, "--map", &place.pipeline]].concat();
+        let said = super::common::workplace::fail(&args);
+        assert!(said.contains("another instrument") && said.contains(&other), "{said}");
+        assert!(place.bytes("state") == before);
+    }
+}
+
+#[test]
 fn a_place_without_a_state_is_told() {
     let place = Ground::new();
     let file = place.downlink();

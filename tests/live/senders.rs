@@ -1,5 +1,7 @@
 //! Misbehaving senders: bad data, or too much.
 
+use lunarray::downlink::wire::cadu::randomize;
+
 use super::*;
 
 /// Headers that announce the longest packet, without one.
@@ -352,4 +354,42 @@ fn a_ground_that_is_slower_slows_the_sender_and_keeps_its_memory() {
     assert_eq!(all, times * length);
     assert_eq!(sender.join().unwrap(), format!("taken {all} bytes\n"));
     assert!(source.listening().report().backlog_bytes_max <= backlog);
+}
+
+#[test]
+fn what_is_no_downlink_is_not_taken() {
+    let place = Place::new();
+    let file = place.downlink("packets");
+    let good = std::fs::read(&file).unwrap();
+    let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    packed.write_all(&good).unwrap();
+    let packed = packed.finish().unwrap();
+    // Frames without sync marker, randomizer and parity, as some stations store them: 5 blocks of 255 octets, 223 of them data.
+    let coded = std::fs::read(place.downlink("cadu")).unwrap();
+    let frame = |cadu: &[u8]| {
+        let mut block = cadu[4..].to_vec();
+        randomize(&mut block);
+        block.truncate(5 * 223);
+        block
+    };
+    let bare: Vec<u8> = coded.chunks_exact(4 + 5 * 255).flat_map(frame).collect();
+    let state = place.path("state");
+    let ground = place.ground("heard", &["--state", &state, "--connections", "2"]);
+    // So that the ground has an instrument.
+    assert_eq!(ground.send(&good), format!("taken {} bytes\n", good.len()));
+    for (bytes, found) in [
+        (&packed[..], "a gzip file: expand it first (gunzip)"),
+        (b"a line of text\n", "a text file"),
+        (b"SIMPLE  =                    T / a header\n", "a FITS file"),
+        (&[0; 300], "no valid packet"),
+        (&bare, "AOS transfer frames"),
+    ] {
+        let answer = ground.send(bytes);
+        assert!(answer.starts_with(&format!("closed after {} bytes: ", bytes.len())), "{answer}");
+        assert!(answer.contains(found), "{answer}");
+    }
+    ground.send(&good);
+    let summary = ground.succeed();
+    assert_eq!(summary["listening"]["ended"]["not-a-downlink"], 5);
+    assert_eq!(summary["listening"]["ended"]["whole"], 2);
 }

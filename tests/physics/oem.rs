@@ -80,6 +80,71 @@ fn circle(angle: f64) -> String {
     text
 }
 
+/// The file of [`circle`] with lines more in its metadata.
+fn circle_with(angle: f64, lines: &str) -> String {
+    circle(angle).replacen("META_STOP", &format!("{lines}META_STOP"), 1)
+}
+
+#[test]
+fn an_epoch_that_ends_with_z_is_utc() {
+    let folder = tempfile::tempdir().unwrap();
+    for n in 1..=3 {
+        fs::write(folder.path().join(format!("sat{n}.oem")), circle(1e-3 * f64::from(n))).unwrap();
+    }
+    let begins = |epoch: &str| {
+        let config = ArrayConfig { oem_epoch: epoch.into(), ..config(folder.path()) };
+        Array::new(&config).map(|array| array.known_s().unwrap()[0]).map_err(|error| error.to_string())
+    };
+    // TDB is ahead of UTC by 37 s + 32.184 s, and less than 2 ms of relativity.
+    let apart_s = begins("2030-01-01T00:10:00").unwrap() - begins("2030-01-01T00:10:00Z").unwrap();
+    assert!((apart_s - 69.184).abs() < 2e-3, "{apart_s}");
+    let said = begins("2030-01-01T23:59:60Z").unwrap_err();
+    assert!(said.contains("a date on UTC"), "{said}");
+}
+
+#[test]
+fn what_is_said_twice_or_of_other_times_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |n: usize, bytes: &[u8]| fs::write(folder.path().join(format!("sat{n}.oem")), bytes).unwrap();
+    let array = || Array::new(&config(folder.path())).map_err(|error| error.to_string());
+    for n in 2..=3 {
+        write(n, circle(1e-3 * n as f64).as_bytes());
+    }
+    // The states go to 00:19; a step more may be claimed. Line ends are those of any system.
+    let whole = "START_TIME = 2029-12-31T23:59:30\nSTOP_TIME = 2030-01-01T00:20:00\n";
+    let good = circle_with(0.0, whole);
+    for text in [good.clone(), good.replace('\n', "\r\n"), good.replace('\n', "\r")] {
+        write(1, text.as_bytes());
+        array().unwrap();
+    }
+    let wide: Vec<u8> = good.bytes().flat_map(|byte| [byte, 0]).collect();
+    for (bytes, told) in [
+        (
+            circle_with(0.0, "TIME_SYSTEM = TAI\n").into_bytes(),
+            "line 10: found TIME_SYSTEM again; expected TIME_SYSTEM once",
+        ),
+        (
+            circle_with(0.0, "STOP_TIME = 2030-01-05T00:19:00\n").into_bytes(),
+            "line 10: found STOP_TIME = 2030-01-05T00:19:00.000",
+        ),
+        (
+            circle_with(0.0, "START_TIME = 2029-12-01T00:00:00\n").into_bytes(),
+            "line 10: found START_TIME = 2029-12-01",
+        ),
+        (circle_with(0.0, "STOP_TIME = soon\n").into_bytes(), "STOP_TIME = a date on TDB"),
+        (wide, "text in UTF-16; expected text as ASCII or UTF-8"),
+        (b"\x28\xb5\x2f\xfd\0".to_vec(), "a zstd file; expected text"),
+    ] {
+        write(1, &bytes);
+        let said = array().unwrap_err();
+        assert!(said.contains(told) && said.contains("sat1.oem"), "{said}: expected {told}");
+    }
+    // A device is not read, and a pipe not waited for.
+    let endless = ArrayConfig { oem: vec!["/dev/zero".into(); 3], ..config(folder.path()) };
+    let said = Array::new(&endless).unwrap_err().to_string();
+    assert!(said.contains("/dev/zero") && said.contains("a device; expected a file"), "{said}");
+}
+
 #[test]
 fn hostile_files_are_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();

@@ -6,8 +6,8 @@ use std::path::Path;
 
 use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, MapOutline, Ordering, Precision, ReadOptions,
-    SkyChannel, WriteOptions, read_map, read_map_file, read_map_from, read_notes, read_prior, read_sky,
-    read_whole_map, write_columns, write_map,
+    SkyChannel, WriteOptions, read_known_sky, read_map, read_map_file, read_map_from, read_notes, read_prior,
+    read_sky, read_whole_map, write_columns, write_map,
 };
 use lunarray::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
@@ -97,12 +97,12 @@ fn several_columns_and_provenance_are_kept() {
         Column { name: "NOISE", unit: "", values: two.values() },
     ];
     write_columns(&path, Frame::Galactic, &columns, &options).unwrap();
-    let second = read_map_file(&path, &ReadOptions { column: 1, ..ReadOptions::default() }).unwrap();
+    let second = read_map_file(&path, &ReadOptions { column: Some(1), ..ReadOptions::default() }).unwrap();
     assert_eq!((second.map, second.name.as_str(), second.unit.as_str()), (two, "NOISE", ""));
     assert_eq!(second.header.get("CFGHASH"), Some(&CardValue::Text(hash)));
     // Those of the file's first header follow.
     assert!(second.header.cards().windows(cards.len()).any(|some| some == cards));
-    let third = read_map(&path, &ReadOptions { column: 2, ..ReadOptions::default() });
+    let third = read_map(&path, &ReadOptions { column: Some(2), ..ReadOptions::default() });
     assert!(matches!(*third.unwrap_err().problem, FitsProblem::NoColumn { column: 2, columns: 2 }));
 }
 
@@ -312,6 +312,7 @@ fn a_sky_that_is_none_is_refused_with_file_pixel_and_value() {
         (-1e17, "pixel 7 with -1e17 K"),
         (1e307, "pixel 7 with 1e307 K"),
         (0.0, "the mean of the pixels is 0e0 K"),
+        (1e-199, "the mean of the pixels is 3.1"),
     ];
     for (value, words) in refusals {
         let refused = read(value, false).unwrap_err();
@@ -478,7 +479,7 @@ fn a_column_is_of_the_channel_that_it_names() {
     }
     // The nearest is scaled, by the law of the configuration alone.
     let said = read_sky(&path, &shared(8e6), &SkyConfig::default()).unwrap_err().to_string();
-    assert!(said.contains("FREQ is 10 MHz; expected 8 MHz"), "{said}");
+    assert!(said.contains("TTYPE3 is 10 MHz; expected 8 MHz"), "{said}");
     let scaled = SkyConfig { frequency: MapFrequency::SpectralIndex(-2.0), ..SkyConfig::default() };
     let value = read_sky(&path, &shared(8e6), &scaled).unwrap().values()[0];
     assert!((value / (3e5 / 0.64) - 1.0).abs() < 1e-12, "{value}");
@@ -486,7 +487,109 @@ fn a_column_is_of_the_channel_that_it_names() {
     write(["T", "Q", "U"]);
     let notes = read_notes(&path, &ReadOptions::default()).unwrap();
     assert!(
-        notes.iter().any(|note| note.contains("3 columns of maps") && note.contains("`T`, the first")),
+        notes.iter().any(|note| note.contains("3 columns") && note.contains("`T`, the first")),
         "{notes:?}"
     );
+}
+
+#[test]
+fn errors_hits_and_polarisation_are_no_sky() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("columns.fits");
+    let columns = |names: [&'static str; 2]| [(names[0], "", [70.0_f32; 12]), (names[1], "K", [3e5; 12])];
+    let primary = ["COORDSYS= 'G'", "FREQ    = '10 MHz'"];
+    let write = |primary: &[&str], names| foreign_map(&path, primary, &["NSIDE   = 1"], &columns(names));
+    for names in [
+        ["SIGMA_10MHz", "T_10MHz"],
+        ["SIGMA", "T"],
+        ["N_OBS", "TEMPERATURE"],
+        ["HITS", "T"],
+        ["PIXEL", "T"],
+        ["Q_POLARISATION", "I_STOKES"],
+    ] {
+        write(&primary, names);
+        let sky = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap();
+        let prior = read_prior(&path, &ReadOptions::default()).unwrap();
+        for map in [&sky, &prior, &read_known_sky(&path, &ReadOptions::default()).unwrap()] {
+            assert_eq!(map.values()[0], 3e5, "{names:?}");
+        }
+    }
+    // Two columns of one frequency, and columns that are errors and numbers only.
+    write(&primary[..1], ["T_10MHz", "T2_10MHz"]);
+    let said = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap_err().to_string();
+    assert!(said.contains("TTYPE1 is 10 MHz; expected one column of that frequency; TTYPE2"), "{said}");
+    write(&primary, ["SIGMA", "N_OBS"]);
+    let said = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap_err().to_string();
+    assert!(said.contains("SIGMA; expected the name of a map"), "{said}");
+    // What columns say and what the file says.
+    write(&["COORDSYS= 'G'", "FREQ    = '3 MHz'"], ["T_10MHz", "HITS"]);
+    let said = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap_err().to_string();
+    assert!(said.contains("FREQ is 3 MHz; expected 10 MHz, as TTYPE1 says"), "{said}");
+    // The keyword that states the frequency is named.
+    write(&["COORDSYS= 'G'", "OBSFREQ = 408. / MHz"], ["T", "HITS"]);
+    let said = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap_err().to_string();
+    assert!(said.contains("OBSFREQ is 408 MHz"), "{said}");
+}
+
+#[test]
+fn numbers_in_quotes_are_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("quoted.fits");
+    let mut values = [3e5_f32; 12];
+    values[7] = -9999.0;
+    let read = |more: &[&str]| {
+        foreign_map(&path, &["COORDSYS= 'G'"], &[&["NSIDE   = 1"], more].concat(), &[("T", "K", values)]);
+        read_whole_map(&path, &ReadOptions::default()).map_err(|error| error.to_string())
+    };
+    for card in ["BAD_DATA= '-9999'", "BAD_DATA= '-9999.0 '", "BAD_DATA= -9999"] {
+        let said = read(&[card]).unwrap_err();
+        assert!(said.contains("1 of 12 pixels") && said.contains("pixel 7 with -9.999e3"), "{said}");
+    }
+    assert_eq!(read(&["TSCAL1  = '100'", "TZERO1  = '1'"]).unwrap().values()[0], 30_000_001.0);
+    for card in ["BAD_DATA= 'below 0'", "TSCAL1  = 'ten'", "TNULL1  = 'none'"] {
+        let said = read(&[card]).unwrap_err();
+        assert!(said.contains(&card[..6]) && said.contains("expected a"), "{said}");
+    }
+}
+
+#[test]
+fn a_frame_is_said_once_and_of_j2000() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("frames.fits");
+    let read = |primary: &[&str], more: &[&str]| {
+        foreign_map(&path, primary, &[&["NSIDE   = 1"], more].concat(), &[("T", "K", [3e5; 12])]);
+        read_map(&path, &ReadOptions::default()).map(|map| map.frame()).map_err(|error| error.to_string())
+    };
+    for (primary, table, said) in [
+        (
+            &["COORDSYS= 'C'"][..],
+            &["COORDSYS= 'G'"][..],
+            "COORDSYS is 'C'; expected Galactic, as the headers say",
+        ),
+        (&["SKYCOORD= 'Equatorial'"], &["COORDSYS= 'G'"], "SKYCOORD is 'Equatorial'"),
+        (&["COORDSYS= 'C'"], &["EQUINOX =               1950.0"], "EQUINOX is 1950.0; expected 2000"),
+        (&["COORDSYS= 'C'"], &["EQUINOX = 'B1950'"], "EQUINOX is 'B1950'"),
+        (&["COORDSYS= 'E'"], &["RADECSYS= 'FK4'"], "RADECSYS is 'FK4'"),
+        (&["COORDSYS= 'C'"], &["EPOCH   =               1950.0"], "EPOCH is 1950.0"),
+    ] {
+        let found = read(primary, table).unwrap_err();
+        assert!(found.contains(said), "{found}: expected {said}");
+    }
+    let galactic = read(&["COORDSYS= 'G'", "SKYCOORD= 'Galactic'"], &["EQUINOX = 1950.0"]);
+    assert_eq!(galactic, Ok(Frame::Galactic));
+    assert_eq!(read(&["COORDSYS= 'C'"], &["EQUINOX = 2000.", "EPOCH = 1982.5"]), Ok(Frame::Equatorial));
+}
+
+#[test]
+fn the_table_with_the_map_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let [path, second] = ["first.fits", "second.fits"].map(|name| folder.path().join(name));
+    foreign_map(&path, &["COORDSYS= 'G'"], &["EXTNAME = 'LOG'"], &[("X", "s", [1.0; 12])]);
+    foreign_map(&second, &[], &["NSIDE   = 1"], &[("T", "K", [3e5; 12])]);
+    let [log, map] = [&path, &second].map(|path| fs::read(path).unwrap());
+    fs::write(&path, [&log, &map[2880..]].concat()).unwrap();
+    assert_eq!(read_map(&path, &ReadOptions::default()).unwrap().values()[0], 3e5);
+    // A table that says nothing of HEALPix is read where no other does, whatever follows it.
+    fs::write(&path, [&log, &map[2880..4000]].concat()).unwrap();
+    assert_eq!(read_map(&path, &ReadOptions::default()).unwrap().values()[0], 1.0);
 }

@@ -43,7 +43,7 @@ fn healpy_files_are_read_bit_for_bit() {
         }
         let name = path.file_stem().unwrap().to_str().unwrap();
         let column = if name.starts_with("columns") { 2 } else { 0 };
-        let map = read_map(&path, &ReadOptions { column, ..ReadOptions::default() }).unwrap();
+        let map = read_map(&path, &ReadOptions { column: Some(column), ..ReadOptions::default() }).unwrap();
         assert!(name.ends_with(map.frame().letter()), "{name}");
         assert!(map.values() == raw_values(&path.with_extension("raw")), "{name}");
         files += 1;

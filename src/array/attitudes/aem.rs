@@ -1,7 +1,7 @@
 //! Segments of attitude messages.
 
 use super::rotation::{Rotation, interpolated};
-use crate::array::oem::{Fault, Message, Metadata, Useable, read_epoch, short, turned, useable_s};
+use crate::array::oem::{Fault, Message, Metadata, SegmentTimes, read_epoch, short, turned};
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::Vec3;
 
@@ -36,7 +36,7 @@ pub(super) struct AttitudeSegment {
 struct SegmentForm {
     object: String,
     scale: TimeScale,
-    useable: Useable,
+    times: SegmentTimes,
     /// Whether rotations are given from the body to the axes.
     is_inverse: bool,
     /// Whether the scalar part comes first.
@@ -113,8 +113,8 @@ impl Message for Collector {
         self.metadata = Metadata::default();
     }
 
-    fn set(&mut self, key: &str, value: &str, line: usize) {
-        const USED: [&str; 12] = [
+    fn set(&mut self, key: &str, value: &str, line: usize) -> Result<(), Fault> {
+        const USED: [&str; 14] = [
             "OBJECT_NAME",
             "OBJECT_ID",
             "REF_FRAME_A",
@@ -125,10 +125,12 @@ impl Message for Collector {
             "QUATERNION_TYPE",
             "INTERPOLATION_METHOD",
             "INTERPOLATION_DEGREE",
+            "START_TIME",
+            "STOP_TIME",
             "USEABLE_START_TIME",
             "USEABLE_STOP_TIME",
         ];
-        self.metadata.set(&USED, key, value, line);
+        self.metadata.set(&USED, key, value, line)
     }
 
     fn end_metadata(&mut self, line: usize) -> Result<(), Fault> {
@@ -152,12 +154,12 @@ impl Message for Collector {
             ("FIRST", _) => true,
             (found, at) => return Err(Fault::new(at, found, "QUATERNION_TYPE = FIRST or LAST")),
         };
-        let useable = metadata.useable(scale, line)?;
+        let times = metadata.times(scale, line)?;
         let points = points_of(&metadata, line)?;
         let (time_s, to_body, lines) = (Vec::new(), Vec::new(), Vec::new());
         let segment = AttitudeSegment { useable_s: [0.0; 2], points, time_s, to_body, turns };
         let object = object.0.to_owned();
-        self.latest = Some(SegmentForm { object, scale, useable, is_inverse, scalar_first, lines, segment });
+        self.latest = Some(SegmentForm { object, scale, times, is_inverse, scalar_first, lines, segment });
         Ok(())
     }
 
@@ -204,7 +206,7 @@ impl Message for Collector {
     }
 
     fn end_segment(&mut self, line: usize) -> Result<(), Fault> {
-        let Some(SegmentForm { object, scale, useable, lines, mut segment, .. }) = self.latest.take() else {
+        let Some(SegmentForm { object, scale, times, lines, mut segment, .. }) = self.latest.take() else {
             return Ok(());
         };
         let count = segment.time_s.len();
@@ -212,9 +214,7 @@ impl Message for Collector {
             let expected = format!("{} or more in a segment, as its interpolation needs", segment.points);
             return Err(Fault::new(line, format!("{count} attitudes"), expected));
         }
-        let zero = Tai::from_seconds_since_1958(0.0);
-        segment.useable_s =
-            useable_s(useable, (zero, scale), [segment.time_s[0], segment.time_s[count - 1]])?;
+        segment.useable_s = times.useable_s(Tai::from_seconds_since_1958(0.0), &segment.time_s)?;
         segment.require_steps(&lines, scale)?;
         self.segments.push((object, segment));
         Ok(())

@@ -1,6 +1,5 @@
 //! Files of messages, KVN or XML, also compressed.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
@@ -9,6 +8,7 @@ use flate2::read::MultiGzDecoder;
 use super::form::{Fault, Message};
 use super::{kvn, xml};
 use crate::array::config::ArrayError;
+use crate::files::{form_of, read_file};
 
 /// Largest file that is read, and largest content of a compressed one, bytes: ten years of states each minute.
 const FILE_BYTES_MAX: u64 = 1 << 30;
@@ -24,27 +24,19 @@ pub(in crate::array) fn at_line(path: &Path, Fault { line, found, expected }: Fa
 
 /// Reads a message, KVN or XML, also compressed by gzip, to the end of its last segment; gives its last line, too.
 pub(in crate::array) fn read_message<M: Message>(path: &Path) -> Result<(M, usize), ArrayError> {
-    let of_io = |source: std::io::Error| error(path, source.to_string());
-    let mut bytes = Vec::new();
-    // A pipe has no size before it is read.
-    let file = File::open(path).map_err(of_io)?;
-    file.take(FILE_BYTES_MAX + 1).read_to_end(&mut bytes).map_err(of_io)?;
-    let too_large = || error(path, format!("it is too long; expected at most {FILE_BYTES_MAX} bytes"));
-    if bytes.len() as u64 > FILE_BYTES_MAX {
-        return Err(too_large());
-    }
+    let mut bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| error(path, source.to_string()))?;
     if bytes.starts_with(&[0x1f, 0x8b]) {
         let mut content = Vec::new();
         // A sum at the end says whether it is whole.
         let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
         unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
         if content.len() as u64 > FILE_BYTES_MAX {
-            return Err(too_large());
+            return Err(error(path, format!("it is too long; expected at most {FILE_BYTES_MAX} bytes")));
         }
         bytes = content;
     }
-    if bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) {
-        return Err(error(path, "UTF-16; expected ASCII or UTF-8".into()));
+    if let Some(form) = form_of(&bytes) {
+        return Err(error(path, format!("{form}; expected text as ASCII or UTF-8, or gzip of it")));
     }
     parse(&bytes).map_err(|fault| at_line(path, fault))
 }

@@ -42,7 +42,7 @@ pub(in crate::array) trait Message: Default {
     fn begin_metadata(&mut self);
 
     /// Takes a value of the metadata.
-    fn set(&mut self, key: &str, value: &str, line: usize);
+    fn set(&mut self, key: &str, value: &str, line: usize) -> Result<(), Fault>;
 
     /// Begins a segment with the metadata that end in a line.
     fn end_metadata(&mut self, line: usize) -> Result<(), Fault>;

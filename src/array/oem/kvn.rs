@@ -20,8 +20,8 @@ pub(super) fn parse<M: Message>(bytes: &[u8]) -> Result<(M, usize), Fault> {
     let mut message = M::default();
     let keyword = format!("CCSDS_{}_VERS", M::NAME);
     let first_line = || format!("{keyword} = {} on the first line", M::VERSIONS.join(" or "));
-    for (line, content) in bytes.split(|byte| *byte == b'\n').enumerate().map(|(k, content)| (k + 1, content))
-    {
+    let line_end = if bytes.contains(&b'\n') { b'\n' } else { b'\r' };
+    for (line, content) in (1..).zip(bytes.split(|byte| *byte == line_end)) {
         let content = String::from_utf8_lossy(content);
         let content = content.trim();
         last = line;
@@ -59,7 +59,7 @@ pub(super) fn parse<M: Message>(bytes: &[u8]) -> Result<(M, usize), Fault> {
                 }
             }
             (Place::Metadata, _) => match content.split_once('=') {
-                Some((key, value)) => message.set(key.trim(), value.trim(), line),
+                Some((key, value)) => message.set(key.trim(), value.trim(), line)?,
                 None => return fault("KEY = VALUE, or META_STOP"),
             },
             (Place::Data, _) if content.contains('=') => {

@@ -89,8 +89,15 @@ pub(super) struct Collector {
     covariances: usize,
 }
 
-/// Useable times and the lines that give them.
-pub(in crate::array) type Useable = [Option<(Tai, usize)>; 2];
+/// Times of a segment's metadata, each with the line that gives it.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::array) struct SegmentTimes {
+    scale: TimeScale,
+    /// Start and stop of the data.
+    data: [Option<(Tai, usize)>; 2],
+    /// Start and stop of what is to be used.
+    useable: [Option<(Tai, usize)>; 2],
+}
 
 /// How states are read.
 #[derive(Clone, Copy, Debug)]
@@ -98,7 +105,7 @@ struct SegmentForm {
     scale: TimeScale,
     /// Whether its axes are equatorial.
     turns: bool,
-    useable: Useable,
+    times: SegmentTimes,
 }
 
 impl Message for Collector {
@@ -122,18 +129,20 @@ impl Message for Collector {
         self.metadata = Metadata::default();
     }
 
-    fn set(&mut self, key: &str, value: &str, line: usize) {
-        // Others say what the data say, or nothing on which positions depend.
-        const USED: [&str; 7] = [
+    fn set(&mut self, key: &str, value: &str, line: usize) -> Result<(), Fault> {
+        // Positions do not depend on others.
+        const USED: [&str; 9] = [
             "CENTER_NAME",
             "REF_FRAME",
             "TIME_SYSTEM",
+            "START_TIME",
+            "STOP_TIME",
             "INTERPOLATION",
             "INTERPOLATION_DEGREE",
             "USEABLE_START_TIME",
             "USEABLE_STOP_TIME",
         ];
-        self.metadata.set(&USED, key, value, line);
+        self.metadata.set(&USED, key, value, line)
     }
 
     /// Begins a segment with the metadata that end in a line.
@@ -143,9 +152,9 @@ impl Message for Collector {
         let turns = metadata.is_equatorial("REF_FRAME", line)?;
         let scale = metadata.scale(line)?;
         let (method, degree) = metadata.interpolation(line)?;
-        let useable = metadata.useable(scale, line)?;
+        let times = metadata.times(scale, line)?;
         self.scale.get_or_insert(scale);
-        self.of_segment = Some(SegmentForm { scale, turns, useable });
+        self.of_segment = Some(SegmentForm { scale, turns, times });
         self.segments.push(OemSegment {
             method,
             degree,
@@ -199,13 +208,10 @@ impl Message for Collector {
         let (Some(segment), Some(zero)) = (self.segments.last_mut(), self.zero) else {
             return Err(Fault::new(line, "0 states", ENOUGH));
         };
-        let (Some(&first_s), Some(&last_s)) = (segment.time_s.first(), segment.time_s.last()) else {
-            return Err(Fault::new(line, "0 states", ENOUGH));
-        };
         if segment.time_s.len() < segment.points().max(2) {
             return Err(Fault::new(line, format!("{} states", segment.time_s.len()), ENOUGH));
         }
-        segment.useable_s = useable_s(form.useable, (zero, form.scale), [first_s, last_s])?;
+        segment.useable_s = form.times.useable_s(zero, &segment.time_s)?;
         Ok(())
     }
 }
@@ -229,9 +235,22 @@ const ENOUGH: &str = "as many states in a segment as its interpolation needs";
 
 impl Metadata {
     /// Takes a value, if its key is one of those that are used.
-    pub(in crate::array) fn set(&mut self, used: &[&str], key: &str, value: &str, line: usize) {
-        if used.contains(&key) {
-            self.0.insert(key.to_owned(), (value.to_uppercase(), line));
+    pub(in crate::array) fn set(
+        &mut self,
+        used: &[&str],
+        key: &str,
+        value: &str,
+        line: usize,
+    ) -> Result<(), Fault> {
+        if !used.contains(&key) {
+            return Ok(());
+        }
+        match self.0.insert(key.to_owned(), (value.to_uppercase(), line)) {
+            None => Ok(()),
+            Some((_, first)) => {
+                let expected = format!("{key} once in a segment's metadata: line {first} has it, too");
+                Err(Fault::new(line, format!("{key} again"), expected))
+            }
         }
     }
 
@@ -242,10 +261,14 @@ impl Metadata {
         TimeScale::from_name(system).ok_or_else(|| Fault::new(line, system, expected))
     }
 
-    /// First and last useable time, if they are given.
-    pub(in crate::array) fn useable(&self, scale: TimeScale, end: usize) -> Result<Useable, Fault> {
+    /// Times of the segment, those that are given.
+    pub(in crate::array) fn times(&self, scale: TimeScale, end: usize) -> Result<SegmentTimes, Fault> {
         let of = |key| self.date(key, scale, end);
-        Ok([of("USEABLE_START_TIME")?, of("USEABLE_STOP_TIME")?])
+        Ok(SegmentTimes {
+            scale,
+            data: [of("START_TIME")?, of("STOP_TIME")?],
+            useable: [of("USEABLE_START_TIME")?, of("USEABLE_STOP_TIME")?],
+        })
     }
 
     /// The value of a key and its line; `nothing`, at the end of the metadata, if it is not given.
@@ -323,29 +346,41 @@ pub(in crate::array) fn read_epoch(epoch: &str, scale: TimeScale, line: usize) -
     })
 }
 
-/// The interval in which a segment is to be used, s after `zero`, of one whose states go from `first_s` to `last_s`.
-pub(in crate::array) fn useable_s(
-    given: Useable,
-    (zero, scale): (Tai, TimeScale),
-    [first_s, last_s]: [f64; 2],
-) -> Result<[f64; 2], Fault> {
-    let mut useable_s = [first_s, last_s];
-    for (end, given) in given.into_iter().enumerate() {
-        let Some((time, at)) = given else { continue };
-        let time_s = time.since_s(zero);
-        if !(first_s - ROUNDED_S..=last_s + ROUNDED_S).contains(&time_s) {
-            let ends = [first_s, last_s].map(|s| zero.plus_s(s).text(scale, 3));
-            let found = format!("a USEABLE time of {}", time.text(scale, 3));
-            return Err(Fault::new(at, found, format!("one among the states, {} to {}", ends[0], ends[1])));
+impl SegmentTimes {
+    /// The interval in which a segment is to be used, s after `zero`, of one whose states have these times, two or more. The data must
+    /// begin and end with its states, to a step: a file may be cut off.
+    pub(in crate::array) fn useable_s(&self, zero: Tai, time_s: &[f64]) -> Result<[f64; 2], Fault> {
+        let (Some(&first_s), Some(&last_s)) = (time_s.first(), time_s.last()) else { return Ok([0.0; 2]) };
+        let step_s = time_s.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
+        let require = |(time, line): (Tai, usize), key: &str, allowed_s: f64| {
+            let at_s = time.since_s(zero);
+            if (first_s - at_s).max(at_s - last_s) <= allowed_s + ROUNDED_S {
+                return Ok(at_s.clamp(first_s, last_s));
+            }
+            let [first, last] = [first_s, last_s].map(|s| zero.plus_s(s).text(self.scale, 3));
+            let found = format!("{key} = {}", time.text(self.scale, 3));
+            Err(Fault::new(
+                line,
+                found,
+                format!("one among the states, {first} to {last}: the file may be cut off"),
+            ))
+        };
+        let mut useable_s = [first_s, last_s];
+        for (end, name) in ["START_TIME", "STOP_TIME"].into_iter().enumerate() {
+            if let Some(given) = self.data[end] {
+                require(given, name, step_s)?;
+            }
+            if let Some(given) = self.useable[end] {
+                useable_s[end] = require(given, &format!("USEABLE_{name}"), 0.0)?;
+            }
         }
-        useable_s[end] = time_s.clamp(first_s, last_s);
+        if useable_s[0] >= useable_s[1] {
+            let line = self.useable.iter().flatten().map(|(_, line)| *line).max().unwrap_or_default();
+            let found = "useable times that end before they begin";
+            return Err(Fault::new(line, found, "USEABLE_START_TIME before USEABLE_STOP_TIME"));
+        }
+        Ok(useable_s)
     }
-    if useable_s[0] >= useable_s[1] {
-        let at = given.iter().flatten().map(|(_, at)| *at).max().unwrap_or_default();
-        let found = "useable times that end before they begin";
-        return Err(Fault::new(at, found, "USEABLE_START_TIME before USEABLE_STOP_TIME"));
-    }
-    Ok(useable_s)
 }
 
 /// From equatorial to ecliptic axes.

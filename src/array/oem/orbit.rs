@@ -12,7 +12,7 @@ use super::message::{Collector, OemMessage, OemSegment, Reading, TableMethod};
 use crate::array::config::ArrayError;
 use crate::array::state::SatelliteState;
 use crate::units::constants::MOON_GM_M3_S2;
-use crate::units::time_scales::Tai;
+use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::{Vec3, cross, dot, norm, scale, sub};
 
 /// An orbit from a file. Cheap to clone.
@@ -71,7 +71,7 @@ pub(in crate::array) struct OemOrbits {
     pub(in crate::array) notes: Vec<String>,
 }
 
-/// Reads the files of all satellites. The mission begins at `epoch`, a date in their time system, or with the last to begin.
+/// Reads the files of all satellites. The mission begins at `epoch`, a date in UTC if it ends with Z, else in their time system, or with the last to begin.
 pub(in crate::array) fn read(
     paths: &[PathBuf],
     epoch: &str,
@@ -132,9 +132,9 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
     let given = if epoch.is_empty() {
         latest
     } else {
-        if let Some((path, reading)) =
-            paths.iter().zip(readings).find(|(_, reading)| reading.scale != first.scale)
-        {
+        let scale = if epoch.ends_with('Z') { TimeScale::Utc } else { first.scale };
+        let other = paths.iter().zip(readings).find(|(_, reading)| reading.scale != scale);
+        if let Some((path, reading)) = other.filter(|_| !epoch.ends_with('Z')) {
             return Err(error(
                 path,
                 format!(
@@ -143,11 +143,8 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
                 ),
             ));
         }
-        Tai::parse(epoch, first.scale).ok_or_else(|| {
-            error(
-                &paths[0],
-                format!("array.oem_epoch = {epoch:?}; expected a date on {}, as in the file", first.scale),
-            )
+        Tai::parse(epoch, scale).ok_or_else(|| {
+            error(&paths[0], format!("array.oem_epoch = {epoch:?}; expected a date on {scale}"))
         })?
     };
     Ok(Tai::from_seconds_since_1958(given.seconds_since_1958()))

@@ -103,7 +103,7 @@ impl<M: Message> Elements<M> {
                 self.state.add_to(&mut self.message, line)?;
                 self.around = XmlContext::Nothing;
             }
-            (XmlContext::Metadata, _) => self.message.set(name, value, line),
+            (XmlContext::Metadata, _) => self.message.set(name, value, line)?,
             (XmlContext::State, _) => self.state.set::<M>(name, value, line)?,
             (XmlContext::Nothing, _) => {}
         }
@@ -123,9 +123,17 @@ enum XmlContext {
 
 impl State {
     fn set<M: Message>(&mut self, name: &str, value: &str, line: usize) -> Result<(), Fault> {
+        let place = M::NUMBERS.iter().position(|known| *known == name);
+        let is_given = match place {
+            Some(place) => self.numbers[place].is_some(),
+            None => name == "EPOCH" && !self.epoch.is_empty(),
+        };
+        if is_given {
+            return Err(Fault::new(line, format!("{name} again"), "one of each in a state"));
+        }
         if name == "EPOCH" {
             value.clone_into(&mut self.epoch);
-        } else if let Some(place) = M::NUMBERS.iter().position(|known| *known == name) {
+        } else if let Some(place) = place {
             let Ok(number) = value.parse() else {
                 return Err(Fault::new(line, format!("{name} = {}", short(value)), "a number"));
             };

@@ -17,6 +17,7 @@ use std::f64::consts::{PI, TAU};
 
 use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
+use super::fit::UNEXPLAINED_MIN;
 use super::solution::PassSolution;
 
 /// Threshold of a step, in standard deviations, which are raised to at least the scatter from pass to pass (see `inflate_sigmas`).
@@ -27,8 +28,6 @@ const CHANGE_MIN: f64 = 0.01;
 const OUTLIER_FRACTION_MAX: f64 = 0.1;
 /// Minimum number of channels to distinguish a clock jump from a phase step.
 const CHANNELS_MIN: usize = 3;
-/// Maximum reduced chi-square of an acceptable fit.
-const CHI2_REDUCED_MAX: f64 = 9.0;
 
 /// Changes of a daughter's gains from one solution to the next.
 struct Change {
@@ -65,7 +64,11 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
         let of_solution: Vec<&Change> = changes.iter().filter(|change| change.solution == index).collect();
         let before = index.checked_sub(1).map(|previous| &solutions[previous]);
         add_step_events(&of_solution, before, solution, &mut events);
-        add_state_events(before, solution, &mut events);
+        add_drifts(solution, &mut events);
+        // Of a pass that jumps divide, a state is told once.
+        let earlier = solutions[..index].iter().rev().enumerate();
+        let earlier = earlier.take_while(|(k, one)| *k == 0 || one.pass == solution.pass).map(|(_, one)| one);
+        add_onsets(&earlier.collect::<Vec<_>>(), solution, &mut events);
         add_disturbance_events(solution, &mut events);
     }
     events
@@ -227,49 +230,83 @@ fn add_step_events(
     }
 }
 
-/// Smallest rms phase change within a pass that is reported, deg.
+/// Smallest phase change within a pass that is reported, deg: that of a steady drift, which is sqrt(12) times its rms.
 const DRIFT_MIN_DEG: f64 = 4.0;
 
-/// Smallest fraction of a phase's variance that a reported drift contributes.
-const DRIFT_FRACTION: f64 = 0.92;
+/// Smallest fraction of the variance of a gain that a reported drift contributes: with noise alone one gain in a
+/// thousand reaches it.
+const DRIFT_FRACTION: f64 = 0.95;
 
-/// Smallest unexplained fraction of the signal that is reported.
-const UNEXPLAINED_MIN: f64 = 0.01;
+/// Unexplained fraction of the signal above which a model says nothing about single daughters.
+const UNEXPLAINED_OF_EVENTS_MAX: f64 = 0.15;
 
-/// Adds events that follow from the state of a solution's gains: onsets of states (dead, wrong model), and drifts.
-fn add_state_events(
-    before: Option<&PassSolution>,
-    solution: &PassSolution,
-    events: &mut Vec<InstrumentEvent>,
-) {
-    let pass = solution.pass;
-    let channels = solution.model_error.len();
+/// Adds drifts within the solution's interval.
+fn add_drifts(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
     let disturbed = disturbed_channels(solution);
-    let is_disturbed = |c: usize| disturbed.get(c) == Some(&true);
+    let model_errors: Vec<ModelErrors> =
+        (0..solution.model_error.len()).map(|c| ModelErrors::of(solution, c)).collect();
     for (n, daughter) in solution.daughters.iter().enumerate() {
-        let number = daughter.daughter;
-        let is_dead =
-            |solution: &PassSolution, c: usize| solution.daughters[n].gains[c].state == GainState::Dead;
-        let dead = (0..channels).filter(|c| is_dead(solution, *c));
-        let dead: Vec<usize> = dead.filter(|c| before.is_none_or(|before| !is_dead(before, *c))).collect();
-        if !dead.is_empty() {
-            events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
-        }
-        // A drift is reported only if it dominates the variance of the phase: with noise alone the estimated scatter can reach 0.9
-        // of it.
-        let is_drifting = |gain: &GainEstimate| {
-            let sigma_deg = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
-            gain.phase_scatter_deg > DRIFT_MIN_DEG
+        let is_drifting = |c: usize, gain: &GainEstimate| {
+            // Where phases are relative to the daughter itself, its amplitude says how well the gain is known.
+            let sigma_deg = match n + 1 == solution.reference as usize {
+                true => gain.amplitude_sigma.to_degrees().hypot(gain.phase_scatter_deg),
+                false => gain.phase_sigma_deg.max(gain.phase_scatter_deg),
+            };
+            12.0_f64.sqrt() * gain.phase_scatter_deg > DRIFT_MIN_DEG
                 && (gain.phase_scatter_deg / sigma_deg).powi(2) > DRIFT_FRACTION
+                && !model_errors[c].can_explain(gain.phase_scatter_deg)
+                && disturbed.get(c) != Some(&true)
         };
-        let drifting =
-            daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(gain) && !is_disturbed(*c));
-        let drifting: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
-        if !drifting.is_empty() {
-            events.push(InstrumentEvent::Drift { pass, daughter: number, channels: drifting });
+        let drifting = daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(*c, gain));
+        let channels: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
+        if !channels.is_empty() {
+            events.push(InstrumentEvent::Drift {
+                pass: solution.pass,
+                from_s: solution.from_s,
+                until_s: solution.until_s,
+                daughter: daughter.daughter,
+                channels,
+            });
         }
     }
-    let unexplained_if_wrong = |solution: &PassSolution, c: usize| {
+}
+
+/// Adds onsets of states, dead or wrong model, that none of the `earlier` solutions has: the one before, and others of
+/// the pass.
+fn add_onsets(earlier: &[&PassSolution], solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
+    let PassSolution { pass, from_s, .. } = *solution;
+    let channels = solution.model_error.len();
+    let disturbed = disturbed_channels(solution);
+    for (n, daughter) in solution.daughters.iter().enumerate() {
+        let is_dead = |solution: &PassSolution, c: usize| {
+            solution.daughters[n].gains[c].state == GainState::Dead
+                && !ModelErrors::of(solution, c).are_large()
+        };
+        let dead = (0..channels).filter(|c| is_dead(solution, *c));
+        let dead: Vec<usize> = dead.filter(|c| !earlier.iter().any(|earlier| is_dead(earlier, *c))).collect();
+        if !dead.is_empty() {
+            events.push(InstrumentEvent::Dead { pass, from_s, daughter: daughter.daughter, channels: dead });
+        }
+    }
+    for channel in (0..channels).filter(|c| disturbed.get(*c) != Some(&true)) {
+        let now = ModelErrors::of(solution, channel);
+        if now.are_seen() && !earlier.iter().any(|one| ModelErrors::of(one, channel).are_seen()) {
+            let unexplained = now.unexplained;
+            events.push(InstrumentEvent::WrongModel { pass, from_s, channel, unexplained });
+        }
+    }
+}
+
+/// Errors of the model in a channel.
+struct ModelErrors {
+    /// Fraction of the signal that no gains explain.
+    unexplained: f64,
+    /// Whether most daughters fit poorly.
+    most_fit_poorly: bool,
+}
+
+impl ModelErrors {
+    fn of(solution: &PassSolution, c: usize) -> Self {
         // The median over daughters: a single daughter may have another problem.
         let gains: Vec<&GainEstimate> =
             solution.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
@@ -279,19 +316,31 @@ fn add_state_events(
         let mut fractions: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
         fractions.sort_unstable_by(f64::total_cmp);
         let median = fractions.get(fractions.len() / 2).copied().unwrap_or(0.0);
-        let most_fit_poorly = count > 0 && 2 * poor > count;
-        let fraction = solution.model_error[c].max(median);
-        (most_fit_poorly || fraction > UNEXPLAINED_MIN).then_some(fraction)
-    };
-    for channel in (0..channels).filter(|c| !is_disturbed(*c)) {
-        let was_wrong = before.and_then(|before| unexplained_if_wrong(before, channel)).is_some();
-        if let Some(unexplained) = unexplained_if_wrong(solution, channel).filter(|_| !was_wrong) {
-            events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
-        }
+        Self { unexplained: solution.model_error[c].max(median), most_fit_poorly: 2 * poor > count }
+    }
+
+    fn are_seen(&self) -> bool {
+        self.most_fit_poorly || self.unexplained > UNEXPLAINED_MIN
+    }
+
+    fn are_large(&self) -> bool {
+        self.most_fit_poorly || self.unexplained > UNEXPLAINED_OF_EVENTS_MAX
+    }
+
+    /// Whether they may look like a change of a phase: they turn a visibility by an rms of sqrt(unexplained / 2) rad,
+    /// a gain by less.
+    fn can_explain(&self, scatter_deg: f64) -> bool {
+        self.are_large() || self.are_seen() && scatter_deg.to_radians().powi(2) < self.unexplained
     }
 }
 
-/// Clock jump that explains the changes of the phases, ns; `None` if none does.
+/// Cost of each free parameter of an explanation, as a chi-square.
+const PARAMETER_COST: f64 = 9.0;
+
+/// Cost of a delay beyond half a turn of the highest frequency: there are many, of which one may fit any step.
+const TURN_COST: f64 = 6.0;
+
+/// Clock jump that explains the changes of the phases better than steps of those channels that jump, ns.
 fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let gains = &solution.daughters[change.daughter].gains;
     let hz = |channel: usize| gains[channel].frequency_hz;
@@ -304,19 +353,24 @@ fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     // highest.
     let step_s = 0.01 / highest;
     let steps = (0.5 / lowest / step_s) as i64;
-    let cost = |delay_s: f64| -> f64 {
-        let square = |ChannelChange { channel, change, sigma }: &ChannelChange| {
-            (wrapped(change + TAU * hz(*channel) * delay_s) / sigma.max(1e-4)).powi(2)
-        };
-        change.phases.iter().map(square).sum::<f64>() / change.phases.len() as f64
+    let square = |phase: &ChannelChange, expected: f64| -> f64 {
+        (wrapped(phase.change - expected) / phase.sigma.max(1e-4)).powi(2)
     };
+    let cost = |delay_s: f64| -> f64 {
+        let expected = |phase: &ChannelChange| -TAU * hz(phase.channel) * delay_s;
+        let chi_square: f64 = change.phases.iter().map(|phase| square(phase, expected(phase))).sum();
+        chi_square + PARAMETER_COST + if (delay_s * highest).abs() > 0.5 { TURN_COST } else { 0.0 }
+    };
+    let of_channel =
+        |phase: &ChannelChange| if is_jump(&phase) { PARAMETER_COST } else { square(phase, 0.0) };
+    let cost_of_steps: f64 = change.phases.iter().map(of_channel).sum();
     let best = |from_s: f64, step_s: f64, steps: i64| {
         let candidates = (-steps..=steps).map(|k| from_s + step_s * k as f64);
         candidates.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(from_s)
     };
     let coarse_s = best(0.0, step_s, steps);
     let delay_s = best(coarse_s, 0.01 * step_s, 100);
-    (cost(delay_s) < CHI2_REDUCED_MAX).then_some(1e9 * delay_s)
+    (cost(delay_s) < cost_of_steps).then_some(1e9 * delay_s)
 }
 
 /// Whether more than half of the finite outlier fractions of a list exceed the threshold.

@@ -64,11 +64,14 @@ impl LinkConfig {
     #[doc(hidden)]
     pub fn problems(&self, format: Format) -> Vec<InvalidValue> {
         let mut checks = Checks::new("downlink.link");
+        // Beyond, nothing arrives: a frame has thousands of bits.
+        let rate = self.bit_error_rate;
+        checks.require("bit_error_rate", rate, (0.0..=0.1).contains(&rate), "a probability, 0 to 0.1");
+        for (key, value) in [("frame_loss", self.frame_loss), ("pass_loss", self.pass_loss)] {
+            checks.require(key, value, (0.0..1.0).contains(&value), "a probability, 0 to less than 1");
+        }
         for (key, value) in [
-            ("bit_error_rate", self.bit_error_rate),
             ("burst_bit_error_rate", self.burst_bit_error_rate),
-            ("frame_loss", self.frame_loss),
-            ("pass_loss", self.pass_loss),
             ("pass_cut", self.pass_cut),
             ("duplicate", self.duplicate),
             ("reorder", self.reorder),

@@ -9,7 +9,7 @@ use super::draft::digest;
 use super::folder::checkpoints;
 use super::journal::{Journal, OtherRecord, SendingKey};
 use super::recovery::record_retraction;
-use crate::downlink::receive::EventReader;
+use crate::downlink::receive::{Decoder, EventReader};
 use crate::downlink::transport::packet_archive::PacketName;
 use crate::downlink::{Event, PacketHeader, PacketKind};
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
@@ -73,7 +73,8 @@ impl Ground {
     /// of visibilities within it. Returns a report, and notes on checkpoints that could not be used. The change is atomic.
     ///
     /// # Errors
-    /// Errors of [`Ground::open`]; a folder without an archive; a file that cannot be read; sums that do not match the journal.
+    /// Errors of [`Ground::open`]; a folder without an archive; a file that cannot be read, or that describes another instrument;
+    /// sums that do not match the journal.
     pub fn retract(
         folder: &Path,
         files: &[PathBuf],
@@ -113,19 +114,30 @@ impl Ground {
 impl Retraction {
     fn retract_file(&mut self, path: &Path) -> Result<(), GroundError> {
         let mut events = EventReader::open(path)?.unfiltered();
-        events.for_each(|event| match event {
-            Event::Packet(packet) => self.retract_packet(&HeldPacket::new(packet)),
-            _ => Ok(()),
+        let mut decoder = Decoder::new();
+        events.for_each(|event| {
+            let Event::Packet(packet) = event else { return Ok(()) };
+            if packet.header.kind == PacketKind::Instrument {
+                decoder.accept(event);
+                self.require_instrument(path, &decoder)?;
+            }
+            self.retract_packet(&HeldPacket::new(packet))
         })?;
         if events.packets() == 0 {
-            let (path, found) = (path.to_owned(), "no packet".into());
-            return Err(GroundError::Damaged {
-                path,
-                found,
-                expected: "a downlink file, as for `lunarray replay`",
-            });
+            return Err(damaged(path, "no packet", "a downlink file, as for `lunarray replay`"));
         }
         Ok(())
+    }
+
+    /// Requires that descriptions in a file are of the archive's instrument. Another mission of the same seed has some equal packets.
+    fn require_instrument(&self, path: &Path, decoder: &Decoder) -> Result<(), GroundError> {
+        let is_other =
+            self.ground.instrument().zip(decoder.instrument()).is_some_and(|(own, found)| own != found);
+        if !is_other && decoder.counters().instruments_contradictory == 0 {
+            return Ok(());
+        }
+        let expected = "packets of the instrument of the state: nothing was changed";
+        Err(damaged(path, "the description of another instrument", expected))
     }
 
     fn retract_packet(&mut self, packet: &HeldPacket) -> Result<(), GroundError> {
@@ -277,6 +289,10 @@ impl Retraction {
 
 const DIFFERENT_CONTENT: &str = "its content differs from the packet in the state";
 const EPHEMERIS_CHANGED: &str = "the ephemeris has changed since the packet was added to the sums";
+
+fn damaged(path: &Path, found: &str, expected: &'static str) -> GroundError {
+    GroundError::Damaged { path: path.to_owned(), found: found.to_owned(), expected }
+}
 
 /// Whether a packet holds visibilities that all lie within a span of mission time.
 fn lies_in(packet: &HeldPacket, [from, to]: [MissionTime; 2]) -> bool {

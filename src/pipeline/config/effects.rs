@@ -59,23 +59,27 @@ fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     }
 }
 
-/// Whether any comparison of a condition holds: `key = value`, `key > number`, or a key alone, which is true if the key differs from its
-/// default.
+/// Whether a condition holds: of each part (joined by `and`) any comparison (joined by `or`): `key = value`, `key > number`, a key alone,
+/// which is true if the key differs from its default, or `no` and a key, if it does not.
 fn holds(condition: &str, set: &Table, keys: &[FlatKey]) -> bool {
-    condition.split(" or ").any(|comparison| {
-        let mut words = comparison.splitn(3, ' ');
-        let (path, sign, wanted) = (words.next().unwrap_or(""), words.next(), words.next());
-        let default = keys.iter().find(|key| key.path == path).and_then(|key| key.default.as_ref());
-        let value = value_of(set, path).or(default);
-        let wanted =
-            wanted.and_then(|text| toml::from_str::<Table>(&format!("v = {text}")).ok()?.remove("v"));
-        match (sign, value, wanted) {
-            (None, value, _) => value != default,
-            (Some("="), Some(value), Some(wanted)) => *value == wanted,
-            (Some(">"), Some(value), Some(wanted)) => is_above(value, &wanted),
-            _ => false,
-        }
-    })
+    condition.split(" and ").all(|part| part.split(" or ").any(|comparison| is_true(comparison, set, keys)))
+}
+
+fn is_true(comparison: &str, set: &Table, keys: &[FlatKey]) -> bool {
+    if let Some(key) = comparison.strip_prefix("no ") {
+        return !is_true(key, set, keys);
+    }
+    let mut words = comparison.splitn(3, ' ');
+    let (path, sign, wanted) = (words.next().unwrap_or(""), words.next(), words.next());
+    let default = keys.iter().find(|key| key.path == path).and_then(|key| key.default.as_ref());
+    let value = value_of(set, path).or(default);
+    let wanted = wanted.and_then(|text| toml::from_str::<Table>(&format!("v = {text}")).ok()?.remove("v"));
+    match (sign, value, wanted) {
+        (None, value, _) => value != default,
+        (Some("="), Some(value), Some(wanted)) => *value == wanted,
+        (Some(">"), Some(value), Some(wanted)) => is_above(value, &wanted),
+        _ => false,
+    }
 }
 
 fn is_above(value: &Value, limit: &Value) -> bool {
@@ -89,6 +93,12 @@ fn is_above(value: &Value, limit: &Value) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Three satellites on an ellipse.
+    const ORBITS: &str = "satellites = 3, kepler = [\
+        { semi_major_axis_m = 2e6, eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 },\
+        { semi_major_axis_m = 2e6, eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.1 },\
+        { semi_major_axis_m = 2e6, eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.3 }]";
 
     fn messages(text: &str) -> Vec<String> {
         let config: Config = toml::from_str(text).unwrap();
@@ -121,6 +131,15 @@ mod tests {
                 "daughters.tones.calibration_k_sr = 2.0 has an effect only with spacecraft.fidelity = \"samples\"",
             ),
             ("sky.frequency = { spectral_index = -2.5 }", "has an effect only with sky.file"),
+            // A formation's shape beside orbits of the satellites' own.
+            (
+                format!("array = {{ {ORBITS}, altitude_m = 1e6 }}").as_str(),
+                "array.altitude_m = 1000000.0 has an effect only with no array.kepler and no array.oem",
+            ),
+            (
+                format!("array = {{ {ORBITS}, breathing.span_m_max = 5e4 }}").as_str(),
+                "array.breathing.span_m_max = 50000.0 has an effect only with no array.kepler and no array.oem",
+            ),
         ] {
             let found = messages(text);
             assert_eq!(found.len(), 1, "{text}: {found:?}");
@@ -137,6 +156,7 @@ mod tests {
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
             // A key that is set to zero still sets its section.
             "instrument.clock_ns = { drift_rms = 0.0, drift_time_s = 60.0 }",
+            format!("array = {{ {ORBITS}, altitude_m = 300e3, moon_radius_m = 1.7e6 }}").as_str(),
         ] {
             assert_eq!(messages(text), Vec::<String>::new(), "{text}");
         }
@@ -145,8 +165,10 @@ mod tests {
     #[test]
     fn every_condition_names_existing_keys() {
         let keys = flat_keys();
-        for comparison in keys.iter().flat_map(|key| &key.only_with).flat_map(|only| only.split(" or ")) {
-            let words: Vec<&str> = comparison.split(' ').collect();
+        let conditions = keys.iter().flat_map(|key| &key.only_with);
+        for comparison in conditions.flat_map(|only| only.split(" and ")).flat_map(|part| part.split(" or "))
+        {
+            let words: Vec<&str> = comparison.strip_prefix("no ").unwrap_or(comparison).split(' ').collect();
             assert!(keys.iter().any(|key| key.path == words[0]), "{comparison}");
             assert!(matches!(words[1..], [] | ["=" | ">", _]), "{comparison}");
         }

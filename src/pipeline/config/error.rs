@@ -10,6 +10,7 @@ use crate::response::MeasuredAntennasError;
 use crate::runtime::{LedgerImbalance, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
+use crate::units::bytes_text;
 
 /// Errors that prevent or end a run of a pipeline.
 #[derive(Debug, Error)]
@@ -174,7 +175,7 @@ pub enum PipelineError {
     #[error(
         "an estimated {} of memory are needed, but {} are available ({}): lower map.nside, \
          map.l_max or the number of channels, take some of them at a time (--groups auto), or state another limit, as in --memory-max {}GB",
-        gigabytes(*needed_bytes), gigabytes(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
+        bytes_text(*needed_bytes), bytes_text(limit.bytes as f64), limit.source, (needed_bytes / 1e9).ceil()
     )]
     Memory {
         /// Estimated need, bytes.
@@ -190,12 +191,4 @@ pub enum PipelineError {
         /// The system's error.
         reason: String,
     },
-}
-
-fn gigabytes(bytes: f64) -> String {
-    match bytes {
-        1e8.. => format!("{:.2} GB", bytes / 1e9),
-        1e5.. => format!("{:.1} MB", bytes / 1e6),
-        _ => format!("{bytes:.0} bytes"),
-    }
 }

@@ -36,12 +36,14 @@ pub enum ConfigError {
     },
     /// The file is not text.
     #[error(
-        "{}: not text; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
+        "{}, line {line}: not text in UTF-8; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
         path.display()
     )]
     NotText {
         /// Path.
         path: PathBuf,
+        /// Line of the first byte that is no text, counted from 1.
+        line: usize,
     },
     /// The file is a study.
     #[error("{}: a study, with {key}; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
@@ -242,7 +244,9 @@ fn read(path: &Path) -> Result<String, ConfigError> {
     let is_truncated_text = |error: std::str::Utf8Error| is_long && error.error_len().is_none();
     match String::from_utf8(bytes) {
         Err(error) if !is_truncated_text(error.utf8_error()) => {
-            Err(ConfigError::NotText { path: path.to_owned() })
+            let text = &error.as_bytes()[..error.utf8_error().valid_up_to()];
+            let line = 1 + text.iter().filter(|byte| **byte == b'\n').count();
+            Err(ConfigError::NotText { path: path.to_owned(), line })
         }
         Ok(text) if !is_long => Ok(text),
         _ => Err(ConfigError::TooLong { path: path.to_owned() }),

@@ -8,6 +8,7 @@ use crate::frames::Instrument;
 use crate::imaging::MapConfig;
 use crate::imaging::cost::EngineCost;
 use crate::pipeline::config::{Config, MemoryLimit};
+use crate::units::bytes_text;
 
 /// Warning that the normal equations of all channels will outgrow memory.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,18 +48,17 @@ impl MemoryAdvice {
 
 impl fmt::Display for MemoryAdvice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let gigabytes = |bytes: f64| format!("{:.1} GB", bytes / 1e9);
         write!(
             f,
             "the sums of {} channels at map.nside = {} grow to an estimated {} over a mission, and {} are available ({})",
             self.channels,
             self.nside,
-            gigabytes(self.needed_bytes),
-            gigabytes(self.limit.bytes as f64),
+            bytes_text(self.needed_bytes),
+            bytes_text(self.limit.bytes as f64),
             self.limit.source
         )?;
         if let Some((nside, bytes)) = self.fitting {
-            write!(f, "; at map.nside = {nside} they take {}", gigabytes(bytes))?;
+            write!(f, "; at map.nside = {nside} they take {}", bytes_text(bytes))?;
         }
         write!(
             f,

@@ -53,8 +53,8 @@ pub struct CalibrateSummary {
     pub late: u64,
     /// Number of gains that are not good, and of all gains.
     pub gains_not_good: [u64; 2],
-    /// Median standard deviation of a daughter's phase, deg, by channel and daughter.
-    pub phase_sigma_deg: Vec<Vec<f64>>,
+    /// Median standard deviation of a daughter's good phases, deg, by channel and daughter; `None` without a good one.
+    pub phase_sigma_deg: Vec<Vec<Option<f64>>>,
     /// The rounds, in order.
     pub rounds: Vec<CalibrateRound>,
     /// Events of the instrument: jumps of clocks, steps of gains, interference, bursts.
@@ -192,8 +192,9 @@ impl FoundSolutions {
         let frequencies_hz = self.instrument.as_ref().map_or_else(Vec::new, Instrument::frequencies_hz);
         let channels = frequencies_hz.len();
         let sigma_deg = |c: usize, n: usize| {
-            let sigmas = self.solutions.iter().map(|solution| solution.daughters[n].gains[c].phase_sigma_deg);
-            median(sigmas.collect()).unwrap_or(f64::NAN)
+            let gains = self.solutions.iter().map(|solution| &solution.daughters[n].gains[c]);
+            let good = gains.filter(|gain| gain.state == GainState::Good);
+            median(good.map(|gain| gain.phase_sigma_deg).collect())
         };
         let (bad, all) = self
             .all_gains()

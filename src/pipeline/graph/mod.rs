@@ -14,8 +14,8 @@ pub(super) mod summary;
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
 pub(crate) use run::SHUTDOWN;
 pub use run::{
-    Destination, GroundSource, OnStart, READ, RunHandles, downlink_file, replay, run, run_with_ranks,
-    simulate, use_threads,
+    Destination, GroundSource, OnStart, READ, RunHandles, downlink_file, main_products, replay, run,
+    run_with_ranks, simulate, use_threads,
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;

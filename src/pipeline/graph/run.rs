@@ -1,11 +1,12 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
 use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
-use super::ground_segment::{MappingContext, SegmentOutcome};
+use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -116,6 +117,13 @@ pub fn downlink_file(format: Format) -> &'static str {
     }
 }
 
+/// Paths of the products of a run that do not depend on its data.
+#[must_use]
+#[doc(hidden)]
+pub fn main_products(config: &Config, out: &Path) -> Vec<PathBuf> {
+    [downlink_file(config.downlink.format), SETTINGS, "summary.json"].map(|name| out.join(name)).into()
+}
+
 /// Runs the whole chain in one process: sky, spacecraft, downlink, ground segment, products in `out`.
 ///
 /// # Errors
@@ -190,7 +198,7 @@ pub fn run_with_ranks(
     on_start(handles);
     let report = start(graph, ranks, &plan.config.runtime, cancel)?;
     let samples = sample_summary(&counts, plan, &report)?;
-    let finished = FinishedGraph { report, outcome, listening: None, samples };
+    let finished = FinishedGraph { samples, ..FinishedGraph::new(report, outcome, None, cancel) };
     collect_and_write_summary(RunScope::Whole, ranks, &plan.config, out, finished)
 }
 
@@ -325,7 +333,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     };
     on_start(handles);
     let report = start(graph, &ranks, &config.runtime, cancel)?;
-    Ok(FinishedGraph { report, outcome, listening, samples: None })
+    Ok(FinishedGraph::new(report, outcome, listening, cancel))
 }
 
 impl Config {
@@ -486,6 +494,19 @@ pub(in crate::pipeline) struct FinishedGraph {
 }
 
 impl FinishedGraph {
+    /// The results of a graph without samples. A run is also cancelled if its source had ended, but sums or maps lack data.
+    fn new(
+        mut report: Report,
+        outcome: SegmentOutcome,
+        listening: Option<Listening>,
+        cancel: &Cancel,
+    ) -> Self {
+        let left_data = outcome.ground.left_data.load(Ordering::Relaxed);
+        let lacks_maps = || report.stage(SOLVE).is_some_and(|solve| solve.items_out < solve.items_in);
+        report.cancelled |= cancel.is_cancelled() && (left_data || lacks_maps());
+        Self { report, outcome, listening, samples: None }
+    }
+
     pub(in crate::pipeline) fn autocorrelation_count(&self) -> u64 {
         self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
     }

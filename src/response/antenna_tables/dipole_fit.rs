@@ -112,12 +112,16 @@ fn require_sphere(samples: &[Directed]) -> Result<(), String> {
         first.max((3.0 * mean(&|s| s.n_hat[k] * s.n_hat[k]) - 1.0).abs())
     });
     let uneven = uneven.fold(0.0, f64::max);
-    if samples.len() >= DIRECTIONS_MIN && weight > 0.0 && uneven <= UNEVEN_MAX {
+    let count = samples.len();
+    if count < DIRECTIONS_MIN {
+        return Err(format!("{count} directions; expected {DIRECTIONS_MIN} or more over the whole sphere"));
+    }
+    if weight > 0.0 && uneven <= UNEVEN_MAX {
         return Ok(());
     }
     Err(format!(
-        "{} directions; expected {DIRECTIONS_MIN} or more, at even steps of theta and phi over the whole sphere",
-        samples.len()
+        "{count} directions that are uneven or of a part of the sphere; expected even steps, in degrees, of theta from 0 to 180 and phi \
+         from 0 to 360"
     ))
 }
 

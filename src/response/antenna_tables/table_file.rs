@@ -5,7 +5,7 @@ use std::path::Path;
 
 use num_complex::Complex64;
 
-use crate::files::read_text;
+use crate::files::{read_file, text_of};
 use crate::units::{echo, shortened};
 
 /// Largest table that is read, bytes: three dipoles at 8 frequencies each degree, at 30 each 2 degrees. A line takes 64 bytes in memory, eight
@@ -58,6 +58,7 @@ impl Value {
 /// Columns of a table, by name.
 struct Columns {
     places: BTreeMap<String, usize>,
+    count: usize,
     has_fields: bool,
     gain: Option<&'static str>,
 }
@@ -66,8 +67,12 @@ const FIELDS: [&str; 4] = ["e_theta_re", "e_theta_im", "e_phi_re", "e_phi_im"];
 
 impl Columns {
     fn of(header: &str) -> Result<Self, String> {
-        let places: BTreeMap<String, usize> =
-            header.split(',').enumerate().map(|(k, name)| (name.trim().to_owned(), k)).collect();
+        let mut places: BTreeMap<String, usize> = BTreeMap::new();
+        for (k, name) in header.split(',').map(str::trim).enumerate() {
+            if places.insert(name.to_owned(), k).is_some() && !name.is_empty() {
+                return Err(format!("several columns {:?}; expected one of each name", echo(name)));
+            }
+        }
         let has = |name: &str| places.contains_key(name);
         let has_fields = FIELDS.iter().all(|name| has(name));
         let gain = ["gain", "gain_db"].into_iter().find(|name| has(name));
@@ -80,12 +85,15 @@ impl Columns {
                 FIELDS.join(", ")
             ));
         }
-        Ok(Self { places, has_fields, gain })
+        Ok(Self { places, count: header.split(',').count(), has_fields, gain })
     }
 
     /// A line's frequency and dipole, and its sample.
     fn sample(&self, line: &str, number: u32) -> Option<((u64, usize), Sample)> {
         let fields: Vec<&str> = line.split(',').map(str::trim).collect();
+        if fields.iter().skip(self.count).any(|field| !field.is_empty()) {
+            return None;
+        }
         let value = |name: &str| -> Option<f64> {
             let value: f64 = fields.get(*self.places.get(name)?)?.parse().ok()?;
             value.is_finite().then_some(value)
@@ -111,7 +119,8 @@ impl Columns {
 
 /// Reads a table, with each direction once.
 pub(super) fn read_table(path: &Path) -> Result<Table, String> {
-    let text = read_text(path, FILE_BYTES_MAX).map_err(|source| source.to_string())?;
+    let bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| source.to_string())?;
+    let text = text_of(&bytes).map_err(|form| format!("{form}; expected CSV as plain text"))?;
     let mut lines =
         text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
     let (_, header) = lines.next().ok_or("no lines; expected a line of columns")?;
@@ -119,8 +128,13 @@ pub(super) fn read_table(path: &Path) -> Result<Table, String> {
     let mut table = Table::new();
     for (k, line) in lines {
         let Some((key, sample)) = columns.sample(line, k as u32 + 1) else {
-            let what = "a frequency above 0, theta from 0 to 180 deg, a dipole from 1 to 3, a gain of 0 or more, finite numbers";
-            return Err(format!("line {}: found {:?}; expected {what}", k + 1, echo(line)));
+            return Err(format!(
+                "line {}: found {:?}; expected {} finite numbers: a frequency above 0, theta from 0 to 180 deg, a dipole from 1 to 3, a \
+                 gain of 0 or more",
+                k + 1,
+                echo(line),
+                columns.count
+            ));
         };
         table.entry(key).or_default().push(sample);
     }

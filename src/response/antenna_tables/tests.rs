@@ -143,6 +143,23 @@ fn frequencies_between_are_linear_and_files_are_of_daughters() {
 }
 
 #[test]
+fn tables_are_text_of_any_editor() {
+    let table = HEADER.to_owned() + &lines(1, |theta, _| [Complex64::from(theta.sin()), Complex64::ZERO]);
+    let file = tempfile::NamedTempFile::new().unwrap();
+    let latin = [b"# caf\xe9\n", table.as_bytes()].concat();
+    let marked = [b"\xef\xbb\xbf", table.as_bytes()].concat();
+    for bytes in
+        [latin, marked, table.replace('\n', "\r").into_bytes(), table.replace('\n', ",\r\n").into_bytes()]
+    {
+        std::fs::write(file.path(), &bytes).unwrap();
+        AntennaTables::read(&[file.path().to_owned()], 1e-6).unwrap();
+    }
+    std::fs::write(file.path(), b"\x1f\x8b\x08\0").unwrap();
+    let said = AntennaTables::read(&[file.path().to_owned()], 1e-6).unwrap_err().to_string();
+    assert!(said.contains("a gzip file; expected CSV as plain text"), "{said}");
+}
+
+#[test]
 fn what_is_no_dipole_is_refused() {
     let field = |theta: f64, phi: f64| [Complex64::from(-theta.sin()), Complex64::from(0.0 * phi)];
     let good = lines(1, field);
@@ -159,7 +176,20 @@ fn what_is_no_dipole_is_refused() {
     // Nothing but the pole, which has no share of the sphere.
     let poles: String = (0..40).map(|phi_deg| format!("2e6,1,0,{phi_deg},0,0,0,0\n")).collect();
     for (text, expected) in [
-        (format!("{HEADER}{half}"), "even steps of theta and phi over the whole sphere"),
+        (
+            format!("{HEADER}{half}"),
+            "684 directions that are uneven or of a part of the sphere; expected even steps",
+        ),
+        (
+            format!("{HEADER}{}", good.split_inclusive('\n').take(30).collect::<String>()),
+            "directions; expected 40 or more",
+        ),
+        (
+            format!("{HEADER}{good}2e6,1,90,0,1,0,0,0,9\n"),
+            "line 1372: found \"2e6,1,90,0,1,0,0,0,9\"; expected 8 finite",
+        ),
+        (format!("{HEADER}{good}").replace("e_phi_im", "e_phi_im,dipole"), "several columns \"dipole\""),
+        ("a\0,\0b\0".to_owned(), "UTF-16; expected CSV"),
         (format!("{HEADER}{lopsided}"), "of the table; expected at most 2.00 %"),
         (format!("{HEADER}{phased}"), "of the table; expected at most 2.00 %"),
         (format!("{HEADER}{good}2e6,1,190,0,0,0,0,0\n"), "line 1372: found \"2e6,1,190,0,0,0,0,0\""),
@@ -170,7 +200,7 @@ fn what_is_no_dipole_is_refused() {
             "lines 670 and 1372: found different values at theta = 90 deg, phi = 10 deg",
         ),
         (format!("{HEADER}{}", lines(1, |_, _| [Complex64::ZERO; 2])), "at 2000000 Hz, dipole 1: all zero"),
-        (format!("{HEADER}{poles}"), "40 directions; expected 40 or more, at even steps"),
+        (format!("{HEADER}{poles}"), "40 directions that are uneven"),
         (format!("{HEADER}{}\n", "9".repeat(10_000)), "... (10000 bytes)"),
         (format!("{}\n", "x".repeat(10_000)), "xxx... (10000 bytes)"),
         (HEADER.to_owned(), "no directions"),

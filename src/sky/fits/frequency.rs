@@ -6,10 +6,13 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::error::{FitsError, FitsProblem};
-use super::metadata::is_same_hz;
-use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map, read_whole_map_file};
+use super::metadata::{StatedFrequency, is_other_quantity, is_same_hz};
+use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map_file};
 use crate::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
-use crate::units::Dimension;
+use crate::units::{Dimension, echo};
+
+/// Least mean of a sky of which something can be known, K.
+const MEAN_K_MIN: f64 = 1e-16;
 
 /// Channel for which a sky is read.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,7 +116,7 @@ pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
     ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), ..ReadOptions::default() }
 }
 
-/// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean above 0 unless the sky may be dark.
+/// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean 1e-16 or more unless the sky may be dark.
 ///
 /// FREQ, or the name of the column, states the frequency of a map. A map of another frequency is refused, or scaled by
 /// a power law, as `config` says. A map that states no frequency is used unchanged if it serves only this channel, and cannot be scaled.
@@ -124,22 +127,22 @@ pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
 pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let map = read_at(path, channel, config)?;
     match mean_k(path, &map)? {
-        value if value <= 0.0 && !channel.is_dark_accepted => {
+        value if value < MEAN_K_MIN && !channel.is_dark_accepted => {
             Err(FitsError::new(path, MapError::Dark { value }.into()))
         }
         _ => Ok(map),
     }
 }
 
-/// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean above 0. When the channel
+/// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean 1e-16 or more. When the channel
 /// is known, [`check_frequency`] compares the frequency.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`MapError::NoTemperature`], [`MapError::NothingKnown`].
 pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
-    let map = read_whole_map(path, options)?;
+    let map = read_temperatures(path, options)?.map;
     match mean_k(path, &map)? {
-        value if value <= 0.0 => Err(FitsError::new(path, MapError::NothingKnown { value }.into())),
+        value if value < MEAN_K_MIN => Err(FitsError::new(path, MapError::NothingKnown { value }.into())),
         _ => Ok(map),
     }
 }
@@ -149,8 +152,18 @@ pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
 /// # Errors
 /// As [`super::read_whole_map`]; [`MapError::NoTemperature`].
 pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
-    let map = read_whole_map(path, options)?;
+    let map = read_temperatures(path, options)?.map;
     mean_k(path, &map).map(|_| map)
+}
+
+/// Reads a whole map of which the name of the column does not say that it is something else.
+fn read_temperatures(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
+    let file = read_whole_map_file(path, options)?;
+    if is_other_quantity(&file.name) {
+        let expected = "the name of a map of the sky's temperature, such as TEMPERATURE or T_10MHz";
+        return Err(FitsError::new(path, FitsProblem::keyword("TTYPEn", echo(&file.name), expected)));
+    }
+    Ok(file)
 }
 
 /// Requires that the frequency of a map is `frequency_hz`, if the map states one. Reads only headers.
@@ -159,8 +172,8 @@ pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsErro
 /// [`FitsError`] for a file that cannot be read; [`FitsProblem::Keyword`] for FREQ.
 pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> {
     match read_frequency(path)? {
-        Some(map_hz) if !is_same_hz(map_hz, frequency_hz) => {
-            Err(FitsError::new(path, other_frequency(map_hz, frequency_hz, "")))
+        Some(found) if !is_same_hz(found.hz, frequency_hz) => {
+            Err(FitsError::new(path, other_frequency(&found, frequency_hz, "")))
         }
         _ => Ok(()),
     }
@@ -184,17 +197,17 @@ fn mean_k(path: &Path, map: &SkyMap) -> Result<f64, FitsError> {
 }
 
 /// Problem of a map whose frequency differs from the channel's; `otherwise` is what the user can do instead of giving another map.
-fn other_frequency(map_hz: f64, frequency_hz: f64, otherwise: &str) -> FitsProblem {
-    let [found, expected] = [map_hz, frequency_hz].map(|hz| Dimension::Frequency.show(hz));
+fn other_frequency(of_map: &StatedFrequency, frequency_hz: f64, otherwise: &str) -> FitsProblem {
+    let [found, expected] = [of_map.hz, frequency_hz].map(|hz| Dimension::Frequency.show(hz));
     let expected = format!("{expected}, the channel's: give a map of that frequency{otherwise}");
-    FitsProblem::keyword("FREQ", found, expected)
+    FitsProblem::keyword(&of_map.keyword, found, expected)
 }
 
 /// Reads a map and converts it to the channel's frequency.
 fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let (rule, wanted_hz) = (config.frequency, channel.frequency_hz);
     let options = sky_options(config, wanted_hz);
-    let MapFile { mut map, frequency_hz, .. } = read_whole_map_file(path, &options)?;
+    let MapFile { mut map, frequency_hz, frequency_keyword, .. } = read_temperatures(path, &options)?;
     let refuse = |problem| FitsError::new(path, problem);
     let Some(map_hz) = frequency_hz else {
         let expected = match rule {
@@ -212,7 +225,8 @@ fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyM
         _ if is_same_hz(map_hz, wanted_hz) => Ok(map),
         MapFrequency::MustMatch => {
             let otherwise = ", or have it scaled by sky.frequency = { spectral_index = -2.5 }";
-            Err(refuse(other_frequency(map_hz, wanted_hz, otherwise)))
+            let of_map = StatedFrequency { hz: map_hz, keyword: frequency_keyword };
+            Err(refuse(other_frequency(&of_map, wanted_hz, otherwise)))
         }
         MapFrequency::SpectralIndex(index) => {
             let factor = (wanted_hz / map_hz).powf(index);

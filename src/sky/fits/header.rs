@@ -90,6 +90,13 @@ impl Header {
         }
     }
 
+    /// Returns the number of an optional keyword, also of one in quotes, as some software writes it.
+    pub(super) fn number(&self, key: &str) -> Result<Option<f64>, FitsProblem> {
+        let Some(found) = self.get(key) else { return Ok(None) };
+        let number = self.real(key).or_else(|| self.text(key)?.parse().ok());
+        number.map(Some).ok_or_else(|| FitsProblem::keyword(key, found, "a number"))
+    }
+
     /// Returns an optional keyword, which must be an integer of at least 0.
     pub(super) fn count(&self, key: &str) -> Result<Option<u64>, FitsProblem> {
         let wrong = |found: &CardValue| FitsProblem::keyword(key, found, "an integer of at least 0");

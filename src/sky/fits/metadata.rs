@@ -21,41 +21,105 @@ pub(super) fn is_same_hz(one: f64, other: f64) -> bool {
     (one - other).abs() <= FREQUENCY_TOLERANCE * other
 }
 
-/// Frequency of a column, Hz, from its own metadata ([`column_hz`]) or else from FREQ in either header; `None` if not stated.
-/// Columns count from 1, as in keywords.
-pub(super) fn frequency_hz(header: &Header, column: usize) -> Result<Option<f64>, FitsProblem> {
-    match column_hz(header, column)? {
-        None => file_hz(header),
-        found => Ok(found),
-    }
+/// A frequency that a header states.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct StatedFrequency {
+    pub hz: f64,
+    /// The keyword that states it.
+    pub keyword: String,
 }
 
-/// Frequency in the metadata of a column, Hz: FREQn, its name (such as `10MHz`), or the comment of the name.
-pub(super) fn column_hz(header: &Header, column: usize) -> Result<Option<f64>, FitsProblem> {
+/// Words in names of columns that are no maps of the sky's temperature: errors, numbers of observations and pixels, polarisation.
+const OTHER_WORDS: [&str; 29] = [
+    "SIGMA",
+    "ERR",
+    "ERROR",
+    "ERRORS",
+    "STD",
+    "STDDEV",
+    "STDEV",
+    "RMS",
+    "VAR",
+    "VARIANCE",
+    "COV",
+    "COVARIANCE",
+    "NOISE",
+    "NOBS",
+    "HITS",
+    "NHITS",
+    "PIXEL",
+    "PIX",
+    "IPIX",
+    "UNIQ",
+    "INDEX",
+    "WEIGHT",
+    "WEIGHTS",
+    "MASK",
+    "Q",
+    "U",
+    "V",
+    "POLARISATION",
+    "POLARIZATION",
+];
+
+/// Whether the name of a column is that of a quantity beside the sky's temperature.
+pub(super) fn is_other_quantity(name: &str) -> bool {
+    let name = name.to_ascii_uppercase().replace("N_OBS", "NOBS");
+    name.split(|c: char| !c.is_ascii_alphabetic()).any(|word| OTHER_WORDS.contains(&word))
+}
+
+/// Frequency of a column, from its own metadata ([`column_frequency`]) or else from FREQ in either header; `None` if not stated.
+/// Columns count from 1, as in keywords. FREQ must be the frequency of a column, if columns state theirs.
+pub(super) fn stated_frequency(
+    header: &Header,
+    column: usize,
+) -> Result<Option<StatedFrequency>, FitsProblem> {
+    let (own, of_file) = (column_frequency(header, column)?, file_frequency(header)?);
+    if let (Some(own), Some(of_file)) = (&own, &of_file) {
+        let columns = header.count("TFIELDS")?.map_or(column, |count| count.min(999) as usize);
+        let mut is_known = false;
+        for other in 1..=columns.max(column) {
+            is_known |=
+                column_frequency(header, other)?.is_some_and(|other| is_same_hz(other.hz, of_file.hz));
+        }
+        if !is_known {
+            return Err(contradiction(of_file, own));
+        }
+    }
+    Ok(own.or(of_file))
+}
+
+/// Frequency in the metadata of a column: FREQn, its name (such as `10MHz`), or the comment of the name.
+pub(super) fn column_frequency(
+    header: &Header,
+    column: usize,
+) -> Result<Option<StatedFrequency>, FitsProblem> {
+    let stated = |card: &Card, hz| StatedFrequency { hz, keyword: card.key.clone() };
     if let Some(card) = header.card(&format!("FREQ{column}")) {
-        return stated_hz(header, card).map(Some);
+        return stated_hz(header, card).map(|hz| Some(stated(card, hz)));
     }
     let Some(card) = header.card(&format!("TTYPE{column}")) else { return Ok(None) };
     let name = header.text(&card.key).and_then(hz_in);
-    Ok(name.or_else(|| hz_in(&card.comment)))
+    Ok(name.or_else(|| hz_in(&card.comment)).map(|hz| stated(card, hz)))
 }
 
-/// Frequency in FREQ of either header, Hz, which must not contradict each other.
-fn file_hz(header: &Header) -> Result<Option<f64>, FitsProblem> {
-    let mut known: Option<f64> = None;
+/// Frequency in FREQ of either header, which must not contradict each other.
+fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProblem> {
+    let mut known: Option<StatedFrequency> = None;
     for card in header.cards().iter().filter(|card| FREQUENCY_KEYS.contains(&card.key.as_str())) {
-        let hz = stated_hz(header, card)?;
-        if let Some(other) = known.filter(|&other| !is_same_hz(hz, other)) {
-            let [hz, other] = [hz, other].map(|hz| Dimension::Frequency.show(hz));
-            return Err(FitsProblem::keyword(
-                &card.key,
-                hz,
-                format!("{other}, as the headers say elsewhere"),
-            ));
+        let found = StatedFrequency { hz: stated_hz(header, card)?, keyword: card.key.clone() };
+        if let Some(other) = known.as_ref().filter(|other| !is_same_hz(found.hz, other.hz)) {
+            return Err(contradiction(&found, other));
         }
-        known.get_or_insert(hz);
+        known.get_or_insert(found);
     }
     Ok(known)
+}
+
+fn contradiction(found: &StatedFrequency, other: &StatedFrequency) -> FitsProblem {
+    let [hz, other_hz] = [found.hz, other.hz].map(|hz| Dimension::Frequency.show(hz));
+    let expected = format!("{other_hz}, as {} says elsewhere in the headers", other.keyword);
+    FitsProblem::keyword(&found.keyword, hz, expected)
 }
 
 /// Frequency of a card, Hz. Its unit is in the text, the comment or FREQUNIT; without a unit it is Hz.
@@ -206,11 +270,13 @@ mod tests {
             (Card::text("FREQUENCY", "1.42GHz", ""), 1.42e9),
             (Card::real("RESTFRQ", 3e6, ""), 3e6),
         ] {
-            let found = frequency_hz(&header(std::slice::from_ref(&card)), 1).unwrap().unwrap();
-            assert!((found / hz - 1.0).abs() < 1e-12, "{card:?}: {found}");
+            let found = stated_frequency(&header(std::slice::from_ref(&card)), 1).unwrap().unwrap();
+            assert!((found.hz / hz - 1.0).abs() < 1e-12, "{card:?}: {found:?}");
+            assert_eq!(found.keyword, card.key);
         }
         let with_key = [Card::real("FREQ", 408.0, ""), Card::text("FREQUNIT", "MHz", "")];
-        assert_eq!(frequency_hz(&header(&with_key), 1).unwrap(), Some(408e6));
+        let found = stated_frequency(&header(&with_key), 1).unwrap();
+        assert_eq!(found, Some(StatedFrequency { hz: 408e6, keyword: "FREQ".into() }));
         for wrong in [
             Card::text("FREQ", "about 10", ""),
             Card::text("FREQ", "10 parsecs", ""),
@@ -218,13 +284,23 @@ mod tests {
             Card::real("FREQ", 10.0, "Hz or MHz"),
             Card::logical("FREQ", true, ""),
         ] {
-            assert!(frequency_hz(&header(std::slice::from_ref(&wrong)), 1).is_err(), "{wrong:?}");
+            assert!(stated_frequency(&header(std::slice::from_ref(&wrong)), 1).is_err(), "{wrong:?}");
         }
         let two = [Card::real("FREQ", 1e7, "Hz"), Card::text("FREQ", "408 MHz", "")];
-        assert!(
-            frequency_hz(&header(&two), 1).unwrap_err().to_string().contains("as the headers say elsewhere")
-        );
-        assert_eq!(frequency_hz(&header(&[]), 1).unwrap(), None);
+        let said = stated_frequency(&header(&two), 1).unwrap_err().to_string();
+        assert!(said.contains("FREQ is 408 MHz; expected 10 MHz, as FREQ says elsewhere"), "{said}");
+        assert_eq!(stated_frequency(&header(&[]), 1).unwrap(), None);
+        // FREQ of the file is that of one of its columns.
+        let columns = |hz| {
+            let names =
+                [(1, "T_3MHz"), (2, "T_10MHz")].map(|(k, name)| Card::text(&format!("TTYPE{k}"), name, ""));
+            header(
+                &[&names[..], &[Card::real("OBSFREQ", hz, "Hz"), Card::integer("TFIELDS", 2, "")]].concat(),
+            )
+        };
+        assert_eq!(stated_frequency(&columns(3e6), 2).unwrap().unwrap().hz, 10e6);
+        let said = stated_frequency(&columns(5e6), 2).unwrap_err().to_string();
+        assert!(said.contains("OBSFREQ is 5 MHz; expected 10 MHz, as TTYPE2 says"), "{said}");
     }
 
     #[test]
@@ -236,8 +312,21 @@ mod tests {
             Card::text("TTYPE4", "30000 kHz", ""),
             Card::real("FREQ3", 10.0, "MHz"),
         ];
-        let found: Vec<_> = (1..=5).map(|column| column_hz(&header(&cards), column).unwrap()).collect();
+        let of = |column| column_frequency(&header(&cards), column).unwrap();
+        let found: Vec<_> = (1..=5).map(|column| of(column).map(|found| found.hz)).collect();
         assert_eq!(found, [Some(1e6), Some(3.5e6), Some(1e7), Some(3e7), None]);
+    }
+
+    #[test]
+    fn names_of_other_quantities_are_no_maps() {
+        for name in
+            ["SIGMA_10MHz", "t_err", "N_OBS", "nobs", "Hits", "PIXEL", "Q_POLARISATION", "II_COV", "STD10"]
+        {
+            assert!(is_other_quantity(name), "{name}");
+        }
+        for name in ["T_10MHz", "TEMPERATURE", "I_STOKES", "", "SIGNAL", "T_OBS", "QUICKLOOK", "VALUE"] {
+            assert!(!is_other_quantity(name), "{name}");
+        }
     }
 
     #[test]

@@ -4,13 +4,17 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-use super::card::CardValue;
+use super::card::{Card, CardValue};
 use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
-use super::metadata::{MapUnit, column_hz, frequency_hz, is_same_hz};
+use super::metadata::{
+    MapUnit, StatedFrequency, column_frequency, is_other_quantity, is_same_hz, stated_frequency,
+};
 use super::table::{CellType, ColumnLayout, TableLayout};
+use crate::files::{form_of, open_file};
 use crate::sky::healpix::{is_valid_nside, nested_to_ring, nside_of, pixel_count};
-use crate::sky::{Frame, SkyMap, is_unseen};
+use crate::sky::{Frame, MapError, SkyMap, is_unseen};
+use crate::units::Dimension;
 use crate::units::constants::HEALPIX_UNSEEN;
 
 const PIECE_BYTES: usize = 1 << 20;
@@ -22,8 +26,9 @@ const NSIDE_MAX_SPARSE: usize = 1024;
 /// Options for reading a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReadOptions {
-    /// Map column of the table, counted from 0 without the column of pixel numbers.
-    pub column: usize,
+    /// Map column of the table, counted from 0 without the column of pixel numbers; `None` for the one of `frequency_hz`, or the first
+    /// whose name is not that of an error, a number of observations or pixels, or polarisation.
+    pub column: Option<usize>,
     /// Frame of files without COORDSYS; `None` makes such files an error.
     pub frame_if_missing: Option<Frame>,
     /// Frequency, Hz: where columns state their frequencies, the column with the nearest one is read in place of `column`.
@@ -43,6 +48,10 @@ pub struct MapFile {
     pub frame_assumed: bool,
     /// Frequency of the map, Hz, from its column or either header.
     pub frequency_hz: Option<f64>,
+    /// Keyword that states the frequency.
+    pub(super) frequency_keyword: String,
+    /// RING number and value of the first pixel that has BAD_DATA.
+    first_bad: Option<(usize, f64)>,
     /// Number of columns with maps of this size in the table.
     pub columns: usize,
     /// Cards of the table's header, then of the primary header.
@@ -73,7 +82,13 @@ pub fn read_whole_map(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
 pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
     let mut file = read_map_file(path, options)?;
     let refuse = |problem| FitsError::new(path, problem);
-    file.map.check_whole().map_err(|problem| refuse(problem.into()))?;
+    file.map.check_whole().map_err(|problem| match (problem, file.first_bad) {
+        // The file has what it calls bad, in place of UNSEEN.
+        (MapError::BadPixels { count, total, first, .. }, Some((bad, value))) if bad == first => {
+            refuse(MapError::BadPixels { count, total, first, value }.into())
+        }
+        (problem, _) => refuse(problem.into()),
+    })?;
     let unit =
         MapUnit::parse(&file.unit).ok_or_else(|| refuse(FitsProblem::Unit { found: file.unit.clone() }))?;
     let factor = unit.kelvin(file.frequency_hz).ok_or_else(|| {
@@ -98,14 +113,14 @@ pub fn read_notes(path: &Path, options: &ReadOptions) -> Result<Vec<String>, Fit
         if unit(header, number)?.is_empty() {
             notes.push("the map states no unit (TUNIT); it is taken as K".to_owned());
         }
-        if frequency_hz(header, number)?.is_none() {
+        if stated_frequency(header, number)?.is_none() {
             notes.push("the map states no frequency (FREQ); it is taken as one at the channel's".to_owned());
         }
         let (_, column) = choose_columns(table, explicit, chosen)?;
         let columns = table.maps_like(column, explicit);
-        if columns > 1 && column_hz(header, number)?.is_none() {
+        if columns > 1 && column_frequency(header, number)?.is_none() {
             notes.push(format!(
-                "the table has {columns} columns of maps and does not say their frequencies; `{}`, the first, is used",
+                "the table has {columns} columns and does not say their frequencies; `{}`, the first that may be a temperature, is used",
                 column.name
             ));
         }
@@ -126,9 +141,20 @@ pub fn read_nside(path: &Path, options: &ReadOptions) -> Result<usize, FitsError
     })
 }
 
-/// Reads the frequency of the first map in a file, Hz, if it is stated, from headers only.
-pub(super) fn read_frequency(path: &Path) -> Result<Option<f64>, FitsError> {
-    read_headers(path, |header, _| frequency_hz(header, 1 + usize::from(is_explicit(header)?)))
+/// Reads the frequency of the first map in a file, if it is stated, from headers only.
+pub(super) fn read_frequency(path: &Path) -> Result<Option<StatedFrequency>, FitsError> {
+    read_headers(path, |header, table| {
+        let explicit = is_explicit(header)?;
+        let chosen = chosen_column(header, table, explicit, &ReadOptions::default())?;
+        stated_frequency(header, chosen + 1 + usize::from(explicit))
+    })
+}
+
+/// Opens a file; gives its length, bytes. A pipe would be waited for, and a device has no length.
+fn open(path: &Path) -> Result<(File, u64), FitsProblem> {
+    let file = open_file(path).map_err(FitsProblem::io("open"))?;
+    let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+    Ok((file, length))
 }
 
 /// Applies `read` to the headers of a file's first map.
@@ -137,8 +163,7 @@ fn read_headers<T>(
     read: impl FnOnce(&Header, &TableLayout) -> Result<T, FitsProblem>,
 ) -> Result<T, FitsError> {
     let from_file = || {
-        let file = File::open(path).map_err(FitsProblem::io("open"))?;
-        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        let (file, length) = open(path)?;
         let mut reader = BufReader::new(file);
         check_start(&mut reader, length)?;
         let (header, start) = find_table(&mut reader, length)?;
@@ -153,8 +178,7 @@ fn read_headers<T>(
 /// [`FitsError`] with the file and its problem.
 pub fn read_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
     let read = || {
-        let file = File::open(path).map_err(FitsProblem::io("open"))?;
-        let length = file.metadata().map_err(FitsProblem::io("examine"))?.len();
+        let (file, length) = open(path)?;
         read_map_from(&mut BufReader::new(file), length, options)
     };
     read().map_err(|problem| FitsError::new(path, problem))
@@ -187,14 +211,23 @@ pub fn read_map_from(
         None => read_implicit(reader, &table, column, nside)?,
         Some(index) => read_explicit(reader, &table, index, column, nside)?,
     };
-    let is_bad = bad_values(&header);
-    values.iter_mut().filter(|value| is_bad(**value)).for_each(|value| *value = HEALPIX_UNSEEN);
-    let values = if nested { to_ring(nside, &values) } else { values };
+    if nested {
+        values = to_ring(nside, &values);
+    }
+    let first_bad = leave_bad_out(&mut values, header.number("BAD_DATA")?);
     let number = chosen + 1 + usize::from(explicit);
-    let (unit, frequency_hz) = (unit(&header, number)?, frequency_hz(&header, number)?);
-    let map = SkyMap::new(frame, values)?;
-    let columns = table.maps_like(column, explicit);
-    Ok(MapFile { map, name: column.name.clone(), unit, frame_assumed, frequency_hz, columns, header })
+    let (unit, frequency) = (unit(&header, number)?, stated_frequency(&header, number)?);
+    Ok(MapFile {
+        map: SkyMap::new(frame, values)?,
+        name: column.name.clone(),
+        unit,
+        frame_assumed,
+        frequency_hz: frequency.as_ref().map(|frequency| frequency.hz),
+        frequency_keyword: frequency.map_or("FREQ".to_owned(), |frequency| frequency.keyword),
+        first_bad,
+        columns: table.maps_like(column, explicit),
+        header,
+    })
 }
 
 fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsProblem> {
@@ -207,60 +240,96 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     if start == b"SIMPLE  =" {
         return Ok(());
     }
-    let found = match start.as_slice() {
-        [0x1f, 0x8b, ..] => "a gzip signature (decompress it first)".to_owned(),
-        other => format!("`{}`", other.escape_ascii()),
+    let found = match form_of(&start) {
+        Some(form) => format!("the signature of {form} (decompress it first, if it is compressed)"),
+        None => format!("`{}`", start.escape_ascii()),
     };
     Err(FitsProblem::NotFits { found })
 }
 
-/// Returns a test for values that mean no value: UNSEEN, or the header's BAD_DATA.
-fn bad_values(header: &Header) -> impl Fn(f64) -> bool + use<> {
-    let stated = header.real("BAD_DATA");
+/// Makes UNSEEN of the values that mean no value: UNSEEN of single precision, or the header's BAD_DATA. Returns the first of the latter.
+fn leave_bad_out(values: &mut [f64], bad: Option<f64>) -> Option<(usize, f64)> {
     // Single precision keeps seven digits.
-    move |value| is_unseen(value) || stated.is_some_and(|bad| (value - bad).abs() <= 1e-6 * bad.abs())
+    let is_bad = |value: f64| bad.is_some_and(|bad| (value - bad).abs() <= 1e-6 * bad.abs());
+    let first = values.iter().position(|value| is_bad(*value) && !is_unseen(*value));
+    let first = first.map(|pixel| (pixel, values[pixel]));
+    let left_out = values.iter_mut().filter(|value| is_unseen(**value) || is_bad(**value));
+    left_out.for_each(|value| *value = HEALPIX_UNSEEN);
+    first
 }
 
-/// Index of the map column to read, from 0: of those that state their frequencies, the nearest to the requested one.
+/// Index of the map column to read, from 0: of those that state their frequencies, the nearest to the requested one, else the first.
 fn chosen_column(
     header: &Header,
     table: &TableLayout,
     explicit: bool,
     options: &ReadOptions,
 ) -> Result<usize, FitsProblem> {
-    let Some(wanted_hz) = options.frequency_hz else { return Ok(options.column) };
-    let mut nearest: Option<(f64, usize)> = None;
-    for column in 0..table.columns.len() - usize::from(explicit) {
-        let Some(hz) = column_hz(header, column + 1 + usize::from(explicit))? else { continue };
-        let distance = if is_same_hz(hz, wanted_hz) { 0.0 } else { (hz / wanted_hz).ln().abs() };
-        if nearest.is_none_or(|(smallest, _)| distance < smallest) {
-            nearest = Some((distance, column));
+    if let Some(column) = options.column {
+        return Ok(column);
+    }
+    let before = usize::from(explicit);
+    let is_map = |(_, column): &(usize, &ColumnLayout)| {
+        column.cell != CellType::Other && column.repeat > 0 && !is_other_quantity(&column.name)
+    };
+    let maps: Vec<usize> =
+        table.columns.iter().skip(before).enumerate().filter(is_map).map(|(k, _)| k).collect();
+    let mut stated = Vec::new();
+    for &column in &maps {
+        stated.extend(column_frequency(header, column + 1 + before)?.map(|frequency| (column, frequency)));
+    }
+    let first = maps.first().copied().unwrap_or_default();
+    let Some(wanted_hz) = options.frequency_hz else { return Ok(first) };
+    let distance = |hz: f64| if is_same_hz(hz, wanted_hz) { 0.0 } else { (hz / wanted_hz).ln().abs() };
+    let nearest = stated.iter().min_by(|(_, a), (_, b)| distance(a.hz).total_cmp(&distance(b.hz)));
+    let Some((column, StatedFrequency { hz, keyword })) = nearest else { return Ok(first) };
+    match stated.iter().find(|(other, frequency)| other != column && is_same_hz(frequency.hz, *hz)) {
+        None => Ok(*column),
+        Some((_, other)) => {
+            let expected = format!("one column of that frequency; {} says it, too", other.keyword);
+            Err(FitsProblem::keyword(keyword, Dimension::Frequency.show(*hz), expected))
         }
     }
-    Ok(nearest.map_or(options.column, |(_, column)| column))
 }
 
-/// Finds the first binary table: its header followed by the primary header, and the offset of its rows.
+/// Keywords of the header of a table with a map.
+const MAP_KEYWORDS: [&str; 4] = ["PIXTYPE", "NSIDE", "ORDERING", "INDXSCHM"];
+
+/// Finds the first binary table that says that it has a map, or else the first: its header followed by the primary header, and the
+/// offset of its rows.
 fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u64), FitsProblem> {
     let mut at = 0;
     let mut units = 0;
-    let mut primary = Header::default();
+    let mut primary = None;
+    let mut first = None;
     while at < length && units < UNITS_MAX {
-        let (header, data) = Header::read(reader, at, length)?;
+        // What follows a table need not be whole.
+        let (header, data) = match Header::read(reader, at, length) {
+            Err(_) if first.is_some() => break,
+            read => read?,
+        };
         units += 1;
-        if header.text("XTENSION") == Some("BINTABLE") {
-            return Ok((header.with_primary(primary), data));
+        let is_table = header.text("XTENSION") == Some("BINTABLE");
+        if is_table && MAP_KEYWORDS.iter().any(|key| header.get(key).is_some()) {
+            return Ok((header.with_primary(primary.unwrap_or_default()), data));
         }
-        let needed = data.saturating_add(header.data_bytes()?);
-        if needed > length {
-            return Err(FitsProblem::Truncated { expected: "data before the table", needed, length });
+        let needed = header.data_bytes().map(|bytes| data.saturating_add(bytes));
+        if is_table && first.is_none() {
+            first = Some((header, data));
+        } else {
+            primary.get_or_insert(header);
         }
-        at = needed.next_multiple_of(BLOCK_BYTES as u64);
-        if units == 1 {
-            primary = header;
-        }
+        at = match needed {
+            Ok(needed) if needed <= length => needed.next_multiple_of(BLOCK_BYTES as u64),
+            _ if first.is_some() => break,
+            Ok(needed) => {
+                return Err(FitsProblem::Truncated { expected: "data before the table", needed, length });
+            }
+            Err(problem) => return Err(problem),
+        };
     }
-    Err(FitsProblem::NoTable { units })
+    let (header, data) = first.ok_or(FitsProblem::NoTable { units })?;
+    Ok((header.with_primary(primary.unwrap_or_default()), data))
 }
 
 fn unit(header: &Header, column: usize) -> Result<String, FitsProblem> {
@@ -346,17 +415,54 @@ fn is_nested(header: &Header) -> Result<bool, FitsProblem> {
     }
 }
 
+/// The frame that COORDSYS and SKYCOORD of both headers name, or else that of the options, and whether it is that one.
 fn frame(header: &Header, options: &ReadOptions) -> Result<(Frame, bool), FitsProblem> {
-    let named = header.text("SKYCOORD").and_then(Frame::from_coordsys);
-    match (header.get("COORDSYS"), named.or(options.frame_if_missing)) {
-        (None, None) => Err(FitsProblem::NoFrame),
-        (None, Some(frame)) => Ok((frame, named.is_none())),
-        (Some(found), _) => header
-            .text("COORDSYS")
-            .and_then(Frame::from_coordsys)
-            .map(|frame| (frame, false))
-            .ok_or_else(|| FitsProblem::keyword("COORDSYS", found, "'E', 'G' or 'C'")),
+    let mut named: Option<Frame> = None;
+    for Card { key, value, .. } in header.cards() {
+        let frame = match value {
+            CardValue::Text(text) => Frame::from_coordsys(text),
+            _ => None,
+        };
+        match (key.as_str(), frame) {
+            ("COORDSYS", None) => return Err(FitsProblem::keyword(key, value, "'E', 'G' or 'C'")),
+            ("COORDSYS" | "SKYCOORD", Some(frame)) => {
+                if let Some(other) = named.filter(|other| *other != frame) {
+                    let expected = format!("{other}, as the headers say elsewhere");
+                    return Err(FitsProblem::keyword(key, value, expected));
+                }
+                named = Some(frame);
+            }
+            _ => {}
+        }
     }
+    let frame = named.or(options.frame_if_missing).ok_or(FitsProblem::NoFrame)?;
+    if frame != Frame::Galactic {
+        require_j2000(header)?;
+    }
+    Ok((frame, named.is_none()))
+}
+
+/// Requires axes of J2000 or ICRS, where the header says which: those of B1950 differ by 0.6 degrees.
+fn require_j2000(header: &Header) -> Result<(), FitsProblem> {
+    let expected = "2000 (FK5 or ICRS): convert the map to axes of J2000";
+    for Card { key, value, .. } in header.cards() {
+        let text = match value {
+            CardValue::Text(text) => text.trim().to_ascii_uppercase(),
+            other => other.to_string(),
+        };
+        let year = text.trim_start_matches(['J', 'B']).parse::<f64>().ok();
+        let is_other = match key.as_str() {
+            "EQUINOX" => year != Some(2000.0),
+            // Often the date of the observation.
+            "EPOCH" => year == Some(1950.0),
+            "RADESYS" | "RADECSYS" => text.starts_with("FK4") || text == "GAPPT",
+            _ => false,
+        };
+        if is_other {
+            return Err(FitsProblem::keyword(key, value, expected));
+        }
+    }
+    Ok(())
 }
 
 /// Calls `use_row` for every row; memory is bounded by one read or one row.

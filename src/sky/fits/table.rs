@@ -1,5 +1,6 @@
 //! Layout and cells of a binary table with fixed-width columns (FITS Standard 4.0, Sect. 7.3).
 
+use super::card::CardValue;
 use super::error::FitsProblem;
 use super::header::Header;
 
@@ -109,19 +110,27 @@ impl ColumnLayout {
         let (Some(repeat), Some(width)) = (repeat, width) else {
             return Err(FitsProblem::keyword(&key, form, expected));
         };
-        let real = |key: &str, otherwise| header.real(&format!("{key}{number}")).unwrap_or(otherwise);
+        let real = |key: &str, otherwise: f64| {
+            header.number(&format!("{key}{number}")).map(|number| number.unwrap_or(otherwise))
+        };
+        let null_key = format!("TNULL{number}");
+        let null = match header.get(&null_key) {
+            None => None,
+            Some(CardValue::Integer(null)) => Some(*null),
+            Some(found) => {
+                let quoted = header.text(&null_key).and_then(|text| text.parse().ok());
+                Some(quoted.ok_or_else(|| FitsProblem::keyword(&null_key, found, "an integer"))?)
+            }
+        };
         Ok(Self {
             name: header.text(&format!("TTYPE{number}")).unwrap_or("").to_owned(),
             cell,
             repeat,
             offset,
             width,
-            scale: real("TSCAL", 1.0),
-            zero: real("TZERO", 0.0),
-            null: header.get(&format!("TNULL{number}")).and_then(|value| match value {
-                crate::sky::fits::CardValue::Integer(null) => Some(*null),
-                _ => None,
-            }),
+            scale: real("TSCAL", 1.0)?,
+            zero: real("TZERO", 0.0)?,
+            null,
         })
     }
 

@@ -100,6 +100,7 @@ impl AddedSky {
                 scale * source.flux_jy * kelvin_sr_per_jansky(generated, frequency_hz) / pixel_area_sr(nside);
             map.values_mut()[pixel_of(nside, source.direction)] += kelvin;
         }
+        map.check_temperatures()?;
         Ok(map)
     }
 }

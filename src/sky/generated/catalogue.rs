@@ -1,13 +1,13 @@
 //! Published catalogues of point sources: text tables with a line of column names.
 
 use std::fmt;
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::columns::{Columns, normalise};
+use super::column_units::{angle_deg, flux_jy, is_unit, require_unit};
+use super::columns::Columns;
+use crate::files::{read_file, text_of};
 use crate::sky::Frame;
 use crate::sky::frame::rotate;
 use crate::units::Dimension;
@@ -15,6 +15,13 @@ use crate::units::vector::Vec3;
 
 /// Maximum size of a catalogue, bytes; a line has some 50.
 const BYTES_MAX: u64 = 256 << 20;
+
+/// Highest flux density, Jy: some 1e15 K in a pixel of 4 degrees at 3 MHz.
+const FLUX_JY_MAX: f64 = 1e12;
+
+/// Lowest and highest frequency of a flux density, Hz.
+const FREQUENCY_HZ_MIN: f64 = 1e4;
+const FREQUENCY_HZ_MAX: f64 = 1e12;
 
 /// Why a catalogue cannot be used.
 #[derive(Debug, Error)]
@@ -99,6 +106,14 @@ impl Catalogue {
     }
 }
 
+/// Units of the columns that are used.
+#[derive(Clone, Copy)]
+struct Units {
+    /// Of longitudes and latitudes that are one number, degrees.
+    angle_deg: [f64; 2],
+    flux_jy: f64,
+}
+
 /// Column names, units and numbered lines of a table.
 struct Table<'a> {
     names: Vec<String>,
@@ -126,6 +141,7 @@ impl Reader<'_> {
         let text = self.text()?;
         let table = self.table(&text)?;
         let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
+        let old = comments.clone().zip(1..).find(|(line, _)| line.contains("B1950") || line.contains("FK4"));
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let is_vlssr = comments.chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
         let columns = Columns::recognise(&table.names, is_vlssr).map_err(|expected| {
@@ -133,44 +149,85 @@ impl Reader<'_> {
             let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
             self.content_error(first, format!("the columns {}", names.join(", ")), expected)
         })?;
-        let flux_unit = flux_unit(&table.names[columns.flux], &table.units[columns.flux])
-            .map_err(|found| self.content_error(1, found, "a flux density in Jy or mJy"))?;
-        let sources = table
+        if let Some((_, line)) = old
+            && columns.frame == Frame::Equatorial
+            && !columns.places.iter().flatten().any(|place| table.names[*place].contains("2000"))
+        {
+            let found = "positions of B1950 (FK4)";
+            return Err(self.content_error(
+                line,
+                found,
+                "of J2000: precess them, and call them RAJ2000 and DEJ2000",
+            ));
+        }
+        let units = self.units(&table, &columns)?;
+        let sources: Vec<Source> = table
             .rows
             .iter()
-            .map(|&(line, text)| {
-                self.source(line, &cells(text, table.separator), &columns, &table, flux_unit.1)
-            })
+            .map(|&(line, text)| self.source(line, &cells(text, table.separator), &columns, &table, units))
             .collect::<Result<_, _>>()?;
+        if sources.is_empty() {
+            return Err(self.content_error(1, "no sources", "one line per source below the names"));
+        }
         let name = |place: usize| table.names[place].clone();
         Ok(Catalogue {
             sources,
             path: self.path.to_owned(),
             frame: columns.frame,
             names: (name(columns.flux), columns.index.map(name)),
-            flux_unit: flux_unit.0,
+            flux_unit: if units.flux_jy < 1.0 { "mJy" } else { "Jy" },
+        })
+    }
+
+    /// The units of the columns that are used, each of which is there once.
+    fn units(&self, table: &Table<'_>, columns: &Columns) -> Result<Units, CatalogueError> {
+        let Columns { places: [lon, lat], flux, frequency_place, index, .. } = columns;
+        let own = frequency_place.map(|(place, _)| place);
+        for &place in lon.iter().chain(lat).chain([flux]).chain(&own).chain(index) {
+            let name = &table.names[place];
+            if table.names.iter().filter(|other| *other == name).count() > 1 {
+                let found = format!("several columns `{}`", displayed(name));
+                return Err(self.content_error(1, found, "one of each name"));
+            }
+        }
+        let of = |place: usize| (table.names[place].as_str(), table.units[place].as_str());
+        let refuse = |(name, _): (&str, &str), expected| {
+            let name = displayed(name);
+            move |unit: String| {
+                self.content_error(1, format!("the unit `{}` of `{name}`", displayed(&unit)), expected)
+            }
+        };
+        let angle = |places: &[usize], hours: Option<f64>, expected| match *places {
+            [place] => angle_deg(of(place), hours).map_err(refuse(of(place), expected)),
+            _ => Ok(hours.unwrap_or(1.0)),
+        };
+        let of_flux = of(*flux);
+        if let Some((place, unit_hz)) = *frequency_place {
+            let expected = "the unit in the column's name, or none";
+            require_unit(of(place), unit_hz).map_err(refuse(of(place), expected))?;
+        }
+        Ok(Units {
+            angle_deg: [
+                angle(lon, Some(15.0), "deg, rad, arcmin, arcsec or hours, as the column's name says")?,
+                angle(lat, None, "deg, rad, arcmin or arcsec, as the column's name says")?,
+            ],
+            flux_jy: flux_jy(of_flux)
+                .map_err(refuse(of_flux, "a flux density in Jy or mJy, as the column's name says"))?,
         })
     }
 
     /// Reads the file as text; invalid UTF-8, as in names in other encodings, is replaced.
     fn text(&self) -> Result<String, CatalogueError> {
-        let failed = |source| CatalogueError::Read { path: self.path.to_owned(), source };
-        let mut bytes = Vec::new();
-        let file = File::open(self.path).map_err(failed)?;
-        file.take(BYTES_MAX + 1).read_to_end(&mut bytes).map_err(failed)?;
-        let found = match bytes.as_slice() {
-            all if all.len() as u64 > BYTES_MAX => "more than 268 MB",
-            [0x1f, 0x8b, ..] => "a gzip file",
-            [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => "text in UTF-16",
-            all if all.starts_with(b"SIMPLE  =") => "a FITS file",
-            all if all.trim_ascii_start().starts_with(b"<") => "an XML document (VOTable)",
-            all if all.starts_with(b"PAR1") || all.starts_with(b"\x89HDF") => "a binary table",
-            _ => {
-                let text = String::from_utf8_lossy(&bytes);
-                return Ok(text.strip_prefix('\u{feff}').unwrap_or(&text).to_owned());
-            }
+        let bytes = read_file(self.path, BYTES_MAX)
+            .map_err(|source| CatalogueError::Read { path: self.path.to_owned(), source })?;
+        let found = match bytes.trim_ascii_start().starts_with(b"<") {
+            true => "an XML document (VOTable)",
+            false => match text_of(&bytes) {
+                Ok(text) => return Ok(text),
+                Err(form) => form,
+            },
         };
-        Err(self.content_error(1, found, "a table as plain text (CSV, TSV), at most 268 MB"))
+        Err(self.content_error(1, found, "a table as plain text (CSV, TSV)"))
     }
 
     /// Divides the text into names, units and rows. The names are the first line, or the last comment before numbers.
@@ -214,19 +271,23 @@ impl Reader<'_> {
         cells: &[String],
         columns: &Columns,
         table: &Table<'_>,
-        flux_jy: f64,
+        units: Units,
     ) -> Result<Source, CatalogueError> {
+        let more = cells.iter().skip(table.names.len()).any(|cell| !cell.is_empty());
+        if more {
+            let found = format!("{} cells", cells.len());
+            return Err(self.content_error(line, found, format!("{}, one a name", table.names.len())));
+        }
         let cell = |place: usize| cells.get(place).map_or("", String::as_str);
         let joined = |places: &[usize]| places.iter().map(|&place| cell(place)).collect::<Vec<_>>().join(" ");
         let angle = |k: usize, expected: &str, limit: f64| {
             let text = joined(&columns.places[k]);
-            let unit = &table.units[columns.places[k][0]];
-            let is_hours = k == 0
-                && columns.frame == Frame::Equatorial
-                && (columns.places[k].len() > 1
-                    || is_sexagesimal(&text)
-                    || unit.to_ascii_lowercase().starts_with('h'));
-            let degrees = angle_of(&text).map(|value| if is_hours { 15.0 * value } else { value });
+            let unit_deg = match is_sexagesimal(&text) {
+                true if k == 0 && (columns.frame == Frame::Equatorial || units.angle_deg[0] == 15.0) => 15.0,
+                true => 1.0,
+                false => units.angle_deg[k],
+            };
+            let degrees = angle_of(&text).map(|value| unit_deg * value);
             let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= limit);
             found.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(&text)), expected))
         };
@@ -237,10 +298,18 @@ impl Reader<'_> {
             value.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(cell(place))), expected))
         };
         let flux = number(columns.flux, "a flux density above 0", |flux| flux > 0.0)?;
+        if units.flux_jy * flux > FLUX_JY_MAX {
+            let found = format!("{flux:e} {}", if units.flux_jy < 1.0 { "mJy" } else { "Jy" });
+            return Err(self.content_error(line, found, format!("at most {FLUX_JY_MAX:e} Jy")));
+        }
         let at_hz = match columns.frequency_place {
             None => columns.flux_hz,
             Some((place, unit)) => unit * number(place, "a frequency above 0", |value| value > 0.0)?,
         };
+        if !(FREQUENCY_HZ_MIN..=FREQUENCY_HZ_MAX).contains(&at_hz) {
+            let expected = "a radio frequency, 10 kHz to 1000 GHz";
+            return Err(self.content_error(line, format!("a flux at {at_hz:e} Hz"), expected));
+        }
         let index = match columns.index {
             // Sources without a fit have no index.
             Some(place) if !is_blank(cell(place)) => {
@@ -253,7 +322,7 @@ impl Reader<'_> {
             Frame::Ecliptic => own,
             frame => rotate(&frame.to_ecliptic(), own),
         };
-        Ok(Source { direction, flux_jy: flux_jy * flux, at_hz, index })
+        Ok(Source { direction, flux_jy: units.flux_jy * flux, at_hz, index })
     }
 }
 
@@ -293,24 +362,7 @@ fn cells(line: &str, separator: char) -> Vec<String> {
 
 /// Whether a row contains units: no numbers, and at least one unit that is usual in catalogues.
 fn is_unit_row(cells: &[String]) -> bool {
-    let units = ["deg", "jy", "mjy", "h:m:s", "d:m:s", "h m s", "d m s", "hms", "hourangle", "hours"];
-    let normalise = |cell: &String| cell.trim_matches(['"', '\'', '(', ')', '[', ']']).to_ascii_lowercase();
-    cells.iter().all(|cell| cell.parse::<f64>().is_err())
-        && cells.iter().any(|cell| units.contains(&normalise(cell).as_str()))
-}
-
-/// Returns the unit of fluxes, from the row of units or the name of the column, and its value in Jy.
-fn flux_unit(name: &str, unit: &str) -> Result<(&'static str, f64), String> {
-    let bracketed = name.split_once(['(', '[']).map_or("", |(_, unit)| unit.trim_end_matches([')', ']']));
-    let unit = if unit.is_empty() { bracketed } else { unit };
-    let normalised_name = normalise(name);
-    match unit.trim().to_ascii_lowercase().as_str() {
-        "mjy" => Ok(("mJy", 1e-3)),
-        "jy" => Ok(("Jy", 1.0)),
-        "" if normalised_name.ends_with("mjy") => Ok(("mJy", 1e-3)),
-        "" => Ok(("Jy", 1.0)),
-        other => Err(format!("the unit `{}` of `{}`", displayed(other), displayed(name))),
-    }
+    cells.iter().all(|cell| cell.parse::<f64>().is_err()) && cells.iter().any(|cell| is_unit(cell))
 }
 
 fn is_blank(cell: &str) -> bool {
@@ -419,6 +471,38 @@ mod tests {
     }
 
     #[test]
+    fn the_row_of_units_is_what_numbers_are_in() {
+        // 60 deg of longitude and 30 deg of latitude, 5 Jy.
+        for table in [
+            "elon,elat,S74\ndeg,deg,Jy\n60,30,5\n",
+            "elon,elat,S74\nrad,rad,mJy\n1.0471975512,0.5235987756,5000\n",
+            "elon,elat,S74\narcmin,arcsec,Jy\n3600,108000,5\n",
+            "elon (rad),elat [deg],S74\n1.0471975512,30,5\n",
+            "elon,elat,S74\nhours,,\n4,30,5\n",
+            "elon,elat,S74\n60,30,5,\n",
+        ] {
+            let read = Catalogue::read(file(table.as_bytes()).path()).unwrap();
+            let [longitude, latitude] = place(&read.sources[0]);
+            let off = (longitude - 60.0).abs().max((latitude - 30.0).abs());
+            // Angles in radians have eleven digits.
+            assert!(off < 1e-8 && (read.sources[0].flux_jy - 5.0).abs() < 1e-12, "{table}");
+        }
+        // Hours are of right ascension as well, without a colon.
+        let read = Catalogue::read(file(b"ra,dec,S74\nhours,deg,Jy\n12,0,5\n").path()).unwrap();
+        assert!((place(&read.sources[0])[0] - 180.0).abs() < 1e-9);
+        for (table, said) in [
+            ("elon_deg,elat,S74\nrad,deg,Jy\n1,2,3\n", "line 1: found the unit `rad` of `elon_deg`"),
+            ("elon,elat,S74\ndeg,hours,Jy\n1,2,3\n", "the unit `hours` of `elat`"),
+            ("elon,elat,S74\ndeg,gon,Jy\n1,2,3\n", "the unit `gon` of `elat`"),
+            ("elon,elat,flux_154mhz_mjy\ndeg,deg,Jy\n1,2,3\n", "the unit `jy` of `flux_154mhz_mjy`"),
+            ("l,b,flux_jy,frequency_mhz\ndeg,deg,Jy,GHz\n1,2,3,0.154\n", "the unit `ghz` of `frequency_mhz`"),
+        ] {
+            let found = Catalogue::read(file(table.as_bytes()).path()).unwrap_err().to_string();
+            assert!(found.contains(said), "{found}: expected {said}");
+        }
+    }
+
+    #[test]
     fn catalogues_that_are_none_say_where() {
         let said = |text: &[u8]| Catalogue::read(file(text).path()).unwrap_err().to_string();
         let head = "ecliptic_longitude_deg,ecliptic_latitude_deg,flux_154mhz_jy";
@@ -428,6 +512,20 @@ mod tests {
         assert!(said(b"\x1f\x8b\x08").contains("gzip"));
         assert!(said(b"<?xml version='1.0'?><VOTABLE/>").contains("VOTable"));
         assert!(said(b"ra,dec,S74 (K)\n1,2,3\n").contains("the unit `k` of `S74 (K)`"));
+        // No sources, other line ends, cells beyond the names, and what no source has.
+        assert!(said(b"ra,dec,S74\n").contains("no sources"));
+        assert!(said(b"ra,dec,S74\r10,20,5\r11,21,x\r").contains("line 3: found `x`"));
+        assert!(said(b"ra,dec,S74\n10,5,20,5,3\n").contains("line 2: found 5 cells, expected 3"));
+        assert!(said(b"ra,dec,S74,S74\n10,20,5,7\n").contains("several columns `S74`"));
+        assert!(said(b"ra,dec,S74\n1,2,1e300\n").contains("line 2: found 1e300 Jy, expected at most 1e12"));
+        let found = said(b"ra,dec,flux_jy,frequency_mhz\n1,2,3,154e6\n");
+        assert!(found.contains("line 2: found a flux at 1.54e14 Hz"), "{found}");
+        let found = said(b"# Name\n# Equinox B1950\nra,dec,S74\n1,2,3\n");
+        assert!(found.contains("line 2: found positions of B1950"), "{found}");
+        assert!(Catalogue::read(file(b"# names of B1950\nRAJ2000,DEJ2000,S74\n1,2,3\n").path()).is_ok());
+        // Forms are named.
+        assert!(said(b"\x28\xb5\x2f\xfd\0").contains("a zstd file"));
+        assert!(said(b"r\0a\0,\0").contains("UTF-16"));
         for (row, words) in [
             ("1,2,x", "found `x`, expected a flux density"),
             ("1,2,-3", "above 0"),

@@ -17,6 +17,7 @@
 
 mod added;
 mod catalogue;
+mod column_units;
 mod columns;
 mod config;
 mod features;

@@ -68,7 +68,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
     let slot = SlotGuard { shared: &shared, number, evicted };
     let mut bytes = 0;
     let (state, mut ended) = exchange(&mut stream, &slot, &mut bytes).await;
-    let (mut packets, mut refused, mut format) = (0, 0, None);
+    let (mut packets, mut refused, mut format, mut foreign_format) = (0, 0, None, None);
     // Number of bytes of the downlink and, for a sender that asks for `held`, the mark of its last packet.
     let (mut sent, mut held_mark) = (bytes, None);
     let (mut mark, mut ticket) = (0, Ok(None));
@@ -92,6 +92,11 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         format = state.receiver.format();
         let preamble = state.receiver.preamble();
         sent = bytes - preamble.bytes();
+        // `taken` would let the sender delete what the ground does not have.
+        if ended == ConnectionEnd::Whole && !state.receiver.is_downlink() {
+            ended = ConnectionEnd::NotADownlink;
+            foreign_format = state.receiver.foreign_format();
+        }
         held_mark = preamble.requests_held().then_some(state.mark);
         mark = state.mark;
         ticket = state.ticket;
@@ -112,7 +117,10 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         }
         ConnectionEnd::Whole => format!("taken {sent} bytes\n"),
         ConnectionEnd::GaveWay => format!("{BUSY}closed after {bytes} bytes: {ended}\n"),
-        other => format!("{CLOSED}after {bytes} bytes: {other}\n"),
+        other => {
+            let found = foreign_format.map(|format| format!(": {format}")).unwrap_or_default();
+            format!("{CLOSED}after {bytes} bytes: {other}{found}\n")
+        }
     };
     // A sender need not read the answer.
     let _ = timeout(ANSWER, stream.write_all(answer.as_bytes())).await;

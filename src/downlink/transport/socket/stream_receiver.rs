@@ -144,6 +144,16 @@ impl StreamReceiver {
         (self.packets, self.packets_refused)
     }
 
+    /// Whether the stream so far is empty, or a downlink that had packets for the ground.
+    pub(super) fn is_downlink(&self) -> bool {
+        self.receiver.bytes() == 0 || (self.packets > 0 && self.receiver.unsupported_frames().is_none())
+    }
+
+    /// Identifies a stream that is not a downlink; `None` if it is not recognised.
+    pub(super) fn foreign_format(&self) -> Option<String> {
+        self.receiver.foreign_format()
+    }
+
     pub(super) fn format(&self) -> Option<Format> {
         self.receiver.format()
     }

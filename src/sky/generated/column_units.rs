@@ -1,0 +1,70 @@
+//! Units of a catalogue's columns: in the row of units, in brackets after the name, and at the name's end, which have to agree.
+
+use super::columns::normalise;
+
+/// Names of units of angles, without case, and their degrees; `NaN` for hours.
+const ANGLES: [(&[&str], f64); 5] = [
+    (&["deg", "degree", "degrees", "d:m:s", "d m s", "dms", "\u{b0}"], 1.0),
+    (&["h", "hr", "hour", "hours", "hourangle", "h:m:s", "h m s", "hms"], f64::NAN),
+    (&["rad", "radian", "radians"], 180.0 / std::f64::consts::PI),
+    (&["arcmin", "arcminute", "arcminutes"], 1.0 / 60.0),
+    (&["arcsec", "arcsecond", "arcseconds"], 1.0 / 3600.0),
+];
+const FLUXES: [(&[&str], f64); 2] = [(&["jy"], 1.0), (&["mjy"], 1e-3)];
+const FREQUENCIES: [(&[&str], f64); 4] = [(&["hz"], 1.0), (&["khz"], 1e3), (&["mhz"], 1e6), (&["ghz"], 1e9)];
+
+fn value_of(units: &[(&[&str], f64)], unit: &str) -> Option<f64> {
+    units.iter().find(|(names, _)| names.contains(&unit)).map(|(_, value)| *value)
+}
+
+fn cleaned(unit: &str) -> String {
+    unit.trim_matches(['"', '\'', '(', ')', '[', ']', ' ']).to_ascii_lowercase()
+}
+
+/// Whether a cell is a unit that is usual in catalogues.
+pub(super) fn is_unit(cell: &str) -> bool {
+    let cell = cleaned(cell);
+    cell.len() > 1
+        && [&ANGLES[..], &FLUXES, &FREQUENCIES].iter().any(|units| value_of(units, &cell).is_some())
+}
+
+/// Units that a column's row and brackets name. Brackets may also have a reference, such as (J2000).
+fn stated((name, unit): (&str, &str)) -> impl Iterator<Item = String> {
+    let bracketed = name.split_once(['(', '[']).map_or_else(String::new, |(_, unit)| cleaned(unit));
+    let is_reference = ["2000", "icrs", "fk5"].iter().any(|reference| bracketed.contains(reference));
+    let bracketed = if is_reference { String::new() } else { bracketed };
+    [cleaned(unit), bracketed].into_iter().filter(|unit| !unit.is_empty())
+}
+
+/// The unit of a column of angles that are one number, degrees; `hours_deg` is that of hours, where there may be any. The error is
+/// the unit that is unknown or contradicts the name.
+pub(super) fn angle_deg(column: (&str, &str), hours_deg: Option<f64>) -> Result<f64, String> {
+    let mut known = normalise(column.0).ends_with("deg").then_some(1.0);
+    for unit in stated(column) {
+        let value = value_of(&ANGLES, &unit).map(|deg| if deg.is_nan() { hours_deg } else { Some(deg) });
+        match value.flatten() {
+            Some(deg) if known.is_none_or(|known| known == deg) => known = Some(deg),
+            _ => return Err(unit),
+        }
+    }
+    Ok(known.unwrap_or(1.0))
+}
+
+/// The unit of a column of flux densities, Jy. The error is the unit that is unknown or contradicts the name.
+pub(super) fn flux_jy(column: (&str, &str)) -> Result<f64, String> {
+    let name = normalise(column.0);
+    let mut known =
+        ["mjy", "jy"].iter().find(|unit| name.ends_with(*unit)).and_then(|unit| value_of(&FLUXES, unit));
+    for unit in stated(column) {
+        match value_of(&FLUXES, &unit) {
+            Some(jy) if known.is_none_or(|known| known == jy) => known = Some(jy),
+            _ => return Err(unit),
+        }
+    }
+    Ok(known.unwrap_or(1.0))
+}
+
+/// Requires that a column of frequencies has the unit of its name, Hz. The error is the other one.
+pub(super) fn require_unit(column: (&str, &str), unit_hz: f64) -> Result<(), String> {
+    stated(column).find(|unit| value_of(&FREQUENCIES, unit) != Some(unit_hz)).map_or(Ok(()), Err)
+}
