@@ -15,6 +15,9 @@ use crate::ranks::Ranks;
 use crate::runtime::{Outlet, Stage};
 use crate::units::vector::Vec3;
 
+/// The sums of all channels, and total powers with the positions of their daughters.
+type SumsAndPowers = (Vec<Snapshot>, Vec<(AutoPower, Vec3)>);
+
 impl Ground {
     /// A ground stage that resumes from the newest checkpoint in `folder`, or starts a new archive there.
     ///
@@ -152,10 +155,7 @@ impl Ground {
     /// # Errors
     /// As [`Ground::sums_in`].
     #[doc(hidden)]
-    pub fn sums_and_powers_in(
-        folder: &Path,
-        config: &GroundConfig,
-    ) -> Result<(Vec<Snapshot>, Vec<(AutoPower, Vec3)>), GroundError> {
+    pub fn sums_and_powers_in(folder: &Path, config: &GroundConfig) -> Result<SumsAndPowers, GroundError> {
         if checkpoints(folder)?.is_empty() {
             return Err(GroundError::without_checkpoint(folder));
         }

@@ -62,6 +62,9 @@ pub struct Agreement {
     pub strain: f64,
 }
 
+/// Sums and scaled blocks of all channels with the weights of their powers, and a solution from which to begin.
+type WeightedEquations<'a> = (JointSums<'a>, Vec<ScaledBlocks>, Option<Vec<f64>>);
+
 /// The sums of all channels with their blocks.
 pub(super) struct Equations<'a> {
     pub(super) prior: &'a Prior,
@@ -87,7 +90,7 @@ impl<'a> Equations<'a> {
         rows: &'a [Option<PowerRows>],
         request: &JointRequest,
         watch: NamedWatch<'_>,
-    ) -> Result<(JointSums<'a>, Vec<ScaledBlocks>, Option<Vec<f64>>), SolveError> {
+    ) -> Result<WeightedEquations<'a>, SolveError> {
         let weighted =
             |rows: &'a Option<PowerRows>| rows.as_ref().map(|rows| rows.weighted(&rows.measured(), 1.0));
         let (mut joint, mut scaled) = self.joint(rows.iter().map(weighted).collect());
