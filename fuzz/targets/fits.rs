@@ -42,7 +42,7 @@ fuzz_target!(|data: &[u8]| {
     }
     let frame_if_missing = (how & 2 != 0).then_some(Frame::Galactic);
     let frequency_hz = (how & 16 != 0).then_some(10e6);
-    let options = ReadOptions { column: usize::from(how >> 2 & 3), frame_if_missing, frequency_hz };
+    let options = ReadOptions { column: (how & 4 == 0).then(|| usize::from(how >> 3 & 3)), frame_if_missing, frequency_hz };
     let length = file.len() as u64;
     match read_map_from(&mut Cursor::new(&file), length, &options) {
         Ok(found) => {
