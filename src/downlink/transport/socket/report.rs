@@ -198,7 +198,7 @@ pub struct StationCounts {
     pub connections: u64,
     /// Those among them that ended otherwise than by the sender, by the end of the run, or for another sender's place.
     pub broken: u64,
-    /// Number of faults in its streams: see [`ReceptionCounters::faults`].
+    /// Number of faults in its streams: see losses of sync, gaps and damaged packets.
     pub faults: u64,
     /// Number of bytes read, including those of open connections.
     pub bytes: u64,
