@@ -38,7 +38,9 @@ impl RefinedProblem<'_> {
         let mut residuals = Vec::new();
         for round in 1.. {
             self.regularisation = Diagonal::ByDegree(found.regularisation.clone());
-            self.rule.passes_max = passes_max.saturating_sub(residuals.len()).max(1);
+            // The first R is that of the circle: a pass is left for one of true rows.
+            let kept = usize::from(round == 1);
+            self.rule.passes_max = passes_max.saturating_sub(residuals.len() + kept).max(1);
             let these = RefineSteps { start: steps.start.take(), save: &mut *steps.save };
             let mut refined = self.solve(right.of_rows.clone(), right.of_circle.to_vec(), these)?;
             residuals.append(&mut refined.residuals);
@@ -52,12 +54,17 @@ impl RefinedProblem<'_> {
             let x = &refined.columns[0].x;
             let next = on_circle.next(&found.fit, x, (factor, &ratio))?;
             let change = next.fit.change(&found.fit).max((factor / found.noise_factor()).ln().abs());
-            let is_last = round >= ROUNDS_MAX || residuals.len() >= passes_max || !self.watch.may_continue();
-            if change <= SETTLED || is_last {
+            let is_spent = round > 1 && residuals.len() >= passes_max;
+            let has_settled = change <= SETTLED || round >= ROUNDS_MAX;
+            if has_settled || is_spent || !self.watch.may_continue() {
                 // Of the R that this map has.
                 let found = on_circle.estimated(&found.fit, x, (factor, &ratio))?;
                 let iterations = residuals.len();
-                let convergence = refined.convergence.map(|last| Convergence { iterations, ..last });
+                let convergence = refined.convergence.map(|last| Convergence {
+                    iterations,
+                    converged: last.converged && has_settled,
+                    ..last
+                });
                 return Ok((RefinedColumns { residuals, convergence, ..refined }, found));
             }
             steps.start = Some(refined.columns.map(|column| column.x));
