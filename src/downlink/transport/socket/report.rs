@@ -194,7 +194,7 @@ pub struct StationCounts {
     pub connections: u64,
     /// Those among them that ended otherwise than by the sender, by the end of the run, or for another sender's place.
     pub broken: u64,
-    /// Number of faults in its streams: see [`ReceptionCounters::faults`].
+    /// Number of faults in its streams: damaged packets, bytes of no packet, losses of synchronisation.
     pub faults: u64,
     /// Number of bytes read, including those of open connections.
     pub bytes: u64,
