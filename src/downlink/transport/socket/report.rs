@@ -54,15 +54,13 @@ pub enum ConnectionEnd {
     NotOnDisk,
     /// The connection was evicted for a new one.
     GaveWay,
-    /// The sender closed the connection, and its bytes had no valid packet, or were frames of an unsupported format.
-    NotADownlink,
     /// The receiver panicked, which is a bug in the program.
     Failed,
 }
 
 impl ConnectionEnd {
     /// All ends.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 16] = [
         Self::Whole,
         Self::Broken,
         Self::Stopped,
@@ -78,7 +76,6 @@ impl ConnectionEnd {
         Self::UnknownToken,
         Self::NotOnDisk,
         Self::GaveWay,
-        Self::NotADownlink,
         Self::Failed,
     ];
 }
@@ -114,7 +111,6 @@ impl fmt::Display for ConnectionEnd {
             Self::GaveWay => {
                 "it gave way to another connection, as downlink.listen.connections_max were open"
             }
-            Self::NotADownlink => "no valid packet in its bytes, or frames of an unsupported format",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
     }
@@ -198,7 +194,7 @@ pub struct StationCounts {
     pub connections: u64,
     /// Those among them that ended otherwise than by the sender, by the end of the run, or for another sender's place.
     pub broken: u64,
-    /// Number of faults in its streams: see losses of sync, gaps and damaged packets.
+    /// Number of faults in its streams: damaged packets, bytes of no packet, losses of synchronisation.
     pub faults: u64,
     /// Number of bytes read, including those of open connections.
     pub bytes: u64,
