@@ -54,13 +54,15 @@ pub enum ConnectionEnd {
     NotOnDisk,
     /// The connection was evicted for a new one.
     GaveWay,
+    /// The sender closed the connection, and its bytes had no valid packet, or were frames of an unsupported format.
+    NotADownlink,
     /// The receiver panicked, which is a bug in the program.
     Failed,
 }
 
 impl ConnectionEnd {
     /// All ends.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::Whole,
         Self::Broken,
         Self::Stopped,
@@ -76,6 +78,7 @@ impl ConnectionEnd {
         Self::UnknownToken,
         Self::NotOnDisk,
         Self::GaveWay,
+        Self::NotADownlink,
         Self::Failed,
     ];
 }
@@ -111,6 +114,7 @@ impl fmt::Display for ConnectionEnd {
             Self::GaveWay => {
                 "it gave way to another connection, as downlink.listen.connections_max were open"
             }
+            Self::NotADownlink => "no valid packet in its bytes, or frames of an unsupported format",
             Self::Failed => "its receiver failed, which is a bug in the program",
         })
     }
