@@ -59,8 +59,8 @@ keys! {
         /// Rate of the argument of the periapsis.
         #[only_with("no array.kepler and no array.oem")]
         expert periapsis_rate_deg_per_day: f64 = 0.0;
-        /// Maximum distance of each daughter from daughter 1 across the track, over that along it: their orbital planes differ by
-        /// this.
+        /// Maximum distance of each daughter from daughter 1 across the track, over that along it, by which their orbital
+        /// planes differ.
         #[only_with("no array.kepler and no array.oem")]
         expert cross_track_ratio: f64 = 0.0;
         /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except along
