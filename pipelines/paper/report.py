@@ -157,13 +157,14 @@ def coverage():
     ten, three = n["channels"]
     rows = []
     for a, b in zip(ten["bands"], three["bands"]):
+        filled = sorted({f"{band['uv_filled']:.2f}" for band in (a, b)})
         rows.append([
             f"{a['latitude_deg'][0]:g} to {a['latitude_deg'][1]:g}", f"{a['pair_h']:,.0f}", f"{b['pair_h']:,.0f}",
             f"{a['shortest_wavelengths']:.2f}", f"{b['shortest_wavelengths']:.2f}",
-            f"{a['uv_filled']:.2f}", f"{b['uv_filled']:.2f}",
+            " or ".join(filled),
         ])
     head = ["degrees from the ecliptic", "pair hours, 10 MHz", "3 MHz", "shortest projected, wavelengths, 10 MHz", "3 MHz",
-            "uv filled, 10 MHz", "3 MHz"]
+            "uv filled, either"]
     return f"`{command}`\n\n" + table(head, rows)
 
 
