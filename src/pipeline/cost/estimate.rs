@@ -433,7 +433,7 @@ impl fmt::Display for Cost {
         write!(
             f,
             "estimated time   {:.digits$} s if nothing else runs on {} cores, from processor times measured on virtual machines (AMD \
-             EPYC; Intel Xeon with AVX-512): others differ by some factor",
+             EPYC; Intel Xeon with AVX-512): other machines differ by some factor",
             self.predicted_s,
             cores()
         )
