@@ -292,6 +292,7 @@ impl ReplayArgs {
             Some(Err(_)) | None => source,
             Some(Ok(source)) => source,
         };
+        let is_of_state = source.file.is_none() && has_state;
         let (source, origin) = source.with_downlink_settings(&self.files);
         match origin {
             SettingsOrigin::Run(origin) if job.is_first() => {
@@ -300,6 +301,12 @@ impl ReplayArgs {
             }
             // A state has its own.
             SettingsOrigin::NotUsed(why) if job.is_first() && !has_state => print_notes([why]),
+            _ if job.is_first() && is_of_state => {
+                let fields = json!({ "from": self.state });
+                let text = "settings of the sums: those of the state; it has no others, so that map.regulariser, map.epsilon and the \
+                            products have their defaults unless --map or --set says otherwise";
+                say("settings", &fields, format_args!("{text}"));
+            }
             _ => {}
         }
         Ok(source)

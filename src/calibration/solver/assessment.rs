@@ -5,7 +5,7 @@ use std::f64::consts::FRAC_PI_2;
 use super::config::{AmplitudeScale, SolverConfig};
 use super::detect::SignalPresence;
 use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
-use super::fit::{UNEXPLAINED_MIN, Unexplained};
+use super::fit::Unexplained;
 use super::robust_fit::RobustFit;
 use super::stability::Excess;
 
@@ -66,17 +66,12 @@ impl GainAssessment<'_> {
         estimates
     }
 
-    /// Whether a working, stable daughter would be detected in a channel. A change that leaves more unexplained than
-    /// the model may is no instability.
+    /// Whether a working, stable daughter would be detected in a channel.
     fn is_detectable(&self, c: usize, n: usize, estimates: &[DaughterEstimate]) -> bool {
         let own_gain = &self.fitted.own_gains[c * self.fitted.layout.satellites + n];
-        let gain = estimates[n].gains[c];
+        let state = estimates[n].gains[c].state;
         own_gain.is_detectable(self.config)
-            && match gain.state {
-                GainState::NoData | GainState::Dead => false,
-                GainState::Unstable => gain.unexplained > self.config.unexplained_max,
-                _ => true,
-            }
+            && !matches!(state, GainState::NoData | GainState::Dead | GainState::Unstable)
     }
 
     /// Variance of the log amplitude common to all daughters of a channel: the flux scale of a model is assumed as
@@ -92,15 +87,11 @@ impl GainAssessment<'_> {
         0.25 * fractions.get(satellites / 2).copied().unwrap_or(0.0).max(self.unexplained.by_channel[c])
     }
 
-    /// Variance of a gain's logarithm due to errors of the model: the persistent error that was detected, and what all
-    /// pairs of the channel leave; if the daughter's residuals show unexplained power, also the part below the noise,
-    /// limited by that power.
+    /// Variance of a gain's logarithm due to errors of the model: the persistent error that was detected; if the daughter's residuals
+    /// show unexplained power, also the part below the noise, limited by that power.
     fn model_variance(&self, k: usize) -> f64 {
         let Excess { model, model_below_noise, model_full_power, .. } = self.excess[k];
-        let of_all = self.unexplained.by_channel[k / self.fitted.layout.satellites];
-        // Less may be noise.
-        let of_channel = if of_all > UNEXPLAINED_MIN { of_all * model_full_power } else { 0.0 };
-        model.max(of_channel).max(model_below_noise.min(self.unexplained.by_gain[k] * model_full_power))
+        model.max(model_below_noise.min(self.unexplained.by_gain[k] * model_full_power))
     }
 
     fn daughter_estimate(&self, n: usize) -> DaughterEstimate {

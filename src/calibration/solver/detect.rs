@@ -202,9 +202,8 @@ impl GainSums {
             () if own.snr_squared() >= DETECTED_SNR2 && gain.norm() >= config.dead_amplitude => {
                 SignalPresence::Detected
             }
-            () if own.snr_squared() < DETECTED_SNR2 && expected_snr_squared < DEAD_SNR2 => {
-                own.undetected_presence(config)
-            }
+            () if own.snr_squared() >= DETECTED_SNR2 => SignalPresence::Dead,
+            () if expected_snr_squared < DEAD_SNR2 => own.undetected_presence(config),
             () if excess > 0.5 * expected_snr_squared + SIGMAS * 2.0 * count.sqrt() => {
                 SignalPresence::Unmodelled
             }

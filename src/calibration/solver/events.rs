@@ -45,8 +45,6 @@ pub enum InstrumentEvent {
     Dead {
         /// First pass of this state.
         pass: u64,
-        /// Start of the first solution of this state, s since the epoch.
-        from_s: f64,
         /// Daughter, from 1.
         daughter: u32,
         /// Channels, from 0.
@@ -56,10 +54,6 @@ pub enum InstrumentEvent {
     Drift {
         /// Pass.
         pass: u64,
-        /// Start of the solution, a pass or part of one, s since the epoch.
-        from_s: f64,
-        /// End of the solution, s.
-        until_s: f64,
         /// Daughter, from 1.
         daughter: u32,
         /// Channels, from 0, and rms phase changes, deg.
@@ -69,8 +63,6 @@ pub enum InstrumentEvent {
     WrongModel {
         /// First pass of this state.
         pass: u64,
-        /// Start of the first solution of this state, s since the epoch.
-        from_s: f64,
         /// Channel, from 0.
         channel: usize,
         /// Fraction of the signal that no gains explain.
@@ -139,24 +131,21 @@ impl fmt::Display for InstrumentEvent {
                     "pass {pass}: amplitudes of daughter {daughter} changed by factors of {factors}{time_suffix}"
                 )
             }
-            Self::Dead { pass, from_s, daughter, channels } => {
+            Self::Dead { pass, daughter, channels } => {
                 let channels: Vec<String> = channels.iter().map(usize::to_string).collect();
                 write!(
                     f,
-                    "pass {pass}: daughter {daughter} delivers noise in channels {}, from {from_s:.1} s",
+                    "pass {pass}: daughter {daughter} delivers noise in channels {}",
                     channels.join(", ")
                 )
             }
-            Self::Drift { pass, from_s, until_s, daughter, channels } => {
-                let list = list(channels, " deg rms");
-                write!(
-                    f,
-                    "pass {pass}: phases of daughter {daughter} drift by {list}, from {from_s:.1} s to {until_s:.1} s"
-                )
+            Self::Drift { pass, daughter, channels } => {
+                let list = list(channels, " deg");
+                write!(f, "pass {pass}: phases of daughter {daughter} drift within the pass by {list} rms")
             }
-            Self::WrongModel { pass, from_s, channel, unexplained } => write!(
+            Self::WrongModel { pass, channel, unexplained } => write!(
                 f,
-                "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal, from {from_s:.1} s",
+                "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal",
                 100.0 * unexplained
             ),
             Self::Interference { pass, channel, outliers } => write!(

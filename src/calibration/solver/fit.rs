@@ -9,7 +9,6 @@
 use super::layout::ParameterLayout;
 use super::newton::NewtonFit;
 use super::robust_fit::RobustFit;
-use super::stability::Excess;
 use super::sums::ModelledBlock;
 
 /// Significance, in standard deviations of noise, of a residual.
@@ -17,9 +16,6 @@ const SIGMAS: f64 = 3.0;
 
 /// Significance of the residual of all pairs of a channel together: what stays below turns amplitudes by no more than two deviations.
 const SIGMAS_OF_ALL: f64 = 2.0;
-
-/// Smallest unexplained fraction of the signal that shows a wrong model.
-pub(super) const UNEXPLAINED_MIN: f64 = 0.01;
 
 /// Unexplained fractions of the signal.
 pub(super) struct Unexplained {
@@ -82,17 +78,11 @@ impl Residual {
     }
 }
 
-/// Unexplained fraction of the signal of a daughter's pairs.
-fn fraction_of(pairs: &[([usize; 2], Residual)], daughter: usize) -> f64 {
-    let of_daughter = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
-    of_daughter.fold(Residual::default(), |sum, (_, left)| sum.plus(*left)).fraction(SIGMAS)
-}
-
 /// Unexplained fractions of the signal of each daughter in each channel, and of each channel. If the worst
-/// daughter of a channel is above `fraction_max`, or changes within the interval by most of what its pairs leave, these
-/// are attributed to it, and the others are judged by the remaining pairs.
+/// daughter of a channel is above `fraction_max`, its pairs are attributed to it, and the others are judged by the
+/// remaining pairs.
 pub(super) fn unexplained(
-    (fitted, excess): (&RobustFit, &[Excess]),
+    fitted: &RobustFit,
     blocks: &[ModelledBlock],
     span_s: [f64; 2],
     fraction_max: f64,
@@ -111,18 +101,13 @@ pub(super) fn unexplained(
                 (pair, Residual::of(layout, newton, block, span_s))
             })
             .collect();
-        let own_change = |k: usize| excess[channel * n + k].scatter.iter().sum::<f64>();
-        let changing: Vec<(usize, f64)> = (0..n)
-            .map(|k| (k, fraction_of(&pairs, k)))
-            .filter(|(k, fraction)| *fraction > 0.0 && own_change(*k) > 0.5 * fraction)
-            .collect();
-        if 2 * changing.len() < n {
-            changing.iter().for_each(|(k, fraction)| fractions[*k] = *fraction);
-            pairs.retain(|(pair, _)| changing.iter().all(|(k, _)| !pair.contains(k)));
-        }
         loop {
+            let fraction_of = |daughter: usize| {
+                let of_daughter = pairs.iter().filter(|(pair, _)| pair.contains(&daughter));
+                of_daughter.fold(Residual::default(), |sum, (_, left)| sum.plus(*left)).fraction(SIGMAS)
+            };
             let open: Vec<(usize, f64)> =
-                (0..n).filter(|k| fractions[*k] == 0.0).map(|k| (k, fraction_of(&pairs, k))).collect();
+                (0..n).filter(|k| fractions[*k] == 0.0).map(|k| (k, fraction_of(k))).collect();
             // Of equally bad daughters the reference is the last to be chosen.
             let worst = open
                 .iter()

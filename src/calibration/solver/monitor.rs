@@ -15,9 +15,10 @@
 
 use std::f64::consts::{PI, TAU};
 
+use num_complex::Complex64;
+
 use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
-use super::fit::UNEXPLAINED_MIN;
 use super::solution::PassSolution;
 
 /// Threshold of a step, in standard deviations, which are raised to at least the scatter from pass to pass (see `inflate_sigmas`).
@@ -28,7 +29,6 @@ const CHANGE_MIN: f64 = 0.01;
 const OUTLIER_FRACTION_MAX: f64 = 0.1;
 /// Minimum number of channels to distinguish a clock jump from a phase step.
 const CHANNELS_MIN: usize = 3;
-
 /// Changes of a daughter's gains from one solution to the next.
 struct Change {
     /// Index of the later solution.
@@ -64,11 +64,7 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
         let of_solution: Vec<&Change> = changes.iter().filter(|change| change.solution == index).collect();
         let before = index.checked_sub(1).map(|previous| &solutions[previous]);
         add_step_events(&of_solution, before, solution, &mut events);
-        add_drifts(solution, &mut events);
-        // Of a pass that jumps divide, a state is told once.
-        let earlier = solutions[..index].iter().rev().enumerate();
-        let earlier = earlier.take_while(|(k, one)| *k == 0 || one.pass == solution.pass).map(|(_, one)| one);
-        add_onsets(&earlier.collect::<Vec<_>>(), solution, &mut events);
+        add_state_events(before, solution, &mut events);
         add_disturbance_events(solution, &mut events);
     }
     events
@@ -230,83 +226,49 @@ fn add_step_events(
     }
 }
 
-/// Smallest phase change within a pass that is reported, deg: that of a steady drift, which is sqrt(12) times its rms.
+/// Smallest rms phase change within a pass that is reported, deg.
 const DRIFT_MIN_DEG: f64 = 4.0;
 
-/// Smallest fraction of the variance of a gain that a reported drift contributes: with noise alone one gain in a
-/// thousand reaches it.
-const DRIFT_FRACTION: f64 = 0.95;
+/// Smallest fraction of a phase's variance that a reported drift contributes.
+const DRIFT_FRACTION: f64 = 0.92;
 
-/// Unexplained fraction of the signal above which a model says nothing about single daughters.
-const UNEXPLAINED_OF_EVENTS_MAX: f64 = 0.15;
+/// Smallest unexplained fraction of the signal that is reported.
+const UNEXPLAINED_MIN: f64 = 0.01;
 
-/// Adds drifts within the solution's interval.
-fn add_drifts(solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
-    let disturbed = disturbed_channels(solution);
-    let model_errors: Vec<ModelErrors> =
-        (0..solution.model_error.len()).map(|c| ModelErrors::of(solution, c)).collect();
-    for (n, daughter) in solution.daughters.iter().enumerate() {
-        let is_drifting = |c: usize, gain: &GainEstimate| {
-            // Where phases are relative to the daughter itself, its amplitude says how well the gain is known.
-            let sigma_deg = match n + 1 == solution.reference as usize {
-                true => gain.amplitude_sigma.to_degrees().hypot(gain.phase_scatter_deg),
-                false => gain.phase_sigma_deg.max(gain.phase_scatter_deg),
-            };
-            12.0_f64.sqrt() * gain.phase_scatter_deg > DRIFT_MIN_DEG
-                && (gain.phase_scatter_deg / sigma_deg).powi(2) > DRIFT_FRACTION
-                && !model_errors[c].can_explain(gain.phase_scatter_deg)
-                && disturbed.get(c) != Some(&true)
-        };
-        let drifting = daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(*c, gain));
-        let channels: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
-        if !channels.is_empty() {
-            events.push(InstrumentEvent::Drift {
-                pass: solution.pass,
-                from_s: solution.from_s,
-                until_s: solution.until_s,
-                daughter: daughter.daughter,
-                channels,
-            });
-        }
-    }
-}
-
-/// Adds onsets of states, dead or wrong model, that none of the `earlier` solutions has: the one before, and others of
-/// the pass.
-fn add_onsets(earlier: &[&PassSolution], solution: &PassSolution, events: &mut Vec<InstrumentEvent>) {
-    let PassSolution { pass, from_s, .. } = *solution;
+/// Adds events that follow from the state of a solution's gains: onsets of states (dead, wrong model), and drifts.
+fn add_state_events(
+    before: Option<&PassSolution>,
+    solution: &PassSolution,
+    events: &mut Vec<InstrumentEvent>,
+) {
+    let pass = solution.pass;
     let channels = solution.model_error.len();
     let disturbed = disturbed_channels(solution);
+    let is_disturbed = |c: usize| disturbed.get(c) == Some(&true);
     for (n, daughter) in solution.daughters.iter().enumerate() {
-        let is_dead = |solution: &PassSolution, c: usize| {
-            solution.daughters[n].gains[c].state == GainState::Dead
-                && !ModelErrors::of(solution, c).are_large()
-        };
+        let number = daughter.daughter;
+        let is_dead =
+            |solution: &PassSolution, c: usize| solution.daughters[n].gains[c].state == GainState::Dead;
         let dead = (0..channels).filter(|c| is_dead(solution, *c));
-        let dead: Vec<usize> = dead.filter(|c| !earlier.iter().any(|earlier| is_dead(earlier, *c))).collect();
+        let dead: Vec<usize> = dead.filter(|c| before.is_none_or(|before| !is_dead(before, *c))).collect();
         if !dead.is_empty() {
-            events.push(InstrumentEvent::Dead { pass, from_s, daughter: daughter.daughter, channels: dead });
+            events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
+        }
+        // A drift is reported only if it dominates the variance of the phase: with noise alone the estimated scatter can reach 0.9
+        // of it.
+        let is_drifting = |gain: &GainEstimate| {
+            let sigma_deg = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
+            gain.phase_scatter_deg > DRIFT_MIN_DEG
+                && (gain.phase_scatter_deg / sigma_deg).powi(2) > DRIFT_FRACTION
+        };
+        let drifting =
+            daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(gain) && !is_disturbed(*c));
+        let drifting: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
+        if !drifting.is_empty() {
+            events.push(InstrumentEvent::Drift { pass, daughter: number, channels: drifting });
         }
     }
-    for channel in (0..channels).filter(|c| disturbed.get(*c) != Some(&true)) {
-        let now = ModelErrors::of(solution, channel);
-        if now.are_seen() && !earlier.iter().any(|one| ModelErrors::of(one, channel).are_seen()) {
-            let unexplained = now.unexplained;
-            events.push(InstrumentEvent::WrongModel { pass, from_s, channel, unexplained });
-        }
-    }
-}
-
-/// Errors of the model in a channel.
-struct ModelErrors {
-    /// Fraction of the signal that no gains explain.
-    unexplained: f64,
-    /// Whether most daughters fit poorly.
-    most_fit_poorly: bool,
-}
-
-impl ModelErrors {
-    fn of(solution: &PassSolution, c: usize) -> Self {
+    let unexplained_if_wrong = |solution: &PassSolution, c: usize| {
         // The median over daughters: a single daughter may have another problem.
         let gains: Vec<&GainEstimate> =
             solution.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
@@ -316,21 +278,15 @@ impl ModelErrors {
         let mut fractions: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
         fractions.sort_unstable_by(f64::total_cmp);
         let median = fractions.get(fractions.len() / 2).copied().unwrap_or(0.0);
-        Self { unexplained: solution.model_error[c].max(median), most_fit_poorly: 2 * poor > count }
-    }
-
-    fn are_seen(&self) -> bool {
-        self.most_fit_poorly || self.unexplained > UNEXPLAINED_MIN
-    }
-
-    fn are_large(&self) -> bool {
-        self.most_fit_poorly || self.unexplained > UNEXPLAINED_OF_EVENTS_MAX
-    }
-
-    /// Whether they may look like a change of a phase: they turn a visibility by an rms of sqrt(unexplained / 2) rad,
-    /// a gain by less.
-    fn can_explain(&self, scatter_deg: f64) -> bool {
-        self.are_large() || self.are_seen() && scatter_deg.to_radians().powi(2) < self.unexplained
+        let most_fit_poorly = count > 0 && 2 * poor > count;
+        let fraction = solution.model_error[c].max(median);
+        (most_fit_poorly || fraction > UNEXPLAINED_MIN).then_some(fraction)
+    };
+    for channel in (0..channels).filter(|c| !is_disturbed(*c)) {
+        let was_wrong = before.and_then(|before| unexplained_if_wrong(before, channel)).is_some();
+        if let Some(unexplained) = unexplained_if_wrong(solution, channel).filter(|_| !was_wrong) {
+            events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
+        }
     }
 }
 
@@ -340,7 +296,7 @@ const PARAMETER_COST: f64 = 9.0;
 /// Cost of a delay beyond half a turn of the highest frequency: there are many, of which one may fit any step.
 const TURN_COST: f64 = 6.0;
 
-/// Clock jump that explains the changes of the phases better than steps of those channels that jump, ns.
+/// Clock jump that explains the changes of the phases better than one step of all channels, or steps of those channels that jump, ns.
 fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let gains = &solution.daughters[change.daughter].gains;
     let hz = |channel: usize| gains[channel].frequency_hz;
@@ -364,13 +320,18 @@ fn fit_clock_jump_ns(change: &Change, solution: &PassSolution) -> Option<f64> {
     let of_channel =
         |phase: &ChannelChange| if is_jump(&phase) { PARAMETER_COST } else { square(phase, 0.0) };
     let cost_of_steps: f64 = change.phases.iter().map(of_channel).sum();
+    let weighted =
+        |phase: &ChannelChange| Complex64::from_polar(phase.sigma.max(1e-4).powi(-2), phase.change);
+    let common = change.phases.iter().map(weighted).sum::<Complex64>().arg();
+    let cost_of_one: f64 =
+        change.phases.iter().map(|phase| square(phase, common)).sum::<f64>() + PARAMETER_COST;
     let best = |from_s: f64, step_s: f64, steps: i64| {
         let candidates = (-steps..=steps).map(|k| from_s + step_s * k as f64);
         candidates.min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(from_s)
     };
     let coarse_s = best(0.0, step_s, steps);
     let delay_s = best(coarse_s, 0.01 * step_s, 100);
-    (cost(delay_s) < cost_of_steps).then_some(1e9 * delay_s)
+    (cost(delay_s) < cost_of_steps.min(cost_of_one)).then_some(1e9 * delay_s)
 }
 
 /// Whether more than half of the finite outlier fractions of a list exceed the threshold.

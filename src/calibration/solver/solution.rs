@@ -201,8 +201,7 @@ fn check_fit(
         fitted = interval.fit(blocks, Some(steady));
         (excess, model_error) = interval.residuals(&fitted, blocks, None).excess(suspects);
     }
-    let unexplained =
-        unexplained((&fitted, &excess), blocks, interval.span_s, interval.config.unexplained_max);
+    let unexplained = unexplained(&fitted, blocks, interval.span_s, interval.config.unexplained_max);
     let counts = Counts::of(blocks, interval.span_s, &fitted);
     CheckedFit { fitted, excess, model_error, unexplained, counts }
 }
