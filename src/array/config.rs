@@ -261,7 +261,7 @@ impl ArrayConfig {
         // Whether a second 60 exists depends on the files' time system.
         let is_date = |scale| Tai::parse(epoch, scale).is_some();
         let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
-        let expected = "an epoch such as 2030-01-31T12:00:00, or nothing";
+        let expected = "a date of the files' time system such as 2030-01-31T12:00:00, a date on UTC with Z at its end, or nothing";
         checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
         let (epoch, good) =
             (&self.stations_epoch, self.stations.is_empty() || self.stations_epoch().is_some());

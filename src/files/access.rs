@@ -2,7 +2,7 @@
 
 use std::fs::{self, File, Metadata};
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Component, Path, PathBuf};
 
 /// The entries of a folder. Repeats interrupted calls, which the standard library does not do here.
 ///
@@ -114,10 +114,22 @@ pub(super) fn is_same(_: &Metadata, _: &Metadata) -> bool {
 pub fn is_same_name(one: &Path, other: &Path) -> bool {
     let place = |path: &Path| {
         let folder = folder_of(path).unwrap_or(Path::new("."));
-        let folder = fs::canonicalize(folder).or_else(|_| std::path::absolute(folder)).ok()?;
+        let folder = fs::canonicalize(folder).or_else(|_| normalized(folder)).ok()?;
         Some(folder.join(path.file_name()?))
     };
     place(one).is_some_and(|found| place(other) == Some(found))
+}
+
+/// The absolute path of a folder, of which a part may not exist, without `..`.
+fn normalized(folder: &Path) -> io::Result<PathBuf> {
+    let mut whole = PathBuf::new();
+    for part in std::path::absolute(folder)?.components() {
+        match part {
+            Component::ParentDir => _ = whole.pop(),
+            part => whole.push(part),
+        }
+    }
+    Ok(fs::canonicalize(&whole).unwrap_or(whole))
 }
 
 /// The folder in `path`; `None` for a bare file name.

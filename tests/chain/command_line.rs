@@ -329,7 +329,7 @@ fn all_errors_come_at_once() {
 
 #[test]
 fn maps_are_read_of_regular_files() {
-    for file in ["/dev/zero", "/dev/null", "/tmp"] {
+    for file in ["/dev/zero", "/dev/null"] {
         let told = complaint(&["compare", file, file]);
         assert!(told.contains(file) && told.contains("not a regular file"), "{told}");
     }

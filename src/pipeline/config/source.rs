@@ -370,7 +370,7 @@ mod tests {
             "line 12: spacecraft.ninth: found one value (integer), expected a section",
             "sky.nside = 7: expected a power of two",
             "spacecraft.duration_s = -3: expected seconds",
-            "map.epsilon = -1: expected above 0",
+            "map.epsilon = -1: expected 1e-16 to 1",
         ];
         for expected in expected {
             assert!(found.iter().any(|line| line.contains(expected)), "{expected} is not in {found:#?}");

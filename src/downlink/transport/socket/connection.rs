@@ -105,7 +105,8 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         if let Some(station) = &station {
             shared.listening.write().record_bytes(station, 0, counters.faults() - state.faults, false);
         }
-        status.done.fetch_add(u64::from(state.receiver.has_valid()), Ordering::Relaxed);
+        let is_downlink = state.receiver.has_valid() && ended != ConnectionEnd::NotADownlink;
+        status.done.fetch_add(u64::from(is_downlink), Ordering::Relaxed);
     }
     let synced = sync(ticket, &shared).await;
     if ended == ConnectionEnd::Whole && synced.is_err() {
