@@ -1,4 +1,4 @@
-//! Orbit and formation of the daughters, occultation by the Moon, observing windows, and the ephemeris.
+//! Orbit and formation of the daughters, stations on the Moon, occultation by the Moon, observing windows, and the ephemeris.
 //!
 //! Pure functions of time and position; uses [`crate::units`] and [`crate::frames`].
 //!

@@ -221,6 +221,10 @@ impl Config {
         let is_possible = reflection == 0.0 || !self.array.is_on_surface();
         let expected = "0 with array.stations: images in the ground under an antenna are part of its pattern";
         checks.require("spacecraft.moon_reflection", reflection, is_possible, expected);
+        let rate = self.downlink.rate_bits_per_s_max;
+        let is_possible = rate == 0.0 || !self.array.is_on_surface();
+        let expected = "0 with array.stations: they observe while the Earth is hidden, and a relay that is not simulated takes the data";
+        checks.require("downlink.rate_bits_per_s_max", rate, is_possible, expected);
     }
 
     /// Requires settings that are possible with three dipoles, and with antenna errors.
