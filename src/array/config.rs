@@ -60,8 +60,8 @@ keys! {
         /// Rate of the argument of the periapsis.
         #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert periapsis_rate_deg_per_day: f64 = 0.0;
-        /// Maximum distance of each daughter from daughter 1 across the track, over that along it: their orbital planes differ by
-        /// this.
+        /// Maximum distance of each daughter from daughter 1 across the track, over that along it, by which their orbital
+        /// planes differ.
         #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert cross_track_ratio: f64 = 0.0;
         /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except with
@@ -85,9 +85,11 @@ keys! {
         /// Stations on the Moon instead of satellites: `{ longitude_deg = 180.0, latitude_deg = -30.0, height_m = 0.0 }` on its mean
         /// Earth axes (MOON_ME), one for each of `satellites`, or a CSV file with these columns. They turn with the Moon, see the sky
         /// above a flat horizon, and observe while the Earth is below that of the first.
+        #[serde(skip_serializing_if = "Stations::is_empty")]
         everyday stations: Stations = Stations::default();
         /// Epoch of a mission of stations, UTC, such as 2030-01-31T12:00:00.
         #[only_with("array.stations")]
+        #[serde(skip_serializing_if = "String::is_empty")]
         expert stations_epoch: String = String::new();
         /// Numerical integration in the Moon's field (GRGM900C), from the formation at the epoch or from array.kepler. Periods,
         /// precession and rates are then ignored.

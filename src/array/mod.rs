@@ -22,6 +22,7 @@ mod placing;
 mod propagate;
 mod state;
 mod stations;
+mod surface;
 mod track;
 mod windows;
 

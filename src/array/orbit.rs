@@ -10,7 +10,7 @@ use super::kepler::{KeplerOrbit, eccentric_anomaly};
 use super::oem::{self, OrbitArc, TableOrbit};
 use super::propagate;
 use super::state::SatelliteState;
-use super::stations::StationMotion;
+use super::surface::{self, StationMotion};
 use crate::units::constants::{DAY_S, MOON_RELIEF_M, SIDEREAL_MONTH_S};
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
@@ -155,7 +155,7 @@ impl Array {
         let own: Vec<OwnOrbit> =
             if let Some(given) = config.stations_epoch().filter(|_| config.is_on_surface()) {
                 epoch = Some(given);
-                let stations = config.stations.motions(config.satellites, given, moon_radius_m)?;
+                let stations = surface::motions(&config.stations, config.satellites, given, moon_radius_m)?;
                 require_distinct(
                     &stations.iter().map(|station| station.state(0.0).position_m).collect::<Vec<_>>(),
                 )?;

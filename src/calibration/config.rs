@@ -36,7 +36,7 @@ keys! {
         /// File of gains for "antenna-gains", such as "gains.json".
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday gains_file: Option<PathBuf> = None;
-        /// Bits of the samples whose correlations are corrected: 1, 2 or 4; 0 for no correction.
+        /// Bits of the samples, for whose quantisation correlations are corrected: 1, 2 or 4; 0 for no correction.
         expert quantiser_bits: u32 = 0;
         /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
         expert sub_bands: usize = 1;

@@ -54,7 +54,7 @@ pub(super) fn execute(args: &RebuildArgs) -> CommandResult {
     if !is_whole {
         let first = found.first_segment;
         print_notes([format!(
-            "the archive begins with segment {first}: older ones have gone, and what they held is missing"
+            "the archive begins with segment {first}: older ones were deleted, and their packets are missing"
         )]);
     }
     let (bytes, out) = (found.bytes, args.out.display());

@@ -55,7 +55,7 @@ pub(super) fn execute(args: &RecalibrateArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     print_text(&format!(
-        "{} packets of {} have other gains: {} visibilities were in the sums, {} are; {} packets have the gains that they had. \
+        "{} packets of {} have new gains: {} of their visibilities were in the sums, {} are now; gains of {} packets did not change. \
          Calibration {}: {}",
         found.packets,
         args.state.display(),

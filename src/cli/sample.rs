@@ -70,7 +70,7 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {
         return Err(format!(
-            "{}: samples are drawn with R from the data, and with these settings R is another (map.regulariser, map.epsilon, map.refine, map.matrix, or \
+            "{}: samples need R from the data, and these settings choose another R (map.regulariser, map.epsilon, map.refine, map.matrix, or \
              pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
             args.state.display()
         )

@@ -88,8 +88,8 @@ keys! {
         /// HEALPix nside of the maps: a power of two up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
-        /// Basis of the normal equations: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or
-        /// with map.refine; or "auto", "harmonic" where the array's orbits allow it, whatever those of the data.
+        /// What a map is made of: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with
+        /// map.refine; or "auto": "harmonic" if the orbits of section `array` allow it.
         everyday engine: EngineKind = EngineKind::Pixel;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
         expert channels_max: usize = 64;
@@ -112,14 +112,15 @@ keys! {
         /// "file" take 1e-4 without it.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
-        /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's
-        /// (default with epsilon, map.refine, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also {
-        /// degree = 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l of tables of l and C_l (K^2), one a
-        /// channel.
+        /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's (default
+        /// with epsilon, map.refine, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also { degree =
+        /// 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l from tables of l and C_l (K^2), one a
+        /// channel. W_max is the largest eigenvalue of the normal matrix.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
         /// Tables of the sky's C_l (K^2), one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the
-        /// map's degrees then counts as noise, by the baseline's length. Tables go on as they end.
+        /// map's degrees then counts as noise, more on some baselines than on others. A table goes on beyond its last degree
+        /// as it ends.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         expert beyond_files: Vec<PathBuf> = Vec::new();
         /// Ecliptic longitudes and latitudes of points whose effective beam is computed, such as `[[0.0, 90.0]]`.

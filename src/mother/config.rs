@@ -74,8 +74,9 @@ keys! {
         expert smear_bandwidth: bool = false;
         /// Add thermal noise. Weights describe it in either case.
         everyday thermal_noise: bool = true;
-        /// Receiver noise T_rec / zeta, added to the sky: one value, one a channel, or a table of [Hz, K sr] at rising
-        /// frequencies, linear in both logarithms, such as `[[1e6, 2e4], [10e6, 300.0], [30e6, 100.0]]`.
+        /// Receiver noise over the antenna's transmission efficiency, T_rec / zeta, added to the sky: one value, one a
+        /// channel, or a table of [Hz, K sr] at rising frequencies, linear in both logarithms, such as `[[1e6, 2e4], [10e6,
+        /// 300.0], [30e6, 100.0]]`.
         everyday receiver_noise_k_sr: ReceiverNoise = ReceiverNoise::default();
         /// Frequency at which the receiver's 1/f noise equals its other noise: `receiver_noise_k_sr` is multiplied by `1 + knee /
         /// frequency`.

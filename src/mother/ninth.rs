@@ -36,7 +36,7 @@ keys! {
         /// Length of an integration.
         #[only_with("spacecraft.ninth.on = true")]
         expert integration_s: f64 = 10.0;
-        /// Receiver noise T_rec / zeta, as the antenna would see it from the sky.
+        /// Receiver noise over the antenna's transmission efficiency, T_rec / zeta.
         #[only_with("spacecraft.ninth.on = true")]
         expert receiver_noise_k_sr: f64 = 0.0;
         /// Arc by which it trails daughter 1 on the same circle.

@@ -19,7 +19,7 @@ keys! {
         expert snapshot_maps: bool = false;
         /// Frame of pictures: "galactic", "ecliptic" or "equatorial"; maps are always on ecliptic axes.
         everyday frame: Frame = Frame::Galactic;
-        /// FWHM to which maps, noise and input, with split pixels, are smoothed before they are compared and drawn; 0 for none.
+        /// FWHM to which maps, noise and input are smoothed, on finer pixels, before they are compared and drawn; 0 for none.
         everyday smooth_fwhm_deg: f64 = 0.0;
     }
 }

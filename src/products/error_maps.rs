@@ -50,9 +50,9 @@ impl ErrorMap {
 pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>) -> &'static str {
     // Sums over pixels are solved without iterations.
     match (refinement, diagnostics.convergence) {
-        (Some(_), _) => "to l_max, nearest circle's matrix; off it use lunarray sample",
-        (None, Some(_)) => "to l_max, phases as if evenly seen; few data: lunarray sample",
-        (None, None) => "matrix of the data, and the sky's degrees beyond the map's",
+        (Some(_), _) => "degrees up to l_max; too small far off a circle: lunarray sample",
+        (None, Some(_)) => "degrees up to l_max; may be too small for few data: lunarray sample",
+        (None, None) => "all degrees, also those beyond the map's",
     }
 }
 

@@ -34,7 +34,7 @@ keys! {
         /// is next high above her.
         #[only_with("array.propagate.days > 0")]
         expert keep_every_days: f64 = 0.0;
-        /// What a correction restores: the "formation", or the "orbit", which is daughter 1's ellipse, too, with the node of that
+        /// What a correction restores: the "formation", or with the "orbit" also daughter 1's ellipse, at the node of that
         /// time.
         #[only_with("array.propagate.keep_every_days > 0")]
         expert keep: StationKeeping = StationKeeping::Formation;

@@ -76,11 +76,11 @@ keys! {
         expert solutions_per_pass: u32 = 1;
         /// Time without data after which a new pass begins.
         expert pass_gap_s: f64 = 900.0;
-        /// Residual beyond which a visibility is left out of a solution, over its spread.
+        /// Residual beyond which a visibility is left out of a solution, over the spread of its pair and channel.
         expert outlier_sigma: f64 = 6.0;
         /// Maximum number of Gauss-Newton iterations in a round.
         expert iterations_max: u32 = 50;
-        /// Maximum number of predictions of the model at positions found before.
+        /// Maximum number of rounds, each with the model at the positions found before. Only positions take more than one.
         expert position_rounds: u32 = 3;
         /// Maximum part of a daughter's signal that a solution may leave unexplained; with more, its data are left out of maps.
         expert unexplained_max: f64 = 0.15;
@@ -101,7 +101,7 @@ keys! {
         expert beacon_direction_deg: [f64; 2] = [0.0, 0.0];
         /// Maximum number of rounds of map and calibration; 0 for the given model alone.
         everyday map_rounds: u32 = 0;
-        /// Rms change of the gains, relative to one, below which map and solutions are settled.
+        /// Rms relative change of the gains below which rounds of map and calibration end.
         expert settled: f64 = 1e-3;
         /// Leave every n-th pass out of the maps that calibrate, to test them; 0 for none.
         expert hold_out_every: u32 = 0;

@@ -14,7 +14,7 @@ keys! {
     /// The `[instrument]` section: what is wrong with the daughters, in either fidelity. Without any of it, data are as
     /// they are without the section. What is wrong with positions and times is in [`NavigationConfig`](super::NavigationConfig).
     pub struct InstrumentConfig {
-        /// Number of the realisation: other random errors, also of `[navigation]`, with the same sky and noise.
+        /// Number of the realisation of random errors, also of `[navigation]`; sky and thermal noise stay the same.
         everyday realisation: u32 = 0;
         /// Natural logarithm of the voltage gain's amplitude, by daughter and channel.
         section amplitude: ErrorTerms = ErrorTerms::default();
@@ -46,7 +46,7 @@ keys! {
         expert dead_channels: Vec<[u32; 2]> = Vec::new();
         /// Probability that a visibility is an outlier.
         expert outlier_probability: f64 = 0.0;
-        /// Standard deviation of either part of what is added to an outlier, over that of thermal noise.
+        /// Standard deviation of what is added to an outlier's real and imaginary part, over that of thermal noise.
         expert outlier_sigma: f64 = 0.0;
         /// Mean time between bursts of interference from the Earth; 0 for none.
         expert burst_every_s: f64 = 0.0;
@@ -68,13 +68,13 @@ keys! {
     /// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
     /// (and from channel to channel, where the error is one of channels).
     pub struct ErrorTerms {
-        /// Given values, one a daughter, or none.
+        /// Given values, one a daughter, or none; the unit of values and rms is that of the section's name.
         expert constant: Vec<f64> = Vec::new();
         /// Given rates since the epoch, one a daughter, or none.
         expert rate_per_day: Vec<f64> = Vec::new();
-        /// Rms of a constant of the mission.
+        /// Rms of a random constant, the same for the whole mission.
         expert constant_rms: f64 = 0.0;
-        /// Rms of a constant of each pass.
+        /// Rms of a random constant, new in each pass.
         expert pass_rms: f64 = 0.0;
         /// Rms of an oscillation with the orbital period.
         expert orbit_rms: f64 = 0.0;

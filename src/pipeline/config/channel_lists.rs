@@ -47,7 +47,10 @@ pub(in crate::pipeline) fn adapt_lists(
         let Some(list) = list.filter(|list| list.len() == before.len() && !is_set(&name)) else { continue };
         *list = now.iter().filter_map(|&hz| nearest(hz).and_then(|k| list.get(k)).cloned()).collect();
         let values: Vec<String> = list.iter().map(ToString::to_string).collect();
-        notes.push(format!("{name} = [{}]: as for the nearest of the file's channels", values.join(", ")));
+        notes.push(format!(
+            "{name} = [{}]: values of the nearest channels of the pipeline file",
+            values.join(", ")
+        ));
     }
     notes
 }

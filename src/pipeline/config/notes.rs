@@ -83,9 +83,9 @@ impl Config {
         };
         corrects.then(|| {
             format!(
-                "corrected positions lie off the common circle by as much as they are not known (3.5 m are {CORRECTED_DEG} deg of \
-                 a baseline of 100 m), and the harmonic engine refuses baselines beyond map.limits.out_of_track_deg_max = {} and \
-                 map.limits.radial_deg_max = {}; {CORRECTED_DEG} for both, or map.refine.passes_max above 0, lets them in",
+                "errors of corrected positions put them off the common circle (3.5 m are {CORRECTED_DEG} deg of a baseline of 100 m), \
+                 and the harmonic engine refuses baselines beyond map.limits.out_of_track_deg_max = {} and \
+                 map.limits.radial_deg_max = {}: set both to {CORRECTED_DEG}, or map.refine.passes_max above 0",
                 limits.out_of_track_deg_max, limits.radial_deg_max
             )
         })

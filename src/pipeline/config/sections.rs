@@ -221,6 +221,9 @@ impl Config {
         let is_possible = reflection == 0.0 || !self.array.is_on_surface();
         let expected = "0 with array.stations: images in the ground under an antenna are part of its pattern";
         checks.require("spacecraft.moon_reflection", reflection, is_possible, expected);
+        let is_possible = isotropic || !self.array.is_on_surface();
+        let expected = "\"isotropic\" with array.stations: dipoles are normal to an orbit";
+        checks.require("spacecraft.antenna", "(dipoles)", is_possible, expected);
         let rate = self.downlink.rate_bits_per_s_max;
         let is_possible = rate == 0.0 || !self.array.is_on_surface();
         let expected = "0 with array.stations: they observe while the Earth is hidden, and a relay that is not simulated takes the data";

@@ -62,7 +62,7 @@ impl fmt::Display for MemoryAdvice {
         }
         write!(
             f,
-            "; --channels maps some of them, and replay --groups auto of files as many at a time as fit"
+            "; map fewer with --channels, or from files with replay --groups auto, which takes as many at a time as fit"
         )
     }
 }

@@ -394,8 +394,8 @@ impl fmt::Display for Cost {
             let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
             writeln!(
                 f,
-                "{:>8.3} MHz simulated by {kind} ({why}): estimated {:.1} s by direct sums; harmonics to l = {l_max} \
-                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, or {:.1} s by rows of any positions",
+                "{:>8.3} MHz simulated with spacecraft.model = \"{kind}\" ({why}); estimates: direct {:.1} s, harmonic to l = {l_max} \
+                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, general {:.1} s",
                 channel.frequency_hz / 1e6,
                 channel.simulation_direct_s,
                 channel.simulation_general_s
@@ -433,7 +433,7 @@ impl fmt::Display for Cost {
         write!(
             f,
             "estimated time   {:.digits$} s if nothing else runs on {} cores, from processor times measured on virtual machines (AMD \
-             EPYC; Intel Xeon with AVX-512): others differ by some factor",
+             EPYC; Intel Xeon with AVX-512): other machines differ by some factor",
             self.predicted_s,
             cores()
         )

@@ -170,16 +170,16 @@ impl FoundSolutions {
         let mut warnings = Vec::new();
         if self.late > 0 {
             warnings.push(format!(
-                "{} visibilities came after their passes had been solved and are in no solution: `lunarray calibrate` uses all of files whose times do not \
-                 overlap",
+                "{} visibilities came after their passes had been solved and are in no solution: `lunarray calibrate` uses all, if times of \
+                 files do not overlap",
                 self.late
             ));
         }
         let mut gains = self.all_gains();
         if !self.solutions.is_empty() && gains.all(|gain| gain.state != GainState::Good) {
             warnings.push(format!(
-                "no gain is good, so that a replay with them maps nothing: the reference (calibrate.reference_daughter = {}) has to have \
-                 data, and the model has to be that of the data (chi-square)",
+                "no gain is good, so a replay with them makes no map: see whether the reference (calibrate.reference_daughter = {}) has \
+                 data, and whether the model is the sky of these data (chi-square)",
                 solver.reference_daughter
             ));
         }

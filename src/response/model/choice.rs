@@ -134,25 +134,22 @@ impl ModelPlan {
             ModelChoice::General => (ModelKind::General, "as configured"),
             ModelChoice::Auto if !load.is_on_circle => {
                 if direct_fringes <= DIRECT_FRINGES_MAX {
-                    (ModelKind::Direct, "takes a minute at most")
+                    (ModelKind::Direct, "at most a minute")
                 } else if general_fringes < pixels {
-                    (ModelKind::General, "no common circle; cheaper than direct sums")
+                    (ModelKind::General, "no common circle; faster than direct sums")
                 } else {
-                    (
-                        ModelKind::Direct,
-                        "harmonics on a circle need a common one; cheaper than at true positions",
-                    )
+                    (ModelKind::Direct, "no common circle; faster than general")
                 }
             }
             ModelChoice::Auto if load.is_time_averaged => (ModelKind::Harmonic, "averages over integrations"),
             ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_MAX => {
-                (ModelKind::Direct, "takes a minute at most")
+                (ModelKind::Direct, "at most a minute")
             }
             ModelChoice::Auto if harmonic_bytes > HARMONIC_BYTES_MAX => {
                 (ModelKind::Direct, "harmonic needs more than 8 GB")
             }
-            ModelChoice::Auto if harmonic_fringes < direct_fringes => (ModelKind::Harmonic, "cheaper"),
-            ModelChoice::Auto => (ModelKind::Direct, "cheaper"),
+            ModelChoice::Auto if harmonic_fringes < direct_fringes => (ModelKind::Harmonic, "faster"),
+            ModelChoice::Auto => (ModelKind::Direct, "faster"),
         };
         let bytes = match kind {
             ModelKind::Direct => 28.0 * pixels,
