@@ -117,7 +117,7 @@ impl Orientation {
     }
 
     /// A direction or position on the ecliptic axes, from one on the mean Earth and polar axes.
-    fn from_mean(&self, [x, y, z]: Vec3) -> Vec3 {
+    fn mean_to_ecliptic(&self, [x, y, z]: Vec3) -> Vec3 {
         let [a, b, c] = self.axes;
         add(scale(x, a), add(scale(y, b), scale(z, c)))
     }
@@ -125,8 +125,8 @@ impl Orientation {
     /// A state on the ecliptic axes, which do not turn, from one on Moon-fixed axes, which do.
     pub(in crate::array) fn state(&self, axes: MoonAxes, fixed: SatelliteState) -> SatelliteState {
         let turn = |v: Vec3| match axes {
-            MoonAxes::MeanEarth => self.from_mean(v),
-            MoonAxes::Principal => self.from_mean(to_mean(v)),
+            MoonAxes::MeanEarth => self.mean_to_ecliptic(v),
+            MoonAxes::Principal => self.mean_to_ecliptic(to_mean(v)),
         };
         let position_m = turn(fixed.position_m);
         let velocity_m_s = add(turn(fixed.velocity_m_s), cross(self.rate_rad_s, position_m));
