@@ -7,6 +7,7 @@ use thiserror::Error;
 
 use super::kepler::KeplerElements;
 use super::propagate::PropagateConfig;
+use super::stations::Stations;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::time_scales::{Tai, TimeScale, utc_text};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, keys};
@@ -28,47 +29,47 @@ keys! {
         /// Number of daughters on the circle.
         everyday satellites: usize = 8;
         /// Altitude of the circular orbit, or of the semi-major axis.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         everyday altitude_m: f64 = 300e3;
         /// Radius of the Moon.
         expert moon_radius_m: f64 = MOON_RADIUS_M;
         /// Inclination to the ecliptic.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         everyday inclination_deg: f64 = 30.0;
         /// Orbital period.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert orbital_period_s: f64 = 8_248.68;
         /// Period of the precession of the node.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert precession_period_s: f64 = 1.3 * YEAR_S;
         /// Sense of the precession: "regress" or "advance".
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert node_motion: NodeMotion = NodeMotion::Regress;
         /// Orbital phase of daughter 1 at the epoch.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert orbital_phase_deg: f64 = 0.0;
         /// Longitude of the ascending node at the epoch.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert node_longitude_deg: f64 = 0.0;
         /// Eccentricity of the formation's orbit.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         everyday eccentricity: f64 = 0.0;
         /// Argument of the periapsis at the epoch.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert periapsis_deg: f64 = 0.0;
         /// Rate of the argument of the periapsis.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert periapsis_rate_deg_per_day: f64 = 0.0;
         /// Maximum distance of each daughter from daughter 1 across the track, over that along it, by which their orbital
         /// planes differ.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert cross_track_ratio: f64 = 0.0;
-        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except along
-        /// `oem` files.
-        #[only_with("no array.oem")]
+        /// Ecliptic longitude of the Earth, seen from the Moon, at the epoch; it moves on a circle in the ecliptic, except with
+        /// `oem` files and `stations`.
+        #[only_with("no array.oem and no array.stations")]
         expert earth_longitude_deg: f64 = 0.0;
         /// Maximum arcs by which daughters 2, 3, ... trail daughter 1, ascending; empty for those of `breathing`.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert arcs_m: Vec<f64> = Vec::new();
         /// Kepler orbits, one a satellite, instead of the formation: `{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01,
         /// inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 }` at the epoch, on
@@ -81,12 +82,21 @@ keys! {
         /// the latest of their first usable times.
         #[only_with("array.oem")]
         expert oem_epoch: String = String::new();
+        /// Stations on the Moon instead of satellites: `{ longitude_deg = 180.0, latitude_deg = -30.0, height_m = 0.0 }` on its mean
+        /// Earth axes (MOON_ME), one for each of `satellites`, or a CSV file with these columns. They turn with the Moon, see the sky
+        /// above a flat horizon, and observe while the Earth is below that of the first.
+        #[serde(skip_serializing_if = "Stations::is_empty")]
+        everyday stations: Stations = Stations::default();
+        /// Epoch of a mission of stations, UTC, such as 2030-01-31T12:00:00.
+        #[only_with("array.stations")]
+        #[serde(skip_serializing_if = "String::is_empty")]
+        expert stations_epoch: String = String::new();
         /// Numerical integration in the Moon's field (GRGM900C), from the formation at the epoch or from array.kepler. Periods,
         /// precession and rates are then ignored.
         #[serde(skip_serializing_if = "PropagateConfig::is_default")]
         section propagate: PropagateConfig = PropagateConfig::default();
         /// Contraction and expansion of the formation.
-        #[only_with("no array.kepler and no array.oem")]
+        #[only_with("no array.kepler and no array.oem and no array.stations")]
         section breathing: BreathingConfig = BreathingConfig::default();
     }
 }
@@ -167,7 +177,7 @@ pub enum ArrayError {
     },
     /// Two satellites have the same position.
     #[error(
-        "array.kepler: satellites {first} and {second} are at one place at the epoch: expected orbits or anomalies that differ"
+        "array: satellites {first} and {second} are at one place at the epoch: expected orbits, anomalies or stations that differ"
     )]
     OnePlace {
         /// The first one, from 1.
@@ -219,7 +229,25 @@ impl ArrayConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn has_own_orbits(&self) -> bool {
-        !self.kepler.is_empty() || !self.oem.is_empty() || self.propagate.is_on()
+        !self.kepler.is_empty() || self.is_dated() || self.propagate.is_on()
+    }
+
+    /// Whether the mission has dates, of files or of stations.
+    pub(super) fn is_dated(&self) -> bool {
+        !self.oem.is_empty() || !self.stations.is_empty()
+    }
+
+    /// Whether the array consists of stations on the Moon.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_on_surface(&self) -> bool {
+        !self.stations.is_empty()
+    }
+
+    /// Epoch of a mission of stations.
+    pub(super) fn stations_epoch(&self) -> Option<Tai> {
+        let epoch = self.stations_epoch.strip_suffix('Z').unwrap_or(&self.stations_epoch);
+        Tai::parse(epoch, TimeScale::Utc)
     }
 
     /// Whether all satellites follow each other on one circle.
@@ -237,6 +265,10 @@ impl ArrayConfig {
         let good = epoch.is_empty() || is_date(TimeScale::Tai) || is_date(TimeScale::Utc);
         let expected = "a date of the files' time system such as 2030-01-31T12:00:00, a date on UTC with Z at its end, or nothing";
         checks.require("oem_epoch", format_args!("{epoch:?}"), good, expected);
+        let (epoch, good) =
+            (&self.stations_epoch, self.stations.is_empty() || self.stations_epoch().is_some());
+        let expected = "with array.stations, a date in UTC such as 2030-01-31T12:00:00";
+        checks.require("stations_epoch", format_args!("{epoch:?}"), good, expected);
     }
 
     /// Checks the Moon, the circular orbit and its breathing.
@@ -317,6 +349,9 @@ impl ArrayConfig {
         checks.require("oem", given, one, "none where array.kepler is given");
         let one = files == 0 || !self.propagate.is_on();
         checks.require("oem", given, one, "none where array.propagate.days is given");
+        let one = self.stations.is_empty() || (files + orbits == 0 && !self.propagate.is_on());
+        let expected = "none where array.kepler, array.oem or array.propagate.days is given";
+        checks.require("stations", "(stations)", one, expected);
     }
 
     /// All invalid values; empty if there are none.
@@ -339,6 +374,7 @@ impl ArrayConfig {
         }
         let mut found = checks.finish();
         found.extend(self.propagate.problems(self.satellites, !self.kepler.is_empty()));
+        found.extend(self.stations.problems(self.satellites));
         let of_one =
             |(index, elements): (usize, &KeplerElements)| elements.problems(index, self.moon_radius_m);
         found.extend(self.kepler.iter().take(MAX_SATELLITES).enumerate().flat_map(of_one));

@@ -2,7 +2,8 @@
 
 use std::fmt::Write;
 
-use super::oem::{OrbitArc, to_equatorial};
+use super::axes::to_equatorial;
+use super::oem::OrbitArc;
 use super::orbit::Array;
 use super::state::SatelliteState;
 use crate::units::time_scales::{Tai, TimeScale};

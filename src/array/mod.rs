@@ -1,4 +1,4 @@
-//! Orbit and formation of the daughters, occultation by the Moon, observing windows, and the ephemeris.
+//! Orbit and formation of the daughters, stations on the Moon, occultation by the Moon, observing windows, and the ephemeris.
 //!
 //! Pure functions of time and position; uses [`crate::units`] and [`crate::frames`].
 //!
@@ -6,6 +6,7 @@
 //! pole.
 
 mod attitudes;
+mod axes;
 mod baseline;
 mod bodies;
 mod config;
@@ -20,6 +21,8 @@ mod orbit;
 mod placing;
 mod propagate;
 mod state;
+mod stations;
+mod surface;
 mod track;
 mod windows;
 
@@ -44,12 +47,16 @@ pub use integration::{IntegrationRule, integration_time_s};
 pub use interpolation::interpolation_error_m;
 #[doc(hidden)]
 pub use kepler::KeplerElements;
+#[doc(hidden)]
+pub use orbit::is_underground;
 pub use orbit::{Array, hidden_by_moon};
 #[doc(hidden)]
 pub use placing::PlacingCounts;
 #[doc(hidden)]
 pub use propagate::{PropagateConfig, StationKeeping, report_propagation_to};
 pub use state::SatelliteState;
+#[doc(hidden)]
+pub use stations::{Station, Stations};
 #[doc(hidden)]
 pub use track::{orbit_normal_hat, tilted_axes, track_axes, track_offset_m};
 #[doc(hidden)]

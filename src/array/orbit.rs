@@ -10,18 +10,20 @@ use super::kepler::{KeplerOrbit, eccentric_anomaly};
 use super::oem::{self, OrbitArc, TableOrbit};
 use super::propagate;
 use super::state::SatelliteState;
-use crate::units::constants::DAY_S;
+use super::surface::{self, StationMotion};
+use crate::units::constants::{DAY_S, MOON_RELIEF_M, SIDEREAL_MONTH_S};
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
 /// Minimum distance of two satellites at the epoch, m.
 const DISTANCE_M_MIN: f64 = 1.0;
 
-/// Orbit of one satellite.
+/// Orbit of one satellite, or the motion of a station.
 #[derive(Clone, Debug, PartialEq)]
 enum OwnOrbit {
     Kepler(KeplerOrbit),
     Table(TableOrbit),
+    Station(StationMotion),
 }
 
 impl OwnOrbit {
@@ -29,6 +31,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.state(t_s),
             Self::Table(orbit) => orbit.state(t_s),
+            Self::Station(station) => station.state(t_s),
         }
     }
 
@@ -36,6 +39,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.normal_hat(t_s),
             Self::Table(orbit) => orbit.normal_hat(t_s),
+            Self::Station(station) => station.north_hat(t_s),
         }
     }
 
@@ -43,6 +47,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.semi_major_axis_m(),
             Self::Table(orbit) => orbit.semi_major_axis_m(),
+            Self::Station(station) => station.radius_m(),
         }
     }
 
@@ -50,6 +55,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.inclination_rad(),
             Self::Table(orbit) => orbit.inclination_rad(),
+            Self::Station(station) => station.north_hat(0.0)[2].clamp(-1.0, 1.0).acos(),
         }
     }
 
@@ -57,6 +63,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.period_s(),
             Self::Table(orbit) => orbit.period_s(),
+            Self::Station(_) => SIDEREAL_MONTH_S,
         }
     }
 
@@ -64,6 +71,7 @@ impl OwnOrbit {
         match self {
             Self::Kepler(orbit) => orbit.apoapsis_m(),
             Self::Table(orbit) => orbit.farthest_m(),
+            Self::Station(station) => station.radius_m(),
         }
     }
 }
@@ -141,27 +149,39 @@ impl Array {
         }
         let rate = TAU / config.precession_period_s;
         let kepler: Vec<KeplerOrbit> = config.kepler.iter().map(KeplerOrbit::new).collect();
-        require_distinct(&kepler)?;
+        require_distinct(&kepler.iter().map(|orbit| orbit.state(0.0).position_m).collect::<Vec<_>>())?;
         let (mut epoch, mut notes) = (None, Vec::new());
-        let own: Vec<OwnOrbit> = if config.propagate.is_on() {
-            propagate::orbits(config)?.into_iter().map(OwnOrbit::Table).collect()
-        } else if config.oem.is_empty() {
-            kepler.into_iter().map(OwnOrbit::Kepler).collect()
-        } else {
-            let found = oem::read(&config.oem, &config.oem_epoch, config.moon_radius_m)?;
-            (epoch, notes) = (Some(found.epoch), found.notes);
-            found.orbits.into_iter().map(OwnOrbit::Table).collect()
-        };
-        let earth = match (epoch, known_s(&own)) {
-            (Some(epoch), Some(known_s)) => Earth::Dated(Arc::new(DatedEarth::new(epoch, known_s))),
-            _ => Earth::Circle(config.earth_longitude_deg.to_radians()),
+        let mut moon_radius_m = config.moon_radius_m;
+        let own: Vec<OwnOrbit> =
+            if let Some(given) = config.stations_epoch().filter(|_| config.is_on_surface()) {
+                epoch = Some(given);
+                let stations = surface::motions(&config.stations, config.satellites, given, moon_radius_m)?;
+                require_distinct(
+                    &stations.iter().map(|station| station.state(0.0).position_m).collect::<Vec<_>>(),
+                )?;
+                // The ground, which leaves every station the half of the sky above its own horizon.
+                moon_radius_m = stations.iter().map(StationMotion::radius_m).fold(0.0, f64::max);
+                stations.into_iter().map(OwnOrbit::Station).collect()
+            } else if config.propagate.is_on() {
+                propagate::orbits(config)?.into_iter().map(OwnOrbit::Table).collect()
+            } else if config.oem.is_empty() {
+                kepler.into_iter().map(OwnOrbit::Kepler).collect()
+            } else {
+                let found = oem::read(&config.oem, &config.oem_epoch, config.moon_radius_m)?;
+                (epoch, notes) = (Some(found.epoch), found.notes);
+                found.orbits.into_iter().map(OwnOrbit::Table).collect()
+            };
+        let earth = match epoch {
+            // Without a span there is no table.
+            Some(epoch) => Earth::Dated(Arc::new(DatedEarth::new(epoch, known_s(&own).unwrap_or_default()))),
+            None => Earth::Circle(config.earth_longitude_deg.to_radians()),
         };
         Ok(Self {
             formation: if own.is_empty() { Some(Formation::new(config)?) } else { None },
             shape: Shape::new(config),
             own,
             orbit_radius_m: config.moon_radius_m + config.altitude_m,
-            moon_radius_m: config.moon_radius_m,
+            moon_radius_m,
             inclination_rad: config.inclination_deg.to_radians(),
             orbital_period_s: config.orbital_period_s,
             phase_rad: config.orbital_phase_deg.to_radians(),
@@ -219,7 +239,7 @@ impl Array {
     pub fn table_bytes(&self) -> u64 {
         let bytes = |orbit: &OwnOrbit| match orbit {
             OwnOrbit::Table(orbit) => orbit.table_bytes(),
-            OwnOrbit::Kepler(_) => 0,
+            OwnOrbit::Kepler(_) | OwnOrbit::Station(_) => 0,
         };
         self.own.iter().map(bytes).sum()
     }
@@ -238,7 +258,14 @@ impl Array {
         self.formation.as_ref().map_or(self.own.len(), Formation::satellites)
     }
 
-    /// Radius of the Moon, m.
+    /// Whether the array consists of stations on the Moon.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn is_on_surface(&self) -> bool {
+        matches!(self.own.first(), Some(OwnOrbit::Station(_)))
+    }
+
+    /// Radius of the Moon, m; under stations, that of the highest one's ground.
     #[must_use]
     pub fn moon_radius_m(&self) -> f64 {
         self.moon_radius_m
@@ -459,14 +486,13 @@ impl Array {
 fn known_s(orbits: &[OwnOrbit]) -> Option<[f64; 2]> {
     let spans = orbits.iter().filter_map(|orbit| match orbit {
         OwnOrbit::Table(orbit) => Some(orbit.span_s()),
-        OwnOrbit::Kepler(_) => None,
+        OwnOrbit::Kepler(_) | OwnOrbit::Station(_) => None,
     });
     spans.reduce(|[from, to], [start, end]| [from.max(start), to.min(end)])
 }
 
 /// Checks that no two satellites have the same position at the epoch.
-fn require_distinct(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
-    let positions: Vec<Vec3> = orbits.iter().map(|orbit| orbit.state(0.0).position_m).collect();
+fn require_distinct(positions: &[Vec3]) -> Result<(), ArrayError> {
     for (second, position) in positions.iter().enumerate() {
         let coincides = |other: &Vec3| norm(sub(*position, *other)) < DISTANCE_M_MIN;
         if let Some(first) = positions[..second].iter().position(coincides) {
@@ -476,7 +502,14 @@ fn require_distinct(orbits: &[KeplerOrbit]) -> Result<(), ArrayError> {
     Ok(())
 }
 
-/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Eq. 8).
+/// Whether a position is below the Moon's surface by more than its relief. Stations lie on the surface, below the highest of them.
+#[must_use]
+pub fn is_underground(r_m: Vec3, moon_radius_m: f64) -> bool {
+    norm(r_m) <= moon_radius_m - MOON_RELIEF_M
+}
+
+/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Eq. 8): from one on the ground, what is below its
+/// horizon.
 #[must_use]
 pub fn hidden_by_moon(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> bool {
     hiding_depth_m(r_m, n_hat, moon_radius_m) > 0.0

@@ -10,9 +10,13 @@ const STEPS_PER_ORBIT: f64 = 64.0;
 /// Number of steps per orbit for an ellipse, on which the Moon may hide the Earth for a short part of an orbit.
 const STEPS_PER_ELLIPSE: f64 = 1024.0;
 
+/// Longest window of stations, s. From the Moon's far side the Earth never rises.
+const SURFACE_WINDOW_S: f64 = 3600.0;
+
 /// Iterator over observing windows in order of time: the intervals in which the Earth is hidden from daughter 1.
 ///
-/// A window in progress at `from_s` or at `until_s` is skipped.
+/// A window in progress at `from_s` or at `until_s` is skipped. Under stations, these intervals are cut into windows of an hour, and
+/// begin at `from_s` and end at `until_s`.
 #[derive(Clone, Debug)]
 pub struct ObservingWindows<'a> {
     array: &'a Array,
@@ -123,12 +127,29 @@ fn bisect(mut before: f64, mut after: f64, is_past: impl Fn(f64) -> bool) -> f64
     after
 }
 
+impl ObservingWindows<'_> {
+    /// Start and end of the next window of stations, s.
+    fn next_on_surface(&self) -> Option<[f64; 2]> {
+        let is_seen = |t_s: f64| self.array.earth_depth_m(t_s) <= 0.0;
+        let start_s = if is_seen(self.now_s) { self.next_edge_s(self.now_s, true)? } else { self.now_s };
+        let end_s = (start_s + SURFACE_WINDOW_S).min(self.until_s);
+        // The Earth rises or sets at most once in an hour.
+        let end_s = if is_seen(end_s) { bisect(start_s, end_s, is_seen) } else { end_s };
+        (end_s > start_s).then_some([start_s, end_s])
+    }
+}
+
 impl Iterator for ObservingWindows<'_> {
     type Item = ObservingWindow;
 
     fn next(&mut self) -> Option<ObservingWindow> {
-        let start_s = self.next_edge_s(self.now_s, true)?;
-        let end_s = self.next_edge_s(start_s, false)?;
+        let [start_s, end_s] = match self.array.is_on_surface() {
+            true => self.next_on_surface()?,
+            false => {
+                let start_s = self.next_edge_s(self.now_s, true)?;
+                [start_s, self.next_edge_s(start_s, false)?]
+            }
+        };
         self.now_s = end_s;
         let index = self.index;
         self.index += 1;

@@ -8,6 +8,10 @@ pub const BOLTZMANN_J_K: f64 = 1.380_649e-23;
 
 /// Mean radius of the Moon, m (IAU 2015; the paper, Sect. 3.2).
 pub const MOON_RADIUS_M: f64 = 1_737_100.0;
+
+/// How far the Moon's ground departs from its mean sphere, m: 9.1 km below to 10.8 km above (LOLA; Smith et al. 2010).
+#[doc(hidden)]
+pub const MOON_RELIEF_M: f64 = 12e3;
 /// GM of the Moon, m^3/s^2 (DE440).
 pub const MOON_GM_M3_S2: f64 = 4.902_800_118e12;
 

@@ -57,6 +57,80 @@ fn a_triple_on_ellipses_is_flown_and_mapped() {
     assert!(Contents::read(Path::new(&downlink)).unwrap().visibilities.count > 1000);
 }
 
+/// Six stations near the equator of the far side, over one turn of the Moon.
+const SURFACE: &str = r#"
+name = "surface"
+seed = 3
+[sky]
+nside = 4
+[array]
+satellites = 6
+stations_epoch = "2030-01-01T00:00:00"
+stations = [
+    { longitude_deg = 170.0, latitude_deg = 0.0 },
+    { longitude_deg = 170.0007, latitude_deg = 0.0004, height_m = 15.0 },
+    { longitude_deg = 169.9985, latitude_deg = 0.0011 },
+    { longitude_deg = 170.0021, latitude_deg = -0.0017 },
+    { longitude_deg = 169.9979, latitude_deg = -0.0024, height_m = -30.0 },
+    { longitude_deg = 170.0004, latitude_deg = 0.0043 },
+]
+[spacecraft]
+channels_hz = [10.0e6]
+duration_s = 2.3606e6
+every_nth_window = 40
+integration_s_max = 600.0
+thermal_noise = false
+[map]
+nside = 4
+epsilon = 1e-6
+baseline_bp_max = 10.0
+rows = "centre"
+[products]
+pictures = false
+"#;
+
+#[test]
+fn stations_on_the_moon_map_the_sky() {
+    let place = Workplace::new(SURFACE);
+    let out = place.path("out");
+    let summary = json(&["run", &place.pipeline, "--out", &out]);
+    // Every 40th of 656 hours, six integrations of ten minutes, 15 pairs.
+    assert_eq!(summary["ledger"]["accumulated"].as_u64().unwrap(), 17 * 6 * 15);
+    // Data of the map's own pixels without noise come back, but for what the regularisation takes: 1e-6 of the largest eigenvalue, of
+    // which the smallest is 0.0207, as numpy finds from rows at the pixels' centres.
+    let error = summary["channels"][0]["snapshots"][0]["rms_error_over_rms_truth"].as_f64().unwrap();
+    assert!(error < 1e-6 / 0.0207, "{error}");
+    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
+    succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &ground]);
+    for (path, bytes) in maps(&ground) {
+        assert!(bytes == maps(&out)[&path], "{} differs", path.display());
+    }
+}
+
+#[test]
+fn what_stations_cannot_do_is_refused() {
+    let place = Workplace::new(SURFACE);
+    let near = "array.stations=[{longitude_deg=0.0,latitude_deg=0.0},{longitude_deg=0.1,latitude_deg=0.0},{longitude_deg=0.2,latitude_deg=0.0}]";
+    for (sets, told) in [
+        (
+            &["spacecraft.fidelity=samples"][..],
+            "expected \"visibilities\" with array.kepler, array.oem, array.stations",
+        ),
+        (&["map.engine=harmonic", "map.rows=average"], "array.stations"),
+        (&["spacecraft.moon_reflection=0.07"], "expected 0 with array.stations"),
+        (&["spacecraft.antenna=dipole-normal"], "expected \"isotropic\" with array.stations"),
+        (&["downlink.rate_bits_per_s_max=1e6"], "a relay that is not simulated"),
+        (&["array.eccentricity=0.1"], "no array.stations"),
+        (&["array.satellites=7"], "at most 64: the limit of the downlink's format"),
+        (&["array.satellites=3", near], "the Earth is above the horizon of station 1"),
+    ] {
+        let mut arguments = vec!["run", &place.pipeline, "--out", "none"];
+        arguments.extend(sets.iter().flat_map(|set| ["--set", set]));
+        let said = fail(&arguments);
+        assert!(said.contains(told), "{said}: expected {told}");
+    }
+}
+
 /// Visibilities of harmonics at the true positions are those of direct sums, and the same bytes whatever the threads.
 #[test]
 fn ellipses_are_simulated_with_harmonics() {

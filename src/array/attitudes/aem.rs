@@ -1,7 +1,8 @@
 //! Segments of attitude messages.
 
 use super::rotation::{Rotation, interpolated};
-use crate::array::oem::{Fault, Message, Metadata, SegmentTimes, read_epoch, short, turned};
+use crate::array::axes::turned;
+use crate::array::oem::{Fault, Message, Metadata, SegmentTimes, read_epoch, short};
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::Vec3;
 

@@ -1,14 +1,17 @@
-//! Directions of the Earth and the Sun from the Moon's centre.
+//! Directions of the Earth and the Sun from the Moon's centre, and the Moon's orientation.
 //!
 //! Missions with dates use ephemerides of both. A mission without dates has an idealised Earth on a circle in the
 //! ecliptic.
 
 mod moon;
+mod orientation;
 mod sun;
 
 use std::f64::consts::TAU;
 use std::fmt;
 use std::sync::Arc;
+
+pub(super) use orientation::{MoonAxes, Orientation};
 
 use super::config::ArrayConfig;
 use crate::frames::EphemerisSegment;
@@ -35,10 +38,13 @@ pub enum EarthModel {
 }
 
 impl EarthModel {
-    /// Model of the Earth for an array: orbits from files have dates.
+    /// Model of the Earth for an array: orbits from files and stations have dates.
     #[must_use]
     pub fn of(config: &ArrayConfig) -> Self {
-        if config.oem.is_empty() { Self::Circle(config.earth_longitude_deg) } else { Self::Dated }
+        match config.is_dated() {
+            true => Self::Dated,
+            false => Self::Circle(config.earth_longitude_deg),
+        }
     }
 
     /// Direction of the Earth from the Moon's centre, some seconds after the mission's epoch (TAI since 1958-01-01, s).

@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use super::form::{Fault, Message, short};
+use crate::array::axes::turned;
+use crate::array::bodies::{MoonAxes, Orientation};
+use crate::array::state::SatelliteState;
 use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::{Vec3, norm};
-
-/// Obliquity of the ecliptic of J2000 (IAU 1976): 84381.448 arc seconds.
-const OBLIQUITY_DEG: f64 = 84_381.448 / 3600.0;
 
 /// Greatest degree of an interpolation.
 pub(super) const DEGREE_MAX: usize = 15;
@@ -103,9 +103,30 @@ pub(in crate::array) struct SegmentTimes {
 #[derive(Clone, Copy, Debug)]
 struct SegmentForm {
     scale: TimeScale,
-    /// Whether its axes are equatorial.
-    turns: bool,
+    axes: Axes,
     times: SegmentTimes,
+}
+
+/// Axes on which states are given.
+#[derive(Clone, Copy, Debug)]
+enum Axes {
+    /// They do not turn; whether they are equatorial, else ecliptic.
+    Still { equatorial: bool },
+    /// They turn with the Moon.
+    Moon(MoonAxes),
+}
+
+impl Axes {
+    /// A state on ecliptic axes.
+    fn turned(self, given: SatelliteState, time: Tai) -> SatelliteState {
+        match self {
+            Self::Moon(axes) => Orientation::at(time).state(axes, given),
+            Self::Still { equatorial } => SatelliteState {
+                position_m: turned(equatorial, given.position_m),
+                velocity_m_s: turned(equatorial, given.velocity_m_s),
+            },
+        }
+    }
 }
 
 impl Message for Collector {
@@ -149,12 +170,12 @@ impl Message for Collector {
     fn end_metadata(&mut self, line: usize) -> Result<(), Fault> {
         let metadata = std::mem::take(&mut self.metadata);
         metadata.require("CENTER_NAME", &["MOON"], "CENTER_NAME = MOON", line)?;
-        let turns = metadata.is_equatorial("REF_FRAME", line)?;
+        let axes = metadata.axes(line)?;
         let scale = metadata.scale(line)?;
         let (method, degree) = metadata.interpolation(line)?;
         let times = metadata.times(scale, line)?;
         self.scale.get_or_insert(scale);
-        self.of_segment = Some(SegmentForm { scale, turns, times });
+        self.of_segment = Some(SegmentForm { scale, axes, times });
         self.segments.push(OemSegment {
             method,
             degree,
@@ -186,8 +207,9 @@ impl Message for Collector {
             let expected = "epochs in rising order: each later than the one before";
             return Err(Fault::new(line, short(epoch), expected));
         }
-        let metres = |v: [f64; 3]| turned(form.turns, v.map(|km| 1e3 * km));
-        let velocity_m_s = metres([*vx, *vy, *vz]);
+        let [position_m, velocity_m_s] = [[*x, *y, *z], [*vx, *vy, *vz]].map(|v| v.map(|km| 1e3 * km));
+        let SatelliteState { position_m, velocity_m_s } =
+            form.axes.turned(SatelliteState { position_m, velocity_m_s }, time);
         if norm(velocity_m_s) > 1e5 {
             return Err(Fault::new(
                 line,
@@ -196,7 +218,7 @@ impl Message for Collector {
             ));
         }
         segment.time_s.push(time_s);
-        segment.position_m.push(metres([*x, *y, *z]));
+        segment.position_m.push(position_m);
         segment.velocity_m_s.push(velocity_m_s);
         lines.push(u32::try_from(line).unwrap_or(u32::MAX));
         Ok(())
@@ -293,13 +315,18 @@ impl Metadata {
         if ["EME2000", "J2000", "ECLIPJ2000"].contains(&frame) || numbered("ICRF") || numbered("GCRF") {
             return Ok(frame != "ECLIPJ2000");
         }
-        let why = match frame.starts_with("MOON") {
-            true => {
-                "EME2000, J2000, ICRF, GCRF or ECLIPJ2000: axes fixed to the Moon are not read; convert the file"
-            }
-            false => "EME2000, J2000, ICRF, ICRF1 to 3, GCRF or ECLIPJ2000: axes that do not turn",
-        };
-        Err(Fault::new(line, frame, format!("{key} = {why}")))
+        let expected = "EME2000, J2000, ICRF, ICRF1 to 3, GCRF or ECLIPJ2000: axes that do not turn; of orbits also MOON_ME or \
+                        MOON_PA, which are fixed to the Moon";
+        Err(Fault::new(line, frame, format!("{key} = {expected}")))
+    }
+
+    /// The axes of an orbit.
+    fn axes(&self, end: usize) -> Result<Axes, Fault> {
+        let key = "REF_FRAME";
+        match MoonAxes::from_name(self.value(key, end).0) {
+            Some(axes) => Ok(Axes::Moon(axes)),
+            None => Ok(Axes::Still { equatorial: self.is_equatorial(key, end)? }),
+        }
     }
 
     fn interpolation(&self, end: usize) -> Result<(TableMethod, usize), Fault> {
@@ -381,19 +408,4 @@ impl SegmentTimes {
         }
         Ok(useable_s)
     }
-}
-
-/// From equatorial to ecliptic axes.
-pub(in crate::array) fn turned(turns: bool, v: Vec3) -> Vec3 {
-    if !turns {
-        return v;
-    }
-    let (sin, cos) = OBLIQUITY_DEG.to_radians().sin_cos();
-    [v[0], cos * v[1] + sin * v[2], cos * v[2] - sin * v[1]]
-}
-
-/// From ecliptic to equatorial axes.
-pub(in crate::array) fn to_equatorial(v: Vec3) -> Vec3 {
-    let (sin, cos) = OBLIQUITY_DEG.to_radians().sin_cos();
-    [v[0], cos * v[1] - sin * v[2], cos * v[2] + sin * v[1]]
 }

@@ -7,6 +7,7 @@ use super::{
     ColumnBlock, ExactPixels, FACTOR_SCALE, PADDING, PixelSetup, PixelSums, RIGHT_STEPS, SymmetricTiles,
     Whitened,
 };
+use crate::array::is_underground;
 use crate::frames::AntennaResponse;
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter};
 use crate::imaging::exact::engine::{Accepted, CommonSetup, ExactEngine, SkyBasis};
@@ -111,7 +112,7 @@ impl SkyBasis for PixelBasis {
         if [r_i_m, r_j_m].into_iter().any(|r_m| !norm(r_m).is_normal()) {
             return Err(Refusal::Geometry(GeometryRefusal::NotFinite));
         }
-        if [r_i_m, r_j_m].into_iter().any(|r_m| norm(r_m) <= self.setup.moon_radius_m) {
+        if [r_i_m, r_j_m].into_iter().any(|r_m| is_underground(r_m, self.setup.moon_radius_m)) {
             return Err(Refusal::Geometry(GeometryRefusal::Altitude));
         }
         if r_i_m == r_j_m {

@@ -134,11 +134,11 @@ mod tests {
             // A formation's shape beside orbits of the satellites' own.
             (
                 format!("array = {{ {ORBITS}, altitude_m = 1e6 }}").as_str(),
-                "array.altitude_m = 1000000.0 has an effect only with no array.kepler and no array.oem",
+                "array.altitude_m = 1000000.0 has an effect only with no array.kepler and no array.oem and no array.stations",
             ),
             (
                 format!("array = {{ {ORBITS}, breathing.span_m_max = 5e4 }}").as_str(),
-                "array.breathing.span_m_max = 50000.0 has an effect only with no array.kepler and no array.oem",
+                "array.breathing.span_m_max = 50000.0 has an effect only with no array.kepler and no array.oem and no array.stations",
             ),
         ] {
             let found = messages(text);

@@ -117,6 +117,15 @@ pub enum PipelineError {
         /// Orbital period, s.
         orbit_s: f64,
     },
+    /// The Earth never sets for the first station.
+    #[error(
+        "array.stations: the Earth is above the horizon of station 1 for all of spacecraft.duration_s = {duration_s}, so there is no \
+         observing window; expected stations on the far side, or spacecraft.thin and every_nth_window that leave out less"
+    )]
+    EarthNeverSets {
+        /// Length of the mission, s.
+        duration_s: f64,
+    },
     /// A downlink that cannot be read more than once.
     #[error("{}: not a regular file; expected one with --groups, which reads the downlink once per group", path.display())]
     NotRepeatable {

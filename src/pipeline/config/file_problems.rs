@@ -120,6 +120,7 @@ impl Config {
         let antennas = self.map.antennas.files.paths().chain(self.instrument.antenna_files.paths());
         let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file);
         let others = others.chain(antennas).cloned();
-        skies.chain(catalogue).chain(others).chain(self.array.oem.iter().map(PathBuf::from)).collect()
+        let orbits = self.array.oem.iter().map(PathBuf::as_path).chain(self.array.stations.file());
+        skies.chain(catalogue).chain(others).chain(orbits.map(PathBuf::from)).collect()
     }
 }

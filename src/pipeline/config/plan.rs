@@ -50,6 +50,9 @@ impl Plan {
         };
         let schedules = spacecraft.schedules();
         let mut windows = Observer::windows(&array, spacecraft.duration_s, spacecraft.window_thinning());
+        if windows.is_empty() && array.is_on_surface() {
+            return Err(PipelineError::EarthNeverSets { duration_s: spacecraft.duration_s });
+        }
         if windows.is_empty() {
             return Err(PipelineError::NoWindow {
                 duration_s: spacecraft.duration_s,

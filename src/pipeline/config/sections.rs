@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::problems::Problems;
-use crate::array::{Array, ArrayConfig};
+use crate::array::{Array, ArrayConfig, Stations};
 use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
@@ -131,14 +131,15 @@ impl Config {
         if let Some(dated_s) = array.epoch_tai_s() {
             let given_s = self.spacecraft.epoch_tai_s;
             let default_s = SpacecraftConfig::default().epoch_tai_s;
-            let expected = format!("nothing with array.oem: by the dates of the files it is {dated_s}");
+            let expected =
+                format!("nothing with array.oem or array.stations: by their dates it is {dated_s}");
             checks.number("epoch_tai_s", given_s, given_s == default_s || given_s == dated_s, expected);
             let date = utc_text(dated_s);
             let is_representable = (0.0..=3.0e9).contains(&dated_s);
             let expected = "an epoch from 1958 to 2053, which is what the packets' time code holds";
             checks.require(
                 "epoch_tai_s",
-                format_args!("(by the files of array.oem) {date} UTC"),
+                format_args!("(by array.oem or array.stations_epoch) {date} UTC"),
                 is_representable,
                 expected,
             );
@@ -211,11 +212,22 @@ impl Config {
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
         ] {
             let expected = format!(
-                "{expected} with array.kepler, array.oem, array.propagate, array.eccentricity or array.cross_track_ratio: the \
+                "{expected} with array.kepler, array.oem, array.stations, array.propagate, array.eccentricity or array.cross_track_ratio: the \
                      other needs a common circle"
             );
             checks.require(key, value, good, expected);
         }
+        let reflection = spacecraft.moon_reflection;
+        let is_possible = reflection == 0.0 || !self.array.is_on_surface();
+        let expected = "0 with array.stations: images in the ground under an antenna are part of its pattern";
+        checks.require("spacecraft.moon_reflection", reflection, is_possible, expected);
+        let is_possible = isotropic || !self.array.is_on_surface();
+        let expected = "\"isotropic\" with array.stations: dipoles are normal to an orbit";
+        checks.require("spacecraft.antenna", "(dipoles)", is_possible, expected);
+        let rate = self.downlink.rate_bits_per_s_max;
+        let is_possible = rate == 0.0 || !self.array.is_on_surface();
+        let expected = "0 with array.stations: they observe while the Earth is hidden, and a relay that is not simulated takes the data";
+        checks.require("downlink.rate_bits_per_s_max", rate, is_possible, expected);
     }
 
     /// Requires settings that are possible with three dipoles, and with antenna errors.
@@ -293,6 +305,9 @@ impl Config {
     pub fn space_hash(&self) -> u64 {
         let Self { name, seed, sky, array, daughters, instrument, navigation, spacecraft, .. } = self;
         let (mut sky, mut array) = (sky.clone(), array.clone());
+        if let Some(path) = array.stations.file() {
+            array.stations = Stations::File(content_checksum(path));
+        }
         array.oem = array.oem.iter().map(|path| content_checksum(path)).collect();
         sky.file = sky.file.map(|files| files.map(|path| content_checksum(path)));
         if let Some(added) = &mut sky.added {

@@ -4,6 +4,7 @@
 //! frame the fringe pattern depends only on the baseline's length and on both satellites' radii and angles in the plane, and is
 //! mirror-symmetric in the plane.
 
+use crate::array::is_underground;
 use crate::response::harmonic::GeometryRefusal;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub};
 
@@ -34,7 +35,7 @@ impl PairView {
         if !(baseline_m + radii_m[0] + radii_m[1]).is_finite() {
             return Err(GeometryRefusal::NotFinite);
         }
-        if radii_m.iter().any(|radius_m| *radius_m <= moon_radius_m) {
+        if [r_i_m, r_j_m].iter().any(|r_m| is_underground(*r_m, moon_radius_m)) {
             return Err(GeometryRefusal::Altitude);
         }
         let y = scale(1.0 / baseline_m, difference);
@@ -48,7 +49,7 @@ impl PairView {
             axes: [x, y, cross(x, y)],
             baseline_m,
             angle_rad: [r_i_m, r_j_m].map(|r_m| dot(r_m, y).atan2(dot(r_m, x))),
-            cos_limb: radii_m.map(|radius_m| (1.0 - (moon_radius_m / radius_m).powi(2)).sqrt()),
+            cos_limb: radii_m.map(|radius_m| (1.0 - (moon_radius_m / radius_m).powi(2)).max(0.0).sqrt()),
         };
         // Otherwise the Moon would hide two separate regions.
         if view.cos_limb.iter().any(|cos_limb| 1.01 * view.half_separation_rad() > cos_limb.acos()) {

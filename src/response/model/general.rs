@@ -190,6 +190,73 @@ mod tests {
         assert!(error < 1e-4 * scale && error > 0.0, "{error} of {scale}");
     }
 
+    /// Three stations on the far side, 106 and 182 m apart.
+    fn stations(epoch: &str) -> Array {
+        use crate::array::{Station, Stations};
+        let places = [(170.0, -30.0, 0.0), (170.004, -30.0, 12.0), (170.0, -29.994, -4.0)];
+        let station =
+            |(longitude_deg, latitude_deg, height_m)| Station { longitude_deg, latitude_deg, height_m };
+        let stations = Stations::List(places.map(station).to_vec());
+        let config =
+            ArrayConfig { satellites: 3, stations, stations_epoch: epoch.into(), ..ArrayConfig::default() };
+        Array::new(&config).unwrap()
+    }
+
+    #[test]
+    fn stations_see_what_other_code_says() {
+        // Three pixels of nside 4, above and below the horizon as the Moon turns, at 10 MHz; real and imaginary parts of pairs 1-2, 1-3, 2-3.
+        // pyuvsim 1.4.2 with lunarsky 1.0.1 (JPL's DE421): twice XX of `run_uvsim` on UniformBeam, world moon, the pixels' centres as sources of area * T
+        // Jy; they are `sum(area * T * exp(-2j pi f / c n @ (r_i - r_j)))` over pixels with `n @ r > 0`, to 1e-5.
+        let mut sky = vec![0.0; 192];
+        for (pixel, kelvin) in [(10, 1e4), (97, 2e4), (150, 5e3)] {
+            sky[pixel] = kelvin;
+        }
+        let sky = SkyMap::new(Frame::Ecliptic, sky).unwrap();
+        let area_sr = 4.0 * std::f64::consts::PI / 192.0;
+        for (epoch, expected, seen_k) in [
+            ("2030-01-01T00:00:00", [[-1125.77, 606.21], [-585.01, -1393.12], [-273.96, 1532.75]], 2.5e4),
+            ("2030-01-09T12:00:00", [[278.89, 171.22], [24.12, -326.36], [-150.20, -290.75]], 5e3),
+            ("2030-01-20T03:00:00", [[0.0; 2]; 3], 0.0),
+            ("2039-06-01T00:00:00", [[-220.03, -1290.37], [662.39, 1129.03], [-1224.31, 463.19]], 2e4),
+        ] {
+            let array = stations(epoch);
+            let place = |[i, j]: [usize; 2]| PairPosition {
+                r_i_m: array.position_m(i, 0.0),
+                r_j_m: array.position_m(j, 0.0),
+                span_rad: 0.0,
+                pair_time: None,
+            };
+            let mut found = [Complex64::ZERO; 3];
+            DirectSum::new(&sky, 1e7, array.moon_radius_m(), AntennaResponse::Isotropic)
+                .predict(&[[0, 1], [0, 2], [1, 2]].map(place), &mut found)
+                .unwrap();
+            for (found, [re, im]) in found.into_iter().zip(expected) {
+                let off = (found - Complex64::new(re, im)).norm();
+                // The orientation is good to 0.005 deg, 8.7e-5 rad: 3.3e-3 rad of phase over 182 m, 6 wavelengths. Values have two decimals,
+                // sums of f32 some 1e-6.
+                assert!(off <= 3.4e-3 * area_sr * seen_k + 0.01, "{epoch}: {found} {re} {im}");
+            }
+        }
+    }
+
+    #[test]
+    fn harmonics_from_the_ground_are_direct_sums() {
+        let array = stations("2030-01-01T00:00:00");
+        let (map, alm) = sky();
+        let moon_m = array.moon_radius_m();
+        let places = positions(&array, 40);
+        let mut found = vec![Complex64::ZERO; places.len()];
+        let mut expected = found.clone();
+        GeneralSum::new(&map, alm, 1e7, moon_m, None).unwrap().predict(&places, &mut found).unwrap();
+        DirectSum::new(&map, 1e7, moon_m, AntennaResponse::Isotropic)
+            .predict(&places, &mut expected)
+            .unwrap();
+        let error = rms(found.iter().zip(&expected).map(|(a, b)| (a - b).norm()));
+        // As off the circle above: the horizon, of 6.3 rad, crosses some 1,000 pixels.
+        assert!(error < 0.06, "{error}");
+        assert!(rms(expected.iter().map(|v| v.norm())) > 3.0);
+    }
+
     #[test]
     fn powers_are_those_of_a_sky_above_the_limb() {
         let array = Array::new(&ArrayConfig::default()).unwrap();
