@@ -277,7 +277,12 @@ impl Accumulator {
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        state.engine.remove(&short)
+        if let (Engine::Harmonic(engine), Some(realisations)) = (&state.engine, &mut state.realisations) {
+            realisations.remove(engine, &short);
+        }
+        let removed = state.engine.remove(&short)?;
+        self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
+        Ok(removed)
     }
 
     /// Sets the first and last mission time, s, of the data in each channel, and drops channels without a span.

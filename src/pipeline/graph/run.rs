@@ -164,7 +164,7 @@ pub fn run_with_ranks(
     let file = out.join(downlink_file(plan.config.downlink.format));
     let recorder = if ranks.is_first() {
         write_settings(&plan.config, out)?;
-        write_instrument_truth(plan, &file)?;
+        write_truth(plan, &file)?;
         Some(Recorder::create(&file)?)
     } else {
         None
@@ -217,7 +217,7 @@ pub fn simulate(
         return Err(DownlinkError::from(SocketError::NoTruthFile).into());
     }
     if let Some(file) = &destination.file {
-        write_instrument_truth(plan, file)?;
+        write_truth(plan, file)?;
     }
     let recorder = match &destination.file {
         Some(file) => Some(Recorder::create(file)?),
@@ -387,13 +387,17 @@ pub(in crate::pipeline) fn add_link(
     })
 }
 
-/// Writes the true errors of the instrument beside a downlink file, if it has any.
-pub(in crate::pipeline) fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
-    let Some(text) = plan.instrument_truth() else { return Ok(()) };
-    let mut name = file.as_os_str().to_owned();
-    name.push(".instrument.csv");
-    let path = PathBuf::from(name);
-    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+/// Writes the true errors of the instrument and the true bursts beside a downlink file, if there are any.
+pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
+    let tables = [(".instrument.csv", plan.instrument_truth()), (".moving.csv", plan.moving_truth())];
+    for (ending, text) in tables {
+        let Some(text) = text else { continue };
+        let mut name = file.as_os_str().to_owned();
+        name.push(ending);
+        let path = PathBuf::from(name);
+        write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?;
+    }
+    Ok(())
 }
 
 /// Writes all settings of a run beside its products, as a pipeline file that repeats the run.
