@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AntennaGains, BurstChoice, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck};
+use super::{
+    AntennaGains, BurstChoice, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck,
+};
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum number of sub-bands of a channel.

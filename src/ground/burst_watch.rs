@@ -19,10 +19,12 @@ const GAP_S: f64 = 600.0;
 /// Maximum number of visibilities that are kept, some 110 MB; beyond it those of the pass so far are judged without the rest.
 const VISIBILITIES_MAX: usize = 1 << 20;
 
-/// A block of visibilities in the sums, and the packet that brought it.
+/// A block of visibilities, and the packet that brought it.
 pub(super) struct WatchedBlock {
     pub(super) placed: PlacedVisibilities,
     pub(super) sent: Option<SendingKey>,
+    /// Whether some are in the sums.
+    pub(super) is_used: bool,
 }
 
 /// The visibilities of the open pass, by channel.
@@ -41,22 +43,22 @@ impl BurstWatch {
             PlacedFrame::Visibilities(placed) => {
                 let Some([from_s, until_s]) = self.span_s else { return false };
                 let ends = placed.time_s.first().zip(placed.time_s.last());
-                let is_apart = ends.is_some_and(|(first, last)| *first > until_s + GAP_S || *last < from_s - GAP_S);
+                let is_apart =
+                    ends.is_some_and(|(first, last)| *first > until_s + GAP_S || *last < from_s - GAP_S);
                 is_apart || self.visibilities + placed.len() > VISIBILITIES_MAX
             }
             _ => false,
         }
     }
 
-    /// Keeps a copy of visibilities that enter the sums.
-    pub(super) fn keep(&mut self, frame: &PlacedFrame, packets: &[DeliveredPacket]) {
-        let PlacedFrame::Visibilities(placed) = frame else { return };
+    /// Keeps visibilities of a mapped channel; `is_used` tells whether some are in the sums.
+    pub(super) fn keep(&mut self, placed: PlacedVisibilities, packets: &[DeliveredPacket], is_used: bool) {
         let Some((&first, &last)) = placed.time_s.first().zip(placed.time_s.last()) else { return };
         let [from_s, until_s] = self.span_s.unwrap_or([first, last]);
         self.span_s = Some([from_s.min(first), until_s.max(last)]);
         self.visibilities += placed.len();
         let sent = packets.first().map(|packet| (packet.header.time, packet.header.count));
-        self.channels.entry(placed.channel).or_default().push(WatchedBlock { placed: placed.clone(), sent });
+        self.channels.entry(placed.channel).or_default().push(WatchedBlock { placed, sent, is_used });
     }
 
     /// Ends the open pass: adds its bursts to a table, and returns the blocks of channels with bursts.

@@ -273,8 +273,16 @@ impl Ground {
             if self.burst_watch.is_ended_by(&placed) {
                 self.end_pass()?;
             }
-            self.burst_watch.keep(&placed, packets);
+            let watched = match &placed {
+                PlacedFrame::Visibilities(placed) if self.accumulator.maps(placed.channel) => {
+                    Some(placed.clone())
+                }
+                _ => None,
+            };
             draft.used_s = self.accumulator.accept(placed, out)?;
+            if let Some(watched) = watched {
+                self.burst_watch.keep(watched, packets, draft.used_s.is_some());
+            }
         }
         if let Some(archive) = &mut self.archive {
             let posted = archive.record(packets, draft, self.calibrator.ephemeris());
@@ -289,9 +297,9 @@ impl Ground {
         let search =
             BurstSearch { moon_radius_m: instrument.moon_radius_m, epoch_tai_s: instrument.epoch_tai_s };
         let bursts = self.outcome.bursts.clone();
-        for WatchedBlock { placed, sent } in self.burst_watch.end(search, &bursts) {
+        for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
             let Some([outside, inside]) = bursts.divided(&placed) else { continue };
-            let removed = self.accumulator.remove(&inside)?.visibilities;
+            let removed = if is_used { self.accumulator.remove(&inside)?.visibilities } else { 0 };
             self.outcome.ledger.reflag(VisibilityReason::Burst, removed);
             if let Some((archive, sent)) = self.archive.as_mut().zip(sent) {
                 archive.reflag(sent, &outside, removed);

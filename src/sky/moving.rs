@@ -150,7 +150,9 @@ impl MovingSource {
         checks.number(key("peak_jy"), peak_jy, (0.0..=1e15).contains(&peak_jy), "0 to 1e15 Jy");
         let hz = self.reference_hz;
         checks.number(key("reference_hz"), hz, (1e3..=1e10).contains(&hz), "1 kHz to 10 GHz");
-        for (name, value) in [("spectral_index", self.spectral_index), ("duration_index", self.duration_index)] {
+        for (name, value) in
+            [("spectral_index", self.spectral_index), ("duration_index", self.duration_index)]
+        {
             checks.number(key(name), value, value.abs() <= 5.0, "-5 to 5");
         }
         for (name, value) in [("rise_s", self.rise_s), ("decay_s", self.decay_s), ("drift_s", self.drift_s)] {

@@ -40,7 +40,7 @@ const BIN_S: [f64; 2] = [10.0, 300.0];
 const BRIGHTEST: usize = 3;
 
 /// Number of visibilities of a pair in a bin that a position is found with.
-const SAMPLES_OF_PAIR: usize = 4;
+const SAMPLES_OF_PAIR: usize = 2;
 
 /// Limit of the number of bins. Time tags are untrusted.
 const BINS_MAX: f64 = 1e5;
@@ -189,7 +189,9 @@ fn describe(
     let (peak, first) = (*brightest.first()?, pairs.first()?.first()?);
     let samples: Vec<Vec<Sample>> = brightest
         .iter()
-        .map(|bin| pairs.iter().flat_map(|pair| samples_of(pair, |time_s| bins.bin(time_s) == *bin)).collect())
+        .map(|bin| {
+            pairs.iter().flat_map(|pair| samples_of(pair, |time_s| bins.bin(time_s) == *bin)).collect()
+        })
         .collect();
     let peak_s = bins.start_s(peak) + 0.5 * bins.width_s;
     let sun_hat = sun_hat_by_date(search.epoch_tai_s, peak_s);
@@ -250,7 +252,9 @@ mod tests {
                 pair,
                 time_s: (0..800).map(|k| 10.0 * f64::from(k)).collect(),
                 // The level of each pair is its own.
-                value_k_sr: (0..800).map(|_| Complex64::new(normal(), normal()) * f64::from(pair.j)).collect(),
+                value_k_sr: (0..800)
+                    .map(|_| Complex64::new(normal(), normal()) * f64::from(pair.j))
+                    .collect(),
                 ..PlacedVisibilities::default()
             };
             let blocks: Vec<PlacedVisibilities> = all_pairs(8).into_iter().map(&mut block).collect();

@@ -8,17 +8,18 @@ mod locate;
 
 pub use detect::{BurstSearch, find_bursts};
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bincode::{Decode, Encode};
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, Serializer};
 
 use crate::frames::PlacedVisibilities;
 use crate::units::{ChannelId, Dimension};
 
-/// Maximum number of bursts in a table, 5 MB. Later ones are found, and stay in the maps.
-const BURSTS_MAX: usize = 32_768;
+/// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
+const BURSTS_MAX: usize = 1 << 18;
 
 /// What is done with bursts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -97,7 +98,10 @@ impl fmt::Display for FoundBurst {
         write!(f, "{:.2e} Jy, {:.0} sigma", self.flux_jy, self.significance)?;
         if let Some([longitude, latitude]) = self.positions_deg.first() {
             let sigma = self.position_sigma_deg;
-            write!(f, ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {sigma:.2})")?;
+            write!(
+                f,
+                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {sigma:.2})"
+            )?;
             match self.positions_deg.len() - 1 {
                 0 => {}
                 others => write!(f, " or {others} other direction(s)")?,
@@ -105,6 +109,66 @@ impl fmt::Display for FoundBurst {
         }
         if let Some(name) = &self.name {
             write!(f, ": {name}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Maximum number of bursts that a summary lists.
+const LISTED_MAX: usize = 1000;
+
+/// Summary of the bursts of a run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BurstSummary {
+    /// Whether their visibilities are left out.
+    pub action: BurstChoice,
+    /// Number of bursts, counted in each channel.
+    pub found: u64,
+    /// Channels with bursts.
+    pub channels: Vec<BurstHours>,
+    /// The bursts; a thousand of them in JSON.
+    #[serde(serialize_with = "first_bursts")]
+    pub bursts: Vec<FoundBurst>,
+}
+
+fn first_bursts<S: Serializer>(bursts: &[FoundBurst], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(bursts.iter().take(LISTED_MAX))
+}
+
+/// Time of the bursts in a channel: what is lost, if they are left out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct BurstHours {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Number of bursts.
+    pub found: u64,
+    /// Total length, h.
+    pub hours: f64,
+}
+
+impl BurstSummary {
+    /// The summary of some bursts; `None` if there are none.
+    #[must_use]
+    pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
+        let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
+        for burst in &bursts {
+            let empty = BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0 };
+            let channel = channels.entry(burst.channel).or_insert(empty);
+            channel.found += 1;
+            channel.hours += burst.length_s() / 3600.0;
+        }
+        let found = bursts.len() as u64;
+        (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
+    }
+}
+
+impl fmt::Display for BurstSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let what = if self.action.is_flag() { "left out" } else { "kept in the maps" };
+        write!(f, "{} bursts, {what}:", self.found)?;
+        for BurstHours { frequency_hz, found, hours } in &self.channels {
+            let hz = Dimension::Frequency.show(*frequency_hz);
+            write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours")?;
         }
         Ok(())
     }
@@ -122,6 +186,32 @@ struct BurstTable {
     bursts: Vec<FoundBurst>,
     /// Number of bursts of earlier sessions.
     earlier: usize,
+    /// Starts and indices of the bursts of each channel, in the order of time.
+    starts: BTreeMap<u16, Vec<(f64, usize)>>,
+    /// Length of the longest burst, s.
+    longest_s: f64,
+}
+
+impl BurstTable {
+    fn add(&mut self, burst: FoundBurst) {
+        self.longest_s = self.longest_s.max(burst.length_s());
+        let starts = self.starts.entry(burst.channel).or_default();
+        let at = starts.partition_point(|(from_s, _)| *from_s <= burst.from_s);
+        starts.insert(at, (burst.from_s, self.bursts.len()));
+        self.bursts.push(burst);
+    }
+
+    /// The bursts in the time of a block, and perhaps some beside it.
+    fn about(&self, placed: &PlacedVisibilities) -> Vec<&FoundBurst> {
+        let starts = self.starts.get(&placed.channel.0).map(Vec::as_slice).unwrap_or_default();
+        let Some((&first, &last)) = placed.time_s.first().zip(placed.time_s.last()) else {
+            return Vec::new();
+        };
+        let half_s = 0.5 * placed.duration_s.iter().copied().fold(0.0, f32::max) as f64;
+        let from = starts.partition_point(|(from_s, _)| *from_s < first - half_s - self.longest_s);
+        let until = starts.partition_point(|(from_s, _)| *from_s <= last + half_s);
+        starts[from..until.max(from)].iter().map(|(_, index)| &self.bursts[*index]).collect()
+    }
 }
 
 impl FoundBursts {
@@ -141,12 +231,18 @@ impl FoundBursts {
         self.choice.is_flag()
     }
 
+    /// What is done with bursts.
+    #[must_use]
+    pub fn choice(&self) -> BurstChoice {
+        self.choice
+    }
+
     /// Adds a burst; returns whether there was room.
     pub fn add(&self, burst: FoundBurst) -> bool {
         let mut table = self.table();
         let has_room = table.bursts.len() < BURSTS_MAX;
         if has_room {
-            table.bursts.push(burst);
+            table.add(burst);
         }
         has_room
     }
@@ -154,8 +250,8 @@ impl FoundBursts {
     /// Resumes with the bursts of earlier sessions.
     pub fn resume(&self, bursts: Vec<FoundBurst>) {
         let mut table = self.table();
-        table.earlier = bursts.len();
-        table.bursts = bursts;
+        *table = BurstTable { earlier: bursts.len(), ..BurstTable::default() };
+        bursts.into_iter().for_each(|burst| table.add(burst));
     }
 
     /// All bursts, in the order in which they were found.
@@ -190,8 +286,9 @@ impl FoundBursts {
             return None;
         }
         let table = self.table();
-        let in_burst = |k: usize| table.bursts.iter().any(|burst| burst.holds(placed, k));
-        if table.bursts.is_empty() || !(0..placed.len()).any(in_burst) {
+        let bursts = table.about(placed);
+        let in_burst = |k: usize| bursts.iter().any(|burst| burst.holds(placed, k));
+        if bursts.is_empty() || !(0..placed.len()).any(in_burst) {
             return None;
         }
         let mut parts = [placed.without_visibilities(), placed.without_visibilities()];

@@ -20,7 +20,13 @@ const SEARCH: BurstSearch = BurstSearch { moon_radius_m: 1_737_100.0, epoch_tai_
 
 /// Visibilities of a pass of 3000 s from `from_s` on: Gaussian noise in place of a steady sky, independent from one to the next, and a
 /// source of power `k_sr(t)`.
-fn pass(array: &Array, seed: u64, from_s: f64, n_hat: Vec3, k_sr: impl Fn(f64) -> f64) -> Vec<PlacedVisibilities> {
+fn pass(
+    array: &Array,
+    seed: u64,
+    from_s: f64,
+    n_hat: Vec3,
+    k_sr: impl Fn(f64) -> f64,
+) -> Vec<PlacedVisibilities> {
     let mut stream = ChaCha8Rng::seed_from_u64(seed);
     let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
     let mut block = |pair| {
@@ -79,7 +85,8 @@ fn a_bright_burst_is_found_where_and_when_it_is() {
     // By then the power is below 1 % of the steady sky's visibilities: 3.3e7 exp(-t / 11.5) < 400 K sr after 130 s.
     assert!((start_s + 130.0..start_s + 250.0).contains(&burst.until_s), "{} {start_s}", burst.until_s);
     assert!((start_s..start_s + 30.0).contains(&burst.peak_s));
-    let off_deg = |[longitude, latitude]: &[f64; 2]| norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees();
+    let off_deg =
+        |[longitude, latitude]: &[f64; 2]| norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees();
     let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
     assert!(nearest_deg < 0.1 && burst.position_sigma_deg < 0.1, "{nearest_deg} {burst:?}");
     // The mean over the peak's bin: the light curve rises and falls within it.
@@ -95,9 +102,12 @@ fn positions_are_within_their_errors() {
     let mut within = 0;
     for seed in 0..10 {
         // Five times the steady sky: the signal-to-noise ratio is some 5 sqrt(2 * 28 * 3).
-        let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 5.0 * STEADY_K_SR } else { 0.0 };
+        let k_sr =
+            |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 5.0 * STEADY_K_SR } else { 0.0 };
         let [burst] = &found(&pass(&array, seed, from_s, n_hat, k_sr))[..] else { panic!("{seed}") };
-        let off_deg = |[longitude, latitude]: &[f64; 2]| norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees();
+        let off_deg = |[longitude, latitude]: &[f64; 2]| {
+            norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees()
+        };
         let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
         // 99 % of positions lie within 3.03 standard deviations of the worst axis.
         within += i32::from(nearest_deg < 3.03 * burst.position_sigma_deg);
@@ -114,7 +124,8 @@ fn bursts_are_found_from_the_stated_power_on_and_quiet_passes_have_none() {
     let n_hat = direction(10.0, 50.0);
     let from_s = seen_from_s(&array, n_hat);
     let count = |factor: f64| {
-        let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { factor * STEADY_K_SR } else { 0.0 };
+        let k_sr =
+            |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { factor * STEADY_K_SR } else { 0.0 };
         (0..8).filter(|seed| !found(&pass(&array, 100 + seed, from_s, n_hat, k_sr)).is_empty()).count()
     };
     // The ratio of 8 to the quartile is 8 * 2 ln 2 = 11.1 times the mean square: a power of 3.3 times the rms.

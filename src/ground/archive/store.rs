@@ -70,12 +70,7 @@ impl Archive {
 
     /// Records that visibilities of an applied packet were taken out of the sums, as they lie in a burst; `outside` are the others of
     /// those offered to the sums.
-    pub(in crate::ground) fn reflag(
-        &mut self,
-        sent: SendingKey,
-        outside: &PlacedVisibilities,
-        removed: u64,
-    ) {
+    pub(in crate::ground) fn reflag(&mut self, sent: SendingKey, outside: &PlacedVisibilities, removed: u64) {
         let Some(record) = self.journal.visibilities.get_mut(&sent) else { return };
         (record.digest, record.offered) = (digest(outside), outside.len() as u32);
         record.accumulated = record.accumulated.saturating_sub(removed as u32);

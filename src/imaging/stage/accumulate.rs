@@ -264,6 +264,12 @@ impl Accumulator {
         Ok(())
     }
 
+    /// Whether visibilities of a channel are accumulated.
+    #[must_use]
+    pub fn maps(&self, channel: ChannelId) -> bool {
+        self.group.as_ref().is_none_or(|group| group.contains(&channel)) && self.config.is_mapped(channel)
+    }
+
     /// Removes visibilities from their channel without posting to the ledger.
     ///
     /// Visibilities beyond the map's longest baseline were never added: they are neither removed nor refused.
@@ -391,8 +397,7 @@ impl Accumulator {
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
-        let is_in_group = self.group.as_ref().is_none_or(|group| group.contains(&placed.channel));
-        if !is_in_group || !self.config.is_mapped(placed.channel) {
+        if !self.maps(placed.channel) {
             self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }

@@ -256,13 +256,28 @@ impl Config {
         let spacecraft = &self.spacecraft;
         let is_plain = spacecraft.antenna != Antenna::DipoleNormal || self.array.is_circle();
         for (key, value, good, expected) in [
-            ("spacecraft.fidelity", "\"samples\"", spacecraft.fidelity == Fidelity::Visibilities, "\"visibilities\""),
+            (
+                "spacecraft.fidelity",
+                "\"samples\"",
+                spacecraft.fidelity == Fidelity::Visibilities,
+                "\"visibilities\"",
+            ),
             ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
             ("spacecraft.moon_reflection", "(above 0)", spacecraft.moon_reflection == 0.0, "0"),
-            ("spacecraft.antenna", "\"dipole-normal\"", is_plain, "another antenna, or daughters on one circle,"),
+            (
+                "spacecraft.antenna",
+                "\"dipole-normal\"",
+                is_plain,
+                "another antenna, or daughters on one circle,",
+            ),
             ("instrument", "(errors of antennas)", !self.instrument.has_own_antennas(), "ideal antennas"),
         ] {
-            checks.require(key, value, good, format!("{expected} with sky.moving, which is not simulated otherwise"));
+            checks.require(
+                key,
+                value,
+                good,
+                format!("{expected} with sky.moving, which is not simulated otherwise"),
+            );
         }
     }
 

@@ -11,6 +11,7 @@ use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
 use super::{ground_segment, space_segment};
+use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
@@ -558,6 +559,7 @@ pub(in crate::pipeline) fn collect_summary(
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();
+    summary.bursts = BurstSummary::new(ground.bursts.choice(), ground.bursts.list());
     let gains = ground.gains.as_ref().map(|gains| GainsWriter::new(config, out).write(gains));
     summary.calibration = gains.transpose()?;
     Ok(summary)

@@ -1,0 +1,133 @@
+//! Bursts of the Sun through the whole chain: made, found, left out of the map.
+
+use std::path::Path;
+
+use lunarray::downlink::{DownlinkConfig, DownlinkReader};
+use lunarray::frames::{GroundFrame, VisibilityBlock};
+use serde_json::Value;
+
+use super::common::downlink::transmit;
+use super::common::workplace::{Workplace, fail, json, succeed};
+
+/// Two days at 10 MHz, all visibilities.
+const MISSION: &str = r#"
+name = "bursts"
+seed = 5
+[sky]
+nside = 8
+[spacecraft]
+channels_hz = [10.0e6]
+duration_s = 172_800.0
+baseline_wavelengths_max = 300.0
+[map]
+nside = 8
+[products]
+pictures = false
+"#;
+
+/// A type III burst of 1e8 Jy at 10 MHz, while the Sun is in sight.
+const BURST: &str = "sky.moving=[{ direction = 'sun', starts_s = [START], peak_jy = 1e8 }]";
+
+/// Mean of rho_l of the map from l = 1 to 8.
+fn rho(summary: &Value) -> f64 {
+    let rho = summary["channels"][0]["rho"].as_array().unwrap();
+    (1..=8).map(|l| rho[l].as_f64().unwrap()).sum::<f64>() / 8.0
+}
+
+fn without(block: &mut VisibilityBlock, [from_s, until_s]: [f64; 2]) {
+    let half_s = |k: usize| 0.5e-6 * f64::from(block.duration_ticks[k]);
+    let is_in =
+        |k: &usize| block.middle_s(*k) + half_s(*k) > from_s && block.middle_s(*k) - half_s(*k) < until_s;
+    let kept: Vec<usize> = (0..block.len()).filter(|k| !is_in(k)).collect();
+    let mut less = VisibilityBlock {
+        channel: block.channel,
+        pair: block.pair,
+        start: block.start,
+        ..Default::default()
+    };
+    for k in kept {
+        less.offset_ticks.push(block.offset_ticks[k]);
+        less.duration_ticks.push(block.duration_ticks[k]);
+        less.value_k_sr.push(block.value_k_sr[k]);
+        less.weight.push(block.weight[k]);
+        less.flags.push(block.flags[k]);
+    }
+    *block = less;
+}
+
+/// The frames of a downlink, without the visibilities in a span of time.
+fn frames_without(file: &str, span_s: [f64; 2]) -> Vec<GroundFrame> {
+    let mut reader = DownlinkReader::open(Path::new(file)).unwrap();
+    let mut frames = Vec::new();
+    while let Some(mut frame) = reader.next_frame().unwrap() {
+        if let GroundFrame::Visibilities(block) = &mut frame {
+            without(block, span_s);
+            if block.is_empty() {
+                continue;
+            }
+        }
+        frames.push(frame);
+    }
+    frames
+}
+
+#[test]
+fn a_burst_of_the_sun_is_found_named_and_left_out() {
+    let place = Workplace::new(MISSION);
+    let run = |name: &str, more: &[&str]| {
+        json(&[&["run", &place.pipeline, "--out", &place.path(name)], more].concat())
+    };
+    let quiet = run("quiet", &[]);
+    assert_eq!(quiet["bursts"], Value::Null);
+    let flagged = run("flag", &["--set", BURST]);
+    let kept = run("keep", &["--set", BURST, "--set", "calibration.bursts=keep"]);
+    let [of_quiet, of_flagged, of_kept] = [&quiet, &flagged, &kept].map(rho);
+    assert!((of_flagged - of_quiet).abs() < 0.01, "{of_quiet} {of_flagged} {of_kept}");
+    assert!(of_kept < of_quiet - 0.1, "{of_quiet} {of_flagged} {of_kept}");
+
+    let found = &flagged["bursts"];
+    assert_eq!((&found["action"], &found["found"]), (&"flag".into(), &1.into()));
+    let burst = &found["bursts"][0];
+    assert_eq!(burst["name"], "sun");
+    let number = |key: &str| burst[key].as_f64().unwrap();
+    // The truth has the peak and the flux density; a bin is at least 10 s wide, and its mean less than the peak.
+    let truth = std::fs::read_to_string(place.path("flag/downlink.ccsds.moving.csv")).unwrap();
+    let line: Vec<&str> = truth.lines().nth(1).unwrap().split(',').collect();
+    let peak_s: f64 = line[4].parse().unwrap();
+    assert!((number("peak_s") - peak_s).abs() < 30.0, "{truth} {burst}");
+    assert!(number("flux_jy") > 1e7 && number("flux_jy") < 1e8, "{burst}");
+    let hours = found["channels"][0]["hours"].as_f64().unwrap();
+    assert!(
+        (3600.0 * hours - (number("until_s") - number("from_s"))).abs() < 1e-6 && hours < 0.15,
+        "{found}"
+    );
+    let reasons = &flagged["ledger"]["flagged"];
+    let left_out = reasons["burst of a point source"].as_u64().unwrap();
+    assert!(left_out > 100, "{reasons}");
+    assert_eq!(kept["ledger"]["flagged"]["burst of a point source"], Value::Null);
+
+    // A ground that never had these visibilities makes the same map.
+    let frames = frames_without(&place.path("flag/downlink.ccsds"), ["from_s", "until_s"].map(number));
+    let never = place.file("never.ccsds", &transmit(&frames, &DownlinkConfig::default()));
+    let out = place.path("never");
+    succeed(&["replay", &never, "--map", &place.pipeline, "--out", &out]);
+    for name in ["map.fits", "noise.fits"] {
+        let bytes = |run: &str| std::fs::read(place.path(&format!("{run}/10.000MHz/{name}"))).unwrap();
+        assert!(bytes("flag") == bytes("never"), "{name}");
+    }
+}
+
+#[test]
+fn what_is_not_simulated_is_refused() {
+    let place = Workplace::new(MISSION);
+    for (key, value) in [
+        ("spacecraft.fidelity", "samples"),
+        ("spacecraft.moon_reflection", "0.07"),
+        ("spacecraft.ninth.on", "true"),
+        ("instrument.pattern.constant_rms", "0.1"),
+    ] {
+        let set = format!("{key}={value}");
+        let text = fail(&["check", &place.pipeline, "--set", BURST, "--set", &set]);
+        assert!(text.contains("with sky.moving, which is not simulated otherwise"), "{key}: {text}");
+    }
+}
