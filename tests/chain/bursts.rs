@@ -9,16 +9,17 @@ use serde_json::Value;
 use super::common::downlink::transmit;
 use super::common::workplace::{Workplace, fail, json, succeed};
 
-/// Two days at 10 MHz, all visibilities.
+/// A day at 10 MHz, with daughters near each other, as a map of nside 8 asks for.
 const MISSION: &str = r#"
 name = "bursts"
 seed = 5
 [sky]
 nside = 8
+[array]
+arcs_m = [15.0, 32.0, 52.0, 80.0, 120.0, 170.0, 240.0]
 [spacecraft]
 channels_hz = [10.0e6]
-duration_s = 172_800.0
-baseline_wavelengths_max = 300.0
+duration_s = 86_400.0
 [map]
 nside = 8
 [products]
@@ -26,7 +27,7 @@ pictures = false
 "#;
 
 /// A type III burst of 1e8 Jy at 10 MHz, while the Sun is in sight.
-const BURST: &str = "sky.moving=[{ direction = 'sun', starts_s = [START], peak_jy = 1e8 }]";
+const BURST: &str = "sky.moving=[{ direction = 'sun', starts_s = [38_000.0], peak_jy = 1e8 }]";
 
 /// Mean of rho_l of the map from l = 1 to 8.
 fn rho(summary: &Value) -> f64 {
@@ -115,6 +116,28 @@ fn a_burst_of_the_sun_is_found_named_and_left_out() {
         let bytes = |run: &str| std::fs::read(place.path(&format!("{run}/10.000MHz/{name}"))).unwrap();
         assert!(bytes("flag") == bytes("never"), "{name}");
     }
+}
+
+#[test]
+fn a_state_knows_its_bursts_and_gives_their_packets_back() {
+    let place = Workplace::new(MISSION);
+    let file = place.simulate("bursts.ccsds", &["--set", BURST]);
+    let state = place.path("state");
+    let replay = |name: &str, more: &[&str]| {
+        json(&[&["replay", &file, "--map", &place.pipeline, "--out", &place.path(name)], more].concat())
+    };
+    let maps = |name: &str| std::fs::read(place.path(&format!("{name}/10.000MHz/map.fits"))).unwrap();
+    let once = replay("once", &[]);
+    let [first, again] = ["first", "again"].map(|name| replay(name, &["--state", &state]));
+    assert!(maps("once") == maps("first") && maps("once") == maps("again"));
+    for later in [&first, &again] {
+        assert_eq!(later["ledger"], once["ledger"]);
+        assert_eq!(later["bursts"], once["bursts"]);
+    }
+    // What is subtracted is what is in the sums: the visibilities in the burst are not.
+    let report = json(&["retract", &file, "--state", &state, "--map", &place.pipeline, "--from-s", "0"]);
+    assert_eq!(report["refused"], 0);
+    assert_eq!(report["accumulated"], once["ledger"]["accumulated"]);
 }
 
 #[test]
