@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::common::downlink::transmit;
 use super::common::workplace::{Workplace, fail, json, succeed};
 
-/// A day at 10 MHz, with daughters near each other, as a map of nside 8 asks for.
+/// Three passes at 10 MHz, with daughters near each other, as a map of nside 8 asks for.
 const MISSION: &str = r#"
 name = "bursts"
 seed = 5
@@ -19,9 +19,12 @@ nside = 8
 arcs_m = [15.0, 32.0, 52.0, 80.0, 120.0, 170.0, 240.0]
 [spacecraft]
 channels_hz = [10.0e6]
-duration_s = 86_400.0
+duration_s = 46_000.0
+every_nth_window = 2
+model = "harmonic"
 [map]
 nside = 8
+epsilon = 1e-6
 [products]
 pictures = false
 "#;
@@ -72,6 +75,36 @@ fn frames_without(file: &str, span_s: [f64; 2]) -> Vec<GroundFrame> {
     frames
 }
 
+/// The system's power of a pair, K sr, from a weight: 1 / weight = P_i P_j / (2 dnu dt).
+fn powers_k_sr(file: &str) -> Vec<(f64, f64)> {
+    let mut found = Vec::new();
+    for frame in frames_without(file, [0.0, 0.0]) {
+        let GroundFrame::Visibilities(block) = frame else { continue };
+        found.extend((0..block.len()).map(|k| {
+            let samples = 2.0 * 8e3 * 1e-6 * f64::from(block.duration_ticks[k]);
+            (block.middle_s(k), (samples / f64::from(block.weight[k])).sqrt())
+        }));
+    }
+    found
+}
+
+/// Powers rise by the flux density of the light curve, 3.2548e7 K sr at its peak (numpy: 1e-18 (c / 1e7)^2 / 2 k).
+fn noise_rises_with_the_burst([quiet, burst]: &[String; 2]) {
+    let mut bright = 0;
+    for ((t_s, quiet_k_sr), (_, k_sr)) in powers_k_sr(quiet).into_iter().zip(powers_k_sr(burst)) {
+        let after_s = t_s - 38_005.0;
+        let expected = match after_s {
+            after_s if after_s <= -5.0 => 0.0,
+            after_s if after_s < 0.0 => 3.2548e7 * (1.0 + after_s / 5.0),
+            after_s => 3.2548e7 * (-after_s / 11.5).exp(),
+        };
+        // The square root of the product of two powers is their mean, to the square of their difference of some percent.
+        assert!((k_sr - quiet_k_sr - expected).abs() < 2e-3 * k_sr, "{t_s}: {quiet_k_sr} {k_sr} {expected}");
+        bright += usize::from(expected > 1e7);
+    }
+    assert!(bright > 10, "{bright}");
+}
+
 #[test]
 fn a_burst_of_the_sun_is_found_named_and_left_out() {
     let place = Workplace::new(MISSION);
@@ -106,6 +139,8 @@ fn a_burst_of_the_sun_is_found_named_and_left_out() {
     let left_out = reasons["burst of a point source"].as_u64().unwrap();
     assert!(left_out > 100, "{reasons}");
     assert_eq!(kept["ledger"]["flagged"]["burst of a point source"], Value::Null);
+
+    noise_rises_with_the_burst(&["quiet", "flag"].map(|run| place.path(&format!("{run}/downlink.ccsds"))));
 
     // A ground that never had these visibilities makes the same map.
     let frames = frames_without(&place.path("flag/downlink.ccsds"), ["from_s", "until_s"].map(number));
