@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::common::downlink::transmit;
 use super::common::workplace::{Workplace, fail, json, succeed};
 
-/// Three passes at 10 MHz, with daughters near each other, as a map of nside 8 asks for.
+/// Three passes at 10 MHz, with daughters near each other, as a map of nside 4 asks for.
 const MISSION: &str = r#"
 name = "bursts"
 seed = 5
@@ -23,8 +23,9 @@ duration_s = 46_000.0
 every_nth_window = 2
 model = "harmonic"
 [map]
-nside = 8
-epsilon = 1e-6
+nside = 4
+engine = "pixel"
+epsilon = 1e-5
 [products]
 pictures = false
 "#;
@@ -106,7 +107,7 @@ fn noise_rises_with_the_burst([quiet, burst]: &[String; 2]) {
 }
 
 #[test]
-fn a_burst_of_the_sun_is_found_named_and_left_out() {
+fn a_burst_of_the_sun_is_found_and_left_out() {
     let place = Workplace::new(MISSION);
     let run = |name: &str, more: &[&str]| {
         json(&[&["run", &place.pipeline, "--out", &place.path(name)], more].concat())
@@ -122,7 +123,8 @@ fn a_burst_of_the_sun_is_found_named_and_left_out() {
     let found = &flagged["bursts"];
     assert_eq!((&found["action"], &found["found"]), (&"flag".into(), &1.into()));
     let burst = &found["bursts"][0];
-    assert_eq!(burst["name"], "sun");
+    // Three hundred metres in a line tell the angle from the line, and no direction.
+    assert!(burst["name"].is_null() && burst["position_sigma_deg"].as_f64().unwrap() > 10.0, "{burst}");
     let number = |key: &str| burst[key].as_f64().unwrap();
     // The truth has the peak and the flux density; a bin is at least 10 s wide, and its mean less than the peak.
     let truth = std::fs::read_to_string(place.path("flag/downlink.ccsds.moving.csv")).unwrap();

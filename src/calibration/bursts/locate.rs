@@ -44,6 +44,9 @@ const HALVINGS: usize = 15;
 /// Distance from the Sun within which its bursts at these frequencies arise and are scattered, rad: two degrees.
 const SUN_RAD: f64 = 0.035;
 
+/// Standard deviation of a position, rad, up to which it can have a name. On short baselines along a line it is any place of a circle.
+const SIGMA_RAD_MAX: f64 = 0.1;
+
 /// Directions of equal likelihood that are reported.
 const REPORTED_MAX: usize = 4;
 
@@ -107,7 +110,7 @@ pub(super) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64, sun_hat: Vec3) ->
         }
     }
     let sun_rad = SUN_RAD + WITHIN.sqrt() * sigma_rad;
-    let is_sun = directions.iter().any(|hat| apart(*hat, sun_hat) < sun_rad);
+    let is_sun = sigma_rad < SIGMA_RAD_MAX && directions.iter().any(|hat| apart(*hat, sun_hat) < sun_rad);
     let significance = largest.max(0.0).sqrt();
     Some(Located { directions, sigma_rad, significance, power_k_sr, power_sigma_k_sr, is_sun })
 }

@@ -63,7 +63,8 @@ pub struct FoundBurst {
     pub positions_deg: Vec<[f64; 2]>,
     /// Standard deviation of the first position along its worst direction, deg.
     pub position_sigma_deg: f64,
-    /// `sun` if the Sun's direction at that time is within two degrees and three standard deviations of a position.
+    /// `sun` if the Sun's direction at that time is within two degrees and three standard deviations of a position known to six
+    /// degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
 }
