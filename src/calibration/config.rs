@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{AntennaGains, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck};
+use super::{
+    AntennaGains, BurstChoice, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck,
+};
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum number of sub-bands of a channel.
@@ -40,6 +42,10 @@ keys! {
         expert quantiser_bits: u32 = 0;
         /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
         expert sub_bands: usize = 1;
+        /// Bursts of point sources, such as the Sun's, that are found in a pass: "flag" leaves their visibilities out of the sums, "keep"
+        /// only reports them.
+        #[serde(skip_serializing_if = "BurstChoice::is_flag")]
+        everyday bursts: BurstChoice = BurstChoice::Flag;
     }
 }
 

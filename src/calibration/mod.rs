@@ -10,6 +10,7 @@
 
 mod autos;
 mod blocks;
+mod bursts;
 mod config;
 mod error;
 mod gains;
@@ -25,6 +26,8 @@ mod van_vleck;
 pub use autos::{AUTOS_MAX, AutoTable};
 #[doc(hidden)]
 pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
+#[doc(hidden)]
+pub use bursts::{BurstChoice, BurstSearch, BurstSummary, FoundBurst, FoundBursts, find_bursts};
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;

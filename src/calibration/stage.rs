@@ -6,7 +6,7 @@ use num_complex::Complex64;
 
 use super::autos::{AUTOS_MAX, AutoTable};
 use super::blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
-use super::{Calibration, CalibrationError, VanVleck};
+use super::{Calibration, CalibrationError, FoundBursts, VanVleck};
 use crate::array::Ephemeris;
 use crate::frames::{
     AutoPower, Channel, CountedVisibilities, EphemerisSegment, GroundFrame, Instrument, PlacedFrame,
@@ -32,6 +32,7 @@ pub struct Calibrator {
     blocks: ReceivedBlocks,
     /// The channels whose values are needed; `None` for all.
     group: Option<BTreeSet<ChannelId>>,
+    bursts: FoundBursts,
 }
 
 impl Calibrator {
@@ -47,6 +48,7 @@ impl Calibrator {
             instrument: None,
             blocks: ReceivedBlocks::default(),
             group: None,
+            bursts: FoundBursts::default(),
         }
     }
 
@@ -56,6 +58,20 @@ impl Calibrator {
     #[doc(hidden)]
     pub fn with_group(self, group: Option<BTreeSet<ChannelId>>) -> Self {
         Self { group, ..self }
+    }
+
+    /// Leaves out visibilities in the bursts of a table.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn with_bursts(self, bursts: &FoundBursts) -> Self {
+        Self { bursts: bursts.clone(), ..self }
+    }
+
+    /// The bursts found so far.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn bursts(&self) -> &FoundBursts {
+        &self.bursts
     }
 
     /// Undoes the quantiser's effect on correlations before calibration.
@@ -327,6 +343,10 @@ impl Calibrator {
         self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
+        if let Some([outside, inside]) = self.bursts.divided(&placed) {
+            self.ledger.add_left_out(VisibilityReason::Burst, inside.len() as u64);
+            placed = outside;
+        }
         Ok(Some(placed))
     }
 

@@ -15,6 +15,7 @@ use serde_json::json;
 
 use super::log::{Level, is_json, note, say, say_entry};
 use super::output::{CommandError, cannot_write, json_text, print_notes};
+use crate::calibration::FoundBurst;
 use crate::calibration::solver::InstrumentEvent;
 use crate::downlink::ReceptionCounters;
 use crate::files::{ProtectedInputs, growing_file, is_same_name};
@@ -145,6 +146,10 @@ enum Entry<'a> {
     /// An event of the instrument, found by calibration.
     Instrument {
         what: InstrumentEvent,
+    },
+    /// A burst of a point source, found in a pass that has ended.
+    Burst {
+        what: FoundBurst,
     },
     End(&'a End),
 }
@@ -330,6 +335,7 @@ struct ReportedState {
     ended: Vec<bool>,
     saving: SavingReport,
     instrument: usize,
+    bursts: usize,
 }
 
 /// Writes events until the end of the run, or until the reader is gone.
@@ -396,6 +402,10 @@ fn write_progress(
         lines.write(Entry::Instrument { what })?;
         reported.instrument += 1;
     }
+    for what in ground.map(|ground| ground.bursts.since(reported.bursts)).unwrap_or_default() {
+        lines.write(Entry::Burst { what })?;
+        reported.bursts += 1;
+    }
     lines.write(progress_entry(handles, &stages, dropped.load(Ordering::Relaxed)))
 }
 
@@ -439,6 +449,11 @@ impl LogState {
             if stage.ended && !std::mem::replace(had_ended, true) && is_json() {
                 say_entry(Level::Info, &Entry::StageEnded { stage: &stage.name }, None);
             }
+        }
+        let bursts = handles.ground.as_ref().map(|ground| ground.bursts.since(self.reported.bursts));
+        for what in bursts.unwrap_or_default() {
+            say("burst", &json!({ "what": what }), &what);
+            self.reported.bursts += 1;
         }
         if let Some(saving) = handles.ground.as_ref().and_then(|ground| ground.saving.report()) {
             self.log_saving(saving);

@@ -69,6 +69,8 @@ pub enum VisibilityReason {
     ChannelNotMapped,
     /// It is flagged: the artificial signal for calibration was on.
     Beacon,
+    /// It is flagged: the ground found a burst of a point source at its time.
+    Burst,
 }
 
 impl VisibilityReason {
@@ -89,6 +91,7 @@ impl VisibilityReason {
                 | Self::WeightOutOfRange
                 | Self::SumsFull
                 | Self::ChannelNotMapped
+                | Self::Burst
         )
     }
 }
@@ -132,6 +135,7 @@ impl Reason for VisibilityReason {
             Self::EarthInSight => "Earth in sight of a daughter",
             Self::ChannelNotMapped => "channel not among map.channels",
             Self::Beacon => "artificial signal on",
+            Self::Burst => "burst of a point source",
         }
     }
 
@@ -193,7 +197,7 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some fixed indices, so that a change of the order is detected.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all[23]), (30, VisibilityReason::NotReceived));
-        assert_eq!(all.last(), Some(&VisibilityReason::Beacon));
+        assert_eq!((all.len(), all[23]), (31, VisibilityReason::NotReceived));
+        assert_eq!(all.last(), Some(&VisibilityReason::Burst));
     }
 }

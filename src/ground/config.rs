@@ -5,7 +5,7 @@ use std::path::Path;
 use super::GroundError;
 use super::pass_gate::{MODEL_FILES_KEY, PassGate};
 use crate::calibration::solver::{PassSolver, SolverConfig};
-use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator};
+use crate::calibration::{CalibrationConfig, CalibrationError, CalibrationHook, Calibrator, FoundBursts};
 use crate::frames::{Instrument, VisibilityReason};
 use crate::imaging::circle::SumPart;
 use crate::imaging::{AccumulationError, Accumulator, ChannelGroup, MapConfig};
@@ -96,7 +96,8 @@ impl GroundConfig {
             .with_van_vleck(self.calibration.van_vleck()?)
             .with_autos()
             .with_segments(SEGMENTS_MAX)
-            .with_group(self.group.clone()))
+            .with_group(self.group.clone())
+            .with_bursts(&FoundBursts::new(self.calibration.bursts)))
     }
 
     /// An accumulator without data that posts to `ledger`.

@@ -5,15 +5,16 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
+use super::burst_watch::{BurstWatch, WatchedBlock};
 use super::live_view::{Activity, LiveViewWriter};
 use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
 use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
-use crate::calibration::{Calibrator, MissingPackets};
+use crate::calibration::{BurstSearch, Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::downlink::{CucTime, PacketHeader, PacketKind};
-use crate::frames::{GroundFrame, Instrument, PlacedFrame};
+use crate::frames::{GroundFrame, Instrument, PlacedFrame, VisibilityReason};
 use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
@@ -43,6 +44,7 @@ pub struct Ground {
     pub(super) steps: u64,
     pub(super) promises: SenderPromises,
     pub(super) live_view_writer: LiveViewWriter,
+    pub(super) burst_watch: BurstWatch,
 }
 
 impl Ground {
@@ -53,10 +55,13 @@ impl Ground {
     pub fn new(config: &GroundConfig) -> Result<Self, GroundError> {
         let gate = config.gate()?;
         let gains = gate.as_ref().map(|gate| gate.gains().clone());
+        let calibrator = |outcome: &GroundOutcome| config.calibrator(gate.as_ref(), &outcome.ledger);
         let outcome = GroundOutcome { gains, ..GroundOutcome::default() };
+        let calibrator = calibrator(&outcome)?;
+        let outcome = GroundOutcome { bursts: calibrator.bursts().clone(), ..outcome };
         Ok(Self {
             collector: Collector::new(config.wait_bytes),
-            calibrator: config.calibrator(gate.as_ref(), &outcome.ledger)?,
+            calibrator,
             gate,
             accumulator: config.accumulator(&outcome.ledger),
             live_view_writer: LiveViewWriter::new(&outcome.live_view),
@@ -67,6 +72,7 @@ impl Ground {
             has_initial_snapshot: false,
             steps: 0,
             promises: SenderPromises::default(),
+            burst_watch: BurstWatch::default(),
         })
     }
 
@@ -259,21 +265,46 @@ impl Ground {
         frame: Option<GroundFrame>,
         out: &mut Outlet<Snapshot>,
     ) -> Result<(), GroundError> {
-        let Some(archive) = &mut self.archive else {
-            if let Some(placed) = placed(&mut self.calibrator, frame)? {
-                self.live_view_writer.add(&placed);
-                self.accumulator.accept(placed, out)?;
-            }
-            return Ok(());
-        };
         let mut draft = RecordDraft::new(frame.as_ref());
-        if let Some(placed) = placed(&mut self.calibrator, frame)? {
+        let placed = placed(&mut self.calibrator, frame)?;
+        if let Some(placed) = placed {
             draft.offer(&placed);
             self.live_view_writer.add(&placed);
+            if self.burst_watch.is_ended_by(&placed) {
+                self.end_pass()?;
+            }
+            let watched = match &placed {
+                PlacedFrame::Visibilities(placed) if self.accumulator.maps(placed.channel) => {
+                    Some(placed.clone())
+                }
+                _ => None,
+            };
             draft.used_s = self.accumulator.accept(placed, out)?;
+            if let Some(watched) = watched {
+                self.burst_watch.keep(watched, packets, draft.used_s.is_some());
+            }
         }
-        let posted = archive.record(packets, draft, self.calibrator.ephemeris());
-        self.outcome.ledger.post_report(&posted);
+        if let Some(archive) = &mut self.archive {
+            let posted = archive.record(packets, draft, self.calibrator.ephemeris());
+            self.outcome.ledger.post_report(&posted);
+        }
+        Ok(())
+    }
+
+    /// Judges the visibilities of the open pass, and takes those in bursts out of the sums.
+    fn end_pass(&mut self) -> Result<(), GroundError> {
+        let Some(instrument) = self.collector.instrument() else { return Ok(()) };
+        let search =
+            BurstSearch { moon_radius_m: instrument.moon_radius_m, epoch_tai_s: instrument.epoch_tai_s };
+        let bursts = self.outcome.bursts.clone();
+        for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
+            let Some([outside, inside]) = bursts.divided(&placed) else { continue };
+            let removed = if is_used { self.accumulator.remove(&inside)?.visibilities } else { 0 };
+            self.outcome.ledger.reflag(VisibilityReason::Burst, removed);
+            if let Some((archive, sent)) = self.archive.as_mut().zip(sent) {
+                archive.reflag(sent, &outside, removed);
+            }
+        }
         Ok(())
     }
 
@@ -429,9 +460,11 @@ impl Stage for Ground {
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.finish();
         self.advance(out)?;
+        self.end_pass()?;
         // The checkpoint keeps held packets held; the final maps use them although their positions are unknown.
         self.last_checkpoint()?;
         self.flush(out)?;
+        self.end_pass()?;
         store(&self.outcome.completeness, self.calibrator.post_losses(self.missing_packets()));
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());

@@ -8,6 +8,7 @@
 
 #[doc(hidden)]
 pub mod archive;
+mod burst_watch;
 mod collector;
 mod collector_state;
 mod config;

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::{GroundError, LiveView};
 
-use crate::calibration::{Completeness, SolvedGains};
+use crate::calibration::{Completeness, FoundBursts, SolvedGains};
 use crate::downlink::ReceptionCounters;
 use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
@@ -27,6 +27,8 @@ pub struct GroundOutcome {
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// The solved gains; `None` if gains are not solved for.
     pub gains: Option<SolvedGains>,
+    /// The bursts of point sources found in any session.
+    pub bursts: FoundBursts,
     /// Bytes of held visibilities. While the stage works, they may lag by a few steps.
     pub waiting_bytes: Arc<AtomicU64>,
     /// The report on checkpoints, up to date at any time.

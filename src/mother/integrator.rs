@@ -7,6 +7,7 @@ use num_complex::{Complex32, Complex64};
 use rand_distr::{Distribution, Gamma, StandardNormal};
 use rayon::prelude::*;
 
+use super::moving::MovingSky;
 use super::noise::NoiseModel;
 use super::pair_errors::PairErrors;
 use super::powers::SkyPowers;
@@ -44,6 +45,7 @@ pub struct Integrator {
     queued: Vec<QueuedWindow>,
     sampled: u64,
     errors: Option<Arc<InstrumentErrors>>,
+    moving: Option<Arc<MovingSky>>,
 }
 
 /// Model of a channel.
@@ -120,13 +122,29 @@ impl Integrator {
         schedules: Vec<Schedule>,
         options: MeasurementOptions,
     ) -> Self {
-        Self { array, models, instrument, schedules, options, queued: Vec::new(), sampled: 0, errors: None }
+        Self {
+            array,
+            models,
+            instrument,
+            schedules,
+            options,
+            queued: Vec::new(),
+            sampled: 0,
+            errors: None,
+            moving: None,
+        }
     }
 
     /// Adds errors of the instrument.
     #[must_use]
     pub fn with_errors(self, errors: Option<Arc<InstrumentErrors>>) -> Self {
         Self { errors, ..self }
+    }
+
+    /// Adds moving sources, to visibilities, auto-correlations and their noise.
+    #[must_use]
+    pub fn with_moving(self, moving: Option<Arc<MovingSky>>) -> Self {
+        Self { moving, ..self }
     }
 
     /// Schedules the integrations of every channel and pair in a window.
@@ -292,7 +310,8 @@ impl Integrator {
     ) -> VisibilityBlock {
         let WindowChannel { window, channel, powers, .. } = context;
         let (pair, noise_model) = (scheduled.pair, &self.options.noise);
-        let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
+        let of_channel = &self.instrument.channels[usize::from(channel.0)];
+        let width_hz = of_channel.width_hz;
         let mut noise = noise_model.stream(window, channel, pair);
         let mut pair_errors = self.pair_errors(context, pair);
         let mut block = VisibilityBlock { channel, pair, start: window.start, ..VisibilityBlock::default() };
@@ -302,6 +321,11 @@ impl Integrator {
             let middle_s = from.seconds() + 0.5 * dt_s;
             let mut sky_powers_k_sr = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
             let mut value = *prediction;
+            if let Some(moving) = &self.moving {
+                let signal = moving.signal(pair, of_channel, [middle_s, dt_s]);
+                value += signal.visibility_k_sr;
+                sky_powers_k_sr.iter_mut().zip(signal.powers_k_sr).for_each(|(total, power)| *total += power);
+            }
             let mut gain = Complex64::ONE;
             if let Some(pair_errors) = &pair_errors {
                 let interference = pair_errors.artificial_signals(middle_s);
@@ -360,7 +384,8 @@ impl Integrator {
             return Vec::new();
         }
         let noise_model = &self.options.noise;
-        let width_hz = self.instrument.channels[usize::from(channel.0)].width_hz;
+        let of_channel = &self.instrument.channels[usize::from(channel.0)];
+        let width_hz = of_channel.width_hz;
         let length = (window.end.0 - window.start.0).clamp(0, i64::from(u32::MAX)) as u32;
         let block = |n: u8| {
             let pair = Pair { i: n, j: n };
@@ -375,6 +400,9 @@ impl Integrator {
                 let middle_s = from.seconds() + 0.5 * dt_s;
                 let mut expected_k_sr =
                     noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
+                if let Some(moving) = &self.moving {
+                    expected_k_sr += moving.signal(pair, of_channel, [middle_s, dt_s]).powers_k_sr[0];
+                }
                 let mut flags = context.flags(pair, from, duration);
                 if let Some(pair_errors) = &pair_errors {
                     expected_k_sr += pair_errors.artificial_signals(middle_s).powers_k_sr[0];

@@ -14,6 +14,7 @@ mod config;
 pub mod correlator;
 mod integrator;
 mod merger;
+mod moving;
 mod ninth;
 mod noise;
 mod observer;
@@ -31,6 +32,7 @@ pub use config::{
 };
 pub use integrator::{ChannelModel, Integrator, MeasurementOptions};
 pub use merger::Merger;
+pub use moving::MovingSky;
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use noise::NoiseModel;
 pub use observer::Observer;

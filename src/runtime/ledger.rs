@@ -48,6 +48,14 @@ impl<R: Reason> Ledger<R> {
         self.counts().leave_out(reason, count);
     }
 
+    /// Counts samples that had reached the result, and were removed from it, as flagged.
+    #[doc(hidden)]
+    pub fn reflag(&self, reason: R, count: u64) {
+        let mut counts = self.counts();
+        counts.accumulated = counts.accumulated.saturating_sub(count);
+        counts.leave_out(reason, count);
+    }
+
     /// Adds all counts of a report.
     #[doc(hidden)]
     pub fn post_report(&self, report: &LedgerReport<R>) {

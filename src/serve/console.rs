@@ -65,6 +65,7 @@ struct LastUpdate {
     solution: Option<(u64, Instant, f64)>,
     ended: Vec<bool>,
     senders: u64,
+    bursts: usize,
     saving: SavingReport,
     products: ProductsReport,
     archive: ArchiveReport,
@@ -262,6 +263,7 @@ impl Console {
             ledger: ground.map(|ground| LedgerStatus::new(ground.ledger.report(), phase == Phase::Ended)),
             completeness,
             reception,
+            bursts: ground.map(|ground| ground.bursts.len() as u64),
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving,
@@ -272,6 +274,10 @@ impl Console {
         };
         for (is_bad, text) in last_update.changes(&status) {
             self.log_event(is_bad, text);
+        }
+        for burst in ground.map(|ground| ground.bursts.since(last_update.bursts)).unwrap_or_default() {
+            self.log_event(false, burst.to_string());
+            last_update.bursts += 1;
         }
         last_update.status = Some(status.clone());
         status

@@ -200,6 +200,10 @@ impl Scrape {
             let about = "Visibilities that wait for their positions";
             gauge(out, MetricInfo("waiting", about, Some(Unit::Bytes)), waiting as f64)?;
         }
+        if let Some(bursts) = self.status.bursts {
+            let about = "Bursts of point sources found, counted in each channel";
+            counter(out, MetricInfo("bursts", about, None), bursts)?;
+        }
         self.saving(out)?;
         let Some(products) = &self.status.products else { return Ok(()) };
         let about = "Attempts to write maps and pictures that failed";

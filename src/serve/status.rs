@@ -186,6 +186,9 @@ pub(super) struct Status {
     /// Bytes of visibilities that wait for their positions.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) waiting_bytes: Option<u64>,
+    /// Number of bursts of point sources found, in any session.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(super) bursts: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) listening: Option<ListenerStatus>,
     #[serde(skip_serializing_if = "Option::is_none")]

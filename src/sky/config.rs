@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::frame::Frame;
 use super::generated::GeneratedSky;
 use super::healpix::is_valid_nside;
+use super::moving::MovingSource;
 use crate::units::{Checks, InvalidValue, PerChannel, keys};
 
 /// Treatment of a map file whose frequency differs from the channel's.
@@ -46,6 +47,11 @@ keys! {
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         expert added: Option<AddedSky> = None;
+        /// Bursts of point sources, such as `[{ direction = "sun", starts_s = [9e4], peak_jy = 1e8 }]`, or `direction = [longitude,
+        /// latitude]`; optional `reference_hz`, `spectral_index`, `rise_s`, `decay_s`, `duration_index`, `drift_s` (a type III burst's). The
+        /// truth is written beside the downlink, as FILE.moving.csv.
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        expert moving: Vec<MovingSource> = Vec::new();
     }
 }
 
@@ -120,6 +126,7 @@ impl SkyConfig {
         }
         let mut found = checks.finish();
         found.extend(self.generated.problems());
+        found.extend(self.moving.iter().enumerate().flat_map(|(index, source)| source.problems(index)));
         found
     }
 }

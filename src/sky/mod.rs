@@ -21,6 +21,7 @@ pub mod generated;
 pub mod harmonics;
 pub mod healpix;
 mod map;
+mod moving;
 mod rotation;
 pub mod spectra;
 
@@ -38,5 +39,7 @@ pub use frame::{Rotation, rotate};
 pub use map::SkyMap;
 #[doc(hidden)]
 pub use map::{TEMPERATURE_K_MAX, is_unseen};
+#[doc(hidden)]
+pub use moving::{Body, MovingDirection, MovingSource, ecliptic_deg, k_sr_per_jy};
 #[doc(hidden)]
 pub use rotation::Bilinear;

@@ -6,6 +6,7 @@ mod common;
 
 mod bench;
 mod bound;
+mod bursts;
 mod calibrate;
 mod coded;
 mod command_line;

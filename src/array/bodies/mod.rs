@@ -156,6 +156,14 @@ fn earth_hat(time: Tai) -> Vec3 {
     unit(sub([0.0; 3], moon::position_m(time.tt_centuries())))
 }
 
+/// Direction of the Sun from the Moon's centre some seconds after a mission's epoch (TAI since 1958-01-01, s), whether or not its
+/// orbits have dates.
+#[must_use]
+#[doc(hidden)]
+pub fn sun_hat_by_date(epoch_tai_s: f64, t_s: f64) -> Vec3 {
+    sun_hat(Tai::from_seconds_since_1958(epoch_tai_s).plus_s(t_s))
+}
+
 /// Direction of the Sun from the Moon, on ecliptic axes of J2000; geometric, to 0.002 degrees from 2020 to 2040.
 fn sun_hat(time: Tai) -> Vec3 {
     let centuries = time.tt_centuries();

@@ -5,6 +5,7 @@ use bincode::enc::Encoder;
 use bincode::error::{DecodeError, EncodeError};
 use bincode::{Decode, Encode};
 
+use crate::calibration::FoundBurst;
 use crate::ground::PassGateState;
 
 #[derive(Clone, Debug, PartialEq)]
@@ -12,11 +13,13 @@ pub(super) struct CalibrationState {
     /// Number of the calibration that the sums were made with, from 1.
     pub(super) version: u32,
     pub(super) passes: PassGateState,
+    /// The bursts found. A checkpoint holds them last, and ends before them if there are none.
+    pub(super) bursts: Vec<FoundBurst>,
 }
 
 impl Default for CalibrationState {
     fn default() -> Self {
-        Self { version: 1, passes: PassGateState::default() }
+        Self { version: 1, passes: PassGateState::default(), bursts: Vec::new() }
     }
 }
 
@@ -26,20 +29,22 @@ impl CalibrationState {
     }
 }
 
-/// Writes nothing for the first calibration without passes, so that such checkpoints keep the format from before recalibration.
+/// Writes nothing for the first calibration without passes and bursts, so that such checkpoints keep the format from before recalibration.
 impl Encode for CalibrationState {
     fn encode<E: Encoder>(&self, encoder: &mut E) -> Result<(), EncodeError> {
         if *self == Self::default() {
             return Ok(());
         }
-        (self.version, &self.passes).encode(encoder)
+        (self.version, &self.passes).encode(encoder)?;
+        if self.bursts.is_empty() { Ok(()) } else { self.bursts.encode(encoder) }
     }
 }
 
+/// Reads all but the bursts, as only the reader of the checkpoint knows whether bytes are left.
 impl<Context> Decode<Context> for CalibrationState {
     fn decode<D: Decoder<Context = Context>>(decoder: &mut D) -> Result<Self, DecodeError> {
         let (version, passes) = Decode::decode(decoder)?;
-        Ok(Self { version, passes })
+        Ok(Self { version, passes, bursts: Vec::new() })
     }
 }
 

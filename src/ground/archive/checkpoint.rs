@@ -182,6 +182,10 @@ pub(super) fn read_from<T>(
     if !head.calibration.passes.is_sound(head.collector.instrument()) {
         return Err(damaged("invalid passes".into(), "passes of the instrument"));
     }
+    let channels = head.collector.instrument().map_or(0, |instrument| instrument.channels.len());
+    if !head.calibration.bursts.iter().all(|burst| burst.is_sound(channels)) {
+        return Err(damaged("invalid bursts".into(), "bursts in channels of the instrument"));
+    }
     let mut engines = from.take(bytes - FIXED_BYTES - length);
     let found = rest(head, &mut engines)?;
     match engines.limit() {
@@ -211,10 +215,15 @@ fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize
     let config = bincode::config::standard().with_limit::<LIMIT>();
     let (fields, used) = bincode::decode_from_slice(bytes, config)?;
     let (settings, collector, ephemeris, autos, accumulator, journal) = fields;
-    let (calibration, more) = match &bytes[used..] {
+    let (mut calibration, mut more) = match &bytes[used..] {
         [] => (CalibrationState::default(), 0),
         rest => bincode::decode_from_slice(rest, config)?,
     };
+    if used + more < bytes.len() {
+        let (bursts, last) = bincode::decode_from_slice(&bytes[used + more..], config)?;
+        calibration.bursts = bursts;
+        more += last;
+    }
     let head =
         ArchiveHead { settings, collector, ephemeris, autos, accumulator, journal, calibration, checksum: 0 };
     Ok((head, used + more))

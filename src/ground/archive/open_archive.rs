@@ -14,6 +14,7 @@ use super::store::Archive;
 use crate::calibration::AutoTable;
 use crate::downlink::{DownlinkError, PacketKind};
 use crate::frames::{EphemerisSegment, VisibilityReason};
+use crate::ground::burst_watch::BurstWatch;
 use crate::ground::live_view::LiveViewWriter;
 use crate::ground::promises::SenderPromises;
 use crate::ground::{Collector, CollectorState, Ground, GroundConfig, GroundError, GroundOutcome};
@@ -54,6 +55,7 @@ impl ArchiveContents {
             return Err(GroundError::SeparateSolutions);
         }
         self.calibration.version = self.calibration.version.max(other.calibration.version);
+        self.calibration.bursts.extend(other.calibration.bursts);
         self.journal.merge(other.journal).map_err(|count| {
             let apid = PacketKind::Visibilities.apid();
             DownlinkError::DuplicatePacket { apid, count }
@@ -192,6 +194,8 @@ impl OpenArchive {
         }
         outcome.gains = gate.as_ref().map(|gate| gate.gains().clone());
         let calibrator = config.calibrator(gate.as_ref(), &posts)?;
+        calibrator.bursts().resume(calibration.bursts);
+        outcome.bursts = calibrator.bursts().clone();
         let calibrator = calibrator.resume(instrument, ephemeris, autos, journal.blocks());
         let collector = Collector::resume(collector, journal.delivered(), journal.reception());
         let (interval, saving, version) = (interval.max(1), outcome.saving.clone(), calibration.version);
@@ -225,6 +229,7 @@ impl OpenArchive {
             steps,
             promises,
             live_view_writer,
+            burst_watch: BurstWatch::default(),
         })
     }
 }

@@ -197,7 +197,9 @@ impl Recalibration {
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
-            calibrator.resume(collector.instrument().cloned(), segments.iter().cloned(), autos, blocks)
+            calibrator
+                .resume(collector.instrument().cloned(), segments.iter().cloned(), autos, blocks)
+                .with_bursts(old.bursts())
         };
         let posts = archive.posts();
         let mut calibrator =

@@ -4,14 +4,14 @@ use std::time::Instant;
 
 use super::calibration_state::CalibrationState;
 use super::checkpoint::{self, ArchiveHeadView};
-use super::draft::RecordDraft;
+use super::draft::{RecordDraft, digest};
 use super::folder::{StateFolder, checkpoints};
-use super::journal::{Journal, OtherRecord};
+use super::journal::{Journal, OtherRecord, SendingKey, SumsSpan};
 use crate::array::Ephemeris;
 use crate::calibration::{AutoTable, Calibrator};
 use crate::downlink::PacketKind;
 use crate::downlink::transport::packet_archive::PacketArchive;
-use crate::frames::{EphemerisSegment, VisibilityReason};
+use crate::frames::{EphemerisSegment, PlacedVisibilities, VisibilityReason};
 use crate::ground::pass_gate::PassGate;
 use crate::ground::{Collector, DeliveredPacket, GroundError, SharedSaving};
 use crate::imaging::anywhere::SegmentFolder;
@@ -66,6 +66,22 @@ impl Archive {
             self.journal.others.insert((header.kind, (header.time, header.count)), record);
         }
         posts
+    }
+
+    /// Records that visibilities of an applied packet were taken out of the sums, as they lie in a burst; `outside` are the others of
+    /// those offered to the sums.
+    pub(in crate::ground) fn reflag(&mut self, sent: SendingKey, outside: &PlacedVisibilities, removed: u64) {
+        let Some(record) = self.journal.visibilities.get_mut(&sent) else { return };
+        (record.digest, record.offered) = (digest(outside), outside.len() as u32);
+        record.accumulated = record.accumulated.saturating_sub(removed as u32);
+        if removed > 0 {
+            record.left_out.push((VisibilityReason::Burst, removed as u32));
+        }
+        let ends = outside.time_s.first().zip(outside.time_s.last()).filter(|_| record.accumulated > 0);
+        record.used = record.used.zip(ends).map(|(used, (&first, &last))| {
+            let [from_s, until_s] = used.span_s;
+            SumsSpan { span_s: [from_s.max(first), until_s.min(last)], ..used }
+        });
     }
 
     /// The ledger for the packet that is being applied.
@@ -189,6 +205,7 @@ impl<'a> ArchiveHeadRef<'a> {
             calibration: CalibrationState {
                 version: self.version,
                 passes: gate.map(PassGate::state).unwrap_or_default(),
+                bursts: calibrator.bursts().list(),
             },
         }
     }

@@ -25,6 +25,8 @@ struct NoisyVisibility {
     place: TorusPoint,
     weight: f64,
     key: NoiseKey,
+    /// -1 to remove it.
+    sign: f64,
 }
 
 /// Sums of a pair of noise realisations: `[node][alpha]` of rows `[first re, im, second re, im][gamma]`.
@@ -60,10 +62,19 @@ impl NoiseSums {
 
     /// Adds noise for the visibilities of a block that the engine accepts.
     pub fn add(&mut self, engine: &HarmonicEngine, placed: &PlacedVisibilities) {
+        self.change(engine, placed, 1.0);
+    }
+
+    /// Removes what [`Self::add`] added for a block.
+    pub fn remove(&mut self, engine: &HarmonicEngine, placed: &PlacedVisibilities) {
+        self.change(engine, placed, -1.0);
+    }
+
+    fn change(&mut self, engine: &HarmonicEngine, placed: &PlacedVisibilities, sign: f64) {
         for k in 0..placed.len() {
             if let Ok(accepted) = engine.accept(placed, k) {
                 let (place, weight) = (accepted.place, accepted.weight);
-                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::new(placed, k) });
+                self.pending.push(NoisyVisibility { place, weight, key: NoiseKey::new(placed, k), sign });
             }
             if self.pending.len() >= HarmonicBasis::BATCH {
                 self.flush();
@@ -74,7 +85,8 @@ impl NoiseSums {
     fn flush(&mut self) {
         let Self { seeds, grids, quanta, realisation_pairs, pending } = self;
         let grid = |visibility: &NoisyVisibility| {
-            let noise = |seed: &u64| unit_noise(*seed, visibility.key) * visibility.weight.sqrt();
+            let scale = visibility.sign * visibility.weight.sqrt();
+            let noise = |seed: &u64| unit_noise(*seed, visibility.key) * scale;
             let pair = |seeds: &[u64]| [noise(&seeds[0]), seeds.get(1).map(noise).unwrap_or_default()];
             GriddedNoise::new(grids, *quanta, &visibility.place, seeds.chunks(2).map(pair))
         };

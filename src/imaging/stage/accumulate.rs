@@ -264,6 +264,12 @@ impl Accumulator {
         Ok(())
     }
 
+    /// Whether visibilities of a channel are accumulated.
+    #[must_use]
+    pub fn maps(&self, channel: ChannelId) -> bool {
+        self.group.as_ref().is_none_or(|group| group.contains(&channel)) && self.config.is_mapped(channel)
+    }
+
     /// Removes visibilities from their channel without posting to the ledger.
     ///
     /// Visibilities beyond the map's longest baseline were never added: they are neither removed nor refused.
@@ -277,7 +283,12 @@ impl Accumulator {
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        state.engine.remove(&short)
+        if let (Engine::Harmonic(engine), Some(realisations)) = (&state.engine, &mut state.realisations) {
+            realisations.remove(engine, &short);
+        }
+        let removed = state.engine.remove(&short)?;
+        self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
+        Ok(removed)
     }
 
     /// Sets the first and last mission time, s, of the data in each channel, and drops channels without a span.
@@ -386,8 +397,7 @@ impl Accumulator {
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
-        let is_in_group = self.group.as_ref().is_none_or(|group| group.contains(&placed.channel));
-        if !is_in_group || !self.config.is_mapped(placed.channel) {
+        if !self.maps(placed.channel) {
             self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }

@@ -7,7 +7,7 @@ use super::sections::Config;
 use crate::array::Array;
 use crate::daughters::{AntennaErrors, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
-use crate::mother::{Fidelity, Observer, Schedule};
+use crate::mother::{Fidelity, MovingSky, Observer, Schedule};
 use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::SkyChannel;
 use crate::units::{ChannelId, MissionTime, all_pairs};
@@ -144,6 +144,28 @@ impl Plan {
     #[doc(hidden)]
     pub fn instrument_truth(&self) -> Option<String> {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
+    }
+
+    /// The moving sources; `None` if there are none.
+    #[must_use]
+    pub(in crate::pipeline) fn moving_sky(&self) -> Option<Arc<MovingSky>> {
+        let Config { sky, spacecraft, .. } = &self.config;
+        let moving = || MovingSky {
+            sources: sky.moving.clone(),
+            array: Arc::clone(&self.array),
+            epoch_tai_s: self.instrument.epoch_tai_s,
+            response: self.instrument.response,
+            smear_integrations: spacecraft.smear_integrations,
+            smear_bandwidth: spacecraft.smear_bandwidth,
+        };
+        (!sky.moving.is_empty()).then(moving).map(Arc::new)
+    }
+
+    /// The true bursts of moving sources as a table (CSV); `None` if there are no such sources.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn moving_truth(&self) -> Option<String> {
+        self.moving_sky().map(|moving| moving.truth_csv(&self.instrument.channels, &self.windows))
     }
 
     /// Data rate of the ninth daughter's spectra while the array observes, bit/s; `None` without that daughter.

@@ -75,6 +75,7 @@ impl Config {
         self.check_quantiser(&mut checks);
         self.check_orbits(&mut checks);
         self.check_antennas(&mut checks);
+        self.check_moving(&mut checks);
         found.extend(checks.finish());
         let array = self.array.problems();
         let spacecraft = self.spacecraft.problems();
@@ -257,6 +258,39 @@ impl Config {
         let is_upright = spacecraft.moon_reflection == 0.0 || !leans;
         let expected = "0 with instrument.tilt_radial_deg or antenna_files";
         checks.require("spacecraft.moon_reflection", spacecraft.moon_reflection, is_upright, expected);
+    }
+
+    /// Requires settings for which moving sources are simulated.
+    fn check_moving(&self, checks: &mut Checks) {
+        if self.sky.moving.is_empty() {
+            return;
+        }
+        let spacecraft = &self.spacecraft;
+        let is_plain = spacecraft.antenna != Antenna::DipoleNormal || self.array.is_circle();
+        for (key, value, good, expected) in [
+            (
+                "spacecraft.fidelity",
+                "\"samples\"",
+                spacecraft.fidelity == Fidelity::Visibilities,
+                "\"visibilities\"",
+            ),
+            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
+            ("spacecraft.moon_reflection", "(above 0)", spacecraft.moon_reflection == 0.0, "0"),
+            (
+                "spacecraft.antenna",
+                "\"dipole-normal\"",
+                is_plain,
+                "another antenna, or daughters on one circle,",
+            ),
+            ("instrument", "(errors of antennas)", !self.instrument.has_own_antennas(), "ideal antennas"),
+        ] {
+            checks.require(
+                key,
+                value,
+                good,
+                format!("{expected} with sky.moving, which is not simulated otherwise"),
+            );
+        }
     }
 
     /// Requires that the van Vleck correction is for the daughters' quantiser.

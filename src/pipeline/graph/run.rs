@@ -11,6 +11,7 @@ use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
 use super::{ground_segment, space_segment};
+use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
@@ -164,7 +165,7 @@ pub fn run_with_ranks(
     let file = out.join(downlink_file(plan.config.downlink.format));
     let recorder = if ranks.is_first() {
         write_settings(&plan.config, out)?;
-        write_instrument_truth(plan, &file)?;
+        write_truth(plan, &file)?;
         Some(Recorder::create(&file)?)
     } else {
         None
@@ -217,7 +218,7 @@ pub fn simulate(
         return Err(DownlinkError::from(SocketError::NoTruthFile).into());
     }
     if let Some(file) = &destination.file {
-        write_instrument_truth(plan, file)?;
+        write_truth(plan, file)?;
     }
     let recorder = match &destination.file {
         Some(file) => Some(Recorder::create(file)?),
@@ -387,13 +388,17 @@ pub(in crate::pipeline) fn add_link(
     })
 }
 
-/// Writes the true errors of the instrument beside a downlink file, if it has any.
-pub(in crate::pipeline) fn write_instrument_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
-    let Some(text) = plan.instrument_truth() else { return Ok(()) };
-    let mut name = file.as_os_str().to_owned();
-    name.push(".instrument.csv");
-    let path = PathBuf::from(name);
-    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+/// Writes the true errors of the instrument and the true bursts beside a downlink file, if there are any.
+pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
+    let tables = [(".instrument.csv", plan.instrument_truth()), (".moving.csv", plan.moving_truth())];
+    for (ending, text) in tables {
+        let Some(text) = text else { continue };
+        let mut name = file.as_os_str().to_owned();
+        name.push(ending);
+        let path = PathBuf::from(name);
+        write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?;
+    }
+    Ok(())
 }
 
 /// Writes all settings of a run beside its products, as a pipeline file that repeats the run.
@@ -554,6 +559,7 @@ pub(in crate::pipeline) fn collect_summary(
     (summary.listening, summary.samples) = (listening, samples);
     summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
     summary.saving = ground.saving.report();
+    summary.bursts = BurstSummary::new(ground.bursts.choice(), ground.bursts.list());
     let gains = ground.gains.as_ref().map(|gains| GainsWriter::new(config, out).write(gains));
     summary.calibration = gains.transpose()?;
     Ok(summary)

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::found_solutions::CalibrateSummary;
 use super::ground_segment::SOLVE;
 use super::sample_summary::SampleSummary;
-use crate::calibration::Completeness;
+use crate::calibration::{BurstChoice, BurstSummary, Completeness, FoundBurst};
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
 use crate::files::write_atomically;
@@ -68,6 +68,9 @@ pub struct RunSummary {
     /// Summary of the solved gains, with `calibration.hook = "solve"`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub calibration: Option<CalibrateSummary>,
+    /// Bursts of point sources that were found; absent if there are none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bursts: Option<BurstSummary>,
     /// Throughput, times and queues of the stages; for the last reading, if the channels were mapped in groups.
     pub report: Report,
     /// Reports of the earlier readings.
@@ -102,13 +105,14 @@ impl RunSummary {
             listening: None,
             saving: None,
             calibration: None,
+            bursts: None,
             report,
             earlier_reports: Vec::new(),
         }
     }
 
     /// Merges this summary with that of an earlier reading of the same downlink, which mapped other channels.
-    pub(in crate::pipeline) fn merged_with_earlier(self, earlier: GroupRecord) -> Self {
+    pub(in crate::pipeline) fn merged_with_earlier(self, earlier: GroupRecord, action: BurstChoice) -> Self {
         let elsewhere = VisibilityReason::ChannelNotMapped;
         let ledger =
             earlier.ledger.merge_readings(&self.ledger, VisibilityReason::is_of_accumulation, elsewhere);
@@ -117,6 +121,13 @@ impl RunSummary {
             space_hash: earlier.space_hash.or(self.space_hash),
             channels: [earlier.channels, self.channels].concat(),
             ledger,
+            bursts: match (earlier.bursts.is_empty(), self.bursts) {
+                (true, ours) => ours,
+                (false, ours) => {
+                    let ours = ours.map(|bursts| bursts.bursts).unwrap_or_default();
+                    BurstSummary::new(action, [earlier.bursts, ours].concat())
+                }
+            },
             ..self
         }
     }
@@ -166,6 +177,7 @@ pub(in crate::pipeline) struct GroupRecord {
     pub(in crate::pipeline) channels: Vec<ChannelSummary>,
     pub(in crate::pipeline) seed: Option<u64>,
     pub(in crate::pipeline) space_hash: Option<String>,
+    pub(in crate::pipeline) bursts: Vec<FoundBurst>,
 }
 
 /// Maximum size of a record, bytes: a channel's curves take some 100 kB.
@@ -193,6 +205,7 @@ impl GroupRecord {
             channels: summary.channels.clone(),
             seed: summary.seed,
             space_hash: summary.space_hash.clone(),
+            bursts: summary.bursts.as_ref().map(|bursts| bursts.bursts.clone()).unwrap_or_default(),
         })
     }
 
@@ -274,6 +287,9 @@ impl fmt::Display for RunSummary {
         }
         if let Some(saving) = self.saving.as_ref().filter(|saving| saving.failed > 0) {
             writeln!(f, "State\n{saving}\n")?;
+        }
+        if let Some(bursts) = &self.bursts {
+            writeln!(f, "Bursts\n{bursts}\n")?;
         }
         if let Some(gains) = &self.calibration {
             writeln!(f, "Gains\n{gains}\n")?;

@@ -148,7 +148,7 @@ impl GroupedReplay<'_> {
             return Err(PipelineError::NotInGroups { found: "no channel", expected: "at least one" });
         };
         for record in done.into_iter().rev() {
-            summary = summary.merged_with_earlier(record);
+            summary = summary.merged_with_earlier(record, config.calibration.bursts);
         }
         if !summary.cancelled {
             // All groups are mapped: a repeated command computes everything anew.

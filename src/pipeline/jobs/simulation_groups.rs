@@ -52,7 +52,7 @@ pub fn simulate_in_groups(
     watch: GroupStepWatcher<'_>,
 ) -> Result<Vec<Report>, PipelineError> {
     let key = plan.spool_key();
-    run::write_instrument_truth(plan, file)?;
+    run::write_truth(plan, file)?;
     // An unwritable path is reported before anything is computed.
     let recorder = Recorder::create(file)?;
     let mut reports = Vec::new();

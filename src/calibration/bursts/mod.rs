@@ -1,0 +1,302 @@
+//! Bursts of point sources, such as the Sun's, found in the visibilities of a pass.
+//!
+//! [`find_bursts`] sees all visibilities of a pass in one channel; [`FoundBursts`] is the table of what was found, which leaves visibilities
+//! that arrive later out as well.
+
+mod detect;
+mod locate;
+
+pub use detect::{BurstSearch, find_bursts};
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use bincode::{Decode, Encode};
+use serde::{Deserialize, Serialize, Serializer};
+
+use crate::frames::PlacedVisibilities;
+use crate::units::{ChannelId, Dimension};
+
+/// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
+const BURSTS_MAX: usize = 1 << 18;
+
+/// What is done with bursts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum BurstChoice {
+    /// Visibilities in a burst stay out of the sums.
+    #[default]
+    Flag,
+    /// Bursts are reported, and their visibilities are used like others.
+    Keep,
+}
+
+impl BurstChoice {
+    #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
+    pub(super) fn is_flag(&self) -> bool {
+        *self == Self::Flag
+    }
+}
+
+/// A burst in one channel.
+#[derive(Clone, Debug, PartialEq, Serialize, Encode, Decode)]
+pub struct FoundBurst {
+    /// Channel, from 0.
+    pub channel: u16,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Start, s since the epoch.
+    pub from_s: f64,
+    /// End, s.
+    pub until_s: f64,
+    /// Time of the brightest interval, s.
+    pub peak_s: f64,
+    /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky.
+    pub significance: f64,
+    /// Flux density in the brightest interval, as an isotropic antenna sees it, Jy.
+    pub flux_jy: f64,
+    /// Standard deviation of the flux density, Jy.
+    pub flux_sigma_jy: f64,
+    /// Ecliptic longitude and latitude, deg, the likeliest first; others have a likelihood within 99 % of its distribution: daughters in
+    /// one plane do not tell its two sides apart.
+    pub positions_deg: Vec<[f64; 2]>,
+    /// Standard deviation of the first position along its worst direction, deg.
+    pub position_sigma_deg: f64,
+    /// `sun` if the Sun's direction at that time is within two degrees and three standard deviations of a position known to six
+    /// degrees.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
+}
+
+impl FoundBurst {
+    /// Length, s.
+    #[must_use]
+    pub fn length_s(&self) -> f64 {
+        self.until_s - self.from_s
+    }
+
+    /// Whether the values are those of a burst. Checkpoints are untrusted.
+    #[must_use]
+    pub fn is_sound(&self, channels: usize) -> bool {
+        usize::from(self.channel) < channels && self.from_s.is_finite() && self.length_s() >= 0.0
+    }
+
+    /// Whether visibility `k` of a block lies in the burst.
+    #[must_use]
+    pub fn holds(&self, placed: &PlacedVisibilities, k: usize) -> bool {
+        let half_s = 0.5 * placed.duration_s.get(k).copied().map_or(0.0, f64::from);
+        ChannelId(self.channel) == placed.channel
+            && placed.time_s[k] + half_s > self.from_s
+            && placed.time_s[k] - half_s < self.until_s
+    }
+}
+
+impl fmt::Display for FoundBurst {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let hz = Dimension::Frequency.show(self.frequency_hz);
+        write!(f, "a burst at {hz} from {:.1} s to {:.1} s: ", self.from_s, self.until_s)?;
+        write!(f, "{:.2e} Jy, {:.0} sigma", self.flux_jy, self.significance)?;
+        if let Some([longitude, latitude]) = self.positions_deg.first() {
+            let sigma = self.position_sigma_deg;
+            write!(
+                f,
+                ", from ecliptic longitude {longitude:.2}, latitude {latitude:.2} deg (+- {sigma:.2})"
+            )?;
+            match self.positions_deg.len() - 1 {
+                0 => {}
+                others => write!(f, " or {others} other direction(s)")?,
+            }
+        }
+        if let Some(name) = &self.name {
+            write!(f, ": {name}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Maximum number of bursts that a summary lists.
+const LISTED_MAX: usize = 1000;
+
+/// Summary of the bursts of a run.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BurstSummary {
+    /// Whether their visibilities are left out.
+    pub action: BurstChoice,
+    /// Number of bursts, counted in each channel.
+    pub found: u64,
+    /// Channels with bursts.
+    pub channels: Vec<BurstHours>,
+    /// The bursts; a thousand of them in JSON.
+    #[serde(serialize_with = "first_bursts")]
+    pub bursts: Vec<FoundBurst>,
+}
+
+fn first_bursts<S: Serializer>(bursts: &[FoundBurst], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(bursts.iter().take(LISTED_MAX))
+}
+
+/// Time of the bursts in a channel: what is lost, if they are left out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct BurstHours {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Number of bursts.
+    pub found: u64,
+    /// Total length, h.
+    pub hours: f64,
+}
+
+impl BurstSummary {
+    /// The summary of some bursts; `None` if there are none.
+    #[must_use]
+    pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
+        let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
+        for burst in &bursts {
+            let empty = BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0 };
+            let channel = channels.entry(burst.channel).or_insert(empty);
+            channel.found += 1;
+            channel.hours += burst.length_s() / 3600.0;
+        }
+        let found = bursts.len() as u64;
+        (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
+    }
+}
+
+impl fmt::Display for BurstSummary {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let what = if self.action.is_flag() { "left out" } else { "kept in the maps" };
+        write!(f, "{} bursts, {what}:", self.found)?;
+        for BurstHours { frequency_hz, found, hours } in &self.channels {
+            let hz = Dimension::Frequency.show(*frequency_hz);
+            write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours")?;
+        }
+        Ok(())
+    }
+}
+
+/// The bursts that a ground has found. Clones share them.
+#[derive(Clone, Debug, Default)]
+pub struct FoundBursts {
+    choice: BurstChoice,
+    table: Arc<Mutex<BurstTable>>,
+}
+
+#[derive(Debug, Default)]
+struct BurstTable {
+    bursts: Vec<FoundBurst>,
+    /// Number of bursts of earlier sessions.
+    earlier: usize,
+    /// Starts and indices of the bursts of each channel, in the order of time.
+    starts: BTreeMap<u16, Vec<(f64, usize)>>,
+    /// Length of the longest burst, s.
+    longest_s: f64,
+}
+
+impl BurstTable {
+    fn add(&mut self, burst: FoundBurst) {
+        self.longest_s = self.longest_s.max(burst.length_s());
+        let starts = self.starts.entry(burst.channel).or_default();
+        let at = starts.partition_point(|(from_s, _)| *from_s <= burst.from_s);
+        starts.insert(at, (burst.from_s, self.bursts.len()));
+        self.bursts.push(burst);
+    }
+
+    /// The bursts in the time of a block, and perhaps some beside it.
+    fn about(&self, placed: &PlacedVisibilities) -> Vec<&FoundBurst> {
+        let starts = self.starts.get(&placed.channel.0).map(Vec::as_slice).unwrap_or_default();
+        let Some((&first, &last)) = placed.time_s.first().zip(placed.time_s.last()) else {
+            return Vec::new();
+        };
+        let half_s = 0.5 * placed.duration_s.iter().copied().fold(0.0, f32::max) as f64;
+        let from = starts.partition_point(|(from_s, _)| *from_s < first - half_s - self.longest_s);
+        let until = starts.partition_point(|(from_s, _)| *from_s <= last + half_s);
+        starts[from..until.max(from)].iter().map(|(_, index)| &self.bursts[*index]).collect()
+    }
+}
+
+impl FoundBursts {
+    /// An empty table.
+    #[must_use]
+    pub fn new(choice: BurstChoice) -> Self {
+        Self { choice, ..Self::default() }
+    }
+
+    fn table(&self) -> MutexGuard<'_, BurstTable> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Whether visibilities in a burst are left out.
+    #[must_use]
+    pub fn flags(&self) -> bool {
+        self.choice.is_flag()
+    }
+
+    /// What is done with bursts.
+    #[must_use]
+    pub fn choice(&self) -> BurstChoice {
+        self.choice
+    }
+
+    /// Adds a burst; returns whether there was room.
+    pub fn add(&self, burst: FoundBurst) -> bool {
+        let mut table = self.table();
+        let has_room = table.bursts.len() < BURSTS_MAX;
+        if has_room {
+            table.add(burst);
+        }
+        has_room
+    }
+
+    /// Resumes with the bursts of earlier sessions.
+    pub fn resume(&self, bursts: Vec<FoundBurst>) {
+        let mut table = self.table();
+        *table = BurstTable { earlier: bursts.len(), ..BurstTable::default() };
+        bursts.into_iter().for_each(|burst| table.add(burst));
+    }
+
+    /// All bursts, in the order in which they were found.
+    #[must_use]
+    pub fn list(&self) -> Vec<FoundBurst> {
+        self.table().bursts.clone()
+    }
+
+    /// Number of bursts.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.table().bursts.len()
+    }
+
+    /// Whether no burst was found.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Bursts of this session, except the first `seen`.
+    #[must_use]
+    pub fn since(&self, seen: usize) -> Vec<FoundBurst> {
+        let table = self.table();
+        table.bursts.get(table.earlier + seen..).unwrap_or_default().to_vec()
+    }
+
+    /// Divides a block into the visibilities outside all bursts and those in one; `None` if all are outside, or bursts are kept.
+    #[must_use]
+    pub fn divided(&self, placed: &PlacedVisibilities) -> Option<[PlacedVisibilities; 2]> {
+        if !self.flags() {
+            return None;
+        }
+        let table = self.table();
+        let bursts = table.about(placed);
+        let in_burst = |k: usize| bursts.iter().any(|burst| burst.holds(placed, k));
+        if bursts.is_empty() || !(0..placed.len()).any(in_burst) {
+            return None;
+        }
+        let mut parts = [placed.without_visibilities(), placed.without_visibilities()];
+        (0..placed.len()).for_each(|k| parts[usize::from(in_burst(k))].push_from(placed, k));
+        Some(parts)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,190 @@
+//! Bursts in simulated passes of the default array.
+
+use num_complex::Complex64;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::*;
+use crate::array::{Array, hidden_by_moon, sun_hat_by_date};
+use crate::response::beacon::plane_wave;
+use crate::sky::k_sr_per_jy;
+use crate::units::all_pairs;
+use crate::units::vector::{Vec3, direction, norm, sub};
+
+const FREQUENCY_HZ: f64 = 1e7;
+const STEP_S: f64 = 10.0;
+/// Rms of a visibility of the steady sky, K sr: as at 8 to 32 wavelengths of the generated sky at 10 MHz.
+const STEADY_K_SR: f64 = 4e4;
+const SEARCH: BurstSearch = BurstSearch { moon_radius_m: 1_737_100.0, epoch_tai_s: 2.178e9 };
+
+/// Visibilities of a pass of 3000 s from `from_s` on: Gaussian noise in place of a steady sky, independent from one to the next, and a
+/// source of power `k_sr(t)`.
+fn pass(
+    array: &Array,
+    seed: u64,
+    from_s: f64,
+    n_hat: Vec3,
+    k_sr: impl Fn(f64) -> f64,
+) -> Vec<PlacedVisibilities> {
+    let mut stream = ChaCha8Rng::seed_from_u64(seed);
+    let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
+    let mut block = |pair| {
+        let frequency_hz = FREQUENCY_HZ;
+        let mut block = PlacedVisibilities { pair, frequency_hz, ..PlacedVisibilities::default() };
+        for k in 0..300 {
+            let t_s = from_s + STEP_S * f64::from(k);
+            let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| array.position_m(n.into(), t_s));
+            let is_hidden = [r_i_m, r_j_m].iter().any(|r_m| hidden_by_moon(*r_m, n_hat, 1_737_100.0));
+            let power_k_sr = if is_hidden { 0.0 } else { k_sr(t_s) };
+            let steady = Complex64::new(normal(), normal()) * STEADY_K_SR * 0.5_f64.sqrt();
+            block.time_s.push(t_s);
+            block.r_i_m.push(r_i_m);
+            block.r_j_m.push(r_j_m);
+            block.value_k_sr.push(steady + plane_wave(power_k_sr, n_hat, sub(r_i_m, r_j_m), frequency_hz));
+            block.weight.push(1e-6);
+            block.duration_s.push(1.0);
+        }
+        block
+    };
+    all_pairs(array.satellites()).into_iter().map(&mut block).collect()
+}
+
+fn found(blocks: &[PlacedVisibilities]) -> Vec<FoundBurst> {
+    find_bursts(SEARCH, &blocks.iter().collect::<Vec<_>>())
+}
+
+fn array() -> Array {
+    Array::new(&Default::default()).unwrap()
+}
+
+/// A time at which the first daughter sees a direction for 1000 s before and 2000 s after.
+fn seen_from_s(array: &Array, n_hat: Vec3) -> f64 {
+    let is_seen = |t_s: f64| !hidden_by_moon(array.position_m(0, t_s), n_hat, 1_737_100.0);
+    let all = |t_s: &f64| (0..60).all(|k| is_seen(t_s + 50.0 * f64::from(k)));
+    (0..900).map(|k| 1e5 + 10.0 * f64::from(k)).find(all).unwrap()
+}
+
+#[test]
+fn a_bright_burst_is_found_where_and_when_it_is() {
+    let array = array();
+    let n_hat = direction(123.0, 31.0);
+    let from_s = seen_from_s(&array, n_hat);
+    // 1e8 Jy, a type III burst's light curve at 10 MHz.
+    let peak_k_sr = 1e8 * k_sr_per_jy(FREQUENCY_HZ);
+    let start_s = from_s + 1000.0;
+    let k_sr = |t_s: f64| match t_s - start_s {
+        after_s if after_s < 0.0 => 0.0,
+        after_s if after_s < 5.0 => peak_k_sr * after_s / 5.0,
+        after_s => peak_k_sr * (-(after_s - 5.0) / 11.5).exp(),
+    };
+    let blocks = pass(&array, 1, from_s, n_hat, k_sr);
+    let [burst] = &found(&blocks)[..] else { panic!("{:?}", found(&blocks)) };
+    // A bin is 20 s wide.
+    assert!((start_s - 40.0..start_s + 20.0).contains(&burst.from_s), "{} {start_s}", burst.from_s);
+    // By then the power is below 1 % of the steady sky's visibilities: 3.3e7 exp(-t / 11.5) < 400 K sr after 130 s.
+    assert!((start_s + 130.0..start_s + 250.0).contains(&burst.until_s), "{} {start_s}", burst.until_s);
+    assert!((start_s..start_s + 30.0).contains(&burst.peak_s));
+    let off_deg =
+        |[longitude, latitude]: &[f64; 2]| norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees();
+    let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
+    assert!(nearest_deg < 0.1 && burst.position_sigma_deg < 0.1, "{nearest_deg} {burst:?}");
+    // The mean over the peak's bin: the light curve rises and falls within it.
+    assert!(burst.flux_jy > 2e7 && burst.flux_jy < 1e8, "{burst}");
+    assert!(burst.significance > 100.0 && burst.name.is_none(), "{burst}");
+}
+
+#[test]
+fn positions_are_within_their_errors() {
+    let array = array();
+    let n_hat = direction(200.0, -40.0);
+    let from_s = seen_from_s(&array, n_hat);
+    let mut within = 0;
+    for seed in 0..10 {
+        // Five times the steady sky: the signal-to-noise ratio is some 5 sqrt(2 * 28 * 3).
+        let k_sr =
+            |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 5.0 * STEADY_K_SR } else { 0.0 };
+        let [burst] = &found(&pass(&array, seed, from_s, n_hat, k_sr))[..] else { panic!("{seed}") };
+        let off_deg = |[longitude, latitude]: &[f64; 2]| {
+            norm(sub(direction(*longitude, *latitude), n_hat)).to_degrees()
+        };
+        let nearest_deg = burst.positions_deg.iter().map(off_deg).fold(f64::INFINITY, f64::min);
+        // 99 % of positions lie within 3.03 standard deviations of the worst axis.
+        within += i32::from(nearest_deg < 3.03 * burst.position_sigma_deg);
+        let error = (burst.flux_jy * k_sr_per_jy(FREQUENCY_HZ) / (5.0 * STEADY_K_SR) - 1.0).abs();
+        // Five standard deviations of the mean of 56 visibilities with a signal-to-noise ratio of 5 sqrt(2) each.
+        assert!(error < 5.0 / (5.0 * 112.0_f64.sqrt()), "{error} {burst}");
+    }
+    assert!(within >= 9, "{within} of 10");
+}
+
+#[test]
+fn bursts_are_found_from_the_stated_power_on_and_quiet_passes_have_none() {
+    let array = array();
+    let n_hat = direction(10.0, 50.0);
+    let from_s = seen_from_s(&array, n_hat);
+    let count = |factor: f64| {
+        let k_sr =
+            |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { factor * STEADY_K_SR } else { 0.0 };
+        (0..8).filter(|seed| !found(&pass(&array, 100 + seed, from_s, n_hat, k_sr)).is_empty()).count()
+    };
+    // The ratio of 8 to the quartile is 8 * 2 ln 2 = 11.1 times the mean square: a power of 3.3 times the rms.
+    assert_eq!([count(0.0), count(1.5), count(4.5)], [0, 0, 8]);
+}
+
+#[test]
+fn the_sun_is_named() {
+    let array = array();
+    let sun_hat = sun_hat_by_date(SEARCH.epoch_tai_s, 1.05e5);
+    let from_s = seen_from_s(&array, sun_hat);
+    let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 1e7 } else { 0.0 };
+    let [burst] = &found(&pass(&array, 3, from_s, sun_hat, k_sr))[..] else { panic!() };
+    assert_eq!(burst.name.as_deref(), Some("sun"), "{burst}");
+    assert!(burst.to_string().ends_with(": sun"), "{burst}");
+}
+
+#[test]
+fn visibilities_of_a_burst_are_divided_from_others() {
+    let array = array();
+    let blocks = pass(&array, 5, 1e5, [0.0, 0.0, 1.0], |_| 0.0);
+    let bursts = FoundBursts::new(BurstChoice::Flag);
+    assert!(bursts.divided(&blocks[0]).is_none());
+    let burst = |from_s: f64, until_s: f64| FoundBurst {
+        channel: 0,
+        frequency_hz: FREQUENCY_HZ,
+        from_s,
+        until_s,
+        peak_s: from_s,
+        significance: 9.0,
+        flux_jy: 1.0,
+        flux_sigma_jy: 0.1,
+        positions_deg: vec![[0.0, 0.0]],
+        position_sigma_deg: 1.0,
+        name: None,
+    };
+    // Integrations of 1 s at 1e5, 1e5 + 10, ...: one ends in the burst, one lies in it, one begins in it.
+    bursts.add(burst(1e5 + 10.2, 1e5 + 29.7));
+    let [outside, inside] = bursts.divided(&blocks[0]).unwrap();
+    assert_eq!(inside.time_s, [1e5 + 10.0, 1e5 + 20.0, 1e5 + 30.0]);
+    assert_eq!(outside.len() + 3, blocks[0].len());
+    let kept = FoundBursts { choice: BurstChoice::Keep, ..bursts.clone() };
+    assert!(kept.divided(&blocks[0]).is_none() && kept.since(0).len() == 1);
+    let sound = burst(2.0, 1.0);
+    assert!(!sound.is_sound(1) && burst(1.0, 2.0).is_sound(1) && !burst(1.0, 2.0).is_sound(0));
+}
+
+#[test]
+fn forged_values_and_times_find_nothing_and_do_no_harm() {
+    let array = array();
+    let mut blocks = pass(&array, 6, 1e5, [0.0, 0.0, 1.0], |_| 0.0);
+    for block in &mut blocks {
+        block.value_k_sr[3] = Complex64::new(f64::INFINITY, f64::NAN);
+        block.value_k_sr[4] = Complex64::new(1e300, 0.0);
+        block.time_s[299] = 1e17;
+        block.weight[7] = f64::MIN_POSITIVE;
+    }
+    let _ = found(&blocks);
+    assert!(found(&[]).is_empty());
+    blocks.iter_mut().for_each(|block| block.value_k_sr.fill(Complex64::ZERO));
+    assert!(found(&blocks).is_empty());
+}

@@ -1,0 +1,193 @@
+//! Bursts of the Sun through the whole chain: made, found, left out of the map.
+
+use std::path::Path;
+
+use lunarray::downlink::{DownlinkConfig, DownlinkReader};
+use lunarray::frames::{GroundFrame, VisibilityBlock};
+use serde_json::Value;
+
+use super::common::downlink::transmit;
+use super::common::workplace::{Workplace, fail, json, succeed};
+
+/// Three passes at 10 MHz, with daughters near each other, as a map of nside 4 asks for.
+const MISSION: &str = r#"
+name = "bursts"
+seed = 5
+[sky]
+nside = 8
+[array]
+arcs_m = [15.0, 32.0, 52.0, 80.0, 120.0, 170.0, 240.0]
+[spacecraft]
+channels_hz = [10.0e6]
+duration_s = 46_000.0
+every_nth_window = 2
+model = "harmonic"
+[map]
+nside = 4
+engine = "pixel"
+epsilon = 1e-5
+[products]
+pictures = false
+"#;
+
+/// A type III burst of 1e8 Jy at 10 MHz, while the Sun is in sight.
+const BURST: &str = "sky.moving=[{ direction = 'sun', starts_s = [38_000.0], peak_jy = 1e8 }]";
+
+/// Mean of rho_l of the map from l = 1 to 8.
+fn rho(summary: &Value) -> f64 {
+    let rho = summary["channels"][0]["rho"].as_array().unwrap();
+    (1..=8).map(|l| rho[l].as_f64().unwrap()).sum::<f64>() / 8.0
+}
+
+fn without(block: &mut VisibilityBlock, [from_s, until_s]: [f64; 2]) {
+    let half_s = |k: usize| 0.5e-6 * f64::from(block.duration_ticks[k]);
+    let is_in =
+        |k: &usize| block.middle_s(*k) + half_s(*k) > from_s && block.middle_s(*k) - half_s(*k) < until_s;
+    let kept: Vec<usize> = (0..block.len()).filter(|k| !is_in(k)).collect();
+    let mut less = VisibilityBlock {
+        channel: block.channel,
+        pair: block.pair,
+        start: block.start,
+        ..Default::default()
+    };
+    for k in kept {
+        less.offset_ticks.push(block.offset_ticks[k]);
+        less.duration_ticks.push(block.duration_ticks[k]);
+        less.value_k_sr.push(block.value_k_sr[k]);
+        less.weight.push(block.weight[k]);
+        less.flags.push(block.flags[k]);
+    }
+    *block = less;
+}
+
+/// The frames of a downlink, without the visibilities in a span of time.
+fn frames_without(file: &str, span_s: [f64; 2]) -> Vec<GroundFrame> {
+    let mut reader = DownlinkReader::open(Path::new(file)).unwrap();
+    let mut frames = Vec::new();
+    while let Some(mut frame) = reader.next_frame().unwrap() {
+        if let GroundFrame::Visibilities(block) = &mut frame {
+            without(block, span_s);
+            if block.is_empty() {
+                continue;
+            }
+        }
+        frames.push(frame);
+    }
+    frames
+}
+
+/// The system's power of a pair, K sr, from a weight: 1 / weight = P_i P_j / (2 dnu dt).
+fn powers_k_sr(file: &str) -> Vec<(f64, f64)> {
+    let mut found = Vec::new();
+    for frame in frames_without(file, [0.0, 0.0]) {
+        let GroundFrame::Visibilities(block) = frame else { continue };
+        found.extend((0..block.len()).map(|k| {
+            let samples = 2.0 * 8e3 * 1e-6 * f64::from(block.duration_ticks[k]);
+            (block.middle_s(k), (samples / f64::from(block.weight[k])).sqrt())
+        }));
+    }
+    found
+}
+
+/// Powers rise by the flux density of the light curve, 3.2548e7 K sr at its peak (numpy: 1e-18 (c / 1e7)^2 / 2 k).
+fn noise_rises_with_the_burst([quiet, burst]: &[String; 2]) {
+    let mut bright = 0;
+    for ((t_s, quiet_k_sr), (_, k_sr)) in powers_k_sr(quiet).into_iter().zip(powers_k_sr(burst)) {
+        let after_s = t_s - 38_005.0;
+        let expected = match after_s {
+            after_s if after_s <= -5.0 => 0.0,
+            after_s if after_s < 0.0 => 3.2548e7 * (1.0 + after_s / 5.0),
+            after_s => 3.2548e7 * (-after_s / 11.5).exp(),
+        };
+        // The square root of the product of two powers is their mean, to the square of their difference of some percent.
+        assert!((k_sr - quiet_k_sr - expected).abs() < 2e-3 * k_sr, "{t_s}: {quiet_k_sr} {k_sr} {expected}");
+        bright += usize::from(expected > 1e7);
+    }
+    assert!(bright > 10, "{bright}");
+}
+
+#[test]
+fn a_burst_of_the_sun_is_found_and_left_out() {
+    let place = Workplace::new(MISSION);
+    let run = |name: &str, more: &[&str]| {
+        json(&[&["run", &place.pipeline, "--out", &place.path(name)], more].concat())
+    };
+    let quiet = run("quiet", &[]);
+    assert_eq!(quiet["bursts"], Value::Null);
+    let flagged = run("flag", &["--set", BURST]);
+    let kept = run("keep", &["--set", BURST, "--set", "calibration.bursts=keep"]);
+    let [of_quiet, of_flagged, of_kept] = [&quiet, &flagged, &kept].map(rho);
+    assert!((of_flagged - of_quiet).abs() < 0.01, "{of_quiet} {of_flagged} {of_kept}");
+    assert!(of_kept < of_quiet - 0.1, "{of_quiet} {of_flagged} {of_kept}");
+
+    let found = &flagged["bursts"];
+    assert_eq!((&found["action"], &found["found"]), (&"flag".into(), &1.into()));
+    let burst = &found["bursts"][0];
+    // Three hundred metres in a line tell the angle from the line, and no direction.
+    assert!(burst["name"].is_null() && burst["position_sigma_deg"].as_f64().unwrap() > 10.0, "{burst}");
+    let number = |key: &str| burst[key].as_f64().unwrap();
+    // The truth has the peak and the flux density; a bin is at least 10 s wide, and its mean less than the peak.
+    let truth = std::fs::read_to_string(place.path("flag/downlink.ccsds.moving.csv")).unwrap();
+    let line: Vec<&str> = truth.lines().nth(1).unwrap().split(',').collect();
+    let peak_s: f64 = line[4].parse().unwrap();
+    assert!((number("peak_s") - peak_s).abs() < 30.0, "{truth} {burst}");
+    assert!(number("flux_jy") > 1e7 && number("flux_jy") < 1e8, "{burst}");
+    let hours = found["channels"][0]["hours"].as_f64().unwrap();
+    assert!(
+        (3600.0 * hours - (number("until_s") - number("from_s"))).abs() < 1e-6 && hours < 0.15,
+        "{found}"
+    );
+    let reasons = &flagged["ledger"]["flagged"];
+    let left_out = reasons["burst of a point source"].as_u64().unwrap();
+    assert!(left_out > 100, "{reasons}");
+    assert_eq!(kept["ledger"]["flagged"]["burst of a point source"], Value::Null);
+
+    noise_rises_with_the_burst(&["quiet", "flag"].map(|run| place.path(&format!("{run}/downlink.ccsds"))));
+
+    // A ground that never had these visibilities makes the same map.
+    let frames = frames_without(&place.path("flag/downlink.ccsds"), ["from_s", "until_s"].map(number));
+    let never = place.file("never.ccsds", &transmit(&frames, &DownlinkConfig::default()));
+    let out = place.path("never");
+    succeed(&["replay", &never, "--map", &place.pipeline, "--out", &out]);
+    for name in ["map.fits", "noise.fits"] {
+        let bytes = |run: &str| std::fs::read(place.path(&format!("{run}/10.000MHz/{name}"))).unwrap();
+        assert!(bytes("flag") == bytes("never"), "{name}");
+    }
+}
+
+#[test]
+fn a_state_knows_its_bursts_and_gives_their_packets_back() {
+    let place = Workplace::new(MISSION);
+    let file = place.simulate("bursts.ccsds", &["--set", BURST]);
+    let state = place.path("state");
+    let replay = |name: &str, more: &[&str]| {
+        json(&[&["replay", &file, "--map", &place.pipeline, "--out", &place.path(name)], more].concat())
+    };
+    let maps = |name: &str| std::fs::read(place.path(&format!("{name}/10.000MHz/map.fits"))).unwrap();
+    let once = replay("once", &[]);
+    let [first, again] = ["first", "again"].map(|name| replay(name, &["--state", &state]));
+    assert!(maps("once") == maps("first") && maps("once") == maps("again"));
+    for later in [&first, &again] {
+        assert_eq!(later["ledger"], once["ledger"]);
+        assert_eq!(later["bursts"], once["bursts"]);
+    }
+    // What is subtracted is what is in the sums: the visibilities in the burst are not.
+    let report = json(&["retract", &file, "--state", &state, "--map", &place.pipeline, "--from-s", "0"]);
+    assert_eq!(report["refused"], 0);
+    assert_eq!(report["accumulated"], once["ledger"]["accumulated"]);
+}
+
+#[test]
+fn what_is_not_simulated_is_refused() {
+    let place = Workplace::new(MISSION);
+    for (key, value) in [
+        ("spacecraft.fidelity", "samples"),
+        ("spacecraft.moon_reflection", "0.07"),
+        ("spacecraft.ninth.on", "true"),
+        ("instrument.pattern.constant_rms", "0.1"),
+    ] {
+        let set = format!("{key}={value}");
+        let text = fail(&["check", &place.pipeline, "--set", BURST, "--set", &set]);
+        assert!(text.contains("with sky.moving, which is not simulated otherwise"), "{key}: {text}");
+    }
+}
