@@ -8,7 +8,7 @@ use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use super::output::print_notes;
 use crate::files::ProtectedInputs;
-use crate::ground::GroundError;
+use crate::ground::{Ground, GroundError};
 use crate::pipeline::{Config, ConfigError, ConfigSource, GroupSize, MemoryLimit};
 use crate::sky::Frame;
 use crate::sky::fits::ReadOptions;
@@ -81,12 +81,49 @@ pub(super) fn require_repeatable(path: &Path, reason: &str) -> Result<(), String
     }
 }
 
-/// Parser of an output file or folder; `-` is refused.
+/// Parser of an output file or folder; `-` is refused, and what lies in the folder of a state.
 pub(super) fn output_path() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| match is_standard(&path) {
-        true => Err("expected a name, as this is not written to standard output; ./- is a file of that name"),
-        false => Ok(path),
+        true => Err("expected a name, as this is not written to standard output; ./- is a file of that name"
+            .to_owned()),
+        false => outside_states(path),
     })
+}
+
+/// Parser of an output file; `-` is standard output.
+pub(super) fn output_or_standard() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(outside_states)
+}
+
+/// Parser of the folder of a new state.
+pub(super) fn new_state_path() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(|path| match Ground::is_state(&path) {
+        // The command says so.
+        Ok(true) => Ok(path),
+        _ => outside_states(path),
+    })
+}
+
+/// Refuses a path in the folder of a state, where nothing but the state is written.
+fn outside_states(path: PathBuf) -> Result<PathBuf, String> {
+    let whole = std::path::absolute(&path).unwrap_or_else(|_| path.clone());
+    let around = whole.ancestors().find(|folder| Ground::is_state(folder).unwrap_or(false));
+    around.map_or(Ok(path), |state| {
+        Err(format!("{} is the folder of a state; expected a name outside it", state.display()))
+    })
+}
+
+/// The folder in `out` for a pipeline or study of this name. A link could lead anywhere, and is refused.
+pub(super) fn default_out(name: &str) -> Result<PathBuf, String> {
+    let folder = PathBuf::from("out").join(name);
+    if folder.is_symlink() {
+        let at = std::fs::read_link(&folder).unwrap_or_default();
+        let (folder, at) = (folder.display(), at.display());
+        return Err(format!(
+            "{folder}: it is a link to {at}; expected a folder, or --out with the folder that is meant"
+        ));
+    }
+    Ok(folder)
 }
 
 /// Parser of a picture to write, as PNG or SVG by its extension. Another extension is likely the name of another file.
@@ -95,7 +132,11 @@ pub(super) fn picture_path() -> impl TypedValueParser<Value = PathBuf> {
         let is_picture = path.extension().is_some_and(|extension| {
             ["png", "svg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
         });
-        if is_picture { Ok(path) } else { Err("expected a name that ends in .png or .svg") }
+        if is_picture {
+            outside_states(path)
+        } else {
+            Err("expected a name that ends in .png or .svg".to_owned())
+        }
     })
 }
 
@@ -129,6 +170,11 @@ impl ArrayArgs {
 }
 
 impl StateMapArgs {
+    /// Protects the input files from being overwritten, until the result is dropped.
+    pub(super) fn protect(&self, config: &Config) -> ProtectedInputs {
+        ProtectedInputs::of(self.map.iter().cloned().chain(config.input_files()))
+    }
+
     /// The settings of the state in a folder, or of the map file if there is one.
     pub(super) fn source(&self, state: &Path) -> Result<ConfigSource, GroundError> {
         self.source_with(state, [])

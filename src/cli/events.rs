@@ -13,6 +13,7 @@ use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 use serde::Serialize;
 use serde_json::json;
 
+use super::arguments::output_or_standard;
 use super::log::{Level, is_json, note, say, say_entry};
 use super::output::{CommandError, cannot_write, json_text, print_notes};
 use crate::calibration::FoundBurst;
@@ -38,7 +39,7 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) struct EventsArgs {
     /// Write progress and events to this file, one JSON object per line; the file is replaced. With - they go to standard output,
     /// which then holds nothing else. The last line has the summary.
-    #[arg(long, value_name = "FILE|-")]
+    #[arg(long, value_name = "FILE|-", value_parser = output_or_standard())]
     events: Option<PathBuf>,
 }
 
@@ -46,6 +47,11 @@ impl EventsArgs {
     /// Whether the events go to standard output.
     pub(super) fn take_stdout(&self) -> bool {
         self.events.as_deref() == Some(Path::new("-"))
+    }
+
+    /// The file, if the events go to one.
+    pub(super) fn file(&self) -> Option<&Path> {
+        self.events.as_deref().filter(|_| !self.take_stdout())
     }
 
     /// Opens the output, if it is requested, and writes the first line. `outputs` are the main files of the command, which it must

@@ -5,7 +5,9 @@ use std::time::SystemTime;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use super::arguments::{ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_path, time_s};
+use super::arguments::{
+    ArrayArgs, MapFileArgs, frame, input_path, is_standard, output_or_standard, output_path, time_s,
+};
 use super::log::system_utc_text;
 use super::output::{
     CommandError, CommandResult, Completion, cannot_write, print_config_notes, print_json_line, print_notes,
@@ -152,7 +154,7 @@ enum Colours {
 #[derive(Debug, Args)]
 struct Destination {
     /// File to be written; - for a table on standard output.
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", value_parser = output_or_standard())]
     out: PathBuf,
     /// Print one JSON object instead of text: file, rows. Not with a table on standard output.
     #[arg(long)]

@@ -9,7 +9,7 @@ use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{DownlinkError, Event, PacketKind};
-use crate::files::{AtomicFile, IfUnfinished, read_text};
+use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, read_text};
 
 /// Largest file of ranges that is read, bytes: a million lines.
 const RANGES_BYTES_MAX: u64 = 1 << 24;
@@ -46,6 +46,7 @@ struct PacketRange {
 }
 
 pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
+    let _inputs = ProtectedInputs::of(args.files.iter().chain([&args.ranges]));
     let name = args.ranges.display();
     let text = match args.ranges.as_os_str() == "-" {
         true => std::io::read_to_string(std::io::stdin()),

@@ -117,6 +117,7 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     for folder in &args.states {
         states.push((folder.as_path(), args.map.source(folder)?.load_ground()?));
     }
+    let _inputs: Vec<_> = states.iter().map(|(_, config)| args.map.protect(config)).collect();
     if let Some((_, config)) = states.first() {
         use_threads(&config.runtime)?;
     }

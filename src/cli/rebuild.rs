@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::arguments::{StateMapArgs, output_path};
+use super::arguments::{StateMapArgs, new_state_path};
 use super::output::{CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::ground::{Ground, WAIT_BYTES, packets_folder};
 use crate::pipeline::use_threads;
@@ -22,7 +22,7 @@ pub(super) struct RebuildArgs {
     #[arg(value_name = "STATE|ARCHIVE")]
     from: PathBuf,
     /// New folder for the state.
-    #[arg(short, long, value_name = "STATE", value_parser = output_path())]
+    #[arg(short, long, value_name = "STATE", value_parser = new_state_path())]
     out: PathBuf,
     #[command(flatten)]
     map: StateMapArgs,

@@ -267,6 +267,13 @@ impl ReplayArgs {
                 format!("--state {path}: it is also the folder of --out; expected two folders").into()
             );
         }
+        // The parsers of names know only states that exist.
+        let mut below = self.out.ancestors().skip(1).chain(self.events.file().and_then(Path::parent));
+        if below.any(|folder| is_same_name(state, folder)) {
+            return Err(
+                format!("--state {path}: --out or --events lies in it; expected other folders").into()
+            );
+        }
         if self.files.is_empty() && !self.listens() && !Ground::is_state(state)? {
             return Err(format!(
                 "--state {path}: no such state, and no files; expected the folder of a state, or downlink files to make one from"

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, group_size, output_path};
+use super::arguments::{PipelineArgs, default_out, group_size, output_path};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::job::Job;
@@ -71,7 +71,7 @@ fn work(args: &RunArgs, job: &Job) -> CommandResult {
         print_notes(sky_notes(&plan)?);
     }
     use_threads(&plan.config.runtime)?;
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&plan.config.name));
+    let out = args.out.clone().map_or_else(|| default_out(&plan.config.name), Ok)?;
     if let Some(size) = args.groups {
         return in_groups(args, &plan, size, &out);
     }

@@ -67,6 +67,7 @@ struct SampledChannel {
 
 pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let config = args.map.source(&args.state)?.load_ground()?;
+    let _inputs = args.map.protect(&config);
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {
         return Err(format!(

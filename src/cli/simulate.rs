@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 
 use clap::Args;
 
-use super::arguments::{PipelineArgs, group_size, is_standard, not_negative_s};
+use super::arguments::{PipelineArgs, group_size, is_standard, not_negative_s, output_or_standard};
 use super::events::EventsArgs;
 use super::interrupt::Interrupt;
 use super::output::{
@@ -15,6 +15,7 @@ use super::output::{
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
+use crate::files::ProtectedInputs;
 use crate::pipeline::{
     Destination, GroupSize, GroupStep, INTEGRATE, MERGE, Plan, RunGroups, Segment, simulate,
     simulate_in_groups, sky_notes, use_threads,
@@ -34,7 +35,7 @@ pub(super) struct SimulateArgs {
     pipeline: PipelineArgs,
     /// Downlink file to write; - for standard output, as input of another program. The truth about errors of the instrument is
     /// then not written.
-    #[arg(short, long, value_name = "FILE|-", required_unless_present = "send")]
+    #[arg(short, long, value_name = "FILE|-", required_unless_present = "send", value_parser = output_or_standard())]
     out: Option<PathBuf>,
     /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
     /// (auto), or this many. The downlink has the same bytes. When interrupted, repeat the command to go on with the next group.
@@ -81,7 +82,7 @@ pub(super) fn execute(args: &SimulateArgs) -> CommandResult {
     }
     let config = args.pipeline.load()?;
     print_config_notes(&config);
-    let _inputs = args.pipeline.protect(&config);
+    let _inputs = (args.pipeline.protect(&config), ProtectedInputs::of(&args.token));
     let plan = Plan::new(config)?;
     print_notes(plan.array.notes());
     print_notes(sky_notes(&plan)?);

@@ -101,7 +101,12 @@ pub(super) fn execute(args: &SkyArgs) -> CommandResult {
         .into());
     }
     let source = ConfigSource { file: args.pipeline.clone(), overrides: args.overrides.clone(), seed };
-    let Config { seed, sky, .. } = source.load()?;
+    let config = source.load()?;
+    if config.sky.file.is_some() {
+        return Err("sky.file: this command generates the sky and reads no map of it; expected a pipeline without sky.file".into());
+    }
+    let _named = ProtectedInputs::of(config.input_files());
+    let Config { seed, sky, .. } = config;
     if !nside.is_power_of_two() || nside > GENERATED_NSIDE_MAX {
         return Err(
             format!("--nside {nside}: expected a power of two from 1 to {GENERATED_NSIDE_MAX}").into()

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde_json::json;
 
-use super::arguments::{output_path, size_bytes};
+use super::arguments::{default_out, output_path, size_bytes};
 use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::{CommandResult, print_json_line, print_notes, print_text};
@@ -65,7 +65,7 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     if let Some(first) = study.cases.first() {
         use_threads(&first.plan.config.runtime)?;
     }
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("out").join(&study.name));
+    let out = args.out.clone().map_or_else(|| default_out(&study.name), Ok)?;
     let interrupt = Interrupt::default();
     let mut progress: Option<Progress> = None;
     let mut gains: Option<(usize, CalibrateLines)> = None;

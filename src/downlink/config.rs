@@ -25,10 +25,13 @@ keys! {
         /// can cost.
         expert repeat_bytes: u64 = 1 << 20;
         /// Reed-Solomon codewords interleaved in a block of "cadu": 1, 2, 3, 4, 5 or 8. Each adds 223 bytes to a frame.
+        #[only_with(r#"downlink.format = "cadu""#)]
         expert interleave: usize = 5;
         /// Spacecraft identifier of "cadu" frames.
+        #[only_with(r#"downlink.format = "cadu""#)]
         expert spacecraft_id: u8 = 0x4C;
         /// Idle "cadu" frames at the start of each pass: the ground needs one to synchronise.
+        #[only_with(r#"downlink.format = "cadu""#)]
         expert idle_frames: u32 = 2;
         /// Maximum rate of the link including coding; 0 for no limit. What exceeds a pass stays on board for later ones; the last
         /// pass sends everything that is left.

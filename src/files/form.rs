@@ -1,18 +1,41 @@
 //! What files are, by their first bytes.
 
-/// First bytes of forms that are no plain text.
-const SIGNATURES: [(&[u8], &str); 10] = [
-    (b"\x1f\x8b", "a gzip file"),
-    (b"\x28\xb5\x2f\xfd", "a zstd file"),
-    (b"\xfd7zXZ", "an xz file"),
-    (b"PK\x03\x04", "a zip file"),
-    (b"\xff\xfe", "text in UTF-16"),
-    (b"\xfe\xff", "text in UTF-16"),
-    (b"SIMPLE  =", "a FITS file"),
-    (b"\x89HDF", "an HDF5 file"),
-    (b"PAR1", "a Parquet file"),
-    (b"%PDF", "a PDF file"),
+/// Place of a signature in a file, the signature, the name of the form, and what makes such a file readable.
+type Form = (usize, &'static [u8], &'static str, &'static str);
+
+/// Forms that are neither plain text nor a downlink.
+const FORMS: [Form; 21] = [
+    (0, b"\x1f\x8b", "a gzip file", "expand it first (gunzip)"),
+    (0, b"\x28\xb5\x2f\xfd", "a zstd file", "expand it first (unzstd)"),
+    (0, b"\xfd7zXZ", "an xz file", "expand it first (unxz)"),
+    (0, b"BZh", "a bzip2 file", "expand it first (bunzip2)"),
+    (0, b"\x04\x22\x4d\x18", "an lz4 file", "expand it first (unlz4)"),
+    (0, b"PK\x03\x04", "a zip file", "expand it first (unzip)"),
+    (0, b"7z\xbc\xaf\x27\x1c", "a 7z file", "expand it first"),
+    (257, b"ustar", "a tar archive", "unpack it first (tar -x)"),
+    (0, b"\xff\xfe", "text in UTF-16", ""),
+    (0, b"\xfe\xff", "text in UTF-16", ""),
+    (0, b"\x89HDF", "an HDF5 file (as UVH5 is)", ""),
+    (0, b"CDF\x01", "a netCDF file", ""),
+    (0, b"CDF\x02", "a netCDF file", ""),
+    (0, b"SIMPLE  =", "a FITS file", ""),
+    (0, b"PAR1", "a Parquet file", ""),
+    (0, b"\x93NUMPY", "a numpy array", ""),
+    (0, b"\x89PNG", "a PNG picture", ""),
+    (0, b"%PDF", "a PDF file", ""),
+    (
+        0,
+        b"LNRSTA",
+        "a checkpoint of a lunarray state",
+        "give the folder of the state to a command that takes states",
+    ),
+    (0, b"\xd4\xc3\xb2\xa1", "a network capture (pcap)", ""),
+    (0, b"\x0a\x0d\x0d\x0a", "a network capture (pcapng)", ""),
 ];
+
+fn signed(bytes: &[u8]) -> Option<&'static Form> {
+    FORMS.iter().find(|(at, signature, ..)| bytes.get(*at..).is_some_and(|rest| rest.starts_with(signature)))
+}
 
 /// Names the form of a file of which these are the first bytes or all; `None` if it may be plain text.
 #[must_use]
@@ -21,8 +44,16 @@ pub fn form_of(bytes: &[u8]) -> Option<&'static str> {
     let is_wide = bytes.first_chunk::<4>().is_some_and(|four| {
         matches!(four.map(|byte| byte == 0), [true, false, true, false] | [false, true, false, true])
     });
-    let signed = SIGNATURES.iter().find(|(signature, _)| bytes.starts_with(signature));
-    signed.map(|(_, name)| *name).or(is_wide.then_some("text in UTF-16"))
+    signed(bytes).map(|(_, _, name, _)| *name).or(is_wide.then_some("text in UTF-16"))
+}
+
+/// Names the form of a file by its signature, and says what makes such a file readable.
+#[must_use]
+pub fn form_with_remedy(bytes: &[u8]) -> Option<String> {
+    signed(bytes).map(|(_, _, name, remedy)| match *remedy {
+        "" => (*name).to_owned(),
+        remedy => format!("{name}: {remedy}"),
+    })
 }
 
 /// The text of a file: without a byte order mark, with line ends `\n`, and with bytes replaced that are no UTF-8, as in names in other
@@ -60,5 +91,7 @@ mod tests {
         ] {
             assert!(text_of(bytes).unwrap_err().contains(name), "{name}");
         }
+        let tar = [&b"s.ccsds"[..], &[0; 250], b"ustar  \0"].concat();
+        assert_eq!(text_of(&tar), Err("a tar archive"));
     }
 }

@@ -16,5 +16,5 @@ pub use atomic::{
     AtomicFile, IfUnfinished, growing_file, nameless_file, remove_unfinished, write_atomically,
 };
 pub use folder_lock::FolderLock;
-pub use form::{form_of, text_of};
+pub use form::{form_of, form_with_remedy, text_of};
 pub use protected::{ProtectedInputs, require_replaceable};

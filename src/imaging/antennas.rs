@@ -17,7 +17,7 @@ keys! {
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
         /// Attitudes and patterns by files, to which tilts are added.
-        #[serde(skip_serializing_if = "AntennaFiles::is_none")]
+        #[serde(skip_serializing_if = "AntennaFiles::is_default")]
         section files: AntennaFiles = AntennaFiles::default();
     }
 }

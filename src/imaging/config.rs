@@ -110,6 +110,7 @@ keys! {
         everyday baseline_bp_max: f64 = 2.0;
         /// Regularisation epsilon; one value, or one a channel. Alone it asks for R = epsilon W_max I, the paper's; "degree" and
         /// "file" take 1e-4 without it.
+        #[only_with(r#"no map.regulariser = "data""#)]
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
         /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's (default
@@ -377,8 +378,6 @@ impl MapConfig {
             !is_by_degree || self.engine == EngineKind::Harmonic,
             "\"data\" or \"identity\" without map.engine = \"harmonic\"",
         );
-        let has_effect = self.epsilon.is_none() || regulariser != RegulariserChoice::Data;
-        checks.require("epsilon", "(set)", has_effect, "no such key with map.regulariser = \"data\"");
         let is_small = self.engine == EngineKind::Harmonic || self.nside <= POWER_NSIDE_MAX;
         checks.require(
             "regulariser",

@@ -18,6 +18,7 @@ keys! {
         /// Write every snapshot as a FITS map, too.
         expert snapshot_maps: bool = false;
         /// Frame of pictures: "galactic", "ecliptic" or "equatorial"; maps are always on ecliptic axes.
+        #[only_with("products.pictures = true")]
         everyday frame: Frame = Frame::Galactic;
         /// FWHM to which maps, noise and input are smoothed, on finer pixels, before they are compared and drawn; 0 for none.
         everyday smooth_fwhm_deg: f64 = 0.0;

@@ -37,10 +37,12 @@ keys! {
         #[only_with("sky.file")]
         expert frequency: MapFrequency = MapFrequency::default();
         /// HEALPix nside of the generated sky, or of map files with `added`: a power of two up to 1024.
+        #[only_with("no sky.file or sky.added")]
         everyday nside: usize = 64;
         /// Maximum degree of the harmonic model; 0 for what the baselines need.
         expert l_max: usize = 0;
         /// The generated sky.
+        #[only_with("no sky.file or sky.added")]
         section generated: GeneratedSky = GeneratedSky::default();
         /// What to add to map files: `{ small_scales = true, sources = true }` adds generated ones, `catalogue = "sources.csv"`
         /// those of a table, as `lunarray sky --sources` writes it.

@@ -83,8 +83,8 @@ fn errors_that_are_off_leave_every_byte_and_seeds_decide_the_rest() {
     let ideal = simulate(&place, "ideal.ccsds", &[]);
     let off = [
         "instrument.realisation=5",
-        "instrument.phase_deg={drift_time_s=100.0}",
-        "instrument.beacon={on_s=60.0}",
+        "instrument.phase_deg={drift_rms=0.0,drift_time_s=100.0}",
+        "instrument.beacon={k_sr=0.0,on_s=60.0}",
     ];
     assert!(simulate(&place, "off.ccsds", &off) == ideal);
     assert!(!Path::new(&place.path("ideal.ccsds.instrument.csv")).exists());

@@ -169,7 +169,7 @@ fn navigation_that_is_off_leaves_every_byte_and_old_keys_are_told_where_they_wen
         std::fs::read(place.path(name)).unwrap()
     };
     let ideal = bytes("ideal", &[]);
-    assert!(bytes("off", &["navigation.along_m={drift_time_s=100.0}"]) == ideal);
+    assert!(bytes("off", &["navigation.along_m={drift_rms=0.0,drift_time_s=100.0}"]) == ideal);
     let errors = ["navigation.radial_m={orbit_rms=5.0}", "navigation.time_tag_ms={pass_rms=5.0}"];
     let on = bytes("on", &errors);
     assert!(on != ideal && bytes("again", &[&errors[..], &["runtime.threads=1"]].concat()) == on);

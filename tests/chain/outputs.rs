@@ -118,6 +118,19 @@ fn outputs_never_replace_inputs() {
     spares(&map, &["export", "alm", &map, "--out", &map], words);
     spares(&map, &["cutout", &map, "--centre", "0,0", "--out", &drawn], words);
     spares(&file, &["corrupt", &file, "--out", &file, "--frame-loss", "0.1"], words);
+    let ranges = place.file("ranges.txt", b"0x103 0 5\n");
+    spares(&ranges, &["extract", &file, "--ranges", &ranges, "--out", &ranges], words);
+    // Files that keys name.
+    let gains = place.file("gains.json", b"{}");
+    let sky = ["sky", &pipeline, "--freq-hz", "3e6", "--nside", "8", "--out"];
+    let named =
+        ["--set", "calibration.hook=antenna-gains", "--set", &format!("calibration.gains_file={gains:?}")];
+    spares(&gains, &[&sky[..], &[&gains, "--no-picture"], &named].concat(), words);
+    let other = place.path("other.fits");
+    spares(&gains, &[&sky[..], &[&other, "--no-picture", "--sources", &gains], &named].concat(), words);
+    // A sky that is read is none that is generated.
+    let read = format!("sky.file={map:?}");
+    spares(&map, &[&sky[..], &[&map, "--set", &read]].concat(), "this command generates the sky");
     spares(&map, &["sky", "--like", &map, "--correlation", "0.5", "--out", &map], words);
     // The user's own file in the folder of the products: before anything is computed.
     let folder = place.path("");
@@ -133,6 +146,57 @@ fn outputs_never_replace_inputs() {
     let prior = format!("{out}/3.000MHz/map.fits");
     let set = format!("map.prior_files=[{prior:?}, {:?}]", format!("{out}/10.000MHz/map.fits"));
     spares(&prior, &["replay", &file, "--map", &pipeline, "--out", &out, "--set", &set], "would replace it");
+}
+
+#[test]
+fn nothing_is_written_into_the_folder_of_a_state() {
+    let place = Workplace::new(SMALL);
+    let (pipeline, state, out) = (place.pipeline.clone(), place.path("state"), place.path("out"));
+    let file = place.simulate("small.ccsds", &[]);
+    let replay = ["replay", &file, "--map", &pipeline, "--state", &state, "--out"];
+    // Before there is a state.
+    let [inside, events] = ["o", "events"].map(|name| format!("{state}/{name}"));
+    assert!(fail(&[&replay[..], &[&inside]].concat()).contains("expected other folders"));
+    assert!(fail(&[&replay[..], &[&out, "--events", &events]].concat()).contains("expected other folders"));
+    assert!(!Path::new(&state).exists());
+    succeed(&[&replay[..], &[&out]].concat());
+    let before = files(Path::new(&state));
+    let checkpoint = before.keys().find(|name| name.to_str().unwrap().contains("checkpoint-")).unwrap();
+    let checkpoint = Path::new(&state).join(checkpoint).to_str().unwrap().to_owned();
+    let picture = format!("{state}/x.png");
+    for args in [
+        &["replay", &file, "--map", &pipeline, "--state", &state, "--out", &out, "--events", &checkpoint][..],
+        &["simulate", &pipeline, "--out", &checkpoint],
+        &["export", "visibilities", &file, "--out", &checkpoint],
+        &["corrupt", &file, "--out", &checkpoint],
+        &["run", &pipeline, "--out", &inside],
+        &["gaps", &state, "--picture", &picture],
+        &["run", &pipeline, "--out", &state],
+        &["sky", &pipeline, "--freq-hz", "3e6", "--out", &checkpoint],
+    ] {
+        let said = fail(args);
+        assert!(said.contains("is the folder of a state; expected a name outside it"), "{args:?}: {said}");
+    }
+    assert!(files(Path::new(&state)) == before);
+}
+
+#[test]
+fn a_link_in_the_folder_of_outputs_is_not_followed() {
+    let place = Workplace::new(SMALL);
+    let elsewhere = place.path("elsewhere");
+    std::fs::create_dir_all(place.path("out")).unwrap();
+    std::fs::create_dir(&elsewhere).unwrap();
+    std::os::unix::fs::symlink(&elsewhere, place.path("out/small")).unwrap();
+    let study =
+        "name = \"small\"\npipeline = \"pipeline.toml\"\n[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4]\n";
+    let study = place.file("study.toml", study.as_bytes());
+    for args in [&["study", &study][..], &["run", &place.pipeline]] {
+        let mut command = Command::new(assert_cmd::cargo::cargo_bin("lunarray"));
+        let ended = command.args(args).current_dir(place.path("")).output().unwrap();
+        let said = String::from_utf8(ended.stderr).unwrap();
+        assert!(!ended.status.success() && said.contains("out/small: it is a link to"), "{said}");
+        assert_eq!(std::fs::read_dir(&elsewhere).unwrap().count(), 0, "{args:?}");
+    }
 }
 
 #[test]

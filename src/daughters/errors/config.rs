@@ -34,29 +34,36 @@ keys! {
         #[serde(skip_serializing_if = "PatternsByFrequency::is_ideal")]
         expert pattern_by_frequency: PatternsByFrequency = PatternsByFrequency::default();
         /// Attitudes and patterns of the antennas by files, to which tilts are added.
-        #[serde(skip_serializing_if = "AntennaFiles::is_none")]
+        #[serde(skip_serializing_if = "AntennaFiles::is_default")]
         section antenna_files: AntennaFiles = AntennaFiles::default();
         /// Allan deviation of every clock at 1 s, with white frequency noise.
         expert clock_allan_deviation: f64 = 0.0;
         /// Time within which steering brings clocks back: their noise is forgotten as exp(-|t| / this).
+        #[only_with(".clock_allan_deviation")]
         expert clock_steering_s: f64 = 86_400.0;
         /// Daughters, from 1, that deliver noise and no signal.
         expert dead_daughters: Vec<u32> = Vec::new();
         /// Receivers that deliver noise and no signal: daughter, from 1, and channel, from 0.
         expert dead_channels: Vec<[u32; 2]> = Vec::new();
         /// Probability that a visibility is an outlier.
+        #[only_with(".outlier_sigma")]
         expert outlier_probability: f64 = 0.0;
         /// Standard deviation of what is added to an outlier's real and imaginary part, over that of thermal noise.
+        #[only_with(".outlier_probability")]
         expert outlier_sigma: f64 = 0.0;
         /// Mean time between bursts of interference from the Earth; 0 for none.
+        #[only_with(".burst_k_sr")]
         expert burst_every_s: f64 = 0.0;
         /// Length of a burst.
+        #[only_with(".burst_every_s")]
         expert burst_s: f64 = 0.0;
         /// Power of a burst at a daughter.
+        #[only_with(".burst_s")]
         expert burst_k_sr: f64 = 0.0;
         /// Power at a daughter of interference from the Earth at the Moon's limb; 0 for none.
         expert leak_k_sr: f64 = 0.0;
         /// Angle below the limb over which the leakage falls by a factor e.
+        #[only_with(".leak_k_sr")]
         expert leak_depth_deg: f64 = 1.0;
         /// Artificial signal for calibration: a plane wave, equal at all daughters. Its integrations are flagged and stay out of
         /// maps.
@@ -81,10 +88,12 @@ keys! {
         /// Rms of a Gauss-Markov process with correlation exp(-|t| / drift_time_s).
         expert drift_rms: f64 = 0.0;
         /// Correlation time of the Gauss-Markov process.
+        #[only_with(".drift_rms")]
         expert drift_time_s: f64 = 3600.0;
         /// Rms of a level that jumps.
         expert step_rms: f64 = 0.0;
         /// Interval in which the level jumps once, at a random time.
+        #[only_with(".step_rms")]
         expert step_every_s: f64 = 86_400.0;
     }
 }
@@ -93,12 +102,16 @@ keys! {
     /// The artificial signal and its times.
     pub struct BeaconSchedule {
         /// Power at a daughter, in every channel; 0 for no signal.
+        #[only_with(".on_s")]
         expert k_sr: f64 = 0.0;
         /// Ecliptic longitude and latitude that it comes from.
+        #[only_with(".k_sr")]
         expert direction_deg: [f64; 2] = [0.0, 0.0];
         /// Time for which it is on, from the start of each pass.
+        #[only_with(".k_sr")]
         expert on_s: f64 = 0.0;
         /// Time after which it is repeated in a pass; 0 for once.
+        #[only_with(".k_sr")]
         expert every_s: f64 = 0.0;
     }
 }
@@ -300,15 +313,19 @@ impl InstrumentConfig {
                 exists(daughter, satellites),
                 expected,
             );
+            let is_new = !self.dead_daughters[..index].contains(&daughter);
+            checks.require(format!("dead_daughters[{index}]"), daughter, is_new, "every daughter once");
         }
         for (index, &[daughter, channel]) in self.dead_channels.iter().enumerate() {
             let good = exists(daughter, satellites) && (channel as usize) < channels;
-            let expected =
-                format!("a daughter, 1 to {satellites}, and a channel, 0 to {}", channels.saturating_sub(1));
+            let expected = format!(
+                "a daughter, 1 to {satellites}, and a channel, 0 to {}, every pair once",
+                channels.saturating_sub(1)
+            );
             checks.require(
                 format!("dead_channels[{index}]"),
                 format!("[{daughter}, {channel}]"),
-                good,
+                good && !self.dead_channels[..index].contains(&[daughter, channel]),
                 expected,
             );
         }

@@ -252,6 +252,15 @@ fn all_invalid_values_of_the_section_are_reported() {
         "beacon.direction_deg",
     ];
     assert_eq!(keys, expected.map(|key| format!("instrument.{key}")));
+    let twice = "dead_daughters = [5, 5]\ndead_channels = [[5, 1], [5, 2], [5, 1]]";
+    let twice: InstrumentConfig = toml::from_str(twice).unwrap();
+    let told: Vec<String> = twice.problems(8, 3, false).iter().map(ToString::to_string).collect();
+    assert_eq!(told.len(), 2, "{told:?}");
+    assert!(
+        told[0].starts_with("instrument.dead_daughters[1] = 5: expected every daughter once"),
+        "{told:?}"
+    );
+    assert!(told[1].starts_with("instrument.dead_channels[2] = [5, 1]: "), "{told:?}");
     let dead: InstrumentConfig = toml::from_str("dead_daughters = [1]").unwrap();
     assert!(dead.problems(8, 3, false).is_empty() && dead.problems(8, 3, true).len() == 1);
 }

@@ -16,8 +16,10 @@ keys! {
         /// Mean distance between bursts; 0 for none. Bursts and gaps are the states of a Gilbert-Elliott channel.
         expert burst_every_bits: f64 = 0.0;
         /// Mean length of bursts.
+        #[only_with(".burst_every_bits")]
         expert burst_bits: f64 = 0.0;
         /// Probability that a bit of a burst is wrong.
+        #[only_with(".burst_every_bits")]
         expert burst_bit_error_rate: f64 = 0.5;
         /// Probability that a frame does not arrive.
         everyday frame_loss: f64 = 0.0;
@@ -30,6 +32,7 @@ keys! {
         /// Probability that a frame arrives late.
         expert reorder: f64 = 0.0;
         /// Maximum delay of a late frame.
+        #[only_with(".reorder")]
         expert reorder_frames: u64 = 16;
         /// Probability that a pass arrives after the next one.
         expert pass_swap: f64 = 0.0;

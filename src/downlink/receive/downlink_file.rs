@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Chain, Cursor, Read};
+use std::io::{self, BufRead, BufReader, Chain, Cursor, IsTerminal, Read};
 use std::path::Path;
 
 use flate2::read::MultiGzDecoder;
@@ -64,6 +64,14 @@ impl DownlinkFile {
     /// # Errors
     /// The file cannot be read.
     pub fn from_file(mut file: File) -> io::Result<Self> {
+        // A terminal ends, and so does a serial line, which is one; /dev/zero does not.
+        #[cfg(unix)]
+        if std::os::unix::fs::FileTypeExt::is_char_device(&file.metadata()?.file_type())
+            && !file.is_terminal()
+        {
+            let reason = "a device, which may be endless; expected a file or a pipe";
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));
+        }
         let mut head = Vec::new();
         Read::by_ref(&mut file).take(ZSTD.len() as u64).read_to_end(&mut head)?;
         let [is_gzip, is_zstd] = [GZIP, ZSTD].map(|signature| head.starts_with(signature));
@@ -202,6 +210,15 @@ mod tests {
     use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn endless_devices_are_refused() {
+        let said = DownlinkFile::open(Path::new("/dev/zero")).err().unwrap().to_string();
+        assert!(said.contains("/dev/zero"), "{said}");
+        let refused = DownlinkFile::from_file(File::open("/dev/zero").unwrap()).err().unwrap();
+        assert!(refused.to_string().contains("a device, which may be endless"), "{refused}");
+    }
 
     fn gzip(bytes: &[u8]) -> Vec<u8> {
         let mut encoder = GzEncoder::new(Vec::new(), Compression::default());

@@ -1,6 +1,7 @@
 //! Identifies streams that are not a downlink from their first bytes, for error messages.
 
 use crate::downlink::wire::cadu::{FrameHeader, IDLE, SYNC_MARKER, SYNC_MARKER_BYTES, randomize};
+use crate::files::{form_of, form_with_remedy};
 
 /// Number of leading bytes of a stream that are kept to identify its format.
 pub(super) const HEAD_BYTES: usize = 16 << 10;
@@ -10,47 +11,21 @@ const FRAME_BYTES: std::ops::RangeInclusive<usize> = 32..=2 * 2048;
 /// Minimum number of consecutive frames or packets that identify a format.
 const FRAMES_MIN: usize = 3;
 
-/// First bytes of formats, with the text for the message.
-const SIGNATURES: [(&[u8], &str); 17] = [
-    (b"\x1f\x8b", "a gzip file: expand it first (gunzip)"),
-    (b"\x28\xb5\x2f\xfd", "a zstd file: expand it first (unzstd)"),
-    (b"\xfd7zXZ\x00", "an xz file: expand it first (unxz)"),
-    (b"BZh", "a bzip2 file: expand it first (bunzip2)"),
-    (b"\x04\x22\x4d\x18", "an lz4 file: expand it first (unlz4)"),
-    (b"PK\x03\x04", "a zip file: expand it first (unzip)"),
-    (b"7z\xbc\xaf\x27\x1c", "a 7z file: expand it first"),
-    (b"\x89HDF\r\n\x1a\n", "an HDF5 file (as UVH5 is)"),
-    (b"CDF", "a netCDF file"),
-    (b"SIMPLE  =", "a FITS file"),
-    (b"PAR1", "a Parquet file"),
-    (b"\x93NUMPY", "a numpy array"),
-    (b"\x89PNG", "a PNG picture"),
-    (b"%PDF", "a PDF document"),
-    (
-        b"LNRSTA",
-        "a checkpoint of a lunarray state: give the folder of the state to a command that takes states",
-    ),
-    (b"\xd4\xc3\xb2\xa1", "a network capture (pcap)"),
-    (b"\x0a\x0d\x0d\x0a", "a network capture (pcapng)"),
-];
-
 /// Identifies a stream from its first bytes; `None` if they are not recognised.
 pub(super) fn identify(head: &[u8]) -> Option<String> {
-    let by_signature = SIGNATURES.iter().find(|(signature, _)| head.starts_with(signature));
-    if let Some((_, name)) = by_signature {
-        return Some((*name).to_owned());
-    }
-    if head.get(257..262) == Some(b"ustar") {
-        return Some("a tar archive: unpack it first (tar -x)".to_owned());
-    }
-    identify_unsupported_frames(head)
+    form_with_remedy(head)
+        .or_else(|| identify_unsupported_frames(head))
         .or_else(|| identify_unsupported_coding(head))
         .or_else(|| identify_packets(head))
         .or_else(|| identify_text(head))
 }
 
-/// Identifies transfer frames that the receiver does not support: without sync markers, or not randomized.
+/// Identifies what contains packets but is no stream of them: files in an archive, and transfer frames without sync markers, or not
+/// randomized.
 pub(super) fn identify_unsupported_frames(head: &[u8]) -> Option<String> {
+    if let archive @ Some("a tar archive") = form_of(head) {
+        return archive.and_then(|_| form_with_remedy(head));
+    }
     if let Some(bytes) = frame_length(|at| head.get(at..)) {
         return Some(format!(
             "AOS transfer frames of {bytes} bytes without sync markers: supply the CADUs as received, or the space packets \
@@ -239,6 +214,10 @@ mod tests {
         ] {
             assert!(identify(head).is_some_and(|found| found.contains(name)), "{name}: {:?}", identify(head));
         }
+        // Packets in an archive would be found, and the rest of it taken for damage.
+        let tar = [&b"s.ccsds"[..], &[0; 250], b"ustar  \0", &[0; 247], &packets].concat();
+        let found = identify_unsupported_frames(&tar);
+        assert_eq!(found.as_deref(), Some("a tar archive: unpack it first (tar -x)"));
         for unknown in [&[0; 600][..], &[0xFF; 600], b"", b"\x01"] {
             assert_eq!(identify(unknown), None);
         }

@@ -12,7 +12,7 @@ const SHOWN_MAX: usize = 60;
 
 /// A key that is set and has no effect.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
-#[error("{key} = {value} has an effect only with {only_with}")]
+#[error("{key} = {value} has {}", told(only_with))]
 pub struct NoEffect {
     /// Full key.
     pub key: String,
@@ -20,6 +20,21 @@ pub struct NoEffect {
     pub value: String,
     /// Condition under which the key has an effect.
     pub only_with: String,
+}
+
+const ONLY_WITH: &str = "an effect only with ";
+
+fn told(condition: &str) -> String {
+    match condition.strip_prefix("no ").filter(|rest| !rest.contains(" or ") && !rest.contains(" and ")) {
+        Some(other) => format!("no effect with {other}; leave one of them out"),
+        None => format!("{ONLY_WITH}{condition}"),
+    }
+}
+
+/// Whether a problem is a key without effect because a strength is zero that is set to zero in `set`: a study steps through it.
+pub(super) fn is_of_strength_zero(problem: &str, set: &Table) -> bool {
+    let strength = problem.split_once(ONLY_WITH).and_then(|(_, key)| value_of(set, key));
+    strength.is_some_and(|value| value.as_float() == Some(0.0) || value.as_integer() == Some(0))
 }
 
 impl Config {
@@ -93,6 +108,7 @@ fn is_above(value: &Value, limit: &Value) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pipeline::ConfigSource;
 
     /// Three satellites on an ellipse.
     const ORBITS: &str = "satellites = 3, kepler = [\
@@ -131,6 +147,46 @@ mod tests {
                 "daughters.tones.calibration_k_sr = 2.0 has an effect only with spacecraft.fidelity = \"samples\"",
             ),
             ("sky.frequency = { spectral_index = -2.5 }", "has an effect only with sky.file"),
+            // What would be left of a generated sky.
+            (
+                "sky = { file = \"a.fits\", nside = 8 }",
+                "sky.nside = 8 has an effect only with no sky.file or sky.added",
+            ),
+            (
+                "sky = { file = \"a.fits\", generated.loops = false }",
+                "sky.generated.loops = false has an effect only with no sky.file or sky.added",
+            ),
+            (
+                "map.epsilon = 0.5\nmap.regulariser = \"data\"",
+                "map.epsilon = 0.5 has no effect with map.regulariser = \"data\"; leave one of them out",
+            ),
+            (
+                "calibration.gains_file = \"g\"",
+                "calibration.gains_file = \"g\" has an effect only with calibration.hook = \"antenna-gains\"",
+            ),
+            (
+                "map.antennas.files.table_error_max = 0.1",
+                "map.antennas.files.table_error_max = 0.1 has an effect only with map.antennas.files.tables",
+            ),
+            // Keys of a term that is off.
+            (
+                "instrument.burst_s = 9.0",
+                "instrument.burst_s = 9.0 has an effect only with instrument.burst_every_s",
+            ),
+            ("instrument.outlier_sigma = 9.0", "only with instrument.outlier_probability"),
+            ("instrument.leak_depth_deg = 9.0", "only with instrument.leak_k_sr"),
+            ("instrument.clock_steering_s = 9e5", "only with instrument.clock_allan_deviation"),
+            ("instrument.beacon.on_s = 9.0", "only with instrument.beacon.k_sr"),
+            ("instrument.amplitude.drift_time_s = 99.0", "only with instrument.amplitude.drift_rms"),
+            ("navigation.along_m.step_every_s = 99.0", "only with navigation.along_m.step_rms"),
+            ("downlink.idle_frames = 9", "only with downlink.format = \"cadu\""),
+            ("downlink.link.burst_bits = 9.0", "only with downlink.link.burst_every_bits"),
+            ("downlink.link.reorder_frames = 9", "only with downlink.link.reorder"),
+            ("products = { frame = \"ecliptic\", pictures = false }", "only with products.pictures = true"),
+            (
+                "sky.generated = { source_flux_jy_min = 5.0, point_sources = false }",
+                "only with sky.generated.point_sources = true or sky.added",
+            ),
             // A formation's shape beside orbits of the satellites' own.
             (
                 format!("array = {{ {ORBITS}, altitude_m = 1e6 }}").as_str(),
@@ -154,12 +210,23 @@ mod tests {
             "map.l_max = 0",
             "map.matrix = \"free\"\nmap.iterations_max = 7",
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
-            // A key that is set to zero still sets its section.
-            "instrument.clock_ns = { drift_rms = 0.0, drift_time_s = 60.0 }",
             format!("array = {{ {ORBITS}, altitude_m = 300e3, moon_radius_m = 1.7e6 }}").as_str(),
         ] {
             assert_eq!(messages(text), Vec::<String>::new(), "{text}");
         }
+    }
+
+    #[test]
+    fn a_strength_that_is_set_to_zero_is_no_slip() {
+        let load = |set: &[&str]| {
+            let overrides = set.iter().map(|&text| text.to_owned()).collect();
+            ConfigSource { overrides, ..ConfigSource::default() }.load().map(|_| ())
+        };
+        let time = "instrument.clock_ns.drift_time_s=60.0";
+        load(&[time, "instrument.clock_ns.drift_rms=0.0"]).unwrap();
+        load(&["downlink.link={reorder=0, reorder_frames=9}"]).unwrap();
+        assert!(load(&[time]).unwrap_err().to_string().contains("only with instrument.clock_ns.drift_rms"));
+        assert!(load(&["products={pictures=false, frame='ecliptic'}"]).is_err());
     }
 
     #[test]

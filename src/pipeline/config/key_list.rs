@@ -26,13 +26,19 @@ pub(super) fn flat_keys() -> Vec<FlatKey> {
 fn collect(section: &str, keys: &'static [Key], only_with: &[String], found: &mut Vec<FlatKey>) {
     for key in keys {
         let path = joined(section, key.name);
-        let condition = (!key.only_with.is_empty()).then(|| key.only_with.to_owned());
+        let condition = (!key.only_with.is_empty()).then(|| in_section(section, key.only_with));
         let only_with: Vec<String> = only_with.iter().cloned().chain(condition).collect();
         let is_section = key.level == Level::Section;
         let default = if is_section { None } else { (key.default)() };
         found.push(FlatKey { path: path.clone(), key, default, only_with: only_with.clone() });
         collect(&path, key.keys, &only_with, found);
     }
+}
+
+/// A condition with the full paths of its keys.
+fn in_section(section: &str, condition: &str) -> String {
+    let full = |word: &str| if word.starts_with('.') { format!("{section}{word}") } else { word.to_owned() };
+    condition.split(' ').map(full).collect::<Vec<_>>().join(" ")
 }
 
 fn joined(section: &str, key: &str) -> String {

@@ -9,7 +9,6 @@ use crate::array::ObservingWindows;
 use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
 use crate::imaging::EngineKind;
 use crate::mother::{Fidelity, largest_gap};
-use crate::sky::SkyConfig;
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
 
@@ -33,22 +32,9 @@ impl Config {
             self.quantiser_note(),
             self.positions_note(),
             self.reach_note(),
-            self.generated_note(),
             self.rate_note(),
         ];
         notes.into_iter().flatten().collect()
-    }
-
-    /// A note if the sky is a file, and settings of the generated sky are left from a pipeline that generated it.
-    fn generated_note(&self) -> Option<String> {
-        let SkyConfig { file, nside, added, generated, .. } = &self.sky;
-        let default = SkyConfig::default();
-        let is_idle = file.is_some() && added.is_none();
-        let idle =
-            [("sky.nside", *nside != default.nside), ("sky.generated", *generated != default.generated)];
-        let names: Vec<&str> = idle.iter().filter(|(_, is_set)| *is_set).map(|(name, _)| *name).collect();
-        (is_idle && !names.is_empty())
-            .then(|| format!("{}: no effect with sky.file, except with sky.added", names.join(" and ")))
     }
 
     /// A note that the rate does not limit the last pass.

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 use super::channel_lists;
+use super::effects::is_of_strength_zero;
 use super::problems::Problems;
 use super::quantities::read_units;
 use super::reader::{KeyLocator, PartialConfig, SHOWN_MAX, parse_table};
@@ -199,11 +200,12 @@ impl ConfigSource {
             }
         }
         read_units(&mut table);
+        notes.extend(drop_replaced(&mut table, &keys));
         channel_lists::wrap_single_channel(&mut table);
         if let Some(before) = channels_hz {
             notes.extend(channel_lists::adapt_lists(&mut table, &before, |key| keys.contains(&key)));
         }
-        let mut partial = PartialConfig::new(table, &locator);
+        let mut partial = PartialConfig::new(table.clone(), &locator);
         if let Some(seed) = self.seed {
             partial.config.seed = seed;
         }
@@ -211,7 +213,8 @@ impl ConfigSource {
             partial.config.name = self.default_name();
         }
         partial.config.choose_engine();
-        let problems = partial.all_problems(value_problems(&partial.config), override_problems);
+        let found = value_problems(&partial.config).without(|problem| is_of_strength_zero(problem, &table));
+        let problems = partial.all_problems(found, override_problems);
         match problems.is_empty() {
             true => Ok(partial.config),
             false => Err(ConfigError::Values { origin, problems }),
@@ -253,6 +256,39 @@ fn read(path: &Path) -> Result<String, ConfigError> {
     }
 }
 
+/// Keys of which an override replaces others of the same section: those that the file sets are left out, as both together would be an
+/// error.
+const REPLACING: [(&str, &str, &[&str]); 4] = [
+    ("spacecraft", "thin", &["every_nth_window", "every_nth_integration"]),
+    ("spacecraft", "every_nth_window", &["thin"]),
+    ("spacecraft", "every_nth_integration", &["thin"]),
+    ("sky", "file", &["nside", "generated"]),
+];
+
+/// Leaves out the keys of a file that the overrides `keys` replace; a note on each.
+fn drop_replaced(table: &mut toml::Table, keys: &[&str]) -> Vec<String> {
+    let mut notes = Vec::new();
+    for (section, by, others) in
+        REPLACING.iter().filter(|(section, by, _)| keys.contains(&&*format!("{section}.{by}")))
+    {
+        let Some(found) = table.get_mut(*section).and_then(toml::Value::as_table_mut) else { continue };
+        // A stride of 1 leaves nothing out, and `sky.added` uses what generates a sky.
+        if found.get(*by).and_then(toml::Value::as_integer) == Some(1) || found.contains_key("added") {
+            continue;
+        }
+        for other in *others {
+            let name = format!("{section}.{other}");
+            let is_set = keys.iter().any(|key| {
+                key.strip_prefix(&*name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+            });
+            if !is_set && found.remove(*other).is_some() {
+                notes.push(format!("{name}: left out, as --set {section}.{by} replaces it"));
+            }
+        }
+    }
+    notes
+}
+
 /// Applies an override `key=value` to a table; a value that is not TOML is taken as a string. Returns the key.
 fn apply_override<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str, ConfigError> {
     let invalid = || ConfigError::Override(shortened(text, SHOWN_MAX));
@@ -292,6 +328,34 @@ mod tests {
     #[test]
     fn the_embedded_pipeline_is_valid() {
         assert!(ConfigSource::default().load().is_ok());
+    }
+
+    #[test]
+    fn an_override_replaces_the_other_way_of_the_file() {
+        let strides = |set: &[&str]| {
+            let found = with(set).unwrap().spacecraft;
+            (found.thin, found.every_nth_window, found.every_nth_integration.values().to_vec())
+        };
+        assert_eq!(strides(&["spacecraft.thin=10"]), (10, 1, vec![1]));
+        assert_eq!(strides(&["spacecraft.thin=1"]), (1, 41, vec![8, 4, 1]));
+        let text = "[spacecraft]\nthin = 10\n[sky]\nnside = 8\ngenerated.loops = false\n";
+        let of_text = |set: &str| {
+            let source = ConfigSource { overrides: vec![set.to_owned()], ..ConfigSource::default() };
+            source.parse_text(text).unwrap()
+        };
+        assert_eq!(of_text("spacecraft.every_nth_window=3").spacecraft.thin, 1);
+        assert_eq!(of_text("spacecraft.every_nth_window=1").spacecraft.thin, 10);
+        assert_eq!(of_text("sky.file='a.fits'").sky.nside, 64);
+        assert!(of_text("sky.file='a.fits'").sky.generated.loops);
+        // Of two that are given together none is taken for a slip.
+        let both = ["spacecraft.thin=10", "spacecraft.every_nth_window=3"];
+        let overrides = both.map(str::to_owned).to_vec();
+        let said = ConfigSource { overrides, ..ConfigSource::default() }.load().unwrap_err().to_string();
+        assert!(said.contains("spacecraft.thin = 10: expected 1, or every_nth_window = 1"), "{said}");
+        let mut notes = Vec::new();
+        let overrides = vec!["spacecraft.thin=10".to_owned()];
+        ConfigSource { overrides, ..ConfigSource::default() }.load_noting(&mut notes).unwrap();
+        assert!(notes.iter().any(|note| note.contains("every_nth_window: left out")), "{notes:?}");
     }
 
     /// The default pipeline is for any orbits: its engine is one that they allow.

@@ -236,13 +236,13 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     }
     let mut start = Vec::new();
     reader.seek(SeekFrom::Start(0)).map_err(FitsProblem::io("seek"))?;
-    reader.by_ref().take(9).read_to_end(&mut start).map_err(FitsProblem::io("read"))?;
-    if start == b"SIMPLE  =" {
+    reader.by_ref().take(512).read_to_end(&mut start).map_err(FitsProblem::io("read"))?;
+    if start.starts_with(b"SIMPLE  =") {
         return Ok(());
     }
     let found = match form_of(&start) {
         Some(form) => format!("the signature of {form} (decompress it first, if it is compressed)"),
-        None => format!("`{}`", start.escape_ascii()),
+        None => format!("`{}`", start[..start.len().min(9)].escape_ascii()),
     };
     Err(FitsProblem::NotFits { found })
 }

@@ -15,10 +15,13 @@ keys! {
         /// Small-scale fluctuations of the diffuse emission.
         expert small_scales: bool = true;
         /// Factor on the amplitude of the small scales of Remazeilles et al. (2015).
+        #[only_with(".small_scales = true or sky.added")]
         expert small_scale_amplitude: f64 = 1.0;
         /// FWHM of the smooth model, below which the small scales are added.
+        #[only_with(".small_scales = true or sky.added")]
         expert small_scale_fwhm_deg: f64 = 5.0;
         /// Maximum degree of the small scales; a map holds at most 3 nside - 1.
+        #[only_with(".small_scales = true or sky.added")]
         expert small_scale_l_max: usize = 3071;
         /// Rms of the logarithm of the gas's opacity over the sky.
         expert cloud_log_rms: f64 = 0.33;
@@ -31,12 +34,16 @@ keys! {
         /// Point sources.
         expert point_sources: bool = true;
         /// Minimum flux density of a source, at 154 MHz; fainter ones are part of the smooth background.
+        #[only_with(".point_sources = true or sky.added")]
         expert source_flux_jy_min: f64 = 4.36;
         /// Maximum flux density of a source, at 154 MHz.
+        #[only_with(".point_sources = true or sky.added")]
         expert source_flux_jy_max: f64 = 75.0;
         /// Spectral index of the sources' flux densities.
+        #[only_with(".point_sources = true or sky.added")]
         expert source_spectral_index: f64 = -0.8;
         /// Absorption of the sources by Galactic gas.
+        #[only_with(".point_sources = true or sky.added")]
         expert sources_absorbed: bool = true;
     }
 }
