@@ -489,7 +489,8 @@ mod tests {
         }
         // Hours are of right ascension as well, without a colon.
         let read = Catalogue::read(file(b"ra,dec,S74\nhours,deg,Jy\n12,0,5\n").path()).unwrap();
-        assert!((place(&read.sources[0])[0] - 180.0).abs() < 1e-9);
+        let longitude = place(&read.sources[0])[0];
+        assert!((longitude - 180.0).abs() < 1e-9, "{longitude}");
         for (table, said) in [
             ("elon_deg,elat,S74\nrad,deg,Jy\n1,2,3\n", "line 1: found the unit `rad` of `elon_deg`"),
             ("elon,elat,S74\ndeg,hours,Jy\n1,2,3\n", "the unit `hours` of `elat`"),
