@@ -60,10 +60,7 @@ fn a_file_of_another_kind_is_told_with_the_command_that_takes_it() {
     let study = place.file("study.toml", b"[[axis]]\nkey = \"map.epsilon\"\nvalues = [1e-4]\n");
     for command in ["run", "check"] {
         let said = fail(&[command, &downlink]);
-        assert!(
-            said.contains("not text in UTF-8; expected a pipeline file") && said.contains("inspect"),
-            "{said}"
-        );
+        assert!(said.contains("not text in UTF-8; expected a pipeline file") && said.contains("inspect"), "{said}");
         let said = fail(&[command, &study]);
         assert!(said.contains("a study, with [[axis]]") && said.contains("lunarray study"), "{said}");
     }
