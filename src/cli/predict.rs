@@ -7,11 +7,11 @@ use serde::Serialize;
 
 use super::arguments::{ArrayArgs, MapFileArgs, TimeOfMission, band_text, frequency_hz, time_of_mission};
 use super::lines::next_line;
-use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
+use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::array::Array;
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
-use crate::sky::fits::{MapFile, ReadOptions, read_whole_map_file};
+use crate::sky::fits::{MapFile, ReadOptions, read_notes, read_whole_map_file};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{Dimension, Pair, echo};
 
@@ -70,6 +70,7 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let array = Array::new(&config.array)?;
     let options = ReadOptions { frequency_hz: args.freq_hz, ..args.maps.options() };
     let MapFile { map, frequency_hz: map_hz, .. } = read_whole_map_file(&args.sky, &options)?;
+    print_notes(read_notes(&args.sky, &options)?);
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
     let print_prediction = |query: VisibilityQuery| -> Result<(), CommandError> {

@@ -14,7 +14,7 @@ use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::response::{MeasuredAntennas, MeasuredAntennasError};
-use crate::sky::fits::check_frequencies;
+use crate::sky::fits::{ReadOptions, check_frequency};
 use crate::sky::healpix::{is_valid_nside, pixel_area_sr};
 use crate::sky::{Frame, TEMPERATURE_K_MAX};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
@@ -543,7 +543,23 @@ impl MapConfig {
     /// [`AccumulationError::Prior`].
     #[doc(hidden)]
     pub fn check_priors(&self, instrument: &Instrument) -> Result<(), AccumulationError> {
-        Ok(check_frequencies(&self.prior_files, &instrument.frequencies_hz())?)
+        let frequencies_hz = instrument.frequencies_hz();
+        let mut priors = self.prior_files.iter().zip(&frequencies_hz).enumerate();
+        match self.prior_files.len() == frequencies_hz.len() {
+            true => Ok(priors.try_for_each(|(channel, (path, &hz))| {
+                check_frequency(path, hz, &self.prior_options(&frequencies_hz, channel))
+            })?),
+            false => Ok(()),
+        }
+    }
+
+    /// Returns the options for reading the prior map of a channel: of its columns, the one of the channel's frequency.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn prior_options(&self, channels_hz: &[f64], channel: usize) -> ReadOptions {
+        let frequency_hz =
+            channels_hz.get(channel).copied().filter(|_| channels_hz.len() == self.prior_files.len());
+        ReadOptions { frame_if_missing: self.prior_frame, frequency_hz, ..ReadOptions::default() }
     }
 
     /// Per-channel settings that do not match an instrument of `channels` channels.

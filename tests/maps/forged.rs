@@ -179,6 +179,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             beams_deg: Vec::new(),
             prior_k: PerChannel::All(0.0),
             prior_maps: Vec::new(),
+            prior_hz: Vec::new(),
             moon_reflection: 0.0,
             rule: StoppingRule { residual_max: 1e-4, iterations_max: 100 },
             refine: RefineRule { passes_max: 0, residual_max: 1e-4 },

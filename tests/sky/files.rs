@@ -6,8 +6,8 @@ use std::path::Path;
 
 use lunarray::sky::fits::{
     Card, CardValue, Column, FitsError, FitsProblem, MapFile, MapOutline, Ordering, Precision, ReadOptions,
-    SkyChannel, WriteOptions, read_known_sky, read_map, read_map_file, read_map_from, read_notes, read_prior,
-    read_sky, read_whole_map, write_columns, write_map,
+    SkyChannel, WriteOptions, check_frequency, read_known_sky, read_map, read_map_file, read_map_from,
+    read_notes, read_prior, read_sky, read_whole_map, sky_notes, write_columns, write_map,
 };
 use lunarray::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use lunarray::units::constants::HEALPIX_UNSEEN;
@@ -448,8 +448,34 @@ fn what_the_header_calls_bad_is_no_temperature() {
     write(&["BAD_DATA=             -32768.0"], -32_768.0);
     let said = read_whole_map(&path, &ReadOptions::default()).unwrap_err().to_string();
     assert!(said.contains("1 of 12 pixels have no usable value") && said.contains("pixel 7"), "{said}");
+    // As other programs call it.
+    for key in ["BADVAL", "BAD_VAL", "MISSVAL", "UNSEEN", "BLANK"] {
+        write(&[&format!("{key:8}=               -32768")], -32_768.0);
+        let said = read_whole_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+        assert!(said.contains("1 of 12 pixels have no usable value") && said.contains("pixel 7"), "{said}");
+    }
+    // Integers have BLANK as other tables have TNULL.
+    let mut integers = [f32::from_bits(300_000); 12];
+    integers[7] = f32::from_bits(9_999);
+    foreign_map(&path, &["COORDSYS= 'G'"], &["NSIDE   = 1", "BLANK   = 9999"], &[("T", "K", integers)]);
+    let mut bytes = fs::read(&path).unwrap();
+    let at = bytes.windows(13).position(|text| text == b"TFORM1  = 'E'").unwrap();
+    bytes[at + 11] = b'J';
+    fs::write(&path, bytes).unwrap();
+    let said = read_whole_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+    assert!(said.contains("1 of 12 pixels have no usable value") && said.contains("pixel 7"), "{said}");
     write(&[], -32_768.0);
     assert!(read_whole_map(&path, &ReadOptions::default()).is_ok());
+    // Below 0 K without such a keyword is noted.
+    let channel = SkyChannel { frequency_hz: 3e6, is_dark_accepted: false, is_file_shared: false };
+    let notes = sky_notes(&path, &channel, &SkyConfig::default()).unwrap();
+    assert!(
+        notes.iter().any(|note| note.contains("1 of 12 pixels are below 0 K, down to -3.2768e4 K")),
+        "{notes:?}"
+    );
+    write(&[], 1.0);
+    let notes = sky_notes(&path, &channel, &SkyConfig::default()).unwrap();
+    assert!(!notes.iter().any(|note| note.contains("below 0 K")), "{notes:?}");
     // UNSEEN in mK and in MK, for priors too.
     for scaled in [-1.6375e27, -1.6375e24, -1.6375e30] {
         write(&[], scaled);
@@ -506,10 +532,13 @@ fn errors_hits_and_polarisation_are_no_sky() {
         ["HITS", "T"],
         ["PIXEL", "T"],
         ["Q_POLARISATION", "I_STOKES"],
+        ["UNCERTAINTY", "T"],
+        ["SENSITIVITY", "T"],
+        ["LOG_T", "T"],
     ] {
         write(&primary, names);
         let sky = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap();
-        let prior = read_prior(&path, &ReadOptions::default()).unwrap();
+        let prior = read_prior(&path, &ReadOptions::default()).unwrap().map;
         for map in [&sky, &prior, &read_known_sky(&path, &ReadOptions::default()).unwrap()] {
             assert_eq!(map.values()[0], 3e5, "{names:?}");
         }
@@ -529,6 +558,80 @@ fn errors_hits_and_polarisation_are_no_sky() {
     write(&["COORDSYS= 'G'", "OBSFREQ = 408. / MHz"], ["T", "HITS"]);
     let said = read_for(&path, 10e6, MapFrequency::MustMatch, false).unwrap_err().to_string();
     assert!(said.contains("OBSFREQ is 408 MHz"), "{said}");
+}
+
+#[test]
+fn headers_agree_on_order_and_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("orders.fits");
+    let write = |primary: &[&str], more: &[&str]| {
+        foreign_map(&path, &[&["COORDSYS= 'G'"], primary].concat(), more, &[("T", "K", [3e5; 12])]);
+    };
+    let refused = || read_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+    write(&["ORDERING= 'NESTED'"], &["NSIDE   = 1", "ORDERING= 'RING'"]);
+    let said = refused();
+    assert!(said.contains("ORDERING is 'NESTED'; expected 'RING', as the headers say elsewhere"), "{said}");
+    write(&["NSIDE   = 2"], &["NSIDE   = 1"]);
+    let said = refused();
+    assert!(said.contains("NSIDE is 2; expected 1, as the headers say elsewhere"), "{said}");
+    let assumed = |notes: &[String]| {
+        notes.iter().any(|note| note.contains("ORDERING") && note.contains("RING is assumed"))
+    };
+    for (cards, shown) in [
+        (&["NSIDE   = 1", "ORDERING= 'nest'"][..], "nside 1 in NESTED order"),
+        (&["NSIDE   = 1", "ORDERING= 'RING'"], "nside 1 in RING order ("),
+        (&["NSIDE   = 1"], "nside 1 in RING order (assumed)"),
+    ] {
+        write(&[], cards);
+        let understood = MapOutline::read(&path, &ReadOptions::default()).unwrap().to_string();
+        assert!(understood.contains(shown), "{understood}");
+        let notes = read_notes(&path, &ReadOptions::default()).unwrap();
+        assert_eq!(assumed(&notes), cards.len() == 1, "{notes:?}");
+    }
+}
+
+#[test]
+fn a_frequency_in_other_words_counts() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("words.fits");
+    let write = |primary: &[&str], more: &[&str]| {
+        let more = [&["NSIDE   = 1"], more].concat();
+        foreign_map(&path, &[&["COORDSYS= 'G'"], primary].concat(), &more, &[("T", "K", [3e5; 12])]);
+    };
+    let read = |hz| read_for(&path, hz, MapFrequency::MustMatch, false).map_err(|error| error.to_string());
+    let noted = |words: &str| {
+        let notes = read_notes(&path, &ReadOptions::default()).unwrap();
+        notes.iter().any(|note| note.contains(words))
+    };
+    for (primary, more, said) in [
+        (&["CTYPE3  = 'FREQ'", "CRVAL3  = 408.", "CUNIT3  = 'MHz'"][..], &[][..], "CRVAL3 is 408 MHz"),
+        (&[], &["FREQ_MHZ= 408"], "FREQ_MHZ is 408 MHz"),
+    ] {
+        write(primary, more);
+        let found = read(10e6).unwrap_err();
+        assert!(found.contains(said) && found.contains("expected 10 MHz"), "{found}");
+        assert!(read(408e6).is_ok() && !noted("states no frequency"));
+    }
+    // Texts: one frequency that is another is refused, unless FREQ says better.
+    for (text, keyword) in [
+        ("EXTNAME = 'HASLAM_408MHZ'", "EXTNAME"),
+        ("TCOMM1  = 'temperature at 408 MHz'", "TCOMM1"),
+        ("BAND    = '408 MHz'", "BAND"),
+        ("COMMENT   All-sky 408 MHz map", "COMMENT"),
+    ] {
+        write(&[], &[text]);
+        let found = read(10e6).unwrap_err();
+        for part in [keyword, "408", "expected 10 MHz, the channel's", "as FREQ in its header"] {
+            assert!(found.contains(part), "{found}: expected {part}");
+        }
+        let found = check_frequency(&path, 10e6, &ReadOptions::default()).unwrap_err().to_string();
+        assert!(found.contains(keyword), "{found}");
+        assert!(read(408e6).is_ok() && noted(&format!("in {keyword}; it is taken as one at the channel's")));
+        write(&["FREQ    = '10 MHz'"], &[text]);
+        assert!(read(10e6).is_ok());
+    }
+    write(&[], &["COMMENT   from 22 MHz and 408 MHz"]);
+    assert!(read(10e6).is_ok() && noted("its header says 'from 22 MHz and 408 MHz' in COMMENT"));
 }
 
 #[test]

@@ -38,6 +38,20 @@ pub enum SolveError {
         /// Pixels of the map.
         expected: usize,
     },
+    /// A prior map is of another frequency than the data.
+    #[error(
+        "map.prior_files: the prior of channel {channel} is at {} MHz, the data at {} MHz; expected one frequency: set \
+         spacecraft.channels_hz to that of the data",
+        prior_hz / 1e6, data_hz / 1e6
+    )]
+    PriorFrequency {
+        /// The channel.
+        channel: ChannelId,
+        /// Frequency of the prior, Hz.
+        prior_hz: f64,
+        /// Frequency of the data, Hz.
+        data_hz: f64,
+    },
     /// A table of angular power is invalid.
     #[error("map.regulariser.file: {}: {found}; expected a table of l and C_l in K^2, from l = 0 on, all above 0", path.display())]
     Power {

@@ -81,6 +81,8 @@ pub struct SolverSetup {
     pub prior_k: PerChannel<f64>,
     /// Prior maps by channel, K, at the map's nside; empty for none.
     pub prior_maps: Vec<Vec<f64>>,
+    /// Frequencies that the files of the prior maps state, Hz.
+    pub prior_hz: Vec<Option<f64>>,
     /// Assumed reflectivity of the Moon: visibilities are divided by 1 plus this.
     pub moon_reflection: f64,
     /// Stopping rule of iterative solutions: harmonic maps, and matrix-free pixel maps.
@@ -331,6 +333,11 @@ impl Stage for Solver {
         let epsilon = self.setup.epsilon.get(index).ok_or(SolveError::NoEpsilon(channel))?;
         let prior = self.prior(index, pixel_count(nside));
         let frequency_hz = instrument.channels.get(index).map_or(0.0, |c| c.frequency_hz);
+        if let Some(&Some(prior_hz)) = self.setup.prior_hz.get(index)
+            && (prior_hz - frequency_hz).abs() > 1e-6 * frequency_hz
+        {
+            return Err(SolveError::PriorFrequency { channel, prior_hz, data_hz: frequency_hz });
+        }
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
         let (setup, last) = (&self.setup, &mut self.last_solutions);
         // An intermediate map must not take time from a final one.

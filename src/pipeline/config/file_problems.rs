@@ -25,8 +25,10 @@ impl Plan {
         let skies = channels.filter_map(|channel| Some((sky.file.as_ref()?.get(channel)?, channel)));
         let skies = skies.map(|(path, channel)| read_sky(&path, &self.sky_channel(channel), sky));
         let priors = self.config.map.prior_files.iter();
-        let options = ReadOptions { frame_if_missing: self.config.map.prior_frame, ..ReadOptions::default() };
-        let priors = priors.map(|path| read_prior(path, &options));
+        let prior_options = |channel| self.config.map.prior_options(&spacecraft.channels_hz, channel);
+        let priors = priors
+            .enumerate()
+            .map(|(channel, path)| read_prior(path, &prior_options(channel)).map(|file| file.map));
         // A file may serve several channels.
         let mut reported = BTreeSet::new();
         for problem in skies.chain(priors).filter_map(Result::err) {
@@ -34,16 +36,18 @@ impl Plan {
                 found.push(|| problem);
             }
         }
-        for files in [&self.config.map.prior_files, &self.config.calibrate.model_files] {
+        let (map, calibrate) = (&self.config.map, &self.config.calibrate);
+        for (files, is_prior) in [(&map.prior_files, true), (&calibrate.model_files, false)] {
             if files.len() != spacecraft.channels_hz.len() {
                 continue;
             }
             // Unreadable files are reported elsewhere.
             let is_keyword = |error: &FitsError| matches!(*error.problem, FitsProblem::Keyword { .. });
-            let errors = files
-                .iter()
-                .zip(&spacecraft.channels_hz)
-                .filter_map(|(path, &frequency_hz)| check_frequency(path, frequency_hz).err());
+            let errors = files.iter().zip(&spacecraft.channels_hz).enumerate();
+            let errors = errors.filter_map(|(channel, (path, &hz))| {
+                let options = if is_prior { prior_options(channel) } else { ReadOptions::default() };
+                check_frequency(path, hz, &options).err()
+            });
             errors.filter(is_keyword).for_each(|problem| found.push(|| problem));
         }
         for problem in self.config.map.power_files().iter().filter_map(|path| Regulariser::read(path).err()) {
@@ -95,14 +99,13 @@ impl Plan {
             let outline = path.and_then(|path| MapOutline::read(&path, &sky_options(sky, hz)).ok());
             add_line("sky.file", outline.map(|outline| outline.to_string()));
         }
-        for (key, files, frame) in [
-            ("map.prior_files", &map.prior_files, map.prior_frame),
-            ("calibrate.model_files", &calibrate.model_files, None),
-        ] {
-            let options = ReadOptions { frame_if_missing: frame, ..ReadOptions::default() };
-            for path in files {
-                add_line(key, MapOutline::read(path, &options).ok().map(|outline| outline.to_string()));
-            }
+        let priors = map.prior_files.iter().enumerate().map(|(channel, path)| {
+            ("map.prior_files", path, map.prior_options(&spacecraft.channels_hz, channel))
+        });
+        let models = calibrate.model_files.iter();
+        let models = models.map(|path| ("calibrate.model_files", path, ReadOptions::default()));
+        for (key, path, options) in priors.chain(models) {
+            add_line(key, MapOutline::read(path, &options).ok().map(|outline| outline.to_string()));
         }
         let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());
         add_line("sky.added.catalogue", catalogue);

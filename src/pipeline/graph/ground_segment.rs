@@ -1,6 +1,6 @@
 //! The stages of the ground segment: from downlink bytes to normal equations, maps and products.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use super::live_gains::GainsWriter;
@@ -14,7 +14,7 @@ use crate::imaging::{
 use crate::pipeline::config::{Config, PipelineError};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
 use crate::runtime::{Graph, Link, Sink};
-use crate::sky::fits::{ReadOptions, read_prior};
+use crate::sky::fits::read_prior;
 
 /// Name of the stage that decodes, calibrates and accumulates, and keeps the state.
 pub(in crate::pipeline) const GROUND: &str = "ground";
@@ -43,13 +43,15 @@ impl Config {
     #[doc(hidden)]
     pub fn solver(&self, watch: SolveWatch) -> Result<SolverSetup, PipelineError> {
         let map = &self.map;
+        let (prior_maps, prior_hz) = prior_maps(self)?;
         Ok(SolverSetup {
             epsilon: map.epsilon(),
             regularisers: regularisers(map)?,
             beams_deg: map.beams_deg.clone(),
             moon_reflection: map.moon_reflection,
             prior_k: map.prior_k.clone(),
-            prior_maps: prior_maps(self)?,
+            prior_maps,
+            prior_hz,
             rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
             assumed: map.assumed().map_err(|error| PipelineError::Antennas("map.antennas.files", error))?,
@@ -138,14 +140,43 @@ fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     })
 }
 
-/// Prior maps of the channels, smoothed and at the resolution of the maps, K.
-fn prior_maps(config: &Config) -> Result<Vec<Vec<f64>>, PipelineError> {
+/// Prior maps of the channels, smoothed and at the resolution of the maps, K, and the frequencies that their files state, Hz.
+fn prior_maps(config: &Config) -> Result<(Vec<Vec<f64>>, Vec<Option<f64>>), PipelineError> {
     let map = &config.map;
-    let options = ReadOptions { frame_if_missing: map.prior_frame, ..ReadOptions::default() };
-    let read = |path: &std::path::PathBuf| {
-        let prior = read_prior(path, &options)?.to_ecliptic();
-        let smooth = prior.smoothed(map.prior_fwhm_deg.to_radians())?;
-        Ok(smooth.resized(map.nside)?.into_values())
+    let read = |(channel, path): (usize, &PathBuf)| {
+        let prior = read_prior(path, &map.prior_options(&config.spacecraft.channels_hz, channel))?;
+        let smooth = prior.map.to_ecliptic().smoothed(map.prior_fwhm_deg.to_radians())?;
+        Ok((smooth.resized(map.nside)?.into_values(), prior.frequency_hz))
     };
-    map.prior_files.iter().map(read).collect()
+    map.prior_files.iter().enumerate().map(read).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sky::Frame;
+    use crate::sky::fits::{Column, WriteOptions, write_columns};
+
+    #[test]
+    fn a_prior_is_the_column_of_its_channel() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("prior.fits");
+        let values = [[1e6; 48], [2e5; 48], [1e4; 48]];
+        let columns: [Column; 3] = std::array::from_fn(|k| Column {
+            name: ["T_1MHz", "T_3MHz", "T_10MHz"][k],
+            unit: "K",
+            values: &values[k],
+        });
+        write_columns(&path, Frame::Ecliptic, &columns, &WriteOptions::default()).unwrap();
+        let mut config = Config::default();
+        config.map.nside = 2;
+        config.map.prior_files = vec![path.clone(), path];
+        config.spacecraft.channels_hz = vec![10e6, 3e6];
+        let (maps, hz) = prior_maps(&config).unwrap();
+        assert_eq!(hz, [Some(10e6), Some(3e6)]);
+        for (map, value) in maps.iter().zip([1e4, 2e5]) {
+            // The smoothing of a constant keeps it as the harmonic transform does, to 1e-6 at this resolution.
+            assert!(map.iter().all(|found| (found / value - 1.0).abs() < 1e-6), "{map:?}");
+        }
+    }
 }

@@ -1,5 +1,6 @@
 //! The stages of the space segment: from observing windows to visibilities, the onboard store and packets.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use super::models;
@@ -11,10 +12,10 @@ use crate::mother::{
     Fidelity, Integrator, MeasurementOptions, Ninth, NinthSetup, NinthSky, NoiseModel, Observer, PacedLink,
     Store,
 };
-use crate::pipeline::config::{PipelineError, Plan};
+use crate::pipeline::config::{Config, PipelineError, Plan};
 use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
-use crate::sky::fits::{read_notes, read_sky, sky_options};
+use crate::sky::fits::{read_notes, read_sky, sky_notes as map_notes};
 use crate::sky::generated::generate;
 use crate::sky::{Frame, SkyMap};
 use crate::units::ChannelId;
@@ -53,21 +54,33 @@ pub(in crate::pipeline) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap
     }
 }
 
-/// Notes on the sky: assumptions about map files, such as their unit, and whether it is too coarse for the baselines.
+/// Notes on the sky: assumptions about map files and catalogues, such as their unit, and whether it is too coarse for the baselines.
 ///
 /// # Errors
-/// A map whose header cannot be read.
+/// A map of the sky that cannot be read.
 pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
-    let (sky, mut notes) = (&plan.config.sky, Vec::new());
-    for (channel, &frequency_hz) in plan.config.spacecraft.channels_hz.iter().enumerate() {
-        let Some(path) = sky.file.as_ref().and_then(|files| files.get(channel)) else { continue };
-        for note in read_notes(&path, &sky_options(sky, frequency_hz))? {
+    let Config { sky, map, spacecraft, .. } = &plan.config;
+    let mut notes: Vec<String> = Vec::new();
+    let mut add = |path: &Path, found: Vec<String>| {
+        for note in found {
             let note = format!("{}: {note}", path.display());
             // A file may serve several channels.
             if !notes.contains(&note) {
                 notes.push(note);
             }
         }
+    };
+    for channel in 0..spacecraft.channels_hz.len() {
+        let Some(path) = sky.file.as_ref().and_then(|files| files.get(channel)) else { continue };
+        add(&path, map_notes(&path, &plan.sky_channel(channel), sky)?);
+    }
+    for (channel, path) in map.prior_files.iter().enumerate() {
+        // A prior that cannot be read is an error where it is used.
+        let options = map.prior_options(&spacecraft.channels_hz, channel);
+        add(path, read_notes(path, &options).unwrap_or_default());
+    }
+    if let Some(added) = &sky.added {
+        notes.extend(added.note()?);
     }
     notes.extend(plan.coarse_sky_note());
     Ok(notes)

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::error::{FitsError, FitsProblem};
-use super::metadata::{StatedFrequency, is_other_quantity, is_same_hz};
-use super::read::{MapFile, ReadOptions, read_frequency, read_whole_map_file};
+use super::metadata::{StatedFrequency, check_quoted, is_other_quantity, is_same_hz};
+use super::read::{MapFile, ReadOptions, read_frequency, read_notes, read_whole_map_file};
 use crate::sky::{Frame, MapError, MapFrequency, SkyConfig, SkyMap};
 use crate::units::{Dimension, echo};
 
@@ -42,6 +42,8 @@ pub struct MapOutline {
     pub column: String,
     /// Number of map columns in the table.
     pub columns: usize,
+    /// Order of the pixels in the file, and whether it is assumed.
+    pub ordering: &'static str,
     /// HEALPix nside.
     pub nside: usize,
     /// Side of a pixel, degrees.
@@ -74,6 +76,7 @@ impl MapOutline {
             unit: file.unit.clone(),
             column: file.name.clone(),
             columns: file.columns,
+            ordering: file.ordering,
             nside,
             pixel_deg: (41_252.961_249_419_27 / values.len() as f64).sqrt(),
             l_max: SkyConfig::l_max_determined(nside),
@@ -98,11 +101,12 @@ impl fmt::Display for MapOutline {
         let [mean, min_k, max_k] = self.mean_min_max_k;
         write!(
             f,
-            "{}: {frequency}, {} frame{frame}, {unit}{column}, nside {} (pixels of {:.2} deg, l up to {}), {} bad pixels, mean {mean:.4e} \
+            "{}: {frequency}, {} frame{frame}, {unit}{column}, nside {} in {} (pixels of {:.2} deg, l up to {}), {} bad pixels, mean {mean:.4e} \
              K, {min_k:.3e} K to {max_k:.3e} K",
             self.file.display(),
             self.frame,
             self.nside,
+            self.ordering,
             self.pixel_deg,
             self.l_max,
             self.bad_pixels
@@ -134,6 +138,24 @@ pub fn read_sky(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result
     }
 }
 
+/// Notes on the map of a sky for a channel: assumptions about its metadata ([`read_notes`]), and temperatures below 0 K.
+///
+/// # Errors
+/// As [`read_sky`].
+pub fn sky_notes(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<Vec<String>, FitsError> {
+    let mut notes = read_notes(path, &sky_options(config, channel.frequency_hz))?;
+    let map = read_at(path, channel, config)?;
+    let below: Vec<f64> = map.values().iter().copied().filter(|value| *value < 0.0).collect();
+    if let Some(least) = below.iter().copied().reduce(f64::min) {
+        let (count, total) = (below.len(), map.values().len());
+        notes.push(format!(
+            "{count} of {total} pixels are below 0 K, down to {least:.4e} K, and count as temperatures: if that means bad pixels, \
+             say so in the header (BAD_DATA), and fill them"
+        ));
+    }
+    Ok(notes)
+}
+
 /// Reads the map of the sky model for calibration, in K. Every pixel must be a temperature, and the mean 1e-16 or more. When the channel
 /// is known, [`check_frequency`] compares the frequency.
 ///
@@ -147,13 +169,13 @@ pub fn read_known_sky(path: &Path, options: &ReadOptions) -> Result<SkyMap, Fits
     }
 }
 
-/// Reads a prior map, in K. Every pixel must be a temperature.
+/// Reads a prior map, in K, with the metadata of its file. Every pixel must be a temperature.
 ///
 /// # Errors
 /// As [`super::read_whole_map`]; [`MapError::NoTemperature`].
-pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<SkyMap, FitsError> {
-    let map = read_temperatures(path, options)?.map;
-    mean_k(path, &map).map(|_| map)
+pub fn read_prior(path: &Path, options: &ReadOptions) -> Result<MapFile, FitsError> {
+    let file = read_temperatures(path, options)?;
+    mean_k(path, &file.map).map(|_| file)
 }
 
 /// Reads a whole map of which the name of the column does not say that it is something else.
@@ -166,17 +188,17 @@ fn read_temperatures(path: &Path, options: &ReadOptions) -> Result<MapFile, Fits
     Ok(file)
 }
 
-/// Requires that the frequency of a map is `frequency_hz`, if the map states one. Reads only headers.
+/// Requires that the frequency of a map is `frequency_hz`, if the map states one, or if its header names only one. Reads only headers.
 ///
 /// # Errors
-/// [`FitsError`] for a file that cannot be read; [`FitsProblem::Keyword`] for FREQ.
-pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> {
-    match read_frequency(path)? {
-        Some(found) if !is_same_hz(found.hz, frequency_hz) => {
-            Err(FitsError::new(path, other_frequency(&found, frequency_hz, "")))
-        }
-        _ => Ok(()),
-    }
+/// [`FitsError`] for a file that cannot be read; [`FitsProblem::Keyword`] for the frequency.
+pub fn check_frequency(path: &Path, frequency_hz: f64, options: &ReadOptions) -> Result<(), FitsError> {
+    let checked = match read_frequency(path, options)? {
+        (Some(found), _) if is_same_hz(found.hz, frequency_hz) => Ok(()),
+        (Some(found), _) => Err(other_frequency(&found, frequency_hz, "")),
+        (None, quoted) => check_quoted(&quoted, frequency_hz),
+    };
+    checked.map_err(|problem| FitsError::new(path, problem))
 }
 
 /// Checks the frequencies of maps ([`check_frequency`]) if there is one per channel; other numbers of maps are refused elsewhere.
@@ -184,8 +206,12 @@ pub fn check_frequency(path: &Path, frequency_hz: f64) -> Result<(), FitsError> 
 /// # Errors
 /// As [`check_frequency`].
 pub fn check_frequencies<P: AsRef<Path>>(paths: &[P], channels_hz: &[f64]) -> Result<(), FitsError> {
+    let options = ReadOptions::default();
     match paths.len() == channels_hz.len() {
-        true => paths.iter().zip(channels_hz).try_for_each(|(path, &hz)| check_frequency(path.as_ref(), hz)),
+        true => {
+            let mut pairs = paths.iter().zip(channels_hz);
+            pairs.try_for_each(|(path, &hz)| check_frequency(path.as_ref(), hz, &options))
+        }
         false => Ok(()),
     }
 }
@@ -207,7 +233,7 @@ fn other_frequency(of_map: &StatedFrequency, frequency_hz: f64, otherwise: &str)
 fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyMap, FitsError> {
     let (rule, wanted_hz) = (config.frequency, channel.frequency_hz);
     let options = sky_options(config, wanted_hz);
-    let MapFile { mut map, frequency_hz, frequency_keyword, .. } = read_temperatures(path, &options)?;
+    let MapFile { mut map, frequency_hz, frequency_keyword, quoted, .. } = read_temperatures(path, &options)?;
     let refuse = |problem| FitsError::new(path, problem);
     let Some(map_hz) = frequency_hz else {
         let expected = match rule {
@@ -217,7 +243,7 @@ fn read_at(path: &Path, channel: &SkyChannel, config: &SkyConfig) -> Result<SkyM
             MapFrequency::MustMatch if channel.is_file_shared => {
                 "the map's frequency, Hz, as sky.file is one map for several channels: add the keyword, or give one map per channel"
             }
-            MapFrequency::MustMatch => return Ok(map),
+            MapFrequency::MustMatch => return check_quoted(&quoted, wanted_hz).map(|()| map).map_err(refuse),
         };
         return Err(refuse(FitsProblem::missing("FREQ", expected)));
     };

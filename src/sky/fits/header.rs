@@ -10,10 +10,12 @@ pub(super) const BLOCK_BYTES: usize = 2880;
 /// Maximum number of cards in a header; map files have tens.
 const CARDS_MAX: usize = 36 * 1000;
 
-/// Cards of a header that have values.
+/// Cards of a header that have values, and its comments.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Header {
     cards: Vec<Card>,
+    /// Texts of COMMENT cards.
+    comments: Vec<String>,
 }
 
 impl Header {
@@ -24,7 +26,7 @@ impl Header {
         length: u64,
     ) -> Result<(Self, u64), FitsProblem> {
         reader.seek(SeekFrom::Start(start)).map_err(FitsProblem::io("seek"))?;
-        let mut cards: Vec<Card> = Vec::new();
+        let (mut cards, mut comments) = (Vec::<Card>::new(), Vec::new());
         let mut block = [0_u8; BLOCK_BYTES];
         for count in 1..=CARDS_MAX * CARD_BYTES / BLOCK_BYTES {
             let needed = start + (count * BLOCK_BYTES) as u64;
@@ -34,9 +36,11 @@ impl Header {
             reader.read_exact(&mut block).map_err(FitsProblem::io("read"))?;
             for card in block.as_chunks::<CARD_BYTES>().0 {
                 if card.starts_with(b"END     ") {
-                    return Ok((Self { cards }, needed));
+                    return Ok((Self { cards, comments }, needed));
                 }
-                if let Some(card) = Card::parse(card) {
+                if let Some(text) = card.strip_prefix(b"COMMENT ") {
+                    comments.push(String::from_utf8_lossy(text).trim().to_owned());
+                } else if let Some(card) = Card::parse(card) {
                     push(&mut cards, card);
                 }
             }
@@ -53,12 +57,18 @@ impl Header {
     /// Appends the cards of the file's primary header, which may have metadata that the table's header lacks.
     pub(super) fn with_primary(mut self, primary: Self) -> Self {
         self.cards.extend(primary.cards);
+        self.comments.extend(primary.comments);
         self
     }
 
     #[cfg(test)]
     pub(super) fn of(cards: Vec<Card>) -> Self {
-        Self { cards }
+        Self { cards, comments: Vec::new() }
+    }
+
+    /// Texts of the COMMENT cards, in order.
+    pub(super) fn comments(&self) -> &[String] {
+        &self.comments
     }
 
     pub(super) fn card(&self, key: &str) -> Option<&Card> {
@@ -201,7 +211,7 @@ mod tests {
             {
                 cards.push(Card::integer(key, value, ""));
             }
-            let header = Header { cards };
+            let header = Header::of(cards);
             assert!(header.data_bytes().is_err(), "{key} = {value}");
         }
     }

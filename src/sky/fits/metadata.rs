@@ -3,8 +3,8 @@
 use super::card::{Card, CardValue};
 use super::error::FitsProblem;
 use super::header::Header;
-use crate::units::Dimension;
 use crate::units::constants::{BOLTZMANN_J_K, SPEED_OF_LIGHT_M_S};
+use crate::units::{Dimension, echo};
 
 const FREQUENCY_KEYS: [&str; 5] = ["FREQ", "FREQUENCY", "OBSFREQ", "RESTFRQ", "RESTFREQ"];
 const FREQUENCY_UNIT_KEYS: [&str; 3] = ["FREQUNIT", "FREQ_UNI", "UNITFREQ"];
@@ -29,8 +29,28 @@ pub(super) struct StatedFrequency {
     pub keyword: String,
 }
 
-/// Words in names of columns that are no maps of the sky's temperature: errors, numbers of observations and pixels, polarisation.
-const OTHER_WORDS: [&str; 29] = [
+/// A frequency in a text of a header that need not be the map's.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct QuotedFrequency {
+    pub hz: f64,
+    /// The keyword of the text.
+    pub keyword: String,
+    /// The text, shortened.
+    pub text: String,
+}
+
+/// Words in names of columns that are no maps of the sky's temperature: errors, numbers of observations and pixels, polarisation, spectral
+/// indices, logarithms.
+const OTHER_WORDS: [&str; 38] = [
+    "UNCERTAINTY",
+    "UNCERTAINTIES",
+    "UNC",
+    "SENSITIVITY",
+    "EXPOSURE",
+    "ALPHA",
+    "BETA",
+    "LOG",
+    "LN",
     "SIGMA",
     "ERR",
     "ERROR",
@@ -103,10 +123,16 @@ pub(super) fn column_frequency(
     Ok(name.or_else(|| hz_in(&card.comment)).map(|hz| stated(card, hz)))
 }
 
-/// Frequency in FREQ of either header, which must not contradict each other.
+/// Frequency in FREQ of either header, in keywords like it, or of an axis of frequency, which must not contradict each other.
 fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProblem> {
     let mut known: Option<StatedFrequency> = None;
-    for card in header.cards().iter().filter(|card| FREQUENCY_KEYS.contains(&card.key.as_str())) {
+    let axes = header.cards().iter().filter_map(|card| match (card.key.strip_prefix("CTYPE"), &card.value) {
+        (Some(axis), CardValue::Text(text)) if text.starts_with("FREQ") => {
+            header.card(&format!("CRVAL{axis}"))
+        }
+        _ => None,
+    });
+    for card in header.cards().iter().filter(|card| states_frequency(card)).chain(axes) {
         let found = StatedFrequency { hz: stated_hz(header, card)?, keyword: card.key.clone() };
         if let Some(other) = known.as_ref().filter(|other| !is_same_hz(found.hz, other.hz)) {
             return Err(contradiction(&found, other));
@@ -114,6 +140,58 @@ fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProble
         known.get_or_insert(found);
     }
     Ok(known)
+}
+
+/// Whether a keyword is of frequency: FREQ and its like, with a unit at the end (FREQ_MHZ), or NU with a unit.
+fn states_frequency(card: &Card) -> bool {
+    let has_unit = || match &card.value {
+        CardValue::Text(text) => !frequencies_in(text).is_empty(),
+        _ => matches!(comment_unit_hz(&card.comment), Some(Some(_))),
+    };
+    FREQUENCY_KEYS.contains(&card.key.as_str())
+        || key_unit_hz(&card.key).is_some()
+        || (card.key == "NU" && has_unit())
+}
+
+/// Unit at the end of a keyword, such as FREQMHZ, Hz.
+fn key_unit_hz(key: &str) -> Option<f64> {
+    unit_hz(key.strip_prefix("FREQ")?.trim_start_matches('_'))
+}
+
+/// The frequencies in texts of the headers: BAND, EXTNAME, OBJECT, TCOMM of the column, comments. Widths are none.
+pub(super) fn quoted_frequencies(header: &Header, column: usize) -> Vec<QuotedFrequency> {
+    let of_column = format!("TCOMM{column}");
+    let of_cards = header.cards().iter().filter_map(|card| match &card.value {
+        CardValue::Text(text) if ["BAND", "EXTNAME", "OBJECT", &of_column].contains(&card.key.as_str()) => {
+            Some((card.key.as_str(), text.as_str()))
+        }
+        _ => None,
+    });
+    let mut found = Vec::new();
+    for (keyword, text) in of_cards.chain(header.comments().iter().map(|text| ("COMMENT", text.as_str()))) {
+        if ["width", "resolution"].iter().any(|word| text.to_ascii_lowercase().contains(word)) {
+            continue;
+        }
+        found.extend(frequencies_in(text).into_iter().map(|hz| QuotedFrequency {
+            hz,
+            keyword: keyword.to_owned(),
+            text: echo(text),
+        }));
+    }
+    found
+}
+
+/// Refuses a map that states no frequency, if its header names exactly one and that is not `wanted_hz`.
+pub(super) fn check_quoted(quoted: &[QuotedFrequency], wanted_hz: f64) -> Result<(), FitsProblem> {
+    let Some(QuotedFrequency { hz, keyword, text }) = quoted.first() else { return Ok(()) };
+    if is_same_hz(*hz, wanted_hz) || quoted.iter().any(|other| !is_same_hz(other.hz, *hz)) {
+        return Ok(());
+    }
+    let expected = format!(
+        "{}, the channel's: give a map of that frequency, or state the map's own as FREQ in its header, which counts before other texts",
+        Dimension::Frequency.show(wanted_hz)
+    );
+    Err(FitsProblem::keyword(keyword, format!("'{text}'"), expected))
 }
 
 fn contradiction(found: &StatedFrequency, other: &StatedFrequency) -> FitsProblem {
@@ -141,7 +219,11 @@ fn stated_hz(header: &Header, card: &Card) -> Result<f64, FitsProblem> {
         }
         CardValue::Logical(_) => return Err(wrong()),
     };
-    let key_unit = || FREQUENCY_UNIT_KEYS.iter().find_map(|key| header.text(key)).and_then(unit_hz);
+    let key_unit = || match card.key.strip_prefix("CRVAL") {
+        Some(axis) => header.text(&format!("CUNIT{axis}")).and_then(unit_hz),
+        None => key_unit_hz(&card.key)
+            .or_else(|| FREQUENCY_UNIT_KEYS.iter().find_map(|key| header.text(key)).and_then(unit_hz)),
+    };
     let unit = match own_unit {
         Some(unit) => unit,
         None => comment_unit_hz(&card.comment).ok_or_else(wrong)?.or_else(key_unit).unwrap_or(1.0),
@@ -176,18 +258,35 @@ fn comment_unit_hz(comment: &str) -> Option<Option<f64>> {
     }
 }
 
-/// Finds a frequency within a text, such as `T_10MHz` or `3.0 MHz`, Hz.
+/// The first frequency in a text, Hz.
 fn hz_in(text: &str) -> Option<f64> {
-    let at = text.to_ascii_lowercase().find("hz")?;
-    let before = &text[..at];
-    let prefix = before.chars().next_back().filter(|c| "kKMmG".contains(*c));
-    let unit = unit_hz(
-        &prefix.map_or_else(|| "Hz".to_owned(), |prefix| format!("{prefix}Hz").replace("mHz", "MHz")),
-    )?;
-    let number = before[..before.len() - prefix.map_or(0, char::len_utf8)].trim_end_matches([' ', '_', '-']);
-    let start = number.rfind(|c: char| !c.is_ascii_digit() && c != '.').map_or(0, |at| at + 1);
-    let number: f64 = number.get(start..)?.parse().ok()?;
-    (number > 0.0 && number.is_finite()).then_some(number * unit)
+    frequencies_in(text).first().copied()
+}
+
+/// Finds the frequencies within a text, such as `T_10MHz` or `3.0 MHz`, Hz; of a range, the upper end and then the lower.
+fn frequencies_in(text: &str) -> Vec<f64> {
+    let mut found = Vec::new();
+    for (at, _) in text.to_ascii_lowercase().match_indices("hz") {
+        let before = &text[..at];
+        let prefix = before.chars().next_back().filter(|c| "kKMmG".contains(*c));
+        let unit =
+            prefix.map_or_else(|| "Hz".to_owned(), |prefix| format!("{prefix}Hz").replace("mHz", "MHz"));
+        let Some(unit) = unit_hz(&unit) else { continue };
+        let mut rest = &before[..before.len() - prefix.map_or(0, char::len_utf8)];
+        loop {
+            let number = rest.trim_end_matches([' ', '_', '-']);
+            let start = number.trim_end_matches(|c: char| c.is_ascii_digit() || c == '.').len();
+            match number[start..].parse::<f64>() {
+                Ok(number) if number > 0.0 && number.is_finite() => found.push(number * unit),
+                _ => break,
+            }
+            rest = &number[..start];
+            if !rest.ends_with('-') {
+                break;
+            }
+        }
+    }
+    found
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -269,6 +368,10 @@ mod tests {
             (Card::text("FREQ", "4.08D2", "[MHz]"), 408e6),
             (Card::text("FREQUENCY", "1.42GHz", ""), 1.42e9),
             (Card::real("RESTFRQ", 3e6, ""), 3e6),
+            (Card::real("FREQMHZ", 408.0, ""), 408e6),
+            (Card::real("FREQ_MHZ", 408.0, "centre"), 408e6),
+            (Card::real("NU", 408.0, "[MHz]"), 408e6),
+            (Card::text("NU", "22 MHz", ""), 22e6),
         ] {
             let found = stated_frequency(&header(std::slice::from_ref(&card)), 1).unwrap().unwrap();
             assert!((found.hz / hz - 1.0).abs() < 1e-12, "{card:?}: {found:?}");
@@ -277,6 +380,19 @@ mod tests {
         let with_key = [Card::real("FREQ", 408.0, ""), Card::text("FREQUNIT", "MHz", "")];
         let found = stated_frequency(&header(&with_key), 1).unwrap();
         assert_eq!(found, Some(StatedFrequency { hz: 408e6, keyword: "FREQ".into() }));
+        // An axis of frequency; a number that may be anything.
+        let axis = |unit: &[Card]| {
+            let cards = [Card::text("CTYPE3", "FREQ-LSR", ""), Card::real("CRVAL3", 408.0, "")];
+            stated_frequency(&header(&[&cards[..], unit].concat()), 1).unwrap().unwrap()
+        };
+        assert_eq!((axis(&[]).hz, axis(&[Card::text("CUNIT3", "MHz", "")]).hz), (408.0, 408e6));
+        assert_eq!(axis(&[]).keyword, "CRVAL3");
+        let other = [
+            Card::real("NU", 408.0, "number"),
+            Card::real("CRVAL3", 408.0, ""),
+            Card::integer("FREQS", 3, ""),
+        ];
+        assert_eq!(stated_frequency(&header(&other), 1).unwrap(), None);
         for wrong in [
             Card::text("FREQ", "about 10", ""),
             Card::text("FREQ", "10 parsecs", ""),
@@ -318,10 +434,44 @@ mod tests {
     }
 
     #[test]
+    fn texts_name_frequencies() {
+        for (text, expected) in [
+            ("HASLAM_408MHZ", &[408e6][..]),
+            ("All-sky 408 MHz map", &[408e6]),
+            ("10-20 MHz, and 1.4GHz", &[20e6, 10e6, 1.4e9]),
+            ("LWA1-38 MHz", &[38e6, 1e6]),
+            ("in Hz", &[]),
+            ("0 MHz", &[]),
+        ] {
+            assert_eq!(frequencies_in(text), expected, "{text}");
+        }
+        let cards = [Card::text("OBJECT", "408 MHz sky", ""), Card::text("TCOMM2", "at 22 MHz", "")];
+        let quoted = |column| quoted_frequencies(&header(&cards), column);
+        assert_eq!((quoted(1).len(), quoted(2).len()), (1, 2));
+        let said = check_quoted(&quoted(1), 10e6).unwrap_err().to_string();
+        assert!(said.contains("OBJECT is '408 MHz sky'; expected 10 MHz") && said.contains("FREQ"), "{said}");
+        assert!(check_quoted(&quoted(1), 408e6).is_ok() && check_quoted(&quoted(2), 10e6).is_ok());
+        let width = [Card::text("BAND", "bandwidth 3 MHz", "")];
+        assert_eq!(quoted_frequencies(&header(&width), 1), []);
+    }
+
+    #[test]
     fn names_of_other_quantities_are_no_maps() {
-        for name in
-            ["SIGMA_10MHz", "t_err", "N_OBS", "nobs", "Hits", "PIXEL", "Q_POLARISATION", "II_COV", "STD10"]
-        {
+        for name in [
+            "UNCERTAINTY",
+            "Sensitivity",
+            "LOG_T",
+            "log10(T)",
+            "SIGMA_10MHz",
+            "t_err",
+            "N_OBS",
+            "nobs",
+            "Hits",
+            "PIXEL",
+            "Q_POLARISATION",
+            "II_COV",
+            "STD10",
+        ] {
             assert!(is_other_quantity(name), "{name}");
         }
         for name in ["T_10MHz", "TEMPERATURE", "I_STOKES", "", "SIGNAL", "T_OBS", "QUICKLOOK", "VALUE"] {

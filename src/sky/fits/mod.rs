@@ -26,7 +26,7 @@ pub use error::FitsProblem;
 #[doc(hidden)]
 pub use frequency::{
     MapOutline, SkyChannel, check_frequencies, check_frequency, read_known_sky, read_prior, read_sky,
-    sky_options,
+    sky_notes, sky_options,
 };
 #[doc(hidden)]
 pub use header::Header;

@@ -8,7 +8,8 @@ use super::card::{Card, CardValue};
 use super::error::{FitsError, FitsProblem};
 use super::header::{BLOCK_BYTES, Header};
 use super::metadata::{
-    MapUnit, StatedFrequency, column_frequency, is_other_quantity, is_same_hz, stated_frequency,
+    MapUnit, QuotedFrequency, StatedFrequency, column_frequency, is_other_quantity, is_same_hz,
+    quoted_frequencies, stated_frequency,
 };
 use super::table::{CellType, ColumnLayout, TableLayout};
 use crate::files::{form_of, open_file};
@@ -50,7 +51,11 @@ pub struct MapFile {
     pub frequency_hz: Option<f64>,
     /// Keyword that states the frequency.
     pub(super) frequency_keyword: String,
-    /// RING number and value of the first pixel that has BAD_DATA.
+    /// Frequencies in other texts of the headers.
+    pub(super) quoted: Vec<QuotedFrequency>,
+    /// Order of the pixels, and whether it is assumed.
+    pub(super) ordering: &'static str,
+    /// RING number and value of the first pixel that the header calls bad.
     first_bad: Option<(usize, f64)>,
     /// Number of columns with maps of this size in the table.
     pub columns: usize,
@@ -100,7 +105,7 @@ pub fn read_whole_map_file(path: &Path, options: &ReadOptions) -> Result<MapFile
     Ok(file)
 }
 
-/// Lists the assumptions made about a map's unit, frequency and column. Reads only headers.
+/// Lists the assumptions made about a map's unit, order, frequency and column. Reads only headers.
 ///
 /// # Errors
 /// [`FitsError`] with the file and its problem.
@@ -113,8 +118,18 @@ pub fn read_notes(path: &Path, options: &ReadOptions) -> Result<Vec<String>, Fit
         if unit(header, number)?.is_empty() {
             notes.push("the map states no unit (TUNIT); it is taken as K".to_owned());
         }
+        if stated_nested(header)?.is_none() {
+            notes.push("the map states no order of its pixels (ORDERING); RING is assumed".to_owned());
+        }
         if stated_frequency(header, number)?.is_none() {
-            notes.push("the map states no frequency (FREQ); it is taken as one at the channel's".to_owned());
+            let quoted = quoted_frequencies(header, number);
+            let said =
+                quoted.first().map_or_else(String::new, |QuotedFrequency { keyword, text, .. }| {
+                    format!(", but its header says '{text}' in {keyword}")
+                });
+            notes.push(format!(
+                "the map states no frequency (FREQ){said}; it is taken as one at the channel's"
+            ));
         }
         let (_, column) = choose_columns(table, explicit, chosen)?;
         let columns = table.maps_like(column, explicit);
@@ -141,12 +156,15 @@ pub fn read_nside(path: &Path, options: &ReadOptions) -> Result<usize, FitsError
     })
 }
 
-/// Reads the frequency of the first map in a file, if it is stated, from headers only.
-pub(super) fn read_frequency(path: &Path) -> Result<Option<StatedFrequency>, FitsError> {
+/// Reads the frequency of a map in a file, if it is stated, and those in other texts, from headers only.
+pub(super) fn read_frequency(
+    path: &Path,
+    options: &ReadOptions,
+) -> Result<(Option<StatedFrequency>, Vec<QuotedFrequency>), FitsError> {
     read_headers(path, |header, table| {
         let explicit = is_explicit(header)?;
-        let chosen = chosen_column(header, table, explicit, &ReadOptions::default())?;
-        stated_frequency(header, chosen + 1 + usize::from(explicit))
+        let number = chosen_column(header, table, explicit, options)? + 1 + usize::from(explicit);
+        Ok((stated_frequency(header, number)?, quoted_frequencies(header, number)))
     })
 }
 
@@ -204,17 +222,17 @@ pub fn read_map_from(
     let (index, column) = choose_columns(&table, explicit, chosen)?;
     let cells = table.rows.saturating_mul(column.repeat as u64);
     let nside = nside(&header, cells, explicit)?;
-    let nested = is_nested(&header)?;
+    let nested = stated_nested(&header)?;
     let (frame, frame_assumed) = frame(&header, options)?;
 
     let mut values = match index {
         None => read_implicit(reader, &table, column, nside)?,
         Some(index) => read_explicit(reader, &table, index, column, nside)?,
     };
-    if nested {
+    if nested == Some(true) {
         values = to_ring(nside, &values);
     }
-    let first_bad = leave_bad_out(&mut values, header.number("BAD_DATA")?);
+    let first_bad = leave_bad_out(&mut values, &bad_values(&header, column)?);
     let number = chosen + 1 + usize::from(explicit);
     let (unit, frequency) = (unit(&header, number)?, stated_frequency(&header, number)?);
     Ok(MapFile {
@@ -223,6 +241,12 @@ pub fn read_map_from(
         unit,
         frame_assumed,
         frequency_hz: frequency.as_ref().map(|frequency| frequency.hz),
+        quoted: quoted_frequencies(&header, number),
+        ordering: match nested {
+            None => "RING order (assumed)",
+            Some(false) => "RING order",
+            Some(true) => "NESTED order",
+        },
         frequency_keyword: frequency.map_or("FREQ".to_owned(), |frequency| frequency.keyword),
         first_bad,
         columns: table.maps_like(column, explicit),
@@ -247,10 +271,20 @@ fn check_start(reader: &mut (impl Read + Seek), length: u64) -> Result<(), FitsP
     Err(FitsProblem::NotFits { found })
 }
 
-/// Makes UNSEEN of the values that mean no value: UNSEEN of single precision, or the header's BAD_DATA. Returns the first of the latter.
-fn leave_bad_out(values: &mut [f64], bad: Option<f64>) -> Option<(usize, f64)> {
+/// The values that the header says are none. BLANK of integers is read with the table, as TNULL.
+fn bad_values(header: &Header, column: &ColumnLayout) -> Result<Vec<f64>, FitsProblem> {
+    let blank = if column.is_integer() { None } else { Some("BLANK") };
+    let mut found = Vec::new();
+    for key in ["BAD_DATA", "BADVAL", "BAD_VAL", "MISSVAL", "UNSEEN"].into_iter().chain(blank) {
+        found.extend(header.number(key)?);
+    }
+    Ok(found)
+}
+
+/// Makes UNSEEN of the values that mean no value: UNSEEN of single precision, or what the header calls bad. Returns the first of the latter.
+fn leave_bad_out(values: &mut [f64], bad: &[f64]) -> Option<(usize, f64)> {
     // Single precision keeps seven digits.
-    let is_bad = |value: f64| bad.is_some_and(|bad| (value - bad).abs() <= 1e-6 * bad.abs());
+    let is_bad = |value: f64| bad.iter().any(|bad| (value - bad).abs() <= 1e-6 * bad.abs());
     let first = values.iter().position(|value| is_bad(*value) && !is_unseen(*value));
     let first = first.map(|pixel| (pixel, values[pixel]));
     let left_out = values.iter_mut().filter(|value| is_unseen(**value) || is_bad(**value));
@@ -390,12 +424,34 @@ fn choose_columns(
     Ok((index, map))
 }
 
+/// The value of a keyword in either header; both have to say the same.
+fn stated_once<T: PartialEq>(
+    header: &Header,
+    key: &str,
+    parse: impl Fn(&CardValue) -> Result<T, FitsProblem>,
+) -> Result<Option<T>, FitsProblem> {
+    let mut known: Option<(&CardValue, T)> = None;
+    for Card { value: found, .. } in header.cards().iter().filter(|card| card.key == key) {
+        let value = parse(found)?;
+        if let Some((other, _)) = known.as_ref().filter(|(_, known)| *known != value) {
+            return Err(FitsProblem::keyword(key, found, format!("{other}, as the headers say elsewhere")));
+        }
+        known = Some((found, value));
+    }
+    Ok(known.map(|(_, value)| value))
+}
+
 fn nside(header: &Header, cells: u64, explicit: bool) -> Result<usize, FitsProblem> {
     let expected = "a power of two from 1 to 8192";
     let Some(nside) = header.count("NSIDE")? else {
         let known = if explicit { None } else { usize::try_from(cells).ok().and_then(nside_of) };
         return known.ok_or_else(|| FitsProblem::missing("NSIDE", expected));
     };
+    stated_once(header, "NSIDE", |found| match found {
+        CardValue::Integer(value) => Ok(*value as f64),
+        CardValue::Real(value) => Ok(*value),
+        other => Err(FitsProblem::keyword("NSIDE", other, expected)),
+    })?;
     match usize::try_from(nside) {
         Ok(nside) if is_valid_nside(nside) => Ok(nside),
         _ => Err(FitsProblem::keyword("NSIDE", nside, expected)),
@@ -406,13 +462,13 @@ fn is_one_of<const N: usize>(text: &str, names: [&str; N]) -> bool {
     names.iter().any(|name| text.trim().eq_ignore_ascii_case(name))
 }
 
-fn is_nested(header: &Header) -> Result<bool, FitsProblem> {
-    match header.get("ORDERING") {
-        None => Ok(false),
-        Some(CardValue::Text(text)) if is_one_of(text, ["RING"]) => Ok(false),
-        Some(CardValue::Text(text)) if is_one_of(text, ["NEST", "NESTED"]) => Ok(true),
-        Some(other) => Err(FitsProblem::keyword("ORDERING", other, "RING or NESTED")),
-    }
+/// Whether the pixels are in NESTED order; `None` if the header does not say.
+fn stated_nested(header: &Header) -> Result<Option<bool>, FitsProblem> {
+    stated_once(header, "ORDERING", |found| match found {
+        CardValue::Text(text) if is_one_of(text, ["RING"]) => Ok(false),
+        CardValue::Text(text) if is_one_of(text, ["NEST", "NESTED"]) => Ok(true),
+        other => Err(FitsProblem::keyword("ORDERING", other, "RING or NESTED")),
+    })
 }
 
 /// The frame that COORDSYS and SKYCOORD of both headers name, or else that of the options, and whether it is that one.

@@ -113,14 +113,18 @@ impl ColumnLayout {
         let real = |key: &str, otherwise: f64| {
             header.number(&format!("{key}{number}")).map(|number| number.unwrap_or(otherwise))
         };
-        let null_key = format!("TNULL{number}");
-        let null = match header.get(&null_key) {
-            None => None,
-            Some(CardValue::Integer(null)) => Some(*null),
+        let null_of = |key: &str| match header.get(key) {
+            None => Ok(None),
+            Some(CardValue::Integer(null)) => Ok(Some(*null)),
             Some(found) => {
-                let quoted = header.text(&null_key).and_then(|text| text.parse().ok());
-                Some(quoted.ok_or_else(|| FitsProblem::keyword(&null_key, found, "an integer"))?)
+                let quoted = header.text(key).and_then(|text| text.parse().ok());
+                quoted.map(Some).ok_or_else(|| FitsProblem::keyword(key, found, "an integer"))
             }
+        };
+        let null = match null_of(&format!("TNULL{number}"))? {
+            // The keyword of images.
+            None if letters.starts_with(['B', 'I', 'J', 'K']) => null_of("BLANK")?,
+            null => null,
         };
         Ok(Self {
             name: header.text(&format!("TTYPE{number}")).unwrap_or("").to_owned(),

@@ -45,6 +45,15 @@ impl AddedSky {
         self.catalogue.as_deref().map(understood).transpose()
     }
 
+    /// A note on what the catalogue may mean otherwise, if there is one.
+    ///
+    /// # Errors
+    /// [`AddedSkyError::Catalogue`] if it cannot be read.
+    pub fn note(&self) -> Result<Option<String>, AddedSkyError> {
+        let catalogue = self.catalogue.as_deref().map(Catalogue::read).transpose()?;
+        Ok(catalogue.and_then(|catalogue| catalogue.note()))
+    }
+
     /// Adds the components to a map, on ecliptic axes, at `nside` or at the nside of the map if that is finer.
     ///
     /// If the map is refined, it is smoothed with the FWHM of one of its pixels, to hide their edges. Small scales are those of a

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::column_units::{angle_deg, flux_jy, is_unit, require_unit};
-use super::columns::Columns;
+use super::column_units::{angle_deg, flux_jy, in_comments, is_unit, require_unit};
+use super::columns::{Columns, normalise};
 use crate::files::{read_file, text_of};
 use crate::sky::Frame;
 use crate::sky::frame::rotate;
@@ -104,6 +104,21 @@ impl Catalogue {
     pub(super) fn read(path: &Path) -> Result<Self, CatalogueError> {
         Reader { path }.read()
     }
+
+    /// A note if most spectral indices are above 0: some catalogues define them with the other sign.
+    pub(super) fn note(&self) -> Option<String> {
+        let own: Vec<f64> = self.sources.iter().filter_map(|source| source.index).collect();
+        let above = own.iter().filter(|index| **index > 0.0).count();
+        let name = self.names.1.as_deref().unwrap_or_default();
+        (2 * above > own.len()).then(|| {
+            format!(
+                "{}: {above} of {} spectral indices `{name}` are above 0, with S ~ nu^{name}; change their sign if the catalogue means \
+                 S ~ nu^-{name}",
+                self.path.display(),
+                own.len()
+            )
+        })
+    }
 }
 
 /// Units of the columns that are used.
@@ -118,8 +133,27 @@ struct Units {
 struct Table<'a> {
     names: Vec<String>,
     units: Vec<String>,
+    /// Names in the comments before the table, and the units that they give.
+    comment_units: Vec<(String, String)>,
     rows: Vec<(usize, &'a str)>,
     separator: char,
+}
+
+impl Table<'_> {
+    /// The name of a column, and its units in their row and in comments, there under its name or else one of `others`.
+    fn units_of(&self, place: usize, others: &[&str]) -> (&str, Vec<String>) {
+        let name = normalise(&self.names[place]);
+        let in_comments = |names: &[&str]| {
+            let of_column = self.comment_units.iter().filter(|(found, _)| names.contains(&found.as_str()));
+            of_column.map(|(_, unit)| unit.clone()).collect::<Vec<String>>()
+        };
+        let mut found = in_comments(&[&name]);
+        if found.is_empty() {
+            found = in_comments(others);
+        }
+        found.push(self.units[place].clone());
+        (&self.names[place], found)
+    }
 }
 
 struct Reader<'a> {
@@ -141,17 +175,17 @@ impl Reader<'_> {
         let text = self.text()?;
         let table = self.table(&text)?;
         let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
-        let old = comments.clone().zip(1..).find(|(line, _)| line.contains("B1950") || line.contains("FK4"));
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-        let is_vlssr = comments.chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
+        let is_vlssr =
+            comments.clone().chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
         let columns = Columns::recognise(&table.names, is_vlssr).map_err(|expected| {
             let names: Vec<String> = table.names.iter().take(40).map(|name| displayed(name)).collect();
             let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
             self.content_error(first, format!("the columns {}", names.join(", ")), expected)
         })?;
-        if let Some((_, line)) = old
-            && columns.frame == Frame::Equatorial
+        if columns.frame == Frame::Equatorial
             && !columns.places.iter().flatten().any(|place| table.names[*place].contains("2000"))
+            && let Some(line) = old_equinox(comments, &table, &columns)
         {
             let found = "positions of B1950 (FK4)";
             return Err(self.content_error(
@@ -190,29 +224,40 @@ impl Reader<'_> {
                 return Err(self.content_error(1, found, "one of each name"));
             }
         }
-        let of = |place: usize| (table.names[place].as_str(), table.units[place].as_str());
-        let refuse = |(name, _): (&str, &str), expected| {
+        let positions = ["positions", "coordinates", "angles"];
+        let fluxes = ["flux", "fluxes", "density", "densities"];
+        let refuse = |(name, _): &(&str, Vec<String>), expected| {
             let name = displayed(name);
             move |unit: String| {
                 self.content_error(1, format!("the unit `{}` of `{name}`", displayed(&unit)), expected)
             }
         };
         let angle = |places: &[usize], hours: Option<f64>, expected| match *places {
-            [place] => angle_deg(of(place), hours).map_err(refuse(of(place), expected)),
+            [place] => {
+                let column = table.units_of(place, &positions);
+                angle_deg(&column, hours).map_err(refuse(&column, expected))
+            }
             _ => Ok(hours.unwrap_or(1.0)),
         };
-        let of_flux = of(*flux);
+        let of_flux = table.units_of(*flux, &fluxes);
+        let of_row = &table.units[*flux];
+        if of_row.starts_with('[') {
+            let expected =
+                "a flux density: brackets mean its logarithm; write Jy or mJy without them if it is none";
+            return Err(refuse(&of_flux, expected)(of_row.clone()));
+        }
         if let Some((place, unit_hz)) = *frequency_place {
+            let column = table.units_of(place, &[]);
             let expected = "the unit in the column's name, or none";
-            require_unit(of(place), unit_hz).map_err(refuse(of(place), expected))?;
+            require_unit(&column, unit_hz).map_err(refuse(&column, expected))?;
         }
         Ok(Units {
             angle_deg: [
                 angle(lon, Some(15.0), "deg, rad, arcmin, arcsec or hours, as the column's name says")?,
                 angle(lat, None, "deg, rad, arcmin or arcsec, as the column's name says")?,
             ],
-            flux_jy: flux_jy(of_flux)
-                .map_err(refuse(of_flux, "a flux density in Jy or mJy, as the column's name says"))?,
+            flux_jy: flux_jy(&of_flux)
+                .map_err(refuse(&of_flux, "a flux density in Jy or mJy, as the column's name says"))?,
         })
     }
 
@@ -232,11 +277,12 @@ impl Reader<'_> {
 
     /// Divides the text into names, units and rows. The names are the first line, or the last comment before numbers.
     fn table<'a>(&self, text: &'a str) -> Result<Table<'a>, CatalogueError> {
-        let mut comment = None;
+        let (mut comment, mut comments) = (None, Vec::new());
         let mut lines = text.lines().zip(1..).map(|(text, line)| (line, text)).filter(|(_, text)| {
             let is_comment = text.trim_start().starts_with('#');
             if is_comment {
                 comment = Some(text.trim_start().trim_start_matches('#').trim());
+                comments.extend(comment);
             }
             !is_comment && !text.trim().is_empty()
         });
@@ -262,7 +308,7 @@ impl Reader<'_> {
             units.iter_mut().zip(found).for_each(|(unit, found)| *unit = found);
         }
         rest.retain(|(_, text)| !is_rule(text));
-        Ok(Table { names, units, rows: rest, separator })
+        Ok(Table { names, units, comment_units: in_comments(&comments), rows: rest, separator })
     }
 
     fn source(
@@ -324,6 +370,33 @@ impl Reader<'_> {
         };
         Ok(Source { direction, flux_jy: units.flux_jy * flux, at_hz, index })
     }
+}
+
+/// The line that says that positions are of B1950: a comment, the names, or a row with a column of equinoxes.
+fn old_equinox<'a>(
+    comments: impl Iterator<Item = &'a str>,
+    table: &Table<'_>,
+    columns: &Columns,
+) -> Option<usize> {
+    let is_old_comment = |line: &str| {
+        let line = line.to_ascii_lowercase();
+        let of_positions = ["equinox", "epoch", "coord", "position"].iter().any(|word| line.contains(word));
+        line.contains("b1950") || line.contains("fk4") || (line.contains("1950") && of_positions)
+    };
+    let is_old_cell = |cell: &str| {
+        let cell = cell.to_ascii_uppercase();
+        cell.contains("FK4") || cell.trim_start_matches('B').parse() == Ok(1950.0)
+    };
+    let in_rows = || {
+        let place = table.names.iter().position(|name| ["equinox", "epoch"].contains(&&*normalise(name)))?;
+        let old = |(_, text): &&(usize, &str)| {
+            cells(text, table.separator).get(place).is_some_and(|cell| is_old_cell(cell))
+        };
+        table.rows.iter().find(old).map(|(line, _)| *line)
+    };
+    let in_names = columns.places.iter().flatten().any(|place| table.names[*place].contains("1950"));
+    let in_comments = comments.zip(1..).find(|(line, _)| is_old_comment(line)).map(|(_, line)| line);
+    in_comments.or(in_names.then_some(1)).or_else(in_rows)
 }
 
 /// Formats a cell for messages: short, and without control characters.
@@ -461,6 +534,20 @@ mod tests {
     }
 
     #[test]
+    fn indices_of_the_other_sign_are_noted() {
+        let note = |indices: [&str; 3]| {
+            let rows: String = indices.iter().map(|index| format!("1,2,3,{index}\n")).collect();
+            Catalogue::read(file(format!("ra,dec,S74,alpha\n{rows}").as_bytes()).path()).unwrap().note()
+        };
+        let noted = note(["0.7", "0.8", "-0.1"]).unwrap();
+        assert!(noted.contains("2 of 3 spectral indices `alpha` are above 0, with S ~ nu^alpha"), "{noted}");
+        assert_eq!(
+            (note(["-0.7", "0.8", "-0.1"]), note(["0.7", "-0.7", ""]), note(["", "", ""])),
+            (None, None, None)
+        );
+    }
+
+    #[test]
     fn a_flux_is_of_its_row_s_frequency() {
         for flux in ["flux_mjy", "flux (mJy)", "S [mJy]"] {
             let table = format!("l,b,{flux},frequency_mhz\n1,2,300,151\n1,2,400,408\n");
@@ -491,7 +578,36 @@ mod tests {
         let read = Catalogue::read(file(b"ra,dec,S74\nhours,deg,Jy\n12,0,5\n").path()).unwrap();
         let longitude = place(&read.sources[0])[0];
         assert!((longitude - 180.0).abs() < 1e-9, "{longitude}");
+        // Units in comments: of ECSV in one line or several, in brackets, and in words.
+        let ecsv = "# %ECSV 1.0\n# ---\n# datatype:\n";
+        for (comments, row) in [
+            (
+                format!(
+                    "{ecsv}# - {{name: elon, unit: hourangle, datatype: float64}}\n# - {{name: S74, unit: mJy}}\n"
+                ),
+                "4,30,5000",
+            ),
+            (format!("{ecsv}# -\n#   name: S74\n#   unit: 'mJy'\n#   datatype: float64\n"), "60,30,5000"),
+            ("# elon [rad], elat [deg], S74 [mJy]\n".to_owned(), "1.0471975512,30,5000"),
+            ("# elon: longitude (arcmin)\n# S74 of [3]\n# S74 (mJy)\n".to_owned(), "3600,30,5000"),
+            ("# positions in degrees and fluxes in mJy\n".to_owned(), "60,30,5000"),
+            ("# elon in hours\n# flux of others [mJy]\n# S74 [Jy]\n".to_owned(), "4,30,5"),
+        ] {
+            let table = format!("{comments}elon,elat,S74\n{row}\n");
+            let read = Catalogue::read(file(table.as_bytes()).path()).unwrap();
+            let [longitude, latitude] = place(&read.sources[0]);
+            let off = (longitude - 60.0).abs().max((latitude - 30.0).abs());
+            assert!(off < 1e-8 && (read.sources[0].flux_jy - 5.0).abs() < 1e-12, "{table}");
+        }
         for (table, said) in [
+            ("# - {name: S74, unit: uJy}\nelon,elat,S74\n1,2,3\n", "the unit `ujy` of `S74`"),
+            ("# - {name: elat, unit: hourangle}\nelon,elat,S74\n1,2,3\n", "the unit `hourangle` of `elat`"),
+            ("# S74 [mJy]\nelon,elat,S74\ndeg,deg,Jy\n1,2,3\n", "`jy` of `S74`"),
+            ("# - {name: S74, unit: dex(Jy)}\nelon,elat,S74\n1,2,3\n", "of `S74`, expected a flux density"),
+            (
+                "elon,elat,S74\n,,[Jy]\n1,2,3\n",
+                "the unit `[Jy]` of `S74`, expected a flux density: brackets mean its logarithm",
+            ),
             ("elon_deg,elat,S74\nrad,deg,Jy\n1,2,3\n", "line 1: found the unit `rad` of `elon_deg`"),
             ("elon,elat,S74\ndeg,hours,Jy\n1,2,3\n", "the unit `hours` of `elat`"),
             ("elon,elat,S74\ndeg,gon,Jy\n1,2,3\n", "the unit `gon` of `elat`"),
@@ -523,6 +639,16 @@ mod tests {
         assert!(found.contains("line 2: found a flux at 1.54e14 Hz"), "{found}");
         let found = said(b"# Name\n# Equinox B1950\nra,dec,S74\n1,2,3\n");
         assert!(found.contains("line 2: found positions of B1950"), "{found}");
+        for (table, line) in [
+            ("# Equinox: 1950\nra,dec,S74\n1,2,3\n", 1),
+            ("#\n# epoch 1950.0 coordinates\nra,dec,S74\n1,2,3\n", 2),
+            ("ra,dec,S74,equinox\n1,2,3,J2000\n1,2,3,B1950\n", 3),
+            ("RA(1950),DEC(1950),S74\n1,2,3\n", 1),
+        ] {
+            let found = said(table.as_bytes());
+            assert!(found.contains(&format!("line {line}: found positions of B1950")), "{found}");
+        }
+        assert!(Catalogue::read(file(b"# found in 1950\nra,dec,S74,epoch\n1,2,3,1982.5\n").path()).is_ok());
         assert!(Catalogue::read(file(b"# names of B1950\nRAJ2000,DEJ2000,S74\n1,2,3\n").path()).is_ok());
         // Forms are named.
         assert!(said(b"\x28\xb5\x2f\xfd\0").contains("a zstd file"));

@@ -1,4 +1,4 @@
-//! Units of a catalogue's columns: in the row of units, in brackets after the name, and at the name's end, which have to agree.
+//! Units of a catalogue's columns: in the row of units, in comments, in brackets after the name, and at the name's end, which have to agree.
 
 use super::columns::normalise;
 
@@ -28,17 +28,69 @@ pub(super) fn is_unit(cell: &str) -> bool {
         && [&ANGLES[..], &FLUXES, &FREQUENCIES].iter().any(|units| value_of(units, &cell).is_some())
 }
 
-/// Units that a column's row and brackets name. Brackets may also have a reference, such as (J2000).
-fn stated((name, unit): (&str, &str)) -> impl Iterator<Item = String> {
+/// Units that comments give, with the names of their columns: of ECSV (`{name: flux, unit: mJy}`), in brackets (`ra [deg], flux [mJy]`),
+/// and in words (`fluxes in mJy`).
+pub(super) fn in_comments(comments: &[&str]) -> Vec<(String, String)> {
+    let (mut found, mut ecsv_name) = (Vec::new(), None);
+    let mut add = |name: &str, unit: &str| found.push((normalise(name), unit.to_owned()));
+    for line in comments {
+        for part in line.split(['{', '}', ',']).map(|part| part.trim_matches([' ', '\t', '-'])) {
+            match part.split_once(':') {
+                Some(("name", name)) => ecsv_name = Some(cleaned(name)),
+                Some(("unit", unit)) => ecsv_name.take().into_iter().for_each(|name| add(&name, unit.trim())),
+                _ => {}
+            }
+        }
+        let brackets: Vec<(usize, &str)> = line.match_indices(['[', '(']).collect();
+        for &(at, bracket) in &brackets {
+            let unit = line[at + 1..].split([']', ')']).next().unwrap_or_default();
+            // Round brackets may have anything; square ones also references.
+            let is_flux = unit.to_ascii_lowercase().contains("jy");
+            let is_word =
+                unit.chars().all(|c| !c.is_whitespace() && !c.is_ascii_digit()) && !is_reference(unit);
+            if is_unit(unit) || is_flux || (bracket == "[" && is_word) {
+                let before = words(&line[..at]);
+                let first = before.clone().next().filter(|_| brackets.len() == 1);
+                before.last().into_iter().chain(first).for_each(|name| add(name, unit));
+            }
+        }
+        let mut names = Vec::new();
+        for word in words(line) {
+            let unit = word.trim_end_matches('.');
+            if names.last() == Some(&"in")
+                && is_unit(unit)
+                && value_of(&FREQUENCIES, &cleaned(unit)).is_none()
+            {
+                names.drain(..).for_each(|name| add(name, unit));
+            } else {
+                names.push(word);
+            }
+        }
+    }
+    found
+}
+
+fn words(text: &str) -> impl Iterator<Item = &str> + Clone {
+    text.split([' ', '\t', ',', ';', ':', '|']).filter(|word| !word.is_empty())
+}
+
+/// Whether a text names axes, such as J2000, and no unit.
+fn is_reference(text: &str) -> bool {
+    let text = text.to_ascii_lowercase();
+    ["1950", "2000", "icrs", "fk5"].iter().any(|reference| text.contains(reference))
+}
+
+/// Units that a column's row, comments and brackets name. Brackets may also have a reference, such as (J2000).
+fn stated((name, units): &(&str, Vec<String>)) -> impl Iterator<Item = String> {
     let bracketed = name.split_once(['(', '[']).map_or_else(String::new, |(_, unit)| cleaned(unit));
-    let is_reference = ["2000", "icrs", "fk5"].iter().any(|reference| bracketed.contains(reference));
-    let bracketed = if is_reference { String::new() } else { bracketed };
-    [cleaned(unit), bracketed].into_iter().filter(|unit| !unit.is_empty())
+    let bracketed = if is_reference(&bracketed) { String::new() } else { bracketed };
+    let units: Vec<String> = units.iter().map(|unit| cleaned(unit)).chain([bracketed]).collect();
+    units.into_iter().filter(|unit| !unit.is_empty())
 }
 
 /// The unit of a column of angles that are one number, degrees; `hours_deg` is that of hours, where there may be any. The error is
 /// the unit that is unknown or contradicts the name.
-pub(super) fn angle_deg(column: (&str, &str), hours_deg: Option<f64>) -> Result<f64, String> {
+pub(super) fn angle_deg(column: &(&str, Vec<String>), hours_deg: Option<f64>) -> Result<f64, String> {
     let mut known = normalise(column.0).ends_with("deg").then_some(1.0);
     for unit in stated(column) {
         let value = value_of(&ANGLES, &unit).map(|deg| if deg.is_nan() { hours_deg } else { Some(deg) });
@@ -51,7 +103,7 @@ pub(super) fn angle_deg(column: (&str, &str), hours_deg: Option<f64>) -> Result<
 }
 
 /// The unit of a column of flux densities, Jy. The error is the unit that is unknown or contradicts the name.
-pub(super) fn flux_jy(column: (&str, &str)) -> Result<f64, String> {
+pub(super) fn flux_jy(column: &(&str, Vec<String>)) -> Result<f64, String> {
     let name = normalise(column.0);
     let mut known =
         ["mjy", "jy"].iter().find(|unit| name.ends_with(*unit)).and_then(|unit| value_of(&FLUXES, unit));
@@ -65,6 +117,6 @@ pub(super) fn flux_jy(column: (&str, &str)) -> Result<f64, String> {
 }
 
 /// Requires that a column of frequencies has the unit of its name, Hz. The error is the other one.
-pub(super) fn require_unit(column: (&str, &str), unit_hz: f64) -> Result<(), String> {
+pub(super) fn require_unit(column: &(&str, Vec<String>), unit_hz: f64) -> Result<(), String> {
     stated(column).find(|unit| value_of(&FREQUENCIES, unit) != Some(unit_hz)).map_or(Ok(()), Err)
 }
