@@ -154,6 +154,8 @@ fn nothing_is_written_into_the_folder_of_a_state() {
     let (pipeline, state, out) = (place.pipeline.clone(), place.path("state"), place.path("out"));
     let file = place.simulate("small.ccsds", &[]);
     let replay = ["replay", &file, "--map", &pipeline, "--state", &state, "--out"];
+    // A folder of this name alone makes no state.
+    std::fs::create_dir(place.path("archive")).unwrap();
     // Before there is a state.
     let [inside, events] = ["o", "events"].map(|name| format!("{state}/{name}"));
     assert!(fail(&[&replay[..], &[&inside]].concat()).contains("expected other folders"));

@@ -12,7 +12,7 @@ use crate::runtime::{Outlet, Stage};
 
 const PACKETS: &str = "archive";
 
-const SETTINGS: &str = "settings.json";
+pub(super) const SETTINGS: &str = "settings.json";
 
 /// Default limit of a raw archive, bytes: 64 GiB, enough for four missions of 30 channels.
 pub const ARCHIVE_BYTES_MAX: u64 = 1 << 36;

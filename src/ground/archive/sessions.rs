@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::checkpoint;
 use super::folder::{StateFolder, checkpoints};
 use super::open_archive::OpenArchive;
-use super::recovery::{kept_settings, packets_folder, require_saved};
+use super::recovery::{SETTINGS, kept_settings, packets_folder, require_saved};
 use super::store::Archive;
 use crate::frames::AutoPower;
 use crate::ground::{Ground, GroundConfig, GroundError};
@@ -103,7 +103,8 @@ impl Ground {
     /// A folder that cannot be read.
     #[doc(hidden)]
     pub fn is_state(folder: &Path) -> Result<bool, GroundError> {
-        Ok(folder.is_dir() && (!checkpoints(folder)?.is_empty() || packets_folder(folder).is_dir()))
+        Ok(folder.is_dir()
+            && (!checkpoints(folder)?.is_empty() || packets_folder(folder).join(SETTINGS).is_file()))
     }
 
     /// Keys and values of the settings on which the sums of an archive depend, from its newest usable checkpoint or its raw
