@@ -172,8 +172,8 @@ fn what_is_said_twice_or_of_other_times_is_refused() {
     for n in 2..=3 {
         write(n, circle(1e-3 * n as f64).as_bytes());
     }
-    // The states go to 00:19; a step more may be claimed. Line ends are those of any system.
-    let whole = "START_TIME = 2029-12-31T23:59:30\nSTOP_TIME = 2030-01-01T00:20:00\n";
+    // The states go to 00:19: the beginning of a file that promises more is known as far as it goes. Line ends are those of any system.
+    let whole = "START_TIME = 2029-12-31T23:59:30\nSTOP_TIME = 2030-01-02T00:00:00\n";
     let good = circle_with(0.0, whole);
     for text in [good.clone(), good.replace('\n', "\r\n"), good.replace('\n', "\r")] {
         write(1, text.as_bytes());
@@ -186,12 +186,12 @@ fn what_is_said_twice_or_of_other_times_is_refused() {
             "line 10: found TIME_SYSTEM again; expected TIME_SYSTEM once",
         ),
         (
-            circle_with(0.0, "STOP_TIME = 2030-01-05T00:19:00\n").into_bytes(),
-            "line 10: found STOP_TIME = 2030-01-05T00:19:00.000",
+            circle_with(0.0, "STOP_TIME = 2030-01-01T00:10:00\n").into_bytes(),
+            "line 10: found STOP_TIME = 2030-01-01T00:10:00.000",
         ),
         (
-            circle_with(0.0, "START_TIME = 2029-12-01T00:00:00\n").into_bytes(),
-            "line 10: found START_TIME = 2029-12-01",
+            circle_with(0.0, "START_TIME = 2030-01-01T00:10:00\n").into_bytes(),
+            "line 10: found START_TIME = 2030-01-01T00:10",
         ),
         (circle_with(0.0, "STOP_TIME = soon\n").into_bytes(), "STOP_TIME = a date on TDB"),
         (wide, "text in UTF-16; expected text as ASCII or UTF-8"),
@@ -433,7 +433,7 @@ fn useable_times_say_which_segment_holds() {
     let said = told(FlownOrbit { metadata: &metadata, ..MADE }.file(1e-3, &minutes(0..81)));
     assert!(
         said.contains(
-            "line 9: found USEABLE_STOP_TIME = 2024-03-01T02:10:00.000; expected one among the states"
+            "line 9: found USEABLE_STOP_TIME = 2024-03-01T02:10:00.000; expected one that fits the states"
         ),
         "{said}"
     );

@@ -231,10 +231,13 @@ fn what_is_no_attitude_is_told_by_line() {
         ),
         (changed("META_STOP", "TIME_SYSTEM = UTC\nMETA_STOP"), "line 16: found TIME_SYSTEM again"),
         (
-            changed("STOP_TIME = 2030-01-31", "STOP_TIME = 2030-02-01"),
-            "line 13: found STOP_TIME = 2030-02-01",
+            changed("STOP_TIME = 2030-01-31", "STOP_TIME = 2030-01-30"),
+            "line 13: found STOP_TIME = 2030-01-30",
         ),
-        (changed("META_STOP", "USEABLE_STOP_TIME = 2030-01-31T12:02:00\nMETA_STOP"), "one among the states"),
+        (
+            changed("META_STOP", "USEABLE_STOP_TIME = 2030-01-31T12:02:00\nMETA_STOP"),
+            "one that fits the states",
+        ),
         (kvn(&format!("{SEGMENT}{SEGMENT}")), "overlap by 60.000 s"),
         (
             changed("DATA_STOP\n", "2030-01-31T12:02:00 0.5 0.1 -0.3 0.8062\n"),

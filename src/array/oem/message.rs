@@ -374,31 +374,31 @@ pub(in crate::array) fn read_epoch(epoch: &str, scale: TimeScale, line: usize) -
 }
 
 impl SegmentTimes {
-    /// The interval in which a segment is to be used, s after `zero`, of one whose states have these times, two or more. The data must
-    /// begin and end with its states, to a step: a file may be cut off.
+    /// The interval in which a segment is to be used, s after `zero`, of one whose states have these times, two or more. States must lie
+    /// between START_TIME and STOP_TIME, to a step; where these promise more, nothing is known there.
     pub(in crate::array) fn useable_s(&self, zero: Tai, time_s: &[f64]) -> Result<[f64; 2], Fault> {
         let (Some(&first_s), Some(&last_s)) = (time_s.first(), time_s.last()) else { return Ok([0.0; 2]) };
         let step_s = time_s.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
-        let require = |(time, line): (Tai, usize), key: &str, allowed_s: f64| {
-            let at_s = time.since_s(zero);
-            if (first_s - at_s).max(at_s - last_s) <= allowed_s + ROUNDED_S {
-                return Ok(at_s.clamp(first_s, last_s));
-            }
-            let [first, last] = [first_s, last_s].map(|s| zero.plus_s(s).text(self.scale, 3));
-            let found = format!("{key} = {}", time.text(self.scale, 3));
-            Err(Fault::new(
-                line,
-                found,
-                format!("one among the states, {first} to {last}: the file may be cut off"),
-            ))
-        };
         let mut useable_s = [first_s, last_s];
         for (end, name) in ["START_TIME", "STOP_TIME"].into_iter().enumerate() {
+            let fault = |key: String, (time, line): (Tai, usize)| {
+                let [first, last] = [first_s, last_s].map(|s| zero.plus_s(s).text(self.scale, 3));
+                let found = format!("{key} = {}", time.text(self.scale, 3));
+                Err(Fault::new(line, found, format!("one that fits the states, {first} to {last}")))
+            };
             if let Some(given) = self.data[end] {
-                require(given, name, step_s)?;
+                let at_s = given.0.since_s(zero);
+                let outside_s = if end == 0 { at_s - first_s } else { last_s - at_s };
+                if outside_s > step_s + ROUNDED_S {
+                    return fault(name.to_owned(), given);
+                }
             }
             if let Some(given) = self.useable[end] {
-                useable_s[end] = require(given, &format!("USEABLE_{name}"), 0.0)?;
+                let at_s = given.0.since_s(zero);
+                if (first_s - at_s).max(at_s - last_s) > ROUNDED_S {
+                    return fault(format!("USEABLE_{name}"), given);
+                }
+                useable_s[end] = at_s.clamp(first_s, last_s);
             }
         }
         if useable_s[0] >= useable_s[1] {

@@ -225,6 +225,9 @@ impl Config {
         let is_possible = isotropic || !self.array.is_on_surface();
         let expected = "\"isotropic\" with array.stations: dipoles are normal to an orbit";
         checks.require("spacecraft.antenna", "(dipoles)", is_possible, expected);
+        let is_possible = !self.map.refine.is_on() || !self.array.is_on_surface();
+        let expected = "none with array.stations: refined maps from the ground have not been validated";
+        checks.require("map.refine", "(set)", is_possible, expected);
         let rate = self.downlink.rate_bits_per_s_max;
         let is_possible = rate == 0.0 || !self.array.is_on_surface();
         let expected = "0 with array.stations: they observe while the Earth is hidden, and a relay that is not simulated takes the data";
