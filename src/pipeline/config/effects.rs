@@ -165,8 +165,8 @@ mod tests {
                 "calibration.gains_file = \"g\" has an effect only with calibration.hook = \"antenna-gains\"",
             ),
             (
-                "map.antennas.files.table_error_max = 0.1",
-                "map.antennas.files.table_error_max = 0.1 has an effect only with map.antennas.files.tables",
+                "instrument.antenna_files.table_error_max = 0.1",
+                "instrument.antenna_files.table_error_max = 0.1 has an effect only with instrument.antenna_files.tables",
             ),
             // Keys of a term that is off.
             (
