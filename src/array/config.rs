@@ -86,7 +86,7 @@ keys! {
         /// Earth axes (MOON_ME), one for each of `satellites`, or a CSV file with these columns. They turn with the Moon, see the sky
         /// above a flat horizon, and observe while the Earth is below that of the first.
         #[serde(skip_serializing_if = "Stations::is_empty")]
-        everyday stations: Stations = Stations::default();
+        expert stations: Stations = Stations::default();
         /// Epoch of a mission of stations, UTC, such as 2030-01-31T12:00:00.
         #[only_with("array.stations")]
         #[serde(skip_serializing_if = "String::is_empty")]

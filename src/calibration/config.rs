@@ -46,7 +46,7 @@ keys! {
         /// Bursts of point sources, such as the Sun's, that are found in a pass: "flag" leaves their visibilities out of the sums, "keep"
         /// only reports them.
         #[serde(skip_serializing_if = "BurstChoice::is_flag")]
-        everyday bursts: BurstChoice = BurstChoice::Flag;
+        expert bursts: BurstChoice = BurstChoice::Flag;
     }
 }
 

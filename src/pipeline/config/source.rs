@@ -523,7 +523,10 @@ mod tests {
         assert_eq!(config.spacecraft.every_nth_integration.values(), [4, 1]);
         assert_eq!(notes.len(), 1, "{notes:?}");
         assert!(
-            notes.iter().any(|note| note.starts_with("spacecraft.every_nth_integration = [4, 1]: as for")),
+            notes
+                .iter()
+                .any(|note| note
+                    .starts_with("spacecraft.every_nth_integration = [4, 1]: values of the nearest")),
             "{notes:?}"
         );
         // Lists that are set by overrides are not adapted, even if their length is wrong.
