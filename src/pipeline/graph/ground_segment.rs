@@ -140,8 +140,11 @@ fn regularisers(map: &MapConfig) -> Result<Vec<Regulariser>, PipelineError> {
     })
 }
 
+/// Prior maps of the channels, K, and the frequencies that their files state, Hz.
+type PriorMaps = (Vec<Vec<f64>>, Vec<Option<f64>>);
+
 /// Prior maps of the channels, smoothed and at the resolution of the maps, K, and the frequencies that their files state, Hz.
-fn prior_maps(config: &Config) -> Result<(Vec<Vec<f64>>, Vec<Option<f64>>), PipelineError> {
+fn prior_maps(config: &Config) -> Result<PriorMaps, PipelineError> {
     let map = &config.map;
     let read = |(channel, path): (usize, &PathBuf)| {
         let prior = read_prior(path, &map.prior_options(&config.spacecraft.channels_hz, channel))?;
