@@ -72,12 +72,11 @@ impl Plan {
     #[must_use]
     pub(in crate::pipeline) fn sky_channel(&self, channel: usize) -> SkyChannel {
         let Config { sky, spacecraft, .. } = &self.config;
-        let file = |channel: usize| sky.file.as_ref().and_then(|files| files.get(channel));
-        let mut others = (0..spacecraft.channels_hz.len()).filter(|other| *other != channel);
+        let channels = spacecraft.channels_hz.len();
         SkyChannel {
             frequency_hz: spacecraft.channels_hz[channel],
             is_dark_accepted: spacecraft.receiver_k_sr()[channel] > 0.0,
-            is_file_shared: file(channel).is_some() && others.any(|other| file(other) == file(channel)),
+            is_file_shared: channels > 1 && sky.file.as_ref().is_some_and(|files| files.values().len() == 1),
         }
     }
 
