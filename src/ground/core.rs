@@ -10,7 +10,7 @@ use super::live_view::{Activity, LiveViewWriter};
 use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
 use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
-use crate::calibration::{BurstSearch, Calibrator, MissingPackets};
+use crate::calibration::{BurstChoice, BurstSearch, Calibrator, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::downlink::{CucTime, PacketHeader, PacketKind};
@@ -274,7 +274,10 @@ impl Ground {
                 self.end_pass()?;
             }
             let watched = match &placed {
-                PlacedFrame::Visibilities(placed) if self.accumulator.maps(placed.channel) => {
+                PlacedFrame::Visibilities(placed)
+                    if self.outcome.bursts.choice() != BurstChoice::Off
+                        && self.accumulator.maps(placed.channel) =>
+                {
                     Some(placed.clone())
                 }
                 _ => None,

@@ -16,6 +16,7 @@ use super::status::{
 };
 use super::subject::Subject;
 use crate::array::EarthModel;
+use crate::calibration::BurstChoice;
 use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
 use crate::downlink::transport::socket::StationCounts;
 use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
@@ -263,7 +264,9 @@ impl Console {
             ledger: ground.map(|ground| LedgerStatus::new(ground.ledger.report(), phase == Phase::Ended)),
             completeness,
             reception,
-            bursts: ground.map(|ground| ground.bursts.len() as u64),
+            bursts: ground
+                .filter(|ground| ground.bursts.choice() != BurstChoice::Off)
+                .map(|ground| ground.bursts.len() as u64),
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
             saving,

@@ -186,7 +186,7 @@ pub(super) struct Status {
     /// Bytes of visibilities that wait for their positions.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) waiting_bytes: Option<u64>,
-    /// Number of bursts of point sources found, in any session.
+    /// Number of bursts of point sources found, in any session; `None` where they are not looked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) bursts: Option<u64>,
     #[serde(skip_serializing_if = "Option::is_none")]

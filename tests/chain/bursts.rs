@@ -28,6 +28,8 @@ engine = "pixel"
 epsilon = 1e-5
 [products]
 pictures = false
+[calibration]
+bursts = "flag"
 "#;
 
 /// A type III burst of 1e8 Jy at 10 MHz, while the Sun is in sight.
@@ -175,6 +177,22 @@ fn a_state_knows_its_bursts_and_gives_their_packets_back() {
     let report = json(&["retract", &file, "--state", &state, "--map", &place.pipeline, "--from-s", "0"]);
     assert_eq!(report["refused"], 0);
     assert_eq!(report["accumulated"], once["ledger"]["accumulated"]);
+}
+
+#[test]
+fn bursts_are_not_looked_for_unless_asked() {
+    let place = Workplace::new(MISSION);
+    let file = place.simulate("bursts.ccsds", &["--set", BURST]);
+    let replay = |choice: &str| {
+        let (set, out) = (format!("calibration.bursts={choice}"), place.path(choice));
+        let summary = json(&["replay", &file, "--map", &place.pipeline, "--out", &out, "--set", &set]);
+        let map = std::fs::read(place.path(&format!("{choice}/10.000MHz/map.fits"))).unwrap();
+        // The header names the settings; the pixels fill the last block.
+        (summary, map[map.len() - 2880..].to_vec())
+    };
+    let [(off, map), (keep, kept)] = ["off", "keep"].map(replay);
+    assert!(map == kept && off["ledger"] == keep["ledger"]);
+    assert_eq!((&off["bursts"], &keep["bursts"]["found"]), (&Value::Null, &1.into()));
 }
 
 #[test]

@@ -7,6 +7,7 @@
 //! The squared modulus of Gaussian visibilities is exponential, so a ratio exceeds x with probability 4^-x. The median of n pairs exceeds it
 //! if more than half of them do: for the least number of pairs, six or seven, with probability 35 * 4^(-4 x) at most, which is 2e-18 for
 //! x = 8. A mission of 30 channels has some 4e7 bins in 5000 passes: one of 1e10 missions has a false alarm, as far as its sky is Gaussian.
+//! Not so where one source outshines the rest: the Moon uncovers and hides it, and a short sight of it is taken for a burst.
 
 use std::collections::BTreeMap;
 use std::f64::consts::LN_2;

@@ -25,8 +25,10 @@ const BURSTS_MAX: usize = 1 << 18;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum BurstChoice {
-    /// Visibilities in a burst stay out of the sums.
+    /// Bursts are not looked for.
     #[default]
+    Off,
+    /// Visibilities in a burst stay out of the sums.
     Flag,
     /// Bursts are reported, and their visibilities are used like others.
     Keep,
@@ -34,8 +36,8 @@ pub enum BurstChoice {
 
 impl BurstChoice {
     #[allow(clippy::trivially_copy_pass_by_ref)] // As serde calls it.
-    pub(super) fn is_flag(&self) -> bool {
-        *self == Self::Flag
+    pub(super) fn is_off(&self) -> bool {
+        *self == Self::Off
     }
 }
 
@@ -165,7 +167,7 @@ impl BurstSummary {
 
 impl fmt::Display for BurstSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let what = if self.action.is_flag() { "left out" } else { "kept in the maps" };
+        let what = if self.action == BurstChoice::Flag { "left out" } else { "kept in the maps" };
         write!(f, "{} bursts, {what}:", self.found)?;
         for BurstHours { frequency_hz, found, hours } in &self.channels {
             let hz = Dimension::Frequency.show(*frequency_hz);
@@ -229,7 +231,7 @@ impl FoundBursts {
     /// Whether visibilities in a burst are left out.
     #[must_use]
     pub fn flags(&self) -> bool {
-        self.choice.is_flag()
+        self.choice == BurstChoice::Flag
     }
 
     /// What is done with bursts.

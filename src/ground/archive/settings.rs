@@ -12,9 +12,11 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
     settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
     settings.push(("calibration.quantiser_bits".to_owned(), config.calibration.quantiser_bits.to_string()));
     settings.push(("calibration.sub_bands".to_owned(), config.calibration.sub_bands.to_string()));
-    if config.calibration.bursts == BurstChoice::Keep {
-        // Nothing for "flag": states from before there was a choice go on.
-        settings.push(("calibration.bursts".to_owned(), "keep".to_owned()));
+    // Nothing for "off": states from before there was a choice go on.
+    match config.calibration.bursts {
+        BurstChoice::Off => {}
+        BurstChoice::Flag => settings.push(("calibration.bursts".to_owned(), "flag".to_owned())),
+        BurstChoice::Keep => settings.push(("calibration.bursts".to_owned(), "keep".to_owned())),
     }
     if let Some(path) = &config.calibration.gains_file {
         settings.push(("calibration.gains_file".to_owned(), checksum(path)?));
