@@ -22,10 +22,13 @@ mod error;
 mod exact;
 #[doc(hidden)]
 pub mod joint;
+mod method;
+mod methods;
 mod pixel;
 mod power;
 pub(crate) mod rates;
 mod regulariser;
+mod request;
 mod solver;
 mod stage;
 
@@ -37,30 +40,32 @@ pub use circle::{
 };
 pub use config::MapConfig;
 #[doc(hidden)]
-pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig, RegulariserChoice};
+pub use config::{ChannelGroup, EngineKind, MatrixKind, Method, REFINED, RefineConfig, RegulariserChoice};
 pub use error::AccumulationError;
 pub use exact::ExactEngine;
 #[doc(hidden)]
 pub use exact::automatic_weight_max;
 #[doc(hidden)]
 pub use pixel::{
-    Cholesky, ColumnBlock, MatrixFreeSums, MatrixFreeVisibilities, NotPositive, PixelExtras, PointBeam,
-    SymmetricTiles, TILE, solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
+    Cholesky, ColumnBlock, MatrixFreeSums, MatrixFreeVisibilities, NotPositive, PixelExtras, SymmetricTiles,
+    TILE, solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
 };
-pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
+pub use pixel::{PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]
 pub use power::{Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
-pub use solver::SolveError;
+#[doc(hidden)]
+pub use request::SolverSetup;
 #[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, STORED_MAX, SolveWatch, Solving, SolvingPart,
-    Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
-    noise_variance, probed_traces, regularisation, spectrum, traces,
+    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, PointBeam, STORED_MAX, SolutionClock,
+    SolveWatch, Solving, SolvingPart, Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT,
+    effective_beam, largest_eigenvalue, noise_variance, probed_traces, regularisation, spectrum, traces,
 };
+pub use solver::{Diagnostics, SolveError};
 #[doc(hidden)]
-pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotData, Solution, Solver, SolverSetup};
+pub use stage::{Accumulator, AccumulatorState, Snapshot, Solution, Solver};
 
 use std::collections::BTreeMap;
 

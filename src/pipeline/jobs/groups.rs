@@ -22,12 +22,12 @@ use crate::pipeline::graph::run::{
     FinishedGraph, collect_summary, lock_products, run_ground, write_settings, write_summary,
 };
 use crate::pipeline::graph::summary::GroupRecord;
-use crate::pipeline::graph::{RunHandles, RunScope, RunSummary, downlink_file, space_segment};
+use crate::pipeline::graph::{RunScope, RunSummary, RunView, downlink_file, space_segment};
 use crate::products::{ProductsError, Truth};
 use crate::runtime::Cancel;
 
 /// Callback that receives the step and the handles of its graph before each reading of the files.
-pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunHandles);
+pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunView);
 
 /// Divides the channels of the instrument that `files` describe into groups, in order.
 ///

@@ -11,7 +11,7 @@ use crate::imaging::ChannelGroup;
 use crate::mother::{Merger, SpoolReader, SpoolWriter};
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::pipeline::graph::run;
-use crate::pipeline::graph::{RunHandles, space_segment};
+use crate::pipeline::graph::{RunView, space_segment};
 use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Report};
 use crate::sky::SkyMap;
@@ -75,7 +75,7 @@ pub fn simulate_in_groups(
         let frames = space_segment::add_integration(&mut graph, plan, &present)?;
         drop(skies);
         graph.sink(SPOOL, frames, writer);
-        watch(GroupStep::Simulate(number), Some(RunHandles::without_ground(&graph)));
+        watch(GroupStep::Simulate(number), Some(RunView::without_ground(&graph)));
         let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
         let is_cancelled = report.cancelled;
         reports.push(report);
@@ -101,7 +101,7 @@ pub fn simulate_in_groups(
     let bytes = space_segment::add_downlink(&mut graph, plan, frames)?;
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
-    watch(GroupStep::Merge, Some(RunHandles::without_ground(&graph)));
+    watch(GroupStep::Merge, Some(RunView::without_ground(&graph)));
     let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
     if !report.cancelled {
         remove_spools(groups, file)?;

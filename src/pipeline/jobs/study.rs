@@ -20,7 +20,7 @@ use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
 use crate::pipeline::graph::run::{DownlinkSinks, replay_with_truth, simulate_skies};
-use crate::pipeline::graph::{RunHandles, downlink_file, space_segment};
+use crate::pipeline::graph::{RunView, downlink_file, space_segment};
 use crate::products::{
     Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, crossings, draw_epsilons,
     draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv,
@@ -35,13 +35,13 @@ const CHECKPOINT_EVERY: u64 = 20_000_000;
 #[derive(Clone, Debug)]
 pub enum StudyStep {
     /// Simulate the downlink that the case shares with others.
-    Simulate(RunHandles),
+    Simulate(RunView),
     /// Calibrate the data.
     Calibrate(CalibrateProgress),
     /// Map the data.
-    Map(RunHandles),
+    Map(RunView),
     /// Map additional noise realisations.
-    Realise(RunHandles),
+    Realise(RunView),
 }
 
 /// Callback that receives the number of the case, from 0, and each step before it runs.
