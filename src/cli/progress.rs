@@ -10,11 +10,14 @@ use indicatif::{DecimalBytes, HumanCount, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
 use super::events::{LogViewer, log_change, progress_line};
+use super::interrupt::Interrupt;
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
 use crate::imaging::{SolutionClock, SolveWatch, Solving, SolvingPart};
-use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunChanges, RunGroups, RunView};
+use crate::pipeline::{
+    CalibrateProgress, ChannelCost, GroupStep, INTEGRATE, MERGE, Plan, READ, RunChanges, RunGroups, RunView,
+};
 use crate::runtime::Cancel;
 use crate::units::ChannelId;
 
@@ -192,11 +195,13 @@ fn amount(count: u64, unit: &str) -> String {
     }
 }
 
-/// Logs the steps of a run in groups, with the time left.
+/// Logs the steps of a run in groups, with the time left and the progress of each.
 pub(super) struct GroupSteps {
     groups: RunGroups,
     parts: Parts,
     channels_hz: Vec<f64>,
+    windows: u64,
+    progress: Option<Progress>,
 }
 
 impl GroupSteps {
@@ -209,11 +214,32 @@ impl GroupSteps {
         let mapped = groups.mapped.iter().map(|group| seconds(&group.channels, |cost| cost.mapping_s));
         // The merging takes negligible time.
         let parts = Parts::new(simulated.chain([0.0]).chain(mapped));
-        Self { groups: groups.clone(), parts, channels_hz: plan.config.spacecraft.channels_hz.clone() }
+        Self {
+            groups: groups.clone(),
+            parts,
+            channels_hz: plan.config.spacecraft.channels_hz.clone(),
+            windows: plan.progress_windows(),
+            progress: None,
+        }
+    }
+
+    /// Logs a step that begins, and shows the progress of its graph, if it has one.
+    pub(super) fn watch(&mut self, step: GroupStep, view: Option<RunView>, interrupt: &Interrupt) {
+        // The bar of the previous step ends first.
+        self.progress = None;
+        self.begin(step);
+        let Some(view) = view else { return };
+        interrupt.arm_or_note();
+        let (stage, total) = match step {
+            GroupStep::Simulate(_) => (INTEGRATE, self.windows),
+            GroupStep::Merge => (MERGE, 0),
+            GroupStep::Map(_) | GroupStep::Sky(_) => (READ, 0),
+        };
+        self.progress = Some(Progress::watch(view, stage, total, interrupt.cancel()));
     }
 
     /// Logs a step that begins.
-    pub(super) fn begin(&mut self, step: GroupStep) {
+    fn begin(&mut self, step: GroupStep) {
         let RunGroups { simulated, mapped } = &self.groups;
         let (what, number, of, part) = match step {
             GroupStep::Simulate(number) => ("simulated", number, simulated.len(), number),

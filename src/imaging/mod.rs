@@ -35,8 +35,7 @@ mod stage;
 pub(crate) use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
-    HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,
-    solve_regularised,
+    HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_noises, solve_regularised,
 };
 pub use config::MapConfig;
 #[doc(hidden)]
@@ -60,8 +59,8 @@ pub use request::SolverSetup;
 #[doc(hidden)]
 pub use solver::{
     Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, PointBeam, STORED_MAX, SolutionClock,
-    SolveWatch, Solving, SolvingPart, Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT,
-    effective_beam, largest_eigenvalue, noise_variance, probed_traces, regularisation, spectrum, traces,
+    SolveWatch, Solving, SolvingPart, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT,
+    largest_eigenvalue, probed_traces, traces,
 };
 pub use solver::{Diagnostics, SolveError};
 #[doc(hidden)]

@@ -65,7 +65,7 @@ pub use setup::{
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k};
-pub use solve::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
+pub use solve::{HarmonicRequest, HarmonicSolution, solve_regularised};
 pub(super) use solve::{largest_of_circle, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 

@@ -51,26 +51,12 @@ pub struct HarmonicSolution {
 
 /// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that are diagonal in m.
 ///
-/// The equations are those of [`crate::imaging::solve_pixels`] for functions of degree up to `l_max`. R is epsilon times the
-/// largest eigenvalue times the identity over orthonormal harmonics, which equals that over pixels up to their area.
-/// `start` holds the [`HarmonicSolution::unknowns`] of an earlier solution.
+/// The equations are those of [`crate::imaging::solve_pixels`] for functions of degree up to `l_max`, with an R that may depend on the
+/// degree. The identity is over orthonormal harmonics, which equals that over pixels up to their area. `start` holds the
+/// [`HarmonicSolution::unknowns`] of an earlier solution.
 ///
 /// # Errors
-/// There is no data, or the size of the prior is not that of a map.
-pub fn solve_harmonics(
-    sums: &HarmonicSums,
-    request: HarmonicRequest,
-    prior_k: Option<&[f64]>,
-    start: Option<&[Vec<f64>; 2]>,
-    watch: NamedWatch<'_>,
-) -> Result<HarmonicSolution, SolveError> {
-    solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
-}
-
-/// Solves as [`solve_harmonics`], with an R that may depend on the degree.
-///
-/// # Errors
-/// As [`solve_harmonics`]; or a table of power ends before the map's degrees.
+/// There is no data, the size of the prior is not that of a map, or a table of power ends before the map's degrees.
 pub fn solve_regularised(
     sums: &HarmonicSums,
     request: HarmonicRequest,

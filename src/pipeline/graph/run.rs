@@ -1,8 +1,8 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use std::sync::PoisonError;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 use std::{fs, io};
 
@@ -16,12 +16,12 @@ use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
-use crate::files::{FolderLock, write_atomically};
+use crate::files::FolderLock;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::Method;
 use crate::imaging::SolveWatch;
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
-use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos};
+use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
@@ -367,8 +367,7 @@ pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), P
         let Some(text) = text else { continue };
         let mut name = file.as_os_str().to_owned();
         name.push(ending);
-        let path = PathBuf::from(name);
-        write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?;
+        write_product(&PathBuf::from(name), text)?;
     }
     Ok(())
 }
@@ -389,7 +388,7 @@ pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result
     if has_same_length && fs::read(&path).is_ok_and(|found| found == text.as_bytes()) {
         return Ok(());
     }
-    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+    Ok(write_product(&path, text)?)
 }
 
 /// Locks a folder for maps; an error if an input file of the configuration lies where a product would be written.
@@ -407,7 +406,7 @@ pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<
 /// Creates and locks a folder; before anything is computed, so that an error shows early.
 pub(in crate::pipeline) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
-    locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+    Ok(locked.map_err(ProductsError::write(out))?)
 }
 
 /// Whether a file lies in a channel's folder (`...MHz`) of `out`.

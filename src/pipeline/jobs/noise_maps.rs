@@ -13,7 +13,7 @@ use crate::pipeline::config::{Config, MemoryLimit, PipelineError};
 use crate::pipeline::graph::ground_segment::GROUND;
 use crate::pipeline::graph::run::start_single_process;
 use crate::pipeline::graph::{OnStart, READ, RunView};
-use crate::products::ProductsError;
+use crate::products::create_folder;
 use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
@@ -139,8 +139,7 @@ impl Sink for NoiseMapSolver {
             map_k.iter_mut().for_each(|value| *value /= factor);
             let path = noise_file(&self.out, frequency_hz, number);
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder)
-                    .map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?;
+                create_folder(folder)?;
             }
             write_map(&path, &SkyMap::new(Frame::Ecliptic, map_k)?, &WriteOptions::default())?;
         }

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::case::key_of;
 use super::group_steps::{GroupStep, GroupStepWatcher};
 use crate::downlink::Recorder;
 use crate::imaging::ChannelGroup;
@@ -24,8 +25,7 @@ pub const MERGE: &str = "merge";
 
 impl Plan {
     fn spool_key(&self) -> u64 {
-        let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
-        crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
+        key_of(format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash()))
     }
 }
 
@@ -113,7 +113,7 @@ pub fn simulate_in_groups(
 fn remove_spools(groups: &[ChannelGroup], file: &Path) -> Result<(), PipelineError> {
     for group in groups {
         let path = spool_path(file, group);
-        fs::remove_file(&path).map_err(|source| ProductsError::Write { path, source })?;
+        fs::remove_file(&path).map_err(ProductsError::write(&path))?;
     }
     Ok(())
 }
