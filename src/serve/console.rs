@@ -268,18 +268,23 @@ impl Console {
             visitors: self.clients.status(),
         };
         let changes = view.map(|view| last_update.told.next(view, &progress)).unwrap_or_default();
+        self.log_changes(&changes, &status, &mut last_update.senders);
+        last_update.status = Some(status.clone());
+        status
+    }
+
+    /// Logs what has changed; `senders` is how many were accepted before.
+    fn log_changes(&self, changes: &[Change], status: &Status, senders: &mut u64) {
         for (is_bad, text) in changes.iter().filter_map(event_of) {
             self.log_event(is_bad, text);
         }
         if let Some(listening) = &status.listening {
             let accepted = listening.report.connections;
-            if accepted > std::mem::replace(&mut last_update.senders, accepted) {
+            if accepted > std::mem::replace(senders, accepted) {
                 let open = listening.open;
                 self.log_event(false, format!("senders: {accepted} connections accepted, {open} open"));
             }
         }
-        last_update.status = Some(status.clone());
-        status
     }
 }
 
