@@ -84,11 +84,8 @@ fn page_of(all: &[KeyDescription]) -> String {
         let KeyDescription { key, default, about, only_with, .. } = described;
         let default = default.as_ref().map_or_else(String::new, |text| format!(" = {text}"));
         // The last condition is that of the key; the others are of its sections.
-        let condition = only_with.last().map_or_else(String::new, |only| {
-            let text = condition_text(only);
-            let (word, keys) = text.split_once(' ').unwrap_or_default();
-            format!(" Only {word} `{keys}`.")
-        });
+        let condition =
+            only_with.last().map_or_else(String::new, |only| format!(" Only {}.", condition_text(only)));
         page.push_str(&format!("| `{key}{default}` | {}{condition} |\n", in_a_cell(about)));
     }
     page.push_str(

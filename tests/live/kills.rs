@@ -7,12 +7,14 @@ use super::*;
 const LINKS: usize = 3;
 
 /// Parts in which a station sends what it heard, each over a connection of its own.
-const PARTS: usize = 5;
+const PARTS: usize = 20;
 
-/// Visibilities held one by one. Two iterations show all that more would, and an inner solution goes on to where it depends on the data
-/// alone.
+/// Most that a ground lives after it listens, ms.
+const PATIENCE_MS: usize = 120;
+
+/// Visibilities held one by one. One iteration shows all that more would, and its solution goes on to where it depends on the data alone.
 const REFINED: [&str; 6] =
-    ["--set", "map.engine=harmonic", "--set", "map.residual_max=1e-9", "--set", "map.refine.passes_max=2"];
+    ["--set", "map.engine=harmonic", "--set", "map.residual_max=1e-8", "--set", "map.refine.passes_max=1"];
 
 /// A number from 0 on, of a generator of full period.
 fn below(state: &mut u32, limit: usize) -> usize {
@@ -72,7 +74,11 @@ fn kill_and_send(more: &[&str], kills: usize, time: Duration) -> (usize, usize) 
             .file("anyone.ccsds", &left.iter().flatten().flatten().copied().collect::<Vec<u8>>());
         let (state, out) = (place.path("state"), place.path("killed.out"));
         let listen = ["replay", "--listen", "tcp://127.0.0.1:0", "--map", place.pipeline(), "--out", &out];
-        while left.iter().any(|parts| !parts.is_empty()) {
+        let parts_left = |left: &[Vec<Vec<u8>>]| left.iter().map(Vec::len).sum::<usize>();
+        // Longer while nothing is taken, as on a busy machine.
+        let mut patience_ms = PATIENCE_MS;
+        while parts_left(&left) > 0 {
+            let before = parts_left(&left);
             let ground = Served::start(&[&listen[..], &["--state", &state], more].concat());
             let address = ground.listening();
             std::thread::scope(|scope| {
@@ -82,10 +88,12 @@ fn kill_and_send(more: &[&str], kills: usize, time: Duration) -> (usize, usize) 
                 let mut page = TcpStream::connect(&ground.address).unwrap();
                 write!(page, "GET /events HTTP/1.1\r\nHost: {}\r\n\r\n", ground.address).unwrap();
                 // While it begins, reads, answers, or writes a checkpoint.
-                std::thread::sleep(Duration::from_millis(below(&mut random, 120) as u64));
+                std::thread::sleep(Duration::from_millis(below(&mut random, patience_ms) as u64));
                 ground.kill();
             });
             killed += 1;
+            patience_ms =
+                if parts_left(&left) < before { PATIENCE_MS } else { (2 * patience_ms).min(1 << 14) };
         }
         let read = place.replay("anyone.out", &anyone, more);
         let map = ["replay", "--map", place.pipeline(), "--out", &out, "--json", "--state", &state];
@@ -100,10 +108,8 @@ fn kill_and_send(more: &[&str], kills: usize, time: Duration) -> (usize, usize) 
 
 #[test]
 fn what_a_killed_ground_has_taken_is_there() {
-    for more in [&[][..], &REFINED] {
-        let (kills, _) = kill_and_send(more, 5, Duration::from_secs(600));
-        assert!(kills >= 5);
-    }
+    let (kills, _) = kill_and_send(&[], 10, Duration::from_secs(600));
+    assert!(kills >= 10);
 }
 
 #[test]

@@ -83,9 +83,11 @@ struct FileOrbit {
 /// with Z, else in their time system, or with the last to begin.
 pub(in crate::array) fn read(config: &ArrayConfig) -> Result<OemOrbits, ArrayError> {
     let ArrayConfig { oem, oem_epoch, moon_radius_m, satellites, .. } = config;
-    let files: Result<Vec<Vec<FileOrbit>>, ArrayError> =
+    let files: Vec<Result<Vec<FileOrbit>, ArrayError>> =
         oem.par_iter().map(|path| read_orbits(path, *moon_radius_m)).collect();
-    let files: Vec<FileOrbit> = files?.into_iter().flatten().collect();
+    // Of several errors the first file's.
+    let files: Vec<Vec<FileOrbit>> = files.into_iter().collect::<Result<_, _>>()?;
+    let files: Vec<FileOrbit> = files.into_iter().flatten().collect();
     if let Some(last) = files.last().filter(|_| files.len() != *satellites) {
         let found = format!("with it the files of array.oem have {} orbits", files.len());
         return Err(error(
