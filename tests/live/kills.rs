@@ -6,7 +6,10 @@ use super::*;
 
 const LINKS: usize = 3;
 
-/// Parts in which a station sends what it heard, each over a connection of its own.
+/// Packets of a station's first delivery, from which a new ground takes its instrument.
+const FIRST_PACKETS: usize = 40;
+
+/// Deliveries of the rest, each over a connection of its own.
 const PARTS: usize = 20;
 
 /// Most that a ground lives after it listens, ms.
@@ -40,8 +43,9 @@ fn heard(packets: &[Vec<u8>], random: &mut u32) -> Vec<Vec<u8>> {
             heard.swap(k, before);
         }
     }
+    let (first, rest) = heard.split_at(FIRST_PACKETS);
     let part = |part: &[&Vec<u8>]| part.iter().flat_map(|packet| packet.iter().copied()).collect();
-    heard.chunks(heard.len().div_ceil(PARTS)).map(part).collect()
+    std::iter::once(first).chain(rest.chunks(rest.len().div_ceil(PARTS))).map(part).collect()
 }
 
 /// Sends the parts that are left, until one is not answered.
