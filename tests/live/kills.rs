@@ -25,17 +25,17 @@ fn below(state: &mut u32, limit: usize) -> usize {
     (*state >> 16) as usize % limit
 }
 
-/// What a station heard: packets are lost, doubled and out of order, a tenth, a tenth and a third of them.
+/// What a station heard: after the first delivery packets are lost, doubled and out of order, a tenth, a tenth and a third of them.
 fn heard(packets: &[Vec<u8>], random: &mut u32) -> Vec<Vec<u8>> {
+    let (first, rest) = packets.split_at(FIRST_PACKETS);
     let mut heard = Vec::new();
-    for (k, packet) in packets.iter().enumerate() {
+    for packet in rest {
         let copies = match below(random, 10) {
-            // The first describes the instrument.
-            0 if k > 0 => 0,
+            0 => 0,
             1 => 2,
             _ => 1,
         };
-        heard.extend(std::iter::repeat_n(packet, copies));
+        heard.extend(std::iter::repeat_n(packet.clone(), copies));
     }
     for k in 1..heard.len() {
         if below(random, 3) == 0 {
@@ -43,9 +43,7 @@ fn heard(packets: &[Vec<u8>], random: &mut u32) -> Vec<Vec<u8>> {
             heard.swap(k, before);
         }
     }
-    let (first, rest) = heard.split_at(FIRST_PACKETS);
-    let part = |part: &[&Vec<u8>]| part.iter().flat_map(|packet| packet.iter().copied()).collect();
-    std::iter::once(first).chain(rest.chunks(rest.len().div_ceil(PARTS))).map(part).collect()
+    std::iter::once(first).chain(heard.chunks(heard.len().div_ceil(PARTS))).map(<[Vec<u8>]>::concat).collect()
 }
 
 /// Sends the parts that are left, until one is not answered.

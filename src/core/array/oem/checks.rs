@@ -135,7 +135,7 @@ impl SegmentCheck<'_> {
     }
 
     /// Position of state `k` that follows from the states around it, up to `reach` on either side.
-    fn from_neighbours(&self, k: usize, reach: usize) -> Vec3 {
+    fn position_by_neighbours(&self, k: usize, reach: usize) -> Vec3 {
         let segment = self.segment;
         let (from, until) = (k.saturating_sub(reach), (k + reach + 1).min(segment.time_s.len()));
         let without = |values: &[Vec3]| [&values[from..k], &values[k + 1..until]].concat();
@@ -151,11 +151,11 @@ impl SegmentCheck<'_> {
     /// How far state `k`, not the first or last, is from where its neighbours have it, m; 0 if they cannot say.
     fn step_m(&self, k: usize) -> f64 {
         let position_m = self.segment.position_m[k];
-        let near = self.from_neighbours(k, 2);
+        let near = self.position_by_neighbours(k, 2);
         if norm(sub(near, position_m)) <= ERROR_M_MAX {
             return 0.0;
         }
-        let far = self.from_neighbours(k, 3);
+        let far = self.position_by_neighbours(k, 3);
         let (off_m, open_m) = (norm(sub(far, position_m)), norm(sub(far, near)));
         if off_m > 10.0 * open_m { off_m } else { 0.0 }
     }
