@@ -28,6 +28,8 @@ pub(crate) mod rates;
 mod regulariser;
 mod solver;
 mod stage;
+#[doc(hidden)]
+pub mod zoom;
 
 pub(crate) use beyond::read_power;
 #[doc(hidden)]

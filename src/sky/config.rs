@@ -49,6 +49,10 @@ keys! {
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         expert added: Option<AddedSky> = None;
+        /// Table (CSV) of steady point sources beside the map, at their exact directions for baselines of any length; as `lunarray sky
+        /// --sources` writes it. Without an index of their own, sources have sky.generated.source_spectral_index.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert points: Option<PathBuf> = None;
         /// Bursts of point sources, such as `[{ direction = "sun", starts_s = [9e4], peak_jy = 1e8 }]`, or `direction = [longitude,
         /// latitude]`; optional `reference_hz`, `spectral_index`, `rise_s`, `decay_s`, `duration_index`, `drift_s` (a type III burst's). The
         /// truth is written beside the downlink, as FILE.moving.csv.
