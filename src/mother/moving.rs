@@ -238,4 +238,40 @@ mod tests {
             assert!(p == q && (signal.visibility_k_sr.norm() / p - 1.0).abs() < 1e-12);
         }
     }
+
+    #[test]
+    fn steady_sources_are_seen_at_any_time_while_the_moon_does_not_hide_them() {
+        let array = Arc::new(Array::new(&Default::default()).unwrap());
+        let sources = vec![(direction(10.0, 80.0), 3.0), (direction(200.0, -5.0), 2.0)];
+        let sky = MovingSky {
+            sources: Vec::new(),
+            points: vec![SteadyPoints { frequency_hz: 1e7, sources: sources.clone() }],
+            array: Arc::clone(&array),
+            epoch_tai_s: 2.2e9,
+            response: AntennaResponse::Isotropic,
+            smear_integrations: false,
+            smear_bandwidth: false,
+        };
+        let channel = Channel { frequency_hz: 1e7, width_hz: 8e3 };
+        let mut hidden = 0;
+        for k in 0..100 {
+            let t_s = 1e6 + 82.0 * f64::from(k);
+            let [r_i_m, r_j_m] = [0, 7].map(|n| array.position_m(n, t_s));
+            let is_seen = |n_hat: Vec3| {
+                ![r_i_m, r_j_m].iter().any(|&r_m| hidden_by_moon(r_m, n_hat, array.moon_radius_m()))
+            };
+            hidden += usize::from(!is_seen(sources[1].0));
+            let wave = |(n_hat, k_sr): &(Vec3, f64)| {
+                let turns = dot(sub(r_i_m, r_j_m), *n_hat) * 1e7 / SPEED_OF_LIGHT_M_S;
+                if is_seen(*n_hat) { *k_sr * Complex64::cis(-2.0 * PI * turns) } else { Complex64::ZERO }
+            };
+            let expected: Complex64 = sources.iter().map(wave).sum();
+            let found = sky.signal(Pair { i: 0, j: 7 }, &channel, [t_s, 1.0]).visibility_k_sr;
+            // 3e3 turns of 16 digits.
+            assert!((found - expected).norm() < 1e-9, "{found} {expected}");
+        }
+        assert!((10..60).contains(&hidden), "{hidden}");
+        let other = Channel { frequency_hz: 2e7, width_hz: 8e3 };
+        assert_eq!(sky.signal(Pair { i: 0, j: 7 }, &other, [1e6, 1.0]).visibility_k_sr, Complex64::ZERO);
+    }
 }
