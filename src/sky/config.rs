@@ -88,6 +88,14 @@ impl SkyConfig {
         L_MAX.min(5 * nside / 2)
     }
 
+    /// Longest baseline to which a map of `nside` has anything to say, wavelengths, beside `points` at exact directions; `None` without
+    /// such points, where maps are all there is.
+    #[must_use]
+    pub fn reach_wavelengths(&self, nside: usize) -> Option<f64> {
+        let degree = if self.l_max > 0 { self.l_max } else { 2 * nside };
+        self.points.as_ref().map(|_| degree as f64 / std::f64::consts::TAU)
+    }
+
     fn l_max_expected(limit: usize) -> String {
         format!("0, or at most {limit}: 2.5 nside of the sky, and {L_MAX}")
     }

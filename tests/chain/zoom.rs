@@ -13,13 +13,11 @@ name = "zoom"
 seed = 11
 [sky]
 nside = 8
-l_max = 8
 [spacecraft]
 channels_hz = [10.0e6]
 duration_s = 8.0e6
 every_nth_window = 121
 window_s_max = 300.0
-model = "harmonic"
 "#;
 
 /// Sources about the ecliptic pole, which the Moon never hides from an orbit inclined by 30 degrees; the fourth is a hundredth of the radius
@@ -72,28 +70,48 @@ fn sources_have_their_fluxes_and_places() {
     // From a patch in the plane of the orbit the Moon takes its part, which is counted.
     let behind = zoom("plane", &["--centre", "90,-20"]);
     let flagged = &behind["ledger"]["flagged"];
-    assert!(flagged["patch behind the Moon"].is_u64() || flagged["the Moon's limb in the patch"].is_u64(), "{flagged}");
+    assert!(
+        flagged["patch behind the Moon"].is_u64() || flagged["the Moon's limb in the patch"].is_u64(),
+        "{flagged}"
+    );
     assert_eq!(behind["sources"][0]["known_name"], "far");
     assert_closes(&behind["ledger"]);
 }
 
 fn assert_closes(ledger: &Value) {
-    let flagged: u64 = ledger["flagged"].as_object().unwrap().values().map(|count| count.as_u64().unwrap()).sum();
+    let flagged: u64 =
+        ledger["flagged"].as_object().unwrap().values().map(|count| count.as_u64().unwrap()).sum();
     let lost: u64 = ledger["lost"].as_array().unwrap().iter().map(|one| one["count"].as_u64().unwrap()).sum();
-    assert_eq!(ledger["sampled"].as_u64().unwrap(), ledger["accumulated"].as_u64().unwrap() + flagged + lost, "{ledger}");
+    assert_eq!(
+        ledger["sampled"].as_u64().unwrap(),
+        ledger["accumulated"].as_u64().unwrap() + flagged + lost,
+        "{ledger}"
+    );
 }
 
 #[test]
 fn what_cannot_be_imaged_is_refused() {
     let place = Workplace::new(MISSION);
-    let downlink = place.simulate("pass.ccsds", &["--set", "spacecraft.duration_s=9000", "--set", "spacecraft.window_s_max=20"]);
+    let downlink = place.simulate(
+        "pass.ccsds",
+        &["--set", "spacecraft.duration_s=9000", "--set", "spacecraft.window_s_max=20"],
+    );
     let table = place.file("sources.csv", SOURCES.as_bytes());
     let out = place.path("out");
-    let refused = |more: &[&str]| fail(&[&["zoom", &downlink, "--catalogue", &table, "--out", &out], more].concat());
-    assert!(refused(&["--centre", "nowhere"]).contains("--centre = nowhere: expected right ascension and declination"));
+    let refused =
+        |more: &[&str]| fail(&[&["zoom", &downlink, "--catalogue", &table, "--out", &out], more].concat());
+    assert!(
+        refused(&["--centre", "nowhere"])
+            .contains("--centre = nowhere: expected right ascension and declination")
+    );
     assert!(refused(&["--centre", "270,66", "--channel", "4"]).contains("--channel"));
-    assert!(refused(&["--centre", "270,66", "--baseline-min", "1e6"]).contains("no visibility sees the whole patch"));
-    assert!(refused(&["--centre", "270,66", "--pixel-arcmin", "60"]).contains("are too large for baselines of"));
+    assert!(
+        refused(&["--centre", "270,66", "--baseline-min", "1e6"])
+            .contains("no visibility sees the whole patch")
+    );
+    assert!(
+        refused(&["--centre", "270,66", "--pixel-arcmin", "60"]).contains("are too large for baselines of")
+    );
 }
 
 #[test]
@@ -103,7 +121,8 @@ fn images_and_tables_are_those_of_astropy() {
     let place = Workplace::new(MISSION);
     let [downlink, table] = simulated(&place);
     let out = place.path("pole");
-    let args = ["zoom", &downlink, "--catalogue", &table, "--centre", "A", "--radius-deg", "1", "--out", &out];
+    let args =
+        ["zoom", &downlink, "--catalogue", &table, "--centre", "A", "--radius-deg", "1", "--out", &out];
     json(&args);
     let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/python/zoom.py");
     let compared = Command::new(python).arg(script).args([&out, &table]).output().unwrap();
