@@ -1,6 +1,6 @@
 //! A calibration step of one's own: one satellite's clock is late, and the hook takes the delay out again.
 //!
-//! To make such a hook part of the program, add it to `CalibrationHook` in `src/calibration/config.rs`.
+//! To make such a hook part of the program, add it to `CalibrationHook` in `src/core/calibration/config.rs`.
 
 mod common;
 

@@ -208,7 +208,7 @@ fn texts() {
         "overrides",
         b"\x02map.nside=8\nspacecraft.duration_s=9e3\nsky.file=[\"a\"]\narray.breathing.ratio=2.0",
     );
-    let gains = include_str!("../src/calibration/gains_example.toml");
+    let gains = include_str!("../src/core/calibration/gains_example.toml");
     save("toml", "gains", &[b"\x03", gains.as_bytes()].concat());
 }
 

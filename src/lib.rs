@@ -56,59 +56,16 @@
 //!
 //! Public items that are not documented here are for the program, its tests and the Python package, and change without notice.
 
-// They panic when nobody reads any more; `cli/output.rs` has what does not.
-#![warn(clippy::print_stdout, clippy::print_stderr)]
-
-pub mod units;
-
-#[doc(hidden)]
-pub mod numerics;
-
-#[doc(hidden)]
-pub mod files;
-
-#[doc(hidden)]
-pub mod ranks;
-
-pub mod frames;
-
-pub mod runtime;
-
-pub mod sky;
-
-pub mod array;
-
-pub mod response;
-
-#[doc(hidden)]
-pub mod daughters;
-
-#[doc(hidden)]
-pub mod mother;
-
-pub mod downlink;
-
-pub mod calibration;
-
-pub mod imaging;
-
-pub mod ground;
-
-pub mod products;
-
-pub mod pipeline;
-
-pub mod prelude;
-
-#[doc(hidden)]
-pub mod figures;
-
 #[doc(hidden)]
 #[cfg(feature = "serve")]
-pub mod serve;
-
+pub use lunarray_app::serve;
 #[doc(hidden)]
-pub mod bench;
-
+pub use lunarray_app::{bench, cli, figures};
+#[doc(inline)]
+pub use lunarray_app::{pipeline, prelude};
+#[doc(inline)]
+pub use lunarray_core::{
+    array, calibration, downlink, frames, ground, imaging, products, response, runtime, sky, units,
+};
 #[doc(hidden)]
-pub mod cli;
+pub use lunarray_core::{daughters, files, mother, numerics, ranks};

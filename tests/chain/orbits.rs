@@ -723,7 +723,7 @@ fn dates_of_orbits_give_epoch_earth_and_windows() {
         let [x, y, z] = [0, 1, 2].map(|k| hat[k].as_f64().unwrap());
         [y.atan2(x).to_degrees().rem_euclid(360.0), z.asin().to_degrees()]
     };
-    // As astropy 8.0.2 has them with DE421 (`src/array/bodies`).
+    // As astropy 8.0.2 has them with DE421 (`src/core/array/bodies`).
     for (key, expected) in [("earth_hat", [40.1461, 2.1637]), ("sun_hat", [340.6916, 0.0065])] {
         let found = degrees(&geometry[key]);
         assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 0.01), "{key}: {found:?}");

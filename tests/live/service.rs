@@ -106,7 +106,7 @@ fn dashboard_and_alerts_name_metrics_that_exist() {
         );
     }
     let mut known = metrics_in(&text);
-    let collector = ours("src/serve/prometheus.rs");
+    let collector = ours("src/app/serve/prometheus.rs");
     // Those of the solver, and of a ground that takes datagrams.
     let elsewhere = [
         ("solver_residual", "ratios"),

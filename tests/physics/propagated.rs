@@ -17,7 +17,7 @@ fn orbits_in_the_moons_field_are_those_of_other_code() {
     let (degree, days) = (12, 0.6);
     let made = Command::new(python)
         .arg(root.join("tests/python/lunar_orbits.py"))
-        .arg(root.join("src/array/propagate/grgm900c.rs"))
+        .arg(root.join("src/core/array/propagate/grgm900c.rs"))
         .args([degree.to_string(), days.to_string()])
         .arg(&out)
         .output()

@@ -2,7 +2,7 @@
 
 usage: downlink_make.py fixtures/downlink_v1.ccsds
 
-Primary headers by spacepackets (PyPI), everything else by struct from the tables in src/downlink. The Rust test
+Primary headers by spacepackets (PyPI), everything else by struct from the tables in src/core/downlink. The Rust test
 that reads it knows the formulas below.
 """
 

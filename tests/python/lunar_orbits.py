@@ -3,7 +3,7 @@ of coefficients.
 
 usage: lunar_orbits.py TABLE DEGREE DAYS OUT          needs numpy
 
-TABLE is src/array/propagate/grgm900c.rs, of which the numbers are read. Three satellites from Kepler elements. The pull is the gradient of the
+TABLE is src/core/array/propagate/grgm900c.rs, of which the numbers are read. Three satellites from Kepler elements. The pull is the gradient of the
 potential in spherical coordinates, by Legendre functions of full norm; Adams, Bashforth and Moulton's method of eighth order with
 steps of 30 s. OUT gets f64: time in s, then x, y, z in m of each satellite on ecliptic axes, at every 23rd step.
 """

@@ -21,7 +21,7 @@ use std::path::Path;
 
 use source::{File, ModulePath, parse};
 
-/// Folders (and files) directly below `src/`, each after all that it may use.
+/// Folders (and files) of `src/core/` and then of `src/app/`, each after all that it may use.
 const ORDER: [&str; 23] = [
     "units",
     "numerics",

@@ -121,8 +121,15 @@ fn files(folder: &Path, found: &mut Vec<PathBuf>) {
 /// Items of the documentation by module, without the re-exports of `prelude`.
 fn items() -> BTreeSet<(String, String)> {
     let mut found = BTreeSet::new();
-    let mut open =
-        vec![(PathBuf::from(SRC), std::fs::read_to_string(Path::new(SRC).join("lib.rs")).unwrap())];
+    // What the library shows are modules of the workspace's members.
+    let rooms = shown(&std::fs::read_to_string(Path::new(SRC).join("lib.rs")).unwrap()).items;
+    let mut open: Vec<_> = rooms
+        .iter()
+        .filter(|room| *room != "prelude")
+        .flat_map(|room| ["core", "app"].map(|member| Path::new(SRC).join(member).join(room)))
+        .filter(|module| module.exists())
+        .map(|module| (module.clone(), text_of(&module)))
+        .collect();
     while let Some((module, text)) = open.pop() {
         let Shown { items, modules } = shown(&text);
         let name = module.strip_prefix(SRC).unwrap().display().to_string();

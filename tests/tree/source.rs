@@ -16,7 +16,9 @@ pub struct File {
 
 /// The file's module, what is in it, and the modules that it declares for tests alone.
 pub fn parse(path: &str, text: &str) -> (ModulePath, File, Vec<ModulePath>) {
-    let mut module: ModulePath = path.trim_end_matches(".rs").split('/').map(str::to_owned).collect();
+    // The members of the workspace are one tree.
+    let place = ["core/", "app/"].iter().find_map(|member| path.strip_prefix(member)).unwrap_or(path);
+    let mut module: ModulePath = place.trim_end_matches(".rs").split('/').map(str::to_owned).collect();
     if matches!(module.last().unwrap().as_str(), "mod" | "lib") {
         module.pop();
     }

@@ -32,7 +32,8 @@ pub struct Packet<'a> {
 
 impl Packet<'_> {
     /// Appends the packet as it was sent. Encoding parsed headers restores every bit.
-    pub(crate) fn append_to(&self, out: &mut Vec<u8>) {
+    #[doc(hidden)]
+    pub fn append_to(&self, out: &mut Vec<u8>) {
         let start = out.len();
         out.reserve(self.header.bytes.min(HEADER_BYTES + self.payload.len() + TRAILER_BYTES));
         out.extend_from_slice(&self.header.to_bytes());

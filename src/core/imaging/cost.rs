@@ -79,36 +79,36 @@ fn element_s(map: &MapConfig) -> f64 {
 
 /// The cost of one channel's engine.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct EngineCost {
+pub struct EngineCost {
     /// Memory of the sums, bytes.
-    pub(crate) sums_bytes: f64,
+    pub sums_bytes: f64,
     /// Memory of a floating-point copy of the sums, from which a map is solved, bytes.
-    pub(crate) copy_bytes: f64,
+    pub copy_bytes: f64,
     /// Memory of tables and workspace, bytes.
-    pub(crate) other_bytes: f64,
+    pub other_bytes: f64,
     /// Estimated time per visibility, s.
-    pub(crate) visibility_s: f64,
+    pub visibility_s: f64,
     /// Estimated time of all solutions, with the random probes and beams of the final one, s.
-    pub(crate) solving_s: f64,
-    pub(crate) visibility_multiply_adds: f64,
+    pub solving_s: f64,
+    pub visibility_multiply_adds: f64,
     /// Multiply-adds of all solutions.
-    pub(crate) solving_multiply_adds: f64,
+    pub solving_multiply_adds: f64,
     /// Number of products with the normal matrix in all solutions; 0 for a factorisation.
-    pub(crate) products: f64,
+    pub products: f64,
 }
 
 /// The data of a channel as planned, before its sums exist.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct ChannelData {
-    pub(crate) frequency_hz: f64,
+pub struct ChannelData {
+    pub frequency_hz: f64,
     /// Visibilities within the map's longest baseline.
-    pub(crate) visibilities: f64,
+    pub visibilities: f64,
     /// Number of observation windows.
-    pub(crate) windows: f64,
+    pub windows: f64,
     /// Number of maps: intermediate ones and the final one.
-    pub(crate) solutions: u64,
+    pub solutions: u64,
     /// Range of the angle between nadir and limb over the mission, rad.
-    pub(crate) limb_range_rad: f64,
+    pub limb_range_rad: f64,
 }
 
 /// Usual number of iterations of a map from this many windows.
@@ -128,7 +128,7 @@ fn over_maps(data: ChannelData, cost: impl Fn(f64) -> f64) -> [f64; 2] {
 
 impl EngineCost {
     /// The cost for the rank with the largest share when ranks share the harmonic sums.
-    pub(crate) fn with_ranks(self, ranks: usize, map: &MapConfig) -> Self {
+    pub fn with_ranks(self, ranks: usize, map: &MapConfig) -> Self {
         let blocks = shared_size(map.degree()).blocks;
         let share = blocks.div_ceil(ranks.max(1)) as f64 / blocks as f64;
         Self {
@@ -142,7 +142,7 @@ impl EngineCost {
 
     /// The cost of sums that are accumulated in `parts` readings of the data and kept on disk. Memory holds one part, and later one block per
     /// reading thread.
-    pub(crate) fn in_parts(self, parts: usize, map: &MapConfig) -> Self {
+    pub fn in_parts(self, parts: usize, map: &MapConfig) -> Self {
         if parts < 2 {
             return self;
         }
@@ -160,7 +160,7 @@ impl EngineCost {
 
     /// The smallest number of parts (a power of two) with which the memory `needed` for a channel is within `limit_bytes`; `None` if there is
     /// none.
-    pub(crate) fn parts_within(
+    pub fn parts_within(
         self,
         map: &MapConfig,
         limit_bytes: f64,
@@ -173,12 +173,12 @@ impl EngineCost {
     }
 
     /// Bytes that a rank sends to the others in all solutions.
-    pub(crate) fn reduced_bytes(&self, map: &MapConfig) -> f64 {
+    pub fn reduced_bytes(&self, map: &MapConfig) -> f64 {
         self.products * shared_size(map.degree()).product_bytes as f64
     }
 
     /// Estimates the cost of a channel's engine.
-    pub(crate) fn estimate(map: &MapConfig, data: ChannelData) -> Self {
+    pub fn estimate(map: &MapConfig, data: ChannelData) -> Self {
         match map.engine {
             EngineKind::Pixel | EngineKind::Auto if map.is_matrix_free() => Self::matrix_free(map, data),
             EngineKind::Pixel | EngineKind::Auto => Self::pixel(map, data.solutions),

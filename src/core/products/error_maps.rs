@@ -11,9 +11,9 @@ use crate::sky::fits::{Column, FitsError, WriteOptions, write_columns};
 const INTERVAL: [f64; 2] = [0.15866, 0.84134];
 
 /// A map that says how well another is known.
-pub(crate) struct ErrorMap {
+pub struct ErrorMap {
     /// Name of its file.
-    pub(crate) file: &'static str,
+    pub file: &'static str,
     column: &'static str,
     unit: &'static str,
     values: Vec<f64>,
@@ -28,7 +28,7 @@ impl ErrorMap {
     }
 
     /// Mask and resolution.
-    pub(crate) fn coverage(errors: &Uncertainty) -> [Self; 2] {
+    pub fn coverage(errors: &Uncertainty) -> [Self; 2] {
         let values = errors.resolution_deg.clone();
         [
             Self { file: "mask.fits", column: "MEASURED", unit: "", values: errors.mask() },
@@ -40,7 +40,7 @@ impl ErrorMap {
     ///
     /// # Errors
     /// As [`write_columns`].
-    pub(crate) fn write(&self, folder: &Path, options: &WriteOptions) -> Result<(), FitsError> {
+    pub fn write(&self, folder: &Path, options: &WriteOptions) -> Result<(), FitsError> {
         let column = Column { name: self.column, unit: self.unit, values: &self.values };
         write_columns(&folder.join(self.file), Frame::Ecliptic, &[column], options)
     }
@@ -57,13 +57,13 @@ pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>)
 }
 
 /// A vector with the standard deviation of each component, in words.
-pub(crate) fn told_vector(value: [f64; 3], sigma: [f64; 3]) -> String {
+pub fn told_vector(value: [f64; 3], sigma: [f64; 3]) -> String {
     let one = |k: usize| format!("{:.2e} +- {:.1e}", value[k], sigma[k]);
     format!("({}, {}, {})", one(0), one(1), one(2))
 }
 
 /// The angular power of samples, a line a degree from l = 1: the median, and the interval that holds it with 68 % probability.
-pub(crate) fn own_power_csv(samples: &[Sample]) -> String {
+pub fn own_power_csv(samples: &[Sample]) -> String {
     let mut table = String::from(
         "# Angular power of the sky itself by the samples, with the interval that holds it with 68 % probability.\n\
          l,power_k2,low_k2,high_k2\n",

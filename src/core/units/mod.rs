@@ -31,9 +31,8 @@ pub use ids::{ChannelId, Pair, all_pairs};
 pub use ids::{MAX_SATELLITES, PairError};
 #[doc(hidden)]
 pub use interval_set::IntervalSet;
-pub(crate) use keys::keys;
 #[doc(hidden)]
-pub use keys::{Key, Level};
+pub use keys::{Key, Level, keys};
 #[doc(hidden)]
 pub use per_channel::PerChannel;
 #[doc(hidden)]

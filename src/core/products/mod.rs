@@ -44,7 +44,8 @@ pub use epsilons::{
 };
 #[doc(hidden)]
 pub use error::ProductsError;
-pub(crate) use error_maps::{ErrorMap, own_power_csv, told_vector};
+#[doc(hidden)]
+pub use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
 #[doc(hidden)]

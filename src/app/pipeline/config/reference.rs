@@ -172,7 +172,9 @@ mod tests {
 
     #[test]
     fn the_reference_file_matches_the_declarations() {
-        let kept = std::fs::read_to_string("pipelines/reference.toml").unwrap();
+        let kept =
+            std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../pipelines/reference.toml"))
+                .unwrap();
         let written = reference(Shown::Folded);
         assert!(
             kept == written,

@@ -113,7 +113,7 @@ fn matches_of<'a>(all: &'a [KeyDescription], wanted: &str) -> Vec<&'a KeyDescrip
 }
 
 /// The JSON schema of `summary.json`, which tests check.
-const SUMMARY_SCHEMA: &str = include_str!("../../docs/summary.schema.json");
+const SUMMARY_SCHEMA: &str = include_str!("summary.schema.json");
 
 /// Print a pipeline file that comes with the program, to start from, or the schema of what it writes.
 ///

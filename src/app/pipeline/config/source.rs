@@ -15,7 +15,7 @@ use crate::units::shortened;
 
 const QUICKLOOK_NAME: &str = "embedded quicklook";
 /// The default pipeline, which is used if no file is named.
-pub const QUICKLOOK: &str = include_str!("../../../pipelines/quicklook.toml");
+pub const QUICKLOOK: &str = include_str!("quicklook.toml");
 
 /// Maximum length of a pipeline file, bytes; a hundred times that of a file with every key.
 const FILE_BYTES_MAX: u64 = 1 << 20;

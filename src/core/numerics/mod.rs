@@ -15,4 +15,4 @@ pub(crate) mod wigner;
 pub(crate) use fft_length::fft_length;
 pub(crate) use lagrange::lagrange_weights;
 pub use real::Real;
-pub(crate) use statistics::{median, percentiles};
+pub use statistics::{median, percentiles};

@@ -17,21 +17,24 @@ mod beyond;
 #[doc(hidden)]
 pub mod circle;
 mod config;
-pub(crate) mod cost;
+#[doc(hidden)]
+pub mod cost;
 mod error;
 mod exact;
 #[doc(hidden)]
 pub mod joint;
 mod pixel;
 mod power;
-pub(crate) mod rates;
+#[doc(hidden)]
+pub mod rates;
 mod regulariser;
 mod solver;
 mod stage;
 #[doc(hidden)]
 pub mod zoom;
 
-pub(crate) use beyond::read_power;
+#[doc(hidden)]
+pub use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
     HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,

@@ -15,6 +15,7 @@ use crate::products::pictures::Picture;
 pub struct FigureFiles {
     /// Name of the figure.
     pub figure: String,
+    /// The numbers of the figure, as they are written.
     pub numbers: Value,
     /// Paths of the files.
     pub files: Vec<PathBuf>,

@@ -47,7 +47,7 @@ pub(in crate::imaging) struct BeyondNoise {
 ///
 /// # Errors
 /// A file that cannot be read or is no such table, or has less than two degrees.
-pub(crate) fn read_power(path: &Path) -> Result<(usize, Vec<f64>), SolveError> {
+pub fn read_power(path: &Path) -> Result<(usize, Vec<f64>), SolveError> {
     let failed = |found: String| SolveError::BeyondPower { path: path.to_owned(), found };
     let text = read_text(path, POWER_FILE_BYTES_MAX).map_err(|error| failed(error.to_string()))?;
     let (first, power_k2) = parse_power(&text).map_err(failed)?;

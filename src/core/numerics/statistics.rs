@@ -1,13 +1,13 @@
 //! Order statistics.
 
 /// The median (the upper one of an even number of values); `None` without values.
-pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
+pub fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// Two percentiles, interpolated linearly between neighbours; `None` without values.
-pub(crate) fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> Option<(f64, f64)> {
+pub fn percentiles(mut values: Vec<f64>, low: f64, high: f64) -> Option<(f64, f64)> {
     if values.is_empty() {
         return None;
     }

@@ -36,6 +36,8 @@ pub struct Key {
 ///
 /// Each field has its documentation (which `lunarray explain` shows), `#[only_with("...")]` with its condition if it has one, its serde
 /// attributes, its level (`everyday`, `expert` or `section`) and its default.
+#[macro_export]
+#[doc(hidden)]
 macro_rules! keys {
     (
         $(#[$outer:meta])*
@@ -89,4 +91,4 @@ macro_rules! keys {
     (@keys section $type:ty) => { <$type>::KEYS };
     (@keys $level:ident $type:ty) => { &[] };
 }
-pub(crate) use keys;
+pub use keys;

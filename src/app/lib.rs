@@ -1,0 +1,24 @@
+//! What surrounds the computation: pipelines, commands, figures of an array, and the page.
+//!
+//! Use `lunarray`, which shows what is public of it.
+
+// They panic when nobody reads any more; `cli/output.rs` has what does not.
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
+use lunarray_core::{
+    array, calibration, daughters, downlink, files, frames, ground, imaging, mother, numerics, products,
+    ranks, response, runtime, sky, units,
+};
+
+pub mod pipeline;
+
+pub mod prelude;
+
+pub mod figures;
+
+#[cfg(feature = "serve")]
+pub mod serve;
+
+pub mod bench;
+
+pub mod cli;
