@@ -19,12 +19,17 @@ def read_map(path: str | PathLike[str], frame: str | None = None) -> tuple[NDArr
     return _native.read_map(path, frame)
 
 
-def sky_of(sky: Any, frame: str | None) -> tuple[NDArray[np.float64], str]:
-    """Pixels and frame of a sky that is a file, a :class:`Map`, or an array of pixels."""
+def sky_of(
+    sky: Any, frame: str | None, frequency_hz: float | None = None
+) -> tuple[NDArray[np.float64], str]:
+    """Pixels and frame of a sky that is a file, a :class:`Map`, or an array of pixels; of a frequency, if one is given."""
     if isinstance(sky, Map):
+        if frequency_hz is not None and not np.isclose(sky.frequency_hz, frequency_hz, rtol=1e-6, atol=0.0):
+            found, wanted = sky.frequency_hz / 1e6, frequency_hz / 1e6
+            raise _native.Error(f"the map is of {found:g} MHz: expected {wanted:g} MHz, the frequency of the visibilities")
         return sky.pixels, "E"
     if isinstance(sky, str) or hasattr(sky, "__fspath__"):
-        return read_map(sky, frame)
+        return _native.read_map(sky, frame, frequency_hz)
     pixels = numbers(sky, "K", "the sky")
     if pixels.ndim != 1:
         raise _native.Error(f"the sky has shape {pixels.shape}: expected its pixels one after the other, in RING order")

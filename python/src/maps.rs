@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use lunarray::imaging::Solution;
 use lunarray::products::{MapViewer, PublishedMap};
 use lunarray::runtime::Cancel;
-use lunarray::sky::fits::{ReadOptions, read_whole_map};
+use lunarray::sky::fits::{ReadOptions, check_frequency, read_whole_map};
 use lunarray::sky::harmonics::{self, AnalysisOptions};
 use lunarray::sky::{Frame, SkyMap};
 use num_complex::Complex64;
@@ -111,17 +111,23 @@ pub(crate) fn sky_map(pixels: &PyReadonlyArray1<'_, f64>, letter: &str) -> PyRes
     SkyMap::new(frame(letter)?, pixels.as_array().to_vec()).map_err(exception)
 }
 
-/// A map file: its pixels in RING order, K, and the letter of its frame.
+/// A map file: its pixels in RING order, K, and the letter of its frame. With a frequency it has to be the map's, if its file says one.
 #[pyfunction]
-#[pyo3(signature = (path, frame_if_missing=None))]
+#[pyo3(signature = (path, frame_if_missing=None, frequency_hz=None))]
 pub(crate) fn read_map<'py>(
     py: Python<'py>,
     path: PathBuf,
     frame_if_missing: Option<&str>,
+    frequency_hz: Option<f64>,
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, char)> {
     let frame_if_missing = frame_if_missing.map(frame).transpose()?;
-    let options = ReadOptions { frame_if_missing, ..ReadOptions::default() };
-    let map = wait(py, &Cancel::new(), move || Ok(read_whole_map(&path, &options)?))?;
+    let options = ReadOptions { frame_if_missing, frequency_hz, ..ReadOptions::default() };
+    let map = wait(py, &Cancel::new(), move || {
+        if let Some(frequency_hz) = frequency_hz {
+            check_frequency(&path, frequency_hz, &options)?;
+        }
+        Ok(read_whole_map(&path, &options)?)
+    })?;
     let letter = map.frame().letter();
     Ok((PyArray1::from_vec(py, map.into_values()), letter))
 }

@@ -47,6 +47,7 @@ fn every_command_has_help_that_teaches() {
         "merge",
         "rebuild",
         "extract",
+        "send",
         "retract",
         "recalibrate",
         "bench",

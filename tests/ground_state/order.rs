@@ -200,3 +200,25 @@ fn a_growing_file_is_followed_to_the_same_bits() {
     assert!(child.wait().unwrap().success());
     assert!(place.bytes("followed") == place.bytes("once"));
 }
+
+#[test]
+fn a_state_remembers_how_its_maps_were_made() {
+    let place = Ground::new();
+    let file = place.downlink();
+    place.replay("state", &[&file], &[]);
+    let made = place.maps("state");
+    let (state, out) = (place.path("state"), place.path("state.out"));
+    let again = |more: &[&str]| {
+        json(&[&["replay", "--state", &state, "--out", &out], more].concat());
+        place.maps("state")
+    };
+    // The pipeline has an epsilon of 1e-4, which is not the default.
+    assert!(again(&[]) == made);
+    assert!(again(&["--set", "map.epsilon=1e-3"]) != made);
+    // The latest counts, and a choice of R does not meet an epsilon of another.
+    let latest = place.maps("state");
+    assert!(again(&[]) == latest);
+    assert!(again(&["--set", "map.regulariser=data"]) != latest);
+    let (regulariser, latest) = (place.maps("state"), again(&[]));
+    assert!(latest == regulariser);
+}

@@ -76,3 +76,23 @@ fn steps_are_passes_or_times() {
     assert_eq!(said.matches("Enter continues").count(), begun.len() - 1, "{said}");
     assert!(place.maps("times") == place.maps("read"));
 }
+
+#[test]
+fn files_are_sent_as_a_station_sends_them() {
+    let place = Place::new();
+    let bytes = std::fs::read(place.downlink("packets")).unwrap();
+    let [first, second] = super::durable::halves(&place.path("small.packets"));
+    let files = [place.workplace.file("first", &first), place.workplace.file("second", &second)];
+    let ground = place.ground("heard", &["--state", &place.path("state"), "--connections", "2"]);
+    let send = ["send", &files[0], &files[1], "--to", &ground.url];
+    let said = succeed(&send);
+    assert!(said.contains(&format!("confirmed all {} bytes", bytes.len())), "{said}");
+    // At a pace, and to a checkpoint; what is sent again is applied once.
+    let said = succeed(&[&send[..], &["--speed", "1e9", "--held", "--json"]].concat());
+    let said: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(said["confirmed"], bytes.len());
+    let heard = ground.succeed();
+    let read = place.replay("read", &place.path("small.packets"), &[]);
+    assert_eq!(heard["ledger"], read["ledger"]);
+    assert!(place.maps("heard") == place.maps("read"));
+}

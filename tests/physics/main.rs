@@ -12,3 +12,4 @@ mod oem;
 mod patterns;
 mod propagated;
 mod response;
+mod spk;

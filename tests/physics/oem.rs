@@ -88,7 +88,7 @@ fn circle_with(angle: f64, lines: &str) -> String {
 /// The states of [`circle`] on the axes MOON_ME_DE421 and MOON_PA_DE421, which turn with the Moon.
 ///
 /// By NAIF's toolkit with JPL's DE421: `pip install lunarsky spiceypy`, `furnsh` of `moon_pa_de421_1900-2050.bpc` and `moon_080317.tf` in
-/// `lunarsky/data`, `sxform("ECLIPJ2000", frame, 946684800 + 60 k) @ state`.
+/// `lunarsky/data`, `sxform("ECLIPJ2000", frame, 946728000 + 60 k) @ state`.
 #[rustfmt::skip]
 const FIXED_TO_THE_MOON: [[&str; 8]; 2] = [
     [
@@ -205,6 +205,46 @@ fn what_is_said_twice_or_of_other_times_is_refused() {
     let endless = ArrayConfig { oem: vec!["/dev/zero".into(); 3], ..config(folder.path()) };
     let said = Array::new(&endless).unwrap_err().to_string();
     assert!(said.contains("/dev/zero") && said.contains("a device; expected a file"), "{said}");
+}
+
+#[test]
+fn a_step_of_a_state_is_seen_and_rounding_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    for n in 2..=3 {
+        fs::write(folder.path().join(format!("sat{n}.oem")), circle(1e-3 * f64::from(n))).unwrap();
+    }
+    // The file with each position x, km, as `change` of the minute and x has it, and numbers rounded to these decimals.
+    let read = |change: &dyn Fn(usize, f64) -> f64, decimals: [usize; 2]| {
+        let row = |line: &str| -> String {
+            let Some((date, numbers)) = line.split_once(' ').filter(|_| line.starts_with("2030")) else {
+                return format!("{line}\n");
+            };
+            let minute = date[14..16].parse().unwrap();
+            let mut six: Vec<f64> = numbers.split(' ').map(|number| number.parse().unwrap()).collect();
+            six[0] = change(minute, six[0]);
+            let six = six.iter().enumerate().map(|(k, number)| format!("{number:.*}", decimals[k / 3]));
+            format!("{date} {}\n", six.collect::<Vec<_>>().join(" "))
+        };
+        fs::write(folder.path().join("sat1.oem"), circle(0.0).lines().map(row).collect::<String>()).unwrap();
+        Array::new(&config(folder.path())).map_err(|error| error.to_string())
+    };
+    // One state, and all from one on: each neighbour has half of that step, on its side.
+    let one =
+        |at: usize, step_km: f64| move |minute: usize, x: f64| if minute == at { x + step_km } else { x };
+    let from =
+        |at: usize, step_km: f64| move |minute: usize, x: f64| if minute >= at { x + step_km } else { x };
+    let told = "a position at 2030-01-01T00:09:00.000 TDB that is 10.0 m from where its neighbours have it";
+    let said = read(&one(9, 0.01), [9, 12]).unwrap_err();
+    assert!(said.contains(told), "{said}");
+    // Also beside the ends, where the interpolation shows it.
+    for at in [1, 2, 17, 18] {
+        read(&one(at, 0.01), [9, 12]).unwrap_err();
+    }
+    let said = read(&from(9, -0.01), [9, 12]).unwrap_err();
+    assert!(said.contains("m from where its neighbours have it"), "{said}");
+    // Metres and millimetres a second, and a step as large as the tolerance.
+    read(&|_, x| x, [3, 6]).unwrap();
+    read(&one(9, 0.0019), [9, 12]).unwrap();
 }
 
 #[test]

@@ -180,6 +180,12 @@ impl StateMapArgs {
         self.source_with(state, [])
     }
 
+    /// The settings of the state's sums, or of the map file if there is one.
+    pub(super) fn source_of_sums(&self, state: &Path) -> Result<ConfigSource, GroundError> {
+        let overrides = self.overrides.clone();
+        ConfigSource { file: self.map.clone(), overrides, seed: None }.with_sums_settings(state)
+    }
+
     /// The settings of the state or the map file, with additional overrides.
     pub(super) fn source_with(
         &self,

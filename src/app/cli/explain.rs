@@ -3,7 +3,7 @@
 use clap::{Args, ValueEnum};
 
 use super::output::{CommandResult, Completion, print_json_line, print_text};
-use crate::pipeline::{KeyDescription, QUICKLOOK, Shown, key_descriptions, reference};
+use crate::pipeline::{KeyDescription, QUICKLOOK, Shown, condition_text, key_descriptions, reference};
 use crate::units::echo;
 
 /// Explain keys of pipeline files: their defaults, units and meaning.
@@ -57,7 +57,10 @@ pub(super) fn explain(args: &ExplainArgs) -> CommandResult {
             };
             let only = match only_with.is_empty() {
                 true => String::new(),
-                false => format!("\n    It has an effect only with {}.", only_with.join(", and ")),
+                false => {
+                    let conditions: Vec<String> = only_with.iter().map(|only| condition_text(only)).collect();
+                    format!("\n    It has an effect only {}.", conditions.join(", and "))
+                }
             };
             print_text(&format!("{head}\n    {about}{only}"))?;
         }
@@ -81,7 +84,8 @@ fn page_of(all: &[KeyDescription]) -> String {
         let KeyDescription { key, default, about, only_with, .. } = described;
         let default = default.as_ref().map_or_else(String::new, |text| format!(" = {text}"));
         // The last condition is that of the key; the others are of its sections.
-        let condition = only_with.last().map_or_else(String::new, |only| format!(" Only with `{only}`."));
+        let condition =
+            only_with.last().map_or_else(String::new, |only| format!(" Only {}.", condition_text(only)));
         page.push_str(&format!("| `{key}{default}` | {}{condition} |\n", in_a_cell(about)));
     }
     page.push_str(

@@ -40,6 +40,7 @@ mod replay;
 mod retract;
 mod run;
 mod sample;
+mod send;
 #[cfg(not(feature = "serve"))]
 #[path = "not_serving.rs"]
 mod serving;
@@ -107,6 +108,7 @@ enum Command {
     Corrupt(corrupt::CorruptArgs),
     Export(export::ExportArgs),
     Extract(extract::ExtractArgs),
+    Send(send::SendArgs),
     Gaps(gaps::GapsArgs),
     Merge(merge::MergeArgs),
     Rebuild(rebuild::RebuildArgs),
@@ -246,6 +248,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Corrupt(args) => corrupt::execute(&args),
         Command::Export(args) => export::execute(&args),
         Command::Extract(args) => extract::execute(&args),
+        Command::Send(args) => send::execute(&args),
         Command::Gaps(args) => gaps::execute(&args),
         Command::Merge(args) => merge::execute(&args),
         Command::Rebuild(args) => rebuild::execute(&args),

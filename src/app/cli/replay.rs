@@ -152,13 +152,13 @@ pub(super) struct ReplayArgs {
 
 /// Speed of a replay relative to real time; `None` for as fast as possible.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Speed(Option<f64>);
+pub(super) struct Speed(pub(super) Option<f64>);
 
 /// Mission time of a step, s; `None` for a pass.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct StepLength(Option<f64>);
 
-fn speed(text: &str) -> Result<Speed, String> {
+pub(super) fn speed(text: &str) -> Result<Speed, String> {
     match (text.trim(), text.trim().parse::<f64>()) {
         ("max", _) => Ok(Speed(None)),
         (_, Ok(times)) if (1e-3..=1e12).contains(&times) => Ok(Speed(Some(times))),

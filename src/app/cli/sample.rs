@@ -66,7 +66,8 @@ struct SampledChannel {
 }
 
 pub(super) fn execute(args: &SampleArgs) -> CommandResult {
-    let config = args.map.source(&args.state)?.load_ground()?;
+    // How earlier maps were made does not bind samples.
+    let config = args.map.source_of_sums(&args.state)?.load_ground()?;
     let _inputs = args.map.protect(&config);
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {

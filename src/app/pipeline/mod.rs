@@ -12,7 +12,7 @@ pub use config::{Config, ConfigError, ConfigSource, PipelineError, Plan};
 #[doc(hidden)]
 pub use config::{
     Expected, KeyDescription, MemoryLimit, MemorySource, NoEffect, Problem, Problems, QUICKLOOK, ReadProblem,
-    SettingsOrigin, Shown, key_descriptions, reference,
+    SettingsOrigin, Shown, condition_text, key_descriptions, reference,
 };
 #[doc(hidden)]
 pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, RunGroups, Segment};

@@ -18,12 +18,19 @@ use tokio::sync::{Semaphore, watch};
 use tokio::time::{Sleep, sleep};
 
 use super::console::Console;
+use super::routes::{PageState, router, vital_router};
 
 /// Maximum number of open connections. A browser keeps one for events, and a few for maps.
 const CONNECTIONS_MAX: usize = 128;
 
 /// Time limit for the header of a request, also between two requests on one connection.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Places beyond [`CONNECTIONS_MAX`] for one request each of health, metrics or status, which no reader can take for long.
+const VITAL_MAX: usize = 16;
+
+/// Time limit for the header of a request in such a place.
+const VITAL_HEADER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Time limit for a client that reads nothing.
 const STALL_TIMEOUT: Duration = Duration::from_secs(10);
@@ -37,18 +44,35 @@ const HEADERS_MAX: usize = 64;
 /// Delay after a connection could not be accepted, for example because too many files are open.
 const ACCEPT_DELAY: Duration = Duration::from_millis(50);
 
-/// Response to a client above the limit of connections.
+/// Response to a client beyond all places.
 const FULL: &[u8] = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 21\r\n\r\ntoo many connections\n";
+
+/// How connections are served.
+#[derive(Clone)]
+struct Service {
+    router: Router,
+    places: Arc<Semaphore>,
+    header_timeout: Duration,
+    /// Whether a connection may have more than one request.
+    keep_alive: bool,
+}
 
 /// Accepts and serves connections until `stop` changes.
 pub(super) async fn accept(
     listener: StdListener,
-    router: Router,
-    console: Arc<Console>,
+    page: PageState,
     mut stop: watch::Receiver<bool>,
 ) -> io::Result<()> {
     let listener = TcpListener::from_std(listener)?;
-    let permits = Arc::new(Semaphore::new(CONNECTIONS_MAX));
+    let console = Arc::clone(&page.console);
+    let service = |router, places, header_timeout, keep_alive| {
+        let places = Arc::new(Semaphore::new(places));
+        Service { router, places, header_timeout, keep_alive }
+    };
+    let services = [
+        service(router(page.clone()), CONNECTIONS_MAX, HEADER_TIMEOUT, true),
+        service(vital_router(page), VITAL_MAX, VITAL_HEADER_TIMEOUT, false),
+    ];
     loop {
         let accepted = tokio::select! {
             _ = stop.changed() => return Ok(()),
@@ -58,29 +82,40 @@ pub(super) async fn accept(
             sleep(ACCEPT_DELAY).await;
             continue;
         };
-        let Ok(permit) = Arc::clone(&permits).try_acquire_owned() else {
+        let place = services.iter().find_map(|service| {
+            let permit = Arc::clone(&service.places).try_acquire_owned().ok()?;
+            Some((service.clone(), permit))
+        });
+        let Some((service, permit)) = place else {
             console.clients.refused.fetch_add(1, Ordering::Relaxed);
             // The server does not wait until the client has read it.
             let _ = stream.try_write(FULL);
             continue;
         };
-        let (router, console) = (router.clone(), Arc::clone(&console));
+        let console = Arc::clone(&console);
         tokio::spawn(async move {
             let _permit = permit;
             console.clients.open.fetch_add(1, Ordering::Relaxed);
-            let served = http1::Builder::new()
-                .timer(TokioTimer::new())
-                .header_read_timeout(HEADER_TIMEOUT)
-                .max_headers(HEADERS_MAX)
-                .max_buf_size(BUFFER_BYTES)
-                .serve_connection(TokioIo::new(TimeoutStream::new(stream)), TowerToHyperService::new(router))
-                .await;
-            // A client that closes its connection does not count.
-            if served.is_err_and(|error| error.is_parse() || error.is_timeout() || is_stalled(&error)) {
-                console.clients.cut.fetch_add(1, Ordering::Relaxed);
-            }
+            service.serve(stream, &console).await;
             console.clients.open.fetch_sub(1, Ordering::Relaxed);
         });
+    }
+}
+
+impl Service {
+    async fn serve(self, stream: TcpStream, console: &Console) {
+        let served = http1::Builder::new()
+            .timer(TokioTimer::new())
+            .header_read_timeout(self.header_timeout)
+            .keep_alive(self.keep_alive)
+            .max_headers(HEADERS_MAX)
+            .max_buf_size(BUFFER_BYTES)
+            .serve_connection(TokioIo::new(TimeoutStream::new(stream)), TowerToHyperService::new(self.router))
+            .await;
+        // A client that closes its connection does not count.
+        if served.is_err_and(|error| error.is_parse() || error.is_timeout() || is_stalled(&error)) {
+            console.clients.cut.fetch_add(1, Ordering::Relaxed);
+        }
     }
 }
 

@@ -9,8 +9,8 @@ use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{Path, Request, State};
 use axum::http::header::{
-    ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, HeaderName, REFERRER_POLICY,
-    X_CONTENT_TYPE_OPTIONS, X_FRAME_OPTIONS,
+    ALLOW, CACHE_CONTROL, CONNECTION, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HOST, HeaderName,
+    REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS, X_FRAME_OPTIONS,
 };
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use axum::middleware::{Next, from_fn_with_state};
@@ -56,8 +56,28 @@ pub(super) struct PageState {
 
 pub(super) const READERS_MAX: usize = 96;
 
-pub(super) fn router(page: PageState) -> Router {
+/// The routes that answer also when all places are taken.
+fn vital_routes() -> Router<PageState> {
     Router::new()
+        .route("/api/status", get(status))
+        .route("/metrics", get(metrics))
+        .route("/healthz", get(healthz))
+        .route("/readyz", get(readyz))
+}
+
+/// Answers beyond the limit of connections: of the vital routes, and to others that there are too many.
+pub(super) fn vital_router(page: PageState) -> Router {
+    vital_routes()
+        .fallback(|State(page): State<PageState>| async move {
+            page.console.clients.refused.fetch_add(1, Ordering::Relaxed);
+            refusal(StatusCode::SERVICE_UNAVAILABLE, "too many connections")
+        })
+        .layer(from_fn_with_state(page.clone(), guard))
+        .with_state(page)
+}
+
+pub(super) fn router(page: PageState) -> Router {
+    vital_routes()
         .route("/", get(|| asset("text/html; charset=utf-8", include_str!("page/index.html"))))
         .route("/page.css", get(|| asset("text/css; charset=utf-8", include_str!("page/page.css"))))
         .route("/page.js", get(|| asset("text/javascript; charset=utf-8", include_str!("page/page.js"))))
@@ -69,7 +89,6 @@ pub(super) fn router(page: PageState) -> Router {
         .route("/page.json", get(page_constants))
         .route("/favicon.svg", get(|| asset("image/svg+xml", include_str!("page/favicon.svg"))))
         .route("/events", get(events))
-        .route("/api/status", get(status))
         .route("/api/config", get(config))
         .route("/api/figures/{channel}", get(figures))
         .route("/api/maps/{channel}/{file}", get(map))
@@ -79,9 +98,6 @@ pub(super) fn router(page: PageState) -> Router {
         .route("/api/hits/{channel}", get(hits))
         .route("/api/powers/{channel}", get(powers))
         .route("/api/gaps", get(gaps))
-        .route("/metrics", get(metrics))
-        .route("/healthz", get(healthz))
-        .route("/readyz", get(readyz))
         .fallback(|| async {
             refusal(StatusCode::NOT_FOUND, "no such page; / has the page, /api/status the state")
         })
@@ -346,7 +362,9 @@ async fn events(State(page): State<PageState>) -> Response {
     match Arc::clone(&page.readers).try_acquire_owned() {
         Ok(permit) => event_stream(page, permit).into_response(),
         Err(_) => {
-            refusal(StatusCode::SERVICE_UNAVAILABLE, "too many readers of events; /api/status has the same")
+            let text = "too many readers of events; /api/status has the same";
+            // It gives its place back.
+            ([(CONNECTION, "close")], refusal(StatusCode::SERVICE_UNAVAILABLE, text)).into_response()
         }
     }
 }

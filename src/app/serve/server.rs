@@ -13,7 +13,7 @@ use super::address::ServeAddress;
 use super::connection::accept;
 use super::console::Console;
 use super::error::ServeError;
-use super::routes::{PageState, READERS_MAX, router};
+use super::routes::{PageState, READERS_MAX};
 use super::subject::Subject;
 use crate::pipeline::RunHandles;
 
@@ -118,7 +118,7 @@ fn serve(
 ) {
     let console = Arc::clone(&page.console);
     runtime.block_on(async {
-        let accepting = tokio::spawn(accept(listener, router(page), Arc::clone(&console), stopped.clone()));
+        let accepting = tokio::spawn(accept(listener, page, stopped.clone()));
         let mut ticks = interval(UPDATE_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {

@@ -75,8 +75,8 @@ keys! {
         /// inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 }` at the epoch, on
         /// ecliptic axes; optional `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
         everyday kepler: Vec<KeplerElements> = Vec::new();
-        /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, instead of the formation. Their dates fix the mission's
-        /// epoch and the Earth's position.
+        /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, or SPK kernels (.bsp), whose objects are satellites in order of
+        /// appearance, instead of the formation. Their dates fix the mission's epoch and the Earth's position.
         everyday oem: Vec<PathBuf> = Vec::new();
         /// Epoch of the mission, in UTC if it ends with Z, else in the files' time system, such as 2030-01-31T12:00:00; empty for
         /// the latest of their first usable times.
@@ -343,8 +343,16 @@ impl ArrayConfig {
         let fits = orbits == 0 || orbits == self.satellites;
         checks.require("kepler", given, fits, "one for each satellite, or none");
         let given = format_args!("({files} files)");
-        let fits = files == 0 || files == self.satellites;
-        checks.require("oem", given, fits, "one for each satellite, or none");
+        // How many objects a kernel has is in the file.
+        let is_kernel = |path: &PathBuf| path.to_string_lossy().to_lowercase().contains(".bsp");
+        let has_kernel = self.oem.iter().any(is_kernel);
+        let fits = files == 0 || files == self.satellites || (has_kernel && files < self.satellites);
+        checks.require(
+            "oem",
+            given,
+            fits,
+            "one for each satellite, or none; an SPK kernel (.bsp) may be of several",
+        );
         let one = files == 0 || orbits == 0;
         checks.require("oem", given, one, "none where array.kepler is given");
         let one = files == 0 || !self.propagate.is_on();

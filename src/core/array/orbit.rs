@@ -167,7 +167,7 @@ impl Array {
             } else if config.oem.is_empty() {
                 kepler.into_iter().map(OwnOrbit::Kepler).collect()
             } else {
-                let found = oem::read(&config.oem, &config.oem_epoch, config.moon_radius_m)?;
+                let found = oem::read(config)?;
                 (epoch, notes) = (Some(found.epoch), found.notes);
                 found.orbits.into_iter().map(OwnOrbit::Table).collect()
             };

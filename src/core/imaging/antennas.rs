@@ -28,6 +28,12 @@ impl AntennasConfig {
         [("tilt_along_deg", tilt_along_deg), ("tilt_radial_deg", tilt_radial_deg), ("pattern", pattern)]
     }
 
+    /// Whether nothing is set.
+    #[must_use]
+    pub fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
     /// Whether all antennas are ideal.
     #[must_use]
     pub fn is_ideal(&self) -> bool {

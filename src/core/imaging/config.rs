@@ -163,7 +163,7 @@ keys! {
         section refine: RefineConfig = RefineConfig::default();
         /// Antennas that a refined map assumes, one value a daughter.
         #[only_with("map.refine.passes_max > 0")]
-        #[serde(skip_serializing_if = "AntennasConfig::is_ideal")]
+        #[serde(skip_serializing_if = "AntennasConfig::is_default")]
         section antennas: AntennasConfig = AntennasConfig::default();
     }
 }

@@ -137,9 +137,14 @@ impl Tai {
             TimeScale::Tai => scaled,
             TimeScale::Gps => scaled.plus_s(TAI_MINUS_GPS_S),
             TimeScale::Tt => scaled.plus_s(-TT_MINUS_TAI_S),
-            // TDB - TT changes so slowly that its value at TDB is that at TT to a picosecond.
-            TimeScale::Tdb => scaled.plus_s(-tdb_minus_tt_s(scaled.centuries()) - TT_MINUS_TAI_S),
+            TimeScale::Tdb => tai_of_tdb(scaled),
         })
+    }
+
+    /// The time `tdb_s` seconds of TDB after J2000 (2000-01-01T12:00:00 TDB).
+    #[must_use]
+    pub fn of_tdb(tdb_s: f64) -> Self {
+        tai_of_tdb(Self::normalised(J2000_1970_S as i64, tdb_s))
     }
 
     /// Seconds since 1958-01-01T00:00:00 TAI, to half a microsecond in this century.
@@ -226,6 +231,12 @@ fn utc_label(whole_s: i64) -> (i64, i64) {
     }
     let label_s = whole_s - offset_s;
     (label_s.div_euclid(DAY_S), label_s.rem_euclid(DAY_S))
+}
+
+/// The time that a label on TDB means.
+fn tai_of_tdb(label: Tai) -> Tai {
+    // TDB - TT changes so slowly that its value at TDB is that at TT to a picosecond.
+    label.plus_s(-tdb_minus_tt_s(label.centuries()) - TT_MINUS_TAI_S)
 }
 
 /// TDB minus TT, s, to 10 us over 1600 to 2200 (USNO Circular 179, Eq. 2.6).

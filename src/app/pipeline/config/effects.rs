@@ -27,7 +27,25 @@ const ONLY_WITH: &str = "an effect only with ";
 fn told(condition: &str) -> String {
     match condition.strip_prefix("no ").filter(|rest| !rest.contains(" or ") && !rest.contains(" and ")) {
         Some(other) => format!("no effect with {other}; leave one of them out"),
-        None => format!("{ONLY_WITH}{condition}"),
+        None => format!("an effect only {}", condition_text(condition)),
+    }
+}
+
+/// A condition in words, which begin with `with` or `without`.
+#[must_use]
+#[doc(hidden)]
+pub fn condition_text(condition: &str) -> String {
+    let without =
+        |part: &str| part.strip_prefix("no ").filter(|rest| !rest.contains(" or ")).map(str::to_owned);
+    let all: Option<Vec<String>> = condition.split(" and ").map(without).collect();
+    match (all, condition.strip_prefix("no ")) {
+        (Some(keys), _) => match keys.split_last() {
+            Some((last, [])) => format!("without {last}"),
+            Some((last, rest)) => format!("without {} or {last}", rest.join(", ")),
+            None => String::new(),
+        },
+        (None, Some(rest)) => format!("without {}", rest.replace(" or ", " or with ")),
+        (None, None) => format!("with {condition}"),
     }
 }
 
@@ -150,11 +168,11 @@ mod tests {
             // What would be left of a generated sky.
             (
                 "sky = { file = \"a.fits\", nside = 8 }",
-                "sky.nside = 8 has an effect only with no sky.file or sky.added",
+                "sky.nside = 8 has an effect only without sky.file or with sky.added",
             ),
             (
                 "sky = { file = \"a.fits\", generated.loops = false }",
-                "sky.generated.loops = false has an effect only with no sky.file or sky.added",
+                "sky.generated.loops = false has an effect only without sky.file or with sky.added",
             ),
             (
                 "map.epsilon = 0.5\nmap.regulariser = \"data\"",
@@ -167,6 +185,10 @@ mod tests {
             (
                 "instrument.antenna_files.table_error_max = 0.1",
                 "instrument.antenna_files.table_error_max = 0.1 has an effect only with instrument.antenna_files.tables",
+            ),
+            (
+                "map.engine = \"harmonic\"\nmap.refine.passes_max = 3\nmap.antennas.files.table_error_max = 0.1",
+                "map.antennas.files.table_error_max = 0.1 has an effect only with map.antennas.files.tables",
             ),
             // Keys of a term that is off.
             (
@@ -190,11 +212,11 @@ mod tests {
             // A formation's shape beside orbits of the satellites' own.
             (
                 format!("array = {{ {ORBITS}, altitude_m = 1e6 }}").as_str(),
-                "array.altitude_m = 1000000.0 has an effect only with no array.kepler and no array.oem and no array.stations",
+                "array.altitude_m = 1000000.0 has an effect only without array.kepler, array.oem or array.stations",
             ),
             (
                 format!("array = {{ {ORBITS}, breathing.span_m_max = 5e4 }}").as_str(),
-                "array.breathing.span_m_max = 50000.0 has an effect only with no array.kepler and no array.oem and no array.stations",
+                "array.breathing.span_m_max = 50000.0 has an effect only without array.kepler, array.oem or array.stations",
             ),
         ] {
             let found = messages(text);

@@ -18,7 +18,7 @@ mod source;
 
 pub(super) use downlink_settings::SETTINGS;
 pub use downlink_settings::SettingsOrigin;
-pub use effects::NoEffect;
+pub use effects::{NoEffect, condition_text};
 pub use error::PipelineError;
 pub use memory::{MemoryLimit, MemorySource};
 pub use plan::{Expected, Plan};

@@ -5,6 +5,7 @@ use std::fmt::Write;
 use serde::Serialize;
 use toml::Value;
 
+use super::effects::condition_text;
 use super::key_list::{FlatKey, flat_keys};
 use crate::units::{Key, Level};
 
@@ -145,7 +146,7 @@ fn put_key(text: &mut String, key: &FlatKey, shown: Shown) {
 fn with_condition(key: &FlatKey) -> String {
     let about = about_text(key.key);
     match key.only_with.last().filter(|_| !key.key.only_with.is_empty()) {
-        Some(only) => format!("{about} Only with {only}."),
+        Some(only) => format!("{about} Only {}.", condition_text(only)),
         None => about,
     }
 }

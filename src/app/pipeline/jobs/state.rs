@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use crate::frames::{AntennaResponse, AutoPower, Instrument};
+use crate::ground::archive::REMEMBERED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, PowerSample, solve_jointly};
 use crate::imaging::{
@@ -26,6 +27,18 @@ impl ConfigSource {
         self.with_settings(folder, Ground::settings_in)
     }
 
+    /// Adds the settings on which the sums of the state in `folder` depend, without those of how maps were made of them.
+    ///
+    /// # Errors
+    /// As [`ConfigSource::with_state_settings`].
+    #[doc(hidden)]
+    pub fn with_sums_settings(self, folder: &Path) -> Result<Self, GroundError> {
+        self.with_settings(folder, |folder| {
+            let settings = Ground::settings_in(folder)?.into_iter();
+            Ok(settings.filter(|(key, _)| !REMEMBERED.contains(&key.as_str())).collect())
+        })
+    }
+
     /// Adds the settings of the state in `folder` without locking it, for each of several ranks before they open it.
     ///
     /// # Errors
@@ -41,8 +54,12 @@ impl ConfigSource {
         settings_in: impl Fn(&Path) -> Result<Vec<(String, String)>, GroundError>,
     ) -> Result<Self, GroundError> {
         if self.file.is_none() {
-            let settings = settings_in(folder)?;
+            let mut settings = settings_in(folder)?;
             require_files(folder, &settings, &self.overrides)?;
+            // They go together: a choice of one replaces both.
+            if REMEMBERED.iter().any(|key| self.overrides.iter().any(|text| sets(text, key))) {
+                settings.retain(|(key, _)| !REMEMBERED.contains(&key.as_str()));
+            }
             let overrides =
                 settings.iter().filter_map(|(key, value)| Some(format!("{key}={}", setting_toml(value)?)));
             self.overrides = overrides.chain(std::mem::take(&mut self.overrides)).collect();
@@ -79,17 +96,18 @@ fn require_files(
                 && value.starts_with(FILE_PREFIX)
         };
         let files: Vec<&str> = settings.iter().filter(is_file).map(|(_, value)| value.as_str()).collect();
-        // An override may also set the whole section.
-        let sets_key = |text: &String| {
-            let name = text.split_once('=').map_or("", |(name, _)| name.trim());
-            name == key || key.split_once('.').is_some_and(|(section, _)| name == section)
-        };
-        if !files.is_empty() && !overrides.iter().any(sets_key) {
+        if !files.is_empty() && !overrides.iter().any(|text| sets(text, key)) {
             let (path, found) = (folder.to_owned(), format!("{description} {}", files.join(", ")));
             return Err(GroundError::FilesOfState { path, found, expected });
         }
     }
     Ok(())
+}
+
+/// Whether an override sets a key, or the whole section.
+fn sets(text: &str, key: &str) -> bool {
+    let name = text.split_once('=').map_or("", |(name, _)| name.trim());
+    name == key || key.split_once('.').is_some_and(|(section, _)| name == section)
 }
 
 /// Beginning of the checksum text that stands for the path of a file in a state.

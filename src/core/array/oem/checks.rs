@@ -4,7 +4,7 @@ use super::form::Fault;
 use super::interpolate::interpolated;
 use super::message::{OemSegment, Reading, TableMethod};
 use crate::units::constants::MOON_GM_M3_S2;
-use crate::units::vector::{norm, sub};
+use crate::units::vector::{Vec3, norm, sub};
 
 /// Tolerance of a position between states, m: a fifth of the shortest observed wavelength, 10 m at 30 MHz.
 const ERROR_M_MAX: f64 = 2.0;
@@ -27,6 +27,10 @@ pub(super) fn check(reading: &Reading, moon_radius_m: f64) -> Result<(), Fault> 
             if k > 0 {
                 check.interval(k - 1, line(k))?;
             }
+        }
+        // After those that say more.
+        for k in 1..segment.time_s.len().saturating_sub(1) {
+            check.position(k, &line)?;
         }
     }
     require_order(reading)
@@ -128,6 +132,53 @@ impl SegmentCheck<'_> {
             segment.degree
         );
         Err(Fault::new(line, found, expected))
+    }
+
+    /// Position of state `k` that follows from the states around it, up to `reach` on either side.
+    fn position_by_neighbours(&self, k: usize, reach: usize) -> Vec3 {
+        let segment = self.segment;
+        let (from, until) = (k.saturating_sub(reach), (k + reach + 1).min(segment.time_s.len()));
+        let without = |values: &[Vec3]| [&values[from..k], &values[k + 1..until]].concat();
+        let around = OemSegment {
+            time_s: [&segment.time_s[from..k], &segment.time_s[k + 1..until]].concat(),
+            position_m: without(&segment.position_m),
+            velocity_m_s: without(&segment.velocity_m_s),
+            ..*segment
+        };
+        interpolated(&around, TableMethod::Hermite, around.time_s.len(), segment.time_s[k]).position_m
+    }
+
+    /// How far state `k`, not the first or last, is from where its neighbours have it, m; 0 if they cannot say.
+    fn step_m(&self, k: usize) -> f64 {
+        let position_m = self.segment.position_m[k];
+        let near = self.position_by_neighbours(k, 2);
+        if norm(sub(near, position_m)) <= ERROR_M_MAX {
+            return 0.0;
+        }
+        let far = self.position_by_neighbours(k, 3);
+        let (off_m, open_m) = (norm(sub(far, position_m)), norm(sub(far, near)));
+        if off_m > 10.0 * open_m { off_m } else { 0.0 }
+    }
+
+    /// Checks that state `k`, not the first or last, is where its neighbours have it.
+    fn position(&self, k: usize, line: &dyn Fn(usize) -> usize) -> Result<(), Fault> {
+        let time_s = self.segment.time_s[k];
+        if !self.is_used(time_s - 1e-3, time_s + 1e-3) || self.step_m(k) <= ERROR_M_MAX {
+            return Ok(());
+        }
+        // A step is seen from its neighbours, too.
+        let last = (k + 3).min(self.segment.time_s.len() - 2);
+        let k = (k..=last).max_by(|a, b| self.step_m(*a).total_cmp(&self.step_m(*b))).unwrap_or(k);
+        let found = format!(
+            "a position at {} that is {:.1} m from where its neighbours have it",
+            self.date(k),
+            self.step_m(k)
+        );
+        Err(Fault::new(
+            line(k),
+            found,
+            format!("at most {ERROR_M_MAX} m: states of one orbit, without steps"),
+        ))
     }
 
     /// Checks that the velocity of state `k` is the derivative of the positions around it.

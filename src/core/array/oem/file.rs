@@ -1,4 +1,4 @@
-//! Files of messages, KVN or XML, also compressed.
+//! Files of messages, KVN or XML, and of kernels, also compressed.
 
 use std::io::Read;
 use std::path::Path;
@@ -22,23 +22,44 @@ pub(in crate::array) fn at_line(path: &Path, Fault { line, found, expected }: Fa
     error(path, format!("line {line}: found {found}; expected {expected}"))
 }
 
+/// The fault of a segment of a kernel, from 1, or of a kernel.
+pub(super) fn at_segment(
+    path: &Path,
+    object: Option<i32>,
+    Fault { line, found, expected }: Fault,
+) -> ArrayError {
+    let segment = if line == 0 { String::new() } else { format!("segment {line}: ") };
+    let object = object.map_or_else(String::new, |object| format!("object {object}, "));
+    error(path, format!("{object}{segment}found {found}; expected {expected}"))
+}
+
+/// The content of a file, which may be compressed by gzip.
+pub(super) fn read_content(path: &Path) -> Result<Vec<u8>, ArrayError> {
+    let bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| error(path, source.to_string()))?;
+    if !bytes.starts_with(&[0x1f, 0x8b]) {
+        return Ok(bytes);
+    }
+    let mut content = Vec::new();
+    // A sum at the end says whether it is whole.
+    let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
+    unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
+    if content.len() as u64 > FILE_BYTES_MAX {
+        return Err(error(path, format!("it is too long; expected at most {FILE_BYTES_MAX} bytes")));
+    }
+    Ok(content)
+}
+
 /// Reads a message, KVN or XML, also compressed by gzip, to the end of its last segment; gives its last line, too.
 pub(in crate::array) fn read_message<M: Message>(path: &Path) -> Result<(M, usize), ArrayError> {
-    let mut bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| error(path, source.to_string()))?;
-    if bytes.starts_with(&[0x1f, 0x8b]) {
-        let mut content = Vec::new();
-        // A sum at the end says whether it is whole.
-        let unpacked = MultiGzDecoder::new(&*bytes).take(FILE_BYTES_MAX + 1).read_to_end(&mut content);
-        unpacked.map_err(|source| error(path, format!("gzip: {source}")))?;
-        if content.len() as u64 > FILE_BYTES_MAX {
-            return Err(error(path, format!("it is too long; expected at most {FILE_BYTES_MAX} bytes")));
-        }
-        bytes = content;
-    }
-    if let Some(form) = form_of(&bytes) {
+    parse_content(path, &read_content(path)?)
+}
+
+/// Reads a message from the content of its file.
+pub(super) fn parse_content<M: Message>(path: &Path, bytes: &[u8]) -> Result<(M, usize), ArrayError> {
+    if let Some(form) = form_of(bytes) {
         return Err(error(path, format!("{form}; expected text as ASCII or UTF-8, or gzip of it")));
     }
-    parse(&bytes).map_err(|fault| at_line(path, fault))
+    parse(bytes).map_err(|fault| at_line(path, fault))
 }
 
 /// Reads a message that is given as bytes.

@@ -1,8 +1,11 @@
 //! Interpolation through some of the states around a time.
 
-use super::message::{DEGREE_MAX, OemSegment, TableMethod};
+use super::message::{OemSegment, TableMethod};
 use crate::array::state::SatelliteState;
 use crate::units::vector::{scale, sub};
+
+/// Most values that a polynomial goes through: those of the greatest degree of kernels, 27, and of another state, with which it is compared.
+const VALUES_MAX: usize = 30;
 
 /// Newton's polynomial through some of a segment's states about a time, and its derivative.
 pub(super) fn interpolated(
@@ -17,8 +20,8 @@ pub(super) fn interpolated(
     // Times count from the middle, so that differences keep their digits.
     let zero_s = segment.time_s[first];
     let count = points * repeats;
-    let mut times = [0.0; 2 * DEGREE_MAX + 2];
-    let mut divided = [[0.0; 3]; 2 * DEGREE_MAX + 2];
+    let mut times = [0.0; VALUES_MAX];
+    let mut divided = [[0.0; 3]; VALUES_MAX];
     for k in 0..count {
         times[k] = segment.time_s[first + k / repeats] - zero_s;
         divided[k] = segment.position_m[first + k / repeats];

@@ -10,7 +10,7 @@ use crate::units::time_scales::{Tai, TimeScale};
 use crate::units::vector::{Vec3, norm};
 
 /// Greatest degree of an interpolation.
-pub(super) const DEGREE_MAX: usize = 15;
+const DEGREE_MAX: usize = 15;
 
 /// Most that a useable time may lie beyond the states, s: a rounded epoch.
 const ROUNDED_S: f64 = 1e-6;

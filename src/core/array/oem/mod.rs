@@ -1,4 +1,4 @@
-//! Orbits from CCSDS Orbit Ephemeris Messages.
+//! Orbits from CCSDS Orbit Ephemeris Messages and SPK kernels.
 
 mod checks;
 mod file;
@@ -7,6 +7,7 @@ mod interpolate;
 mod kvn;
 mod message;
 mod orbit;
+mod spk;
 mod xml;
 
 pub(super) use file::{at_line, error, read_message};

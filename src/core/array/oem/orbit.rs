@@ -6,10 +6,11 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::checks::check;
-use super::file::{at_line, error, read_message};
+use super::file::{at_line, at_segment, error, parse_content, read_content};
 use super::interpolate::interpolated;
 use super::message::{Collector, OemMessage, OemSegment, Reading, TableMethod};
-use crate::array::config::ArrayError;
+use super::spk::{self, Kernel};
+use crate::array::config::{ArrayConfig, ArrayError};
 use crate::array::state::SatelliteState;
 use crate::units::constants::MOON_GM_M3_S2;
 use crate::units::time_scales::{Tai, TimeScale};
@@ -71,22 +72,35 @@ pub(in crate::array) struct OemOrbits {
     pub(in crate::array) notes: Vec<String>,
 }
 
-/// Reads the files of all satellites. The mission begins at `epoch`, a date in UTC if it ends with Z, else in their time system, or with the last to begin.
-pub(in crate::array) fn read(
-    paths: &[PathBuf],
-    epoch: &str,
-    moon_radius_m: f64,
-) -> Result<OemOrbits, ArrayError> {
-    let readings: Result<Vec<Reading>, ArrayError> =
-        paths.par_iter().map(|path| read_file(path, moon_radius_m)).collect();
-    let readings = readings?;
-    let epoch = epoch_of(paths, &readings, epoch)?;
-    let mut orbits = Vec::with_capacity(readings.len());
+/// An orbit of a file, and what of the file is not used.
+struct FileOrbit {
+    path: PathBuf,
+    reading: Reading,
+    note: Option<String>,
+}
+
+/// Reads the files of all satellites, which are as many as the files have orbits. The mission begins at `epoch`, a date in UTC if it ends
+/// with Z, else in their time system, or with the last to begin.
+pub(in crate::array) fn read(config: &ArrayConfig) -> Result<OemOrbits, ArrayError> {
+    let ArrayConfig { oem, oem_epoch, moon_radius_m, satellites, .. } = config;
+    let files: Vec<Result<Vec<FileOrbit>, ArrayError>> =
+        oem.par_iter().map(|path| read_orbits(path, *moon_radius_m)).collect();
+    // Of several errors the first file's.
+    let files: Vec<Vec<FileOrbit>> = files.into_iter().collect::<Result<_, _>>()?;
+    let files: Vec<FileOrbit> = files.into_iter().flatten().collect();
+    if let Some(last) = files.last().filter(|_| files.len() != *satellites) {
+        let found = format!("with it the files of array.oem have {} orbits", files.len());
+        return Err(error(
+            &last.path,
+            format!("{found}; expected as many as array.satellites = {satellites}"),
+        ));
+    }
+    let epoch = epoch_of(&files, oem_epoch)?;
+    let mut orbits = Vec::with_capacity(files.len());
     let mut notes = Vec::new();
-    for (path, reading) in paths.iter().zip(readings) {
-        if reading.covariances > 0 {
-            notes.push(format!("{}: {} covariances are not used", path.display(), reading.covariances));
-        }
+    let mut paths = Vec::new();
+    for FileOrbit { path, reading, note } in files {
+        notes.extend(note);
         let Reading { message, scale, .. } = reading;
         let text = |s: f64| format!("{} {scale}", message.zero.plus_s(s).text(scale, 3));
         let epoch_s = epoch.since_s(message.zero);
@@ -98,9 +112,10 @@ pub(in crate::array) fn read(
                 text(epoch_s),
                 spans.join(", ")
             );
-            return Err(error(path, found));
+            return Err(error(&path, found));
         };
         orbits.push(TableOrbit { epoch_s, span_s, message: Arc::new(message) });
+        paths.push(path);
     }
     for (second, path) in paths.iter().enumerate() {
         for first in 0..second {
@@ -120,21 +135,21 @@ pub(in crate::array) fn read(
 }
 
 /// The mission's epoch, to the digits that time codes have.
-fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai, ArrayError> {
-    let begins = |reading: &Reading| {
+fn epoch_of(files: &[FileOrbit], epoch: &str) -> Result<Tai, ArrayError> {
+    let begins = |FileOrbit { reading, .. }: &FileOrbit| {
         let first = reading.message.segments.first();
         reading.message.zero.plus_s(first.map_or(0.0, |segment| segment.useable_s[0]))
     };
-    let latest = readings.iter().map(begins).reduce(|a, b| if b > a { b } else { a });
-    let (Some(latest), Some(first)) = (latest, readings.first()) else {
+    let latest = files.iter().map(begins).reduce(|a, b| if b > a { b } else { a });
+    let (Some(latest), Some(FileOrbit { path, reading: first, .. })) = (latest, files.first()) else {
         return Ok(Tai::from_seconds_since_1958(0.0));
     };
     let given = if epoch.is_empty() {
         latest
     } else {
         let scale = if epoch.ends_with('Z') { TimeScale::Utc } else { first.scale };
-        let other = paths.iter().zip(readings).find(|(_, reading)| reading.scale != scale);
-        if let Some((path, reading)) = other.filter(|_| !epoch.ends_with('Z')) {
+        let other = files.iter().find(|file| file.reading.scale != scale);
+        if let Some(FileOrbit { path, reading, .. }) = other.filter(|_| !epoch.ends_with('Z')) {
             return Err(error(
                 path,
                 format!(
@@ -143,18 +158,36 @@ fn epoch_of(paths: &[PathBuf], readings: &[Reading], epoch: &str) -> Result<Tai,
                 ),
             ));
         }
-        Tai::parse(epoch, scale).ok_or_else(|| {
-            error(&paths[0], format!("array.oem_epoch = {epoch:?}; expected a date on {scale}"))
-        })?
+        Tai::parse(epoch, scale)
+            .ok_or_else(|| error(path, format!("array.oem_epoch = {epoch:?}; expected a date on {scale}")))?
     };
     Ok(Tai::from_seconds_since_1958(given.seconds_since_1958()))
 }
 
-fn read_file(path: &Path, moon_radius_m: f64) -> Result<Reading, ArrayError> {
-    let (collector, line) = read_message::<Collector>(path)?;
-    let reading = collector.finish(line);
-    let reading = reading.and_then(|reading| check(&reading, moon_radius_m).map(|()| reading));
-    reading.map_err(|fault| at_line(path, fault))
+/// Reads the orbits of a file: one of a message, those of all objects of a kernel.
+fn read_orbits(path: &Path, moon_radius_m: f64) -> Result<Vec<FileOrbit>, ArrayError> {
+    let bytes = read_content(path)?;
+    let orbit = |reading, note| FileOrbit { path: path.to_owned(), reading, note };
+    if !spk::is_daf(&bytes) {
+        let (collector, line) = parse_content::<Collector>(path, &bytes)?;
+        let reading = collector.finish(line);
+        let reading = reading.and_then(|reading| check(&reading, moon_radius_m).map(|()| reading));
+        let reading = reading.map_err(|fault| at_line(path, fault))?;
+        let unused = reading.covariances;
+        let note = (unused > 0).then(|| format!("{}: {unused} covariances are not used", path.display()));
+        return Ok(vec![orbit(reading, note)]);
+    }
+    let Kernel { objects, other_centres } =
+        spk::read(&bytes).map_err(|fault| at_segment(path, None, fault))?;
+    let mut note = (other_centres > 0).then(|| {
+        let path = path.display();
+        format!("{path}: {other_centres} segments about other centres than the Moon are not used")
+    });
+    let checked = |(object, reading): (i32, Reading)| {
+        check(&reading, moon_radius_m).map_err(|fault| at_segment(path, Some(object), fault))?;
+        Ok(orbit(reading, note.take()))
+    };
+    objects.into_iter().map(checked).collect()
 }
 
 /// A time, s since the epoch, at which two orbits meet, among the states of both.

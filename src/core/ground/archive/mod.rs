@@ -93,5 +93,6 @@ pub use gaps::{ChannelCoverage, EphemerisPacket, Gaps, ReceivedPackets, RestartR
 pub use recalibrate::Recalibrated;
 pub use recovery::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use retract::{RefusedPacket, Retracted};
+pub use settings::REMEMBERED;
 pub(super) use store::Archive;
 pub use survey::CoverageSurvey;

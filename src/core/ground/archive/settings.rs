@@ -4,8 +4,9 @@ use std::path::Path;
 
 use crate::calibration::{BurstChoice, CalibrationHook};
 use crate::ground::{GroundConfig, GroundError};
+use crate::imaging::RegulariserChoice;
 
-/// The settings on which the sums depend, including checksums of input files.
+/// The settings on which the sums depend, including checksums of input files, and those that are [`REMEMBERED`].
 pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>, GroundError> {
     let mut settings: Vec<(String, String)> =
         config.map.sum_settings().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
@@ -33,7 +34,24 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
             settings.push((format!("calibrate.model_files[{number}]"), checksum(path)?));
         }
     }
+    settings.extend(remembered(config));
     Ok(settings)
+}
+
+/// Keys of how maps are made of sums. A state remembers them for sessions without a map file; sums do not depend on them.
+pub const REMEMBERED: [&str; 2] = ["map.epsilon", "map.regulariser"];
+
+/// Values of [`REMEMBERED`] as TOML. Tables of a regulariser are not remembered: their paths may lead elsewhere tomorrow.
+fn remembered(config: &GroundConfig) -> impl Iterator<Item = (String, String)> {
+    let epsilon = config.map.epsilon.as_ref().and_then(|epsilon| serde_json::to_string(epsilon).ok());
+    let regulariser = config.map.regulariser.as_ref().and_then(|regulariser| match regulariser {
+        RegulariserChoice::Data => Some("\"data\"".to_owned()),
+        RegulariserChoice::Identity => Some("\"identity\"".to_owned()),
+        RegulariserChoice::Degree(exponent) => Some(format!("{{ degree = {exponent:?} }}")),
+        RegulariserChoice::File(_) => None,
+    });
+    let values = REMEMBERED.into_iter().zip([epsilon, regulariser]);
+    values.filter_map(|(key, value)| Some((key.to_owned(), value?)))
 }
 
 fn checksum(path: &Path) -> Result<String, GroundError> {
@@ -51,7 +69,8 @@ pub(super) fn require_equal(
     let value_of = |settings: &[(String, String)], key: &str| {
         settings.iter().find(|(k, _)| k == key).map_or("(nothing)".to_owned(), |(_, value)| value.clone())
     };
-    for (key, _) in expected.iter().chain(found) {
+    let of_sums = |(key, _): &&(String, String)| !REMEMBERED.contains(&key.as_str());
+    for (key, _) in expected.iter().chain(found).filter(of_sums) {
         let (found, expected) = (value_of(found, key), value_of(expected, key));
         if found != expected {
             return Err(GroundError::Settings { path: path.to_owned(), key: key.clone(), found, expected });
