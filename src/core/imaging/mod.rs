@@ -33,6 +33,8 @@ mod regulariser;
 mod request;
 mod solver;
 mod stage;
+#[doc(hidden)]
+pub mod zoom;
 
 #[doc(hidden)]
 pub use beyond::read_power;
