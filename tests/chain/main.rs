@@ -32,3 +32,4 @@ mod sample;
 mod schema;
 mod start_up;
 mod study;
+mod zoom;

@@ -131,7 +131,14 @@ pub(super) fn execute(args: &CutoutArgs) -> CommandResult {
         .maps
         .iter()
         .zip(&pieces)
-        .map(|(path, values)| Patch { caption: name(path), cutout, values, scale, unit: "K".to_owned() })
+        .map(|(path, values)| Patch {
+            caption: name(path),
+            cutout,
+            values,
+            scale,
+            unit: "K".to_owned(),
+            beam: None,
+        })
         .collect();
     let title =
         args.subtract_fwhm.map_or_else(String::new, |fwhm| format!("scales above {fwhm} deg subtracted"));

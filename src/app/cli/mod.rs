@@ -52,6 +52,7 @@ mod sky;
 mod study;
 #[cfg(feature = "serve")]
 mod top;
+mod zoom;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -115,6 +116,7 @@ enum Command {
     Retract(retract::RetractArgs),
     Sample(sample::SampleArgs),
     Joint(joint::JointArgs),
+    Zoom(zoom::ZoomArgs),
     Compare(compare::CompareArgs),
     Geometry(geometry::GeometryArgs),
     Figure(figure::FigureArgs),
@@ -254,6 +256,7 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Retract(args) => retract::execute(&args),
         Command::Sample(args) => sample::execute(&args),
         Command::Joint(args) => joint::execute(&args),
+        Command::Zoom(args) => zoom::execute(&args),
         Command::Compare(args) => compare::execute(&args),
         Command::Geometry(args) => geometry::execute(&args),
         Command::Figure(args) => figure::execute(&args),

@@ -71,6 +71,14 @@ pub enum VisibilityReason {
     Beacon,
     /// It is flagged: the ground found a burst of a point source at its time.
     Burst,
+    /// The Moon hides the patch that is imaged.
+    PatchHidden,
+    /// The Moon's limb crosses the patch that is imaged.
+    PatchOnLimb,
+    /// Its baseline is shorter than the limit.
+    BaselineShort,
+    /// Its antennas hardly respond to the patch that is imaged.
+    PatchInsensitive,
 }
 
 impl VisibilityReason {
@@ -136,6 +144,10 @@ impl Reason for VisibilityReason {
             Self::ChannelNotMapped => "channel not among map.channels",
             Self::Beacon => "artificial signal on",
             Self::Burst => "burst of a point source",
+            Self::PatchHidden => "patch behind the Moon",
+            Self::PatchOnLimb => "the Moon's limb in the patch",
+            Self::BaselineShort => "baseline shorter than the limit",
+            Self::PatchInsensitive => "antennas insensitive to the patch",
         }
     }
 

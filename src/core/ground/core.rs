@@ -351,21 +351,6 @@ impl Ground {
         self.outcome.waiting_bytes.store(self.collector.held().waiting_bytes(), Ordering::Relaxed);
     }
 
-    /// Counts the packets of visibilities that are known to be missing.
-    fn missing_packets(&self) -> MissingPackets {
-        let latest = self.calibrator.blocks().latest_report().0;
-        let reported = self.instrument().zip(latest).map(|(instrument, latest)| {
-            // No packet is made beyond the range of the time code.
-            CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
-        });
-        let mut missing = MissingPackets::default();
-        for (_, received) in self.collector.received().filter(|(kind, _)| *kind == PacketKind::Visibilities) {
-            let [all, since] = received.missing_since(reported.unwrap_or_default());
-            missing = MissingPackets { all, unreported: if reported.is_some() { since } else { all } };
-        }
-        missing
-    }
-
     /// Writes a checkpoint, if there is an archive.
     pub(super) fn checkpoint(&mut self) -> Result<(), GroundError> {
         let Some(archive) = &mut self.archive else { return Ok(()) };
@@ -420,6 +405,21 @@ impl Ground {
     }
 }
 
+/// Counts the packets of visibilities that are known to be missing.
+pub(super) fn missing_packets(collector: &Collector, calibrator: &Calibrator) -> MissingPackets {
+    let latest = calibrator.blocks().latest_report().0;
+    let reported = collector.instrument().zip(latest).map(|(instrument, latest)| {
+        // No packet is made beyond the range of the time code.
+        CucTime::new(instrument.epoch_tai_s, latest.time).unwrap_or(CucTime(u64::MAX))
+    });
+    let mut missing = MissingPackets::default();
+    for (_, received) in collector.received().filter(|(kind, _)| *kind == PacketKind::Visibilities) {
+        let [all, since] = received.missing_since(reported.unwrap_or_default());
+        missing = MissingPackets { all, unreported: if reported.is_some() { since } else { all } };
+    }
+    missing
+}
+
 /// Whether visibilities can be applied: their positions and gains are known.
 fn is_due(calibrator: &Calibrator, gate: Option<&PassGate>, outline: &VisibilitiesOutline) -> bool {
     calibrator.ephemeris().covers(outline.span) && gate.is_none_or(|gate| gate.is_due(outline))
@@ -468,7 +468,10 @@ impl Stage for Ground {
         self.last_checkpoint()?;
         self.flush(out)?;
         self.end_pass()?;
-        store(&self.outcome.completeness, self.calibrator.post_losses(self.missing_packets()));
+        store(
+            &self.outcome.completeness,
+            self.calibrator.post_losses(missing_packets(&self.collector, &self.calibrator)),
+        );
         if let Some(archive) = &self.archive {
             self.outcome.ledger.post_report(&archive.take_posts());
         }

@@ -16,6 +16,11 @@ pub enum GroundError {
         replay the files of all of them into one new state"
     )]
     SeparateSolutions,
+    /// Gains that are found from the data, where they have to be known.
+    #[error(
+        "calibration.hook = \"solve\": expected \"identity\" or \"antenna-gains\", as with --calibration and the gains that `lunarray calibrate` found"
+    )]
+    GainsFromData,
     /// Changed gains for packets that no file has.
     #[error(
         "{missing} packets of visibilities in the state need new gains and are in none of the files, the one with count {count} \

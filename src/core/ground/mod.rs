@@ -19,6 +19,7 @@ mod live_view;
 mod outcome;
 mod pass_gate;
 mod pass_line;
+mod placed_files;
 mod power_waterfall;
 mod promises;
 mod reception;
@@ -46,6 +47,8 @@ pub use outcome::{GroundOutcome, SavingReport, SharedSaving};
 pub use pass_gate::{PassGateState, PassObserver};
 #[doc(hidden)]
 pub use pass_line::{KindLine, MissingRange, PassLine};
+#[doc(hidden)]
+pub use placed_files::read_placed;
 #[doc(hidden)]
 pub use power_waterfall::PowerWaterfall;
 #[doc(hidden)]

@@ -30,6 +30,8 @@ pub mod rates;
 mod regulariser;
 mod solver;
 mod stage;
+#[doc(hidden)]
+pub mod zoom;
 
 #[doc(hidden)]
 pub use beyond::read_power;

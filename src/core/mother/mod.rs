@@ -32,7 +32,7 @@ pub use config::{
 };
 pub use integrator::{ChannelModel, Integrator, MeasurementOptions};
 pub use merger::Merger;
-pub use moving::MovingSky;
+pub use moving::{MovingSky, SteadyPoints};
 pub use ninth::{NINTH_BAND_HZ, Ninth, NinthConfig, NinthSetup, NinthSky};
 pub use noise::NoiseModel;
 pub use observer::Observer;

@@ -25,6 +25,8 @@ const INSTANTS: u32 = 16;
 pub struct MovingSky {
     /// The sources.
     pub sources: Vec<MovingSource>,
+    /// Steady sources in each channel.
+    pub points: Vec<SteadyPoints>,
     /// Orbits of the daughters.
     pub array: Arc<Array>,
     /// Epoch of the mission, TAI seconds since 1958-01-01.
@@ -35,6 +37,15 @@ pub struct MovingSky {
     pub smear_integrations: bool,
     /// Whether visibilities are averages over the channel's width.
     pub smear_bandwidth: bool,
+}
+
+/// Steady point sources at the frequency of a channel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SteadyPoints {
+    /// Frequency of the channel, Hz.
+    pub frequency_hz: f64,
+    /// Direction of each source on ecliptic axes, and its power, K sr.
+    pub sources: Vec<(Vec3, f64)>,
 }
 
 /// What the moving sources add to a visibility, and to the powers of its two daughters.
@@ -58,10 +69,15 @@ impl MovingSky {
     pub(super) fn signal(&self, pair: Pair, channel: &Channel, [middle_s, dt_s]: [f64; 2]) -> MovingSignal {
         let mut total = MovingSignal::default();
         let ends_s = [middle_s - 0.5 * dt_s, middle_s + 0.5 * dt_s];
+        let instants = if self.smear_integrations { INSTANTS } else { 1 };
+        let instant_s = |k: u32| ends_s[0] + dt_s * (f64::from(k) + 0.5) / f64::from(instants);
+        if !self.points.is_empty() {
+            (0..instants)
+                .for_each(|k| self.add_points(&mut total, f64::from(instants), pair, channel, instant_s(k)));
+        }
         for source in self.sources.iter().filter(|source| source.is_on(channel.frequency_hz, ends_s)) {
-            let instants = if self.smear_integrations { INSTANTS } else { 1 };
             for k in 0..instants {
-                let t_s = ends_s[0] + dt_s * (f64::from(k) + 0.5) / f64::from(instants);
+                let t_s = instant_s(k);
                 let k_sr = source.flux_jy(channel.frequency_hz, t_s) * k_sr_per_jy(channel.frequency_hz);
                 if k_sr > 0.0 {
                     self.add(&mut total, (source, k_sr / f64::from(instants)), pair, channel, t_s);
@@ -69,6 +85,28 @@ impl MovingSky {
             }
         }
         total
+    }
+
+    /// Adds the steady sources at one of some instants.
+    fn add_points(&self, total: &mut MovingSignal, instants: f64, pair: Pair, channel: &Channel, t_s: f64) {
+        let (response, moon_radius_m, hz) = (self.response, self.array.moon_radius_m(), channel.frequency_hz);
+        let daughters = [pair.i, pair.j].map(|n| SingleGeometry {
+            r_m: self.array.position_m(n.into(), t_s),
+            normal_hat: self.array.normal_hat(n.into(), t_s),
+            moon_radius_m,
+            response,
+        });
+        let [r_i_m, r_j_m] = daughters.map(|daughter| daughter.r_m);
+        let geometry = PairGeometry { r_i_m, r_j_m, frequency_hz: hz, moon_radius_m, response };
+        let width_hz = if self.smear_bandwidth { channel.width_hz } else { 0.0 };
+        let of_channel = self.points.iter().filter(|points| points.frequency_hz == hz);
+        for &(n_hat, k_sr) in of_channel.flat_map(|points| &points.sources) {
+            let seen_k_sr = daughters.map(|daughter| k_sr / instants * daughter.envelope(n_hat));
+            total.powers_k_sr.iter_mut().zip(seen_k_sr).for_each(|(power, seen)| *power += seen);
+            if pair.i != pair.j && seen_k_sr.iter().all(|k_sr| *k_sr > 0.0) {
+                total.visibility_k_sr += point_source(k_sr / instants, n_hat, &geometry, width_hz);
+            }
+        }
     }
 
     /// Adds a source of a power at an instant.
@@ -180,6 +218,7 @@ mod tests {
             toml::from_str("direction = 'sun'\nstarts_s = [1000.0]\npeak_jy = 1e8\ndecay_s = 1e5").unwrap();
         let sky = MovingSky {
             sources: vec![source],
+            points: Vec::new(),
             array: Arc::new(Array::new(&Default::default()).unwrap()),
             epoch_tai_s: 2.2e9,
             response: AntennaResponse::Isotropic,
@@ -198,5 +237,41 @@ mod tests {
             let [p, q] = signal.powers_k_sr;
             assert!(p == q && (signal.visibility_k_sr.norm() / p - 1.0).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn steady_sources_are_seen_at_any_time_while_the_moon_does_not_hide_them() {
+        let array = Arc::new(Array::new(&Default::default()).unwrap());
+        let sources = vec![(direction(10.0, 80.0), 3.0), (direction(200.0, -5.0), 2.0)];
+        let sky = MovingSky {
+            sources: Vec::new(),
+            points: vec![SteadyPoints { frequency_hz: 1e7, sources: sources.clone() }],
+            array: Arc::clone(&array),
+            epoch_tai_s: 2.2e9,
+            response: AntennaResponse::Isotropic,
+            smear_integrations: false,
+            smear_bandwidth: false,
+        };
+        let channel = Channel { frequency_hz: 1e7, width_hz: 8e3 };
+        let mut hidden = 0;
+        for k in 0..100 {
+            let t_s = 1e6 + 82.0 * f64::from(k);
+            let [r_i_m, r_j_m] = [0, 7].map(|n| array.position_m(n, t_s));
+            let is_seen = |n_hat: Vec3| {
+                ![r_i_m, r_j_m].iter().any(|&r_m| hidden_by_moon(r_m, n_hat, array.moon_radius_m()))
+            };
+            hidden += usize::from(!is_seen(sources[1].0));
+            let wave = |(n_hat, k_sr): &(Vec3, f64)| {
+                let turns = dot(sub(r_i_m, r_j_m), *n_hat) * 1e7 / SPEED_OF_LIGHT_M_S;
+                if is_seen(*n_hat) { *k_sr * Complex64::cis(-2.0 * PI * turns) } else { Complex64::ZERO }
+            };
+            let expected: Complex64 = sources.iter().map(wave).sum();
+            let found = sky.signal(Pair { i: 0, j: 7 }, &channel, [t_s, 1.0]).visibility_k_sr;
+            // 3e3 turns of 16 digits.
+            assert!((found - expected).norm() < 1e-9, "{found} {expected}");
+        }
+        assert!((10..60).contains(&hidden), "{hidden}");
+        let other = Channel { frequency_hz: 2e7, width_hz: 8e3 };
+        assert_eq!(sky.signal(Pair { i: 0, j: 7 }, &other, [1e6, 1.0]).visibility_k_sr, Complex64::ZERO);
     }
 }

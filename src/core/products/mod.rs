@@ -28,6 +28,7 @@ mod time_coverage;
 mod truth;
 mod viewer;
 mod visibility_table;
+mod zoom;
 
 #[doc(hidden)]
 pub use autos::{AutoSummary, summarise, write_autos};
@@ -73,3 +74,5 @@ pub use truth::{MapShape, Truth};
 pub use viewer::{MapViewer, MapWatch, PublishedMap};
 #[doc(hidden)]
 pub use visibility_table::{VisibilityRow, VisibilityTable, jansky_per_k_sr};
+#[doc(hidden)]
+pub use zoom::{ListedSource, SourceEntry, ZoomSummary, write_zoom};

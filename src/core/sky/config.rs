@@ -49,6 +49,10 @@ keys! {
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         expert added: Option<AddedSky> = None;
+        /// Table (CSV) of steady point sources beside the map, at their exact directions for baselines of any length; as `lunarray sky
+        /// --sources` writes it. Without an index of their own, sources have sky.generated.source_spectral_index.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert points: Option<PathBuf> = None;
         /// Bursts of point sources, such as `[{ direction = "sun", starts_s = [9e4], peak_jy = 1e8 }]`, or `direction = [longitude,
         /// latitude]`; optional `reference_hz`, `spectral_index`, `rise_s`, `decay_s`, `duration_index`, `drift_s` (a type III burst's). The
         /// truth is written beside the downlink, as FILE.moving.csv.
@@ -82,6 +86,14 @@ impl SkyConfig {
     #[must_use]
     pub fn l_max_limit(nside: usize) -> usize {
         L_MAX.min(5 * nside / 2)
+    }
+
+    /// Longest baseline to which a map of `nside` has anything to say, wavelengths, beside `points` at exact directions; `None` without
+    /// such points, where maps are all there is.
+    #[must_use]
+    pub fn reach_wavelengths(&self, nside: usize) -> Option<f64> {
+        let degree = if self.l_max > 0 { self.l_max } else { 2 * nside };
+        self.points.as_ref().map(|_| degree as f64 / std::f64::consts::TAU)
     }
 
     fn l_max_expected(limit: usize) -> String {

@@ -70,6 +70,9 @@ pub enum PipelineError {
     /// The ground segment failed.
     #[error(transparent)]
     Ground(#[from] crate::ground::GroundError),
+    /// A patch cannot be imaged.
+    #[error(transparent)]
+    Zoom(#[from] crate::imaging::zoom::ZoomError),
     /// No data for any map.
     #[error(
         "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

@@ -62,6 +62,9 @@ impl Plan {
         if let Some(Err(problem)) = sky.added.as_ref().map(AddedSky::check) {
             found.push(|| problem);
         }
+        if let Err(problem) = self.moving_sky() {
+            found.push(|| problem);
+        }
         if let Err(problem) = self.antenna_errors() {
             found.push(|| problem);
         }
@@ -118,7 +121,8 @@ impl Config {
     #[must_use]
     pub fn input_files(&self) -> Vec<PathBuf> {
         let skies = self.sky.file.iter().flat_map(|files| files.values().iter().cloned());
-        let catalogue = self.sky.added.iter().filter_map(|added| added.catalogue.clone());
+        let catalogue =
+            self.sky.added.iter().filter_map(|added| added.catalogue.clone()).chain(self.sky.points.clone());
         let maps = self.map.prior_files.iter().chain(self.map.power_files()).chain(&self.map.beyond_files);
         let antennas = self.map.antennas.files.paths().chain(self.instrument.antenna_files.paths());
         let others = maps.chain(&self.calibrate.model_files).chain(&self.calibration.gains_file);

@@ -1,5 +1,6 @@
 //! A checked configuration, with the array, schedules and observing windows that follow from it.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::error::PipelineError;
@@ -7,9 +8,11 @@ use super::sections::Config;
 use crate::array::Array;
 use crate::daughters::{AntennaErrors, InstrumentErrors, truth_csv};
 use crate::frames::{Instrument, ObservingWindow};
-use crate::mother::{Fidelity, MovingSky, Observer, Schedule};
+use crate::mother::{Fidelity, MovingSky, Observer, Schedule, SteadyPoints};
 use crate::response::{MeasuredAntennas, MeasuredAntennasError};
 use crate::sky::fits::SkyChannel;
+use crate::sky::generated::{AddedSkyError, CataloguePoint, read_catalogue};
+use crate::sky::k_sr_per_jy;
 use crate::units::{ChannelId, MissionTime, all_pairs};
 
 /// A checked configuration, with the array, schedules and observing windows that follow from it.
@@ -146,26 +149,44 @@ impl Plan {
         self.instrument_errors().map(|errors| truth_csv(&errors, &self.windows))
     }
 
-    /// The moving sources; `None` if there are none.
-    #[must_use]
-    pub(in crate::pipeline) fn moving_sky(&self) -> Option<Arc<MovingSky>> {
+    /// The moving sources, and the steady ones of a table; `None` if there are none.
+    ///
+    /// # Errors
+    /// A table that cannot be read.
+    pub(in crate::pipeline) fn moving_sky(&self) -> Result<Option<Arc<MovingSky>>, PipelineError> {
         let Config { sky, spacecraft, .. } = &self.config;
-        let moving = || MovingSky {
+        let index = sky.generated.source_spectral_index;
+        let read = |path: &PathBuf| read_catalogue(path, index).map_err(AddedSkyError::from);
+        let table = sky.points.as_ref().map(read).transpose()?;
+        if sky.moving.is_empty() && table.is_none() {
+            return Ok(None);
+        }
+        let at = |frequency_hz: f64| {
+            let k_sr = |point: &CataloguePoint| point.flux_jy(frequency_hz) * k_sr_per_jy(frequency_hz);
+            let sources = table.iter().flatten().map(|point| (point.direction, k_sr(point))).collect();
+            SteadyPoints { frequency_hz, sources }
+        };
+        let points = self.instrument.channels.iter().map(|channel| at(channel.frequency_hz)).collect();
+        Ok(Some(Arc::new(MovingSky {
             sources: sky.moving.clone(),
+            points,
             array: Arc::clone(&self.array),
             epoch_tai_s: self.instrument.epoch_tai_s,
             response: self.instrument.response,
             smear_integrations: spacecraft.smear_integrations,
             smear_bandwidth: spacecraft.smear_bandwidth,
-        };
-        (!sky.moving.is_empty()).then(moving).map(Arc::new)
+        })))
     }
 
     /// The true bursts of moving sources as a table (CSV); `None` if there are no such sources.
     #[must_use]
     #[doc(hidden)]
     pub fn moving_truth(&self) -> Option<String> {
-        self.moving_sky().map(|moving| moving.truth_csv(&self.instrument.channels, &self.windows))
+        if self.config.sky.moving.is_empty() {
+            return None;
+        }
+        let moving = self.moving_sky().ok().flatten()?;
+        Some(moving.truth_csv(&self.instrument.channels, &self.windows))
     }
 
     /// Data rate of the ninth daughter's spectra while the array observes, bit/s; `None` without that daughter.

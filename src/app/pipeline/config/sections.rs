@@ -265,9 +265,10 @@ impl Config {
 
     /// Requires settings for which moving sources are simulated.
     fn check_moving(&self, checks: &mut Checks) {
-        if self.sky.moving.is_empty() {
+        if self.sky.moving.is_empty() && self.sky.points.is_none() {
             return;
         }
+        let key_of_sources = if self.sky.moving.is_empty() { "sky.points" } else { "sky.moving" };
         let spacecraft = &self.spacecraft;
         let is_plain = spacecraft.antenna != Antenna::DipoleNormal || self.array.is_circle();
         for (key, value, good, expected) in [
@@ -291,7 +292,7 @@ impl Config {
                 key,
                 value,
                 good,
-                format!("{expected} with sky.moving, which is not simulated otherwise"),
+                format!("{expected} with {key_of_sources}, which is not simulated otherwise"),
             );
         }
     }
@@ -350,6 +351,7 @@ impl Config {
         if let Some(added) = &mut sky.added {
             added.catalogue = added.catalogue.as_deref().map(content_checksum);
         }
+        sky.points = sky.points.as_deref().map(content_checksum);
         let mut instrument = instrument.clone();
         instrument.antenna_files = instrument.antenna_files.map_paths(|path| content_checksum(path));
         let daughters = HashedDaughters::new(daughters);

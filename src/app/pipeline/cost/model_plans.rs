@@ -46,7 +46,13 @@ impl Plan {
             let load = Workload {
                 visibilities: expected.sent * frequencies as f64,
                 sky_nside,
-                baseline_wavelengths_max: longest * stretch,
+                baseline_wavelengths_max: self
+                    .config
+                    .sky
+                    .reach_wavelengths(sky_nside)
+                    .unwrap_or(longest)
+                    .min(longest)
+                    * stretch,
                 l_max: self.config.sky.l_max,
                 is_time_averaged: spacecraft.smear_integrations,
                 is_on_circle: self.array.formation().is_some(),
@@ -87,6 +93,10 @@ impl Plan {
     /// A note if the baselines of some channels resolve finer scales than the sky's pixels represent.
     #[must_use]
     pub(in crate::pipeline) fn coarse_sky_note(&self) -> Option<String> {
+        // Beside points, the map is not asked for what it does not hold.
+        if self.config.sky.points.is_some() {
+            return None;
+        }
         let distance_m_max = self.distance_m_max();
         let coarse: Vec<(String, usize, usize)> = self
             .schedules

@@ -13,7 +13,7 @@ use crate::response::harmonic::{GeometryLimits, RotationTable};
 use crate::response::model::{
     AntennaPatterns, AntennaSum, BandAverage, DirectSum, GeneralSum, HarmonicSum, HarmonicSumSetup,
     ModelKind, ModelPlan, TimeAverage, VisibilityModel, WithEmission, WithFlatReflection,
-    WithSphereReflection,
+    WithSphereReflection, WithinBaselines,
 };
 use crate::sky::harmonics::{Alm, AnalysisOptions, Method, analysis};
 use crate::sky::{Frame, MapError, SkyConfig, SkyMap};
@@ -33,8 +33,14 @@ pub(crate) fn build(plan: &Plan, skies: &[Option<&SkyMap>]) -> Result<Vec<Channe
         let antennas = antennas
             .as_ref()
             .map(|antennas| Arc::new(antennas.at(schedule.frequency_hz)) as Arc<dyn AntennaPatterns>);
-        let model =
-            sky.map(|sky| channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations));
+        let model = sky.map(|sky| -> Result<Box<dyn VisibilityModel>, PipelineError> {
+            let model = channel_model((plan, antennas.as_ref()), choice, sky, schedule, &mut rotations)?;
+            let reach = plan.config.sky.reach_wavelengths(sky.nside());
+            Ok(match reach {
+                Some(reach) => Box::new(WithinBaselines::new(model, schedule.frequency_hz, reach)),
+                None => model,
+            })
+        });
         models.push(ChannelModel { batch: choice.kind.batch(), model: model.transpose()? });
     }
     Ok(models)

@@ -131,7 +131,7 @@ pub(in crate::pipeline) fn add_integration(
     let integrator =
         Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options)
             .with_errors(plan.instrument_errors())
-            .with_moving(plan.moving_sky());
+            .with_moving(plan.moving_sky()?);
     // A window itself is small; its visibilities are not.
     let windows = graph.source("observe", 1, Observer::new(windows.clone()));
     Ok(graph.stage(INTEGRATE, config.runtime.queue_capacity, windows, integrator))

@@ -12,6 +12,7 @@ mod simulation_groups;
 mod state;
 mod study;
 mod study_file;
+mod zoom;
 
 pub use bound::{BoundSummary, bound};
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
@@ -24,3 +25,4 @@ pub use simulation_groups::{MERGE, simulate_in_groups};
 pub use state::{joint_channels, sample_state, solve_state, solve_states_jointly};
 pub use study::{StudyStep, StudySummary, StudyWatcher, run_study};
 pub use study_file::{Study, StudyCase, StudyError};
+pub use zoom::{ZoomCentre, ZoomJob, ZoomReport, zoom_downlink};

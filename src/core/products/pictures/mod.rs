@@ -25,7 +25,7 @@ pub use error::PictureError;
 pub use mollweide::Sampling;
 pub use mollweide::View;
 #[doc(hidden)]
-pub use patch::{Patch, draw_patches};
+pub use patch::{BeamMark, Patch, draw_patches};
 pub use png_file::Picture;
 #[doc(hidden)]
 pub use raster::{Raster, draw_rasters};

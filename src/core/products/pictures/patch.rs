@@ -21,7 +21,32 @@ pub struct Patch<'a> {
     pub scale: ColourScale,
     /// Unit of the values.
     pub unit: String,
+    /// Beam, drawn with a bar of a whole length in the lower corners.
+    pub beam: Option<BeamMark>,
 }
+
+/// The ellipse of a beam at half its maximum.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BeamMark {
+    /// Longer axis, degrees.
+    pub major_deg: f64,
+    /// Shorter axis, degrees.
+    pub minor_deg: f64,
+    /// Angle of the longer axis from north towards east, degrees.
+    pub angle_deg: f64,
+}
+
+/// Possible lengths of the bar, degrees, and their names.
+const BARS: [(f64, &str); 8] = [
+    (1.0 / 60.0, "1'"),
+    (2.0 / 60.0, "2'"),
+    (5.0 / 60.0, "5'"),
+    (10.0 / 60.0, "10'"),
+    (0.5, "30'"),
+    (1.0, "1°"),
+    (2.0, "2°"),
+    (5.0, "5°"),
+];
 
 /// Side of a cutout, pixels.
 const SIDE_PX: f64 = 600.0;
@@ -80,6 +105,9 @@ fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
         }
     }
     graticule(canvas, frame, patch);
+    if let Some(beam) = &patch.beam {
+        draw_beam(canvas, frame, patch.cutout.size_deg, beam);
+    }
     canvas.outline(frame, Stroke::solid(INK, 1.0, 1.4));
     if !patch.caption.is_empty() {
         let style = Style::new(1.1 * FONT, INK).medium();
@@ -99,6 +127,29 @@ fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
         height: FONT,
     };
     draw_bar(canvas, bar, (&patch.scale, &patch.unit), FONT);
+}
+
+/// Draws a beam in the lower left corner, at least a few pixels wide, and a bar in the lower right one.
+fn draw_beam(canvas: &mut Canvas, frame: Rect, size_deg: f64, beam: &BeamMark) {
+    let scale = SIDE_PX / size_deg;
+    let (sin, cos) = beam.angle_deg.to_radians().sin_cos();
+    let (x, y) = (frame.x + 0.05 * frame.width, frame.bottom() - 0.05 * frame.height);
+    let outline = (0..=48).map(|k| {
+        let (up, across) = (std::f64::consts::TAU * f64::from(k) / 48.0).sin_cos();
+        let along = 0.5 * (scale * beam.major_deg).max(3.0) * up;
+        let across = 0.5 * (scale * beam.minor_deg).max(3.0) * across;
+        // East is to the left.
+        (x - along * sin - across * cos, y - along * cos + across * sin)
+    });
+    let line = Stroke::solid(WHITE, 1.0, 1.6);
+    canvas.polyline(&outline.collect::<Vec<_>>(), line);
+    let Some((length_deg, name)) = BARS.into_iter().rev().find(|(deg, _)| *deg < 0.3 * size_deg) else {
+        return;
+    };
+    let right = frame.right() - 0.05 * frame.width;
+    canvas.polyline(&[(right - length_deg * scale, y), (right, y)], Stroke::solid(WHITE, 1.0, 2.5));
+    let middle = (right - 0.5 * length_deg * scale, y - 0.7 * FONT);
+    canvas.text(name, middle, Align::Middle, Style::new(FONT, WHITE));
 }
 
 /// The smallest spacing that gives at most six lines.
@@ -206,6 +257,7 @@ mod tests {
                     values: &values,
                     scale: ColourScale::new(0.0, 1.0, Scaling::Linear, Palette::Inferno).unwrap(),
                     unit: "K".to_owned(),
+                    beam: Some(BeamMark { major_deg: 1.0, minor_deg: 0.5, angle_deg: 30.0 }),
                 };
                 assert!(draw_patches("", std::slice::from_ref(&patch), 1).is_ok());
                 let short = Patch { values: &values[1..], ..patch };

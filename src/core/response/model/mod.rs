@@ -10,6 +10,7 @@
 //! | [`GeneralSum`] | sums over spherical harmonics, for satellites at any positions |
 //! | [`WithFlatReflection`], [`WithSphereReflection`] | another model plus the sky reflected by a flat or a spherical Moon |
 //! | [`WithEmission`] | another model plus the Moon's thermal emission |
+//! | [`WithinBaselines`] | another model, and nothing on longer baselines |
 //! | [`BandAverage`], [`TimeAverage`] | means of another model over a channel or an integration |
 
 mod antennas;
@@ -22,6 +23,7 @@ mod general;
 mod harmonic;
 mod sphere_reflection;
 mod time_average;
+mod within;
 
 pub use antennas::{AntennaPatterns, AntennaSum};
 pub use band_average::BandAverage;
@@ -33,6 +35,7 @@ pub use general::GeneralSum;
 pub use harmonic::{HarmonicSum, HarmonicSumSetup};
 pub use sphere_reflection::WithSphereReflection;
 pub use time_average::TimeAverage;
+pub use within::WithinBaselines;
 
 use num_complex::Complex64;
 use thiserror::Error;

@@ -64,6 +64,8 @@ pub(super) struct Source {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Catalogue {
     pub sources: Vec<Source>,
+    /// Names of the sources; empty without a column of names.
+    pub source_names: Vec<String>,
     path: PathBuf,
     frame: Frame,
     /// Names of the columns of flux and, if there is one, spectral index.
@@ -204,8 +206,16 @@ impl Reader<'_> {
             return Err(self.content_error(1, "no sources", "one line per source below the names"));
         }
         let name = |place: usize| table.names[place].clone();
+        let is_name = |name: &String| ["name", "source", "id"].contains(&&*normalise(name));
+        let source_names = table.names.iter().position(is_name).map_or_else(Vec::new, |place| {
+            let name = |(_, text): &(usize, &str)| {
+                cells(text, table.separator).get(place).cloned().unwrap_or_default()
+            };
+            table.rows.iter().map(name).collect()
+        });
         Ok(Catalogue {
             sources,
+            source_names,
             path: self.path.to_owned(),
             frame: columns.frame,
             names: (name(columns.flux), columns.index.map(name)),

@@ -23,6 +23,7 @@ mod config;
 mod features;
 mod fluctuations;
 mod galaxy;
+mod points;
 mod sources;
 
 #[doc(hidden)]
@@ -30,6 +31,8 @@ pub use added::AddedSkyError;
 #[doc(hidden)]
 pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};
+#[doc(hidden)]
+pub use points::{CataloguePoint, read_catalogue};
 #[doc(hidden)]
 pub use sources::{CatalogueSource, catalogue};
 

@@ -1,0 +1,152 @@
+//! What sources leave of a patch, as a regularised map: `(B'WB + R) x = B'W V`, solved by conjugate gradients.
+//!
+//! R is `1 / variance` of a pixel, the same for all: nothing is assumed of the sky's smoothness. The variance is what the dirty image has
+//! beyond its noise, over the sum of the squared beam. The preconditioner takes `B'WB` for a convolution with the beam, which it nearly is.
+
+use num_complex::Complex64;
+use rayon::prelude::*;
+use rustfft::{Fft, FftPlanner};
+use serde::Serialize;
+use std::sync::Arc;
+
+use super::find::PatchData;
+use crate::numerics::fft_length;
+
+/// Residual of the normal equations, relative to the right-hand side, in the preconditioner's norm.
+const RESIDUAL_MAX: f64 = 1e-3;
+/// Maximum iterations.
+const ITERATIONS_MAX: usize = 30;
+/// The least part of the noise's variance that counts as that of a sky, in standard deviations of the image's variance.
+const SIGNIFICANT: f64 = 5.0;
+
+/// A regularised map of a patch.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SmoothMap {
+    /// Flux density in each pixel, Jy; 0 outside the patch.
+    pub pixel_jy: Vec<f64>,
+    /// How it was solved.
+    pub report: SmoothReport,
+}
+
+/// How a regularised map was solved.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct SmoothReport {
+    /// Standard deviation of a pixel of the sky, which is R, Jy.
+    pub pixel_sigma_jy: f64,
+    /// Iterations.
+    pub iterations: usize,
+    /// Residual.
+    pub residual: f64,
+}
+
+/// Multiplies by functions of spatial frequency.
+struct Filter {
+    side: usize,
+    length: usize,
+    forward: Arc<dyn Fft<f64>>,
+    back: Arc<dyn Fft<f64>>,
+    response: Vec<f64>,
+}
+
+impl Filter {
+    /// The transform of the beam, in columns of pixels with the centre at `side / 2`, times the weight.
+    fn new(side: usize, beam: &[f64], weight: f64) -> Self {
+        let length = fft_length(side);
+        let mut planner = FftPlanner::new();
+        let (forward, back) = (planner.plan_fft_forward(length), planner.plan_fft_inverse(length));
+        let mut filter = Self { side, length, forward, back, response: Vec::new() };
+        let mut square = vec![Complex64::ZERO; length * length];
+        let centred = |k: usize| (k + length - side / 2) % length;
+        for (index, value) in beam.iter().enumerate() {
+            square[centred(index / side) * length + centred(index % side)].re = weight * value;
+        }
+        filter.transform(&mut square, true);
+        // Sampled side lobes that the square cuts off make it slightly negative.
+        filter.response = square.iter().map(|value| value.re.max(0.0)).collect();
+        filter
+    }
+
+    fn transform(&self, square: &mut Vec<Complex64>, is_forward: bool) {
+        let fft = if is_forward { &self.forward } else { &self.back };
+        for _ in 0..2 {
+            square.par_chunks_mut(self.length).for_each(|row| fft.process(row));
+            let source = std::mem::take(square);
+            *square = vec![Complex64::ZERO; source.len()];
+            square.par_chunks_mut(self.length).enumerate().for_each(|(k, row)| {
+                row.iter_mut().enumerate().for_each(|(j, value)| *value = source[j * self.length + k]);
+            });
+        }
+    }
+
+    /// `x / (response + r)` by spatial frequency.
+    fn divide(&self, x: &[f64], r: f64) -> Vec<f64> {
+        let mut square = vec![Complex64::ZERO; self.length * self.length];
+        for (row, x) in square.chunks_exact_mut(self.length).zip(x.chunks_exact(self.side)) {
+            row.iter_mut().zip(x).for_each(|(value, x)| value.re = *x);
+        }
+        self.transform(&mut square, true);
+        square.par_iter_mut().zip(&self.response).for_each(|(value, response)| *value /= response + r);
+        self.transform(&mut square, false);
+        let scale = ((self.length * self.length) as f64).recip();
+        square
+            .chunks_exact(self.length)
+            .take(self.side)
+            .flat_map(|row| &row[..self.side])
+            .map(|v| scale * v.re)
+            .collect()
+    }
+}
+
+impl PatchData<'_> {
+    /// The regularised map of residual visibilities, whose dirty image is given; `None` if that is noise.
+    #[must_use]
+    pub fn smooth_map(&self, image_jy: &[f64], beam: &[f64]) -> Option<SmoothMap> {
+        let grid = self.transform.grid();
+        let inside: Vec<bool> = (0..grid.len()).map(|k| grid.is_inside(k)).collect();
+        let square = |values: &[f64]| values.iter().map(|value| value * value).sum::<f64>();
+        let (pixels, squared_beam) = (inside.iter().filter(|inside| **inside).count() as f64, square(beam));
+        let thermal = self.sums.sigma_jy().powi(2);
+        // The noise of pixels is correlated as the beam: there are this many independent ones.
+        let independent = pixels / squared_beam.max(1.0);
+        let excess = square(image_jy) / pixels - thermal;
+        if excess <= SIGNIFICANT * thermal * (2.0 / independent).sqrt() {
+            return None;
+        }
+        let pixel_sigma_jy = (excess / squared_beam).sqrt();
+        let r = pixel_sigma_jy.powi(-2);
+        let filter = Filter::new(grid.side, beam, self.sums.weight);
+        let precondition = |x: &[f64]| {
+            let mut z = filter.divide(x, r);
+            z.iter_mut().zip(&inside).filter(|(_, inside)| !**inside).for_each(|(z, _)| *z = 0.0);
+            z
+        };
+        let product = |x: &[f64]| {
+            let mut values = self.transform.forward(x);
+            values.iter_mut().zip(self.rows).for_each(|(value, row)| *value *= row.weight);
+            let mut y = self.transform.adjoint(&values);
+            y.iter_mut().zip(x).for_each(|(y, x)| *y += r * x);
+            y
+        };
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let mut residual: Vec<f64> = image_jy.iter().map(|value| self.sums.weight * value).collect();
+        let mut direction = precondition(&residual);
+        let mut norm = dot(&residual, &direction);
+        let first = norm;
+        let mut x = vec![0.0; residual.len()];
+        let mut iterations = 0;
+        while iterations < ITERATIONS_MAX && norm > RESIDUAL_MAX * RESIDUAL_MAX * first {
+            let along = product(&direction);
+            let step = norm / dot(&direction, &along);
+            x.iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);
+            residual.iter_mut().zip(&along).for_each(|(r, a)| *r -= step * a);
+            let next = precondition(&residual);
+            let next_norm = dot(&residual, &next);
+            let beta = next_norm / norm;
+            norm = next_norm;
+            direction.iter_mut().zip(&next).for_each(|(d, z)| *d = z + beta * *d);
+            iterations += 1;
+        }
+        let residual = (norm / first).sqrt();
+        Some(SmoothMap { pixel_jy: x, report: SmoothReport { pixel_sigma_jy, iterations, residual } })
+    }
+}
