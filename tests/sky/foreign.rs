@@ -12,6 +12,7 @@ use common::workplace::{Workplace, fail, json, lunarray};
 const PIPELINE: &str = r#"
 name = "foreign"
 [spacecraft]
+channels_hz = [10.0e6]
 every_nth_window = 300
 baseline_wavelengths_max = 1.0
 [products]
@@ -24,7 +25,8 @@ const BESIDE: [&str; 4] = ["make.py", "mate_2.oem", "mate_3.oem", "verdicts.csv"
 struct Verdict<'a> {
     file: &'a str,
     kind: &'a str,
-    channel: &'a str,
+    /// Whether the map states its frequency, from which it is scaled.
+    is_scaled: bool,
     is_read: bool,
     says: &'a str,
 }
@@ -38,11 +40,11 @@ fn verdicts(table: &str) -> Vec<Verdict<'_>> {
         .lines()
         .skip(1)
         .map(|line| {
-            let [file, kind, channel, verdict, says, by] = line.split(',').collect::<Vec<_>>()[..] else {
+            let [file, kind, frequency, verdict, says, by] = line.split(',').collect::<Vec<_>>()[..] else {
                 panic!("{line}: expected six cells")
             };
             assert!(["read", "refused"].contains(&verdict) && !says.is_empty() && !by.is_empty(), "{line}");
-            Verdict { file, kind, channel, is_read: verdict == "read", says }
+            Verdict { file, kind, is_scaled: frequency == "scaled", is_read: verdict == "read", says }
         })
         .collect()
 }
@@ -121,16 +123,16 @@ fn files_of_others_are_read_or_refused_as_is_right() {
             "orbit" => check_orbit(verdict, path),
             "map" => {
                 let map = place.file("map.fits", &fits_of(&fs::read_to_string(path).unwrap()));
-                let (file, channel) =
-                    (format!("sky.file='{map}'"), format!("spacecraft.channels_hz=['{}']", verdict.channel));
-                check_command(verdict, &["check", &place.pipeline, "--set", &file, "--set", &channel]);
+                let file = format!("sky.file='{map}'");
+                let scaled = ["--set", "sky.frequency={ spectral_index = -2.5 }"];
+                let sets = if verdict.is_scaled { &scaled[..] } else { &[] };
+                check_command(verdict, &[&["check", &place.pipeline, "--set", &file][..], sets].concat());
             }
             "catalogue" => {
                 let (file, added) =
                     (format!("sky.file='{sky}'"), format!("sky.added={{ catalogue = '{path}' }}"));
                 let sets = ["--set", &file, "--set", &added, "--set", "sky.nside=4"];
-                let channel = "spacecraft.channels_hz=['10MHz']";
-                check_command(verdict, &[&["check", &place.pipeline, "--set", channel][..], &sets].concat());
+                check_command(verdict, &[&["check", &place.pipeline][..], &sets].concat());
             }
             "stream" => check_command(verdict, &["inspect", path]),
             kind => panic!("{}: no such kind: {kind}", verdict.file),
