@@ -51,7 +51,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for round in 1..=5 {
         let before = rank_k_limit(nside);
         let since = Instant::now();
-        let summary = run(&plan, &out, &Cancel::new(), &mut |_: lunarray::pipeline::RunHandles| {})?;
+        let summary = run(&plan, &out, &Cancel::new(), &mut |_: lunarray::pipeline::RunView| {})?;
         let elapsed_s = since.elapsed().as_secs_f64();
         let limit = 0.5 * (before + rank_k_limit(nside));
         let rate = summary.ledger.accumulated as f64 / elapsed_s;

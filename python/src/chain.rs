@@ -10,8 +10,7 @@ use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
 use lunarray::imaging::SolveWatch;
 use lunarray::pipeline::{
-    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunHandles, Segment, SettingsOrigin,
-    use_threads,
+    self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunView, Segment, SettingsOrigin, use_threads,
 };
 use lunarray::runtime::{Cancel, Metrics};
 use pyo3::exceptions::PyUserWarning;
@@ -54,7 +53,7 @@ pub(crate) fn ground_config(
 struct Watch(Arc<OnceLock<(Arc<Metrics>, u64)>>);
 
 impl Watch {
-    fn begin(&self, watched: &RunHandles, windows: u64) {
+    fn begin(&self, watched: &RunView, windows: u64) {
         let _ = self.0.set((Arc::clone(&watched.metrics), windows));
     }
 

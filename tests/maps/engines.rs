@@ -1,14 +1,14 @@
 //! The two engines, pixels and harmonics, on the same data; and what is estimated without a matrix against what a
 //! matrix gives.
 
-use faer::{Mat, Side};
+use crate::spectrum::Spectrum;
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::Samples;
 use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, nominal_orbit};
 use lunarray::imaging::{
-    HarmonicRequest, SolveWatch, StoppingRule, effective_beam, noise_variance, probed_traces, regularisation,
-    solve_harmonics, solve_pixels, spectrum, traces,
+    HarmonicRequest, HarmonicSolution, NamedWatch, Regulariser, SolveError, SolveWatch, StoppingRule,
+    W_MAX_EXACT, largest_eigenvalue, probed_traces, solve_pixels, solve_regularised, traces,
 };
 use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup};
 use lunarray::response::harmonic::GeometryLimits;
@@ -146,41 +146,37 @@ fn both_engines_make_the_same_map() {
     }
 }
 
+/// Solves with R = epsilon W_max I.
+pub fn solve_harmonics(
+    sums: &HarmonicSums,
+    request: HarmonicRequest,
+    prior_k: Option<&[f64]>,
+    start: Option<&[Vec<f64>; 2]>,
+    watch: NamedWatch<'_>,
+) -> Result<HarmonicSolution, SolveError> {
+    solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
+}
+
 /// A small case whose matrix can be written down.
-fn small() -> (HarmonicSums, Mat<f64>) {
+fn small() -> (HarmonicSums, Spectrum) {
     let sky = SkyMap::new(Frame::Ecliptic, vec![1e6; 12 * 8 * 8]).unwrap();
-    let blocks = observe(&sky, 3e6, 1_000.0, 3_000);
-    let sums = harmonic_sums(&blocks, 16, 1_000.0);
-    let order = sums.unknowns();
-    let mut matrix = Mat::zeros(order, order);
-    let (mut e, mut column) = (vec![0.0; order], vec![0.0; order]);
-    for k in 0..order {
-        e[k] = 1.0;
-        sums.apply(&e, &mut column);
-        e[k] = 0.0;
-        (0..order).for_each(|row| matrix[(row, k)] = column[row]);
-    }
-    (sums, matrix)
+    let sums = harmonic_sums(&observe(&sky, 3e6, 1_000.0, 3_000), 16, 1_000.0);
+    let spectrum = Spectrum::new(&sums);
+    (sums, spectrum)
 }
 
 #[test]
 fn estimates_without_a_matrix_agree_with_the_matrix() {
-    let (sums, matrix) = small();
-    let order = sums.unknowns();
-    let scale = matrix[(0, 0)];
-    let unit = Mat::from_fn(order, order, |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)]) / scale);
-    let decomposed = unit.self_adjoint_eigen(Side::Lower).unwrap();
-    let eigenvalues: Vec<f64> = decomposed.S().column_vector().iter().map(|w| w * scale).collect();
-    let vectors = decomposed.U();
-    let w_max = eigenvalues.iter().copied().fold(0.0, f64::max);
+    let (sums, exact) = small();
+    let w_max = exact.w_max();
     let epsilon = 1e-3;
-    let eps = regularisation(&sums, epsilon);
+    let eps = epsilon * largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value;
     assert!((eps / (epsilon * w_max) - 1.0).abs() < 1e-5, "{eps}");
     let watch = SolveWatch::default();
     let found = probed_traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap().unwrap();
     let held = traces(&sums, epsilon, w_max, 24, watch.named("test")).unwrap().unwrap();
-    let exact_n: f64 = eigenvalues.iter().map(|w| w / (w + eps).powi(2)).sum();
-    let exact_s: f64 = eigenvalues.iter().map(|w| (eps / (w + eps)).powi(2)).sum();
+    let exact_n = exact.trace(|w| w / (w + eps).powi(2));
+    let exact_s = exact.trace(|w| (eps / (w + eps)).powi(2));
     for (found, exact) in [(found.sigma_n_k2, exact_n), (found.sigma_s, exact_s)] {
         // Four standard errors, the probability of which is 1e-3 with 24 vectors; and the error bar means something.
         assert!((found.value - exact).abs() < 4.0 * found.error, "{found:?} {exact}");
@@ -188,8 +184,8 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
     }
     // Held, it is the same matrix but for roundings in f64, and epsilon refers to the W_max that was given.
     let given = epsilon * w_max;
-    let exact_n: f64 = eigenvalues.iter().map(|w| w / (w + given).powi(2)).sum();
-    let exact_s: f64 = eigenvalues.iter().map(|w| (given / (w + given)).powi(2)).sum();
+    let exact_n = exact.trace(|w| w / (w + given).powi(2));
+    let exact_s = exact.trace(|w| (given / (w + given)).powi(2));
     assert!((held.sigma_n_k2.value / exact_n - 1.0).abs() < 1e-9, "{held:?} {exact_n}");
     assert!((held.sigma_s.value / exact_s - 1.0).abs() < 1e-9, "{held:?} {exact_s}");
     assert_eq!((held.probes, found.probes), (0, 24));
@@ -203,47 +199,12 @@ fn estimates_without_a_matrix_agree_with_the_matrix() {
         probes: 0,
     };
     let solved = solve_harmonics(&sums, request, None, None, watch.named("test")).unwrap();
-    let apply = |f: &dyn Fn(f64) -> f64, v: &[f64]| -> Vec<f64> {
-        let mut out = vec![0.0; order];
-        for k in 0..order {
-            let part: f64 = (0..order).map(|i| vectors[(i, k)] * v[i]).sum();
-            (0..order).for_each(|i| out[i] += f(eigenvalues[k]) * part * vectors[(i, k)]);
-        }
-        out
-    };
-    let exact = apply(&|w| 1.0 / (w + eps), right);
+    let exact = exact.apply(|w| 1.0 / (w + eps), right);
     let length = exact.iter().map(|x| x * x).sum::<f64>().sqrt();
     let error =
         exact.iter().zip(&solved.unknowns[1]).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() / length;
     // Products in f32, whose rounding the least eigenvalues, 1e-3 of the greatest, magnify.
     assert!(error < 1e-3, "{error:e}");
-    // Pixel noise and beam: diagonals and columns of functions of the matrix, at the pixels of a map.
-    let nside = 4;
-    let transform = lunarray::sky::harmonics::Transform::new(nside, 16).unwrap();
-    let variance = noise_variance(&sums, eps, nside, 64, watch.named("test")).unwrap();
-    let mut ratios = Vec::new();
-    for pixel in [0, 50, 100, 191] {
-        let mut map = vec![0.0; variance.len()];
-        map[pixel] = 1.0 / pixel_area_sr(nside);
-        // Rows of the synthesis: Y_lm at the pixel's centre.
-        let y = lunarray::imaging::circle::unknowns(&transform.adjoint(&map).unwrap());
-        let exact: f64 =
-            apply(&|w| w.max(0.0) / (w + eps).powi(2), &y).iter().zip(&y).map(|(a, b)| a * b).sum();
-        ratios.push(variance[pixel] / exact);
-        let beam = effective_beam(&sums, eps, nside, pixel, watch.named("test")).unwrap();
-        let area = pixel_area_sr(nside);
-        let delta: Vec<f64> = y.iter().map(|y| y * area).collect();
-        let exact = transform
-            .synthesis(&lunarray::imaging::circle::coefficients(&apply(&|w| w / (w + eps), &delta), 16))
-            .unwrap();
-        for (a, b) in beam.iter().zip(&exact) {
-            assert!((a - b).abs() < 2e-3 * exact[pixel], "{pixel}: {a} {b}");
-        }
-    }
-    for ratio in ratios {
-        // Of 64 maps: a relative standard error of sqrt(2 / 64) = 0.18; four of them.
-        assert!((ratio - 1.0).abs() < 0.71, "{ratio}");
-    }
 }
 
 /// The thermal trace of a map of harmonics against that of pixels.
@@ -252,13 +213,14 @@ fn traces_agree_with_the_pixel_engine() {
     let (frequency_hz, baseline_m_max, nside) = (1e6, 750.0, 8);
     let sky = SkyMap::new(Frame::Ecliptic, vec![1e6; 12 * 8 * 8]).unwrap();
     let blocks = observe(&sky, frequency_hz, baseline_m_max, 3_000);
-    let exact = spectrum(&pixel_sums(&blocks, nside)).unwrap();
+    let exact = Spectrum::new(&pixel_sums(&blocks, nside));
     let sums = harmonic_sums(&blocks, 22, baseline_m_max);
     for epsilon in [0.1, 1e-2] {
-        let w_max = regularisation(&sums, 1.0);
+        let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value;
         let found = traces(&sums, epsilon, w_max, 24, SolveWatch::default().named("test")).unwrap().unwrap();
         let found = found.sigma_n_k2 / pixel_area_sr(nside);
-        let exact = exact.trace_sigma_n(epsilon);
+        let eps = epsilon * exact.w_max();
+        let exact = exact.trace(|w| w / (w + eps).powi(2));
         // Fringes of u < 2.5 end at l = 16; a pixel's window of nside 8 lowers their power there by 9 %, on average
         // over l by half of that. (At 1e-3 modes beyond the band's end count, 768 in one and 529 in the other.)
         assert!((found.value / exact - 1.0).abs() < 0.05 + 4.0 * found.error / exact, "{found:?} {exact}");

@@ -1,7 +1,8 @@
 //! What epsilon is chosen by, and an R that depends on the degree, against dense matrices of other code.
 
 use crate::common;
-use crate::engines::{harmonic_sums, observe};
+use crate::engines::{harmonic_sums, observe, solve_harmonics};
+use crate::spectrum::Spectrum;
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -9,13 +10,14 @@ use std::process::{Command, Stdio};
 use lunarray::array::ArrayConfig;
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::Samples;
+use lunarray::imaging::circle::{coefficients, unknowns};
 use lunarray::imaging::{
     Fit, HarmonicRequest, PixelExtras, Regulariser, SolveWatch, StoppingRule, Traces, W_MAX_EXACT,
-    effective_beam, harmonic_beams, largest_eigenvalue, solve_harmonics, solve_pixels_with,
-    solve_regularised, spectrum,
+    harmonic_beams, largest_eigenvalue, solve_pixels_with, solve_regularised,
 };
 use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
 use lunarray::response::pixel::PixelMethod;
+use lunarray::sky::harmonics::Transform;
 use lunarray::sky::healpix::pixel_area_sr;
 use lunarray::sky::{Frame, SkyMap};
 use lunarray::units::{StreamKind, random_stream};
@@ -191,7 +193,11 @@ fn beams_of_points_are_columns_of_the_effective_beam() {
     let blocks = noisy(3e6, 1_500.0, 900, 2e4);
     let (pixel, epsilon) = (77, 1e-2);
     let sums = pixel_sums(&blocks, 4);
-    let expected = spectrum(&sums).unwrap().effective_beam(epsilon, pixel);
+    let spectrum = Spectrum::new(&sums);
+    let eps = epsilon * spectrum.w_max();
+    let mut point = vec![0.0; 192];
+    point[pixel] = 1.0;
+    let expected = spectrum.apply(|w| w / (w + eps), &point);
     let watch = SolveWatch::default();
     let extras = PixelExtras { probes: 0, beams: &[pixel] };
     let solved = solve_pixels_with(sums.clone(), epsilon, None, extras, watch.named("test")).unwrap();
@@ -199,15 +205,20 @@ fn beams_of_points_are_columns_of_the_effective_beam() {
     assert!(apart(&solved.beams[0].map_k, &expected) < 1e-8);
     let none = PixelExtras { probes: 0, beams: &[192] };
     assert!(solve_pixels_with(sums, epsilon, None, none, watch.named("test")).is_err());
-    // Harmonics: conjugate gradients against the Krylov space of a point.
+    // Harmonics: of a point up to the map's degree.
     let sums = harmonic_sums(&blocks, 12, 1_500.0);
     let rule = StoppingRule { residual_max: 1e-7, iterations_max: 500 };
     let request = HarmonicRequest { epsilon, nside: 8, rule, samples: Samples::default(), probes: 0 };
     let w_max = largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value;
     let with = (&Regulariser::default(), w_max);
     let found = harmonic_beams(&sums, request, with, &[300], watch.named("test")).unwrap();
-    let expected = effective_beam(&sums, epsilon * w_max, 8, 300, watch.named("test")).unwrap();
-    // Both iterate to 1e-4 or better of what is left, in products in f32.
+    let transform = Transform::new(8, 12).unwrap();
+    let mut point = vec![0.0; 768];
+    point[300] = 1.0;
+    let point = unknowns(&transform.adjoint(&point).unwrap());
+    let beam = Spectrum::new(&sums).apply(|w| w / (w + epsilon * w_max), &point);
+    let expected = transform.synthesis(&coefficients(&beam, 12)).unwrap();
+    // Products are in f32.
     assert!(apart(&found[0].map_k, &expected) < 1e-3, "{}", apart(&found[0].map_k, &expected));
 }
 

@@ -11,7 +11,7 @@ use lunarray::imaging::anywhere::AssumedInstrument;
 use lunarray::imaging::anywhere::RefineRule;
 use lunarray::imaging::{
     Accumulator, EngineKind, MapConfig, NormalEngine, PixelEngine, PixelSetup, RefineConfig, Snapshot,
-    SnapshotData, SumCounts,
+    SumCounts,
 };
 use lunarray::imaging::{SolveError, SolveWatch, Solver, SolverSetup, StoppingRule};
 use lunarray::response::pixel::PixelMethod;
@@ -171,7 +171,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             is_final,
             span_s: [0.0, 1.0],
             nside: 2,
-            data: SnapshotData::Pixel(sums),
+            data: Box::new(sums),
         };
         let setup = SolverSetup {
             epsilon: PerChannel::All(1e-4),

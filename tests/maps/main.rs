@@ -12,5 +12,6 @@ mod forged;
 mod lengths;
 mod matrix_free;
 mod refined;
+mod spectrum;
 mod tikhonov;
 mod traces;

@@ -1,6 +1,7 @@
 //! Refined maps: against a dense solution by other code, on a circle, and whatever the order of arrival.
 
 use crate::common;
+use crate::engines::solve_harmonics;
 
 use std::f64::consts::{PI, TAU};
 use std::fs;
@@ -20,7 +21,7 @@ use lunarray::imaging::anywhere::solve_refined;
 use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, VisibilityArchive};
 use lunarray::imaging::circle::{coefficients, degrees};
 use lunarray::imaging::{
-    HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule, solve_harmonics,
+    HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule,
 };
 use lunarray::response::general::{GeneralRows, RowsSetup, TimedPair};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};

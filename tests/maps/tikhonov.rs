@@ -1,11 +1,12 @@
 //! Normal equations, solutions and traces against values computed by independent code.
 
 use crate::common;
+use crate::spectrum::Spectrum;
 
 use lunarray::array::{Array, ArrayConfig};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
 use lunarray::imaging::{NormalEngine, NormalSums, PixelEngine, PixelSetup, PixelSums};
-use lunarray::imaging::{W_MAX_EXACT, largest_eigenvalue, solve_pixels, spectrum};
+use lunarray::imaging::{SolveWatch, W_MAX_EXACT, largest_eigenvalue, solve_pixels, traces};
 use lunarray::response::pixel::PixelMethod;
 use lunarray::units::Pair;
 use num_complex::Complex64;
@@ -82,7 +83,7 @@ fn sums_solutions_and_traces_agree() {
     assert!(difference(sums.right_hand_side(), &numbers(&reference["dirty_map"])) < TOLERANCE);
     let w_max = number(&reference["w_max"]);
     assert!((largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| true).value / w_max - 1.0).abs() < TOLERANCE);
-    let spectrum = spectrum(&sums).unwrap();
+    let spectrum = Spectrum::new(&sums);
     assert!(difference(&spectrum.eigenvalues, &numbers(&reference["eigenvalues"])) < TOLERANCE);
     let solutions = reference["solutions"].as_object().unwrap();
     assert_eq!(solutions.len(), 3);
@@ -94,31 +95,13 @@ fn sums_solutions_and_traces_agree() {
         let map = solve_pixels(sums.clone(), epsilon, Some(&prior)).unwrap().map_k;
         let with_prior = numbers(&expected["map_flat_prior_3e5_k"]);
         assert!(difference(&map, &with_prior) < TOLERANCE, "epsilon {epsilon}, prior");
+        let found = traces(&sums, epsilon, w_max, 1, SolveWatch::default().named("test")).unwrap().unwrap();
         let traces = [
-            (spectrum.trace_sigma_n(epsilon), number(&expected["trace_sigma_n"])),
-            (spectrum.trace_sigma_s(epsilon), number(&expected["trace_sigma_s"])),
+            (found.sigma_n_k2.value, number(&expected["trace_sigma_n"])),
+            (found.sigma_s.value, number(&expected["trace_sigma_s"])),
         ];
         for (found, expected) in traces {
             assert!((found / expected - 1.0).abs() < TOLERANCE, "epsilon {epsilon}: {found} {expected}");
         }
     }
-}
-
-#[test]
-#[ignore = "needs LUNARRAY_SHARED"]
-fn pixel_noise_and_beam_are_parts_of_the_traces() {
-    let path = common::shared("reference/tikhonov_nside4.json");
-    let reference: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
-    let spectrum = spectrum(&sums(&reference)).unwrap();
-    let expected = &reference["solutions"]["0.01"];
-    // The trace is the sum of the variances, and B_eff - I has the imperfection's trace as its norm.
-    let variance: f64 = spectrum.pixel_noise_k(0.01).iter().map(|sigma| sigma * sigma).sum();
-    assert!((variance / number(&expected["trace_sigma_n"]) - 1.0).abs() < TOLERANCE);
-    let mut norm = 0.0;
-    for pixel in 0..192 {
-        for (k, beam) in spectrum.effective_beam(0.01, pixel).into_iter().enumerate() {
-            norm += (beam - if k == pixel { 1.0 } else { 0.0 }).powi(2);
-        }
-    }
-    assert!((norm / number(&expected["trace_sigma_s"]) - 1.0).abs() < TOLERANCE);
 }

@@ -22,7 +22,7 @@ use crate::downlink::ReceptionCounters;
 use crate::files::{ProtectedInputs, growing_file, is_same_name};
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
-use crate::pipeline::{Config, RunHandles};
+use crate::pipeline::{Change, Config, RunChanges, RunView};
 use crate::products::{MapViewer, PublishedMap, SnapshotSummary};
 use crate::runtime::{LedgerReport, StageProgress};
 
@@ -90,10 +90,10 @@ pub(super) struct Events {
 
 impl Events {
     /// Starts to report a graph: the run, or a further reading of it.
-    pub(super) fn watch(&self, handles: &RunHandles) {
+    pub(super) fn watch(&self, view: &RunView) {
         let Some(writer) = &self.writer else { return };
-        handles.maps.add_viewer(Box::new(writer.viewer()));
-        writer.send(Message::Watch(Box::new(handles.clone())));
+        view.maps.add_viewer(Box::new(writer.viewer()));
+        writer.send(Message::Watch(Box::new(view.clone())));
     }
 
     /// Writes the last line, with the summary or the error; `cancelled` tells whether a summary is of a cancelled run.
@@ -233,7 +233,7 @@ struct EventLine<'a> {
 }
 
 enum Message {
-    Watch(Box<RunHandles>),
+    Watch(Box<RunView>),
     Map(MapEntry),
     End(Box<End>),
 }
@@ -335,15 +335,6 @@ impl EventLines {
     }
 }
 
-/// State of a run that has been reported.
-#[derive(Default)]
-struct ReportedState {
-    ended: Vec<bool>,
-    saving: SavingReport,
-    instrument: usize,
-    bursts: usize,
-}
-
 /// Writes events until the end of the run, or until the reader is gone.
 fn write_events(
     mut lines: EventLines,
@@ -352,24 +343,24 @@ fn write_events(
     messages: &Receiver<Message>,
     dropped: &AtomicU64,
 ) {
-    let mut handles: Option<RunHandles> = None;
-    let mut reported = ReportedState::default();
+    let mut view: Option<RunView> = None;
+    let mut told = RunChanges::default();
     let mut write = || -> std::io::Result<()> {
         lines.write(Entry::Begin { version: env!("CARGO_PKG_VERSION"), name, segment })?;
         let mut next = Instant::now() + PROGRESS_EVERY;
         loop {
             match messages.recv_deadline(next) {
-                Ok(Message::Watch(new)) => (handles, reported) = (Some(*new), ReportedState::default()),
+                Ok(Message::Watch(new)) => (view, told) = (Some(*new), RunChanges::default()),
                 Ok(Message::Map(map)) => lines.write(Entry::Map(map))?,
                 Ok(Message::End(end)) => {
-                    if let Some(handles) = &handles {
-                        write_progress(&mut lines, handles, &mut reported, dropped)?;
+                    if let Some(view) = &view {
+                        write_progress(&mut lines, view, &mut told, dropped)?;
                     }
                     return lines.write(Entry::End(&end));
                 }
                 Err(RecvTimeoutError::Timeout) => {
-                    if let Some(handles) = &handles {
-                        write_progress(&mut lines, handles, &mut reported, dropped)?;
+                    if let Some(view) = &view {
+                        write_progress(&mut lines, view, &mut told, dropped)?;
                     }
                     next = Instant::now() + PROGRESS_EVERY;
                 }
@@ -385,44 +376,35 @@ fn write_events(
 /// Writes the events since the last call, and the counts.
 fn write_progress(
     lines: &mut EventLines,
-    handles: &RunHandles,
-    reported: &mut ReportedState,
+    view: &RunView,
+    told: &mut RunChanges,
     dropped: &AtomicU64,
 ) -> std::io::Result<()> {
-    let stages = handles.metrics.snapshot();
-    reported.ended.resize(stages.len(), false);
-    for (had_ended, stage) in reported.ended.iter_mut().zip(&stages) {
-        if stage.ended && !std::mem::replace(had_ended, stage.ended) {
-            lines.write(Entry::StageEnded { stage: &stage.name })?;
+    let stages = view.stages();
+    for change in told.next(view, &stages) {
+        if let Some(entry) = Entry::of_change(&change) {
+            lines.write(entry)?;
         }
     }
-    let ground = handles.ground.as_ref();
-    if let Some(saving) = ground.and_then(|ground| ground.saving.report()) {
-        if (saving.written, saving.failed) != (reported.saving.written, reported.saving.failed) {
-            lines.write(Entry::Checkpoint { saving: saving.clone() })?;
-        }
-        reported.saving = saving;
+    lines.write(progress_entry(view, &stages, dropped.load(Ordering::Relaxed)))
+}
+
+impl<'a> Entry<'a> {
+    /// The event of a change; `None` for failures to write, which are of the log only.
+    fn of_change(change: &'a Change) -> Option<Self> {
+        Some(match change {
+            Change::StageEnded(stage) => Self::StageEnded { stage },
+            Change::Saving { now, .. } => Self::Checkpoint { saving: now.clone() },
+            Change::Instrument(what) => Self::Instrument { what: what.clone() },
+            Change::Burst(what) => Self::Burst { what: what.clone() },
+            Change::Products(_) | Change::Archive(_) => return None,
+        })
     }
-    let gains = ground.and_then(|ground| ground.gains.as_ref());
-    for what in gains.map(|gains| gains.events_since(reported.instrument)).unwrap_or_default() {
-        lines.write(Entry::Instrument { what })?;
-        reported.instrument += 1;
-    }
-    for what in ground.map(|ground| ground.bursts.since(reported.bursts)).unwrap_or_default() {
-        lines.write(Entry::Burst { what })?;
-        reported.bursts += 1;
-    }
-    lines.write(progress_entry(handles, &stages, dropped.load(Ordering::Relaxed)))
 }
 
 /// Content of a progress line; `untold` is the number of dropped maps.
-fn progress_entry(handles: &RunHandles, stages: &[StageProgress], untold: u64) -> Entry<'static> {
-    let ground = handles.ground.as_ref();
-    let reception = ground.map(|ground| {
-        let counters = ground.reception.lock();
-        Box::new(counters.unwrap_or_else(std::sync::PoisonError::into_inner).clone())
-    });
-    let solving = handles.solving.progress().map(|solving| SolveCount {
+fn progress_entry(view: &RunView, stages: &[StageProgress], untold: u64) -> Entry<'static> {
+    let solving = view.solving.progress().map(|solving| SolveCount {
         what: solving.what,
         iteration: solving.iteration,
         residual: solving.residual,
@@ -430,81 +412,49 @@ fn progress_entry(handles: &RunHandles, stages: &[StageProgress], untold: u64) -
     });
     Entry::Progress {
         stages: stages.iter().map(StageCount::from).collect(),
-        ledger: ground.map(|ground| ground.ledger.report()),
-        reception,
-        senders: handles.listening.as_ref().map(|listening| listening.status.open()),
+        ledger: view.ground.as_ref().map(|ground| ground.ledger.report()),
+        reception: view.reception().map(Box::new),
+        senders: view.listening.as_ref().map(|listening| listening.status.open()),
         solving,
         untold,
     }
 }
 
-/// State of a run that has been logged.
-#[derive(Default)]
-pub(super) struct LogState {
-    reported: ReportedState,
-    products: Option<String>,
-    archive: Option<String>,
-}
-
-impl LogState {
-    /// Logs the changes since the last call: failures to write and their ends; as JSON, all events of `--events`.
-    pub(super) fn log_changes(&mut self, handles: &RunHandles) {
-        let stages = handles.metrics.snapshot();
-        self.reported.ended.resize(stages.len(), false);
-        for (had_ended, stage) in self.reported.ended.iter_mut().zip(&stages) {
-            if stage.ended && !std::mem::replace(had_ended, true) && is_json() {
-                say_entry(Level::Info, &Entry::StageEnded { stage: &stage.name }, None);
-            }
+/// Logs a change: failures to write and their ends; as JSON, all events of `--events`.
+pub(super) fn log_change(change: &Change) {
+    match change {
+        Change::StageEnded(stage) if is_json() => {
+            say_entry(Level::Info, &Entry::StageEnded { stage }, None);
         }
-        let bursts = handles.ground.as_ref().map(|ground| ground.bursts.since(self.reported.bursts));
-        for what in bursts.unwrap_or_default() {
-            say("burst", &json!({ "what": what }), &what);
-            self.reported.bursts += 1;
-        }
-        if let Some(saving) = handles.ground.as_ref().and_then(|ground| ground.saving.report()) {
-            self.log_saving(saving);
-        }
-        if let Some(products) = &handles.products {
-            let now = products.report().unwritten;
-            log_failure_change("products", "maps", &mut self.products, now);
-        }
-        let archive = handles.listening.as_ref().and_then(|listening| listening.archive.as_ref());
-        if let Some(archive) = archive {
-            let now = archive.report().unwritten;
-            let what = "the raw archive, and nothing is taken: packets";
-            log_failure_change("archive", what, &mut self.archive, now);
-        }
-    }
-
-    fn log_saving(&mut self, saving: SavingReport) {
-        let before = std::mem::replace(&mut self.reported.saving, saving);
-        let now = &self.reported.saving;
-        if (before.written, before.failed) == (now.written, now.failed) {
-            return;
-        }
-        let level = if now.unsaved.is_some() { Level::Warn } else { Level::Info };
-        if is_json() {
-            return say_entry(level, &Entry::Checkpoint { saving: now.clone() }, Some(&now.to_string()));
-        }
-        match (&before.unsaved, &now.unsaved) {
-            (None, Some(_)) | (Some(_), None) => print_notes([now.to_string()]),
-            _ => {}
+        Change::StageEnded(_) => {}
+        Change::Saving { before, now } => log_saving(before, now),
+        Change::Instrument(what) => say("instrument", &json!({ "what": what }), what),
+        Change::Burst(what) => say("burst", &json!({ "what": what }), what),
+        Change::Products(now) => log_failure_change("products", "maps", now.as_ref()),
+        Change::Archive(now) => {
+            log_failure_change("archive", "the raw archive, and nothing is taken: packets", now.as_ref());
         }
     }
 }
 
-/// Logs when writing `what` begins to fail, and when it works again.
-fn log_failure_change(event: &str, what: &str, before: &mut Option<String>, now: Option<String>) {
-    match (&before, &now) {
-        (None, Some(reason)) => {
+fn log_saving(before: &SavingReport, now: &SavingReport) {
+    let level = if now.unsaved.is_some() { Level::Warn } else { Level::Info };
+    if is_json() {
+        return say_entry(level, &Entry::Checkpoint { saving: now.clone() }, Some(&now.to_string()));
+    }
+    if before.unsaved.is_some() != now.unsaved.is_some() {
+        print_notes([now.to_string()]);
+    }
+}
+
+/// Logs that writing `what` begins to fail, or works again.
+fn log_failure_change(event: &str, what: &str, now: Option<&String>) {
+    match now {
+        Some(reason) => {
             note(event, &json!({ "unwritten": reason }), format_args!("{what} cannot be written: {reason}"));
         }
-        (Some(_), None) => {
-            say(event, &json!({ "unwritten": null }), format_args!("{what} are written again"))
-        }
-        _ => {}
+        None => say(event, &json!({ "unwritten": null }), format_args!("{what} are written again")),
     }
-    *before = now;
 }
 
 /// Receives maps for the log in JSON.
@@ -525,7 +475,7 @@ pub(super) struct ProgressLine {
 }
 
 /// The progress line of a run that has lasted `elapsed`.
-pub(super) fn progress_line(handles: &RunHandles, elapsed: Duration) -> ProgressLine {
-    let entry = progress_entry(handles, &handles.metrics.snapshot(), 0);
+pub(super) fn progress_line(view: &RunView, elapsed: Duration) -> ProgressLine {
+    let entry = progress_entry(view, &view.stages(), 0);
     ProgressLine { elapsed_s: elapsed.as_secs_f64(), entry }
 }

@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::interrupt::Interrupt;
 use super::output::CommandError;
-use crate::pipeline::{Config, RunHandles};
+use crate::pipeline::{Config, RunView};
 
 /// No arguments.
 #[derive(Debug, Args)]
@@ -27,7 +27,7 @@ impl ServeArgs {
 pub(super) struct Page;
 
 impl Page {
-    pub(super) fn watch(&self, _watched: &RunHandles) {}
+    pub(super) fn watch(&self, _watched: &RunView) {}
 
     pub(super) fn conclude<T, E: Into<CommandError>>(
         &self,

@@ -8,7 +8,7 @@ use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::pipeline::RunHandles;
+use crate::pipeline::RunView;
 use crate::runtime::Cancel;
 
 /// Interval of checks for cancellation.
@@ -26,11 +26,11 @@ pub(super) struct Notifier {
 
 impl Notifier {
     /// Reports that the ground segment is ready, and starts to send its status; `None` without a supervisor.
-    pub(super) fn start(handles: &RunHandles, cancel: &Cancel) -> Option<Self> {
+    pub(super) fn start(view: &RunView, cancel: &Cancel) -> Option<Self> {
         let supervisor = Supervisor::from_environment()?;
-        supervisor.send(&format!("READY=1\nSTATUS={}", status_line(handles)));
+        supervisor.send(&format!("READY=1\nSTATUS={}", status_line(view)));
         let (stop, stopped) = channel();
-        let (handles, cancel) = (handles.clone(), cancel.clone());
+        let (view, cancel) = (view.clone(), cancel.clone());
         let thread = std::thread::spawn(move || {
             let (mut alive, mut shown, mut is_ending) = (Instant::now(), Instant::now(), false);
             while matches!(stopped.recv_timeout(POLL), Err(RecvTimeoutError::Timeout)) {
@@ -43,7 +43,7 @@ impl Notifier {
                     alive = Instant::now();
                 }
                 if !is_ending && shown.elapsed() >= STATUS_EVERY {
-                    supervisor.send(&format!("STATUS={}", status_line(&handles)));
+                    supervisor.send(&format!("STATUS={}", status_line(&view)));
                     shown = Instant::now();
                 }
             }
@@ -103,18 +103,18 @@ fn socket_address(name: &str) -> Option<SocketAddr> {
     }
 }
 
-fn status_line(handles: &RunHandles) -> String {
+fn status_line(view: &RunView) -> String {
     let mut parts = Vec::new();
-    if let Some(listening) = &handles.listening {
+    if let Some(listening) = &view.listening {
         parts.push(format!("{} senders connected", listening.status.open()));
     }
-    for stage in handles.metrics.snapshot() {
+    for stage in view.stages() {
         let verbs = [("ground", "received"), ("publish", "published")];
         if let Some((_, verb)) = verbs.iter().find(|(name, _)| *name == stage.name) {
             parts.push(format!("{} {} {verb}", stage.units.count, stage.units.name));
         }
     }
-    if let Some(saving) = handles.ground.as_ref().and_then(|ground| ground.saving.report()) {
+    if let Some(saving) = view.saving() {
         parts.push(match saving.unsaved {
             Some(_) => saving.to_string(),
             None => format!("{} checkpoints", saving.written),

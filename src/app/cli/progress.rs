@@ -9,12 +9,15 @@ use std::time::{Duration, Instant};
 use indicatif::{DecimalBytes, HumanCount, ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 
-use super::events::{LogState, LogViewer, progress_line};
+use super::events::{LogViewer, log_change, progress_line};
+use super::interrupt::Interrupt;
 use super::log::{Level, is_json, print_line, say, say_entry};
 use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
-use crate::imaging::{SolveWatch, Solving, SolvingPart};
-use crate::pipeline::{CalibrateProgress, ChannelCost, GroupStep, Plan, RunGroups, RunHandles};
+use crate::imaging::{SolutionClock, SolveWatch, Solving, SolvingPart};
+use crate::pipeline::{
+    CalibrateProgress, ChannelCost, GroupStep, INTEGRATE, MERGE, Plan, READ, RunChanges, RunGroups, RunView,
+};
 use crate::runtime::Cancel;
 use crate::units::ChannelId;
 
@@ -49,7 +52,7 @@ pub(super) struct Progress {
 
 impl Progress {
     /// Starts to show the progress of `stage` through `total` items (0 if unknown); also logs events, and when the run is cancelled.
-    pub(super) fn watch(handles: RunHandles, stage: &'static str, total: u64, cancel: &Cancel) -> Self {
+    pub(super) fn watch(handles: RunView, stage: &'static str, total: u64, cancel: &Cancel) -> Self {
         let (stop, stopped) = channel();
         let cancel = cancel.clone();
         if is_json() {
@@ -192,11 +195,13 @@ fn amount(count: u64, unit: &str) -> String {
     }
 }
 
-/// Logs the steps of a run in groups, with the time left.
+/// Logs the steps of a run in groups, with the time left and the progress of each.
 pub(super) struct GroupSteps {
     groups: RunGroups,
     parts: Parts,
     channels_hz: Vec<f64>,
+    windows: u64,
+    progress: Option<Progress>,
 }
 
 impl GroupSteps {
@@ -209,11 +214,32 @@ impl GroupSteps {
         let mapped = groups.mapped.iter().map(|group| seconds(&group.channels, |cost| cost.mapping_s));
         // The merging takes negligible time.
         let parts = Parts::new(simulated.chain([0.0]).chain(mapped));
-        Self { groups: groups.clone(), parts, channels_hz: plan.config.spacecraft.channels_hz.clone() }
+        Self {
+            groups: groups.clone(),
+            parts,
+            channels_hz: plan.config.spacecraft.channels_hz.clone(),
+            windows: plan.progress_windows(),
+            progress: None,
+        }
+    }
+
+    /// Logs a step that begins, and shows the progress of its graph, if it has one.
+    pub(super) fn watch(&mut self, step: GroupStep, view: Option<RunView>, interrupt: &Interrupt) {
+        // The bar of the previous step ends first.
+        self.progress = None;
+        self.begin(step);
+        let Some(view) = view else { return };
+        interrupt.arm_or_note();
+        let (stage, total) = match step {
+            GroupStep::Simulate(_) => (INTEGRATE, self.windows),
+            GroupStep::Merge => (MERGE, 0),
+            GroupStep::Map(_) | GroupStep::Sky(_) => (READ, 0),
+        };
+        self.progress = Some(Progress::watch(view, stage, total, interrupt.cancel()));
     }
 
     /// Logs a step that begins.
-    pub(super) fn begin(&mut self, step: GroupStep) {
+    fn begin(&mut self, step: GroupStep) {
         let RunGroups { simulated, mapped } = &self.groups;
         let (what, number, of, part) = match step {
             GroupStep::Simulate(number) => ("simulated", number, simulated.len(), number),
@@ -259,11 +285,8 @@ struct ProgressView {
     /// Bytes received from all senders at the last refresh, and its time.
     received: (u64, Instant),
     since: Instant,
-    /// Number of logged events of the instrument.
-    events_logged: usize,
-    log: LogState,
-    /// The solution in progress: its number, when it was first seen, and its residual at that time.
-    solution: Option<(u64, Instant, f64)>,
+    told: RunChanges,
+    solution: SolutionClock,
 }
 
 impl ProgressView {
@@ -283,26 +306,16 @@ impl ProgressView {
             total,
             received: (0, now),
             since: now,
-            events_logged: 0,
-            log: LogState::default(),
-            solution: None,
+            told: RunChanges::default(),
+            solution: SolutionClock::default(),
         }
     }
 
     /// Text on the state of the solver, with an estimate of the time left.
     fn solution(&mut self, solving: &Solving) -> String {
-        let Solving { number, what, iteration, residual, target, part } = solving;
-        let (_, since, first) = match self.solution {
-            Some(seen) if seen.0 == *number => seen,
-            _ => *self.solution.insert((*number, Instant::now(), *residual)),
-        };
-        let (done, total) = ((first / residual).ln(), (first / target).ln());
-        let elapsed_s = since.elapsed().as_secs_f64();
-        let left = if done > 0.05 * total && elapsed_s > 1.0 {
-            format!(", about {:.0} s left", elapsed_s * (total / done - 1.0).max(0.0))
-        } else {
-            String::new()
-        };
+        let Solving { what, iteration, residual, target, part, .. } = solving;
+        let left_s = self.solution.left_s(solving);
+        let left = left_s.map_or_else(String::new, |left_s| format!(", about {left_s:.0} s left"));
         let step = part.map_or_else(String::new, |SolvingPart { what, iteration, residual, target }| {
             format!("; {what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}")
         });
@@ -323,39 +336,29 @@ impl ProgressView {
     }
 
     /// Logs new events of the instrument, the checkpoints, the archive and the products.
-    fn log_events(&mut self, handles: &RunHandles) {
-        self.log.log_changes(handles);
-        let gains = handles.ground.as_ref().and_then(|ground| ground.gains.as_ref());
-        for event in gains.map(|gains| gains.events_since(self.events_logged)).unwrap_or_default() {
-            say("instrument", &json!({ "what": event }), &event);
-            self.events_logged += 1;
-        }
+    fn log_events(&mut self, view: &RunView) {
+        self.told.next(view, &view.stages()).iter().for_each(log_change);
     }
 
-    fn show(&mut self, handles: &RunHandles, stage: &str) {
+    fn show(&mut self, view: &RunView, stage: &str) {
         if is_json() {
-            let entry = progress_line(handles, self.since.elapsed());
+            let entry = progress_line(view, self.since.elapsed());
             return say_entry(Level::Info, &entry, None);
         }
-        let stages = handles.metrics.snapshot();
+        let stages = view.stages();
         let done = stages.iter().find(|s| s.name == stage).map_or(0, |s| s.items_in.saturating_sub(1));
         let mut message: Vec<String> = stages
             .iter()
             .filter(|s| !s.units.name.is_empty() && s.units.count > 0)
             .map(|s| format!("{} {}", s.name, amount(s.units.count, s.units.name)))
             .collect();
-        if let Some(listening) = &handles.listening {
+        if let Some(listening) = &view.listening {
             message.insert(0, self.senders(&listening.status));
         }
-        if let Some(solving) = handles.solving.progress() {
+        if let Some(solving) = view.solving.progress() {
             message.push(self.solution(&solving));
         }
-        if let Some(saving) = handles
-            .ground
-            .as_ref()
-            .and_then(|ground| ground.saving.report())
-            .filter(|saving| saving.unsaved.is_some())
-        {
+        if let Some(saving) = view.saving().filter(|saving| saving.unsaved.is_some()) {
             message.insert(0, saving.to_string());
         }
         let message = message.join(", ");

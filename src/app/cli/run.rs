@@ -15,8 +15,8 @@ use super::output::{
 use super::progress::{GroupSteps, Progress};
 use super::serving::ServeArgs;
 use crate::pipeline::{
-    GroupSize, GroupStep, INTEGRATE, MERGE, Plan, READ, RunSummary, Segment, main_products, run_in_groups,
-    run_with_ranks, sky_notes, use_threads,
+    GroupSize, INTEGRATE, Plan, RunSummary, Segment, main_products, run_in_groups, run_with_ranks, sky_notes,
+    use_threads,
 };
 
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
@@ -123,22 +123,10 @@ fn in_groups(args: &RunArgs, plan: &Plan, size: GroupSize, out: &Path) -> Comman
     let groups = plan.run_groups(size, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
-    let mut progress = None;
-    let windows = plan.progress_windows();
-    let result = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |step, handles| {
-        // The bar of the previous step ends first.
-        progress = None;
-        steps.begin(step);
-        let Some(handles) = handles else { return };
-        interrupt.arm_or_note();
-        let (stage, total) = match step {
-            GroupStep::Simulate(_) => (INTEGRATE, windows),
-            GroupStep::Merge => (MERGE, 0),
-            GroupStep::Map(_) | GroupStep::Sky(_) => (READ, 0),
-        };
-        progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
+    let result = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |step, view| {
+        steps.watch(step, view, &interrupt);
     });
-    drop(progress);
+    drop(steps);
     let Some(summary) = result? else {
         return Ok(interrupt.completion(true));
     };

@@ -9,7 +9,7 @@ use serde_json::json;
 use super::interrupt::Interrupt;
 use super::log::say;
 use super::output::CommandError;
-use crate::pipeline::{Config, RunHandles};
+use crate::pipeline::{Config, RunView};
 use crate::serve::{ServeAddress, ServeError, Server, Subject};
 
 /// Time for which a failure is served: several typical scrape intervals.
@@ -61,7 +61,7 @@ pub(super) struct Page {
 
 impl Page {
     /// Starts to show a run.
-    pub(super) fn watch(&self, handles: &RunHandles) {
+    pub(super) fn watch(&self, handles: &RunView) {
         if let Some(server) = &self.server {
             server.watch(handles);
         }

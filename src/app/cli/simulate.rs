@@ -17,8 +17,8 @@ use super::serving::ServeArgs;
 use crate::downlink::transport::socket::{SendOptions, SocketSink, Stations, TcpUrl};
 use crate::files::ProtectedInputs;
 use crate::pipeline::{
-    Destination, GroupSize, GroupStep, INTEGRATE, MERGE, Plan, RunGroups, Segment, simulate,
-    simulate_in_groups, sky_notes, use_threads,
+    Destination, GroupSize, INTEGRATE, Plan, RunGroups, Segment, simulate, simulate_in_groups, sky_notes,
+    use_threads,
 };
 
 /// Simulate the space segment, and write its downlink to a file or send it to a listening ground segment.
@@ -163,19 +163,10 @@ fn in_groups(args: &SimulateArgs, plan: &Plan, size: GroupSize, out: &Path) -> C
     let groups = RunGroups { simulated, mapped: Vec::new() };
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
-    let mut progress = None;
-    let windows = plan.progress_windows();
-    let result =
-        simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, handles| {
-            // The bar of the previous step ends first.
-            progress = None;
-            steps.begin(step);
-            let Some(handles) = handles else { return };
-            interrupt.arm_or_note();
-            let (stage, total) = if step == GroupStep::Merge { (MERGE, 0) } else { (INTEGRATE, windows) };
-            progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
-        });
-    drop(progress);
+    let result = simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, view| {
+        steps.watch(step, view, &interrupt);
+    });
+    drop(steps);
     let reports = result?;
     let is_cancelled = reports.last().is_some_and(|report| report.cancelled);
     let message = match is_cancelled {

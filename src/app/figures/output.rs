@@ -6,9 +6,8 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::error::FigureError;
-use crate::files::write_atomically;
-use crate::products::ProductsError;
 use crate::products::pictures::Picture;
+use crate::products::{ProductsError, write_product};
 
 /// A figure that has been written.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -49,9 +48,8 @@ impl FigureParts {
             reason: error.to_string(),
         };
         let json = serde_json::to_vec_pretty(&self.numbers).map_err(encoded)?;
-        for (path, bytes) in [(path("csv"), self.csv.into_bytes()), (path("json"), json)] {
-            write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
-        }
+        write_product(&path("csv"), self.csv)?;
+        write_product(&path("json"), json)?;
         self.picture.write(&path("png"))?;
         self.picture.write(&path("svg"))?;
         let files = ["png", "svg", "csv", "json"].map(path).into_iter().chain(self.extra_files).collect();

@@ -22,8 +22,9 @@ pub use graph::{
     main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
 };
 pub use graph::{
-    CalibrateSummary, Destination, GroundSource, OnStart, RunHandles, RunSummary, replay, run, simulate,
+    CalibrateSummary, Destination, GroundSource, OnStart, RunSummary, RunView, replay, run, simulate,
 };
+pub(crate) use graph::{Change, RunChanges};
 #[doc(hidden)]
 pub use jobs::{
     BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, GroupStep, GroupStepWatcher,

@@ -17,13 +17,13 @@ use super::status::{
 use super::subject::Subject;
 use crate::array::EarthModel;
 use crate::calibration::BurstChoice;
-use crate::downlink::transport::packet_archive::{ArchiveReport, PacketArchive};
+use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::downlink::transport::socket::StationCounts;
-use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, SavingReport, UvwDensity};
-use crate::imaging::Solving;
-use crate::pipeline::RunHandles;
-use crate::products::{MapViewer, ProductsReport, ProductsWatch, PublishedMap};
-use crate::runtime::{Metrics, StageProgress};
+use crate::ground::{GroundOutcome, HitsMap, PassLine, PowerWaterfall, UvwDensity};
+use crate::imaging::{SolutionClock, Solving};
+use crate::pipeline::{Change, RunChanges, RunView};
+use crate::products::{MapViewer, ProductsWatch, PublishedMap};
+use crate::runtime::StageProgress;
 use crate::units::ChannelId;
 
 /// Maximum number of senders in a status, which is sent twice a second.
@@ -62,14 +62,9 @@ struct RunEnd {
 #[derive(Debug, Default)]
 struct LastUpdate {
     rates: RateMeter,
-    /// The solution in progress: its number, when it was first seen, and its residual at that time.
-    solution: Option<(u64, Instant, f64)>,
-    ended: Vec<bool>,
+    solution: SolutionClock,
+    told: RunChanges,
     senders: u64,
-    bursts: usize,
-    saving: SavingReport,
-    products: ProductsReport,
-    archive: ArchiveReport,
     status: Option<Status>,
 }
 
@@ -90,7 +85,7 @@ pub(super) struct Console {
     pub(super) maps: Arc<MapCache>,
     pub(super) log: Arc<EventLog>,
     pub(super) clients: ClientCounts,
-    pub(super) handles: OnceLock<RunHandles>,
+    pub(super) handles: OnceLock<RunView>,
     end: Mutex<Option<RunEnd>>,
     /// Whether metrics were read since the run failed.
     pub(super) is_failure_scraped: AtomicBool,
@@ -126,7 +121,7 @@ impl Console {
         self.log.push(is_bad, text.into());
     }
 
-    pub(super) fn set_run(&self, handles: &RunHandles) {
+    pub(super) fn set_run(&self, handles: &RunView) {
         let viewer = PageViewer { maps: Arc::clone(&self.maps), log: Arc::clone(&self.log) };
         handles.maps.add_viewer(Box::new(viewer));
         if let Some(ground) = &handles.ground {
@@ -168,7 +163,7 @@ impl Console {
 
     /// The stages' counters; empty before the run.
     pub(super) fn progress(&self) -> Vec<StageProgress> {
-        self.handles.get().map(|handles| Metrics::snapshot(&handles.metrics)).unwrap_or_default()
+        self.handles.get().map(RunView::stages).unwrap_or_default()
     }
 
     fn ground(&self) -> Option<&GroundOutcome> {
@@ -207,7 +202,7 @@ impl Console {
         let phase = self.phase();
         let progress = self.progress();
         let end = self.end.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let handles = self.handles.get();
+        let view = self.handles.get();
         let ground = self.ground();
         if let Some(ground) = ground {
             ground.live_view.refresh();
@@ -220,7 +215,7 @@ impl Console {
             Some(_) => whole_run_rates(&progress, elapsed_s),
             None => last_update.rates.sample(&progress, now),
         };
-        let listening = handles.and_then(|handles| handles.listening.as_ref()).map(|listening| {
+        let listening = view.and_then(|view| view.listening.as_ref()).map(|listening| {
             let mut report = listening.report();
             report.senders.listed.truncate(SENDERS_SHOWN);
             let silence_s = |counts: &StationCounts| Some(counts.heard?.elapsed().as_secs_f64());
@@ -238,17 +233,14 @@ impl Console {
                 report,
             }
         });
-        let solving = handles.and_then(|handles| handles.solving.progress());
-        let saving = ground.and_then(|ground| ground.saving.report());
-        let read = |ground: &GroundOutcome| {
-            let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            if let Some(listening) = &listening {
-                listening.report.complete(&mut reception);
-            }
-            let completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
-            (reception, (phase == Phase::Ended).then_some(completeness))
-        };
-        let (reception, completeness) = ground.map(read).map_or((None, None), |(a, b)| (Some(a), b));
+        let solving = view.and_then(|view| view.solving.progress());
+        let mut reception = view.and_then(RunView::reception);
+        if let (Some(reception), Some(listening)) = (&mut reception, &listening) {
+            listening.report.complete(reception);
+        }
+        let completeness = ground
+            .filter(|_| phase == Phase::Ended)
+            .map(|ground| ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone());
         let status = Status {
             version: env!("CARGO_PKG_VERSION"),
             name: self.name.clone(),
@@ -260,7 +252,7 @@ impl Console {
             up_s,
             elapsed_s,
             stages: stages_of(&progress, &rates),
-            solving: solving.map(|solving| last_update.solver(solving, now)),
+            solving: solving.map(|solving| last_update.solver(solving)),
             ledger: ground.map(|ground| LedgerStatus::new(ground.ledger.report(), phase == Phase::Ended)),
             completeness,
             reception,
@@ -269,86 +261,63 @@ impl Console {
                 .map(|ground| ground.bursts.len() as u64),
             waiting_bytes: ground.map(|ground| ground.waiting_bytes.load(Ordering::Relaxed)),
             listening,
-            saving,
-            products: handles.and_then(|handles| handles.products.as_ref()).map(ProductsWatch::report),
+            saving: view.and_then(RunView::saving),
+            products: view.and_then(|view| view.products.as_ref()).map(ProductsWatch::report),
             channels: self.maps.status(),
             has_state: self.state.is_some(),
             visitors: self.clients.status(),
         };
-        for (is_bad, text) in last_update.changes(&status) {
-            self.log_event(is_bad, text);
-        }
-        for burst in ground.map(|ground| ground.bursts.since(last_update.bursts)).unwrap_or_default() {
-            self.log_event(false, burst.to_string());
-            last_update.bursts += 1;
-        }
+        let changes = view.map(|view| last_update.told.next(view, &progress)).unwrap_or_default();
+        self.log_changes(&changes, &status, &mut last_update.senders);
         last_update.status = Some(status.clone());
         status
+    }
+
+    /// Logs what has changed; `senders` is how many were accepted before.
+    fn log_changes(&self, changes: &[Change], status: &Status, senders: &mut u64) {
+        for (is_bad, text) in changes.iter().filter_map(event_of) {
+            self.log_event(is_bad, text);
+        }
+        if let Some(listening) = &status.listening {
+            let accepted = listening.report.connections;
+            if accepted > std::mem::replace(senders, accepted) {
+                let open = listening.open;
+                self.log_event(false, format!("senders: {accepted} connections accepted, {open} open"));
+            }
+        }
     }
 }
 
 impl LastUpdate {
     /// The status of the solver, with an estimate of the time left.
-    fn solver(&mut self, solving: Solving, now: Instant) -> SolverStatus {
-        let Solving { number, what, iteration, residual, target, .. } = solving;
-        let (_, since, first) = match self.solution {
-            Some(seen) if seen.0 == number => seen,
-            _ => *self.solution.insert((number, now, residual)),
-        };
-        let (done, total) = ((first / residual).ln(), (first / target).ln());
-        let elapsed_s = now.duration_since(since).as_secs_f64();
-        let is_known = done > 0.05 * total && elapsed_s > 1.0;
-        let left_s = is_known.then(|| elapsed_s * (total / done - 1.0).max(0.0));
+    fn solver(&mut self, solving: Solving) -> SolverStatus {
+        let left_s = self.solution.left_s(&solving);
+        let Solving { what, iteration, residual, target, .. } = solving;
         SolverStatus { what, iteration, residual, target, left_s }
     }
+}
 
-    /// Events since the last update, and whether they need attention.
-    fn changes(&mut self, status: &Status) -> Vec<(bool, String)> {
-        let mut found = Vec::new();
-        self.ended.resize(status.stages.len(), false);
-        for (had_ended, stage) in self.ended.iter_mut().zip(&status.stages) {
-            if stage.ended && !*had_ended {
-                found.push((false, format!("stage {} has ended", stage.name)));
-            }
-            *had_ended = stage.ended;
+/// The event of a change, and whether it needs attention; `None` for changes that the page does not list.
+fn event_of(change: &Change) -> Option<(bool, String)> {
+    match change {
+        Change::StageEnded(stage) => Some((false, format!("stage {stage} has ended"))),
+        Change::Saving { before, now } if now.unsaved.is_some() && now.failed > before.failed => {
+            Some((true, now.to_string()))
         }
-        if let Some(listening) = &status.listening {
-            let accepted = listening.report.connections;
-            if accepted > self.senders {
-                found.push((
-                    false,
-                    format!("senders: {accepted} connections accepted, {} open", listening.open),
-                ));
-            }
-            self.senders = accepted;
-        }
-        if let Some(saving) = &status.saving {
-            if saving.written > self.saving.written {
-                found.push((false, format!("checkpoint {} of this session is written", saving.written)));
-            }
-            if saving.unsaved.is_some() && saving.failed > self.saving.failed {
-                found.push((true, saving.to_string()));
-            }
-            self.saving = saving.clone();
-        }
-        if let Some(products) = &status.products {
-            found.extend(failure_change("maps", &self.products.unwritten, &products.unwritten));
-            self.products = products.clone();
-        }
-        if let Some(archive) = status.listening.as_ref().and_then(|listening| listening.archive.as_ref()) {
-            found.extend(failure_change("the raw archive", &self.archive.unwritten, &archive.unwritten));
-            self.archive = archive.clone();
-        }
-        found
+        Change::Saving { before, now } => (now.written > before.written)
+            .then(|| (false, format!("checkpoint {} of this session is written", now.written))),
+        Change::Instrument(_) => None,
+        Change::Burst(burst) => Some((false, burst.to_string())),
+        Change::Products(now) => Some(failure_change("maps", now.as_ref())),
+        Change::Archive(now) => Some(failure_change("the raw archive", now.as_ref())),
     }
 }
 
 /// The event when writing `what` begins to fail, or works again.
-fn failure_change(what: &str, before: &Option<String>, now: &Option<String>) -> Option<(bool, String)> {
-    match (before, now) {
-        (None, Some(reason)) => Some((true, format!("{what} cannot be written: {reason}"))),
-        (Some(_), None) => Some((false, format!("{what}: written again"))),
-        _ => None,
+fn failure_change(what: &str, now: Option<&String>) -> (bool, String) {
+    match now {
+        Some(reason) => (true, format!("{what} cannot be written: {reason}")),
+        None => (false, format!("{what}: written again")),
     }
 }
 

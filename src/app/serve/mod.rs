@@ -2,7 +2,7 @@
 //!
 //! `docs/live.md` describes the routes: the page, `/events`, `/api/...`, `/metrics`, `/healthz` and `/readyz`.
 //!
-//! The server reads the handles of a running graph ([`crate::pipeline::RunHandles`]) and receives maps through a hook of the
+//! The server reads the handles of a running graph ([`crate::pipeline::RunView`]) and receives maps through a hook of the
 //! publisher. Nothing in the chain waits for it: a slow browser skips to the newest state. Memory is bounded: maps held, connections,
 //! and the size of a request. No request can name a file.
 //!

@@ -15,7 +15,7 @@ use super::console::Console;
 use super::error::ServeError;
 use super::routes::{PageState, READERS_MAX};
 use super::subject::Subject;
-use crate::pipeline::RunHandles;
+use crate::pipeline::RunView;
 
 const UPDATE_INTERVAL: Duration = Duration::from_millis(500);
 
@@ -71,7 +71,7 @@ impl Server {
     }
 
     /// Starts to show a run.
-    pub fn watch(&self, handles: &RunHandles) {
+    pub fn watch(&self, handles: &RunView) {
         self.console.set_run(handles);
         update(&self.console, &self.newest_status);
     }

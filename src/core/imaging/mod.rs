@@ -23,11 +23,14 @@ mod error;
 mod exact;
 #[doc(hidden)]
 pub mod joint;
+mod method;
+mod methods;
 mod pixel;
 mod power;
 #[doc(hidden)]
 pub mod rates;
 mod regulariser;
+mod request;
 mod solver;
 mod stage;
 #[doc(hidden)]
@@ -37,35 +40,36 @@ pub mod zoom;
 pub use beyond::read_power;
 #[doc(hidden)]
 pub use circle::{
-    HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_harmonics, solve_noises,
-    solve_regularised,
+    HarmonicRequest, HarmonicSolution, NOISES_TOGETHER, harmonic_beams, solve_noises, solve_regularised,
 };
 pub use config::MapConfig;
 #[doc(hidden)]
-pub use config::{ChannelGroup, EngineKind, MatrixKind, REFINED, RefineConfig, RegulariserChoice};
+pub use config::{ChannelGroup, EngineKind, MatrixKind, Method, REFINED, RefineConfig, RegulariserChoice};
 pub use error::AccumulationError;
 pub use exact::ExactEngine;
 #[doc(hidden)]
 pub use exact::automatic_weight_max;
 #[doc(hidden)]
 pub use pixel::{
-    Cholesky, ColumnBlock, MatrixFreeSums, MatrixFreeVisibilities, NotPositive, PixelExtras, PointBeam,
-    SymmetricTiles, TILE, solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
+    Cholesky, ColumnBlock, MatrixFreeSums, MatrixFreeVisibilities, NotPositive, PixelExtras, SymmetricTiles,
+    TILE, solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
 };
-pub use pixel::{Diagnostics, PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
+pub use pixel::{PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]
 pub use power::{Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
-pub use solver::SolveError;
+#[doc(hidden)]
+pub use request::SolverSetup;
 #[doc(hidden)]
 pub use solver::{
-    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, STORED_MAX, SolveWatch, Solving, SolvingPart,
-    Spectrum, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT, effective_beam, largest_eigenvalue,
-    noise_variance, probed_traces, regularisation, spectrum, traces,
+    Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, PointBeam, STORED_MAX, SolutionClock,
+    SolveWatch, Solving, SolvingPart, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT,
+    largest_eigenvalue, probed_traces, traces,
 };
+pub use solver::{Diagnostics, SolveError};
 #[doc(hidden)]
-pub use stage::{Accumulator, AccumulatorState, Snapshot, SnapshotData, Solution, Solver, SolverSetup};
+pub use stage::{Accumulator, AccumulatorState, Snapshot, Solution, Solver};
 
 use std::collections::BTreeMap;
 

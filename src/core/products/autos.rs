@@ -6,9 +6,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::error::ProductsError;
+use super::error::{ProductsError, write_product};
 use super::pictures::{Axis, Curve, Picture, PictureError, Plot, draw_plots};
-use crate::files::write_atomically;
 use crate::frames::AutoPower;
 
 /// Maximum number of frequencies with a plot of power over time.
@@ -88,15 +87,12 @@ pub fn write_autos(
     // The order of arrival must not matter.
     powers.sort_unstable_by(|a, b| key(a).cmp(&key(b)).then(a.time_s.total_cmp(&b.time_s)));
     let path = folder.join("autos.csv");
-    let write = |path: &Path, bytes: &[u8]| {
-        write_atomically(path, bytes).map_err(|source| ProductsError::Write { path: path.to_owned(), source })
-    };
-    write(&path, table(powers).as_bytes())?;
+    write_product(&path, table(powers).as_bytes())?;
     let summaries = summarise(powers);
     let path = folder.join("autos.json");
     let text = serde_json::to_vec_pretty(&summaries)
         .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
-    write(&path, &text)?;
+    write_product(&path, &text)?;
     if pictures {
         draw(powers, &summaries)?.write(&folder.join("autos.png"))?;
     }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::beam::EffectiveBeam;
 use super::comparison_pictures::{draw_comparison, draw_relative_error};
 use super::config::{PostProcessing, ProductsConfig};
-use super::error::ProductsError;
+use super::error::{ProductsError, create_folder, write_product};
 use super::error_maps::{ErrorMap, limits};
 use super::latitudes::latitude_errors;
 use super::pictures::{
@@ -17,7 +17,7 @@ use super::sheet_maps::SheetMaps;
 use super::summary::{ChannelSummary, PowerSpectra, SnapshotSummary};
 use super::truth::ChannelTruth;
 use super::viewer::{MapWatch, PublishedMap};
-use crate::files::{disk_space, write_atomically};
+use crate::files::disk_space;
 use crate::imaging::Solution;
 use crate::sky::fits::{Card, WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
@@ -57,9 +57,7 @@ impl ChannelFolder {
         let channel = usize::from(solution.channel.0);
         let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |c| c.frequency_hz);
         let name = format!("{:.3}MHz", frequency_hz / 1e6);
-        let folder = root.join(&name);
-        std::fs::create_dir_all(&folder)
-            .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
+        create_folder(&root.join(&name))?;
         Ok(Self {
             config: config.clone(),
             root: root.to_owned(),
@@ -307,14 +305,10 @@ impl ChannelFolder {
                 self.file(map.file);
                 map.write(&self.root.join(&self.name), &WriteOptions { cards, ..WriteOptions::default() })?;
             }
-            let path = self.file("sky-power.csv");
-            write_atomically(&path, errors.power.csv().as_bytes())
-                .map_err(|source| ProductsError::Write { path, source })?;
+            write_product(&self.file("sky-power.csv"), errors.power.csv().as_bytes())?;
         }
         if let Some(refinement) = &origin.solution.refinement {
-            let path = self.file("residuals.csv");
-            write_atomically(&path, refinement.chi_square.csv().as_bytes())
-                .map_err(|source| ProductsError::Write { path, source })?;
+            write_product(&self.file("residuals.csv"), refinement.chi_square.csv().as_bytes())?;
         }
         Ok(())
     }
@@ -334,9 +328,7 @@ impl ChannelFolder {
             self.beams.push(PointBeamSummary::new(beam.pixel, &map, l_max, processed.as_ref())?);
         }
         if !self.beams.is_empty() {
-            let path = self.file("beams.csv");
-            write_atomically(&path, beams_csv(&self.beams).as_bytes())
-                .map_err(|source| ProductsError::Write { path, source })?;
+            write_product(&self.file("beams.csv"), beams_csv(&self.beams))?;
         }
         Ok(())
     }

@@ -144,7 +144,10 @@ fn point(channel: &ChannelFigures) -> Option<EpsilonPoint> {
     let measured = traces.measured?;
     let (n, residual) = (fit.numbers as f64, fit.residual);
     // A single probe gives no error estimate of a trace.
-    let (residual_error, measured_error) = (residual.error?, measured.error.unwrap_or(f64::INFINITY));
+    let (residual_error, measured_error) = (residual.error, measured.error);
+    if residual_error.is_infinite() {
+        return None;
+    }
     let degrees_of_freedom = n - measured.value;
     let square = degrees_of_freedom * degrees_of_freedom;
     let score = (degrees_of_freedom > 0.0).then(|| n * residual.value / square);

@@ -1,9 +1,10 @@
 //! Errors of products.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
+use crate::files::write_atomically;
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 
@@ -12,6 +13,31 @@ fn folder_hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
         std::io::ErrorKind::InvalidInput => "",
         _ => "; expected a writable folder (choose one with --out)",
+    }
+}
+
+/// Writes a product, which is there whole or not at all.
+///
+/// # Errors
+/// [`ProductsError::Write`].
+pub fn write_product(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), ProductsError> {
+    write_atomically(path, bytes.as_ref()).map_err(ProductsError::write(path))
+}
+
+/// Creates a folder for products.
+///
+/// # Errors
+/// [`ProductsError::Write`].
+pub fn create_folder(path: &Path) -> Result<(), ProductsError> {
+    std::fs::create_dir_all(path).map_err(ProductsError::write(path))
+}
+
+impl ProductsError {
+    /// The error of a file or folder that cannot be written.
+    #[doc(hidden)]
+    pub fn write(path: &Path) -> impl FnOnce(std::io::Error) -> Self + use<> {
+        let path = path.to_owned();
+        move |source| Self::Write { path, source }
     }
 }
 

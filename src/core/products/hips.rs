@@ -95,10 +95,7 @@ impl Hips {
     /// # Errors
     /// A folder that is not empty, or in which files cannot be written; values beyond single precision.
     pub fn write(&self, map: &SkyMap, folder: &Path) -> Result<HipsReport, ProductsError> {
-        let failed = |path: &Path| {
-            let path = path.to_owned();
-            move |source| ProductsError::Write { path, source }
-        };
+        let failed = ProductsError::write;
         fs::create_dir_all(folder).map_err(failed(folder))?;
         let properties = folder.join("properties");
         let mut existing = Vec::new();

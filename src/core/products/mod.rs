@@ -45,6 +45,8 @@ pub use epsilons::{
 #[doc(hidden)]
 pub use error::ProductsError;
 #[doc(hidden)]
+pub use error::{create_folder, write_product};
+#[doc(hidden)]
 pub use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
@@ -60,8 +62,8 @@ pub use publisher::{ProductsReport, ProductsWatch, Publisher};
 pub use run_pictures::draw_runs;
 #[doc(hidden)]
 pub use runs::{
-    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, EstimateFigures, FitFigures, PowerFigures,
-    RunFigures, TraceFigures, crossings, runs_csv, spectra_csv,
+    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, PowerFigures, RunFigures, TraceFigures,
+    crossings, runs_csv, spectra_csv,
 };
 pub use summary::ChannelSummary;
 #[doc(hidden)]

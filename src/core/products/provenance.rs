@@ -6,7 +6,7 @@ use super::config::PostProcessing;
 use crate::frames::{AntennaResponse, Instrument};
 use crate::imaging::Solution;
 use crate::imaging::anywhere::Refinement;
-use crate::imaging::{EngineKind, MapConfig, RegulariserChoice};
+use crate::imaging::{MapConfig, Method, RegulariserChoice};
 use crate::sky::fits::Card;
 use crate::units::calendar::tai_text;
 
@@ -63,10 +63,10 @@ impl Provenance {
         let mut cards = vec![
             Card::text("NOISE", noise_state(&solution.instrument), "thermal noise in the visibilities"),
             Card::text("ANTENNA", antenna_name(solution.instrument.response), "response of every daughter"),
-            Card::text("ENGINE", engine_name(map.engine), "unknowns of the solution"),
+            Card::text("ENGINE", engine_name(map), "unknowns of the solution"),
         ];
-        match map.engine {
-            EngineKind::Pixel | EngineKind::Auto => {
+        match map.method() {
+            Method::Pixel | Method::MatrixFree => {
                 let rows = format!("{:?}", map.rows).to_lowercase();
                 cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
                 if let Some(convergence) = solution.diagnostics.convergence {
@@ -75,7 +75,7 @@ impl Provenance {
                     cards.push(Card::real("RESIDUAL", convergence.residual, "of the equations, relative"));
                 }
             }
-            EngineKind::Harmonic => {
+            Method::Harmonic | Method::Refined => {
                 let l_max = i64::try_from(map.degree()).unwrap_or(i64::MAX);
                 cards.push(Card::integer("LMAX", l_max, "greatest degree of the solution"));
                 if let Some(refinement) = &solution.refinement {
@@ -185,11 +185,8 @@ fn antenna_name(response: AntennaResponse) -> &'static str {
     }
 }
 
-fn engine_name(engine: EngineKind) -> &'static str {
-    match engine {
-        EngineKind::Pixel | EngineKind::Auto => "pixel",
-        EngineKind::Harmonic => "harmonic",
-    }
+fn engine_name(map: &MapConfig) -> &'static str {
+    if map.is_harmonic() { "harmonic" } else { "pixel" }
 }
 
 /// Encodes a text for a header: UTF-8 bytes that are not printable ASCII are percent-encoded (RFC 3986).

@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use super::channel::ChannelFolder;
 use super::config::ProductsConfig;
-use super::error::ProductsError;
+use super::error::{ProductsError, create_folder};
 use super::provenance::Provenance;
 use super::summary::ChannelSummary;
 use super::truth::Truth;
@@ -79,8 +79,7 @@ impl Publisher {
         provenance: Provenance,
         summaries: Arc<Mutex<Vec<ChannelSummary>>>,
     ) -> Result<Self, ProductsError> {
-        std::fs::create_dir_all(folder)
-            .map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?;
+        create_folder(folder)?;
         let (folder, viewers) = (folder.to_owned(), MapWatch::default());
         Ok(Self {
             config,

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ProductsError;
 use super::latitudes::LatitudeError;
+use crate::imaging::{Estimate, Fit};
 
 /// Figures of the maps of a run, from its `summary.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -93,41 +94,19 @@ pub struct DiagnosticFigures {
     pub traces: Option<TraceFigures>,
     /// Residuals of the data, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub fit: Option<FitFigures>,
-}
-
-/// Residuals of the data of a map.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct FitFigures {
-    /// Number of real data.
-    pub numbers: u64,
-    /// Power of the data, `V'N^-1V`.
-    pub data_power: f64,
-    /// `|V - B T|^2` in units of the noise.
-    pub residual: EstimateFigures,
-    /// `|T - T_p|^2` over the pixels, K^2.
-    pub solution_k2: f64,
+    pub fit: Option<Fit>,
 }
 
 /// Traces of the covariances (the paper, Sect. 5.1).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TraceFigures {
     /// Trace of the noise covariance, Tr Sigma_n, K^2.
-    pub sigma_n_k2: EstimateFigures,
+    pub sigma_n_k2: Estimate,
     /// Trace for the regularisation bias, Tr Sigma_s.
-    pub sigma_s: EstimateFigures,
+    pub sigma_s: Estimate,
     /// Effective number of parameters, Tr A (A + R)^-1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub measured: Option<EstimateFigures>,
-}
-
-/// An estimate and its error.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct EstimateFigures {
-    /// Estimated value.
-    pub value: f64,
-    /// Bound on the error; `None` if unbounded.
-    pub error: Option<f64>,
+    pub measured: Option<Estimate>,
 }
 
 /// The effective beam of a map and its noise.
@@ -317,9 +296,9 @@ pub fn runs_csv(runs: &[&RunFigures]) -> String {
             channel.input_mean_k(),
             Some(channel.noise_rms_k),
             n.map(|n| n.value),
-            n.and_then(|n| n.error),
+            n.map(|n| n.error).filter(|error| error.is_finite()),
             s.map(|s| s.value),
-            s.and_then(|s| s.error),
+            s.map(|s| s.error).filter(|error| error.is_finite()),
             channel.rho_mean(),
             channel.beam.as_ref().and_then(|beam| beam.fwhm_deg),
             channel.beam.as_ref().and_then(|beam| beam.noise_rms_jy),
@@ -366,7 +345,7 @@ pub(super) mod tests {
     use super::*;
 
     pub(in crate::products) fn run(label: &str, epsilon: f64, n: f64, s: f64) -> RunFigures {
-        let estimate = |value| EstimateFigures { value, error: None };
+        let estimate = |value| Estimate { value, error: f64::INFINITY };
         let traces = TraceFigures { sigma_n_k2: estimate(n), sigma_s: estimate(s), measured: None };
         // A mean of 10 K.
         let c0 = 4.0 * std::f64::consts::PI * 100.0;

@@ -125,15 +125,10 @@ impl SkyMap {
             return Ok(self.clone());
         }
         let children = (self.nside / nside).pow(2);
-        let mut values = vec![0.0; pixel_count(nside)];
-        values.par_chunks_mut(PIXELS_PER_TASK).enumerate().for_each(|(task, chunk)| {
-            for (k, value) in chunk.iter_mut().enumerate() {
-                let first = ring_to_nested(nside, task * PIXELS_PER_TASK + k) * children;
-                let child = |c| self.values[nested_to_ring(self.nside, first + c)];
-                *value = mean_of_seen((0..children).map(child));
-            }
-        });
-        Ok(Self { nside, frame: self.frame, values })
+        Ok(self.of_nested(nside, |nested| {
+            let child = |c| self.values[nested_to_ring(self.nside, nested * children + c)];
+            mean_of_seen((0..children).map(child))
+        }))
     }
 
     /// Averages or splits the pixels of the map to `nside`.
@@ -159,14 +154,18 @@ impl SkyMap {
             return Ok(self.clone());
         }
         let children = (nside / self.nside).pow(2);
+        Ok(self.of_nested(nside, |nested| self.values[nested_to_ring(self.nside, nested / children)]))
+    }
+
+    /// A map of this frame with the values of the pixels at `nside`, by their nested index.
+    fn of_nested(&self, nside: usize, value_of: impl Fn(usize) -> f64 + Sync) -> Self {
         let mut values = vec![0.0; pixel_count(nside)];
         values.par_chunks_mut(PIXELS_PER_TASK).enumerate().for_each(|(task, chunk)| {
             for (k, value) in chunk.iter_mut().enumerate() {
-                let parent = ring_to_nested(nside, task * PIXELS_PER_TASK + k) / children;
-                *value = self.values[nested_to_ring(self.nside, parent)];
+                *value = value_of(ring_to_nested(nside, task * PIXELS_PER_TASK + k));
             }
         });
-        Ok(Self { nside, frame: self.frame, values })
+        Self { nside, frame: self.frame, values }
     }
 
     /// Checks that every pixel is a temperature of a sky, of at most 1e16 K in magnitude. Pixels may be negative, as in filtered

@@ -7,7 +7,7 @@ use super::plan::Plan;
 use super::sections::Config;
 use crate::array::ObservingWindows;
 use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
-use crate::imaging::EngineKind;
+use crate::imaging::Method;
 use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
@@ -57,7 +57,7 @@ impl Config {
         let (map, calibration) = (&self.map, &self.calibration);
         let limits = &map.limits;
         let are_narrow = limits.out_of_track_deg_max.min(limits.radial_deg_max) < CORRECTED_DEG;
-        if map.engine != EngineKind::Harmonic || map.refine.is_on() || !are_narrow {
+        if map.method() != Method::Harmonic || !are_narrow {
             return None;
         }
         let has_positions =
@@ -146,6 +146,7 @@ impl Plan {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::imaging::EngineKind;
 
     #[test]
     fn the_default_has_no_notes_and_a_low_orbit_has() {

@@ -10,7 +10,7 @@ use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
 use crate::downlink::DownlinkConfig;
-use crate::imaging::{EngineKind, MapConfig, RegulariserChoice};
+use crate::imaging::{EngineKind, MapConfig, Method, RegulariserChoice};
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
@@ -184,12 +184,7 @@ impl Config {
         let is_general = spacecraft.model != ModelChoice::Harmonic;
         let isotropic = spacecraft.antenna == Antenna::Isotropic;
         for (key, value, good, expected) in [
-            (
-                "map.engine",
-                "\"harmonic\"",
-                map.engine != EngineKind::Harmonic || map.refine.is_on(),
-                "\"pixel\", or map.refine,",
-            ),
+            ("map.engine", "\"harmonic\"", map.method() != Method::Harmonic, "\"pixel\", or map.refine,"),
             ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
             ("spacecraft.model", "\"harmonic\"", is_general, "\"auto\", \"general\" or \"direct\""),
             (

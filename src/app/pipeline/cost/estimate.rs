@@ -148,11 +148,7 @@ impl Plan {
             let is_mapped = map.is_mapped(ChannelId(channel as u16));
             let visibilities = expected.mapped;
             let data = ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad };
-            if is_mapped {
-                EngineCost::estimate(map, data).with_ranks(ranks, map)
-            } else {
-                EngineCost::default()
-            }
+            if is_mapped { map.cost(data).with_ranks(ranks, map) } else { EngineCost::default() }
         };
         let engines: Vec<EngineCost> = frequencies.iter().zip(&expected).enumerate().map(engine).collect();
         let channels: Vec<ChannelCost> = frequencies

@@ -142,10 +142,7 @@ pub(in crate::pipeline) fn complete_costs(
     let cost = |frequency_hz: f64| {
         let (visibilities, solutions) = (map.refine.visibilities_max as f64, memory_solutions(map));
         let (windows, limb_range_rad) = (f64::INFINITY, f64::INFINITY);
-        EngineCost::estimate(
-            map,
-            ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad },
-        )
+        map.cost(ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad })
     };
     channels
         .filter(|(channel, _)| map.is_mapped(*channel))

@@ -6,26 +6,15 @@ use serde::Serialize;
 
 use super::found_solutions::{CalibrateSummary, FoundSolutions};
 use crate::calibration::solver::{GainEstimate, GainState, PassSolution, solutions_csv};
-use crate::files::write_atomically;
 use crate::pipeline::config::PipelineError;
-use crate::products::ProductsError;
 use crate::products::pictures::{Axis, Curve, Plot, draw_plots};
+use crate::products::{ProductsError, write_product};
 use crate::units::constants::DAY_S;
-
-pub(in crate::pipeline) fn create_folder(folder: &Path) -> Result<(), PipelineError> {
-    let created = std::fs::create_dir_all(folder);
-    Ok(created.map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?)
-}
-
-fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
-    let written = write_atomically(path, bytes);
-    Ok(written.map_err(|source| ProductsError::Write { path: path.to_owned(), source })?)
-}
 
 pub(in crate::pipeline) fn write_json(path: &Path, value: &impl Serialize) -> Result<(), PipelineError> {
     let text = serde_json::to_vec(value)
         .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
-    write_bytes(path, &text)
+    Ok(write_product(path, text)?)
 }
 
 /// Content of `solutions.json`.
@@ -43,7 +32,7 @@ pub(in crate::pipeline) fn write_products(
     pictures: bool,
 ) -> Result<(), PipelineError> {
     let solutions = &found.solutions[..];
-    write_bytes(&out.join("solutions.csv"), solutions_csv(solutions).as_bytes())?;
+    write_product(&out.join("solutions.csv"), solutions_csv(solutions))?;
     write_json(&out.join("solutions.json"), &SolutionsFile { summary, solutions })?;
     if pictures && !solutions.is_empty() {
         let channels = found.instrument.as_ref().map_or(0, |instrument| instrument.channels.len());

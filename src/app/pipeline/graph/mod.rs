@@ -10,14 +10,17 @@ mod sample_summary;
 pub(crate) mod sampling;
 pub(crate) mod space_segment;
 pub(super) mod summary;
+mod view;
 
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
 pub(crate) use run::SHUTDOWN;
 pub use run::{
-    Destination, GroundSource, OnStart, READ, RunHandles, downlink_file, main_products, replay, run,
-    run_with_ranks, simulate, use_threads,
+    Destination, GroundSource, OnStart, READ, downlink_file, main_products, replay, run, run_with_ranks,
+    simulate, use_threads,
 };
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
 pub use space_segment::{INTEGRATE, sky_notes};
 pub use summary::{RunScope, RunSummary};
+pub use view::RunView;
+pub(crate) use view::{Change, RunChanges};

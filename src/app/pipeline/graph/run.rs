@@ -1,8 +1,8 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
 use std::path::{Path, PathBuf};
+use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, PoisonError};
 use std::time::Duration;
 use std::{fs, io};
 
@@ -10,44 +10,21 @@ use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
+use super::view::RunView;
 use super::{ground_segment, space_segment};
 use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
-use crate::files::{FolderLock, write_atomically};
-use crate::ground::{Ground, GroundOutcome, WAIT_BYTES};
-use crate::imaging::EngineKind;
+use crate::files::FolderLock;
+use crate::ground::{Ground, WAIT_BYTES};
+use crate::imaging::Method;
 use crate::imaging::SolveWatch;
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
-use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos};
+use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product};
 use crate::ranks::Ranks;
-use crate::runtime::{Cancel, Graph, Link, Metrics, Report, RuntimeConfig, Source};
+use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
-
-/// Handles to monitor a running graph.
-#[derive(Clone, Debug)]
-pub struct RunHandles {
-    /// Counters and times of the stages.
-    pub metrics: Arc<Metrics>,
-    /// Progress of the solution.
-    pub solving: SolveWatch,
-    /// The senders, if the ground segment listens.
-    pub listening: Option<Listening>,
-    /// Ledger, reception and checkpoints of the ground segment, if there is one.
-    pub ground: Option<GroundOutcome>,
-    /// The maps, for display.
-    pub maps: MapWatch,
-    /// State of the product files; `Some` if a failure to write them does not end the run.
-    pub products: Option<ProductsWatch>,
-}
-
-impl RunHandles {
-    pub(in crate::pipeline) fn without_ground(graph: &Graph) -> Self {
-        let (solving, maps) = (SolveWatch::default(), MapWatch::default());
-        Self { metrics: graph.metrics(), solving, listening: None, ground: None, maps, products: None }
-    }
-}
 
 /// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
@@ -102,7 +79,7 @@ impl<P: AsRef<Path>> From<&P> for Destination {
 }
 
 /// Callback that receives the handles of a graph once, just before it runs.
-pub type OnStart<'a> = &'a mut dyn FnMut(RunHandles);
+pub type OnStart<'a> = &'a mut dyn FnMut(RunView);
 
 /// Name of the stage that reads the downlink.
 pub const READ: &str = "read";
@@ -188,7 +165,7 @@ pub fn run_with_ranks(
     let mapping =
         MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), product_state: None };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
-    let handles = RunHandles {
+    let handles = RunView {
         metrics: graph.metrics(),
         solving,
         listening: None,
@@ -261,7 +238,7 @@ pub(in crate::pipeline) fn simulate_skies(
         // Neither file nor socket: `Graph::run` reports the unconnected link as an error.
         (None, None) => drop(bytes),
     }
-    on_start(RunHandles::without_ground(&graph));
+    on_start(RunView::without_ground(&graph));
     let report = start_single_process(graph, &plan.config.runtime, cancel)?;
     sample_summary(&counts, plan, &report)?;
     Ok(report)
@@ -324,7 +301,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     let (viewers, product_state) = (maps.clone(), products.clone());
     let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, product_state };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
-    let handles = RunHandles {
+    let handles = RunView {
         metrics: graph.metrics(),
         solving,
         listening: listening.clone(),
@@ -344,24 +321,19 @@ impl Config {
     /// [`PipelineError::NotShareable`].
     #[doc(hidden)]
     pub fn require_shareable(&self, ranks: usize) -> Result<(), PipelineError> {
-        let found = match self {
-            _ if ranks < 2 => None,
-            Self { map, .. } if map.engine != EngineKind::Harmonic => {
-                Some(("map.engine = \"pixel\"", "\"harmonic\""))
-            }
-            Self { map, .. } if map.refine.is_on() => Some(("map.refine.passes_max above 0", "0")),
-            _ => None,
+        let (found, expected) = match self.map.method() {
+            Method::Harmonic => return Ok(()),
+            _ if ranks < 2 => return Ok(()),
+            Method::Refined => ("map.refine.passes_max above 0", "0"),
+            Method::Pixel | Method::MatrixFree => ("map.engine = \"pixel\"", "\"harmonic\""),
         };
-        match found {
-            Some((found, expected)) => Err(PipelineError::NotShareable { found, expected }),
-            None => Ok(()),
-        }
+        Err(PipelineError::NotShareable { found, expected })
     }
 
     /// Resolution and processing of the maps, for a comparison with the input sky.
     pub(in crate::pipeline) fn map_shape(&self) -> MapShape {
         let Self { map, products, .. } = self;
-        let l_max = (map.engine == EngineKind::Harmonic).then(|| map.degree());
+        let l_max = map.is_harmonic().then(|| map.degree());
         MapShape { nside: map.nside, l_max, processing: products.processing() }
     }
 }
@@ -395,8 +367,7 @@ pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), P
         let Some(text) = text else { continue };
         let mut name = file.as_os_str().to_owned();
         name.push(ending);
-        let path = PathBuf::from(name);
-        write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?;
+        write_product(&PathBuf::from(name), text)?;
     }
     Ok(())
 }
@@ -417,7 +388,7 @@ pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result
     if has_same_length && fs::read(&path).is_ok_and(|found| found == text.as_bytes()) {
         return Ok(());
     }
-    Ok(write_atomically(&path, text.as_bytes()).map_err(|source| ProductsError::Write { path, source })?)
+    Ok(write_product(&path, text)?)
 }
 
 /// Locks a folder for maps; an error if an input file of the configuration lies where a product would be written.
@@ -435,7 +406,7 @@ pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<
 /// Creates and locks a folder; before anything is computed, so that an error shows early.
 pub(in crate::pipeline) fn lock_folder(out: &Path) -> Result<FolderLock, PipelineError> {
     let locked = FolderLock::acquire(out, ".lock", true);
-    locked.map_err(|source| ProductsError::Write { path: out.to_owned(), source }.into())
+    Ok(locked.map_err(ProductsError::write(out))?)
 }
 
 /// Whether a file lies in a channel's folder (`...MHz`) of `out`.

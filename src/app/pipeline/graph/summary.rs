@@ -14,11 +14,10 @@ use super::sample_summary::SampleSummary;
 use crate::calibration::{BurstChoice, BurstSummary, Completeness, FoundBurst};
 use crate::downlink::ReceptionCounters;
 use crate::downlink::transport::socket::ListenReport;
-use crate::files::write_atomically;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
 use crate::pipeline::config::Config;
-use crate::products::{ChannelSummary, ProductsError};
+use crate::products::{ChannelSummary, ProductsError, write_product};
 use crate::runtime::{LedgerReport, Report, StageReport};
 
 /// Which part of the chain ran.
@@ -150,8 +149,7 @@ impl RunSummary {
         let text = serde_json::to_vec_pretty(self)
             .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
         let previous = std::fs::read(&path).unwrap_or_default();
-        write_atomically(&path, &text)
-            .map_err(|source| ProductsError::Write { path: path.clone(), source })?;
+        write_product(&path, &text)?;
         let ours: BTreeSet<&str> =
             self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
         // If this run lacks maps, those of the previous run are kept.
@@ -229,12 +227,11 @@ impl GroupRecord {
     }
 
     pub(in crate::pipeline) fn write(&self, path: &Path, key: u64) -> Result<(), ProductsError> {
-        let failed = |source| ProductsError::Write { path: path.to_owned(), source };
         let body = bincode::encode_to_vec(self, CODEC)
             .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
         let crc = crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &body);
         let bytes = [key.to_le_bytes().as_slice(), &body, &crc.to_le_bytes()].concat();
-        write_atomically(path, &bytes).map_err(failed)
+        write_product(path, bytes)
     }
 }
 

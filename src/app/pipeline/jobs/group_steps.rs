@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::pipeline::graph::RunHandles;
+use crate::pipeline::graph::RunView;
 use crate::units::ChannelId;
 
 /// One reading of the downlink, for a group or a part of its sums.
@@ -39,4 +39,4 @@ pub enum GroupStep {
 }
 
 /// Callback that receives each step before it runs, with the handles of its graph; [`GroupStep::Sky`] has none.
-pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Option<RunHandles>);
+pub type GroupStepWatcher<'a> = &'a mut dyn FnMut(GroupStep, Option<RunView>);

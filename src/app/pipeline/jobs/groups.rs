@@ -9,10 +9,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use super::case::{is_marked, key_of};
 use super::group_steps::{GroupStep, GroupStepWatcher, MapStep};
 use super::simulation_groups::simulate_in_groups;
 use crate::downlink::FileSource;
-use crate::files::write_atomically;
 use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
 use crate::imaging::ChannelGroup;
 use crate::imaging::circle::SumPart;
@@ -22,12 +22,12 @@ use crate::pipeline::graph::run::{
     FinishedGraph, collect_summary, lock_products, run_ground, write_settings, write_summary,
 };
 use crate::pipeline::graph::summary::GroupRecord;
-use crate::pipeline::graph::{RunHandles, RunScope, RunSummary, downlink_file, space_segment};
-use crate::products::{ProductsError, Truth};
+use crate::pipeline::graph::{RunScope, RunSummary, RunView, downlink_file, space_segment};
+use crate::products::{Truth, write_product};
 use crate::runtime::Cancel;
 
 /// Callback that receives the step and the handles of its graph before each reading of the files.
-pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunHandles);
+pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunView);
 
 /// Divides the channels of the instrument that `files` describe into groups, in order.
 ///
@@ -198,9 +198,8 @@ impl GroupedReplay<'_> {
         let files: Vec<_> = files.iter().map(file).collect();
         let channels: Vec<u16> = group.iter().map(|channel| channel.0).collect();
         let hashes = (config.space_hash(), config.ground_hash());
-        let text =
-            format!("{} {hashes:?} {files:?} {channels:?} {:?}", env!("CARGO_PKG_VERSION"), config.products);
-        crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
+        let version = env!("CARGO_PKG_VERSION");
+        key_of(format!("{version} {hashes:?} {files:?} {channels:?} {:?}", config.products))
     }
 }
 
@@ -225,13 +224,12 @@ pub fn run_in_groups(
     let RunGroups { simulated, mapped } = groups;
     let file = out.join(downlink_file(config.downlink.format));
     let marker = out.join(SIMULATED);
-    if !fs::read(&marker).is_ok_and(|found| found == downlink_key(plan, &file).as_bytes()) {
+    if !is_marked(&marker, downlink_key(plan, &file)) {
         let reports = simulate_in_groups(plan, simulated, &file, cancel, watch)?;
         if reports.last().is_some_and(|report| report.cancelled) {
             return Ok(None);
         }
-        write_atomically(&marker, downlink_key(plan, &file).as_bytes())
-            .map_err(|source| ProductsError::Write { path: marker.clone(), source })?;
+        write_product(&marker, downlink_key(plan, &file))?;
     }
     let watch = RefCell::new(watch);
     let truth = |group: &ChannelGroup| {

@@ -7,13 +7,13 @@ use crate::downlink::FileSource;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::Samples;
 use crate::imaging::circle::{NoiseSums, memory};
-use crate::imaging::{EngineKind, Snapshot, SnapshotData};
 use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, SolverSetup, solve_noises};
+use crate::imaging::{Method, Snapshot};
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError};
 use crate::pipeline::graph::ground_segment::GROUND;
 use crate::pipeline::graph::run::start_single_process;
-use crate::pipeline::graph::{OnStart, READ, RunHandles};
-use crate::products::ProductsError;
+use crate::pipeline::graph::{OnStart, READ, RunView};
+use crate::products::create_folder;
 use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
@@ -37,7 +37,7 @@ impl Config {
     /// Whether noise realisations can share the weights and the matrix: with the harmonic engine, without iterative refinement and
     /// without random errors of the instrument.
     pub(in crate::pipeline) fn shares_realisations(&self) -> bool {
-        self.map.engine == EngineKind::Harmonic && !self.map.refine.is_on() && !self.has_errors()
+        self.map.method() == Method::Harmonic && !self.has_errors()
     }
 }
 
@@ -100,7 +100,7 @@ impl NoiseMaps<'_> {
         let solving = SolveWatch::new(cancel.clone());
         let setup = config.solver(solving.clone())?;
         graph.sink("noise maps", sums, NoiseMapSolver { setup, out: self.out.to_owned(), first });
-        watch(RunHandles { solving, ..RunHandles::without_ground(&graph) });
+        watch(RunView { solving, ..RunView::without_ground(&graph) });
         Ok(!start_single_process(graph, &config.runtime, cancel)?.cancelled)
     }
 }
@@ -118,7 +118,7 @@ impl Sink for NoiseMapSolver {
 
     fn take(&mut self, snapshot: Snapshot) -> Result<(), PipelineError> {
         let Snapshot { instrument, channel, nside, is_final, data, .. } = snapshot;
-        let SnapshotData::Harmonic(sums) = data else { return Ok(()) };
+        let Ok(sums) = data.into_harmonic() else { return Ok(()) };
         if !is_final {
             return Ok(());
         }
@@ -139,8 +139,7 @@ impl Sink for NoiseMapSolver {
             map_k.iter_mut().for_each(|value| *value /= factor);
             let path = noise_file(&self.out, frequency_hz, number);
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder)
-                    .map_err(|source| ProductsError::Write { path: folder.to_owned(), source })?;
+                create_folder(folder)?;
             }
             write_map(&path, &SkyMap::new(Frame::Ecliptic, map_k)?, &WriteOptions::default())?;
         }

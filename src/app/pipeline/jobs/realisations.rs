@@ -8,9 +8,8 @@ use serde::Serialize;
 use super::case::CaseSummary;
 use super::noise_maps::noise_file;
 use super::study_file::direction_name;
-use crate::files::write_atomically;
 use crate::pipeline::config::PipelineError;
-use crate::products::{ChannelFigures, ProductsError};
+use crate::products::{ChannelFigures, write_product};
 use crate::sky::fits::{Column, ReadOptions, WriteOptions, read_whole_map, write_columns, write_map};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::healpix::{pixel_count, pixel_of};
@@ -210,7 +209,7 @@ fn channel_spread(
     for (kind, spread) in [("noise", Some(&noise)), ("map", map.as_ref())] {
         let Some(spread) = spread else { continue };
         let name = PathBuf::from(format!("covariance-{kind}-{number}-{mhz}.csv"));
-        write(&out.join(&name), spread.csv().as_bytes())?;
+        write_product(&out.join(&name), spread.csv())?;
         files.push(name);
     }
     Ok(RealisationSpread {
@@ -223,11 +222,6 @@ fn channel_spread(
         map,
         files,
     })
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<(), PipelineError> {
-    let failed = |source| ProductsError::Write { path: path.to_owned(), source };
-    Ok(write_atomically(path, bytes).map_err(failed)?)
 }
 
 pub(in crate::pipeline) fn spreads_csv(spreads: &[RealisationSpread]) -> String {

@@ -5,13 +5,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::case::key_of;
 use super::group_steps::{GroupStep, GroupStepWatcher};
 use crate::downlink::Recorder;
 use crate::imaging::ChannelGroup;
 use crate::mother::{Merger, SpoolReader, SpoolWriter};
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::pipeline::graph::run;
-use crate::pipeline::graph::{RunHandles, space_segment};
+use crate::pipeline::graph::{RunView, space_segment};
 use crate::products::ProductsError;
 use crate::runtime::{Cancel, Graph, Report};
 use crate::sky::SkyMap;
@@ -24,8 +25,7 @@ pub const MERGE: &str = "merge";
 
 impl Plan {
     fn spool_key(&self) -> u64 {
-        let text = format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash());
-        crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_bytes())
+        key_of(format!("{} {:016x}", env!("CARGO_PKG_VERSION"), self.config.space_hash()))
     }
 }
 
@@ -75,7 +75,7 @@ pub fn simulate_in_groups(
         let frames = space_segment::add_integration(&mut graph, plan, &present)?;
         drop(skies);
         graph.sink(SPOOL, frames, writer);
-        watch(GroupStep::Simulate(number), Some(RunHandles::without_ground(&graph)));
+        watch(GroupStep::Simulate(number), Some(RunView::without_ground(&graph)));
         let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
         let is_cancelled = report.cancelled;
         reports.push(report);
@@ -101,7 +101,7 @@ pub fn simulate_in_groups(
     let bytes = space_segment::add_downlink(&mut graph, plan, frames)?;
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
-    watch(GroupStep::Merge, Some(RunHandles::without_ground(&graph)));
+    watch(GroupStep::Merge, Some(RunView::without_ground(&graph)));
     let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
     if !report.cancelled {
         remove_spools(groups, file)?;
@@ -113,7 +113,7 @@ pub fn simulate_in_groups(
 fn remove_spools(groups: &[ChannelGroup], file: &Path) -> Result<(), PipelineError> {
     for group in groups {
         let path = spool_path(file, group);
-        fs::remove_file(&path).map_err(|source| ProductsError::Write { path, source })?;
+        fs::remove_file(&path).map_err(ProductsError::write(&path))?;
     }
     Ok(())
 }

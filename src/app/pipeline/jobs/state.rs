@@ -6,9 +6,7 @@ use crate::frames::{AntennaResponse, AutoPower, Instrument};
 use crate::ground::archive::REMEMBERED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, PowerSample, solve_jointly};
-use crate::imaging::{
-    REFINED, Regulariser, RegulariserChoice, Snapshot, SnapshotData, SolveError, StoppingRule,
-};
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice, Snapshot, SolveError, StoppingRule};
 use crate::imaging::{Samples, Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
@@ -217,20 +215,13 @@ pub fn joint_channels(
         for Snapshot { instrument, channel, nside, data, .. } in sums {
             let channel = instrument.channels.get(usize::from(channel.0));
             let frequency_hz = channel.map_or(0.0, |channel| channel.frequency_hz);
-            let found = match data {
-                SnapshotData::Harmonic(sums) => {
-                    let powers = if with_powers {
-                        powers_of(&all_powers, &instrument, frequency_hz)?
-                    } else {
-                        Vec::new()
-                    };
-                    channels.push(JointChannel { frequency_hz, nside, sums, powers });
-                    continue;
-                }
-                SnapshotData::Pixel(_) => "sums over pixels",
-                _ => "visibilities one by one",
+            let not_harmonic = |found| SolveError::NotHarmonic { frequency_hz, found };
+            let sums = data.into_harmonic().map_err(not_harmonic)?;
+            let powers = match with_powers {
+                true => powers_of(&all_powers, &instrument, frequency_hz)?,
+                false => Vec::new(),
             };
-            return Err(SolveError::NotHarmonic { frequency_hz, found }.into());
+            channels.push(JointChannel { frequency_hz, nside, sums, powers });
         }
     }
     Ok(channels)

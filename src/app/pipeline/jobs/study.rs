@@ -10,20 +10,19 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
-use super::case::{CaseMarker, CaseSummary, MARKER};
+use super::case::{CaseSummary, MARKER, is_marked, key_of, marker_of};
 use super::noise_maps::NoiseMaps;
 use super::realisations::{RealisationSpread, SpreadProducts, spreads, spreads_csv};
 use super::study_file::{Study, StudyCase};
 use crate::calibration::solver::SolverConfig;
 use crate::downlink::{FileSource, Recorder};
-use crate::files::{FolderLock, write_atomically};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
-use crate::pipeline::graph::run::{DownlinkSinks, replay_with_truth, simulate_skies};
-use crate::pipeline::graph::{RunHandles, downlink_file, space_segment};
+use crate::pipeline::graph::run::{DownlinkSinks, lock_folder, replay_with_truth, simulate_skies};
+use crate::pipeline::graph::{RunView, downlink_file, space_segment};
 use crate::products::{
-    Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, crossings, draw_epsilons,
-    draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv,
+    Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, create_folder, crossings,
+    draw_epsilons, draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv, write_product,
 };
 use crate::runtime::Cancel;
 use crate::sky::SkyMap;
@@ -35,13 +34,13 @@ const CHECKPOINT_EVERY: u64 = 20_000_000;
 #[derive(Clone, Debug)]
 pub enum StudyStep {
     /// Simulate the downlink that the case shares with others.
-    Simulate(RunHandles),
+    Simulate(RunView),
     /// Calibrate the data.
     Calibrate(CalibrateProgress),
     /// Map the data.
-    Map(RunHandles),
+    Map(RunView),
     /// Map additional noise realisations.
-    Realise(RunHandles),
+    Realise(RunView),
 }
 
 /// Callback that receives the number of the case, from 0, and each step before it runs.
@@ -99,12 +98,8 @@ pub fn run_study(
     cancel: &Cancel,
     watch: StudyWatcher<'_>,
 ) -> Result<StudySummary, PipelineError> {
-    let failed = |path: &Path| {
-        let path = path.to_owned();
-        move |source| PipelineError::from(ProductsError::Write { path, source })
-    };
-    fs::create_dir_all(out).map_err(failed(out))?;
-    let _lock = FolderLock::acquire(out, ".lock", true).map_err(failed(out))?;
+    create_folder(out)?;
+    let _lock = lock_folder(out)?;
     let mut run = StudyRun { study, out, cancel, watch };
     let pending = |k: &usize| !is_done(&study.cases[*k], out);
     let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
@@ -116,7 +111,7 @@ pub fn run_study(
         let file = out.join(format!("downlink-{key:016x}.{}", extension(&study.cases[first].plan.config)));
         is_cancelled = !run.make_group(&group, &file, keep)?;
         if !is_cancelled && !keep {
-            fs::remove_file(&file).map_err(failed(&file))?;
+            fs::remove_file(&file).map_err(ProductsError::write(&file))?;
         }
         pending = rest;
     }
@@ -131,15 +126,12 @@ fn extension(config: &Config) -> &'static str {
 }
 
 fn is_done(case: &StudyCase, out: &Path) -> bool {
-    let marker = fs::read(out.join(case.folder()).join(MARKER)).ok();
-    let found = marker.and_then(|bytes| serde_json::from_slice::<CaseMarker>(&bytes).ok());
-    found.is_some_and(|found| found == CaseMarker::new(case))
+    is_marked(&out.join(case.folder()).join(MARKER), marker_of(case))
 }
 
 /// Hash of the settings that decide the downlink.
 fn downlink_key(config: &Config) -> u64 {
-    let text = serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default();
-    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+    key_of(serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default())
 }
 
 /// Hash of the settings that decide the sums of a downlink.
@@ -156,9 +148,7 @@ fn sums_key(case: &StudyCase) -> u64 {
     );
     // Self-calibration depends on the settings of the solution, too.
     let solution = solver.filter(|solver| solver.map_rounds > 0).map(|_| map);
-    let text = serde_json::to_vec(&(sums, solution));
-    let text = text.unwrap_or_default();
-    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &text)
+    key_of(serde_json::to_vec(&(sums, solution)).unwrap_or_default())
 }
 
 /// Cache of the input sky for one shape of maps, as consecutive cases often share it.
@@ -212,8 +202,7 @@ impl StudyRun<'_> {
                 }
             }
             if !keep && state.exists() {
-                fs::remove_dir_all(&state)
-                    .map_err(|source| ProductsError::Write { path: state.clone(), source })?;
+                fs::remove_dir_all(&state).map_err(ProductsError::write(&state))?;
             }
             left = rest;
         }
@@ -225,8 +214,7 @@ impl StudyRun<'_> {
     fn calibrate(&mut self, number: usize, file: &Path) -> Result<Option<PathBuf>, PipelineError> {
         let case = &self.study.cases[number];
         let folder = self.out.join(case.folder());
-        fs::create_dir_all(&folder)
-            .map_err(|source| ProductsError::Write { path: folder.clone(), source })?;
+        create_folder(&folder)?;
         let out = folder.join("calibration");
         let watch = &mut self.watch;
         let job = CalibrateJob {
@@ -274,9 +262,7 @@ impl StudyRun<'_> {
         if summary.cancelled || !self.map_noise_realisations(number, config, file)? {
             return Ok(false);
         }
-        let path = folder.join(MARKER);
-        let text = serde_json::to_vec_pretty(&CaseMarker::new(case)).unwrap_or_default();
-        write_atomically(&path, &text).map_err(|source| ProductsError::Write { path, source })?;
+        write_product(&folder.join(MARKER), marker_of(case))?;
         Ok(true)
     }
 
@@ -390,11 +376,9 @@ fn write_results(summary: &StudySummary, out: &Path) -> Result<(), PipelineError
         ("realisations.csv", table_if_any(&summary.spreads, spreads_csv)),
         ("epsilons.csv", table_if_any(&summary.epsilons, epsilons_csv)),
     ] {
-        if bytes.is_empty() {
-            continue;
+        if !bytes.is_empty() {
+            write_product(&out.join(name), &bytes)?;
         }
-        let path = out.join(name);
-        write_atomically(&path, &bytes).map_err(|source| ProductsError::Write { path, source })?;
     }
     let groups = figures_of_groups(&summary.cases, &summary.epsilon_groups);
     let picture = draw_runs(&summary.name, &runs, &groups).map_err(ProductsError::from)?;

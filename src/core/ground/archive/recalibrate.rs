@@ -14,7 +14,6 @@ use crate::downlink::receive::EventReader;
 use crate::downlink::{Event, PacketKind};
 use crate::frames::GroundFrame;
 use crate::ground::{DeliveredPacket, Ground, GroundConfig, GroundError, HeldPacket};
-use crate::imaging::EngineKind;
 use crate::runtime::Outlet;
 use crate::units::ChannelId;
 
@@ -85,7 +84,7 @@ impl Ground {
         }
         work.add(files, &new)?;
         let moves = gains.iter().flatten().any(AntennaGains::corrects_positions);
-        if config.map.engine == EngineKind::Harmonic {
+        if config.map.is_harmonic() {
             work.check_first_data(&firsts, moves)?;
         }
         let report = work.write(&new)?;

@@ -4,7 +4,9 @@
 mod archive;
 mod archived;
 mod assumed_instrument;
+mod cost;
 mod iterations;
+mod method;
 mod refinement;
 mod segments;
 mod solve;
@@ -15,7 +17,7 @@ mod with_power;
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
 pub use archived::RefinedSetup;
 pub use assumed_instrument::{AssumedAntenna, AssumedInstrument};
-pub(super) use iterations::IterationFile;
+pub(super) use method::{ArchiveUse, ArchivedSums, RefinedMaps};
 pub use refinement::{ChiSquares, Refinement};
 pub use segments::{ArchiveSegment, HELD_BYTES, SegmentFolder};
 pub use solve::{RefineRule, RefineSteps, solve_refined};

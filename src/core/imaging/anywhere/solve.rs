@@ -23,17 +23,12 @@ use num_complex::Complex64;
 use super::refinement::{Refinement, chi_squares};
 use super::subspace::{Column, Subspace};
 use crate::imaging::anywhere::RefinedSums;
-use crate::imaging::circle::{
-    HarmonicRequest, HarmonicSolution, Posterior, W_MAX_TOLERANCE, lifted, prior_unknowns,
-};
-use crate::imaging::circle::{OrderFactors, coefficients, unknowns_of_gradient};
-use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
+use crate::imaging::circle::{HarmonicRequest, HarmonicSolution, Posterior, largest_of_circle};
+use crate::imaging::circle::{OrderFactors, coefficients, prior_unknowns, unknowns_of_gradient};
 use crate::imaging::power::FoundPower;
 use crate::imaging::regulariser::{Diagonal, Regulariser};
-use crate::imaging::solver::{Convergence, StoppingRule, System};
-use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from};
-use crate::imaging::solver::{NamedWatch, SolveTask};
-use crate::imaging::solver::{add, dot};
+use crate::imaging::solver::{Convergence, Diagnostics, LargestEigenvalue, NamedWatch, SolveTask};
+use crate::imaging::solver::{StoppingRule, System, add, check_request, dot, right_hand_side};
 use crate::imaging::{AccumulationError, NormalSums, SolveError};
 use crate::sky::harmonics::synthesis;
 use crate::sky::healpix::pixel_area_sr;
@@ -99,10 +94,7 @@ pub fn solve_refined(
     let l_max = sums.circle.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
     let order_blocks = sums.circle.order_blocks();
-    let mut circle_data = sums.circle.right_hand_side().to_vec();
-    if let Some(prior) = &prior {
-        subtract_prediction(&sums.circle, prior, &mut circle_data);
-    }
+    let circle_data = right_hand_side(&sums.circle, prior.as_deref())?;
     let inner = request.rule;
     let mut problem = RefinedProblem { sums, regularisation: Diagonal::Uniform(0.0), inner, rule, watch };
     let right = problem.right(prior.as_deref());
@@ -112,12 +104,8 @@ pub fn solve_refined(
         let (refined, found) = problem.solve_with_power(&blocks, of, steps)?;
         (refined, Some(found), Diagnostics::of_power(l_max, &[]))
     } else {
-        let LargestEigenvalue { value: w_max, iterations, .. } = {
-            let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-            let start = lifted(&order_blocks, sums.circle.unknowns());
-            let report = &mut |wants, step, change| task.report_step(wants, step, change);
-            largest_eigenvalue_from(start, &sums.circle, W_MAX_TOLERANCE, report)
-        };
+        let LargestEigenvalue { value: w_max, iterations, .. } =
+            largest_of_circle(&sums.circle, &order_blocks, watch);
         problem.regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
         let diagnostics = Diagnostics {
             epsilon: Some(request.epsilon),

@@ -5,11 +5,8 @@
 use super::solve::HarmonicRequest;
 use super::{HarmonicSums, coefficients, unknowns};
 use crate::imaging::NormalSums;
-use crate::imaging::pixel::PointBeam;
 use crate::imaging::regulariser::Regulariser;
-use crate::imaging::solver::NamedWatch;
-use crate::imaging::solver::SolveError;
-use crate::imaging::solver::System;
+use crate::imaging::solver::{NamedWatch, PointBeam, SolveError, System};
 use crate::sky::harmonics::Transform;
 use crate::sky::healpix::pixel_count;
 

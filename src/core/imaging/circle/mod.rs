@@ -22,10 +22,12 @@
 mod beams;
 mod blocks;
 mod checkpoint;
+mod cost;
 mod coverage;
 mod exact;
 mod grid;
 mod lines;
+mod method;
 mod noise_maps;
 mod noises;
 mod operator;
@@ -48,8 +50,10 @@ use std::sync::{Arc, OnceLock};
 
 pub use beams::harmonic_beams;
 pub use blocks::{OrderBlocks, OrderFactors};
+pub(super) use cost::harmonic_cost;
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
+pub(super) use method::CircleMaps;
 pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
@@ -61,8 +65,8 @@ pub use setup::{
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k};
-pub use solve::{HarmonicRequest, HarmonicSolution, solve_harmonics, solve_regularised};
-pub(super) use solve::{W_MAX_TOLERANCE, lifted, prior_unknowns};
+pub use solve::{HarmonicRequest, HarmonicSolution, solve_regularised};
+pub(super) use solve::{largest_of_circle, prior_unknowns};
 pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
 
 use self::checkpoint::HarmonicHead;

@@ -1,15 +1,11 @@
 //! Noise-only maps of many realisations, which share everything but their right-hand sides.
 
 use super::posterior::NOISES_TOGETHER;
-use super::solve::{HarmonicRequest, W_MAX_TOLERANCE, lifted, power_of_data};
+use super::solve::{HarmonicRequest, largest_of_circle, power_of_data};
 use super::{HarmonicSums, coefficients};
 use crate::imaging::NormalSums;
-use crate::imaging::pixel::check_request;
 use crate::imaging::regulariser::Regulariser;
-use crate::imaging::solver::NamedWatch;
-use crate::imaging::solver::SolveError;
-use crate::imaging::solver::System;
-use crate::imaging::solver::largest_eigenvalue_from;
+use crate::imaging::solver::{NamedWatch, SolveError, System, check_request};
 use crate::sky::harmonics::synthesis;
 
 /// Solves for the noise-only maps, K, of the additional realisations of the sums ([`HarmonicSums::noise_realisations`]). Each equals the
@@ -32,14 +28,7 @@ pub fn solve_noises(
     let epsilon = if is_from_data { 1.0 } else { request.epsilon };
     check_request(sums, epsilon)?;
     let blocks = sums.order_blocks();
-    let w_max = {
-        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
-            task.report_step(needs_step, step, change)
-        })
-        .value
-    };
+    let w_max = largest_of_circle(sums, &blocks, watch).value;
     let l_max = sums.setup().l_max;
     let regularisation = regulariser.diagonal(epsilon, w_max, l_max)?;
     let factors = blocks.factors_with(&|l| regularisation.at(l));

@@ -3,22 +3,17 @@
 use super::posterior::Posterior;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
-use crate::imaging::pixel::{Diagnostics, check_request, subtract_prediction};
 use crate::imaging::power::{Factors, PowerProblem, Samples, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
-use crate::imaging::solver::FitInputs;
-use crate::imaging::solver::NamedWatch;
-use crate::imaging::solver::SolveError;
-use crate::imaging::solver::traces;
-use crate::imaging::solver::{Convergence, StoppingRule, System};
-use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, normalised, random_vector};
-use crate::imaging::solver::{add, dot};
+use crate::imaging::solver::{Convergence, Diagnostics, FitInputs, NamedWatch, SolveError, StoppingRule};
+use crate::imaging::solver::{LargestEigenvalue, System, largest_eigenvalue_from, normalised, random_vector};
+use crate::imaging::solver::{add, check_request, dot, right_hand_side, traces};
 use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};
 
 /// Relative change of W_max at which it has converged. It only scales R, and epsilon is never needed to a percent.
-pub(in crate::imaging) const W_MAX_TOLERANCE: f64 = 1e-3;
+const W_MAX_TOLERANCE: f64 = 1e-3;
 
 /// Number of products with the blocks before the iteration for W_max.
 const POWER_STEPS: usize = 6;
@@ -56,26 +51,12 @@ pub struct HarmonicSolution {
 
 /// Solves by conjugate gradients, preconditioned by the blocks of BtN^-1B that are diagonal in m.
 ///
-/// The equations are those of [`crate::imaging::solve_pixels`] for functions of degree up to `l_max`. R is epsilon times the
-/// largest eigenvalue times the identity over orthonormal harmonics, which equals that over pixels up to their area.
-/// `start` holds the [`HarmonicSolution::unknowns`] of an earlier solution.
+/// The equations are those of [`crate::imaging::solve_pixels`] for functions of degree up to `l_max`, with an R that may depend on the
+/// degree. The identity is over orthonormal harmonics, which equals that over pixels up to their area. `start` holds the
+/// [`HarmonicSolution::unknowns`] of an earlier solution.
 ///
 /// # Errors
-/// There is no data, or the size of the prior is not that of a map.
-pub fn solve_harmonics(
-    sums: &HarmonicSums,
-    request: HarmonicRequest,
-    prior_k: Option<&[f64]>,
-    start: Option<&[Vec<f64>; 2]>,
-    watch: NamedWatch<'_>,
-) -> Result<HarmonicSolution, SolveError> {
-    solve_regularised(sums, request, &Regulariser::default(), prior_k, start, watch)
-}
-
-/// Solves as [`solve_harmonics`], with an R that may depend on the degree.
-///
-/// # Errors
-/// As [`solve_harmonics`]; or a table of power ends before the map's degrees.
+/// There is no data, the size of the prior is not that of a map, or a table of power ends before the map's degrees.
 pub fn solve_regularised(
     sums: &HarmonicSums,
     request: HarmonicRequest,
@@ -91,18 +72,9 @@ pub fn solve_regularised(
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
     let blocks = sums.order_blocks();
-    let LargestEigenvalue { value: w_max, iterations, .. } = {
-        let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
-        let start = lifted(&blocks, sums.unknowns());
-        largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
-            task.report_step(needs_step, step, change)
-        })
-    };
+    let LargestEigenvalue { value: w_max, iterations, .. } = largest_of_circle(sums, &blocks, watch);
     let regularisation = regulariser.diagonal(request.epsilon, w_max, l_max)?;
-    let mut right = sums.right_hand_side().to_vec();
-    if let Some(prior) = &prior {
-        subtract_prediction(sums, prior, &mut right);
-    }
+    let right = right_hand_side(sums, prior.as_deref())?;
     let right_hand_sides = [right.as_slice(), sums.noise_right_hand_side()];
     let factors = blocks.factors_with(&|l| regularisation.at(l));
     // Frees memory: at high degrees blocks are as large as the factors.
@@ -119,12 +91,7 @@ pub fn solve_regularised(
         epsilon: Some(request.epsilon),
         w_max: Some(w_max * area_sr),
         w_max_iterations: iterations,
-        l_max: Some(l_max),
-        convergence: convergence.first().copied(),
-        noise_convergence: convergence.get(1).copied(),
-        traces: None,
-        traces_refused: None,
-        fit: None,
+        ..Diagnostics::of_power(l_max, &convergence)
     };
     if request.probes > 0 {
         let mut product = vec![0.0; whole.len()];
@@ -184,10 +151,7 @@ fn solve_with_power(
     let HarmonicRequest { nside, rule, samples, .. } = request;
     let l_max = sums.setup().l_max;
     let prior = prior_k.map(|map| prior_unknowns(map, l_max)).transpose()?;
-    let mut right = sums.right_hand_side().to_vec();
-    if let Some(prior) = &prior {
-        subtract_prediction(sums, prior, &mut right);
-    }
+    let right = right_hand_side(sums, prior.as_deref())?;
     let order_blocks = sums.order_blocks();
     let (blocks, degrees) = (order_blocks.blocks(), degrees(l_max).collect::<Vec<usize>>());
     let SumCounts { visibilities, power, .. } = sums.counts();
@@ -242,15 +206,22 @@ fn solve_with_power(
     })
 }
 
-/// A start vector near the eigenvectors of the largest eigenvalues: a random vector after several power iterations with the blocks of BtN^-1B,
-/// which take less time than one product.
-pub(in crate::imaging) fn lifted(blocks: &OrderBlocks, unknowns: usize) -> Vec<f64> {
-    let mut vector = random_vector(unknowns);
+/// The largest eigenvalue of the sums. The iteration starts near its eigenvector: from a random vector after several power iterations with
+/// the blocks of BtN^-1B, which take less time than one product.
+pub(in crate::imaging) fn largest_of_circle(
+    sums: &HarmonicSums,
+    blocks: &OrderBlocks,
+    watch: NamedWatch<'_>,
+) -> LargestEigenvalue {
+    let task = watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+    let mut start = random_vector(sums.unknowns());
     for _ in 0..POWER_STEPS {
-        blocks.multiply(&mut vector);
-        vector = normalised(vector);
+        blocks.multiply(&mut start);
+        start = normalised(start);
     }
-    vector
+    largest_eigenvalue_from(start, sums, W_MAX_TOLERANCE, &mut |needs_step, step, change| {
+        task.report_step(needs_step, step, change)
+    })
 }
 
 /// Solves for the map and the noise-only map, from an earlier solution of the same size if there is one.

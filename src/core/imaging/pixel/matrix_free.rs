@@ -36,12 +36,6 @@ pub struct MatrixFreeSums {
 }
 
 impl MatrixFreeVisibilities {
-    /// Number, weight and power of the visibilities.
-    #[must_use]
-    pub fn counts(&self) -> SumCounts {
-        self.archive.counts()
-    }
-
     /// Sorts the visibilities and computes the right-hand sides.
     ///
     /// # Errors

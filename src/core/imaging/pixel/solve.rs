@@ -1,89 +1,10 @@
 //! The regularised solution over pixels.
 
-use serde::Serialize;
-
 use super::cholesky::{Cholesky, NotPositive};
-use crate::imaging::solver::Convergence;
-use crate::imaging::solver::SolveError;
-use crate::imaging::solver::{Fit, FitInputs};
+use crate::imaging::solver::{Diagnostics, FitInputs, NamedWatch, PointBeam, SolveError, SolveWatch};
 use crate::imaging::solver::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
-use crate::imaging::solver::{NamedWatch, SolveWatch};
-use crate::imaging::solver::{Traces, UnsupportedEpsilon, traces};
-use crate::imaging::solver::{add, subtract};
+use crate::imaging::solver::{add, check_request, right_hand_side, subtract, traces};
 use crate::imaging::{NormalSums, PixelSums};
-
-/// Diagnostics of a solution. Eigenvalues and traces are in pixel units, for harmonic maps too.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
-pub struct Diagnostics {
-    /// epsilon of `R = epsilon W_max I`; absent if R is from the data.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub epsilon: Option<f64>,
-    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent if R is from the data.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub w_max: Option<f64>,
-    /// Number of Lanczos iterations for W_max.
-    pub w_max_iterations: usize,
-    /// Maximum degree of a harmonic map; absent for a pixel map.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub l_max: Option<usize>,
-    /// Convergence of the map; absent after a factorisation.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub convergence: Option<Convergence>,
-    /// Convergence of the noise-only map.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub noise_convergence: Option<Convergence>,
-    /// Traces of the covariances, if requested and not interrupted.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub traces: Option<Traces>,
-    /// Why requested traces could not be computed.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub traces_refused: Option<UnsupportedEpsilon>,
-    /// The fit of the map to the data, if traces were requested.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub fit: Option<Fit>,
-}
-
-impl Diagnostics {
-    /// Diagnostics of a map up to `l_max` with R from the data.
-    pub(in crate::imaging) fn of_power(l_max: usize, convergence: &[Convergence]) -> Self {
-        Self {
-            epsilon: None,
-            w_max: None,
-            w_max_iterations: 0,
-            l_max: Some(l_max),
-            convergence: convergence.first().copied(),
-            noise_convergence: convergence.get(1).copied(),
-            traces: None,
-            traces_refused: None,
-            fit: None,
-        }
-    }
-
-    /// Adds traces in pixel units; `per_area_sr` is a pixel's area for harmonic sums, 1 for pixel sums.
-    pub(in crate::imaging) fn with_traces(
-        mut self,
-        found: Result<Option<Traces>, UnsupportedEpsilon>,
-        per_area_sr: f64,
-    ) -> Self {
-        match found {
-            Ok(traces) => {
-                self.traces =
-                    traces.map(|traces| Traces { sigma_n_k2: traces.sigma_n_k2 / per_area_sr, ..traces });
-            }
-            Err(refused) => self.traces_refused = Some(refused),
-        }
-        self
-    }
-}
-
-/// The map of a sky that is 1 K in one pixel.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PointBeam {
-    /// Index of the pixel.
-    pub pixel: usize,
-    /// Map, K, HEALPix RING; for harmonic maps the sky is that pixel up to the map's maximum degree.
-    pub map_k: Vec<f64>,
-}
 
 /// A map and its noise-only companion.
 #[derive(Clone, Debug, PartialEq)]
@@ -105,24 +26,6 @@ pub struct PixelExtras<'a> {
     pub probes: usize,
     /// Pixels whose effective beams are computed.
     pub beams: &'a [usize],
-}
-
-/// Requires that there is data and a positive regularisation.
-pub(in crate::imaging) fn check_request(sums: &dyn NormalSums, epsilon: f64) -> Result<(), SolveError> {
-    if sums.counts().visibilities == 0 {
-        return Err(SolveError::NoData);
-    }
-    if epsilon.is_nan() || epsilon <= 0.0 {
-        return Err(SolveError::Epsilon(epsilon));
-    }
-    Ok(())
-}
-
-/// Computes `right -= BtN^-1B prior`.
-pub(in crate::imaging) fn subtract_prediction(sums: &dyn NormalSums, prior: &[f64], right: &mut [f64]) {
-    let mut predicted = vec![0.0; prior.len()];
-    sums.apply(prior, &mut predicted);
-    subtract(right, 1.0, &predicted);
 }
 
 /// Solves by Cholesky factorisation, in the memory of the sums.
@@ -199,18 +102,11 @@ pub fn solve_pixels_with(
 ) -> Result<PixelSolution, SolveError> {
     check_request(&sums, epsilon)?;
     let PixelExtras { probes, beams } = extras;
-    let pixels = sums.unknowns();
+    let mut map_k = right_hand_side(&sums, prior_k)?;
     let LargestEigenvalue { value: w_max, iterations, .. } =
         largest_eigenvalue(&sums, W_MAX_EXACT, &mut |_, _| watch.may_continue());
     // Before the factorisation, which overwrites the sums.
     let traces = (probes > 0).then(|| traces(&sums, epsilon, w_max, probes, watch));
-    let mut map_k = sums.right.clone();
-    if let Some(prior_k) = prior_k {
-        if prior_k.len() != pixels {
-            return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
-        }
-        subtract_prediction(&sums, prior_k, &mut map_k);
-    }
     let accuracy = sums.accuracy();
     let mut beams = beams.iter().map(|&pixel| point_response(&sums, pixel)).collect::<Result<Vec<_>, _>>()?;
     let PixelSums { mut normal, right, noise: mut noise_k, counts, .. } = sums;
@@ -240,12 +136,8 @@ pub fn solve_pixels_with(
         epsilon: Some(epsilon),
         w_max: Some(w_max),
         w_max_iterations: iterations,
-        l_max: None,
-        convergence: None,
-        noise_convergence: None,
-        traces: None,
-        traces_refused: None,
         fit,
+        ..Diagnostics::default()
     };
     let diagnostics = match traces {
         Some(found) => diagnostics.with_traces(found, 1.0),

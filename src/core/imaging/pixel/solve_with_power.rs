@@ -5,12 +5,11 @@ use std::borrow::Cow;
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, Par};
 
-use super::solve::{
-    Diagnostics, PixelSolution, PointBeam, check_request, point_response, subtract_prediction,
-};
+use super::solve::{PixelSolution, point_response};
 use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Samples, Uncertainty};
-use crate::imaging::solver::{NamedWatch, SolveError, add, dot, subtract};
+use crate::imaging::solver::{Diagnostics, NamedWatch, PointBeam, SolveError};
+use crate::imaging::solver::{add, check_request, dot, right_hand_side, subtract};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, Transform, analysis};
 use crate::sky::healpix::pixel_area_sr;
@@ -40,16 +39,9 @@ pub fn solve_pixels_with_power(
 ) -> Result<(PixelSolution, Uncertainty), SolveError> {
     check_request(sums, 1.0)?;
     let (nside, pixels) = (sums.nside, sums.unknowns());
-    let mut right = sums.right.clone();
-    let mut predicted = 0.0;
-    if let Some(prior_k) = prior_k {
-        if prior_k.len() != pixels {
-            return Err(SolveError::PriorLength { found: prior_k.len(), expected: pixels });
-        }
-        subtract_prediction(sums, prior_k, &mut right);
-        // p.(2 b - A p), with b - A p in `right`.
-        predicted = dot(prior_k, &sums.right) + dot(prior_k, &right);
-    }
+    let right = right_hand_side(sums, prior_k)?;
+    // p.(2 b - A p), with b - A p in `right`.
+    let predicted = prior_k.map_or(0.0, |prior_k| dot(prior_k, &sums.right) + dot(prior_k, &right));
     let l_max = (DEGREES_PER_NSIDE * nside as f64) as usize;
     let transform = Transform::new(nside, l_max)?;
     let to_pixels = |x: &[f64]| transform.synthesis(&coefficients(x, l_max)).map_err(SolveError::from);

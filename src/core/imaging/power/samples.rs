@@ -11,7 +11,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::blocks::Factors;
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::SolveTask;
-use crate::imaging::solver::{dot, normalised, subtract};
+use crate::imaging::solver::{dot, normalised, orthogonalise};
 use crate::units::{StreamKind, random_stream};
 
 /// Relative change per Lanczos step at which a sample has converged; far below the scatter of samples.
@@ -73,13 +73,7 @@ impl LanczosSampler {
     fn step(&mut self, mut next: Vec<f64>) {
         let Some(last) = self.basis.last() else { return };
         self.alphas.push(dot(last, &next));
-        // Full reorthogonalisation; the second round removes rounding errors of the first.
-        for _ in 0..2 {
-            for vector in &self.basis {
-                let part = dot(vector, &next);
-                subtract(&mut next, part, vector);
-            }
-        }
+        orthogonalise(&mut next, &self.basis);
         let Some(coefficients) = inverse_sqrt_first_column(&self.alphas, &self.betas) else {
             self.is_running = false;
             return;

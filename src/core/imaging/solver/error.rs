@@ -164,7 +164,4 @@ pub enum SolveError {
     /// A transform between map and harmonics failed.
     #[error(transparent)]
     Harmonics(#[from] HarmonicsError),
-    /// An eigenvalue decomposition did not converge.
-    #[error("the eigenvalues of the normal matrix did not converge; expected finite numbers in it")]
-    Eigenvalues,
 }

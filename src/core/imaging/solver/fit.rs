@@ -13,7 +13,9 @@ use super::vectors::dot;
 use crate::imaging::{Accuracy, SumCounts};
 
 /// The fit of a map to its data.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize, bincode::Encode, bincode::Decode,
+)]
 pub struct Fit {
     /// Number of real data: two per visibility.
     pub numbers: u64,

@@ -3,7 +3,7 @@
 use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::vectors::{dot, norm, subtract};
+use super::vectors::{dot, norm, orthogonalise};
 use crate::imaging::NormalSums;
 use crate::units::{StreamKind, random_stream};
 
@@ -91,13 +91,7 @@ impl Krylov {
         let mut next = vec![0.0; last.len()];
         sums.apply(last, &mut next);
         self.alphas.push(dot(last, &next));
-        // The second round removes rounding errors of the first.
-        for _ in 0..2 {
-            for vector in &self.basis {
-                let part = dot(vector, &next);
-                subtract(&mut next, part, vector);
-            }
-        }
+        orthogonalise(&mut next, &self.basis);
         let beta = norm(&next);
         let largest = self.alphas.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
         if beta.is_nan() || beta <= f64::EPSILON * largest {

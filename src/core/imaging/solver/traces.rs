@@ -30,13 +30,21 @@ const DISTANCE_MAX: f64 = 1e-3;
 const ACCURACY_FRACTION_MAX: f64 = 0.5;
 
 /// A value with its error.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, bincode::Encode, bincode::Decode)]
+#[derive(
+    Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize, bincode::Encode, bincode::Decode,
+)]
 pub struct Estimate {
     /// Value.
     pub value: f64,
     /// Error: the sum of the standard error over probes (0 if the matrix was stored, infinite for a single probe), half the
     /// distance of the bounds, and the effect of the accuracy of BtN^-1B.
+    #[serde(deserialize_with = "infinite_if_null")]
     pub error: f64,
+}
+
+/// Reads a number that JSON has as null because it is infinite.
+fn infinite_if_null<'a, D: serde::Deserializer<'a>>(from: D) -> Result<f64, D::Error> {
+    Ok(<Option<f64> as serde::Deserialize>::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
 impl std::ops::Div<f64> for Estimate {

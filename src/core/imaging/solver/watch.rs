@@ -1,7 +1,7 @@
 //! Progress reports and interruption of long solutions.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use crate::ranks::Ranks;
 use crate::runtime::Cancel;
@@ -34,6 +34,27 @@ pub struct SolvingPart {
     pub residual: f64,
     /// Target residual.
     pub target: f64,
+}
+
+/// Estimates the time left of a solution from how its residual falls.
+#[derive(Debug, Default)]
+pub struct SolutionClock {
+    /// The solution in progress: its number, when it was first seen, and its residual at that time.
+    seen: Option<(u64, Instant, f64)>,
+}
+
+impl SolutionClock {
+    /// Time left, s, if the residual keeps falling at the same rate; `None` at the beginning.
+    pub fn left_s(&mut self, solving: &Solving) -> Option<f64> {
+        let &Solving { number, residual, target, .. } = solving;
+        let (_, since, first) = match self.seen {
+            Some(seen) if seen.0 == number => seen,
+            _ => *self.seen.insert((number, Instant::now(), residual)),
+        };
+        let (done, total) = ((first / residual).ln(), (first / target).ln());
+        let elapsed_s = since.elapsed().as_secs_f64();
+        (done > 0.05 * total && elapsed_s > 1.0).then(|| elapsed_s * (total / done - 1.0).max(0.0))
+    }
 }
 
 /// The progress of a solver, which the progress display and the interrupt handler share.

@@ -5,12 +5,12 @@ use std::io::{Read, Write};
 use std::path::Path;
 use std::sync::Arc;
 
-use super::engine::{Engine, NewOrRefused, new_engine};
-use super::snapshot::{Snapshot, SnapshotData};
+use super::snapshot::Snapshot;
 use crate::frames::{Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::{ArchiveSegment, SegmentFolder};
 use crate::imaging::beyond::{BeyondNoise, read_power};
-use crate::imaging::circle::{NoiseSums, SumPart};
+use crate::imaging::circle::SumPart;
+use crate::imaging::method::{MapSums, NewOrRefused, SumShare};
 use crate::imaging::solver::SolveError;
 use crate::imaging::{AccumulationError, Added, ChannelGroup, MapConfig};
 use crate::ranks::{RankShare, Ranks};
@@ -31,13 +31,21 @@ pub struct AccumulatorState {
 /// The time span of a channel without data.
 const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
-/// The engine of one channel, and the time span of its data.
+/// The sums of one channel, and the time span of their data.
 struct ChannelState {
-    engine: Engine,
-    /// Sums of additional noise realisations (harmonic engine only).
-    realisations: Option<NoiseSums>,
+    sums: Box<dyn MapSums>,
     span_s: [f64; 2],
     snapshots: u32,
+}
+
+impl ChannelState {
+    fn new(sums: Box<dyn MapSums>) -> Self {
+        Self { sums, span_s: NO_SPAN_S, snapshots: 0 }
+    }
+
+    fn has_data(&self) -> bool {
+        self.sums.counts().visibilities > 0
+    }
 }
 
 /// Accumulates calibrated visibilities, and emits snapshots at equal steps of mission time and a final one.
@@ -52,12 +60,7 @@ pub struct Accumulator {
     memory_max_bytes: Option<u64>,
     /// The channels to accumulate; `None` for all.
     group: Option<ChannelGroup>,
-    /// The ranks that share the sums.
-    ranks: Ranks,
-    /// The part of the harmonic sums that this reading of the data accumulates, if memory cannot hold all of them.
-    part: Option<SumPart>,
-    /// Seeds of the additional noise realisations.
-    realisation_seeds: Vec<u64>,
+    share: SumShare,
     /// The sky beyond the degrees of the maps, by channel, where it counts as noise.
     beyond: BTreeMap<ChannelId, BeyondNoise>,
 }
@@ -76,9 +79,7 @@ impl Accumulator {
             cancel: Cancel::new(),
             memory_max_bytes: None,
             group: None,
-            ranks: Ranks::single(),
-            part: None,
-            realisation_seeds: Vec::new(),
+            share: SumShare { ranks: Ranks::single(), part: None, realisation_seeds: Vec::new() },
             beyond: BTreeMap::new(),
         }
     }
@@ -86,20 +87,20 @@ impl Accumulator {
     /// Makes it one of several ranks: it receives all visibilities and holds its share of the harmonic sums.
     #[must_use]
     pub fn with_ranks(self, ranks: &Ranks) -> Self {
-        Self { ranks: ranks.clone(), ..self }
+        Self { share: SumShare { ranks: ranks.clone(), ..self.share }, ..self }
     }
 
     /// Accumulates only this part of the harmonic sums; `None` for all of them. The complete sums are emitted after the last part, and no
     /// snapshots before.
     #[must_use]
     pub fn with_part(self, part: Option<SumPart>) -> Self {
-        Self { part, ..self }
+        Self { share: SumShare { part, ..self.share }, ..self }
     }
 
     /// Also accumulates additional noise realisations, one per seed, for the final harmonic sums.
     #[must_use]
     pub fn with_noise_realisations(self, seeds: &[u64]) -> Self {
-        Self { realisation_seeds: seeds.to_vec(), ..self }
+        Self { share: SumShare { realisation_seeds: seeds.to_vec(), ..self.share }, ..self }
     }
 
     /// A copy with the same settings and ledger but without data; additional noise realisations are not copied.
@@ -107,9 +108,9 @@ impl Accumulator {
     pub fn without_data(&self) -> Self {
         let (config, ledger) = (self.config.clone(), self.ledger.clone());
         Self::new(config, ledger)
-            .with_ranks(&self.ranks)
+            .with_ranks(&self.share.ranks)
             .with_group(self.group.clone())
-            .with_part(self.part.clone())
+            .with_part(self.share.part.clone())
             .with_memory_limit(self.memory_max_bytes)
             .cancelled_by(&self.cancel)
     }
@@ -117,7 +118,7 @@ impl Accumulator {
     /// The ranks that share the sums.
     #[must_use]
     pub fn ranks(&self) -> &Ranks {
-        &self.ranks
+        &self.share.ranks
     }
 
     /// Restricts it to the channels of a group; `None` for all channels.
@@ -157,25 +158,20 @@ impl Accumulator {
         segments: SegmentFolder<'_>,
     ) -> Result<(), AccumulationError> {
         for state in self.channels.iter_mut().flatten() {
-            state.engine.checkpoint(out, segments)?;
+            state.sums.save(out, segments)?;
         }
         Ok(())
     }
 
     /// The archive files that belong to the checkpoint.
     pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
-        self.channels.iter().flatten().flat_map(|state| match &state.engine {
-            Engine::Archive(archive) => archive.segments(),
-            Engine::Pixel(_) | Engine::Harmonic(_) => &[],
-        })
+        self.channels.iter().flatten().flat_map(|state| state.sums.segments())
     }
 
     /// Forgets the archive files, so that the next checkpoint can go into another folder.
     pub fn forget_segments(&mut self) {
         for state in self.channels.iter_mut().flatten() {
-            if let Engine::Archive(archive) = &mut state.engine {
-                archive.forget_segments();
-            }
+            state.sums.forget_segments();
         }
     }
 
@@ -207,12 +203,10 @@ impl Accumulator {
     ) -> Result<Self, AccumulationError> {
         let mut channels = Vec::new();
         for has_engine in state.channels {
-            if !has_engine {
-                channels.push(None);
-                continue;
-            }
-            let engine = Engine::restore(&self.config, from, folder, (part, &self.ranks))?;
-            channels.push(Some(ChannelState { engine, realisations: None, span_s: NO_SPAN_S, snapshots: 0 }));
+            channels.push(match has_engine {
+                true => Some(ChannelState::new(self.config.load_sums(from, folder, (part, &self.share))?)),
+                false => None,
+            });
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
@@ -229,10 +223,7 @@ impl Accumulator {
         for (slot, theirs) in self.channels.iter_mut().zip(other.channels) {
             match (slot, theirs) {
                 (None, None) => {}
-                (
-                    Some(ChannelState { engine: Engine::Harmonic(ours), .. }),
-                    Some(ChannelState { engine: Engine::Harmonic(theirs), .. }),
-                ) => ours.join(*theirs)?,
+                (Some(ours), Some(theirs)) => ours.sums.join(theirs.sums)?,
                 _ => return Err(AccumulationError::Undivided),
             }
         }
@@ -255,7 +246,7 @@ impl Accumulator {
                 (_, None) => {}
                 (None, theirs) => *slot = theirs,
                 (Some(ours), Some(theirs)) => {
-                    ours.engine.merge(theirs.engine)?;
+                    ours.sums.merge(theirs.sums)?;
                     let ([first, last], [from, to]) = (ours.span_s, theirs.span_s);
                     ours.span_s = [first.min(from), last.max(to)];
                 }
@@ -283,10 +274,7 @@ impl Accumulator {
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        if let (Engine::Harmonic(engine), Some(realisations)) = (&state.engine, &mut state.realisations) {
-            realisations.remove(engine, &short);
-        }
-        let removed = state.engine.remove(&short)?;
+        let removed = state.sums.remove(&short)?;
         self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
         Ok(removed)
     }
@@ -354,20 +342,8 @@ impl Accumulator {
         let slot = self.channels.get_mut(index).ok_or_else(unknown)?;
         let state = match slot {
             Some(state) => state,
-            empty => match new_engine(&self.config, instrument, placed)? {
-                Ok(engine) => {
-                    let engine = match &self.part {
-                        Some(part) => engine.with_ranks(&part.ranks()),
-                        None => engine.with_ranks(&self.ranks),
-                    };
-                    let realisations = match &engine {
-                        Engine::Harmonic(engine) if !self.realisation_seeds.is_empty() => {
-                            Some(NoiseSums::new(engine, &self.realisation_seeds))
-                        }
-                        _ => None,
-                    };
-                    empty.insert(ChannelState { engine, realisations, span_s: NO_SPAN_S, snapshots: 0 })
-                }
+            empty => match self.config.new_sums(instrument, placed, &self.share)? {
+                Ok(sums) => empty.insert(ChannelState::new(sums)),
                 Err(reason) => return Ok(Err(reason)),
             },
         };
@@ -414,10 +390,7 @@ impl Accumulator {
                 return Ok(None);
             }
         };
-        let Added { visibilities, refused } = state.engine.add(&short)?;
-        if let (Engine::Harmonic(engine), Some(realisations)) = (&state.engine, &mut state.realisations) {
-            realisations.add(engine, &short);
-        }
+        let Added { visibilities, refused } = state.sums.add(&short)?;
         let offered_s = short.time_s.first().zip(short.time_s.last()).map(|(&first, &last)| [first, last]);
         if let Some([first, last]) = offered_s {
             state.span_s = [state.span_s[0].min(first), state.span_s[1].max(last)];
@@ -445,7 +418,7 @@ impl Accumulator {
             if self.cancel.is_cancelled() {
                 return Ok(());
             }
-            let Some(state) = slot.as_mut().filter(|state| !state.engine.is_empty()) else { continue };
+            let Some(state) = slot.as_mut().filter(|state| state.has_data()) else { continue };
             state.snapshots += 1;
             let snapshot = Snapshot {
                 instrument: Arc::clone(instrument),
@@ -454,7 +427,7 @@ impl Accumulator {
                 is_final: false,
                 span_s: state.span_s,
                 nside: self.config.nside,
-                data: state.engine.snapshot_data(&self.config)?,
+                data: state.sums.snapshot()?,
             };
             out.push_unless(snapshot, &self.cancel);
         }
@@ -464,7 +437,7 @@ impl Accumulator {
     /// Emits snapshots when the first data of the next step of mission time arrive.
     fn emit_if_due(&mut self, time_s: f64, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         let every_s = self.config.snapshot_every_s;
-        if every_s <= 0.0 || self.part.is_some() {
+        if every_s <= 0.0 || self.share.part.is_some() {
             return Ok(());
         }
         let next_s = ((time_s / every_s).floor() + 1.0) * every_s;
@@ -503,20 +476,14 @@ impl Stage for Accumulator {
             if out.is_closed() {
                 return Ok(());
             }
-            let Some(ChannelState { engine, realisations, span_s, snapshots }) =
-                slot.filter(|state| !state.engine.is_empty())
+            // After cancellation the remaining parts would not see the same visibilities, so nothing is emitted.
+            let is_cut = self.share.part.is_some() && self.cancel.is_cancelled();
+            let Some(ChannelState { sums, span_s, snapshots }) =
+                slot.filter(|state| state.has_data() && !is_cut)
             else {
                 continue;
             };
-            let data = match (&self.part, engine) {
-                // After cancellation the remaining parts would not see the same visibilities, so nothing is emitted.
-                (Some(_), _) if self.cancel.is_cancelled() => continue,
-                (Some(part), Engine::Harmonic(engine)) => match engine.finish_part(part)? {
-                    Some(sums) => SnapshotData::Harmonic(Box::new(sums)),
-                    None => continue,
-                },
-                (_, engine) => engine.into_final_data(&self.config).with_noise_realisations(realisations),
-            };
+            let Some(data) = sums.finish()? else { continue };
             out.push(Snapshot {
                 instrument: Arc::clone(&instrument),
                 channel: ChannelId(index as u16),

@@ -1,10 +1,9 @@
 //! The two pipeline stages that make maps: one accumulates the sums of each channel, the other solves them.
 
 mod accumulate;
-mod engine;
 mod snapshot;
 mod solve;
 
 pub use accumulate::{Accumulator, AccumulatorState};
-pub use snapshot::{Snapshot, SnapshotData};
-pub use solve::{Solution, Solver, SolverSetup};
+pub use snapshot::Snapshot;
+pub use solve::{Solution, Solver};

@@ -3,6 +3,7 @@
 use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::error::PictureError;
 use super::labels::Ticks;
+use super::page::Page;
 use super::png_file::Picture;
 use super::text::{Align, Style};
 use super::{labels, text};
@@ -66,30 +67,8 @@ pub(super) const FONT: f64 = 19.0;
 /// # Errors
 /// [`PictureError::Size`] without plots, or with too many for a page.
 pub fn draw_plots(title: &str, plots: &[Plot], columns: usize) -> Result<Picture, PictureError> {
-    if plots.is_empty() || plots.len() > 64 {
-        let value = plots.len();
-        return Err(PictureError::Size { what: "number of plots", value, expected: "1 to 64" });
-    }
-    let columns = columns.clamp(1, plots.len());
-    let head = if title.is_empty() { 0 } else { 62 };
-    let (width, height) = (PLOT_PX.0 * columns, head + PLOT_PX.1 * plots.len().div_ceil(columns));
-    Picture::check_size(width, height)?;
-    let mut canvas = Canvas::new(width, height);
-    if !title.is_empty() {
-        let style = Style::new(1.45 * FONT, INK).medium();
-        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
-    }
-    for (number, plot) in plots.iter().enumerate() {
-        let area = Rect {
-            x: (number % columns * PLOT_PX.0) as f64,
-            y: (head + number / columns * PLOT_PX.1) as f64,
-            width: PLOT_PX.0 as f64,
-            height: PLOT_PX.1 as f64,
-        };
-        draw_plot(&mut canvas, area, plot);
-    }
-    let title = if title.is_empty() { plots[0].title.as_str() } else { title };
-    Ok(Picture::from_canvas(canvas, width, height, title))
+    let page = Page { what: "number of plots", title, title_size: 1.45 * FONT, columns, panel_px: PLOT_PX };
+    page.draw(plots, |plot| &plot.title, draw_plot)
 }
 
 #[derive(Clone, Copy, Debug)]

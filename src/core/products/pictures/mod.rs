@@ -9,6 +9,7 @@ mod curves;
 mod error;
 mod labels;
 mod mollweide;
+mod page;
 mod patch;
 mod png_file;
 mod projection;

@@ -2,6 +2,7 @@
 
 use super::canvas::{Canvas, FAINT, INK, Rect, Stroke, WHITE};
 use super::error::PictureError;
+use super::page::Page;
 use super::png_file::Picture;
 use super::scale::ColourScale;
 use super::sheet::draw_bar;
@@ -61,39 +62,18 @@ const STEPS_DEG: [f64; 9] = [0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0, 60.0];
 /// # Errors
 /// [`PictureError::Size`] without cutouts, with too many for a page, or with a wrong number of values.
 pub fn draw_patches(title: &str, patches: &[Patch<'_>], columns: usize) -> Result<Picture, PictureError> {
-    if patches.is_empty() || patches.len() > 64 {
-        let value = patches.len();
-        return Err(PictureError::Size { what: "number of cutouts", value, expected: "1 to 64" });
-    }
     if let Some(bad) =
         patches.iter().find(|p| p.values.is_empty() || p.values.len() != p.cutout.pixels.pow(2))
     {
         let value = bad.values.len();
         return Err(PictureError::Size { what: "number of values", value, expected: "pixels squared" });
     }
-    let columns = columns.clamp(1, patches.len());
-    let head = if title.is_empty() { 0 } else { 62 };
-    let (width, height) = (PANEL_PX.0 * columns, head + PANEL_PX.1 * patches.len().div_ceil(columns));
-    Picture::check_size(width, height)?;
-    let mut canvas = Canvas::new(width, height);
-    if !title.is_empty() {
-        let style = Style::new(1.3 * FONT, INK).medium();
-        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
-    }
-    for (number, patch) in patches.iter().enumerate() {
-        let frame = Rect {
-            x: (number % columns * PANEL_PX.0) as f64 + 90.0,
-            y: (head + number / columns * PANEL_PX.1) as f64 + 50.0,
-            width: SIDE_PX,
-            height: SIDE_PX,
-        };
-        draw_patch(&mut canvas, frame, patch);
-    }
-    let title = if title.is_empty() { patches[0].caption.as_str() } else { title };
-    Ok(Picture::from_canvas(canvas, width, height, title))
+    let page = Page { what: "number of cutouts", title, title_size: 1.3 * FONT, columns, panel_px: PANEL_PX };
+    page.draw(patches, |patch| &patch.caption, draw_patch)
 }
 
-fn draw_patch(canvas: &mut Canvas, frame: Rect, patch: &Patch<'_>) {
+fn draw_patch(canvas: &mut Canvas, area: Rect, patch: &Patch<'_>) {
+    let frame = Rect { x: area.x + 90.0, y: area.y + 50.0, width: SIDE_PX, height: SIDE_PX };
     let pixels = patch.cutout.pixels;
     let cell = |place: f64| ((place / SIDE_PX * pixels as f64) as usize).min(pixels - 1);
     for y in 0..SIDE_PX as usize {

@@ -3,11 +3,12 @@
 use super::canvas::{Canvas, INK, Rect, Stroke};
 use super::curves::{Axis, FONT, Plot, Range, write_axes};
 use super::error::PictureError;
+use super::page::Page;
 use super::png_file::Picture;
 use super::scale::ColourScale;
 use super::sheet::draw_bar;
 use super::text;
-use super::text::{Align, Style};
+use super::text::Style;
 
 /// Values in equal cells over two axes.
 #[derive(Clone, Debug)]
@@ -36,10 +37,6 @@ const RASTER_PX: (usize, usize) = (700, 760);
 /// # Errors
 /// [`PictureError::Size`] without rasters, with too many for a page, or with an incomplete row.
 pub fn draw_rasters(title: &str, rasters: &[Raster<'_>], columns: usize) -> Result<Picture, PictureError> {
-    if rasters.is_empty() || rasters.len() > 64 {
-        let value = rasters.len();
-        return Err(PictureError::Size { what: "number of rasters", value, expected: "1 to 64" });
-    }
     for raster in rasters {
         let value = raster.values.len();
         if raster.columns == 0 || value == 0 || !value.is_multiple_of(raster.columns) {
@@ -47,26 +44,9 @@ pub fn draw_rasters(title: &str, rasters: &[Raster<'_>], columns: usize) -> Resu
             return Err(PictureError::Size { what: "number of values of a raster", value, expected });
         }
     }
-    let columns = columns.clamp(1, rasters.len());
-    let head = if title.is_empty() { 0 } else { 62 };
-    let (width, height) = (RASTER_PX.0 * columns, head + RASTER_PX.1 * rasters.len().div_ceil(columns));
-    Picture::check_size(width, height)?;
-    let mut canvas = Canvas::new(width, height);
-    if !title.is_empty() {
-        let style = Style::new(1.3 * FONT, INK).medium();
-        canvas.text(title, (0.5 * width as f64, 38.0), Align::Middle, style);
-    }
-    for (number, raster) in rasters.iter().enumerate() {
-        let area = Rect {
-            x: (number % columns * RASTER_PX.0) as f64,
-            y: (head + number / columns * RASTER_PX.1) as f64,
-            width: RASTER_PX.0 as f64,
-            height: RASTER_PX.1 as f64,
-        };
-        draw_raster(&mut canvas, area, raster);
-    }
-    let title = if title.is_empty() { rasters[0].title.as_str() } else { title };
-    Ok(Picture::from_canvas(canvas, width, height, title))
+    let page =
+        Page { what: "number of rasters", title, title_size: 1.3 * FONT, columns, panel_px: RASTER_PX };
+    page.draw(rasters, |raster| &raster.title, draw_raster)
 }
 
 fn draw_raster(canvas: &mut Canvas, area: Rect, raster: &Raster<'_>) {

@@ -103,75 +103,75 @@ impl GeneralRows {
     /// and `Im T_lm`, as real and imaginary part.
     #[must_use]
     pub fn adjoint(&self, plan: &RowPlan, values: &[&[Complex64]]) -> Vec<Alm> {
-        let (tables, pool) = (Tables::new(&self.setup, plan), WorkspacePool::default());
+        let tables = Tables::new(&self.setup, plan);
         let skies = values.len() * self.products.count();
+        let out = self.sum_over_groups(plan, skies, |tracks, workspace, gradients| {
+            let rows = row_range(tracks);
+            let values: Vec<&[Complex64]> = values.iter().map(|values| &values[rows.clone()]).collect();
+            self.interpolate_transposed(plan, tracks, &values, workspace);
+            let frames = self.frames(plan, tracks);
+            self.clear_gradients(frames.as_ref(), skies, workspace);
+            for indices in Self::batches(plan, tracks) {
+                self.compute_patterns(plan, tracks, &tables, indices, 0, workspace);
+                self.compute_gradients(0, frames.as_ref(), workspace, gradients);
+            }
+            self.rotate_gradients_back(frames.as_ref(), workspace, gradients);
+        });
+        self.products.gradients_of_skies(out)
+    }
+
+    /// Sums gradients with respect to `skies` skies over the groups of a plan; `add` adds those of the tracks of a group. Sums are
+    /// added in the order of the groups, so that results do not depend on threads.
+    fn sum_over_groups(
+        &self,
+        plan: &RowPlan,
+        skies: usize,
+        add: impl Fn(&[Track], &mut Workspace, &mut [Alm]) + Sync,
+    ) -> Vec<Alm> {
+        let pool = WorkspacePool::default();
         let mut out = vec![Alm::zeros(self.setup.l_max); skies];
-        // Sums are added in the order of the groups, so that results do not depend on threads.
         for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
             let parts = groups.par_iter().map(|group| {
                 pool.with_workspace(|workspace| {
-                    let tracks = &plan.tracks[group.clone()];
-                    let rows = row_range(tracks);
-                    let values: Vec<&[Complex64]> =
-                        values.iter().map(|values| &values[rows.clone()]).collect();
-                    self.interpolate_transposed(plan, tracks, &values, workspace);
                     let mut gradients = vec![Alm::zeros(self.setup.l_max); skies];
-                    let frames = self.frames(plan, tracks);
-                    self.clear_gradients(frames.as_ref(), skies, workspace);
-                    for indices in Self::batches(plan, tracks) {
-                        self.compute_patterns(plan, tracks, &tables, indices, 0, workspace);
-                        self.compute_gradients(0, frames.as_ref(), workspace, &mut gradients);
-                    }
-                    self.rotate_gradients_back(frames.as_ref(), workspace, &mut gradients);
+                    add(&plan.tracks[group.clone()], workspace, &mut gradients);
                     gradients
                 })
             });
             let parts: Vec<_> = parts.collect();
             parts.iter().for_each(|part| add_gradients(&mut out, part));
         }
-        self.products.gradients_of_skies(out)
+        out
     }
 
     /// Computes `Bt W B x` for several x, with W the rows' weights; each row is computed once for both products.
     #[must_use]
     pub fn normal(&self, plan: &RowPlan, skies: &[Alm], weight: &[f64]) -> Vec<Alm> {
-        let (tables, pool) = (Tables::new(&self.setup, plan), WorkspacePool::default());
+        let tables = Tables::new(&self.setup, plan);
         let (count, skies) = (skies.len(), self.products.multiply(skies));
         let skies = skies.as_slice();
-        let mut out = vec![Alm::zeros(self.setup.l_max); skies.len()];
-        for groups in plan.groups.chunks(GROUPS_AT_ONCE) {
-            let parts = groups.par_iter().map(|group| {
-                pool.with_workspace(|workspace| {
-                    let tracks = &plan.tracks[group.clone()];
-                    self.clear_amplitudes(tracks, skies.len(), &mut workspace.amplitudes);
-                    let frames = self.frames(plan, tracks);
-                    self.rotate_skies(frames.as_ref(), skies, workspace);
-                    let batches = Self::batches(plan, tracks);
-                    let batch_count = batches.len();
-                    for (number, indices) in batches.into_iter().enumerate() {
-                        self.compute_patterns(plan, tracks, &tables, indices, number, workspace);
-                        self.compute_amplitudes(number, skies, frames.as_ref(), workspace);
-                    }
-                    let visibilities = self.interpolate(plan, tracks, count, workspace);
-                    let weight = &weight[row_range(tracks)];
-                    let weighted = |visibilities: &Vec<Complex64>| -> Vec<Complex64> {
-                        visibilities.iter().zip(weight).map(|(v, w)| v * *w).collect()
-                    };
-                    let weighted: Vec<Vec<Complex64>> = visibilities.iter().map(weighted).collect();
-                    let weighted: Vec<&[Complex64]> = weighted.iter().map(Vec::as_slice).collect();
-                    self.interpolate_transposed(plan, tracks, &weighted, workspace);
-                    let mut gradients = vec![Alm::zeros(self.setup.l_max); skies.len()];
-                    self.clear_gradients(frames.as_ref(), skies.len(), workspace);
-                    for number in 0..batch_count {
-                        self.compute_gradients(number, frames.as_ref(), workspace, &mut gradients);
-                    }
-                    self.rotate_gradients_back(frames.as_ref(), workspace, &mut gradients);
-                    gradients
-                })
-            });
-            let parts: Vec<_> = parts.collect();
-            parts.iter().for_each(|gradients| add_gradients(&mut out, gradients));
-        }
+        let out = self.sum_over_groups(plan, skies.len(), |tracks, workspace, gradients| {
+            self.clear_amplitudes(tracks, skies.len(), &mut workspace.amplitudes);
+            let frames = self.frames(plan, tracks);
+            self.rotate_skies(frames.as_ref(), skies, workspace);
+            let batches = Self::batches(plan, tracks);
+            let batch_count = batches.len();
+            for (number, indices) in batches.into_iter().enumerate() {
+                self.compute_patterns(plan, tracks, &tables, indices, number, workspace);
+                self.compute_amplitudes(number, skies, frames.as_ref(), workspace);
+            }
+            let mut visibilities = self.interpolate(plan, tracks, count, workspace);
+            for visibilities in &mut visibilities {
+                visibilities.iter_mut().zip(&weight[row_range(tracks)]).for_each(|(v, w)| *v *= *w);
+            }
+            let weighted: Vec<&[Complex64]> = visibilities.iter().map(Vec::as_slice).collect();
+            self.interpolate_transposed(plan, tracks, &weighted, workspace);
+            self.clear_gradients(frames.as_ref(), skies.len(), workspace);
+            for number in 0..batch_count {
+                self.compute_gradients(number, frames.as_ref(), workspace, gradients);
+            }
+            self.rotate_gradients_back(frames.as_ref(), workspace, gradients);
+        });
         self.products.gradients_of_skies(out)
     }
 

@@ -69,6 +69,22 @@ impl QuarterTurns {
     /// Rotates vectors of degree l, given by real and imaginary parts, by a quarter turn. Only orders of the parities in `parities`
     /// are written.
     pub(super) fn rotate(&self, l: usize, parities: &[usize], from: [&[Value]; 2], to: [&mut [Value]; 2]) {
+        self.for_each_table(l, parities, from, to, |table, from, mut to, [k, m]| {
+            let (rows, inner) = (parity_count(l, k), parity_count(l, m));
+            let from = from.subrows(first_of_parity(l, m), inner);
+            multiply(to.as_mut().subrows_mut(first_of_parity(l, k), rows), table, from, Accum::Replace);
+        });
+    }
+
+    /// Calls `apply` for real and imaginary parts with the table of orders of parity m to those of each parity k, and [k, m].
+    fn for_each_table(
+        &self,
+        l: usize,
+        parities: &[usize],
+        from: [&[Value]; 2],
+        to: [&mut [Value]; 2],
+        apply: impl Fn(MatRef<'_, Value>, MatRef<'_, Value>, MatMut<'_, Value>, [usize; 2]),
+    ) {
         let columns = from[0].len() / (l + 1);
         for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
             let from = MatRef::from_row_major_slice(from, l + 1, columns);
@@ -76,16 +92,10 @@ impl QuarterTurns {
             for &k in parities {
                 let m = (l + k + part) % 2;
                 let (rows, inner) = (parity_count(l, k), parity_count(l, m));
-                if rows == 0 || inner == 0 {
-                    continue;
+                if rows > 0 && inner > 0 {
+                    let table = MatRef::from_column_major_slice(&self.degrees[l][k][m], rows, inner);
+                    apply(table, from, to.as_mut(), [k, m]);
                 }
-                let table = MatRef::from_column_major_slice(&self.degrees[l][k][m], rows, inner);
-                multiply(
-                    to.as_mut().subrows_mut(first_of_parity(l, k), rows),
-                    table,
-                    from.subrows(first_of_parity(l, m), inner),
-                    Accum::Replace,
-                );
             }
         }
     }
@@ -128,26 +138,15 @@ impl QuarterTurns {
         from: [&[Value]; 2],
         to: [&mut [Value]; 2],
     ) {
-        let columns = from[0].len() / (l + 1);
-        for (part, (from, to)) in from.into_iter().zip(to).enumerate() {
-            to.fill(0.0);
-            let from = MatRef::from_row_major_slice(from, l + 1, columns);
-            let mut to = MatMut::from_row_major_slice_mut(to, l + 1, columns);
-            for &k in parities {
-                let m = (l + k + part) % 2;
-                let (rows, inner) = (parity_count(l, k), parity_count(l, m));
-                if rows == 0 || inner == 0 {
-                    continue;
-                }
-                let table = MatRef::from_column_major_slice(&self.degrees[l][k][m], rows, inner);
-                multiply(
-                    to.as_mut().subrows_mut(first_of_parity(l, m), inner),
-                    table.transpose(),
-                    from.subrows(first_of_parity(l, k), rows),
-                    Accum::Add,
-                );
-            }
-        }
+        let [re, im] = to;
+        re.fill(0.0);
+        im.fill(0.0);
+        self.for_each_table(l, parities, from, [re, im], |table, from, mut to, [k, m]| {
+            let (rows, inner) = (parity_count(l, k), parity_count(l, m));
+            let from = from.subrows(first_of_parity(l, k), rows);
+            let to = to.as_mut().subrows_mut(first_of_parity(l, m), inner);
+            multiply(to, table.transpose(), from, Accum::Add);
+        });
     }
 }
 

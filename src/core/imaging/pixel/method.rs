@@ -1,0 +1,195 @@
+//! Pixel maps as map methods: with a stored matrix, or from visibilities whose rows are computed again.
+
+use std::io::{Read, Write};
+use std::path::Path;
+
+use super::cost;
+use super::matrix_free::MatrixFreeVisibilities;
+use super::solve::{PixelExtras, PixelSolution, solve_pixels_with};
+use super::solve_matrix_free::solve_matrix_free;
+use super::solve_with_power::solve_pixels_with_power;
+use super::{PixelEngine, PixelSetup, PixelSums};
+use crate::frames::PlacedVisibilities;
+use crate::imaging::anywhere::{ArchiveUse, ArchivedSums, SegmentFolder, VisibilityArchive};
+use crate::imaging::circle::HarmonicSums;
+use crate::imaging::cost::{ChannelData, EngineCost};
+use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
+use crate::imaging::request::{MapRequest, SolvedMap};
+use crate::imaging::{AccumulationError, Added, MapConfig, NormalEngine, Regulariser};
+use crate::imaging::{SolveError, SumCounts, Uncertainty};
+use crate::ranks::{RankShare, Ranks};
+use crate::response::pixel::PixelMethod;
+
+/// Maps over pixels with a stored matrix.
+pub(in crate::imaging) struct PixelMaps;
+
+impl MapMethod for PixelMaps {
+    fn create(&self, channel: &NewChannel<'_>) -> Result<NewOrRefused<Box<dyn MapSums>>, AccumulationError> {
+        let NewChannel { config, instrument, frequency_hz, weight_max, .. } = *channel;
+        let engine = PixelEngine::new(PixelSetup {
+            nside: config.nside,
+            frequency_hz,
+            method: config.rows,
+            moon_radius_m: instrument.moon_radius_m,
+            response: instrument.response,
+            companion_seed: config.companion_seed,
+            weight_max,
+        })?;
+        Ok(Ok(Box::new(engine)))
+    }
+
+    fn load(
+        &self,
+        _config: &MapConfig,
+        from: &mut dyn Read,
+        _folder: Option<&Path>,
+        _shares: (RankShare, &Ranks),
+    ) -> Result<Box<dyn MapSums>, AccumulationError> {
+        Ok(Box::new(PixelEngine::restore(from)?))
+    }
+
+    fn cost(&self, map: &MapConfig, data: ChannelData) -> EngineCost {
+        cost::stored(map, data.solutions)
+    }
+}
+
+impl MapSums for PixelEngine {
+    fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        NormalEngine::add(self, placed)
+    }
+
+    fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        NormalEngine::remove(self, placed)
+    }
+
+    fn merge(&mut self, other: Box<dyn MapSums>) -> Result<(), AccumulationError> {
+        NormalEngine::merge(self, *same_method(other)?)
+    }
+
+    fn save(&mut self, out: &mut dyn Write, _segments: SegmentFolder<'_>) -> Result<(), AccumulationError> {
+        self.checkpoint(out)
+    }
+
+    fn counts(&self) -> SumCounts {
+        NormalEngine::counts(self)
+    }
+
+    fn snapshot(&mut self) -> Result<Box<dyn MapEquations>, AccumulationError> {
+        Ok(Box::new(self.sums()))
+    }
+
+    fn finish(self: Box<Self>) -> Result<Option<Box<dyn MapEquations>>, AccumulationError> {
+        Ok(Some(Box::new(self.into_sums())))
+    }
+}
+
+impl MapEquations for PixelSums {
+    fn counts(&self) -> SumCounts {
+        self.counts
+    }
+
+    fn solve(self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
+        let (prior, beams, watch) = (request.prior.as_deref(), &request.beam_pixels()[..], request.watch);
+        let solved = match request.regulariser {
+            Regulariser::Data => solve_pixels_with_power(&self, prior, request.samples(), beams, watch)
+                .map(|(solved, errors)| solved.into_map(Some(errors))),
+            _ => {
+                let extras = PixelExtras { probes: request.probes(), beams };
+                solve_pixels_with(*self, request.epsilon, prior, extras, watch).map(|map| map.into_map(None))
+            }
+        };
+        match solved {
+            Err(SolveError::Interrupted) => Ok(None),
+            // The first data, or forged data, may not determine a map. A later snapshot has more data, so only a final failure is an error.
+            Err(SolveError::NotPositive { .. } | SolveError::NoPower) if !request.is_final => Ok(None),
+            solved => solved.map(Some),
+        }
+    }
+
+    fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {
+        Err("sums over pixels")
+    }
+}
+
+impl PixelSolution {
+    fn into_map(self, uncertainty: Option<Uncertainty>) -> SolvedMap {
+        let Self { map_k, noise_k, diagnostics, beams } = self;
+        SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }
+    }
+}
+
+/// Maps over pixels from visibilities whose rows of B are computed again for each product.
+pub(in crate::imaging) struct MatrixFreeMaps;
+
+/// What rows of pixels an archive of visibilities is solved with.
+#[derive(Clone, Copy)]
+struct PixelRows {
+    nside: usize,
+    method: PixelMethod,
+}
+
+impl PixelRows {
+    fn of(config: &MapConfig) -> Self {
+        Self { nside: config.nside, method: config.rows }
+    }
+}
+
+impl ArchiveUse for PixelRows {
+    fn snapshot(&self, archive: &mut VisibilityArchive) -> Result<Box<dyn MapEquations>, AccumulationError> {
+        Ok(self.finish(archive.copy()))
+    }
+
+    fn finish(self, archive: VisibilityArchive) -> Box<dyn MapEquations> {
+        Box::new(MatrixFreeVisibilities { nside: self.nside, method: self.method, archive })
+    }
+}
+
+impl MapMethod for MatrixFreeMaps {
+    fn create(&self, channel: &NewChannel<'_>) -> Result<NewOrRefused<Box<dyn MapSums>>, AccumulationError> {
+        // A pixel map has no l_max.
+        Ok(Ok(Box::new(ArchivedSums::new(channel, 0, PixelRows::of(channel.config))?)))
+    }
+
+    fn load(
+        &self,
+        config: &MapConfig,
+        from: &mut dyn Read,
+        folder: Option<&Path>,
+        _shares: (RankShare, &Ranks),
+    ) -> Result<Box<dyn MapSums>, AccumulationError> {
+        Ok(Box::new(ArchivedSums::load(config, from, folder, PixelRows::of(config))?))
+    }
+
+    fn cost(&self, map: &MapConfig, data: ChannelData) -> EngineCost {
+        cost::matrix_free(map, data)
+    }
+}
+
+impl MapEquations for MatrixFreeVisibilities {
+    fn counts(&self) -> SumCounts {
+        self.archive.counts()
+    }
+
+    fn solve(self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
+        let sums = self.into_sums()?;
+        // A final solution starts from zero, so that its bits do not depend on intermediate maps.
+        let start = request.last.take().filter(|_| !request.is_final);
+        let (prior, rule) = (request.prior.as_deref(), request.setup.rule);
+        let (solved, unknowns) =
+            match solve_matrix_free(&sums, request.epsilon, prior, start, rule, request.watch) {
+                Err(SolveError::Interrupted) => return Ok(None),
+                solved => solved?,
+            };
+        if request.is_stopped() {
+            return Ok(None);
+        }
+        if !request.is_final {
+            *request.last = Some(unknowns);
+        }
+        Ok(Some(solved.into_map(None)))
+    }
+
+    fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {
+        Err("visibilities one by one")
+    }
+}
