@@ -121,7 +121,7 @@ fn what_stations_cannot_do_is_refused() {
         (&["spacecraft.moon_reflection=0.07"], "expected 0 with array.stations"),
         (&["spacecraft.antenna=dipole-normal"], "expected \"isotropic\" with array.stations"),
         (&["downlink.rate_bits_per_s_max=1e6"], "a relay that is not simulated"),
-        (&["array.eccentricity=0.1"], "no array.stations"),
+        (&["array.eccentricity=0.1"], "without array.kepler, array.oem or array.stations"),
         (&["array.satellites=7"], "at most 64: the limit of the downlink's format"),
         (&["array.satellites=3", near], "the Earth is above the horizon of station 1"),
     ] {

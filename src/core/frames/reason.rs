@@ -209,7 +209,8 @@ mod tests {
         assert_eq!(texts.len(), all.len());
         // Some fixed indices, so that a change of the order is detected.
         assert_eq!((all[5], all[12]), (VisibilityReason::Duplicate, VisibilityReason::BaselineBeyondMap));
-        assert_eq!((all.len(), all[23]), (31, VisibilityReason::NotReceived));
-        assert_eq!(all.last(), Some(&VisibilityReason::Burst));
+        assert_eq!((all.len(), all[23]), (35, VisibilityReason::NotReceived));
+        assert_eq!(all[30], VisibilityReason::Burst);
+        assert_eq!(all.last(), Some(&VisibilityReason::PatchInsensitive));
     }
 }

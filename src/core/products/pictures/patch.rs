@@ -93,13 +93,13 @@ fn draw_patch(canvas: &mut Canvas, area: Rect, patch: &Patch<'_>) {
         let style = Style::new(1.1 * FONT, INK).medium();
         canvas.text(&patch.caption, (frame.middle_x(), frame.y - 0.95 * FONT), Align::Middle, style);
     }
-    let name = match patch.cutout.frame {
-        Frame::Galactic => "Galactic",
-        Frame::Ecliptic => "ecliptic",
-        Frame::Equatorial => "equatorial",
+    let axes = match patch.cutout.frame {
+        Frame::Galactic => "Galactic longitude and latitude",
+        Frame::Ecliptic => "ecliptic longitude and latitude",
+        Frame::Equatorial => "right ascension and declination (J2000)",
     };
     let below = (frame.middle_x(), frame.bottom() + 2.7 * FONT);
-    canvas.text(&format!("{name} longitude and latitude"), below, Align::Middle, Style::new(FONT, FAINT));
+    canvas.text(axes, below, Align::Middle, Style::new(FONT, FAINT));
     let bar = Rect {
         x: frame.x + 0.08 * frame.width,
         y: frame.bottom() + 4.2 * FONT,
