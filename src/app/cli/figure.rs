@@ -16,7 +16,7 @@ use crate::units::Pair;
 /// Leaves a picture (PNG), a table (CSV) and numbers (JSON) of each:
 /// spacing: the ratio q0 of the formation's steps against R and R_2;
 /// baselines: lengths, components across the track and upwards, and altitudes, over the mission;
-/// pair-time: observing time of pairs, also for other breathing periods, and visibilities by baseline length;
+/// pair-time: observing time of pairs, also for other breathing ratios, and visibilities by baseline length;
 /// uvw: distribution of baselines on ecliptic axes;
 /// coverage: observing time, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;
 /// rows: a row of B at pixel centres and averaged over pixels, drawn without the Moon;
