@@ -82,7 +82,7 @@ def test_the_page_of_the_package_runs(tmp_path, monkeypatch, capsys):
         run_python("python.md", block, line, names)
     said = capsys.readouterr().out
     assert "map.nside = 7: expected a power of two" in said and "final map at 3 MHz" in said
-    assert (tmp_path / "map.png").stat().st_size > 10_000 and (tmp_path / "channel1.uvh5").exists()
+    assert (tmp_path / "channel1.uvh5").exists()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -193,12 +193,10 @@ def test_the_page_of_a_live_ground_runs(tmp_path, monkeypatch):
     script = GROUNDS
     for kind, block, _ in blocks("live.md"):
         assert kind == "sh"
-        if "answer held" in block:
-            # That section is of a ground without tokens.
-            script += "rm stations\nlunarray replay --listen tcp://127.0.0.1:4711 --state out/state --out out/live\n"
         script += block
     said = run_shell(script + 'kill "$ground"\nwait "$ground"\n')
-    assert said.count("taken ") >= 3 and "held " in said
+    # What is sent by `simulate` and by `send`.
+    assert said.count(" confirmed all ") == script.count(" --send ") + script.count("lunarray send ") >= 3
 
 
 def test_the_first_screen_runs(tmp_path, monkeypatch, capsys):

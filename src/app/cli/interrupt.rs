@@ -67,9 +67,12 @@ impl Interrupt {
     fn arm(&self) -> std::io::Result<()> {
         let _ = ARMED.set((self.cancel.clone(), Arc::clone(&self.signal)));
         let ignored = ignored_signals();
+        // A flag of its own: the thread of `remove_files_on_signal` may cancel before the shutdown looks.
+        let is_second = Arc::new(AtomicBool::new(false));
         for signal in SIGNALS.into_iter().filter(|signal| ignored >> (signal - 1) & 1 == 0) {
             // The order matters: at the first signal, the shutdown must find the flag unset.
-            flag::register_conditional_shutdown(signal, SHELL_BASE + signal, self.cancel.flag())?;
+            flag::register_conditional_shutdown(signal, SHELL_BASE + signal, Arc::clone(&is_second))?;
+            flag::register(signal, Arc::clone(&is_second))?;
             flag::register_usize(signal, Arc::clone(&self.signal), signal.unsigned_abs() as usize)?;
             flag::register(signal, self.cancel.flag())?;
         }
