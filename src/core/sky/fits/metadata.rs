@@ -212,7 +212,7 @@ fn stated_hz(header: &Header, card: &Card) -> Result<f64, FitsProblem> {
         FitsProblem::keyword(
             &card.key,
             found,
-            "10 kHz or more, a number, Hz, or with one unit, such as '408 MHz'",
+            "a positive number of 10 kHz or more, Hz, or with one unit, such as '408 MHz'",
         )
     };
     let (number, own_unit) = match &card.value {
