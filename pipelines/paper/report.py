@@ -154,18 +154,14 @@ def coverage():
     command = "lunarray figure coverage pipelines/paper-10mhz.toml --set spacecraft.channels_hz=[10e6,3e6]"
     if n is None:
         return missing(command)
-    ten, three = n["channels"]
-    rows = []
-    for a, b in zip(ten["bands"], three["bands"]):
-        filled = sorted({f"{band['uv_filled']:.2f}" for band in (a, b)})
-        rows.append([
-            f"{a['latitude_deg'][0]:g} to {a['latitude_deg'][1]:g}", f"{a['pair_h']:,.0f}", f"{b['pair_h']:,.0f}",
-            f"{a['shortest_wavelengths']:.2f}", f"{b['shortest_wavelengths']:.2f}",
-            " or ".join(filled),
-        ])
-    head = ["degrees from the ecliptic", "pair hours, 10 MHz", "3 MHz", "shortest projected, wavelengths, 10 MHz", "3 MHz",
-            "uv filled, either"]
-    return f"`{command}`\n\n" + table(head, rows)
+    rows = [
+        [f"{band['latitude_deg'][0]:g} to {band['latitude_deg'][1]:g}", f"{band['pair_h']:,.0f}",
+         f"{band['shortest_wavelengths']:.2f}", f"{band['uv_filled']:.2f}"]
+        for band in n["channels"][0]["bands"]
+    ]
+    head = ["degrees from the ecliptic", "pair hours at 10 MHz", "shortest projected, wavelengths", "uv filled"]
+    least, mean, most = (1 / share for share in reversed(n["first_over_channel"][1]))
+    return f"`{command}`\n\n" + table(head, rows) + f"\nHours at 3 MHz over those at 10: {mean:.2f} ({least:.2f} to {most:.2f}).\n"
 
 
 def beam_row(n):
@@ -197,7 +193,7 @@ def sub_pixel(n):
             *[show(by[to]["of_visibility"] if to in by else None, "{:.3f}") for to in (0.5, 1.0, 1.5, 2.0)],
             f"{case['sigma_b_k']:.2e}", f"{case['tr_sigma_b_k2']:.2e}",
         ])
-    head = ["nside", "rows", "visibilities", *[f"N_b, b < {to} b_p" for to in (0.5, 1.0, 1.5, 2.0)], "Sigma_b, K rms",
+    head = ["nside", "rows", "visibilities", *[f"sqrt(N_b / V), {to - 0.25:g} to {to:g} b_p" for to in (0.5, 1.0, 1.5, 2.0)], "Sigma_b, K rms",
             "Tr Sigma_b, K²"]
     return table(head, rows)
 

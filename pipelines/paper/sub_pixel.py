@@ -101,7 +101,7 @@ def matrix(sky):
                 residual[method, part, k] = sky.area * (deviation.ravel() @ sky.values)
     power = (visibilities**2).mean()
     print(f"pair {i + 1}-{j + 1}, {length / bp:.3f} b_p, {INSTANTS} instants of {(end - start) / 60:.0f} min; |V| {np.sqrt(2 * power):.3e} K sr rms")
-    print("| rows | N_b over V | residual over V | correlation at lags 1, 4, 16, 64 by N_b | of residuals | mean abs(correlation) |\n|---|---|---|---|---|---|")
+    print("| rows | sqrt(N_b / V) | the same of residuals | correlation at lags 1, 4, 16, 64 by N_b | of residuals | mean abs(correlation) |\n|---|---|---|---|---|---|")
     panels, lags = [], (1, 4, 16, 64)
     for method, name in enumerate(METHODS):
         n_b = vectors[method] @ vectors[method].T

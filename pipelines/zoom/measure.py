@@ -65,7 +65,7 @@ def main():
     commands = parser.add_subparsers(required=True)
     one = commands.add_parser("draw")
     one.add_argument("file")
-    one.add_argument("--sigma-jy", type=float, default=50.0)
+    one.add_argument("--sigma-jy", type=float, default=55.0)
     one.add_argument("--mhz", type=int, default=10)
     one.add_argument("--radius-deg", type=float, default=4.95)
     one.add_argument("--count", type=int, default=40)

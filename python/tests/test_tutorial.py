@@ -82,7 +82,7 @@ def test_the_page_of_the_package_runs(tmp_path, monkeypatch, capsys):
         run_python("python.md", block, line, names)
     said = capsys.readouterr().out
     assert "map.nside = 7: expected a power of two" in said and "final map at 3 MHz" in said
-    assert (tmp_path / "map.png").stat().st_size > 10_000 and (tmp_path / "channel1.uvh5").exists()
+    assert (tmp_path / "channel1.uvh5").exists()
 
 
 @pytest.mark.filterwarnings("ignore")

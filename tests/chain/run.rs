@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use common::process::{wait_until, written};
 use common::workplace::{Workplace, fail, files, lunarray, succeed};
+use lunarray::sky::fits::{ReadOptions, read_map};
 use serde_json::Value;
 
 /// A small mission: real geometry, small maps, at most a few minutes of work.
@@ -118,6 +119,28 @@ fn the_ledger_closes_and_the_summary_is_complete() {
             assert!(Path::new(&out).join(file.as_str().unwrap()).exists(), "{file}");
         }
     }
+}
+
+/// With fewer visibilities than the sky has structure the map is smooth, not wild: 1,410 visibilities of a sky that is much finer than the map.
+#[test]
+fn few_data_of_a_fine_sky_give_a_smooth_map() {
+    let place = Workplace::new("");
+    let settings =
+        ["spacecraft.channels_hz=[10e6]", "spacecraft.every_nth_window=410", "sky.nside=128", "map.nside=8"];
+    let out = place.path("few");
+    let mut args = vec!["run", "--out", &out, NO_PICTURES[0], NO_PICTURES[1]];
+    args.extend(settings.iter().flat_map(|setting| ["--set", *setting]));
+    succeed(&args);
+    let of = |name: &str| {
+        read_map(&Path::new(&out).join("10.000MHz").join(name), &ReadOptions::default()).unwrap()
+    };
+    let (map, sky) = (of("map.fits"), of("input.fits"));
+    let differences = map.values().iter().zip(sky.values()).map(|(a, b)| a - b);
+    let rms = |squares: f64| (squares / sky.values().len() as f64).sqrt();
+    let error_k = rms(differences.map(|off| off * off).sum());
+    let sky_k = rms(sky.values().iter().map(|value| value * value).sum());
+    // The map that says nothing, 0 K, has 1; the sky's mean alone is wrong by some 0.4, its structure.
+    assert!(error_k < 0.4 * sky_k, "{error_k} {sky_k}");
 }
 
 #[test]

@@ -207,7 +207,13 @@ fn kernels_that_cannot_be_used_are_refused_with_a_reason() {
         shared[place..place + 40].copy_from_slice(&first);
     }
     shared[1024 + 16..1024 + 24].copy_from_slice(&25.0_f64.to_le_bytes());
+    // The number of the next record of summaries.
+    let next = |record: f64| [&whole[..1024], &record.to_le_bytes()[..], &whole[1032..]].concat();
     for (bytes, told) in [
+        (next(f64::NAN), "summaries in record NaN of"),
+        (next(1e30), "summaries in record 1000"),
+        (next(-1.0), "summaries in record -1 of"),
+        (next(2.5), "summaries in record 2.5 of"),
         (named(b"DAF/CK  "), "found \"DAF/CK\"; expected a binary SPK kernel"),
         (named(b"DAFETF N"), "expected a binary SPK kernel, DAF/SPK; NAIF's `tobin`"),
         ([&whole[..88], b"VAX-GFLT", &whole[96..]].concat(), "VAX-GFLT"),

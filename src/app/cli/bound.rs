@@ -20,7 +20,7 @@ pub(super) struct BoundArgs {
     /// Pipeline file (TOML); the embedded quicklook if none is given.
     #[arg(value_name = "PIPELINE.toml", value_parser = input_path())]
     pipeline: Option<PathBuf>,
-    /// HEALPix map of the sky in K; one a channel, in their order; calibrate.model_files if not given.
+    /// HEALPix map of the sky in K; one per channel, in their order; calibrate.model_files if not given.
     #[arg(long, value_name = "MAP.fits", num_args = 1..)]
     model: Vec<PathBuf>,
     /// Number of the pass, from 0.

@@ -15,8 +15,8 @@ use crate::sky::{Cutout, Frame, PlaneProjection};
 
 /// Cut the same square piece out of one or more maps, and draw them side by side.
 ///
-/// North is up and east to the left, with a graticule. --subtract-fwhm leaves out large scales: each map less itself
-/// smoothed to that FWHM. All pieces share one colour scale, that of the first map. Leaves a picture, and a table (CSV) of the
+/// North is up and east to the left, with a graticule. --subtract-fwhm removes large scales: it subtracts from each
+/// map the same map smoothed to that FWHM. All pieces share one colour scale, that of the first map. Leaves a picture, and a table (CSV) of the
 /// values beside it.
 ///
 /// Example: lunarray cutout input-smooth.fits map-smooth.fits --centre 0,0 --subtract-fwhm 10 --out patch.png

@@ -16,8 +16,8 @@ const RANGES_BYTES_MAX: u64 = 1 << 24;
 
 /// Cut the packets of given counts out of downlink files.
 ///
-/// For a station that is to send again what a ground lacks: ranges are lines of APID, first and last count, as *copy ranges* on the page
-/// copies them and `lunarray gaps` lists them. Writes each sound packet of the files that is in a range, once, as CCSDS packets, which
+/// For a station that is asked to send missing packets again: ranges are lines of APID, first and last count, as *copy ranges* on the page
+/// copies them and `lunarray gaps` lists them. Writes each intact packet of the files that is in a range, once, as CCSDS packets, which
 /// `lunarray replay` and a listening ground take.
 ///
 /// Example: lunarray extract pass-*.cadu --ranges ranges.txt --out again.ccsds
@@ -26,7 +26,7 @@ pub(super) struct ExtractArgs {
     /// Downlink files, packets or CADUs.
     #[arg(required = true, value_name = "FILE", value_parser = input_path())]
     files: Vec<PathBuf>,
-    /// File of ranges, one a line: APID, first and last count, such as `0x103 61 62`; - for standard input.
+    /// File of ranges, one per line: APID, first and last count, such as `0x103 61 62`; - for standard input.
     #[arg(long, value_name = "FILE|-")]
     ranges: PathBuf,
     /// File for the packets.

@@ -15,13 +15,13 @@ use crate::units::Pair;
 ///
 /// Leaves a picture (PNG), a table (CSV) and numbers (JSON) of each:
 /// spacing: the ratio q0 of the formation's steps against R and R_2;
-/// baselines: lengths, parts across the track and upwards, altitudes, over the mission;
-/// pair-time: time of pairs, also with other breathings, and visibilities by baseline length;
-/// uvw: where baselines lie on ecliptic axes;
-/// coverage: time of pairs, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;
+/// baselines: lengths, components across the track and upwards, and altitudes, over the mission;
+/// pair-time: observing time of pairs, also for other breathing ratios, and visibilities by baseline length;
+/// uvw: distribution of baselines on ecliptic axes;
+/// coverage: observing time, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;
 /// rows: a row of B at pixel centres and averaged over pixels, drawn without the Moon;
 /// waterfall: visibilities of one pair over time and frequency, of a fine sky and of the sky in the map's pixels;
-/// sub-pixel: what the sky's structure within pixels of nside 8 and 16 does to visibilities and maps.
+/// sub-pixel: effect of the sky's structure within pixels of nside 8 and 16 on visibilities and maps.
 ///
 /// Example: lunarray figure pair-time pipelines/paper-10mhz.toml --out out/figures
 #[derive(Debug, Args)]

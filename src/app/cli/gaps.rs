@@ -14,10 +14,10 @@ use crate::products::draw_coverage;
 
 /// List missing packets, and what they would add to the map.
 ///
-/// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by what their
-/// recovery would add: their weight over that in the map of the same channel, averaged over channels. Request the given range of
-/// packet counts from the spacecraft (the sequence count is its lower 14 bits). The content of a gap is estimated from that of a
-/// whole window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities
+/// Reads a state folder of `lunarray replay --state`, one of its checkpoints, or a downlink file. Gaps are sorted by the gain of
+/// their recovery: their weight relative to that in the map of the same channel, averaged over channels. Request the ranges of packet
+/// counts from the spacecraft (the sequence count is the lower 14 bits). The content of a gap is estimated from that of a complete
+/// window near it, and, for a state, from the fraction that entered the map. Missing positions count as the visibilities
 /// that need them. Packets sent after the last one received, or before a restart of the counts, cannot be recognised as missing.
 ///
 /// Example: lunarray gaps state/ --most 5 --picture coverage.png

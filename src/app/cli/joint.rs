@@ -22,18 +22,18 @@ use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
 /// Maximum number of posterior samples, which are in memory for every channel.
 const COUNT_MAX: u64 = 1_000;
 
-/// Make maps of several channels together, each with what its neighbours see, and with the daughters' total powers.
+/// Make maps of several channels together, also from the daughters' total powers.
 ///
-/// The sky's structure changes slowly with frequency. The data say how alike the channels are, and R follows from it: scales that
-/// one frequency hardly sees come from those that see them. Takes the sums of one state or of several, whose nside may differ; no
+/// The sky's structure changes slowly with frequency. The correlation of channels is estimated from the data and sets R: scales that
+/// one frequency hardly measures come from others that do. Takes the sums of one state or of several, whose nside may differ; no
 /// visibility is read again, and the states stay as they are.
 ///
-/// Where a state has total powers (spacecraft.auto_powers = true), they are in the fit: as the Moon's disc moves over the sky they see its
+/// Where a state has total powers (spacecraft.auto_powers = true), they are fitted, too: as the Moon's disc moves over the sky they measure its
 /// largest scales, and its mean. Gain, offset and slope of each are free in every pass of every daughter. With powers one channel suffices.
 ///
 /// Leaves in the output folder for each channel, and each frequency of --at, map.fits (temperature and standard deviation, K) and a picture;
-/// spectra.fits (spectral index, curvature, and their standard deviations); and joint.json: means with errors, how alike the channels are,
-/// and how the data of each agree with the sky of all.
+/// spectra.fits (spectral index, curvature, and their standard deviations); and joint.json: means with errors, the correlation of channels,
+/// and the chi-square of each channel's data.
 ///
 /// Example: lunarray joint state/ --at 6MHz --out joint/
 #[derive(Debug, Args)]
@@ -44,7 +44,7 @@ pub(super) struct JointArgs {
     /// Make a map at this frequency between the channels, too: Hz, or with a unit, such as 6MHz. May be repeated.
     #[arg(long, value_name = "FREQUENCY", value_parser = frequency_hz)]
     at: Vec<f64>,
-    /// Draws from which errors of means and spectra are taken.
+    /// Posterior samples, for the errors of means and spectra.
     #[arg(long, value_name = "NUMBER", default_value_t = 16, value_parser = clap::value_parser!(u64).range(2..=COUNT_MAX))]
     count: u64,
     /// Leave out the total powers.
@@ -53,7 +53,7 @@ pub(super) struct JointArgs {
     /// Standard deviations of gain, offset and slope of a power over a pass, percent of the power.
     #[arg(long, value_name = "GAIN,OFFSET,SLOPE", default_value = "10,1,1", value_parser = power_priors)]
     power_priors: [f64; 3],
-    /// What the powers have beside the sky, receiver noise and the Moon's emission: one value, or one for each channel in order of frequency.
+    /// Part of the powers that is not the sky, receiver noise and the Moon's emission, K sr: one value, or one for each channel in order of frequency.
     #[arg(long, value_name = "K_SR", default_value = "0", value_delimiter = ',')]
     power_constant_k_sr: Vec<f64>,
     /// Output folder.

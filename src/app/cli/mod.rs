@@ -69,21 +69,21 @@ use crate::units::InvalidValue;
 
 /// Simulate a lunar-orbit radio interferometer, and map the sky from its downlink.
 ///
-/// Below 30 MHz the ionosphere hides the sky. Eight small satellites in lunar orbit correlate their signals while the
-/// Moon hides the Earth, and send visibilities down when the Earth is in sight again. lunarray simulates the satellites,
-/// receives their downlink, and makes maps of the whole sky.
+/// Below 30 MHz the ionosphere hides the sky. Eight small satellites in lunar orbit observe it while the Moon hides the
+/// Earth; a mother satellite correlates their signals, and sends visibilities down when the Earth is in sight again. lunarray
+/// simulates the satellites, receives their downlink, and makes maps of the whole sky.
 ///
 /// Start with `lunarray run`: it needs no input file and writes maps to out/quicklook/.
 ///
-/// A file of - is standard input where a pipeline or a downlink is read: cat pass.cadu | lunarray inspect -
+/// The file name - means standard input for a pipeline or a downlink: cat pass.cadu | lunarray inspect -
 ///
 /// Exit codes: 0 done; 1 failed; 2 wrong usage or an unusable configuration; 3 a failure of the system (disk, socket, lock,
-/// memory), after which the same command may succeed; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, with what was
-/// received saved if there is a state. 0 also for `replay --listen` and `--follow` that SIGTERM ends.
+/// memory), after which the same command may succeed; 130 ended by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP, after
+/// data received were saved if there is a state. SIGTERM is the regular end of `replay --listen` and `--follow`: 0.
 #[derive(Debug, Parser)]
 #[command(name = "lunarray", version, propagate_version = true, max_term_width = 100)]
 struct Cli {
-    /// Format of messages on standard error: text, or json: one object a line with time (UTC), level, event, message and fields.
+    /// Format of messages on standard error: text, or json: one object per line with time (UTC), level, event, message and fields.
     #[arg(
         long,
         global = true,

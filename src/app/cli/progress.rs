@@ -317,9 +317,9 @@ impl ProgressView {
         let left_s = self.solution.left_s(solving);
         let left = left_s.map_or_else(String::new, |left_s| format!(", about {left_s:.0} s left"));
         let step = part.map_or_else(String::new, |SolvingPart { what, iteration, residual, target }| {
-            format!("; {what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}")
+            format!("; {what}: iteration {iteration}, residual {residual:.1e} (target {target:.0e})")
         });
-        format!("{what}: iteration {iteration}, residual {residual:.1e} of {target:.0e}{left}{step}")
+        format!("{what}: iteration {iteration}, residual {residual:.1e} (target {target:.0e}){left}{step}")
     }
 
     /// Text on the number of senders, their data rate and the backlog.

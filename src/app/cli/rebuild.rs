@@ -11,9 +11,8 @@ use crate::pipeline::use_threads;
 
 /// Make a new state from the raw archive of a ground.
 ///
-/// A ground that listens keeps every packet that it takes in a raw archive, in the folder `archive` of its state. This command
-/// applies them to a new state, as `lunarray replay` does: when the checkpoints are damaged, were made by another version, or with
-/// other settings. Packets that were retracted stay out. The archive stays as it is, and may be a copy.
+/// A ground that listens keeps every packet in a raw archive, the folder `archive` of its state. This command applies them to a new
+/// state, as `lunarray replay` does: for other settings or another version, or when the checkpoints are damaged. Packets that were retracted stay out. The archive stays as it is, and may be a copy.
 ///
 /// Example: lunarray rebuild state/ --out state-new/
 #[derive(Debug, Args)]

@@ -9,17 +9,16 @@ use super::output::{CommandResult, Completion, print_json_line, print_notes, pri
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::{Config, use_threads, with_gains};
 
-/// Give the data of a state other gains.
+/// Replace the gains that were applied to the data of a state.
 ///
-/// Visibilities of the files are taken out of the sums under the gains that they were added with, and added under the new ones;
-/// both are exact, so that the sums are those of a new state made with the new gains. All packets whose gains change have to be
-/// in the files. The state then belongs to the new gains: later data are replayed with the same --calibration. Its number of
-/// calibrations grows by one. If interrupted, the folder holds either the old state or the new one.
+/// The visibilities of the files are subtracted from the sums with their old gains, and added with the new ones, both exactly: the
+/// sums are those of a new state made with the new gains. The files have to contain all packets whose gains change. Replay later data
+/// with the same --calibration. The state's version grows by one. If interrupted, the folder holds either the old state or the new one.
 ///
 /// Example: lunarray recalibrate pass.ccsds --state state/ --old-calibration old/gains.json --calibration new/gains.json
 #[derive(Debug, Args)]
 pub(super) struct RecalibrateArgs {
-    /// Downlink files whose visibilities get other gains.
+    /// Downlink files whose visibilities get new gains.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// State folder of `lunarray replay --state`.
@@ -28,7 +27,7 @@ pub(super) struct RecalibrateArgs {
     /// The new gains, as `lunarray calibrate` writes them.
     #[arg(long, value_name = "GAINS")]
     calibration: PathBuf,
-    /// The gains that the state was made with, if they are those of a file.
+    /// The gains file that the state was made with, if any.
     #[arg(long, value_name = "GAINS")]
     old_calibration: Option<PathBuf>,
     #[command(flatten)]

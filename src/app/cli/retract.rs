@@ -14,8 +14,8 @@ use crate::units::MissionTime;
 ///
 /// Every packet of the files that is in the state is removed from the sums, the counters and the received set, as if it
 /// had never arrived. A good copy can be replayed later; until then the packet is a gap in `lunarray gaps` and lost in the
-/// ledger. Packets that are not in the state are counted. A packet that differs from the one applied, like a good copy of
-/// a bad packet, is not removed but listed, because subtracting other values would corrupt the sums. Positions that other
+/// ledger. Packets that are not in the state are counted. A packet that differs from the one applied, such as a good
+/// copy of a bad packet, is listed and not removed, because subtracting other values would corrupt the sums. Positions that other
 /// visibilities depend on stay too. If interrupted, the folder holds either the old state or the new one.
 ///
 /// Example: lunarray retract bad-pass.ccsds --state state/

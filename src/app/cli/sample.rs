@@ -18,12 +18,12 @@ use crate::sky::{Frame, SkyMap};
 /// Most samples: each is a map in memory.
 const COUNT_MAX: u64 = 10_000;
 
-/// Draw maps that are as likely as the map of a state, given its data.
+/// Draw posterior samples of the map of a state.
 ///
-/// They differ from the map by what the data leave open, noise and unseen scales alike: whatever is computed from each of them scatters
-/// by its error. Needs R from the data (map.regulariser = "data"). Leaves in the output folder, for each channel, the map, each sample,
-/// sigma.fits, their standard deviation around the map, pixel by pixel, mask.fits and resolution.fits as beside maps, and spectrum.csv, the
-/// sky's own angular power with the interval that holds it with 68 % probability. No visibility is read again, and the state stays as it is.
+/// They scatter around the map by its errors, from noise and from scales that the data do not measure: so does whatever is computed from
+/// each of them. Needs R from the data (map.regulariser = "data"). Leaves in the output folder, for each channel, the map, each sample,
+/// sigma.fits (standard deviation of each pixel), mask.fits and resolution.fits as of maps, and spectrum.csv, the sky's angular power with
+/// its 68 % interval. No visibility is read again, and the state stays as it is.
 ///
 /// Example: lunarray sample state/ --count 100 --out samples/
 #[derive(Debug, Args)]
@@ -34,8 +34,7 @@ pub(super) struct SampleArgs {
     /// Number of samples.
     #[arg(long, value_name = "NUMBER", default_value_t = 20, value_parser = clap::value_parser!(u64).range(1..=COUNT_MAX))]
     count: u64,
-    /// Draw the sky's angular power with each map (Gibbs sampling), in place of the most likely one: samples then scatter by what is not known
-    /// of it, too. Takes some four times as long.
+    /// Draw the sky's angular power with each map (Gibbs sampling), in place of the most likely one: samples then include its uncertainty. Takes some four times as long.
     #[arg(long)]
     gibbs: bool,
     /// Output folder.

@@ -33,11 +33,11 @@ use crate::pipeline::{
 pub(super) struct SimulateArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Downlink file to write; - for standard output, as input of another program. The truth about errors of the instrument is
-    /// then not written.
+    /// Downlink file to write; - for standard output, as input of another program. No file of the true errors of the
+    /// instrument is then written.
     #[arg(short, long, value_name = "FILE|-", required_unless_present = "send", value_parser = output_or_standard())]
     out: Option<PathBuf>,
-    /// Simulate the channels in groups, to files beside the downlink of which it is then made: as many at a time as memory allows
+    /// Simulate the channels in groups, to files beside the downlink, which are then merged: as many at a time as memory allows
     /// (auto), or this many. The downlink has the same bytes. When interrupted, repeat the command to go on with the next group.
     #[arg(long, value_name = "auto|NUMBER", value_parser = group_size, requires = "out", conflicts_with_all = ["send", "events"])]
     #[cfg_attr(feature = "serve", arg(conflicts_with = "serve"))]

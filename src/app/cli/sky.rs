@@ -22,9 +22,9 @@ use crate::units::Dimension;
 /// coordinates: the sky that `lunarray run` observes with the same pipeline file, seed and settings. The same seed gives
 /// the same sky at every frequency and nside.
 ///
-/// With --like it writes a wrong prior instead: a sky with the mean and the angular power of another map, and a given correlation
+/// With --like it writes a sky to serve as a wrong prior: one with the mean and the angular power of another map, and a given correlation
 /// with it at every degree. With --extrapolate-from it writes a wrong model: the sky of another frequency times a power of
-/// frequency, although gas absorbs below 10 MHz.
+/// frequency, without the absorption by gas below 10 MHz.
 ///
 /// Examples: lunarray sky --freq-hz 10e6 --out sky.fits; lunarray sky --like sky.fits --correlation 0.8 --out wrong.fits
 #[derive(Debug, Args)]
@@ -47,13 +47,13 @@ pub(super) struct SkyArgs {
     /// Correlation with that map at every degree from 1 to 2 nside: 0 to 1.
     #[arg(long, requires = "like")]
     correlation: Option<f64>,
-    /// Frequency, Hz or with a unit, whose sky is continued to --freq-hz as a power of frequency.
+    /// Frequency, Hz or with a unit, whose sky is scaled to --freq-hz as a power of frequency.
     #[arg(long, value_parser = frequency_hz, conflicts_with = "like")]
     extrapolate_from: Option<f64>,
     /// Temperature index of that power.
     #[arg(long, default_value_t = -2.5, allow_negative_numbers = true, requires = "extrapolate_from")]
     index: f64,
-    /// Table of the point sources (CSV): place, flux density at 154 MHz and at the frequency, unabsorbed.
+    /// Table of the point sources (CSV): position, flux density at 154 MHz and at --freq-hz, without absorption.
     #[arg(long, value_name = "FILE")]
     sources: Option<PathBuf>,
     /// Seed of fluctuations and sources, in place of the file's.

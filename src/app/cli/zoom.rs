@@ -15,9 +15,9 @@ const RADIUS_DEG_MAX: f64 = 20.0;
 
 /// Image a patch of sky with baselines of any length, and list its sources.
 ///
-/// Reads downlink files as `lunarray replay` does. Visibilities are turned to the centre and averaged while the edge hardly turns; those
-/// for which the Moon hides the patch, or its limb crosses it, are left out and counted. Sources are points of any position; what they leave
-/// is an image, and a map if it is more than noise. Short baselines, which see the diffuse sky around, are left out by --baseline-min.
+/// Reads downlink files as `lunarray replay` does. Visibilities are phased to the centre, and averaged while phases at the edge hardly change;
+/// those for which the Moon hides the patch, or its limb crosses it, are left out and counted. Sources are points of any position; the
+/// residual gives an image, and a map if it exceeds the noise. Short baselines, which see the diffuse sky around, are left out by --baseline-min.
 ///
 /// Leaves image.fits, residual.fits, sigma.fits and beam.fits (J2000, for DS9, CARTA or Aladin), image.png, sources.csv, sources.vot
 /// (VOTable) and summary.json in the output folder.
@@ -46,7 +46,7 @@ pub(super) struct ZoomArgs {
     /// Longest baseline, wavelengths; by default all.
     #[arg(long, value_name = "WAVELENGTHS")]
     baseline_max: Option<f64>,
-    /// Table (CSV) of known sources, which name those found.
+    /// Table (CSV) of known sources, whose names sources found get.
     #[arg(long, value_name = "SOURCES.csv", value_parser = input_path())]
     catalogue: Option<PathBuf>,
     /// Subtract sources of the catalogue outside the patch that are at least this bright, Jy.

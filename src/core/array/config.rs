@@ -71,11 +71,11 @@ keys! {
         /// Maximum arcs by which daughters 2, 3, ... trail daughter 1, ascending; empty for those of `breathing`.
         #[only_with("no array.kepler and no array.oem and no array.stations")]
         expert arcs_m: Vec<f64> = Vec::new();
-        /// Kepler orbits, one a satellite, instead of the formation: `{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01,
+        /// Kepler orbits, one per satellite, instead of the formation: `{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01,
         /// inclination_deg = 30.0, node_longitude_deg = 0.0, periapsis_deg = 0.0, mean_anomaly_deg = 0.0 }` at the epoch, on
         /// ecliptic axes; optional `node_rate_deg_per_day` and `periapsis_rate_deg_per_day`.
         everyday kepler: Vec<KeplerElements> = Vec::new();
-        /// CCSDS OEM files (KVN or XML, also gzip), one a satellite, or SPK kernels (.bsp), whose objects are satellites in order of
+        /// CCSDS OEM files (KVN or XML, also gzip), one per satellite, or SPK kernels (.bsp), whose objects are satellites in order of
         /// appearance, instead of the formation. Their dates fix the mission's epoch and the Earth's position.
         everyday oem: Vec<PathBuf> = Vec::new();
         /// Epoch of the mission, in UTC if it ends with Z, else in the files' time system, such as 2030-01-31T12:00:00; empty for

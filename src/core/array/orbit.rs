@@ -508,7 +508,7 @@ pub fn is_underground(r_m: Vec3, moon_radius_m: f64) -> bool {
     norm(r_m) <= moon_radius_m - MOON_RELIEF_M
 }
 
-/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Eq. 8): from one on the ground, what is below its
+/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Sect. 3.2): from one on the ground, what is below its
 /// horizon.
 #[must_use]
 pub fn hidden_by_moon(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> bool {

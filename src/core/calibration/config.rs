@@ -32,8 +32,8 @@ keys! {
     /// The `[calibration]` section.
     #[derive(Eq)]
     pub struct CalibrationConfig {
-        /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": found while the data arrive, by the
-        /// section `calibrate`.
+        /// Correction of gains: "identity" for none, "antenna-gains" from a file, or "solve": solved for while the data
+        /// arrive, with the settings of section `calibrate`.
         everyday hook: CalibrationHook = CalibrationHook::Identity;
         /// File of gains for "antenna-gains", such as "gains.json".
         #[only_with(r#"calibration.hook = "antenna-gains""#)]

@@ -56,13 +56,13 @@ keys! {
         /// Flag a visibility while one of its daughters sees the Earth. Windows are daughter 1's; the others trail her into the
         /// shadow.
         expert flag_earth: bool = true;
-        /// Send only every n-th integration of a window; one value, or one a channel.
+        /// Send only every n-th integration of a window; one value, or one per channel.
         everyday every_nth_integration: PerChannel<u64> = PerChannel::All(1);
         /// Maximum length of an integration.
         expert integration_s_max: f64 = IntegrationRule::default().duration_s_max;
         /// Maximum motion of a baseline in one integration.
         expert motion_wavelengths_max: f64 = IntegrationRule::default().motion_wavelengths_max;
-        /// Maximum baseline that is correlated; 0 for no limit; one value, or one a channel.
+        /// Maximum baseline that is correlated; 0 for no limit; one value, or one per channel.
         expert baseline_wavelengths_max: PerChannel<f64> = PerChannel::All(0.0);
         /// Model of the visibilities: "direct" sums over pixels, "harmonic" on a circle, "general" harmonics anywhere, or
         /// "auto", by cost.
@@ -74,7 +74,7 @@ keys! {
         expert smear_bandwidth: bool = false;
         /// Add thermal noise. Weights describe it in either case.
         everyday thermal_noise: bool = true;
-        /// Receiver noise over the antenna's transmission efficiency, T_rec / zeta, added to the sky: one value, one a
+        /// Receiver noise over the antenna's transmission efficiency, T_rec / zeta, added to the sky: one value, one per
         /// channel, or a table of [Hz, K sr] at rising frequencies, linear in both logarithms, such as `[[1e6, 2e4], [10e6,
         /// 300.0], [30e6, 100.0]]`.
         everyday receiver_noise_k_sr: ReceiverNoise = ReceiverNoise::default();
@@ -82,10 +82,10 @@ keys! {
         /// frequency`.
         #[serde(skip_serializing_if = "is_zero")]
         expert receiver_knee_hz: f64 = 0.0;
-        /// Radio interference of the spacecraft itself, added to every daughter's receiver noise; one value, or one a channel.
+        /// Radio interference of the spacecraft itself, added to every daughter's receiver noise; one value, or one per channel.
         #[serde(skip_serializing_if = "is_none")]
         expert interference_floor_k_sr: PerChannel<f64> = PerChannel::All(0.0);
-        /// Share xi_R of the sky's power that the Moon reflects; the paper has 0.07.
+        /// Fraction xi_R of the sky's power that the Moon reflects; 0.07 in the paper.
         everyday moon_reflection: f64 = 0.0;
         /// Form of the Moon that reflects: "flat", or "sphere" with spacecraft.model = "direct".
         #[serde(skip_serializing_if = "MoonMirror::is_flat")]

@@ -18,7 +18,7 @@ pub struct NoiseModel {
 
 impl NoiseModel {
     /// Standard deviation of the real and of the imaginary part, K sr, for sky powers `Int T S A dn` at the two daughters:
-    /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Eq. 12, with each daughter's own
+    /// `sqrt(P_i P_j / (2 dnu dt))` with `P = T_rec / zeta + Int T S A dn` (the paper, Sect. 3.2, with each daughter's own
     /// system temperature).
     ///
     /// With three dipoles the visibility is half the sum over the dipoles. The sky's power in it is P, the receivers'

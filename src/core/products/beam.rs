@@ -22,7 +22,8 @@ pub struct EffectiveBeam {
     /// FWHM of the effective beam `sum_l (2 l + 1) w_l P_l(cos theta) / 4 pi`, degrees; absent without a peak. For `w_l = 1` up to
     /// l_max it is 4.430 / (l_max + 1) rad.
     pub fwhm_deg: Option<f64>,
-    /// Solid angle of the beam, `4 pi w_0 / sum (2 l + 1) w_l`, sr. It converts the peak of a source in K to its flux density.
+    /// Solid angle, `4 pi / sum (2 l + 1) w_l`, sr. It converts the peak of a source in K to its flux density, also where the map
+    /// loses its mean (w_0 below 1).
     pub area_sr: Option<f64>,
     /// RMS of the noise-only map as compared, K.
     pub noise_rms_k: f64,
@@ -57,13 +58,11 @@ fn flux_jy(temperature_k: f64, frequency_hz: f64, area_sr: f64) -> f64 {
     2.0 * BOLTZMANN_J_K * temperature_k * per_m * per_m * area_sr / JANSKY
 }
 
-/// Solid angle of the beam `sum_l (2 l + 1) w_l P_l / 4 pi` over its value at 0, sr. Unknown w_l count as 0. `None` without a
-/// peak or monopole.
+/// 1 over the value at 0 of the beam `sum_l (2 l + 1) w_l P_l / 4 pi`, sr. Unknown w_l count as 0. `None` without a peak.
 fn area_sr(w: &[f64]) -> Option<f64> {
     let finite = |w: &f64| if w.is_finite() { *w } else { 0.0 };
     let peak: f64 = (0..).zip(w).map(|(l, w)| f64::from(2 * l + 1) * finite(w)).sum();
-    let area_sr = 2.0 * TAU * finite(w.first()?) / peak;
-    (peak > 0.0 && area_sr > 0.0).then_some(area_sr)
+    (peak > 0.0).then_some(2.0 * TAU / peak)
 }
 
 /// Full width at half maximum of `sum_l (2 l + 1) w_l P_l(cos theta)`, rad. Unknown w_l count as 0. `None` without a peak at
@@ -111,10 +110,14 @@ mod tests {
     }
 
     #[test]
-    fn the_area_is_that_of_the_beam_itself() {
+    fn the_area_makes_flux_densities_of_peaks() {
         // Equal w_l up to l_max: sum (2 l + 1) = (l_max + 1)^2, so 4 pi / 161^2 = 4.848e-4 sr. A Gaussian of that width has 8.58e-4.
-        let sharp = area_sr(&[0.7; 161]).unwrap();
+        let sharp = area_sr(&[1.0; 161]).unwrap();
         assert!((sharp / 4.848e-4 - 1.0).abs() < 1e-4, "{sharp}");
+        // A map that keeps 0.7 of all degrees makes peaks 0.7 times as high; one that loses its mean only lowers them by 1 / 161^2.
+        assert!((area_sr(&[0.7; 161]).unwrap() * 0.7 / sharp - 1.0).abs() < 1e-12);
+        let without_mean: Vec<f64> = (0..161).map(|l| if l == 0 { 0.0 } else { 1.0 }).collect();
+        assert!((area_sr(&without_mean).unwrap() / sharp - 1.0).abs() < 1e-4);
         // A well-sampled Gaussian has 2 pi sigma^2, up to relative terms of sigma^2.
         let fwhm_rad = 2.0_f64.to_radians();
         let smooth = area_sr(&gaussian_beam(fwhm_rad, 600)).unwrap();

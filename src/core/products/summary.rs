@@ -134,7 +134,7 @@ impl ChannelSummary {
         let Some(power) = &self.sky_power else {
             return match self.diagnostics.epsilon {
                 Some(epsilon) => {
-                    format!("regularised with epsilon {epsilon:e}: no errors of pixels")
+                    format!("regulariser with epsilon {epsilon:e}: no errors of pixels")
                 }
                 None => String::new(),
             };
@@ -142,8 +142,8 @@ impl ChannelSummary {
         let decided: f64 = power.decided.iter().sum();
         let all = power.decided.len().pow(2);
         format!(
-            "regularised by the sky's power as the data have it (map.regulariser = \"data\"): {decided:.0} of {all} harmonics \
-            measured, residuals {:.2} times the noise; errors of pixels in sigma.fits ({})",
+            "regulariser from the data: {decided:.0} of {all} harmonics measured, residuals {:.2} times the noise; errors of pixels in \
+            sigma.fits ({})",
             power.noise_factor,
             limits(&self.diagnostics, self.refinement.as_ref())
         )

@@ -148,7 +148,7 @@ impl MeasuredAntennas {
         {
             let names: Vec<String> = attitudes.objects().take(20).map(echo).collect();
             return other(format!(
-                "attitudes: {} objects ({}); expected {satellites}, one a daughter in the order in which they appear",
+                "attitudes: {} objects ({}); expected {satellites}, one per daughter in the order in which they appear",
                 attitudes.objects().len(),
                 names.join(", ")
             ));
@@ -156,7 +156,7 @@ impl MeasuredAntennas {
         let Some(tables) = &self.tables else { return Ok(()) };
         if ![1, satellites].contains(&tables.count()) {
             return other(format!(
-                "tables: {} files; expected 1, or {satellites}: one a daughter",
+                "tables: {} files; expected 1, or {satellites}: one per daughter",
                 tables.count()
             ));
         }

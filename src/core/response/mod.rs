@@ -1,6 +1,6 @@
 //! The beam matrix B: the response of each pair of daughters to the sky.
 //!
-//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Eq. 7). A row of B is
+//! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i (nu/c) n . r_ij) dn`, in K sr (the paper, Sect. 3.2). A row of B is
 //! the integrand without T, over pixels or over spherical harmonics.
 //!
 //! | module | holds |

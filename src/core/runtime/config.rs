@@ -7,7 +7,7 @@ keys! {
     pub struct RuntimeConfig {
         /// Maximum number of items between two stages.
         expert queue_capacity: usize = 64;
-        /// Threads for the work inside stages; 0 for one a core.
+        /// Threads for the work inside stages; 0 for one per core.
         everyday threads: usize = 0;
         /// Time for maps of the data so far after Ctrl-C; longer solutions are cut off. What was received is saved before.
         everyday grace_s: f64 = 2.5;

@@ -25,7 +25,7 @@ pub enum MapFrequency {
 keys! {
     /// The `[sky]` section.
     pub struct SkyConfig {
-        /// Map of the sky: HEALPix FITS, such as "map.fits", for all channels, or a list with one a channel. Without it the sky
+        /// Map of the sky: HEALPix FITS, such as "map.fits", for all channels, or a list, one per channel. Without it the sky
         /// is generated.
         everyday file: Option<PerChannel<PathBuf>> = None;
         /// Frame of map files without COORDSYS: "ecliptic", "galactic" or "equatorial". Without it they are refused.

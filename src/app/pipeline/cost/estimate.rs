@@ -390,8 +390,8 @@ impl fmt::Display for Cost {
             let [set_up_s, visibilities_s] = channel.simulation_harmonic_s;
             writeln!(
                 f,
-                "{:>8.3} MHz simulated with spacecraft.model = \"{kind}\" ({why}); estimates: direct {:.1} s, harmonic to l = {l_max} \
-                 {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, general {:.1} s",
+                "{:>8.3} MHz simulated with spacecraft.model = \"{kind}\" ({why}); estimates: direct {:.1} s, harmonic (l up \
+                 to {l_max}) {set_up_s:.1} s to set up and {visibilities_s:.1} s for visibilities, general {:.1} s",
                 channel.frequency_hz / 1e6,
                 channel.simulation_direct_s,
                 channel.simulation_general_s

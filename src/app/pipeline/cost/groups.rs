@@ -53,8 +53,13 @@ impl fmt::Display for RunGroups {
         };
         let simulated: Vec<String> = self.simulated.iter().map(range).collect();
         let mapped: Vec<String> = self.mapped.iter().map(mapped).collect();
-        writeln!(f, "simulated        in {} groups of channels: {}", simulated.len(), simulated.join(", "))?;
-        write!(f, "mapped           in {} groups of channels: {}", mapped.len(), mapped.join(", "))
+        writeln!(
+            f,
+            "simulated        in groups of channels ({}): {}",
+            simulated.len(),
+            simulated.join(", ")
+        )?;
+        write!(f, "mapped           in groups of channels ({}): {}", mapped.len(), mapped.join(", "))
     }
 }
 

@@ -123,9 +123,9 @@ impl Plan {
             false => "shorter baselines".to_owned(),
         };
         Some(format!(
-            "the sky is too coarse for the longest baselines of {}{more}: they see degrees up to l = {seen}, its pixels (nside {nside}) \
-             hold l up to {held}. Beyond, direct sums take the pixels for points and harmonics leave out what is finer: the two may \
-             differ by tens of per cent. Expected {mend} (spacecraft.baseline_wavelengths_max)",
+            "the sky (nside {nside}, l up to {held}) is too coarse for the longest baselines, which see l up to {seen}, of {}{more}: \
+             visibilities by direct sums and by harmonics differ there, by up to tens of per cent. Expected {mend} \
+             (spacecraft.baseline_wavelengths_max)",
             names.join(", ")
         ))
     }

@@ -142,7 +142,7 @@ fn check(config: &Config, models: &[SkyMap]) -> Result<(), PipelineError> {
     }
     let needs_sky = solver.mode == CalibrationMode::Sky;
     if needs_sky && models.is_empty() {
-        let expected = "maps of the sky, one a channel, or calibrate.mode = \"beacon\" or \"joint\"";
+        let expected = "maps of the sky, one per channel, or calibrate.mode = \"beacon\" or \"joint\"";
         return Err(invalid(MODEL, "(none)", expected));
     }
     if solver.mode == CalibrationMode::Beacon && solver.map_rounds > 0 {

@@ -135,14 +135,15 @@ impl<'a> Daf<'a> {
     fn summaries(&self) -> Result<Vec<Summary>, Fault> {
         let mut found = Vec::new();
         let mut record = self.integer(76).unwrap_or(0) as f64;
+        let records = self.bytes.len() / RECORD_BYTES;
         // Each record of summaries is read once at most.
-        for _ in 0..self.bytes.len() / RECORD_BYTES {
-            if record < 1.0 {
-                break;
-            }
-            let first = (record as usize - 1) * (RECORD_BYTES / WORD_BYTES) + 1;
-            let cut =
-                || Fault::new(found.len(), "the end of the file", "a record of summaries: the whole kernel");
+        for _ in 0..records {
+            let cut = || {
+                let record = format!("summaries in record {record} of {records}");
+                Fault::new(found.len(), record, "the whole kernel, as it was written")
+            };
+            let Some(before) = count(Some(&record), records).ok_or_else(cut)?.checked_sub(1) else { break };
+            let first = before * (RECORD_BYTES / WORD_BYTES) + 1;
             let (Some(next), Some(count)) = (self.word(first), self.word(first + 2)) else {
                 return Err(cut());
             };

@@ -64,13 +64,13 @@ keys! {
         expert amplitude_scale: AmplitudeScale = AmplitudeScale::default();
         /// Daughter, from 1, whose phase, clock and position are the reference.
         expert reference_daughter: u32 = 1;
-        /// Expected deviation of the natural logarithm of a gain's amplitude.
+        /// Prior standard deviation of the natural logarithm of a gain's amplitude.
         everyday amplitude_sigma: f64 = 0.3;
-        /// Expected deviation of a gain's phase.
+        /// Prior standard deviation of a gain's phase.
         everyday phase_sigma_deg: f64 = 120.0;
-        /// Expected deviation of a clock, for all channels.
+        /// Prior standard deviation of a clock, for all channels.
         everyday clock_sigma_ns: f64 = 0.0;
-        /// Expected deviation of a position along each axis.
+        /// Prior standard deviation of a position along each axis.
         everyday position_sigma_m: f64 = 0.0;
         /// Solutions of equal length in a pass, smoothed as a random walk.
         expert solutions_per_pass: u32 = 1;
@@ -88,7 +88,7 @@ keys! {
         expert phase_sigma_deg_max: f64 = 15.0;
         /// Gain amplitude below which a receiver counts as dead.
         expert dead_amplitude: f64 = 0.05;
-        /// Maps of the known sky (K, FITS), one a channel of the downlink.
+        /// Maps of the known sky (K, FITS), one per channel of the downlink.
         everyday model_files: Vec<PathBuf> = Vec::new();
         /// HEALPix nside to which the model map's pixels are split; 0 for its own.
         expert model_nside: usize = 0;

@@ -75,9 +75,9 @@ keys! {
     /// Terms of one error, which add up. Random terms are Gaussian, zero on average, and independent from daughter to daughter
     /// (and from channel to channel, where the error is one of channels).
     pub struct ErrorTerms {
-        /// Given values, one a daughter, or none; the unit of values and rms is that of the section's name.
+        /// Given values, one per daughter, or none; the unit of values and rms is that of the section's name.
         expert constant: Vec<f64> = Vec::new();
-        /// Given rates since the epoch, one a daughter, or none.
+        /// Given rates since the epoch, one per daughter, or none.
         expert rate_per_day: Vec<f64> = Vec::new();
         /// Rms of a random constant, the same for the whole mission.
         expert constant_rms: f64 = 0.0;

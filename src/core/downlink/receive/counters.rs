@@ -308,7 +308,7 @@ impl std::fmt::Display for ReceptionCounters {
         }
         write!(
             f,
-            "{} bytes between packets, {} in a truncated end, {} payloads refused, {} visibilities of bad value",
+            "{} bytes between packets, {} in a truncated end, {} payloads refused, {} visibilities with invalid values",
             self.bytes_garbage,
             self.bytes_truncated,
             self.faults.total(),

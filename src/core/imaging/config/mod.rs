@@ -93,7 +93,7 @@ keys! {
         /// HEALPix nside of the maps: a power of two up to 64 (engine "pixel"), 256 (with matrix = "free") or 1024 (engine
         /// "harmonic").
         everyday nside: usize = 16;
-        /// What a map is made of: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with
+        /// Map method: "pixel", exact on any orbit; "harmonic", far cheaper, for satellites on one circle or with
         /// map.refine; or "auto": "harmonic" if the orbits of section `array` allow it.
         everyday engine: EngineKind = EngineKind::Pixel;
         /// Maximum number of channels of an instrument: each takes memory for a map, so a forged description is refused.
@@ -113,18 +113,18 @@ keys! {
         expert l_max: usize = 0;
         /// Maximum baseline used, in units of b_p = wavelength / sqrt(4 pi / N_pix).
         everyday baseline_bp_max: f64 = 2.0;
-        /// Regularisation epsilon; one value, or one a channel. Alone it asks for R = epsilon W_max I, the paper's; "degree" and
+        /// Regularisation epsilon; one value, or one per channel. Alone it selects R = epsilon W_max I, the paper's; "degree" and
         /// "file" take 1e-4 without it.
         #[only_with(r#"no map.regulariser = "data""#)]
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
-        /// Regulariser R: "data", 1 / C_l as found from the data (default); "identity", epsilon W_max I, the paper's (default
+        /// Regulariser R: "data", 1 / C_l estimated from the data (default); "identity", epsilon W_max I, the paper's (default
         /// with epsilon, map.refine, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also { degree =
-        /// 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l from tables of l and C_l (K^2), one a
+        /// 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l from tables of l and C_l (K^2), one per
         /// channel. W_max is the largest eigenvalue of the normal matrix.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
-        /// Tables of the sky's C_l (K^2), one a channel, such as sky-power.csv of an earlier map: what the sky has beyond the
+        /// Tables of the sky's C_l (K^2), one per channel, such as sky-power.csv of an earlier map: what the sky has beyond the
         /// map's degrees then counts as noise, more on some baselines than on others. A table goes on beyond its last degree
         /// as it ends.
         #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -132,9 +132,9 @@ keys! {
         /// Ecliptic longitudes and latitudes of points whose effective beam is computed, such as `[[0.0, 90.0]]`.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         everyday beams_deg: Vec<[f64; 2]> = Vec::new();
-        /// Uniform prior map; 0 for none; one value, or one a channel.
+        /// Uniform prior map; 0 for none; one value, or one per channel.
         everyday prior_k: PerChannel<f64> = PerChannel::All(0.0);
-        /// Prior maps: HEALPix FITS files, one a channel, in K.
+        /// Prior maps: HEALPix FITS files, one per channel, in K.
         everyday prior_files: Vec<PathBuf> = Vec::new();
         /// Frame of prior maps without COORDSYS, as sky.frame. Without it they are refused.
         #[only_with("map.prior_files")]
@@ -143,7 +143,7 @@ keys! {
         /// FWHM to which prior maps are smoothed.
         #[only_with("map.prior_files")]
         expert prior_fwhm_deg: f64 = 5.0;
-        /// Share xi_R of the sky's power that the Moon is taken to reflect: visibilities are divided by one plus this.
+        /// Fraction xi_R of the sky's power that the Moon is taken to reflect: visibilities are divided by one plus this.
         expert moon_reflection: f64 = 0.0;
         /// Mission time between snapshot maps; 0 for a final map only.
         everyday snapshot_every_s: f64 = 0.0;

@@ -14,10 +14,10 @@ use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
 const ROUNDS_MAX: usize = 6;
 /// Change of ln C_l at which rounds have converged: a tenth in C_l changes a map by far less than its error.
 const TOLERANCE: f64 = 0.1;
-/// Tolerance for intermediate maps.
-const INTERMEDIATE_TOLERANCE: f64 = 0.5;
-/// Error of an intermediate solution in units of its posterior error.
-const INTERMEDIATE_ERROR: f64 = 0.1;
+/// That of early rounds, and of intermediate maps.
+const EARLY_TOLERANCE: f64 = 0.5;
+/// Error of a solution of early rounds in units of its posterior error.
+const EARLY_ERROR: f64 = 0.1;
 /// Ids of the posterior samples for trace estimates, different from those of maps. The first alone suffices if the preconditioner is accurate.
 const TRACE_SAMPLES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
 /// Maximum difference of ln(trace) between the true matrix and the preconditioner for which one sample suffices.
@@ -116,6 +116,9 @@ impl PowerProblem<'_> {
     }
 
     /// Estimates the power in rounds, from the initial solution `start`.
+    ///
+    /// The first rounds stop their solutions early and do without samples, and those of an intermediate map are all so. For data of a short time
+    /// the power of the blocks, with which they begin, is far too large: a solution to the end would follow the rounding of the matrix.
     pub(in crate::imaging) fn solve(
         &self,
         start: Option<&[f64]>,
@@ -130,19 +133,17 @@ impl PowerProblem<'_> {
         }];
         let mut ratio = vec![1.0; l_max + 1];
         let mut factor = 1.0;
-        // Intermediate maps do without samples. For data of a short time the blocks overestimate the information, so that the power is too small
-        // and the map too smooth, which is safe.
-        let is_final = watch.has_priority();
-        let tolerance = if is_final { TOLERANCE } else { INTERMEDIATE_TOLERANCE };
-        for round in 1..=ROUNDS_MAX {
+        let (mut is_early, mut round) = (true, 0);
+        loop {
+            round += 1;
             let r = fit.regularisation();
             let factors = Factors::new(self.blocks, &r);
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
-            if is_final {
-                ratio = self.sampled_ratio(&regularisation, &factors, &ratio, watch);
+            if is_early {
+                rule = self.early_rule(&factors, factor, rule);
             } else {
-                rule = self.intermediate_rule(&factors, factor, rule);
+                ratio = self.sampled_ratio(&regularisation, &factors, &ratio, watch);
             }
             let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
             {
@@ -154,13 +155,16 @@ impl PowerProblem<'_> {
             let next = self.next(&fit, &x[0], (factor, &ratio))?;
             // That of the noise is one of the power, too.
             let change = next.fit.change(&fit).max((factor / before).ln().abs());
+            let tolerance = if is_early { EARLY_TOLERANCE } else { TOLERANCE };
             let task = watch.start("the sky's power", tolerance);
             if !task.report_step(change > tolerance && round < ROUNDS_MAX, round, change) {
-                return Ok(next);
+                if !is_early || !watch.has_priority() {
+                    return Ok(next);
+                }
+                (is_early, round) = (false, 0);
             }
             fit = next.fit;
         }
-        Err(SolveError::NoPower)
     }
 
     /// The power of `fit`, of which `x` is the solution, with its uncertainty.
@@ -220,8 +224,8 @@ impl PowerProblem<'_> {
         })
     }
 
-    /// The stopping rule of an intermediate map: its solver error is a fraction of its posterior error, or as `rule` requires.
-    pub(in crate::imaging) fn intermediate_rule(
+    /// The stopping rule of an early solution: its error is a fraction of its posterior error, or as `rule` requires.
+    pub(in crate::imaging) fn early_rule(
         &self,
         factors: &Factors<'_>,
         factor: f64,
@@ -232,10 +236,7 @@ impl PowerProblem<'_> {
         // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
         let posterior_error = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
         // At least a tenth of the map, for any noise.
-        StoppingRule {
-            residual_max: rule.residual_max.max(INTERMEDIATE_ERROR * posterior_error.min(1.0)),
-            ..rule
-        }
+        StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
     }
 
     /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.

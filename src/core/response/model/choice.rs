@@ -13,7 +13,7 @@ use crate::sky::SkyConfig;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ModelChoice {
-    /// Direct sums if they take about a minute or less, otherwise the cheaper model.
+    /// Direct sums if they take seconds (without a common circle: a minute) or less, otherwise the cheaper model.
     #[default]
     Auto,
     /// Sums over the sky's pixels.
@@ -100,8 +100,10 @@ pub struct ModelPlan {
 
 /// Maximum band limit unless the configuration sets one.
 const DEFAULT_L_MAX_MAX: usize = 1024;
-/// Direct sums up to this cost are preferred: they take about a minute on two cores, and have no band limit.
+/// Without a circle direct sums up to this cost are preferred: they take about a minute on two cores, and have no band limit.
 const DIRECT_FRINGES_MAX: f64 = 1.2e11;
+/// The same on a circle, where harmonics are as accurate: some seconds.
+const CIRCLE_DIRECT_FRINGES_MAX: f64 = 5e9;
 /// Memory of a batch of the general model, bytes per position: its coordinates, its view, and the index of its row.
 const POSITION_BYTES: f64 = 600.0;
 /// Maximum memory of a harmonic model unless the configuration sets that model, bytes.
@@ -142,8 +144,8 @@ impl ModelPlan {
                 }
             }
             ModelChoice::Auto if load.is_time_averaged => (ModelKind::Harmonic, "averages over integrations"),
-            ModelChoice::Auto if direct_fringes <= DIRECT_FRINGES_MAX => {
-                (ModelKind::Direct, "at most a minute")
+            ModelChoice::Auto if direct_fringes <= CIRCLE_DIRECT_FRINGES_MAX => {
+                (ModelKind::Direct, "seconds")
             }
             ModelChoice::Auto if harmonic_bytes > HARMONIC_BYTES_MAX => {
                 (ModelKind::Direct, "harmonic needs more than 8 GB")
@@ -205,6 +207,7 @@ mod tests {
     fn small_jobs_are_summed_and_large_ones_are_not() {
         let plan = |load| ModelPlan::new(ModelChoice::Auto, load);
         assert_eq!(plan(load(5e4, 64, 31.3)).kind, ModelKind::Direct);
+        assert_eq!(plan(load(5e4, 128, 31.3)).kind, ModelKind::Harmonic);
         let paper = plan(load(2.6e7, 512, 125.2));
         assert_eq!(paper.kind, ModelKind::Harmonic);
         // 2 pi 125.2 = 787, plus the width of the decay.

@@ -1,7 +1,7 @@
 //! Rows of the beam matrix B over HEALPix pixels, and visibilities as direct sums over a sky.
 //!
 //! `V_ij(nu) = Int T(n) A(n) S_i(n) S_j(n) exp(-2 pi i u . n) dn` with `u = (nu/c) (r_i - r_j)`, in K sr
-//! (the paper, Eq. 7). S is 0 for directions that the Moon hides from a satellite, and 1 otherwise. A row of B is
+//! (the paper, Sect. 3.2). S is 0 for directions that the Moon hides from a satellite, and 1 otherwise. A row of B is
 //! the integrand without T, pixel by pixel, times the pixel's solid angle.
 //!
 //! | entry point | computes |
