@@ -142,7 +142,10 @@ impl GainAssessment<'_> {
         let [reference_scatter, reference_model] = if is_reference {
             [0.0; 2]
         } else {
-            [self.excess[reference].scatter[1], self.model_variance(reference)]
+            [
+                self.excess[reference].scatter[1] + self.excess[reference].hidden,
+                self.model_variance(reference),
+            ]
         };
         // A daughter left out of the joint solution is assessed from its own data.
         let is_from_own_data = self.fitted.dropped_gains[k] && own_gain.presence != SignalPresence::NoData;
@@ -155,7 +158,7 @@ impl GainAssessment<'_> {
             (layout.gain(&newton.values, c, n), [sigma, self.phase_sigma(c, n)])
         };
         let relative = if is_reference { 0.0 } else { 1.0 };
-        let scatter = [excess.scatter[0], excess.scatter[1] + reference_scatter];
+        let scatter = [excess.scatter[0], excess.scatter[1] + excess.hidden + reference_scatter];
         let own_model = self.model_variance(k);
         let model = [own_model + self.common_amplitude_variance(c), relative * (own_model + reference_model)];
         let noise = noise.map(sigma_with_coverage);

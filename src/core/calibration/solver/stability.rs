@@ -58,6 +58,8 @@ const MODEL_SIGMAS: f64 = 3.0;
 pub(super) struct Excess {
     /// Variance of the change within the interval, of log amplitude and phase (rad).
     pub(super) scatter: [f64; 2],
+    /// Variance of a change of the phase that changes of most other daughters may hide.
+    pub(super) hidden: f64,
     /// Variance due to errors of the model that are seen, of either: those that last, and those that look like changes.
     pub(super) model: f64,
     /// The same by errors that noise may hide.
@@ -229,6 +231,7 @@ impl Residuals {
         for (channel, part) in parts.iter_mut().enumerate() {
             let (changing, scale) = self.find_changes(channel, suspects);
             let fitted = (changing.len(), scale);
+            let hidden = hidden_variance(&changing, self.satellites);
             for (daughter, scatter) in changing {
                 excess[channel * self.satellites + daughter].scatter = scatter.variance;
             }
@@ -256,6 +259,9 @@ impl Residuals {
                 let share = if sum > 0.0 { square / (sum * sum) } else { 0.0 };
                 let excess = &mut excess[channel * self.satellites + daughter];
                 excess.model = 0.5 * most * share + apparent[0].max(apparent[1]);
+                if excess.scatter[1] < hidden {
+                    excess.hidden = hidden;
+                }
                 excess.model_below_noise = 0.5 * of_daughter[1] * share;
                 excess.model_full_power = 0.5 * share;
             }
@@ -403,6 +409,18 @@ impl Scatter {
         }
         scatter
     }
+}
+
+/// Part of the usual variance of changes that the gain of a daughter may have unseen, where most daughters change: a change
+/// that all share is seen of none, and each is judged beside what blurs the others.
+const HIDDEN_PART: f64 = 0.25;
+
+/// Variance of a phase's change that may be hidden by changes of most other daughters.
+fn hidden_variance(changing: &[(usize, Scatter)], satellites: usize) -> f64 {
+    let mut variances: Vec<f64> = changing.iter().map(|(_, scatter)| scatter.variance[1]).collect();
+    variances.sort_unstable_by(f64::total_cmp);
+    let median = variances.get(variances.len() / 2).copied().unwrap_or(0.0);
+    if 2 * changing.len() > satellites { HIDDEN_PART * median } else { 0.0 }
 }
 
 /// Chi-square (two degrees of freedom) of a certain jump: noise reaches it at fewer than one of a hundred million
