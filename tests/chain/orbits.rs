@@ -38,6 +38,16 @@ rows = "centre"
 pictures = false
 "#;
 
+/// The ground makes the run's maps of the downlink alone, whose path is returned: it knows the orbits.
+fn assert_replayed(place: &Workplace, out: &str) -> String {
+    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
+    succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &ground]);
+    for (path, bytes) in maps(&ground) {
+        assert!(bytes == maps(out)[&path], "{} differs", path.display());
+    }
+    downlink
+}
+
 #[test]
 fn a_triple_on_ellipses_is_flown_and_mapped() {
     let place = Workplace::new(TRIPLE);
@@ -48,12 +58,7 @@ fn a_triple_on_ellipses_is_flown_and_mapped() {
     // Data of the map's own pixels without noise come back, but for what the regularisation takes.
     let error = summary["channels"][0]["snapshots"][0]["rms_error_over_rms_truth"].as_f64().unwrap();
     assert!(error < 0.05, "{error}");
-    // The ground knows the orbits from the downlink alone.
-    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
-    succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &ground]);
-    for (path, bytes) in maps(&ground) {
-        assert!(bytes == maps(&out)[&path], "{} differs", path.display());
-    }
+    let downlink = assert_replayed(&place, &out);
     assert!(Contents::read(Path::new(&downlink)).unwrap().visibilities.count > 1000);
 }
 
@@ -100,11 +105,7 @@ fn stations_on_the_moon_map_the_sky() {
     // which the smallest is 0.0207, as numpy finds from rows at the pixels' centres.
     let error = summary["channels"][0]["snapshots"][0]["rms_error_over_rms_truth"].as_f64().unwrap();
     assert!(error < 1e-6 / 0.0207, "{error}");
-    let (downlink, ground) = (format!("{out}/downlink.ccsds"), place.path("ground"));
-    succeed(&["replay", &downlink, "--map", &place.pipeline, "--out", &ground]);
-    for (path, bytes) in maps(&ground) {
-        assert!(bytes == maps(&out)[&path], "{} differs", path.display());
-    }
+    assert_replayed(&place, &out);
 }
 
 #[test]

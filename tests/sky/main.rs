@@ -6,6 +6,8 @@ mod common;
 
 mod cutouts;
 mod files;
+mod foreign;
 mod harmonics;
 mod python_files;
 mod python_harmonics;
+mod verified;

@@ -16,8 +16,7 @@ use crate::units::Pair;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, direction, dot, sub};
 
-/// Instants of an integration, where visibilities are averages over it. Light curves and the Moon's limb have edges, for which equal
-/// steps are as good as any.
+/// Instants of an integration, where visibilities are averages over it. The Moon's limb is an edge, for which equal steps are as good as any.
 const INSTANTS: u32 = 16;
 
 /// The moving sources of a mission.
@@ -33,7 +32,7 @@ pub struct MovingSky {
     pub epoch_tai_s: f64,
     /// Antennas of the daughters.
     pub response: AntennaResponse,
-    /// Whether visibilities are averages over their integrations, or instantaneous values at their middle.
+    /// Whether directions change within integrations, or are those of their middle. Flux densities are means over integrations.
     pub smear_integrations: bool,
     /// Whether visibilities are averages over the channel's width.
     pub smear_bandwidth: bool,
@@ -78,7 +77,9 @@ impl MovingSky {
         for source in self.sources.iter().filter(|source| source.is_on(channel.frequency_hz, ends_s)) {
             for k in 0..instants {
                 let t_s = instant_s(k);
-                let k_sr = source.flux_jy(channel.frequency_hz, t_s) * k_sr_per_jy(channel.frequency_hz);
+                let half_s = 0.5 * dt_s / f64::from(instants);
+                let flux_jy = source.mean_flux_jy(channel.frequency_hz, [t_s - half_s, t_s + half_s]);
+                let k_sr = flux_jy * k_sr_per_jy(channel.frequency_hz);
                 if k_sr > 0.0 {
                     self.add(&mut total, (source, k_sr / f64::from(instants)), pair, channel, t_s);
                 }

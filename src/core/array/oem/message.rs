@@ -169,7 +169,8 @@ impl Message for Collector {
     /// Begins a segment with the metadata that end in a line.
     fn end_metadata(&mut self, line: usize) -> Result<(), Fault> {
         let metadata = std::mem::take(&mut self.metadata);
-        metadata.require("CENTER_NAME", &["MOON"], "CENTER_NAME = MOON", line)?;
+        // GMAT calls the Moon Luna.
+        metadata.require("CENTER_NAME", &["MOON", "LUNA"], "CENTER_NAME = MOON", line)?;
         let axes = metadata.axes(line)?;
         let scale = metadata.scale(line)?;
         let (method, degree) = metadata.interpolation(line)?;

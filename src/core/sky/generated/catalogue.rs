@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::column_units::{angle_deg, flux_jy, in_comments, is_unit, require_unit};
+use super::column_units::{
+    FLUX_WORDS, POSITION_WORDS, angle_deg, flux_jy, in_comments, is_unit, require_unit,
+};
 use super::columns::{Columns, normalise};
 use crate::files::{read_file, text_of};
 use crate::sky::Frame;
@@ -234,8 +236,6 @@ impl Reader<'_> {
                 return Err(self.content_error(1, found, "one of each name"));
             }
         }
-        let positions = ["positions", "coordinates", "angles"];
-        let fluxes = ["flux", "fluxes", "density", "densities"];
         let refuse = |(name, _): &(&str, Vec<String>), expected| {
             let name = displayed(name);
             move |unit: String| {
@@ -244,12 +244,12 @@ impl Reader<'_> {
         };
         let angle = |places: &[usize], hours: Option<f64>, expected| match *places {
             [place] => {
-                let column = table.units_of(place, &positions);
+                let column = table.units_of(place, &POSITION_WORDS);
                 angle_deg(&column, hours).map_err(refuse(&column, expected))
             }
             _ => Ok(hours.unwrap_or(1.0)),
         };
-        let of_flux = table.units_of(*flux, &fluxes);
+        let of_flux = table.units_of(*flux, &FLUX_WORDS);
         let of_row = &table.units[*flux];
         if of_row.starts_with('[') {
             let expected =
@@ -421,10 +421,9 @@ fn separator_of(line: &str) -> char {
 
 /// Splits a line into cells. A cell in quotes may contain the separator, and a doubled quote means a quote.
 fn cells(line: &str, separator: char) -> Vec<String> {
-    if separator == ' ' {
-        return line.split_whitespace().map(|cell| cell.trim_matches('"').to_owned()).collect();
-    }
+    let is_end = |c: char| c == separator || (separator == ' ' && c.is_whitespace());
     let (mut cells, mut cell, mut quoted) = (Vec::new(), String::new(), false);
+    let mut was_quoted = false;
     let mut letters = line.chars().peekable();
     while let Some(c) = letters.next() {
         match c {
@@ -434,13 +433,17 @@ fn cells(line: &str, separator: char) -> Vec<String> {
             }
             '"' if quoted => quoted = false,
             // A quote within a cell, as for arcseconds, is literal.
-            '"' if cell.trim().is_empty() => quoted = true,
-            c if c == separator && !quoted => cells.push(std::mem::take(&mut cell)),
+            '"' if cell.trim().is_empty() => (quoted, was_quoted) = (true, true),
+            c if is_end(c) && !quoted => {
+                cells.push((std::mem::take(&mut cell), std::mem::take(&mut was_quoted)));
+            }
             c => cell.push(c),
         }
     }
-    cells.push(cell);
-    cells.into_iter().map(|cell| cell.trim().to_owned()).collect()
+    cells.push((cell, was_quoted));
+    // Any number of blanks separates.
+    let is_cell = |(cell, was_quoted): &(String, bool)| separator != ' ' || *was_quoted || !cell.is_empty();
+    cells.into_iter().filter(is_cell).map(|(cell, _)| cell.trim().to_owned()).collect()
 }
 
 /// Whether a row contains units: no numbers, and at least one unit that is usual in catalogues.

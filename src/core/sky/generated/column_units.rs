@@ -13,6 +13,10 @@ const ANGLES: [(&[&str], f64); 5] = [
 const FLUXES: [(&[&str], f64); 2] = [(&["jy"], 1.0), (&["mjy"], 1e-3)];
 const FREQUENCIES: [(&[&str], f64); 4] = [(&["hz"], 1.0), (&["khz"], 1e3), (&["mhz"], 1e6), (&["ghz"], 1e9)];
 
+/// Words that stand for the columns of positions and of fluxes in comments.
+pub(super) const POSITION_WORDS: [&str; 3] = ["positions", "coordinates", "angles"];
+pub(super) const FLUX_WORDS: [&str; 4] = ["flux", "fluxes", "density", "densities"];
+
 fn value_of(units: &[(&[&str], f64)], unit: &str) -> Option<f64> {
     units.iter().find(|(names, _)| names.contains(&unit)).map(|(_, value)| *value)
 }
@@ -32,7 +36,16 @@ pub(super) fn is_unit(cell: &str) -> bool {
 /// and in words (`fluxes in mJy`).
 pub(super) fn in_comments(comments: &[&str]) -> Vec<(String, String)> {
     let (mut found, mut ecsv_name) = (Vec::new(), None);
-    let mut add = |name: &str, unit: &str| found.push((normalise(name), unit.to_owned()));
+    let mut add = |name: &str, unit: &str| {
+        let name = normalise(name);
+        // Of "positions of J2000, fluxes in mJy" the unit is that of the fluxes.
+        let is_of = |units| value_of(units, &cleaned(unit)).is_some();
+        let is_other = (is_of(&FLUXES) && POSITION_WORDS.contains(&&*name))
+            || (is_of(&ANGLES) && FLUX_WORDS.contains(&&*name));
+        if !is_other {
+            found.push((name, unit.to_owned()));
+        }
+    };
     for line in comments {
         for part in line.split(['{', '}', ',']).map(|part| part.trim_matches([' ', '\t', '-'])) {
             match part.split_once(':') {
@@ -46,8 +59,9 @@ pub(super) fn in_comments(comments: &[&str]) -> Vec<(String, String)> {
             let unit = line[at + 1..].split([']', ')']).next().unwrap_or_default();
             // Round brackets may have anything; square ones also references.
             let is_flux = unit.to_ascii_lowercase().contains("jy");
-            let is_word =
-                unit.chars().all(|c| !c.is_whitespace() && !c.is_ascii_digit()) && !is_reference(unit);
+            // VizieR's [ucd=..] is the kind of quantity.
+            let is_word = unit.chars().all(|c| !c.is_whitespace() && !c.is_ascii_digit() && c != '=')
+                && !is_reference(unit);
             if is_unit(unit) || is_flux || (bracket == "[" && is_word) {
                 let before = words(&line[..at]);
                 let first = before.clone().next().filter(|_| brackets.len() == 1);
