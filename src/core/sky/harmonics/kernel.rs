@@ -221,20 +221,27 @@ impl<S: Simd, const U: usize> FunctionSink<S, U> for SumDegrees<'_, S, U> {
 struct SumRings<'a, S: Simd, const U: usize> {
     simd: S,
     parts: [[S::f64s; U]; 4],
-    lanes: &'a mut [[S::f64s; 4]],
+    /// The sums of rings that are equal modulo `GROUP`, on every processor.
+    by_lane: &'a mut [S::f64s],
+    /// Position of the block among the vectors of a group.
+    first: usize,
 }
 
 impl<S: Simd, const U: usize> FunctionSink<S, U> for SumRings<'_, S, U> {
     #[inline(always)]
     fn take(&mut self, j: usize, q: &[S::f64s; U]) {
         let simd = self.simd;
-        let lanes = &mut self.lanes[j];
+        let vectors = GROUP / S::F64_LANES;
+        let sums = &mut self.by_lane[j * 4 * vectors..][..4 * vectors];
         for part in 0..4 {
-            let mut sum = lanes[part];
-            for u in 0..U {
-                sum = simd.mul_add_e_f64s(self.parts[part][u], q[u], sum);
+            for r in 0..vectors.min(U) {
+                let at = if U >= vectors { r } else { (self.first + r) % vectors };
+                let mut sum = sums[part * vectors + at];
+                for u in (r..U).step_by(vectors) {
+                    sum = simd.mul_add_e_f64s(self.parts[part][u], q[u], sum);
+                }
+                sums[part * vectors + at] = sum;
             }
-            lanes[part] = sum;
         }
     }
 }
@@ -281,8 +288,8 @@ impl AdjointTask<'_> {
         let width = U * S::F64_LANES;
         let count = self.order.len();
         self.by_lane.clear();
-        self.by_lane.resize(4 * S::F64_LANES * count, 0.0);
-        let lanes = S::as_mut_simd_f64s(self.by_lane.as_mut_slice()).0.as_chunks_mut::<4>().0;
+        self.by_lane.resize(4 * GROUP * count, 0.0);
+        let by_lane = S::as_mut_simd_f64s(self.by_lane.as_mut_slice()).0;
         for at in self.chunk.clone().step_by(width) {
             if self.order.m > order_max(self.l_max, self.rings.sin[at + width - 1]) {
                 continue;
@@ -296,16 +303,13 @@ impl AdjointTask<'_> {
                     *vector = S::as_simd_f64s(&self.parts[group..group + S::F64_LANES]).0[0];
                 }
             }
-            let mut sink = SumRings { simd, parts, lanes: &mut *lanes };
+            let first = at / S::F64_LANES % (GROUP / S::F64_LANES);
+            let mut sink = SumRings { simd, parts, by_lane: &mut *by_lane, first };
             RingBlock::new(simd, self.order, self.rings, at).run(&self.order.steps, &mut sink);
         }
         self.sums.clear();
-        for vectors in lanes.iter() {
-            let mut sum = [0.0; 4];
-            for part in 0..4 {
-                sum[part] = simd.reduce_sum_f64s(vectors[part]);
-            }
-            self.sums.push(sum);
+        for parts in self.by_lane.as_chunks::<GROUP>().0.as_chunks::<4>().0 {
+            self.sums.push(parts.map(|s| ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7]))));
         }
     }
 }
@@ -325,6 +329,11 @@ impl WithSimd for AdjointTask<'_> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        if S::REGISTER_COUNT >= 32 { self.run::<S, 4>(simd) } else { self.run::<S, 2>(simd) }
+        // AVX2 takes the parts from memory, and loads and stores sums half as often.
+        if S::REGISTER_COUNT >= 32 || S::F64_LANES == 4 {
+            self.run::<S, 4>(simd)
+        } else {
+            self.run::<S, 2>(simd)
+        }
     }
 }
