@@ -8,9 +8,9 @@ use crate::units::vector::Vec3;
 const AXIS_AU: [f64; 3] = [5.202_603_209_2, 1.9132e-6, -3.9e-9];
 const ECCENTRICITY: [f64; 3] = [0.048_497_925_5, 0.001_632_254_2, -4.713_66e-5];
 const LONGITUDE: [f64; 3] = [34.351_518_74, 109_256_603.779_91, -30.603_78];
-const PERIHELION: [f64; 3] = [14.331_206_87, 7758.751_63, 259.959_38];
+const PERIHELION: [f64; 3] = [14.331_206_87, 7_758.751_63, 259.959_38];
 const INCLINATION: [f64; 3] = [1.303_266_98, -71.558_9, 11.952_97];
-const NODE: [f64; 3] = [100.464_407_02, 6362.035_61, 326.521_78];
+const NODE: [f64; 3] = [100.464_407_02, 6_362.035_61, 326.521_78];
 
 /// Frequency of the periodic terms in units of [`RATE`], and 1e7 times the factors of cosine and sine, for the axis (au).
 const OF_AXIS: [[f64; 3]; 8] = [
