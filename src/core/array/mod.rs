@@ -31,7 +31,7 @@ pub use attitudes::Attitudes;
 #[doc(hidden)]
 pub use baseline::scaled_baseline;
 #[doc(hidden)]
-pub use bodies::{EarthModel, earth_is_hidden_by_date, sun_hat_by_date};
+pub use bodies::{EarthModel, earth_is_hidden_by_date, jupiter_hat_by_date, sun_hat_by_date};
 pub use config::{ArrayConfig, ArrayError};
 #[doc(hidden)]
 pub use config::{BreathingConfig, NodeMotion, Spacing};

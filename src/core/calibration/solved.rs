@@ -35,6 +35,7 @@ impl ClosedPass {
                 && solution.daughters.iter().all(|daughter| daughter.gains.len() == channels)
                 && solution.outlier_fractions.has_channels(channels)
                 && solution.model_error.len() == channels
+                && solution.models.len() == channels
                 && (1..=satellites).contains(&(solution.reference as usize))
         };
         self.span_s.iter().all(|time_s| time_s.is_finite())

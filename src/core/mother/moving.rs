@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use num_complex::Complex64;
 
-use crate::array::{Array, hidden_by_moon, sun_hat_by_date};
+use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::frames::{AntennaResponse, Channel, ObservingWindow};
 use crate::response::beacon::plane_wave;
 use crate::response::pixel::exact::envelope;
@@ -59,6 +59,7 @@ impl MovingSky {
     fn source_hat(&self, source: &MovingSource, t_s: f64) -> Vec3 {
         match source.direction {
             MovingDirection::Body(Body::Sun) => sun_hat_by_date(self.epoch_tai_s, t_s),
+            MovingDirection::Body(Body::Jupiter) => jupiter_hat_by_date(self.epoch_tai_s, t_s),
             MovingDirection::Fixed([longitude_deg, latitude_deg]) => direction(longitude_deg, latitude_deg),
         }
     }

@@ -53,9 +53,9 @@ keys! {
         /// --sources` writes it. Without an index of their own, sources have sky.generated.source_spectral_index.
         #[serde(skip_serializing_if = "Option::is_none")]
         expert points: Option<PathBuf> = None;
-        /// Bursts of point sources, such as `[{ direction = "sun", starts_s = [9e4], peak_jy = 1e8 }]`, or `direction = [longitude,
-        /// latitude]`; optional `reference_hz`, `spectral_index`, `rise_s`, `decay_s`, `duration_index`, `drift_s` (a type III burst's). The
-        /// truth is written beside the downlink, as FILE.moving.csv.
+        /// Point sources that move or burst, such as `[{ direction = "sun", starts_s = [9e4], peak_jy = 1e8 }]`; direction = `"sun"`,
+        /// `"jupiter"` or `[longitude, latitude]`; optional `steady_jy`, `reference_hz`, `spectral_index`, `rise_s`, `decay_s`,
+        /// `duration_index`, `drift_s` (a type III burst's). The bursts are listed beside the downlink, in FILE.moving.csv.
         #[serde(skip_serializing_if = "Vec::is_empty")]
         expert moving: Vec<MovingSource> = Vec::new();
     }

@@ -36,9 +36,11 @@ pub enum MovingDirection {
 pub enum Body {
     /// The Sun.
     Sun,
+    /// Jupiter.
+    Jupiter,
 }
 
-/// A point source with bursts (`[[sky.moving]]`), all with the same light curve: a linear rise, then an exponential decay.
+/// A point source with steady flux, bursts or both (`[[sky.moving]]`); all bursts have the same light curve: a linear rise, then an exponential decay.
 ///
 /// At frequency f the flux density scales as f^spectral_index, the rise and the decay as f^-duration_index, and a burst is late by
 /// `drift_s ((f / reference_hz)^-0.84 - 1)`. The defaults are those of a solar type III burst: the drift rate is 0.01 f^1.84 MHz/s
@@ -46,11 +48,16 @@ pub enum Body {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MovingSource {
-    /// `"sun"`, or ecliptic longitude and latitude in degrees.
+    /// `"sun"`, `"jupiter"`, or ecliptic longitude and latitude in degrees.
     pub direction: MovingDirection,
+    /// Steady flux density at the reference frequency, Jy.
+    #[serde(default)]
+    pub steady_jy: f64,
     /// Starts of the bursts at the reference frequency, s after the mission's epoch.
+    #[serde(default)]
     pub starts_s: Vec<f64>,
-    /// Flux density at the peak, at the reference frequency, Jy.
+    /// Flux density at the peak of bursts, at the reference frequency, Jy.
+    #[serde(default)]
     pub peak_jy: f64,
     /// Reference frequency, Hz.
     #[serde(default = "reference_hz")]
@@ -94,7 +101,7 @@ fn drift_s() -> f64 {
 }
 
 impl MovingSource {
-    /// Mean flux density at a frequency between two times, Jy: bursts are shorter than integrations.
+    /// Mean flux density at a frequency between two times, Jy, since bursts are shorter than integrations.
     #[must_use]
     pub fn mean_flux_jy(&self, frequency_hz: f64, [from_s, until_s]: [f64; 2]) -> f64 {
         let [rise_s, decay_s] = self.times_s(frequency_hz);
@@ -112,15 +119,18 @@ impl MovingSource {
             until(until_s - begin_s) - until(from_s - begin_s)
         };
         let total: f64 = self.starts_s.iter().map(of_burst).sum();
-        self.peak_at_jy(frequency_hz) * total / (until_s - from_s)
+        self.factor(frequency_hz) * (self.steady_jy + self.peak_jy * total / (until_s - from_s))
     }
 
-    /// Whether a burst may be on at a frequency between two times.
+    /// Whether it has flux at a frequency between two times.
     #[must_use]
     pub fn is_on(&self, frequency_hz: f64, [from_s, until_s]: [f64; 2]) -> bool {
         let [rise_s, decay_s] = self.times_s(frequency_hz);
         let begins_s = self.starts_s.iter().map(|start_s| start_s + self.delay_s(frequency_hz));
-        begins_s.into_iter().any(|begin_s| begin_s < until_s && from_s < begin_s + rise_s + DECAYS * decay_s)
+        self.steady_jy > 0.0
+            || begins_s
+                .into_iter()
+                .any(|begin_s| begin_s < until_s && from_s < begin_s + rise_s + DECAYS * decay_s)
     }
 
     /// Delay of the start at a frequency after that at the reference frequency, s.
@@ -139,7 +149,12 @@ impl MovingSource {
     /// Flux density at the peak at a frequency, Jy.
     #[must_use]
     pub fn peak_at_jy(&self, frequency_hz: f64) -> f64 {
-        self.peak_jy * (frequency_hz / self.reference_hz).powf(self.spectral_index)
+        self.peak_jy * self.factor(frequency_hz)
+    }
+
+    /// Flux density at a frequency in units of that at the reference frequency.
+    fn factor(&self, frequency_hz: f64) -> f64 {
+        (frequency_hz / self.reference_hz).powf(self.spectral_index)
     }
 
     /// Lists the problems of source `index` of the list.
@@ -149,13 +164,14 @@ impl MovingSource {
         let key = |name: &str| format!("moving[{index}].{name}");
         if let MovingDirection::Fixed([longitude, latitude]) = self.direction {
             let good = longitude.is_finite() && (-90.0..=90.0).contains(&latitude);
-            let expected = "\"sun\", or ecliptic longitude and latitude, -90 to 90 degrees";
+            let expected = "\"sun\", \"jupiter\", or ecliptic longitude and latitude, -90 to 90 degrees";
             checks.require(key("direction"), format!("[{longitude}, {latitude}]"), good, expected);
         }
         let is_time = |s: f64| s.abs() <= 1e10;
         checks.numbers(key("starts_s"), &self.starts_s, is_time, "times after the epoch, s");
-        let peak_jy = self.peak_jy;
-        checks.number(key("peak_jy"), peak_jy, (0.0..=1e15).contains(&peak_jy), "0 to 1e15 Jy");
+        for (name, value) in [("steady_jy", self.steady_jy), ("peak_jy", self.peak_jy)] {
+            checks.number(key(name), value, (0.0..=1e15).contains(&value), "0 to 1e15 Jy");
+        }
         let hz = self.reference_hz;
         checks.number(key("reference_hz"), hz, (1e3..=1e10).contains(&hz), "1 kHz to 10 GHz");
         for (name, value) in
@@ -209,6 +225,15 @@ mod tests {
             // Without what is left after 20 decay times, 2e-9.
             assert!((found - expected).abs() < 1e-9, "{found} {expected}");
         }
+    }
+
+    #[test]
+    fn steady_sources_have_flux_at_all_times() {
+        let text = "direction = 'jupiter'\nsteady_jy = 200.0\nspectral_index = -2.0";
+        let steady: MovingSource = toml::from_str(text).unwrap();
+        assert!(steady.is_on(5e6, [-1e6, -9e5]) && steady.problems(0).is_empty());
+        // Twice the wavelength of the reference frequency, 10 MHz.
+        assert!((steady.mean_flux_jy(5e6, [3.0, 4.0]) - 800.0).abs() < 1e-9);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! Missions with dates use ephemerides of both. A mission without dates has an idealised Earth on a circle in the
 //! ecliptic.
 
+mod jupiter;
 mod moon;
 mod orientation;
 mod sun;
@@ -164,6 +165,19 @@ pub fn sun_hat_by_date(epoch_tai_s: f64, t_s: f64) -> Vec3 {
     sun_hat(Tai::from_seconds_since_1958(epoch_tai_s).plus_s(t_s))
 }
 
+/// Direction of Jupiter from the Moon's centre some seconds after a mission's epoch (TAI since 1958-01-01, s), on ecliptic axes of J2000;
+/// geometric, to 0.03 degrees from 2020 to 2040.
+#[must_use]
+#[doc(hidden)]
+pub fn jupiter_hat_by_date(epoch_tai_s: f64, t_s: f64) -> Vec3 {
+    let centuries = Tai::from_seconds_since_1958(epoch_tai_s).plus_s(t_s).tt_centuries();
+    let from_earth_m: Vec3 = {
+        let (sun, jupiter) = (sun::position_m(centuries), jupiter::position_m(centuries));
+        std::array::from_fn(|k| sun[k] + jupiter[k])
+    };
+    unit(sub(from_earth_m, moon::position_m(centuries)))
+}
+
 /// Direction of the Sun from the Moon, on ecliptic axes of J2000; geometric, to 0.002 degrees from 2020 to 2040.
 fn sun_hat(time: Tai) -> Vec3 {
     let centuries = time.tt_centuries();
@@ -214,6 +228,27 @@ mod tests {
             let [earth_deg, sun_deg] = [off_deg(earth_hat(time), earth), off_deg(sun_hat(time), sun)];
             assert!(earth_deg < 0.004, "{date}: Earth off by {earth_deg} degrees");
             assert!(sun_deg < 0.002, "{date}: Sun off by {sun_deg} degrees");
+        }
+    }
+
+    /// As above, of Jupiter.
+    const JUPITER: [(&str, [f64; 2]); 7] = [
+        ("2020-01-01T00:00:00", [276.3806, 0.0932]),
+        ("2022-11-08T06:00:00", [358.8812, -1.5279]),
+        ("2026-08-12T18:00:00", [129.1836, 0.4923]),
+        ("2029-12-01T00:00:00", [224.1396, 0.9812]),
+        ("2033-05-05T12:00:00", [332.9011, -0.8242]),
+        ("2037-07-01T00:00:00", [97.9886, -0.0524]),
+        ("2040-01-01T00:00:00", [180.9296, 1.2808]),
+    ];
+
+    #[test]
+    fn jupiter_is_where_another_ephemeris_has_it() {
+        for (date, place) in JUPITER {
+            let epoch_tai_s = Tai::parse(date, TimeScale::Utc).unwrap().seconds_since_1958() - 1e5;
+            let off_deg = norm(sub(jupiter_hat_by_date(epoch_tai_s, 1e5), towards(place))).to_degrees();
+            // The stated accuracy: 78" seen from the Sun, up to a quarter more from the Earth.
+            assert!(off_deg < 0.03, "{date}: {off_deg} degrees");
         }
     }
 

@@ -3,7 +3,7 @@
 use crate::units::vector::Vec3;
 
 /// Astronomical unit, m (IAU 2012, exact).
-const AU_M: f64 = 149_597_870_700.0;
+pub(super) const AU_M: f64 = 149_597_870_700.0;
 
 /// Amplitude (au), phase (rad) and frequency (rad a Julian year) of the cosines of x, y and z.
 #[rustfmt::skip]

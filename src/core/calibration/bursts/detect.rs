@@ -14,8 +14,7 @@ use std::f64::consts::LN_2;
 use std::ops::Range;
 
 use super::FoundBurst;
-use super::locate::{Sample, locate};
-use crate::array::sun_hat_by_date;
+use super::locate::{KnownBody, Sample, locate};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
 use crate::response::pixel::PairGeometry;
@@ -188,15 +187,18 @@ fn describe(
     let brightest: Vec<usize> =
         bins.brightest(range.clone()).filter(|bin| bins.ratios[*bin] > 0.0).take(BRIGHTEST).collect();
     let (peak, first) = (*brightest.first()?, pairs.first()?.first()?);
+    // A power for each half of a bin, as a burst may be as short as an integration, of which a bin holds two or more.
     let samples: Vec<Vec<Sample>> = brightest
         .iter()
-        .map(|bin| {
-            pairs.iter().flat_map(|pair| samples_of(pair, |time_s| bins.bin(time_s) == *bin)).collect()
+        .flat_map(|bin| [false, true].map(|is_late| (*bin, is_late)))
+        .map(|(bin, is_late)| {
+            let middle_s = bins.start_s(bin) + 0.5 * bins.width_s;
+            let is_in = |time_s: f64| bins.bin(time_s) == bin && (time_s >= middle_s) == is_late;
+            pairs.iter().flat_map(|pair| samples_of(pair, is_in)).collect()
         })
         .collect();
     let peak_s = bins.start_s(peak) + 0.5 * bins.width_s;
-    let sun_hat = sun_hat_by_date(search.epoch_tai_s, peak_s);
-    let located = locate(&samples, search.moon_radius_m, sun_hat)?;
+    let located = locate(&samples, search.moon_radius_m, &KnownBody::all(search.epoch_tai_s, peak_s))?;
     let jy = k_sr_per_jy(first.block.frequency_hz).recip();
     Some(FoundBurst {
         channel: first.block.channel.0,
@@ -209,7 +211,7 @@ fn describe(
         flux_sigma_jy: jy * located.power_sigma_k_sr,
         positions_deg: located.directions.iter().map(|hat| ecliptic_deg(*hat)).collect(),
         position_sigma_deg: located.sigma_rad.to_degrees(),
-        name: located.is_sun.then(|| "sun".to_owned()),
+        name: located.name.map(str::to_owned),
     })
 }
 

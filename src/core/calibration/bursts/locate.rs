@@ -13,7 +13,7 @@ use std::f64::consts::{PI, TAU};
 use num_complex::Complex64;
 use rayon::prelude::*;
 
-use crate::array::hidden_by_moon;
+use crate::array::{hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::response::pixel::PairGeometry;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, sub, unit};
 
@@ -43,6 +43,8 @@ const HALVINGS: usize = 15;
 
 /// Distance from the Sun within which its bursts at these frequencies arise and are scattered, rad: two degrees.
 const SUN_RAD: f64 = 0.035;
+/// The error of Jupiter's direction, rad.
+const JUPITER_RAD: f64 = 5e-4;
 
 /// Standard deviation of a position, rad, up to which it can have a name. On short baselines along a line it is any place of a circle.
 const SIGMA_RAD_MAX: f64 = 0.1;
@@ -62,6 +64,25 @@ pub(super) struct Sample {
     pub(super) information: f64,
 }
 
+/// A body that a source may be.
+pub(super) struct KnownBody {
+    pub(super) name: &'static str,
+    /// Direction from the Moon.
+    pub(super) hat: Vec3,
+    /// How far from its centre bursts may be, rad.
+    pub(super) radius_rad: f64,
+}
+
+impl KnownBody {
+    /// The Sun and Jupiter some seconds after a mission's epoch.
+    pub(super) fn all(epoch_tai_s: f64, t_s: f64) -> [Self; 2] {
+        [
+            Self { name: "sun", hat: sun_hat_by_date(epoch_tai_s, t_s), radius_rad: SUN_RAD },
+            Self { name: "jupiter", hat: jupiter_hat_by_date(epoch_tai_s, t_s), radius_rad: JUPITER_RAD },
+        ]
+    }
+}
+
 /// A located source.
 #[derive(Clone, Debug)]
 pub(super) struct Located {
@@ -70,10 +91,11 @@ pub(super) struct Located {
     /// Standard deviation of the first direction along its worst axis, rad.
     pub(super) sigma_rad: f64,
     pub(super) significance: f64,
-    /// Power in the first bin, and its standard deviation, K sr.
+    /// Power in the bin where it is most significant, and its standard deviation, K sr.
     pub(super) power_k_sr: f64,
     pub(super) power_sigma_k_sr: f64,
-    pub(super) is_sun: bool,
+    /// The body that may be at one of the directions.
+    pub(super) name: Option<&'static str>,
 }
 
 /// Samples of a bin with their baselines in wavelengths.
@@ -92,14 +114,14 @@ struct Place {
     twice_log: f64,
 }
 
-/// Finds the direction of a source, whose power may differ from bin to bin; the first bin is the brightest. `None` without samples.
-pub(super) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64, sun_hat: Vec3) -> Option<Located> {
+/// Finds the direction of a source, whose power may differ from bin to bin. `None` without samples.
+pub(super) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64, bodies: &[KnownBody]) -> Option<Located> {
     let search = Search::new(bins, moon_radius_m)?;
     let best = search.all_sky();
     let (largest, longest) = (best.first()?.twice_log, search.lengths().last().copied()?.max(1.0));
     let first = search.direction(best.first()?);
-    let sigma_rad = search.information(first, longest).sqrt().recip();
-    let [power_k_sr, power_sigma_k_sr] = search.power(first);
+    let sigma_rad = search.scatter(first) * search.information(first, longest).sqrt().recip();
+    let [power_k_sr, power_sigma_k_sr] = search.power(first)?;
     let mut directions: Vec<Vec3> = Vec::new();
     let apart = |a: Vec3, b: Vec3| norm(sub(a, b));
     for place in best.iter().filter(|place| largest - place.twice_log < WITHIN) {
@@ -109,10 +131,13 @@ pub(super) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64, sun_hat: Vec3) ->
             directions.push(hat);
         }
     }
-    let sun_rad = SUN_RAD + WITHIN.sqrt() * sigma_rad;
-    let is_sun = sigma_rad < SIGMA_RAD_MAX && directions.iter().any(|hat| apart(*hat, sun_hat) < sun_rad);
+    let is_at = |body: &&KnownBody| {
+        let within_rad = body.radius_rad + WITHIN.sqrt() * sigma_rad;
+        directions.iter().any(|hat| apart(*hat, body.hat) < within_rad)
+    };
+    let name = bodies.iter().find(is_at).filter(|_| sigma_rad < SIGMA_RAD_MAX).map(|body| body.name);
     let significance = largest.max(0.0).sqrt();
-    Some(Located { directions, sigma_rad, significance, power_k_sr, power_sigma_k_sr, is_sun })
+    Some(Located { directions, sigma_rad, significance, power_k_sr, power_sigma_k_sr, name })
 }
 
 impl Sample {
@@ -220,12 +245,12 @@ impl<'a> Search<'a> {
         best
     }
 
-    /// Sums of a bin in a direction, over baselines of at most `reach` wavelengths: C and I.
-    fn sums(&self, bin: usize, n_hat: Vec3, reach: f64) -> [f64; 2] {
+    /// Sums of a bin in a direction, over baselines of at most `reach` wavelengths whose daughters see the direction `sight`: C and I.
+    fn sums(&self, bin: usize, [n_hat, sight]: [Vec3; 2], reach: f64) -> [f64; 2] {
         let mut sums = [0.0; 2];
         for (sample, u, length) in &self.bins[bin] {
             let Sample { geometry, value_k_sr, information } = sample;
-            let is_hidden = |r_m| hidden_by_moon(r_m, n_hat, self.moon_radius_m);
+            let is_hidden = |r_m| hidden_by_moon(r_m, sight, self.moon_radius_m);
             if *length > reach || is_hidden(geometry.r_i_m) || is_hidden(geometry.r_j_m) {
                 continue;
             }
@@ -239,27 +264,45 @@ impl<'a> Search<'a> {
 
     /// Twice the logarithm of the likelihood ratio.
     fn twice_log(&self, n_hat: Vec3, reach: f64) -> f64 {
-        let of_bin = |bin| match self.sums(bin, n_hat, reach) {
+        self.twice_log_of_sight([n_hat; 2], reach)
+    }
+
+    fn twice_log_of_sight(&self, hats: [Vec3; 2], reach: f64) -> f64 {
+        let of_bin = |bin| match self.sums(bin, hats, reach) {
             [c, i] if c > 0.0 && i > 0.0 => 2.0 * c * c / i,
             _ => 0.0,
         };
         (0..self.bins.len()).map(of_bin).sum()
     }
 
-    /// Power of the first bin in a direction and its standard deviation, K sr.
-    fn power(&self, n_hat: Vec3) -> [f64; 2] {
-        let [c, i] = self.sums(0, n_hat, f64::INFINITY);
-        [c / i, (2.0 * i).sqrt().recip()]
+    /// Power in a direction, of the bin where it is most significant, and its standard deviation, K sr.
+    fn power(&self, n_hat: Vec3) -> Option<[f64; 2]> {
+        let sums = (0..self.bins.len()).map(|bin| self.sums(bin, [n_hat; 2], f64::INFINITY));
+        let seen = sums.filter(|[_, i]| *i > 0.0);
+        let [c, i] = seen.max_by(|[c, i], [d, j]| (c * c / i).total_cmp(&(d * d / j)))?;
+        Some([c / i, (2.0 * i).sqrt().recip()])
     }
 
-    /// Least information on the direction along any axis across it, rad^-2: from the curvature of the likelihood.
+    /// Scatter of the residuals of a source in a direction in units of their stated deviations, at least 1.
+    fn scatter(&self, n_hat: Vec3) -> f64 {
+        let (mut squares, mut numbers) = (0.0, -2.0);
+        for (sample, ..) in self.bins.iter().flatten() {
+            squares += 2.0 * sample.information * sample.value_k_sr.norm_sqr();
+            numbers += 2.0;
+        }
+        numbers -= self.bins.len() as f64;
+        ((squares - self.twice_log(n_hat, f64::INFINITY)) / numbers.max(1.0)).max(1.0).sqrt()
+    }
+
+    /// Least information on the direction along any axis across it, rad^-2: from the curvature of the likelihood, to which the Moon's limb, an
+    /// edge, does not add.
     fn information(&self, n_hat: Vec3, longest: f64) -> f64 {
         let [a, b] = axes(n_hat);
         // A tenth of a radian of phase on the longest baseline.
         let h = 0.1 / (TAU * longest.max(1.0));
         let at = |x: f64, y: f64| {
             let hat = unit(add(n_hat, add(scale(x * h, a), scale(y * h, b))));
-            0.5 * self.twice_log(hat, f64::INFINITY) / (h * h)
+            0.5 * self.twice_log_of_sight([hat, n_hat], f64::INFINITY) / (h * h)
         };
         let middle = at(0.0, 0.0);
         let xx = 2.0 * middle - at(1.0, 0.0) - at(-1.0, 0.0);

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::*;
-use crate::array::{Array, hidden_by_moon, sun_hat_by_date};
+use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::response::beacon::plane_wave;
 use crate::sky::k_sr_per_jy;
 use crate::units::all_pairs;
@@ -133,14 +133,18 @@ fn bursts_are_found_from_the_stated_power_on_and_quiet_passes_have_none() {
 }
 
 #[test]
-fn the_sun_is_named() {
+fn sun_and_jupiter_are_named() {
     let array = array();
-    let sun_hat = sun_hat_by_date(SEARCH.epoch_tai_s, 1.05e5);
-    let from_s = seen_from_s(&array, sun_hat);
-    let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 1e7 } else { 0.0 };
-    let [burst] = &found(&pass(&array, 3, from_s, sun_hat, k_sr))[..] else { panic!() };
-    assert_eq!(burst.name.as_deref(), Some("sun"), "{burst}");
-    assert!(burst.to_string().ends_with(": sun"), "{burst}");
+    for (name, hat) in [
+        ("sun", sun_hat_by_date(SEARCH.epoch_tai_s, 1.05e5)),
+        ("jupiter", jupiter_hat_by_date(SEARCH.epoch_tai_s, 1.05e5)),
+    ] {
+        let from_s = seen_from_s(&array, hat);
+        let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 1e7 } else { 0.0 };
+        let [burst] = &found(&pass(&array, 3, from_s, hat, k_sr))[..] else { panic!() };
+        assert_eq!(burst.name.as_deref(), Some(name), "{burst}");
+        assert!(burst.to_string().ends_with(&format!(": {name}")), "{burst}");
+    }
 }
 
 #[test]

@@ -55,6 +55,14 @@ impl GainAssessment<'_> {
                 // If most daughters fit poorly, the model is wrong for the channel.
                 detectable.into_iter().for_each(|n| estimates[n].gains[c].state = GainState::PoorFit);
             }
+            let is_explained = |gain: &GainState| !matches!(gain, GainState::PoorFit | GainState::Unstable);
+            if good <= 1 && !estimates.iter().all(|one| is_explained(&one.gains[c].state)) {
+                // Noise cannot be told from a signal that is not the model's.
+                let states = estimates.iter_mut().map(|one| &mut one.gains[c].state);
+                states
+                    .filter(|state| **state == GainState::Dead)
+                    .for_each(|state| *state = GainState::PoorFit);
+            }
             let mut all: Vec<&mut GainState> =
                 estimates.iter_mut().map(|one| &mut one.gains[c].state).collect();
             all.retain(|state| **state == GainState::Good);
@@ -76,7 +84,7 @@ impl GainAssessment<'_> {
 
     /// Variance of the log amplitude common to all daughters of a channel: the flux scale of a model is assumed as
     /// uncertain as its shape. The factor is 1/4 as an amplitude is the square root of a visibility's.
-    fn common_amplitude_variance(&self, c: usize) -> f64 {
+    pub(super) fn common_amplitude_variance(&self, c: usize) -> f64 {
         let satellites = self.fitted.layout.satellites;
         if self.config.amplitude_scale == AmplitudeScale::UnitMean {
             return 0.0;
@@ -134,7 +142,10 @@ impl GainAssessment<'_> {
         let [reference_scatter, reference_model] = if is_reference {
             [0.0; 2]
         } else {
-            [self.excess[reference].scatter[1], self.model_variance(reference)]
+            [
+                self.excess[reference].scatter[1] + self.excess[reference].hidden,
+                self.model_variance(reference),
+            ]
         };
         // A daughter left out of the joint solution is assessed from its own data.
         let is_from_own_data = self.fitted.dropped_gains[k] && own_gain.presence != SignalPresence::NoData;
@@ -147,7 +158,7 @@ impl GainAssessment<'_> {
             (layout.gain(&newton.values, c, n), [sigma, self.phase_sigma(c, n)])
         };
         let relative = if is_reference { 0.0 } else { 1.0 };
-        let scatter = [excess.scatter[0], excess.scatter[1] + reference_scatter];
+        let scatter = [excess.scatter[0], excess.scatter[1] + excess.hidden + reference_scatter];
         let own_model = self.model_variance(k);
         let model = [own_model + self.common_amplitude_variance(c), relative * (own_model + reference_model)];
         let noise = noise.map(sigma_with_coverage);
@@ -160,6 +171,7 @@ impl GainAssessment<'_> {
             phase_deg: gain.arg().to_degrees(),
             phase_sigma_deg: if is_reference { 0.0 } else { total(1).to_degrees() },
             phase_scatter_deg: excess.scatter[1].sqrt().to_degrees(),
+            amplitude_scatter: excess.scatter[0].sqrt(),
             unexplained: self.unexplained.by_gain[k],
             visibilities,
             outliers,

@@ -62,6 +62,8 @@ pub struct GainEstimate {
     pub phase_sigma_deg: f64,
     /// Rms change of the phase within the interval, deg; 0 where it may be noise.
     pub phase_scatter_deg: f64,
+    /// Rms change of the logarithm of the amplitude within the interval; 0 where it may be noise.
+    pub amplitude_scatter: f64,
     /// Fraction of the daughter's signal that the solution leaves unexplained; 0 where it may be noise.
     pub unexplained: f64,
     /// Number of visibilities used.

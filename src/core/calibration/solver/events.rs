@@ -59,6 +59,15 @@ pub enum InstrumentEvent {
         /// Channels, from 0, and rms phase changes, deg.
         channels: Vec<(usize, f64)>,
     },
+    /// Amplitudes of a daughter drift within a pass.
+    GainDrift {
+        /// Pass.
+        pass: u64,
+        /// Daughter, from 1.
+        daughter: u32,
+        /// Channels, from 0, and rms changes of the logarithm of the amplitude.
+        channels: Vec<(usize, f64)>,
+    },
     /// The model of the sky, or of the artificial signal, does not match the data.
     WrongModel {
         /// First pass of this state.
@@ -67,6 +76,22 @@ pub enum InstrumentEvent {
         channel: usize,
         /// Fraction of the signal that no gains explain.
         unexplained: f64,
+    },
+    /// The model is of another strength than the signal, or all receivers are.
+    WrongStrength {
+        /// First pass of this state.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Strength of the model over that of the signal, if amplitudes are one on average.
+        factor: f64,
+    },
+    /// The known signal is too weak for any gain.
+    WeakSignal {
+        /// First pass of this state.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
     },
     /// A channel is disturbed.
     Interference {
@@ -98,7 +123,10 @@ impl InstrumentEvent {
             | Self::GainStep { pass, .. }
             | Self::Dead { pass, .. }
             | Self::Drift { pass, .. }
+            | Self::GainDrift { pass, .. }
             | Self::WrongModel { pass, .. }
+            | Self::WrongStrength { pass, .. }
+            | Self::WeakSignal { pass, .. }
             | Self::Interference { pass, .. }
             | Self::Burst { pass, .. } => *pass,
         }
@@ -143,11 +171,29 @@ impl fmt::Display for InstrumentEvent {
                 let list = list(channels, " deg");
                 write!(f, "pass {pass}: phases of daughter {daughter} drift within the pass by {list} rms")
             }
+            Self::GainDrift { pass, daughter, channels } => {
+                let percent: Vec<(usize, f64)> =
+                    channels.iter().map(|(channel, rms)| (*channel, 100.0 * rms)).collect();
+                let list = list(&percent, " %");
+                write!(
+                    f,
+                    "pass {pass}: amplitudes of daughter {daughter} drift within the pass by {list} rms"
+                )
+            }
             Self::WrongModel { pass, channel, unexplained } => write!(
                 f,
                 "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal",
                 100.0 * unexplained
             ),
+            Self::WrongStrength { pass, channel, factor } => write!(
+                f,
+                "pass {pass}: the model of channel {channel} is {factor:.3} times as strong as the signal, if amplitudes are one on average: \
+                 {:.3} is common to all",
+                factor.sqrt().recip()
+            ),
+            Self::WeakSignal { pass, channel } => {
+                write!(f, "pass {pass}: the known signal is too weak in channel {channel}: no gain is known")
+            }
             Self::Interference { pass, channel, outliers } => write!(
                 f,
                 "pass {pass}: interference in channel {channel}, {:.1} % of its visibilities are outliers",

@@ -46,6 +46,7 @@ mod model;
 mod moments;
 mod monitor;
 mod newton;
+mod part_gains;
 mod passes;
 #[cfg(test)]
 mod position_tests;
@@ -63,6 +64,7 @@ mod sums;
 mod table;
 #[cfg(test)]
 mod tests;
+mod verdict;
 
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
@@ -75,3 +77,4 @@ pub use passes::{PassBlocks, PassSolver, SolvedPass};
 pub use solution::{PassData, PassSolution, solve_pass, solve_pass_in_parts};
 pub use sums::{MODEL_TERMS, ModelTerms, ModelledBlock};
 pub use table::{gains_file, solutions_csv};
+pub use verdict::ModelVerdict;

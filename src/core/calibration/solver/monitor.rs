@@ -6,8 +6,10 @@
 //! | phase step | phases of one daughter change otherwise |
 //! | gain step | amplitudes of one daughter change |
 //! | dead | a daughter delivers only noise |
-//! | drift | phases of one daughter change gradually within a pass |
+//! | drift, gain drift | phases, amplitudes of one daughter change gradually within a pass |
 //! | wrong model | residuals of pairs that gains cannot explain |
+//! | wrong strength | amplitudes of all daughters have a factor in common |
+//! | weak signal | no daughter has a gain, as the known signal is too weak |
 //! | interference | outliers in one channel, in most pairs and most of the time |
 //! | burst | outliers at one time, in most pairs and channels |
 //!
@@ -20,6 +22,7 @@ use num_complex::Complex64;
 use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
 use super::solution::PassSolution;
+use super::verdict::ModelVerdict;
 
 /// Threshold of a step, in standard deviations, which are raised to at least the scatter from pass to pass (see `inflate_sigmas`).
 const JUMP_SIGMAS: f64 = 6.0;
@@ -229,11 +232,11 @@ fn add_step_events(
 /// Smallest rms phase change within a pass that is reported, deg.
 const DRIFT_MIN_DEG: f64 = 4.0;
 
-/// Smallest fraction of a phase's variance that a reported drift contributes.
-const DRIFT_FRACTION: f64 = 0.92;
+/// The same of a log amplitude: equal changes of a gain along and across it.
+const GAIN_DRIFT_MIN: f64 = DRIFT_MIN_DEG * PI / 180.0;
 
-/// Smallest unexplained fraction of the signal that is reported.
-const UNEXPLAINED_MIN: f64 = 0.01;
+/// Smallest fraction of the variance of a phase or log amplitude that a reported drift contributes.
+const DRIFT_FRACTION: f64 = 0.92;
 
 /// Adds events that follow from the state of a solution's gains: onsets of states (dead, wrong model), and drifts.
 fn add_state_events(
@@ -242,50 +245,53 @@ fn add_state_events(
     events: &mut Vec<InstrumentEvent>,
 ) {
     let pass = solution.pass;
-    let channels = solution.model_error.len();
+    let channels = solution.models.len();
     let disturbed = disturbed_channels(solution);
+    // What a known signal too weak to be seen leaves says nothing of daughters.
     let is_disturbed = |c: usize| disturbed.get(c) == Some(&true);
+    let tells = |c: usize| !is_disturbed(c) && !matches!(solution.models[c], ModelVerdict::Weak);
     for (n, daughter) in solution.daughters.iter().enumerate() {
         let number = daughter.daughter;
         let is_dead =
             |solution: &PassSolution, c: usize| solution.daughters[n].gains[c].state == GainState::Dead;
-        let dead = (0..channels).filter(|c| is_dead(solution, *c));
+        let dead = (0..channels).filter(|c| is_dead(solution, *c) && tells(*c));
         let dead: Vec<usize> = dead.filter(|c| before.is_none_or(|before| !is_dead(before, *c))).collect();
         if !dead.is_empty() {
             events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
         }
-        // A drift is reported only if it dominates the variance of the phase: with noise alone the estimated scatter can reach 0.9
-        // of it.
-        let is_drifting = |gain: &GainEstimate| {
-            let sigma_deg = gain.phase_sigma_deg.max(gain.phase_scatter_deg);
-            gain.phase_scatter_deg > DRIFT_MIN_DEG
-                && (gain.phase_scatter_deg / sigma_deg).powi(2) > DRIFT_FRACTION
+        let drifting = |rms_and_sigma: fn(&GainEstimate) -> [f64; 2], least: f64| -> Vec<(usize, f64)> {
+            let gains = daughter.gains.iter().enumerate().filter(|(c, _)| tells(*c));
+            let drifts = gains.filter_map(|(c, gain)| {
+                let [rms, sigma] = rms_and_sigma(gain);
+                // A drift is reported only if it dominates the variance: with noise alone the estimated scatter can reach
+                // 0.9 of it.
+                (rms > least && (rms / sigma.max(rms)).powi(2) > DRIFT_FRACTION).then_some((c, rms))
+            });
+            drifts.collect()
         };
-        let drifting =
-            daughter.gains.iter().enumerate().filter(|(c, gain)| is_drifting(gain) && !is_disturbed(*c));
-        let drifting: Vec<(usize, f64)> = drifting.map(|(c, gain)| (c, gain.phase_scatter_deg)).collect();
-        if !drifting.is_empty() {
-            events.push(InstrumentEvent::Drift { pass, daughter: number, channels: drifting });
+        let channels = drifting(|gain| [gain.phase_scatter_deg, gain.phase_sigma_deg], DRIFT_MIN_DEG);
+        if !channels.is_empty() {
+            events.push(InstrumentEvent::Drift { pass, daughter: number, channels });
+        }
+        let channels = drifting(|gain| [gain.amplitude_scatter, gain.amplitude_sigma], GAIN_DRIFT_MIN);
+        if !channels.is_empty() {
+            events.push(InstrumentEvent::GainDrift { pass, daughter: number, channels });
         }
     }
-    let unexplained_if_wrong = |solution: &PassSolution, c: usize| {
-        // The median over daughters: a single daughter may have another problem.
-        let gains: Vec<&GainEstimate> =
-            solution.daughters.iter().map(|daughter| &daughter.gains[c]).collect();
-        let has_signal = |gain: &&&GainEstimate| !matches!(gain.state, GainState::NoData | GainState::Dead);
-        let count = gains.iter().filter(has_signal).count();
-        let poor = gains.iter().filter(|gain| gain.state == GainState::PoorFit).count();
-        let mut fractions: Vec<f64> = gains.iter().map(|gain| gain.unexplained).collect();
-        fractions.sort_unstable_by(f64::total_cmp);
-        let median = fractions.get(fractions.len() / 2).copied().unwrap_or(0.0);
-        let most_fit_poorly = count > 0 && 2 * poor > count;
-        let fraction = solution.model_error[c].max(median);
-        (most_fit_poorly || fraction > UNEXPLAINED_MIN).then_some(fraction)
-    };
     for channel in (0..channels).filter(|c| !is_disturbed(*c)) {
-        let was_wrong = before.and_then(|before| unexplained_if_wrong(before, channel)).is_some();
-        if let Some(unexplained) = unexplained_if_wrong(solution, channel).filter(|_| !was_wrong) {
-            events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
+        let verdict = solution.models[channel];
+        if before.is_some_and(|before| before.models[channel].is_like(verdict)) {
+            continue;
+        }
+        match verdict {
+            ModelVerdict::Right => {}
+            ModelVerdict::Wrong { unexplained } => {
+                events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
+            }
+            ModelVerdict::Weak => events.push(InstrumentEvent::WeakSignal { pass, channel }),
+            ModelVerdict::OtherStrength { factor } => {
+                events.push(InstrumentEvent::WrongStrength { pass, channel, factor });
+            }
         }
     }
 }

@@ -171,6 +171,7 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::calibration::solver::ModelVerdict;
     use crate::units::{StreamKind, random_stream};
 
     /// The smoother given q is the solution of the normal equations of all values, which are written out here.
@@ -224,6 +225,7 @@ mod tests {
             phase_deg: (phase + PI).rem_euclid(TAU).to_degrees() - 180.0,
             phase_sigma_deg: noise_sigma[1].to_degrees(),
             phase_scatter_deg: 0.0,
+            amplitude_scatter: 0.0,
             unexplained: 0.0,
             visibilities: 100,
             outliers: 0,
@@ -245,6 +247,7 @@ mod tests {
             outliers: 0,
             chi_square: 1.0,
             model_error: vec![0.0],
+            models: vec![ModelVerdict::Right],
             reference: 1,
             begins_with_jump: false,
             is_held_out: false,

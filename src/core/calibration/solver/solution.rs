@@ -10,7 +10,8 @@ use super::estimates::{Counts, DaughterEstimate, GainState, OutlierFractions};
 use super::fit::{Unexplained, unexplained};
 use super::robust_fit::{Interval, RobustFit};
 use super::stability::{Excess, jump_s};
-use super::sums::ModelledBlock;
+use super::sums::{ModelledBlock, PairSums};
+use super::verdict::{ModelVerdict, common_amplitudes, model_verdict};
 use crate::units::vector::Vec3;
 
 /// Maximum number of parts that jumps divide an interval into.
@@ -37,6 +38,8 @@ pub struct PassSolution {
     pub chi_square: f64,
     /// Fraction of the signal in each channel that is due to errors of the model; 0 where it may be noise.
     pub model_error: Vec<f64>,
+    /// Verdict on the model of each channel.
+    pub models: Vec<ModelVerdict>,
     /// Daughter that phases are relative to, from 1: the configured one, or another if that is dead or unstable.
     pub reference: u32,
     /// Whether the solution begins at a jump of a gain within a pass.
@@ -99,13 +102,14 @@ pub fn solve_pass_in_parts(
     let mut drifting = vec![false; position_m.len() * frequencies_hz.len()];
     let (parts, jumps) = loop {
         let (parts, jumps) = divide_at_jumps(&full_interval, blocks, &drifting);
-        // A gain that jumps twice within a pass drifts.
-        let repeated = (0..drifting.len()).filter(|k| jumps.iter().filter(|jump| *jump == k).count() > 1);
-        let repeated: Vec<usize> = repeated.collect();
-        if repeated.is_empty() {
+        // A gain that jumps twice within a pass drifts, and one that changes beside its jump.
+        let changing = changing_in(&parts, &jumps, &full_interval, blocks);
+        let is_drift = |k: &usize| changing[*k] || jumps.iter().filter(|jump| *jump == k).count() > 1;
+        let newly: Vec<usize> = jumps.iter().copied().filter(is_drift).collect();
+        if newly.is_empty() {
             break (parts, jumps);
         }
-        repeated.into_iter().for_each(|k| drifting[k] = true);
+        newly.into_iter().for_each(|k| drifting[k] = true);
     };
     let suspects: Vec<bool> = (0..drifting.len()).map(|k| drifting[k] || jumps.contains(&k)).collect();
     let solution = |(k, span_s): (usize, [f64; 2])| {
@@ -140,6 +144,26 @@ fn divide_at_jumps(
         }
     }
     (steady, jumps)
+}
+
+/// Whether each gain changes within a part; only looked at if there are jumps.
+fn changing_in(
+    parts: &[[f64; 2]],
+    jumps: &[usize],
+    full_interval: &Interval<'_>,
+    blocks: &mut [ModelledBlock],
+) -> Vec<bool> {
+    let mut changing = vec![false; full_interval.satellites * full_interval.frequencies_hz.len()];
+    let no_suspects = changing.clone();
+    for span_s in parts.iter().filter(|_| !jumps.is_empty()) {
+        let interval = Interval { span_s: *span_s, ..*full_interval };
+        let fitted = interval.fit(blocks, None);
+        let (excess, _) = interval.residuals(&fitted, blocks, None).excess(&no_suspects);
+        for (changing, excess) in changing.iter_mut().zip(excess) {
+            *changing |= excess.scatter != [0.0; 2];
+        }
+    }
+    changing
 }
 
 fn new_interval<'a>(
@@ -234,6 +258,8 @@ impl CheckedFit {
             && config.unexplained_max < 1.0
             && is_contradicted(layout, newton, &fitted.used_sums());
         let assessment = GainAssessment { config, fitted, counts, unexplained, excess };
+        let mut daughters = assessment.estimates();
+        let models = self.models(config, &mut daughters, &assessment);
         let mut solution = PassSolution {
             pass,
             from_s: interval.span_s[0],
@@ -244,16 +270,53 @@ impl CheckedFit {
             outliers: counts.out,
             chi_square: if count > 0.0 { square / (2.0 * count) } else { f64::NAN },
             model_error: model_error.clone(),
+            models,
             reference: layout.reference as u32 + 1,
             begins_with_jump: false,
             is_held_out: false,
             outlier_fractions: counts.parts(),
-            daughters: assessment.estimates(),
+            daughters,
             normal_hat,
         };
         if contradicted {
             solution.mark_ambiguous(|n, _| n != layout.reference);
         }
         solution
+    }
+
+    /// Verdicts on the models of all channels. A factor that amplitudes have in common is added to their errors.
+    fn models(
+        &self,
+        config: &SolverConfig,
+        daughters: &mut [DaughterEstimate],
+        assessment: &GainAssessment<'_>,
+    ) -> Vec<ModelVerdict> {
+        let channels = self.model_error.len();
+        let uncertainty: Vec<f64> =
+            (0..channels).map(|c| assessment.common_amplitude_variance(c).sqrt()).collect();
+        let common = common_amplitudes(config, daughters, &uncertainty);
+        for daughter in &mut *daughters {
+            for (gain, common) in daughter.gains.iter_mut().zip(&common) {
+                gain.amplitude_sigma = gain.amplitude_sigma.hypot(common.unwrap_or(0.0));
+            }
+        }
+        let verdict = |channel: usize| {
+            let sums: Vec<PairSums> =
+                self.fitted.sums.iter().filter(|sums| sums.channel == channel).copied().collect();
+            let verdict = model_verdict(config, (daughters, channel), self.model_error[channel], &sums);
+            match (verdict, common[channel]) {
+                (ModelVerdict::Right, Some(common)) => {
+                    ModelVerdict::OtherStrength { factor: (-2.0 * common).exp() }
+                }
+                (verdict, _) => verdict,
+            }
+        };
+        let verdicts: Vec<ModelVerdict> = (0..channels).map(verdict).collect();
+        for daughter in daughters {
+            let weak = daughter.gains.iter_mut().zip(&verdicts).filter(|(_, is)| **is == ModelVerdict::Weak);
+            weak.filter(|(gain, _)| gain.state == GainState::Good)
+                .for_each(|(gain, _)| gain.state = GainState::PoorFit);
+        }
+        verdicts
     }
 }

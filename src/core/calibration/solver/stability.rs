@@ -3,11 +3,14 @@
 //! The residuals of a pair in a channel, projected on the prediction of the solution, are summed over parts of the
 //! interval: `score`, whose variance is the `information` of the part. If the gain of daughter n is off by a factor
 //! `1 + d` during a part, `information * d` is added to all of its pairs, so that their sum shows the change of the
-//! gain; the rest comes from the model, not from gains.
+//! gain; the rest comes from the model, not from gains. A wrong model leaves residuals that look like changes of gains,
+//! too: as many as its errors have in common by chance. So changes count against what no gains explain, not against
+//! noise alone ([`Residuals::model_factors`]).
 
 use num_complex::Complex64;
 
 use super::layout::{ParameterLayout, ParameterValues};
+use super::part_gains::{PairPart, fit_part};
 use super::sums::ModelledBlock;
 
 /// Number of parts of an interval.
@@ -40,14 +43,24 @@ pub(super) struct Residuals {
     satellites: usize,
     channels: usize,
     pairs: Vec<PairResiduals>,
+    /// See [`Self::model_factors`]; by channel, then daughter.
+    model_factors: Vec<ModelFactors>,
 }
+
+/// Mean square of what no gains explain, over noise, at each of [`SCALES`]; 1 where it may be noise.
+type ModelFactors = [f64; SCALES.len()];
+
+/// Significance, in standard deviations, from which residuals beyond all gains count as errors of the model.
+const MODEL_SIGMAS: f64 = 3.0;
 
 /// Variance of the logarithm of a gain beyond that due to noise.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Excess {
     /// Variance of the change within the interval, of log amplitude and phase (rad).
     pub(super) scatter: [f64; 2],
-    /// Variance due to errors of the model that are seen to last, of either.
+    /// Variance of a change of the phase that changes of most other daughters may hide.
+    pub(super) hidden: f64,
+    /// Variance due to errors of the model that are seen, of either: those that last, and those that look like changes.
     pub(super) model: f64,
     /// The same by errors that noise may hide.
     pub(super) model_below_noise: f64,
@@ -109,7 +122,40 @@ impl Residuals {
             );
             sums
         });
-        Self { satellites: layout.satellites, channels: layout.channels(), pairs: pairs.collect() }
+        let mut residuals = Self {
+            satellites: layout.satellites,
+            channels: layout.channels(),
+            pairs: pairs.collect(),
+            model_factors: Vec::new(),
+        };
+        residuals.model_factors =
+            (0..residuals.channels).flat_map(|channel| residuals.model_factors(channel)).collect();
+        residuals
+    }
+
+    /// Mean square of what changes of all gains of a channel leave of each daughter's residuals, over noise.
+    fn model_factors(&self, channel: usize) -> Vec<ModelFactors> {
+        let own: Vec<&PairResiduals> = self.pairs.iter().filter(|pair| pair.channel == channel).collect();
+        let all: Vec<usize> = (0..self.satellites).collect();
+        let mut factors = vec![[1.0; SCALES.len()]; self.satellites];
+        for (place, scale) in SCALES.into_iter().enumerate() {
+            let mut sums = vec![(0.0, 0.0); self.satellites];
+            for group in 0..scale {
+                let parts: Vec<PairPart> = own.iter().map(|pair| pair.part(group, scale)).collect();
+                for (pair, left) in own.iter().zip(fit_part(&parts, self.satellites, &all)) {
+                    for n in pair.daughters {
+                        sums[n].0 += left.chi_square;
+                        sums[n].1 += left.degrees_of_freedom;
+                    }
+                }
+            }
+            for (factors, (chi_square, degrees)) in factors.iter_mut().zip(sums) {
+                if chi_square > degrees + MODEL_SIGMAS * f64::sqrt(2.0 * degrees) && degrees > 0.5 {
+                    factors[place] = chi_square / degrees;
+                }
+            }
+        }
+        factors
     }
 
     fn series(&self, channel: usize, daughter: usize) -> Series {
@@ -126,42 +172,52 @@ impl Residuals {
         series
     }
 
-    /// Subtracts the change of a daughter's gain from its pairs, in `scale` parts.
-    fn subtract_change(&mut self, channel: usize, daughter: usize, series: &Series, scale: usize) {
+    /// Subtracts the changes of daughters' gains, in `scale` parts, from what the pairs of a channel were at first.
+    fn subtract_changes(
+        &mut self,
+        at_first: &[PairResiduals],
+        channel: usize,
+        daughters: &[usize],
+        scale: usize,
+    ) {
         let parts_per_group = PARTS / scale;
-        let change: Vec<Complex64> = series.chunks(parts_per_group).map(mean).collect();
-        let has_daughter =
-            |pair: &&mut PairResiduals| pair.channel == channel && pair.daughters.contains(&daughter);
-        for pair in self.pairs.iter_mut().filter(has_daughter) {
-            for part in 0..PARTS {
-                let change = change[part / parts_per_group];
-                let change = if pair.daughters[0] == daughter { change } else { change.conj() };
-                pair.score[part] -= pair.information[part] * change;
+        for group in 0..scale {
+            let parts: Vec<PairPart> = at_first.iter().map(|pair| pair.part(group, scale)).collect();
+            let left = fit_part(&parts, self.satellites, daughters);
+            let pairs = self.pairs.iter_mut().filter(|pair| pair.channel == channel);
+            for ((pair, at_first), left) in pairs.zip(at_first).zip(left) {
+                for part in group * parts_per_group..(group + 1) * parts_per_group {
+                    pair.score[part] =
+                        at_first.score[part] - at_first.information[part] * (left.change - 1.0);
+                }
             }
         }
     }
 
-    /// Finds the gains that change, the worst of each channel first, and subtracts each change before the next is
-    /// found.
-    fn subtract_changes(&mut self, suspects: &[bool]) -> Vec<(usize, usize, Scatter)> {
-        let mut found = Vec::new();
-        for channel in 0..self.channels {
-            let mut open: Vec<usize> = (0..self.satellites).collect();
-            while let Some((at, scatter)) = self.most_variable(channel, &open, suspects) {
-                let daughter = open.remove(at);
-                let series = self.series(channel, daughter);
-                self.subtract_change(channel, daughter, &series, scatter.scale);
-                found.push((channel, daughter, scatter));
-            }
+    fn pairs_of(&self, channel: usize) -> Vec<PairResiduals> {
+        self.pairs.iter().filter(|pair| pair.channel == channel).cloned().collect()
+    }
+
+    /// Finds the gains of a channel that change, the worst first, and subtracts their changes before the next is found;
+    /// returns them with the number of parts in which changes were fitted.
+    fn find_changes(&mut self, channel: usize, suspects: &[bool]) -> (Vec<(usize, Scatter)>, usize) {
+        let at_first = self.pairs_of(channel);
+        let (mut found, mut open, mut scale) = (Vec::new(), (0..self.satellites).collect::<Vec<_>>(), 1);
+        while let Some((at, scatter)) = self.most_variable(channel, &open, suspects) {
+            scale = scale.max(scatter.scale);
+            found.push((open.remove(at), scatter));
+            let daughters: Vec<usize> = found.iter().map(|(daughter, _)| *daughter).collect();
+            self.subtract_changes(&at_first, channel, &daughters, scale);
         }
-        found
+        (found, scale)
     }
 
     /// The daughter of `open` whose gain changes most, if significantly.
     fn most_variable(&self, channel: usize, open: &[usize], suspects: &[bool]) -> Option<(usize, Scatter)> {
         let scatter = |(at, n): (usize, &usize)| {
             let least = if suspects[channel * self.satellites + n] { SUSPECT_SIGMAS } else { SIGMAS };
-            (at, Scatter::of(&self.series(channel, *n), least))
+            let factors = &self.model_factors[channel * self.satellites + n];
+            (at, Scatter::of(&self.series(channel, *n), least, factors))
         };
         let each = open.iter().enumerate().map(scatter).filter(|(_, scatter)| scatter.is_significant());
         each.max_by(|(_, a), (_, b)| a.significance.total_cmp(&b.significance))
@@ -171,15 +227,27 @@ impl Residuals {
     /// errors of the model, 0 where that may be noise.
     pub(super) fn excess(mut self, suspects: &[bool]) -> (Vec<Excess>, Vec<f64>) {
         let mut excess = vec![Excess::default(); self.satellites * self.channels];
-        for (channel, daughter, scatter) in self.subtract_changes(suspects) {
-            excess[channel * self.satellites + daughter].scatter = scatter.variance;
-        }
         let mut parts = vec![0.0; self.channels];
         for (channel, part) in parts.iter_mut().enumerate() {
-            let of_all = self.model_error_fraction(channel, None);
+            let (changing, scale) = self.find_changes(channel, suspects);
+            let fitted = (changing.len(), scale);
+            let hidden = hidden_variance(&changing, self.satellites);
+            for (daughter, scatter) in changing {
+                excess[channel * self.satellites + daughter].scatter = scatter.variance;
+            }
+            let of_all = self.model_error_fractions(channel, None, fitted)[0];
             *part = of_all;
             for daughter in 0..self.satellites {
-                let most = of_all.max(self.model_error_fraction(channel, Some(daughter)));
+                let of_daughter = self.model_error_fractions(channel, Some(daughter), fitted);
+                let most = of_all.max(of_daughter[0]);
+                // What is left of a steady gain may look like a change because of the model.
+                let is_steady = excess[channel * self.satellites + daughter].scatter == [0.0; 2];
+                let apparent = match is_steady {
+                    true => {
+                        Scatter::of(&self.series(channel, daughter), SIGMAS, &[1.0; SCALES.len()]).variance
+                    }
+                    false => [0.0; 2],
+                };
                 let own =
                     self.pairs.iter().filter(|p| p.channel == channel && p.daughters.contains(&daughter));
                 let (sum, square) = own.fold((0.0, 0.0), |(sum, square), pair| {
@@ -190,22 +258,25 @@ impl Residuals {
                 // pairs.
                 let share = if sum > 0.0 { square / (sum * sum) } else { 0.0 };
                 let excess = &mut excess[channel * self.satellites + daughter];
-                excess.model = 0.5 * most * share;
-                excess.model_below_noise =
-                    0.5 * self.model_error_fractions(channel, Some(daughter))[1] * share;
+                excess.model = 0.5 * most * share + apparent[0].max(apparent[1]);
+                if excess.scatter[1] < hidden {
+                    excess.hidden = hidden;
+                }
+                excess.model_below_noise = 0.5 * of_daughter[1] * share;
                 excess.model_full_power = 0.5 * share;
             }
         }
         (excess, parts)
     }
 
-    /// Fraction of the signal, of all pairs or of one daughter's, that remains beyond noise; 0 where it may be noise.
-    fn model_error_fraction(&self, channel: usize, daughter: Option<usize>) -> f64 {
-        self.model_error_fractions(channel, daughter)[0]
-    }
-
-    /// [`Self::model_error_fraction`], and as much as noise may hide.
-    fn model_error_fractions(&self, channel: usize, daughter: Option<usize>) -> [f64; 2] {
+    /// Fraction of the signal, of all pairs or of one daughter's, that remains beyond noise (0 where it may be noise),
+    /// and as much as noise may hide. So many gains were `fitted`, in so many parts.
+    fn model_error_fractions(
+        &self,
+        channel: usize,
+        daughter: Option<usize>,
+        (fitted, fitted_parts): (usize, usize),
+    ) -> [f64; 2] {
         let own: Vec<&PairResiduals> = self.pairs.iter().filter(|pair| pair.channel == channel).collect();
         let mut present = vec![false; self.satellites];
         own.iter().flat_map(|pair| pair.daughters).for_each(|n| present[n] = true);
@@ -224,7 +295,8 @@ impl Residuals {
                 }
             }
             // The solution fits the gains, so residuals of noise have less than its variance.
-            let degrees_of_freedom: f64 = (1.0 - (2.0 * gains - 1.0) / f64::max(all, 1.0)).max(0.0);
+            let changes = 2.0 * (fitted * (fitted_parts.min(scale) - 1)) as f64;
+            let degrees_of_freedom: f64 = (1.0 - (2.0 * gains - 1.0 + changes) / f64::max(all, 1.0)).max(0.0);
             let excess_power = square - count * degrees_of_freedom;
             let noise = SIGMAS * (2.0 * count).sqrt();
             if information > 0.0 {
@@ -244,16 +316,20 @@ impl Residuals {
         let mut found: Vec<(usize, usize, f64)> = Vec::new();
         let suspects = vec![false; drifting.len()];
         for channel in 0..self.channels {
-            let mut open: Vec<usize> = (0..self.satellites).collect();
+            let at_first = self.pairs_of(channel);
+            let (mut open, mut passed) = ((0..self.satellites).collect::<Vec<_>>(), Vec::new());
+            let mut scale = 1;
             while let Some((at, scatter)) = self.most_variable(channel, &open, &suspects) {
                 let daughter = open.remove(at);
-                let series = self.series(channel, daughter);
-                let jump = largest_jump(&series).filter(|_| !drifting[channel * self.satellites + daughter]);
-                if let Some(jump) = jump {
+                let k = channel * self.satellites + daughter;
+                let jump = largest_jump(&self.series(channel, daughter), &self.model_factors[k]);
+                if let Some(jump) = jump.filter(|_| !drifting[k]) {
                     found.push((daughter, channel, jump));
                     break;
                 }
-                self.subtract_change(channel, daughter, &series, scatter.scale);
+                passed.push(daughter);
+                scale = scale.max(scatter.scale);
+                self.subtract_changes(&at_first, channel, &passed, scale);
             }
         }
         let (daughter, ..) = *found.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
@@ -262,16 +338,21 @@ impl Residuals {
 }
 
 impl PairResiduals {
+    /// Sums of one of `scale` groups of parts.
+    fn part(&self, group: usize, scale: usize) -> PairPart {
+        let parts = group * PARTS / scale..(group + 1) * PARTS / scale;
+        PairPart {
+            daughters: self.daughters,
+            score: self.score[parts.clone()].iter().sum(),
+            information: self.information[parts].iter().sum(),
+        }
+    }
+
     fn grouped(&self, scale: usize) -> impl Iterator<Item = (Complex64, f64)> + '_ {
         let parts_per_group = PARTS / scale;
         let scores = self.score.chunks(parts_per_group).map(|scores| scores.iter().sum());
         scores.zip(self.information.chunks(parts_per_group).map(|information| information.iter().sum()))
     }
-}
-
-fn mean(parts: &[(Complex64, f64)]) -> Complex64 {
-    let (score, information) = total(parts);
-    if information > 0.0 { score / information } else { Complex64::ZERO }
 }
 
 fn total(parts: &[(Complex64, f64)]) -> (Complex64, f64) {
@@ -294,14 +375,14 @@ impl Scatter {
         self.variance.iter().any(|variance| *variance > 0.0)
     }
 
-    /// Computes the scatter; changes count from a significance of `least`.
-    fn of(series: &Series, least: f64) -> Self {
+    /// Computes the scatter; changes count from a significance of `least` beyond noise times `factors`.
+    fn of(series: &Series, least: f64, factors: &ModelFactors) -> Self {
         let mut scatter = Self { scale: PARTS, ..Self::default() };
         let (sum, information) = total(series);
         if information <= 0.0 {
             return scatter;
         }
-        for scale in SCALES {
+        for (scale, factor) in SCALES.into_iter().zip(factors) {
             let (mut squares, mut count) = ([0.0; 2], -1.0);
             for (score, of_part) in series.chunks(PARTS / scale).map(total) {
                 if of_part > 0.0 {
@@ -315,8 +396,8 @@ impl Scatter {
             }
             let excess_power = [sum.re, sum.im].map(|sum| sum * sum / information);
             for axis in [0, 1] {
-                let excess = squares[axis] - excess_power[axis] - count;
-                let significance = excess / (2.0 * count).sqrt();
+                let excess = squares[axis] - excess_power[axis] - factor * count;
+                let significance = excess / (factor * (2.0 * count).sqrt());
                 // Many parts raise the chance of a false detection.
                 if significance > least + if scale > 8 { 1.0 } else { 0.0 } {
                     scatter.variance[axis] = scatter.variance[axis].max(excess / information);
@@ -328,6 +409,18 @@ impl Scatter {
         }
         scatter
     }
+}
+
+/// Part of the usual variance of changes that the gain of a daughter may have unseen, where most daughters change: a change
+/// that all share is seen of none, and each is judged beside what blurs the others.
+const HIDDEN_PART: f64 = 0.25;
+
+/// Variance of a phase's change that may be hidden by changes of most other daughters.
+fn hidden_variance(changing: &[(usize, Scatter)], satellites: usize) -> f64 {
+    let mut variances: Vec<f64> = changing.iter().map(|(_, scatter)| scatter.variance[1]).collect();
+    variances.sort_unstable_by(f64::total_cmp);
+    let median = variances.get(variances.len() / 2).copied().unwrap_or(0.0);
+    if 2 * changing.len() > satellites { HIDDEN_PART * median } else { 0.0 }
 }
 
 /// Chi-square (two degrees of freedom) of a certain jump: noise reaches it at fewer than one of a hundred million
@@ -343,8 +436,9 @@ const SUDDEN_FRACTION: f64 = 0.7;
 /// Number of parts on either side of a jump within which it must show.
 const JUMP_PARTS: usize = 3;
 
-/// Chi-square of the largest jump between two parts, if the change is a jump.
-fn largest_jump(series: &Series) -> Option<f64> {
+/// Chi-square of the largest jump between two parts, if the change is a jump; over the largest of the `factors`.
+fn largest_jump(series: &Series, factors: &ModelFactors) -> Option<f64> {
+    let factor = factors.iter().copied().fold(1.0, f64::max);
     let all = total(series);
     let own = |parts: &[(Complex64, f64)]| -> f64 {
         let squares = parts.iter().filter(|(_, information)| *information > 0.0);
@@ -354,7 +448,7 @@ fn largest_jump(series: &Series) -> Option<f64> {
     let chi_square = |at: usize| jump_between(&series[..at], &series[at..]).map_or(0.0, |jump| jump.1);
     let at = (1..PARTS).max_by(|a, b| chi_square(*a).total_cmp(&chi_square(*b)))?;
     let (jump, found) = jump_between(&series[..at], &series[at..])?;
-    if found < JUMP_CHI2 || found < EXPLAINED_FRACTION * changes {
+    if found < JUMP_CHI2 * factor || found < EXPLAINED_FRACTION * changes {
         return None;
     }
     // The jump may be within the part on either side.
@@ -366,7 +460,7 @@ fn largest_jump(series: &Series) -> Option<f64> {
         // Component along the jump.
         Some((near * jump.conj()).re / jump.norm() + sigma)
     });
-    (near.fold(0.0, f64::max) > SUDDEN_FRACTION * jump.norm()).then_some(found)
+    (near.fold(0.0, f64::max) > SUDDEN_FRACTION * jump.norm()).then_some(found / factor)
 }
 
 /// Change of the mean between two groups of parts, and its chi-square.

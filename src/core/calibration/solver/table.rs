@@ -16,7 +16,7 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     let mut text = String::from(
         "pass,from_s,until_s,daughter,frequency_hz,amplitude,ln_amplitude_sigma,phase_deg,phase_sigma_deg,clock_ns,\
          clock_sigma_ns,along_m,along_sigma_m,across_m,across_sigma_m,radial_m,radial_sigma_m,visibilities,outliers,\
-         chi_square,converged,held_out,state,phase_scatter_deg,unexplained,reference,data_from_s,data_until_s\n",
+         chi_square,converged,held_out,state,phase_scatter_deg,unexplained,reference,data_from_s,data_until_s,ln_amplitude_scatter\n",
     );
     for solution in solutions {
         for daughter in &solution.daughters {
@@ -26,7 +26,7 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
                 let _ = writeln!(
                     text,
                     "{},{:.6},{:.6},{},{},{:.7},{:.3e},{:.6},{:.3e},{:.6},{:.3e},{x:.5},{sx:.3e},{y:.5},{sy:.3e},{z:.5},\
-                     {sz:.3e},{},{},{:.5},{},{},{},{:.4},{:.5},{},{:.6},{:.6}",
+                     {sz:.3e},{},{},{:.5},{},{},{},{:.4},{:.5},{},{:.6},{:.6},{:.5}",
                     solution.pass,
                     solution.from_s,
                     solution.until_s,
@@ -49,6 +49,7 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
                     solution.reference,
                     gain.data_s[0],
                     gain.data_s[1],
+                    gain.amplitude_scatter,
                 );
             }
         }

@@ -16,9 +16,9 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA07";
+const MAGIC: &[u8; 8] = b"LNRSTA08";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 07; earlier versions lack data: make a new state with `lunarray rebuild`, or \
+const VERSION: &str = "a checkpoint of version 08; earlier versions lack data: make a new state with `lunarray rebuild`, or \
 replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
@@ -468,7 +468,7 @@ mod tests {
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 07") && said.contains("replay the files into a new folder"),
+                said.contains("version 08") && said.contains("replay the files into a new folder"),
                 "{said}"
             );
         });
