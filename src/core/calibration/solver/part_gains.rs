@@ -154,8 +154,9 @@ mod tests {
         let degrees: f64 = left.iter().map(|pair| pair.degrees_of_freedom).sum();
         assert!((degrees - 19.0).abs() < 0.01, "{degrees}");
         // Errors of 5 % that alternate from pair to pair stay: at least half of their chi-square, as 19 of 30 degrees do.
-        let error =
-            |i: usize, j: usize| Complex64::new(if (i + 2 * j) % 3 == 0 { 0.05 } else { -0.025 }, 0.0);
+        let error = |i: usize, j: usize| {
+            Complex64::new(if (i + 2 * j).is_multiple_of(3) { 0.05 } else { -0.025 }, 0.0)
+        };
         let with_error = pairs(&[Complex64::ZERO; 6], error);
         let before: f64 = with_error.iter().map(|pair| pair.score.norm_sqr() / pair.information).sum();
         let after: f64 = fit_part(&with_error, 6, &all).iter().map(|pair| pair.chi_square).sum();
