@@ -78,14 +78,14 @@ fn frames_without(file: &str, span_s: [f64; 2]) -> Vec<GroundFrame> {
     frames
 }
 
-/// The system's power of a pair, K sr, from a weight: 1 / weight = P_i P_j / (2 dnu dt).
-fn powers_k_sr(file: &str) -> Vec<(f64, f64)> {
+/// The middle and length of each integration, s, and the system's power of a pair, K sr, from a weight: 1 / weight = P_i P_j / (2 dnu dt).
+fn powers_k_sr(file: &str) -> Vec<([f64; 2], f64)> {
     let mut found = Vec::new();
     for frame in frames_without(file, [0.0, 0.0]) {
         let GroundFrame::Visibilities(block) = frame else { continue };
         found.extend((0..block.len()).map(|k| {
-            let samples = 2.0 * 8e3 * 1e-6 * f64::from(block.duration_ticks[k]);
-            (block.middle_s(k), (samples / f64::from(block.weight[k])).sqrt())
+            let dt_s = 1e-6 * f64::from(block.duration_ticks[k]);
+            ([block.middle_s(k), dt_s], (2.0 * 8e3 * dt_s / f64::from(block.weight[k])).sqrt())
         }));
     }
     found
@@ -94,13 +94,15 @@ fn powers_k_sr(file: &str) -> Vec<(f64, f64)> {
 /// Powers rise by the flux density of the light curve, 3.2548e7 K sr at its peak (numpy: 1e-18 (c / 1e7)^2 / 2 k).
 fn noise_rises_with_the_burst([quiet, burst]: &[String; 2]) {
     let mut bright = 0;
-    for ((t_s, quiet_k_sr), (_, k_sr)) in powers_k_sr(quiet).into_iter().zip(powers_k_sr(burst)) {
-        let after_s = t_s - 38_005.0;
-        let expected = match after_s {
-            after_s if after_s <= -5.0 => 0.0,
-            after_s if after_s < 0.0 => 3.2548e7 * (1.0 + after_s / 5.0),
-            after_s => 3.2548e7 * (-after_s / 11.5).exp(),
-        };
+    let light_curve = |after_s: f64| match after_s {
+        after_s if after_s <= -5.0 => 0.0,
+        after_s if after_s < 0.0 => 3.2548e7 * (1.0 + after_s / 5.0),
+        after_s => 3.2548e7 * (-after_s / 11.5).exp(),
+    };
+    for (([t_s, dt_s], quiet_k_sr), (_, k_sr)) in powers_k_sr(quiet).into_iter().zip(powers_k_sr(burst)) {
+        // The mean over the integration, of 1,000 instants.
+        let instants = (0..1000).map(|k| t_s - 38_005.0 + dt_s * ((f64::from(k) + 0.5) / 1000.0 - 0.5));
+        let expected = instants.map(light_curve).sum::<f64>() / 1000.0;
         // The square root of the product of two powers is their mean, to the square of their difference of some percent.
         assert!((k_sr - quiet_k_sr - expected).abs() < 2e-3 * k_sr, "{t_s}: {quiet_k_sr} {k_sr} {expected}");
         bright += usize::from(expected > 1e7);

@@ -217,7 +217,7 @@ fn kernels_that_cannot_be_used_are_refused_with_a_reason() {
         (named(b"DAF/CK  "), "found \"DAF/CK\"; expected a binary SPK kernel"),
         (named(b"DAFETF N"), "expected a binary SPK kernel, DAF/SPK; NAIF's `tobin`"),
         ([&whole[..88], b"VAX-GFLT", &whole[96..]].concat(), "VAX-GFLT"),
-        (whole[..2000].to_vec(), "numbers that are not in the file"),
+        (whole[..2000].to_vec(), "summaries in record 2 of 1; expected the whole kernel"),
         (whole[..whole.len() - 8].to_vec(), "segment 3: found numbers that are not in the file"),
         (shared, "each with numbers of its own"),
         (kernel(&good[..2], false), "have 2 orbits; expected as many as array.satellites = 3"),
