@@ -172,6 +172,20 @@ impl MovingSource {
         for (name, value) in [("steady_jy", self.steady_jy), ("peak_jy", self.peak_jy)] {
             checks.number(key(name), value, (0.0..=1e15).contains(&value), "0 to 1e15 Jy");
         }
+        let (has_starts, has_peak) = (!self.starts_s.is_empty(), self.peak_jy > 0.0);
+        let says_what = has_starts == has_peak && (has_peak || self.steady_jy > 0.0);
+        let given = format!(
+            "{} Jy with {} starts_s and steady_jy = {}",
+            self.peak_jy,
+            self.starts_s.len(),
+            self.steady_jy
+        );
+        checks.require(
+            key("peak_jy"),
+            given,
+            says_what,
+            "steady_jy, or starts_s and peak_jy of bursts, or both",
+        );
         let hz = self.reference_hz;
         checks.number(key("reference_hz"), hz, (1e3..=1e10).contains(&hz), "1 kHz to 10 GHz");
         for (name, value) in
@@ -273,6 +287,12 @@ mod tests {
             ]
         );
         assert!(burst("").problems(0).is_empty());
+        // Bursts without a flux density or without times, and a source without either.
+        for given in ["starts_s = [9.0]", "peak_jy = 1e8", "steady_jy = 3.0\nstarts_s = [9.0]", ""] {
+            let source: MovingSource = toml::from_str(&format!("direction = 'sun'\n{given}")).unwrap();
+            let [problem] = &source.problems(0)[..] else { panic!("{given}") };
+            assert!(problem.to_string().contains("expected steady_jy, or starts_s and peak_jy"), "{problem}");
+        }
         assert!(toml::from_str::<MovingSource>("direction = 'mars'\nstarts_s = []\npeak_jy = 1").is_err());
     }
 

@@ -41,7 +41,7 @@ const RATE: f64 = 0.359_536_20;
 
 /// Position from the Sun's centre, m, on ecliptic axes of J2000, `t` Julian centuries of TDB after J2000.
 ///
-/// Source: Simon et al. 1994, Astron. Astrophys. 282, 663, Table 6: to 0.02 degrees from 1800 to 2050.
+/// Source: Simon et al. 1994, Astron. Astrophys. 282, 663, with the numbers that the library ERFA has (plan94): to 0.02 degrees from 1800 to 2050.
 pub(super) fn position_m(t: f64) -> Vec3 {
     let t = 0.1 * t;
     let polynomial = |[a, b, c]: [f64; 3]| a + (b + c * t) * t;

@@ -56,17 +56,18 @@ pub struct FoundBurst {
     pub peak_s: f64,
     /// Signal-to-noise ratio of a point source at the position. The noise is that of the visibilities and the steady sky.
     pub significance: f64,
-    /// Flux density in the brightest interval, as an isotropic antenna sees it, Jy.
+    /// Flux density in that half of an interval in which it is most significant, as an isotropic antenna sees it, Jy.
     pub flux_jy: f64,
     /// Standard deviation of the flux density, Jy.
     pub flux_sigma_jy: f64,
     /// Ecliptic longitude and latitude, deg, the likeliest first; others have a likelihood within 99 % of its distribution: daughters in
     /// one plane do not tell its two sides apart.
     pub positions_deg: Vec<[f64; 2]>,
-    /// Standard deviation of the first position along its worst direction, deg.
+    /// Standard deviation of the first position along its worst direction, deg. Too small for arrays of few wavelengths, as the steady sky is
+    /// the same at all times.
     pub position_sigma_deg: f64,
-    /// `sun` if the Sun's direction at that time is within two degrees and three standard deviations of a position known to six
-    /// degrees.
+    /// `sun` or `jupiter` if that is within three standard deviations (and two degrees of the Sun, 0.03 of Jupiter) of a position known to
+    /// six degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
 }
