@@ -60,7 +60,6 @@ impl OrderBlocks {
                 parts.iter().for_each(|part| part.add(m, blocks));
             });
         }
-        blocks.par_iter_mut().flatten().for_each(make_definite);
         Self { l_max, blocks }
     }
 
@@ -146,21 +145,6 @@ impl OrderFactors {
     }
 }
 
-/// Adds to the diagonal of a block what its products in f32 may be wrong by, if rounding leaves it without a positive smallest eigenvalue: few
-/// data leave eigenvalues of 0, and what rounding makes of them, of either sign, has no meaning. Without it the evidence of the sky's power
-/// has no maximum.
-fn make_definite(block: &mut Mat<f64>) {
-    let rounding = ROUNDING * (0..block.nrows()).map(|k| block[(k, k)]).fold(0.0, f64::max);
-    let shifted = |shift: f64| {
-        let mut block = block.clone();
-        (0..block.nrows()).for_each(|k| block[(k, k)] += shift);
-        block
-    };
-    if rounding > 0.0 && shifted(-rounding).llt(Side::Lower).is_err() {
-        *block = shifted(2.0 * rounding);
-    }
-}
-
 /// The order m of each of [`OrderBlocks::blocks`].
 pub(super) fn orders_of(l_max: usize) -> Vec<usize> {
     let of_order = |m: usize| (0..2).filter(move |parity| size(l_max, m, *parity) > 0).map(move |_| m);
@@ -185,9 +169,6 @@ fn scatter(of_m: &mut [f64], parity: usize, parts: usize, values: &Mat<f64>) {
         }
     }
 }
-
-/// What rounding may change of a block's eigenvalues, relative to its largest diagonal element: that of some ten products in f32.
-const ROUNDING: f64 = 4.0 * f32::EPSILON as f64;
 
 /// Number of orders mu whose parts are in memory at once.
 const MUS_AT_ONCE: usize = 16;
