@@ -1,6 +1,6 @@
 //! Orbital motion of the daughters, direction of the Earth, and occultation by the Moon.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
 
 use super::bodies::{DatedEarth, Earth};
@@ -308,8 +308,25 @@ impl Array {
     }
 
     /// The formation whose breathing changes the speeds, on a circle or not.
-    pub(super) fn breathing(&self) -> Option<&Formation> {
+    #[must_use]
+    pub(crate) fn breathing(&self) -> Option<&Formation> {
         self.formation.as_ref()
+    }
+
+    /// Least distance of two daughters whose arcs differ by `arc_m`, anywhere on their orbits, m; 0 if there is no such bound.
+    #[must_use]
+    pub(crate) fn distance_m_min(&self, arc_m: f64) -> f64 {
+        let (axis_m, e) = (self.orbit_radius_m, self.shape.map_or(0.0, |shape| shape.eccentricity));
+        let cross_track_ratio = self.shape.map_or(0.0, |shape| shape.cross_track_ratio);
+        // The true anomaly is slowest at the apoapsis, r = a (1 + e), by dnu / dM = a^2 sqrt(1 - e^2) / r^2.
+        let angle = arc_m.abs() / axis_m;
+        let along = angle * (1.0 - e * e).sqrt() / (1.0 + e).powi(2);
+        if angle > FRAC_PI_2 {
+            return 0.0;
+        }
+        // Directions at angles of t and u from the common node, in planes that are tilted by d, differ by at least t - u times
+        // cos(d / 2): 1 - cos = 1 - cos(t - u) + sin t sin u (1 - cos d), and sin t sin u >= -sin^2((t - u) / 2).
+        2.0 * axis_m * (1.0 - e) * (0.5 * along).sin() * (0.5 * cross_track_ratio * angle).cos()
     }
 
     /// State of daughter `n` (from 0) at `t_s`.

@@ -84,22 +84,22 @@ impl Schedule {
     }
 }
 
-/// Shortest baseline of a pair in a window, m. A chord depends only on the daughters' arcs, which are linear in time
-/// between turnarounds, so it is shortest at an end of the window or at a turnaround.
+/// Lower bound of a pair's baseline in a window, m. Arcs are linear in time between turnarounds, so they are closest at an end of the
+/// window or at a turnaround.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
-    // Elliptic orbits give no bound.
-    let Some(formation) = array.formation() else { return 0.0 };
+    // Orbits of one's own give no bound.
+    let Some(formation) = array.breathing() else { return 0.0 };
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
-    let length_m =
-        |t_s: f64| norm(sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s)));
-    let next = |t_s: &f64| Some(formation.next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
-    let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
-    let shortest = instants.chain([end_s]).map(length_m).fold(f64::INFINITY, f64::min);
     // There is no bound for a formation with more turnarounds.
     if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * formation.period_s() {
         return 0.0;
     }
-    shortest
+    let arc_m = |n: u8, t_s: f64| formation.arc_m(n.into(), t_s).0;
+    let next = |t_s: &f64| Some(formation.next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
+    let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
+    let arcs_m = instants.chain([end_s]).map(|t_s| (arc_m(pair.i, t_s) - arc_m(pair.j, t_s)).abs());
+    // Beyond the rounding of positions.
+    (1.0 - 1e-9) * array.distance_m_min(arcs_m.fold(f64::INFINITY, f64::min))
 }
 
 /// Maximum number of turnarounds considered in a window; the paper's formation has at most one.
@@ -147,8 +147,16 @@ mod tests {
 
     #[test]
     fn baselines_beyond_the_limit_are_left_out() {
-        let array = Array::new(&ArrayConfig::default()).unwrap();
-        for window in ObservingWindows::new(&array, 0.0, 15.0 * 86_400.0).step_by(7) {
+        left_out_of(&ArrayConfig::default(), 7);
+        left_out_of(
+            &ArrayConfig { eccentricity: 0.05, cross_track_ratio: 0.3, ..ArrayConfig::default() },
+            70,
+        );
+    }
+
+    fn left_out_of(config: &ArrayConfig, every_nth: usize) {
+        let array = Array::new(config).unwrap();
+        for window in ObservingWindows::new(&array, 0.0, 15.0 * 86_400.0).step_by(every_nth) {
             for pair in all_pairs(8) {
                 let limit_m = 31.3 * SPEED_OF_LIGHT_M_S / 10e6;
                 let near = schedule(31.3, 1).integrations(&array, window, pair);
@@ -158,6 +166,34 @@ mod tests {
                     norm(sub(array.position_m(i, t_s), array.position_m(j, t_s))) < limit_m
                 });
                 assert_eq!(near, kept.collect::<Vec<_>>(), "{pair} in window {}", window.index);
+            }
+        }
+    }
+
+    #[test]
+    fn no_baseline_is_shorter_than_its_bound() {
+        // Bound over the shortest distance of an orbit: 1 on a circle; of an ellipse at least (1 - e) / (1 + e)^2 and what inclined planes
+        // add, which is half of the distance along the track at most.
+        for (eccentricity, cross_track_ratio, least) in
+            [(0.0, 0.0, 1.0 - 1e-6), (0.05, 0.0, 0.85), (0.05, 0.3, 0.75)]
+        {
+            let config = ArrayConfig { eccentricity, cross_track_ratio, ..ArrayConfig::default() };
+            let array = Array::new(&config).unwrap();
+            for window in ObservingWindows::new(&array, 0.0, 15.0 * 86_400.0).step_by(31) {
+                for pair in all_pairs(8) {
+                    let bound_m = shortest_m(&array, window, pair);
+                    let start_s = window.start.seconds();
+                    let distance_m = |k: i32| {
+                        let t_s = start_s + array.orbital_period_s() * f64::from(k) / 500.0;
+                        norm(sub(array.position_m(pair.i.into(), t_s), array.position_m(pair.j.into(), t_s)))
+                    };
+                    let until = ((window.end.seconds() - start_s) / array.orbital_period_s() * 500.0) as i32;
+                    let within = (0..=until).map(distance_m).fold(f64::INFINITY, f64::min);
+                    assert!(bound_m <= within, "{pair}: {bound_m} {within}");
+                    // Arcs change by 1 % in an orbit, if they do.
+                    let around = (0..=500).map(distance_m).fold(f64::INFINITY, f64::min);
+                    assert!(bound_m >= 0.98 * least * around, "{pair}: {bound_m} {around}");
+                }
             }
         }
     }
