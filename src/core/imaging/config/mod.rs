@@ -119,7 +119,7 @@ keys! {
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
         /// Regulariser R: "data", 1 / C_l estimated from the data (default); "identity", epsilon W_max I, the paper's (default
-        /// with epsilon, map.refine, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also { degree =
+        /// with epsilon, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also { degree =
         /// 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l from tables of l and C_l (K^2), one per
         /// channel. W_max is the largest eigenvalue of the normal matrix.
         #[serde(skip_serializing_if = "Option::is_none")]
@@ -237,13 +237,13 @@ impl MapConfig {
         self.engine == EngineKind::Harmonic
     }
 
-    /// The choice of R: from the data unless set otherwise. The default is the identity if epsilon is set, if visibilities are stored, or if
-    /// there are too many pixels for an R from the data.
+    /// The choice of R: from the data unless set otherwise. The default is the identity if epsilon is set, if the normal matrix is not
+    /// computed, or if there are too many pixels for an R from the data.
     #[must_use]
     #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
         let is_large = self.engine != EngineKind::Harmonic && self.nside > POWER_NSIDE_MAX;
-        let is_identity = self.holds_visibilities() || self.epsilon.is_some() || is_large;
+        let is_identity = self.is_matrix_free() || self.epsilon.is_some() || is_large;
         let default = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
         self.regulariser.clone().unwrap_or(default)
     }
