@@ -57,25 +57,25 @@ const WITHIN: f64 = 9.21;
 
 /// A visibility for the search.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Sample {
-    pub(super) geometry: PairGeometry,
-    pub(super) value_k_sr: Complex64,
+pub(in crate::calibration) struct Sample {
+    pub(in crate::calibration) geometry: PairGeometry,
+    pub(in crate::calibration) value_k_sr: Complex64,
     /// Inverse variance of the visibility, real and imaginary part together.
-    pub(super) information: f64,
+    pub(in crate::calibration) information: f64,
 }
 
 /// A body that a source may be.
-pub(super) struct KnownBody {
-    pub(super) name: &'static str,
+pub(in crate::calibration) struct KnownBody {
+    pub(in crate::calibration) name: &'static str,
     /// Direction from the Moon.
-    pub(super) hat: Vec3,
+    pub(in crate::calibration) hat: Vec3,
     /// How far from its centre bursts may be, rad.
-    pub(super) radius_rad: f64,
+    pub(in crate::calibration) radius_rad: f64,
 }
 
 impl KnownBody {
     /// The Sun and Jupiter some seconds after a mission's epoch.
-    pub(super) fn all(epoch_tai_s: f64, t_s: f64) -> [Self; 2] {
+    pub(in crate::calibration) fn all(epoch_tai_s: f64, t_s: f64) -> [Self; 2] {
         [
             Self { name: "sun", hat: sun_hat_by_date(epoch_tai_s, t_s), radius_rad: SUN_RAD },
             Self { name: "jupiter", hat: jupiter_hat_by_date(epoch_tai_s, t_s), radius_rad: JUPITER_RAD },
@@ -85,17 +85,17 @@ impl KnownBody {
 
 /// A located source.
 #[derive(Clone, Debug)]
-pub(super) struct Located {
+pub(in crate::calibration) struct Located {
     /// The likeliest direction first.
-    pub(super) directions: Vec<Vec3>,
+    pub(in crate::calibration) directions: Vec<Vec3>,
     /// Standard deviation of the first direction along its worst axis, rad.
-    pub(super) sigma_rad: f64,
-    pub(super) significance: f64,
+    pub(in crate::calibration) sigma_rad: f64,
+    pub(in crate::calibration) significance: f64,
     /// Power in the bin where it is most significant, and its standard deviation, K sr.
-    pub(super) power_k_sr: f64,
-    pub(super) power_sigma_k_sr: f64,
+    pub(in crate::calibration) power_k_sr: f64,
+    pub(in crate::calibration) power_sigma_k_sr: f64,
     /// The body that may be at one of the directions.
-    pub(super) name: Option<&'static str>,
+    pub(in crate::calibration) name: Option<&'static str>,
 }
 
 /// Samples of a bin with their baselines in wavelengths.
@@ -115,7 +115,11 @@ struct Place {
 }
 
 /// Finds the direction of a source, whose power may differ from bin to bin. `None` without samples.
-pub(super) fn locate(bins: &[Vec<Sample>], moon_radius_m: f64, bodies: &[KnownBody]) -> Option<Located> {
+pub(in crate::calibration) fn locate(
+    bins: &[Vec<Sample>],
+    moon_radius_m: f64,
+    bodies: &[KnownBody],
+) -> Option<Located> {
     let search = Search::new(bins, moon_radius_m)?;
     let best = search.all_sky();
     let (largest, longest) = (best.first()?.twice_log, search.lengths().last().copied()?.max(1.0));

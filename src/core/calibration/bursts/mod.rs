@@ -7,6 +7,7 @@ mod detect;
 mod locate;
 
 pub use detect::{BurstSearch, find_bursts};
+pub(super) use locate::{Sample, locate};
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -77,6 +77,30 @@ pub enum InstrumentEvent {
         /// Fraction of the signal that no gains explain.
         unexplained: f64,
     },
+    /// The model is of another frequency than the data.
+    WrongFrequency {
+        /// First pass of this state.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Fraction of the signal that no gains explain.
+        unexplained: f64,
+        /// Frequency of the data over that of the model.
+        ratio: f64,
+    },
+    /// The sky has a source that the model lacks.
+    MissingSource {
+        /// First pass of this state.
+        pass: u64,
+        /// Channel, from 0.
+        channel: usize,
+        /// Fraction of the signal that no gains explain.
+        unexplained: f64,
+        /// Ecliptic longitude and latitude, deg.
+        position_deg: [f64; 2],
+        /// Flux density, as an isotropic antenna sees it, Jy.
+        flux_jy: f64,
+    },
     /// The model is of another strength than the signal, or all receivers are.
     WrongStrength {
         /// First pass of this state.
@@ -125,6 +149,8 @@ impl InstrumentEvent {
             | Self::Drift { pass, .. }
             | Self::GainDrift { pass, .. }
             | Self::WrongModel { pass, .. }
+            | Self::WrongFrequency { pass, .. }
+            | Self::MissingSource { pass, .. }
             | Self::WrongStrength { pass, .. }
             | Self::WeakSignal { pass, .. }
             | Self::Interference { pass, .. }
@@ -185,6 +211,17 @@ impl fmt::Display for InstrumentEvent {
                 "pass {pass}: the model does not match the data in channel {channel}: gains cannot explain {:.1} % of the signal",
                 100.0 * unexplained
             ),
+            Self::WrongFrequency { pass, channel, ratio, .. } => write!(
+                f,
+                "pass {pass}: the data of channel {channel} are of another frequency than its model: about {ratio:.3} times that"
+            ),
+            Self::MissingSource { pass, channel, position_deg: [longitude, latitude], flux_jy, .. } => {
+                write!(
+                    f,
+                    "pass {pass}: the model of channel {channel} lacks a source of {flux_jy:.2e} Jy at ecliptic longitude {longitude:.1}, \
+                 latitude {latitude:.1} deg"
+                )
+            }
             Self::WrongStrength { pass, channel, factor } => write!(
                 f,
                 "pass {pass}: the model of channel {channel} is {factor:.3} times as strong as the signal, if amplitudes are one on average: \

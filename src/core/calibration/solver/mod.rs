@@ -15,6 +15,8 @@
 //! | `fit` | fraction of the signal that a solution leaves unexplained |
 //! | `assessment` | uncertainty and quality state of each gain |
 //! | `solution` | solutions of a pass, divided where gains jump |
+//! | `verdict` | what residuals say of the model |
+//! | `diagnosis` | what is wrong with the model: its frequency, or a source |
 //! | `agree` | whether daughters contradict one another |
 //! | `positions` | position errors of a large fraction of a wavelength |
 //! | `global` | position errors of radians of phase: a search over all offsets |
@@ -36,6 +38,7 @@ mod config;
 mod cramer_rao;
 mod dense;
 mod detect;
+mod diagnosis;
 mod estimates;
 mod events;
 mod expansion;
@@ -69,6 +72,7 @@ mod verdict;
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
+pub use diagnosis::ModelFault;
 pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierFractions};
 pub use events::InstrumentEvent;
 pub use model::{KnownSignal, Offsets};

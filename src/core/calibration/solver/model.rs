@@ -6,11 +6,13 @@ use num_complex::Complex64;
 
 use super::circle::{CircleSky, Rotations};
 use super::config::{CalibrationMode, SkyModel, SolverConfig};
+use super::diagnosis::DIAGNOSIS_NSIDE;
 use super::sums::{MODEL_TERMS, ModelTerms};
 use crate::array::{track_axes, track_offset_m};
-use crate::frames::{Channel, Instrument, PlacedVisibilities};
+use crate::frames::{AntennaResponse, Channel, Instrument, PlacedVisibilities};
 use crate::response::beacon::Beacon;
 use crate::response::model::{DirectMoments, DirectSum, ModelError, PairPosition, VisibilityModel};
+use crate::response::pixel::PairGeometry;
 use crate::sky::{MapError, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{Vec3, sub};
@@ -37,6 +39,10 @@ pub struct KnownSignal {
     beacon: Beacon,
     frequencies_hz: Vec<f64>,
     solves_positions: bool,
+    /// Maps of low resolution, one per channel, to tell a wrong frequency.
+    coarse: Vec<SkyMap>,
+    moon_radius_m: f64,
+    response: AntennaResponse,
 }
 
 /// Position errors of all daughters about which the model is linearised, and the normals of their orbits.
@@ -73,6 +79,10 @@ impl KnownSignal {
                 false => ChannelSky::Value(DirectSum::new(&map, hz, moon_m, response)),
             })
         };
+        let coarse = |map: &SkyMap| match map.nside() > DIAGNOSIS_NSIDE {
+            true => map.degrade(DIAGNOSIS_NSIDE),
+            false => Ok(map.clone()),
+        };
         let skies = maps.iter().zip(&instrument.channels).filter(|_| uses_sky).map(sky);
         Ok(Self {
             sky: skies.collect::<Result<_, MapError>>()?,
@@ -80,6 +90,9 @@ impl KnownSignal {
             beacon: config.beacon(),
             frequencies_hz: instrument.channels.iter().map(|channel| channel.frequency_hz).collect(),
             solves_positions,
+            coarse: maps.iter().filter(|_| uses_sky).map(coarse).collect::<Result<_, MapError>>()?,
+            moon_radius_m: instrument.moon_radius_m,
+            response: instrument.response,
         })
     }
 
@@ -104,6 +117,31 @@ impl KnownSignal {
         match self.sky.get(channel) {
             Some(ChannelSky::Gradient(sum)) => sum.weighted_sums(positions, functions),
             _ => Ok(Vec::new()),
+        }
+    }
+
+    /// The sky of a channel at low resolution, with its frequency times a factor; `None` without one.
+    pub(super) fn at_ratio(
+        &self,
+        channel: usize,
+        ratio: f64,
+        positions: &[PairPosition],
+    ) -> Option<Vec<Complex64>> {
+        let hz = ratio * self.frequencies_hz[channel];
+        let mut sum = DirectSum::new(self.coarse.get(channel)?, hz, self.moon_radius_m, self.response);
+        let mut values = vec![Complex64::ZERO; positions.len()];
+        sum.predict(positions, &mut values).ok()?;
+        Some(values)
+    }
+
+    /// Geometry of a visibility.
+    pub(super) fn geometry(&self, placed: &PlacedVisibilities, k: usize) -> PairGeometry {
+        PairGeometry {
+            r_i_m: placed.r_i_m[k],
+            r_j_m: placed.r_j_m[k],
+            frequency_hz: placed.frequency_hz,
+            moon_radius_m: self.moon_radius_m,
+            response: self.response,
         }
     }
 

@@ -8,6 +8,7 @@
 //! | dead | a daughter delivers only noise |
 //! | drift, gain drift | phases, amplitudes of one daughter change gradually within a pass |
 //! | wrong model | residuals of pairs that gains cannot explain |
+//! | wrong frequency, missing source | the same, and a model of another frequency, or with one more source, explains them |
 //! | wrong strength | amplitudes of all daughters have a factor in common |
 //! | weak signal | no daughter has a gain, as the known signal is too weak |
 //! | interference | outliers in one channel, in most pairs and most of the time |
@@ -19,6 +20,7 @@ use std::f64::consts::{PI, TAU};
 
 use num_complex::Complex64;
 
+use super::diagnosis::ModelFault;
 use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
 use super::solution::PassSolution;
@@ -285,9 +287,15 @@ fn add_state_events(
         }
         match verdict {
             ModelVerdict::Right => {}
-            ModelVerdict::Wrong { unexplained } => {
-                events.push(InstrumentEvent::WrongModel { pass, channel, unexplained });
-            }
+            ModelVerdict::Wrong { unexplained, fault } => events.push(match fault {
+                None => InstrumentEvent::WrongModel { pass, channel, unexplained },
+                Some(ModelFault::Frequency { ratio }) => {
+                    InstrumentEvent::WrongFrequency { pass, channel, unexplained, ratio }
+                }
+                Some(ModelFault::Source { position_deg, flux_jy }) => {
+                    InstrumentEvent::MissingSource { pass, channel, unexplained, position_deg, flux_jy }
+                }
+            }),
             ModelVerdict::Weak => events.push(InstrumentEvent::WeakSignal { pass, channel }),
             ModelVerdict::OtherStrength { factor } => {
                 events.push(InstrumentEvent::WrongStrength { pass, channel, factor });

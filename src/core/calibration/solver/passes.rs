@@ -1,17 +1,21 @@
 //! Solutions of passes: from visibilities as they were sent, with the positions of the packets.
 
+use std::collections::BTreeMap;
+
 use super::config::{CalibrationMode, SolverConfig};
+use super::diagnosis::{Datum, diagnose};
 use super::model::{KnownSignal, Offsets};
 use super::positions::{Search, modelled};
 use super::smooth::smooth;
 use super::solution::{PassData, PassSolution, solve_from, solve_pass_in_parts};
 use super::sums::ModelledBlock;
+use super::verdict::ModelVerdict;
 use crate::array::{Ephemeris, orbit_normal_hat};
 use crate::calibration::{CalibrationError, VanVleck};
 use crate::frames::{Flags, Instrument, PlacedVisibilities, VisibilityBlock};
 use crate::sky::SkyMap;
-use crate::units::InvalidValue;
 use crate::units::vector::Vec3;
+use crate::units::{InvalidValue, Pair};
 
 /// Time between the two positions that determine an orbit's plane, s.
 const NORMAL_S: f64 = 60.0;
@@ -173,6 +177,9 @@ impl PassTask<'_> {
                     self.intervals().flat_map(|span_s| self.solve_in_parts(span_s, &mut blocks)).collect()
                 }
             };
+            if !solves_positions {
+                solutions.iter_mut().for_each(|solution| name_faults(solution, placed, &blocks, signal));
+            }
             let ([solution], true) = (&solutions[..], solves_positions) else { break };
             let now: Vec<[f64; 3]> = solution.daughters.iter().map(|daughter| daughter.position_m).collect();
             let sigma = |n: usize, axis: usize| solution.daughters[n].position_sigma_m[axis];
@@ -230,6 +237,35 @@ impl PassTask<'_> {
     fn full_span_s(&self) -> [f64; 2] {
         let [from_s, until_s] = self.span_s;
         [from_s, until_s + 1e-6 * (1.0 + until_s - from_s)]
+    }
+}
+
+/// Names what is wrong with the models of channels whose residuals say that they are.
+fn name_faults(
+    solution: &mut PassSolution,
+    placed: &[(PlacedVisibilities, bool)],
+    blocks: &[ModelledBlock],
+    signal: &KnownSignal,
+) {
+    let span_s = solution.from_s..solution.until_s;
+    for (channel, verdict) in solution.models.iter_mut().enumerate() {
+        let ModelVerdict::Wrong { fault, .. } = verdict else { continue };
+        let mut pairs: BTreeMap<Pair, Vec<Datum>> = BTreeMap::new();
+        for ((placed, beacon_is_on), block) in placed.iter().zip(blocks) {
+            if block.channel != channel || *beacon_is_on {
+                continue;
+            }
+            let used =
+                (0..block.time_s.len()).filter(|k| !block.is_out[*k] && span_s.contains(&block.time_s[*k]));
+            pairs.entry(block.pair).or_default().extend(used.map(|k| Datum {
+                geometry: signal.geometry(placed, k),
+                value_k_sr: block.value_k_sr[k],
+                weight: block.weight[k],
+                model: block.model[k][0],
+            }));
+        }
+        let pairs: Vec<Vec<Datum>> = pairs.into_values().filter(|pair| !pair.is_empty()).collect();
+        *fault = diagnose(&pairs, &|ratio, positions| signal.at_ratio(channel, ratio, positions));
     }
 }
 

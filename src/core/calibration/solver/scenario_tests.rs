@@ -13,6 +13,7 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{StreamKind, all_pairs, random_stream};
 
 mod event_tests;
+mod fault_tests;
 mod kind_tests;
 
 const DAUGHTERS: usize = 8;

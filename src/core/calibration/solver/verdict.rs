@@ -4,6 +4,7 @@ use bincode::{Decode, Encode};
 use serde::Serialize;
 
 use super::config::{AmplitudeScale, CalibrationMode, SolverConfig};
+use super::diagnosis::ModelFault;
 use super::estimates::{DaughterEstimate, GainEstimate, GainState};
 use super::sums::PairSums;
 
@@ -18,6 +19,9 @@ pub enum ModelVerdict {
     Wrong {
         /// Fraction of the signal that no gains explain.
         unexplained: f64,
+        /// What is wrong, if that is known.
+        #[serde(flatten, skip_serializing_if = "Option::is_none")]
+        fault: Option<ModelFault>,
     },
     /// The known signal is too weak for any gain.
     Weak,
@@ -67,7 +71,7 @@ pub(super) fn model_verdict(
         return ModelVerdict::Weak;
     }
     if let Some(unexplained) = unexplained {
-        return ModelVerdict::Wrong { unexplained };
+        return ModelVerdict::Wrong { unexplained, fault: None };
     }
     let count = |is: fn(GainState) -> bool| gains.iter().filter(|gain| is(gain.state)).count();
     let with_data = count(|state| !matches!(state, GainState::NoData | GainState::Dead));
