@@ -156,6 +156,33 @@ fn perfect_data_stay_as_they_are() {
     }
 }
 
+#[test]
+fn a_source_that_the_model_lacks_is_named_with_its_place_and_flux() {
+    let place = Workplace::new(SMALL);
+    let ideal = command(&place, "run", "ideal", &[]);
+    let source = "sky.moving=[{ direction = [130.0, 35.0], steady_jy = 1e6 }]";
+    let with_source = command(&place, "run", "source", &[&GAINS[..], &[source]].concat());
+    let set = ["calibrate.clock_sigma_ns=60.0", "calibrate.amplitude_sigma=0.2"];
+    let (summary, _) = calibrated(&place, (&with_source, "solved"), &inputs(&ideal), &set);
+    let events = summary["events"].as_array().unwrap();
+    for channel in [0, 1] {
+        let named: Vec<_> = events
+            .iter()
+            .filter(|event| event["event"] == "missing-source" && event["channel"] == channel)
+            .collect();
+        let others = ["wrong-model", "wrong-frequency", "wrong-strength", "dead"];
+        let is_other = |event: &&serde_json::Value| others.iter().any(|name| event["event"] == *name);
+        assert!(!named.is_empty() && !events.iter().any(|event| is_other(&event)), "{events:?}");
+        for event in named {
+            let [longitude, latitude] = [0, 1].map(|k| event["position_deg"][k].as_f64().unwrap());
+            let flux_jy = event["flux_jy"].as_f64().unwrap();
+            // Baselines of 400 wavelengths have fringes of 0.14 deg; amplitudes have an error of 10 %, squared.
+            assert!((longitude - 130.0).abs() < 0.15 && (latitude - 35.0).abs() < 0.15, "{event}");
+            assert!((flux_jy / 1e6).ln().abs() < 0.3, "{event}");
+        }
+    }
+}
+
 const BEACON: [&str; 4] = [
     "instrument.beacon={k_sr=1e10,direction_deg=[40.0,10.0],on_s=300.0,every_s=1000.0}",
     "calibrate.beacon_k_sr=1e10",

@@ -57,6 +57,9 @@ const STEPS: [f64; 3] = [0.25, 0.06, 0.015];
 const VISIBILITIES: usize = 96;
 const OF_PAIR: usize = 8;
 
+/// Least number of visibilities that tell a frequency.
+const VISIBILITIES_MIN: usize = 32;
+
 /// Rounds in which the flux density of a source and the factors of the pairs are fitted in turn.
 const ROUNDS: usize = 8;
 
@@ -102,7 +105,7 @@ pub(super) fn diagnose(pairs: &[Vec<Datum>], at_ratio: AtRatio<'_>) -> Option<Mo
     if left < LEFT_SIGMAS * noise(count) {
         return None;
     }
-    frequency(pairs, at_ratio).or_else(|| source(pairs, left))
+    source(pairs, left).or_else(|| frequency(pairs, at_ratio))
 }
 
 /// Standard deviation of [`left_over`] by noise alone: the square of a visibility has a variance of 4.
@@ -143,7 +146,7 @@ fn frequency(pairs: &[Vec<Datum>], at_ratio: AtRatio<'_>) -> Option<ModelFault> 
     let mut near: Vec<(f64, &Vec<Datum>)> = pairs
         .iter()
         .map(|pair| (pair.iter().map(Datum::wavelengths).fold(0.0, f64::max), pair))
-        .filter(|(longest, pair)| !pair.is_empty() && *longest > 0.0 && *longest < REACH_WAVELENGTHS)
+        .filter(|(longest, pair)| pair.len() >= OF_PAIR && *longest > 0.0 && *longest < REACH_WAVELENGTHS)
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0));
     let longest = near.last()?.0;
@@ -162,7 +165,8 @@ fn frequency(pairs: &[Vec<Datum>], at_ratio: AtRatio<'_>) -> Option<ModelFault> 
     };
     let before = left(0.0)?;
     let count: usize = near.iter().map(Vec::len).sum();
-    if before < LEFT_SIGMAS * noise(count) {
+    // Few numbers agree with some frequency by chance.
+    if count < VISIBILITIES_MIN || before < LEFT_SIGMAS * noise(count) {
         return None;
     }
     let mut best = (0.0, before);

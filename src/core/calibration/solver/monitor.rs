@@ -262,7 +262,10 @@ fn add_state_events(
             events.push(InstrumentEvent::Dead { pass, daughter: number, channels: dead });
         }
         let drifting = |rms_and_sigma: fn(&GainEstimate) -> [f64; 2], least: f64| -> Vec<(usize, f64)> {
-            let gains = daughter.gains.iter().enumerate().filter(|(c, _)| tells(*c));
+            // What a named fault of the model leaves changes with time, as drifts do.
+            let is_of_model =
+                |c: usize| matches!(solution.models[c], ModelVerdict::Wrong { fault: Some(_), .. });
+            let gains = daughter.gains.iter().enumerate().filter(|(c, _)| tells(*c) && !is_of_model(*c));
             let drifts = gains.filter_map(|(c, gain)| {
                 let [rms, sigma] = rms_and_sigma(gain);
                 // A drift is reported only if it dominates the variance: with noise alone the estimated scatter can reach
