@@ -20,6 +20,7 @@ mod instrument;
 mod joint;
 mod live_gains;
 mod navigation;
+mod orbit_files;
 mod orbits;
 mod outputs;
 mod paper;

@@ -4,6 +4,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod bodies;
 mod departures;
 mod forward;
 mod general;

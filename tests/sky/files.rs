@@ -606,6 +606,12 @@ fn a_frequency_in_other_words_counts() {
     for (primary, more, said) in [
         (&["CTYPE3  = 'FREQ'", "CRVAL3  = 408.", "CUNIT3  = 'MHz'"][..], &[][..], "CRVAL3 is 408 MHz"),
         (&[], &["FREQ_MHZ= 408"], "FREQ_MHZ is 408 MHz"),
+        // Long keywords as astropy writes them, and those of Planck's components and of receivers.
+        (&["HIERARCH FREQUENCY = 408.0 / [MHz]"], &[], "FREQUENCY is 408 MHz"),
+        (&[], &["HIERARCH map frequency = '408 MHz'"], "map frequency is 408 MHz"),
+        (&[], &["NU_REF  = '408.0 MHz'"], "NU_REF is 408 MHz"),
+        (&[], &["CENTFREQ= 408.0 / central frequency [MHz]"], "CENTFREQ is 408 MHz"),
+        (&["REFFREQ = 4.08E8"], &["FREQ0   = 408000.0 / kHz"], "FREQ0 is 408 MHz"),
     ] {
         write(primary, more);
         let found = read(10e6).unwrap_err();
@@ -618,6 +624,7 @@ fn a_frequency_in_other_words_counts() {
         ("TCOMM1  = 'temperature at 408 MHz'", "TCOMM1"),
         ("BAND    = '408 MHz'", "BAND"),
         ("COMMENT   All-sky 408 MHz map", "COMMENT"),
+        ("HISTORY   All-sky 408 MHz map, destriped", "HISTORY"),
     ] {
         write(&[], &[text]);
         let found = read(10e6).unwrap_err();
@@ -630,8 +637,34 @@ fn a_frequency_in_other_words_counts() {
         write(&["FREQ    = '10 MHz'"], &[text]);
         assert!(read(10e6).is_ok());
     }
+    // FREQ counts before others, and widths, steps and ends of bands are no frequencies of maps.
+    for others in [
+        &["FREQ    = '10 MHz'", "FREQ_REF= 408.0 / MHz"][..],
+        &["FREQMIN = 9E6", "FREQMAX = 11E6", "FREQRES = 24E3 / Hz", "FREQ_BW = '408 kHz'", "NFREQ   = 3"],
+        &["OBS_FREQ= 22E6 / width of a channel, Hz"],
+    ] {
+        write(others, &[]);
+        assert_eq!(
+            (read(10e6).is_ok(), noted("states no frequency")),
+            (true, others.len() != 2),
+            "{others:?}"
+        );
+    }
+    write(&["FREQ_OBS= '22 MHz'", "FREQ_REF= '408 MHz'"], &[]);
+    assert!(read(10e6).is_ok() && noted("its header says '22 MHz' in FREQ_OBS"));
     write(&[], &["COMMENT   from 22 MHz and 408 MHz"]);
     assert!(read(10e6).is_ok() && noted("its header says 'from 22 MHz and 408 MHz' in COMMENT"));
+}
+
+#[test]
+fn a_compressed_image_is_no_map() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("image.fits");
+    // Its tiles are rows of a table, as fpack and astropy write them.
+    let image = ["ZIMAGE  =                    T", "ZCMPTYPE= 'RICE_1'"];
+    foreign_map(&path, &["COORDSYS= 'G'"], &image, &[("ZSCALE", "", [3e5; 12])]);
+    let said = read_map(&path, &ReadOptions::default()).unwrap_err().to_string();
+    assert!(said.contains("no binary table of a map among its 2 units"), "{said}");
 }
 
 #[test]

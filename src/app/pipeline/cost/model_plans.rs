@@ -56,6 +56,7 @@ impl Plan {
                 l_max: self.config.sky.l_max,
                 is_time_averaged: spacecraft.smear_integrations,
                 is_on_circle: self.array.formation().is_some(),
+                has_points: self.config.sky.points.is_some(),
             };
             if spacecraft.fidelity == Fidelity::Samples {
                 // The sampler needs auto-correlations and baselines scaled over the channel, which only direct sums provide.
@@ -145,6 +146,7 @@ impl Plan {
                 l_max: 5 * nside / 2,
                 is_time_averaged: false,
                 is_on_circle: true,
+                has_points: false,
             };
             map + if solver.is_harmonic(nside) {
                 ModelPlan::new(ModelChoice::Harmonic, load).bytes

@@ -59,7 +59,23 @@ pub(super) fn parse_content<M: Message>(path: &Path, bytes: &[u8]) -> Result<(M,
     if let Some(form) = form_of(bytes) {
         return Err(error(path, format!("{form}; expected text as ASCII or UTF-8, or gzip of it")));
     }
+    if let Some(table) = other_table(bytes) {
+        return Err(error(path, format!("{table}; expected a CCSDS {} as KVN or XML", M::NAME)));
+    }
     parse(bytes).map_err(|fault| at_line(path, fault))
+}
+
+/// A table of states that is no message, and what its program writes instead.
+fn other_table(bytes: &[u8]) -> Option<&'static str> {
+    let text = bytes.trim_ascii_start();
+    let is_horizons = || text.windows(5).take(1 << 16).any(|five| five == b"$$SOE");
+    if text.starts_with(b"stk.v.") {
+        Some("an ephemeris of STK (.e), which also exports CCSDS OEM")
+    } else if text.starts_with(b"**********") && is_horizons() {
+        Some("a table of JPL's Horizons, which also makes SPK kernels (.bsp)")
+    } else {
+        None
+    }
 }
 
 /// Reads a message that is given as bytes.

@@ -33,7 +33,13 @@ pub(super) fn identify_unsupported_frames(head: &[u8]) -> Option<String> {
         ));
     }
     let (marked, bytes) = marker_period(head)?;
-    is_chain(bytes, |at| marked.get(at + SYNC_MARKER_BYTES..)).then(|| {
+    let frame = |at: usize| marked.get(at + SYNC_MARKER_BYTES..);
+    if is_telemetry(bytes, frame) {
+        return Some(format!(
+            "TM transfer frames of {bytes} bytes with sync markers (CCSDS 132.0-B): supply the space packets extracted from the frames"
+        ));
+    }
+    is_chain(bytes, frame).then(|| {
         format!(
             "CADUs of {bytes} bytes whose blocks are not randomized: expected the pseudo-randomizer of CCSDS 131.0-B, and \
              Reed-Solomon (255, 223) parity"
@@ -83,6 +89,20 @@ fn is_chain<'a>(bytes: usize, at: impl Fn(usize) -> Option<&'a [u8]>) -> bool {
         frames += 1;
     }
     frames >= FRAMES_MIN && consecutive + 1 >= FRAMES_MIN
+}
+
+/// Whether headers at multiples of `bytes` are those of TM frames of one spacecraft, with consecutive counts of its master channel.
+fn is_telemetry<'a>(bytes: usize, at: impl Fn(usize) -> Option<&'a [u8]>) -> bool {
+    let header = |k: usize| at(k * bytes).and_then(<[u8]>::first_chunk::<3>).copied();
+    let Some([first, second, count]) = header(0) else { return false };
+    // Version 0, ten bits of the spacecraft, three of the virtual channel, a flag.
+    let is_next = |k: usize, [a, b, c]: [u8; 3]| {
+        a == first && b >> 4 == second >> 4 && c == count.wrapping_add(k as u8)
+    };
+    let headers: Vec<[u8; 3]> = (0..).map_while(header).collect();
+    first >> 6 == 0
+        && headers.len() >= FRAMES_MIN
+        && headers.into_iter().enumerate().all(|(k, found)| is_next(k, found))
 }
 
 /// The stream from its first sync marker on, and the distance between markers.
@@ -188,6 +208,17 @@ mod tests {
         );
         // Randomized frames may be valid, so they are no reason to refuse a stream.
         assert_eq!(identify_unsupported_frames(&marked(randomize)), None);
+        // Version 0, spacecraft 0x123, channels 1 and 2, counts that wrap.
+        let telemetry = |step: u8| -> Vec<u8> {
+            let frame = |k: u8| {
+                let header = [0x12, 0x32 + 2 * (k % 2), 250_u8.wrapping_add(step * k), k / 2, 0x18, 0];
+                [&SYNC_MARKER.to_be_bytes()[..], &header, &[k; 1109]].concat()
+            };
+            (0..9).flat_map(frame).collect()
+        };
+        let found = identify_unsupported_frames(&telemetry(1)).unwrap();
+        assert!(found.starts_with("TM transfer frames of 1119 bytes"), "{found}");
+        assert_eq!(identify_unsupported_frames(&telemetry(3)), None);
         // A stream may begin anywhere.
         assert_eq!(identify(&marked(|_| {})[500..]), Some(plain));
     }

@@ -73,6 +73,17 @@ pub struct Workload {
     pub is_time_averaged: bool,
     /// Whether all satellites are on one circle, as the harmonic model requires.
     pub is_on_circle: bool,
+    /// Whether the sky has points at exact directions, beside which its map need not hold all that the baselines see.
+    pub has_points: bool,
+}
+
+impl Workload {
+    /// Whether baselines see degrees of the sky that its map does not determine, and no band limit was asked for. Harmonics leave them
+    /// out, so that their choice would change what is simulated.
+    fn is_beyond_map(&self) -> bool {
+        let seen = l_max_of_fringes(self.baseline_wavelengths_max);
+        self.l_max == 0 && !self.has_points && seen > SkyConfig::l_max_determined(self.sky_nside)
+    }
 }
 
 /// The chosen model, the reason, and the cost of each.
@@ -134,6 +145,9 @@ impl ModelPlan {
             ModelChoice::Direct => (ModelKind::Direct, "as configured"),
             ModelChoice::Harmonic => (ModelKind::Harmonic, "as configured"),
             ModelChoice::General => (ModelKind::General, "as configured"),
+            ModelChoice::Auto if load.is_beyond_map() && !load.is_time_averaged => {
+                (ModelKind::Direct, "harmonics would leave out what baselines see")
+            }
             ModelChoice::Auto if !load.is_on_circle => {
                 if direct_fringes <= DIRECT_FRINGES_MAX {
                     (ModelKind::Direct, "at most a minute")
@@ -200,6 +214,7 @@ mod tests {
             l_max: 0,
             is_time_averaged: false,
             is_on_circle: true,
+            has_points: false,
         }
     }
 
@@ -222,6 +237,27 @@ mod tests {
             plan(Workload { is_time_averaged: true, ..load(5e4, 64, 31.3) }).kind,
             ModelKind::Harmonic
         );
+    }
+
+    #[test]
+    fn a_choice_by_cost_never_leaves_out_what_baselines_see() {
+        let plan = |load| ModelPlan::new(ModelChoice::Auto, load).kind;
+        // Baselines of 31.3 wavelengths see degrees up to 241; 9/4 nside are 144 and 288.
+        for (nside, is_on_circle, kind) in [
+            (64, true, ModelKind::Direct),
+            (64, false, ModelKind::Direct),
+            (128, true, ModelKind::Harmonic),
+            (128, false, ModelKind::General),
+        ] {
+            assert_eq!(
+                plan(Workload { is_on_circle, ..load(2.6e7, nside, 31.3) }),
+                kind,
+                "{nside} {is_on_circle}"
+            );
+        }
+        // What is asked for, and points beside a map that need not hold them.
+        assert_eq!(plan(Workload { l_max: 144, ..load(2.6e7, 64, 31.3) }), ModelKind::Harmonic);
+        assert_eq!(plan(Workload { has_points: true, ..load(2.6e7, 64, 31.3) }), ModelKind::Harmonic);
     }
 
     #[test]

@@ -26,7 +26,7 @@ pub enum CardValue {
 /// A keyword of a header with its value and comment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Card {
-    /// Keyword of up to 8 characters A-Z, 0-9, `-` and `_`.
+    /// Keyword of up to 8 characters A-Z, 0-9, `-` and `_`; of a HIERARCH card as it is read, what follows that word.
     pub key: String,
     /// Value.
     pub value: CardValue,
@@ -117,13 +117,14 @@ impl Card {
 
     /// Reads one card; `None` if it has no value (comments, blank cards, anything unreadable).
     pub(super) fn parse(card: &[u8; CARD_BYTES]) -> Option<Self> {
-        let key = std::str::from_utf8(&card[..8]).ok()?.trim_end().to_owned();
-        let continued = key == "CONTINUE";
-        if !continued && &card[8..10] != b"= " {
-            return None;
-        }
-        let field: String = card[10..].iter().map(|&c| if c.is_ascii() { c as char } else { '?' }).collect();
-        let field = field.trim_start();
+        let text: String = card.iter().map(|&c| if c.is_ascii() { c as char } else { '?' }).collect();
+        let (key, field) = match text.strip_prefix("HIERARCH ") {
+            // ESO's convention of long keywords, in which astropy writes those of more than eight letters.
+            Some(long) => long.split_once('=')?,
+            None if text.starts_with("CONTINUE") || &text[8..10] == "= " => (&text[..8], &text[10..]),
+            None => return None,
+        };
+        let (key, field) = (key.trim().to_owned(), field.trim_start());
         let (value, rest) = match field.strip_prefix('\'') {
             Some(quoted) => {
                 let (text, rest) = unquote(quoted)?;
@@ -222,6 +223,18 @@ mod tests {
             let bytes = written(&card);
             assert_eq!(Card::parse(bytes.as_slice().try_into().unwrap()), Some(card));
         }
+    }
+
+    #[test]
+    fn long_keywords_are_read() {
+        let read = |text: &str| Card::parse(format!("{text:<80}").as_bytes().try_into().unwrap());
+        // As astropy 8 writes them.
+        assert_eq!(read("HIERARCH FREQUENCY = 408000000.0 / Hz"), Some(Card::real("FREQUENCY", 408e6, "Hz")));
+        assert_eq!(
+            read("HIERARCH map frequency = '408 = x' / y"),
+            Some(Card::text("map frequency", "408 = x", "y"))
+        );
+        assert_eq!((read("HIERARCH"), read("HIERARCH no value")), (None, None));
     }
 
     #[test]

@@ -80,8 +80,8 @@ pub enum FitsProblem {
     },
     /// The file holds no binary table.
     #[error(
-        "no binary table among its {units} units; expected an extension with XTENSION = 'BINTABLE', as \
-             healpy writes maps"
+        "no binary table of a map among its {units} units (images are none); expected an extension with XTENSION = 'BINTABLE', as \
+         healpy writes maps"
     )]
     NoTable {
         /// Number of header-data units found.

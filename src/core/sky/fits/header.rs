@@ -14,8 +14,8 @@ const CARDS_MAX: usize = 36 * 1000;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Header {
     cards: Vec<Card>,
-    /// Texts of COMMENT cards.
-    comments: Vec<String>,
+    /// Keywords and texts of COMMENT and HISTORY cards.
+    comments: Vec<(&'static str, String)>,
 }
 
 impl Header {
@@ -38,8 +38,9 @@ impl Header {
                 if card.starts_with(b"END     ") {
                     return Ok((Self { cards, comments }, needed));
                 }
-                if let Some(text) = card.strip_prefix(b"COMMENT ") {
-                    comments.push(String::from_utf8_lossy(text).trim().to_owned());
+                let is = |keyword: &&str| card.starts_with(keyword.as_bytes()) && card[7] == b' ';
+                if let Some(keyword) = ["COMMENT", "HISTORY"].into_iter().find(is) {
+                    comments.push((keyword, String::from_utf8_lossy(&card[8..]).trim().to_owned()));
                 } else if let Some(card) = Card::parse(card) {
                     push(&mut cards, card);
                 }
@@ -66,8 +67,8 @@ impl Header {
         Self { cards, comments: Vec::new() }
     }
 
-    /// Texts of the COMMENT cards, in order.
-    pub(super) fn comments(&self) -> &[String] {
+    /// Keywords and texts of the COMMENT and HISTORY cards, in order.
+    pub(super) fn comments(&self) -> &[(&'static str, String)] {
         &self.comments
     }
 

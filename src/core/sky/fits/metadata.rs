@@ -9,6 +9,10 @@ use crate::units::{Dimension, echo};
 const FREQUENCY_KEYS: [&str; 5] = ["FREQ", "FREQUENCY", "OBSFREQ", "RESTFRQ", "RESTFREQ"];
 /// Lowest frequency of a map, Hz: the number of a band or of gigahertz is less.
 const FREQUENCY_HZ_MIN: f64 = 1e4;
+/// Parts of other keywords of frequency, and those of keywords that are about ends, widths and steps of bands.
+const FREQUENCY_WORDS: [&str; 5] = ["FREQ", "NU_REF", "NUREF", "REF_NU", "REFNU"];
+const BAND_WORDS: [&str; 12] =
+    ["MIN", "MAX", "LO", "HI", "WID", "RES", "STEP", "DEL", "INC", "BW", "UNIT", "TYPE"];
 const FREQUENCY_UNIT_KEYS: [&str; 3] = ["FREQUNIT", "FREQ_UNI", "UNITFREQ"];
 
 /// Relative difference up to which two frequencies count as equal, as headers may lose digits.
@@ -128,7 +132,8 @@ pub(super) fn column_frequency(
     Ok(name.or_else(|| hz_in(&card.comment)).map(|hz| stated(card, hz)))
 }
 
-/// Frequency in FREQ of either header, in keywords like it, or of an axis of frequency, which must not contradict each other.
+/// Frequency in FREQ of either header, in keywords like it, or of an axis of frequency, which must not contradict each other; else the
+/// only one in other keywords of frequency.
 fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProblem> {
     let mut known: Option<StatedFrequency> = None;
     let axes = header.cards().iter().filter_map(|card| match (card.key.strip_prefix("CTYPE"), &card.value) {
@@ -144,7 +149,26 @@ fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProble
         }
         known.get_or_insert(found);
     }
-    Ok(known)
+    let mut others = other_frequencies(header);
+    let other = others.next().filter(|first| others.all(|(_, other)| is_same_hz(other.hz, first.1.hz)));
+    Ok(known.or(other.map(|(_, found)| found)))
+}
+
+/// Frequencies in keywords that are no others' standard, such as NU_REF of Planck's component maps, CENTFREQ and OBS_FREQ.
+fn other_frequencies(header: &Header) -> impl Iterator<Item = (&Card, StatedFrequency)> {
+    header.cards().iter().filter_map(|card| {
+        let key = card.key.to_ascii_uppercase();
+        let has = |words: &[&str]| words.iter().any(|word| key.contains(word));
+        let is_column = key.strip_prefix("FREQ").is_some_and(|rest| matches!(rest.parse(), Ok(1..=999)));
+        if !has(&FREQUENCY_WORDS) || has(&BAND_WORDS) || is_column || is_width(&card.comment) {
+            return None;
+        }
+        Some((card, StatedFrequency { hz: stated_hz(header, card).ok()?, keyword: card.key.clone() }))
+    })
+}
+
+fn is_width(text: &str) -> bool {
+    ["width", "resolution"].iter().any(|word| text.to_ascii_lowercase().contains(word))
 }
 
 /// Whether a keyword is of frequency: FREQ and its like, with a unit at the end (FREQ_MHZ), or NU with a unit.
@@ -163,7 +187,8 @@ fn key_unit_hz(key: &str) -> Option<f64> {
     unit_hz(key.strip_prefix("FREQ")?.trim_start_matches('_'))
 }
 
-/// The frequencies in texts of the headers: BAND, EXTNAME, OBJECT, TCOMM of the column, comments. Widths are none.
+/// The frequencies in texts of the headers: BAND, EXTNAME, OBJECT, TCOMM of the column, comments, history, and keywords of frequency that
+/// contradict each other. Widths are none.
 pub(super) fn quoted_frequencies(header: &Header, column: usize) -> Vec<QuotedFrequency> {
     let of_column = format!("TCOMM{column}");
     let of_cards = header.cards().iter().filter_map(|card| match &card.value {
@@ -172,11 +197,14 @@ pub(super) fn quoted_frequencies(header: &Header, column: usize) -> Vec<QuotedFr
         }
         _ => None,
     });
-    let mut found = Vec::new();
-    for (keyword, text) in of_cards.chain(header.comments().iter().map(|text| ("COMMENT", text.as_str()))) {
-        if ["width", "resolution"].iter().any(|word| text.to_ascii_lowercase().contains(word)) {
-            continue;
-        }
+    let quoted = |(card, StatedFrequency { hz, keyword }): (&Card, StatedFrequency)| QuotedFrequency {
+        hz,
+        keyword,
+        text: echo(card.value.to_string().trim_matches('\'')),
+    };
+    let mut found: Vec<QuotedFrequency> = other_frequencies(header).map(quoted).collect();
+    let comments = header.comments().iter().map(|(keyword, text)| (*keyword, text.as_str()));
+    for (keyword, text) in of_cards.chain(comments).filter(|(_, text)| !is_width(text)) {
         found.extend(frequencies_in(text).into_iter().map(|hz| QuotedFrequency {
             hz,
             keyword: keyword.to_owned(),
@@ -313,8 +341,11 @@ impl MapUnit {
     /// Parses the name of a unit; `None` for a unit of another quantity. A map without a unit is in K.
     pub(super) fn parse(unit: &str) -> Option<Self> {
         let unit = unit.trim().trim_matches(['[', ']', '(', ')']).trim();
-        if unit.is_empty() {
-            return Some(Self::Kelvin(1.0));
+        match unit {
+            // PyGDSM's names of K_RJ and K_CMB.
+            "" | "TRJ" => return Some(Self::Kelvin(1.0)),
+            "TCMB" => return Some(Self::CmbKelvin(1.0)),
+            _ => {}
         }
         let prefixes = [
             ("", 1.0),
@@ -367,7 +398,7 @@ fn is_kelvin(base: &str, kinds: &[&str]) -> bool {
 
 fn is_jansky_per_sr(base: &str) -> bool {
     let base: String = base.chars().filter(|c| !" .*^_".contains(*c)).collect();
-    ["Jy/sr", "Jysr-1", "JY/SR", "jy/sr", "Jy/steradian"].contains(&base.as_str())
+    ["Jy/sr", "Jysr-1", "Jysr", "JY/SR", "jy/sr", "Jy/steradian"].contains(&base.as_str())
 }
 
 #[cfg(test)]
@@ -512,6 +543,9 @@ mod tests {
             ("K_CMB", 1.0),
             ("KRJ", 1.0),
             ("K_RJ", 1.0),
+            ("TRJ", 1.0),
+            ("TCMB", 1.0),
+            ("T", f64::NAN),
             ("K (Rayleigh", f64::NAN),
             ("mK", 1e-3),
             ("[uK]", 1e-6),
@@ -534,7 +568,9 @@ mod tests {
         // Planck's 30 GHz: x = 0.52826, from CODATA.
         let found = MapUnit::parse("K_CMB").unwrap().kelvin(Some(30e9)).unwrap();
         assert!((found - 0.977_066).abs() < 1e-6, "{found}");
-        assert_eq!(MapUnit::parse("MJy sr^-1"), Some(MapUnit::JanskyPerSr(1e6)));
+        for unit in ["MJy sr^-1", "MJysr"] {
+            assert_eq!(MapUnit::parse(unit), Some(MapUnit::JanskyPerSr(1e6)));
+        }
         assert_eq!(kelvin("MJy/sr"), None);
     }
 }

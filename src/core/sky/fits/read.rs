@@ -343,7 +343,9 @@ fn find_table(reader: &mut (impl Read + Seek), length: u64) -> Result<(Header, u
             read => read?,
         };
         units += 1;
-        let is_table = header.text("XTENSION") == Some("BINTABLE");
+        // Compressed images are tables of tiles.
+        let is_image = header.get("ZIMAGE") == Some(&CardValue::Logical(true));
+        let is_table = header.text("XTENSION") == Some("BINTABLE") && !is_image;
         if is_table && MAP_KEYWORDS.iter().any(|key| header.get(key).is_some()) {
             return Ok((header.with_primary(primary.unwrap_or_default()), data));
         }

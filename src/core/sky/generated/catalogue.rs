@@ -21,6 +21,9 @@ const BYTES_MAX: u64 = 256 << 20;
 /// Highest flux density, Jy: some 1e15 K in a pixel of 4 degrees at 3 MHz.
 const FLUX_JY_MAX: f64 = 1e12;
 
+/// Title of the columns of machine-readable tables of CDS and AAS.
+const BY_BYTES: &str = "Byte-by-byte Description of file";
+
 /// Lowest and highest frequency of a flux density, Hz.
 const FREQUENCY_HZ_MIN: f64 = 1e4;
 const FREQUENCY_HZ_MAX: f64 = 1e12;
@@ -227,9 +230,9 @@ impl Reader<'_> {
 
     /// The units of the columns that are used, each of which is there once.
     fn units(&self, table: &Table<'_>, columns: &Columns) -> Result<Units, CatalogueError> {
-        let Columns { places: [lon, lat], flux, frequency_place, index, .. } = columns;
+        let Columns { places: [lon, lat], flux, unfitted_flux, frequency_place, index, .. } = columns;
         let own = frequency_place.map(|(place, _)| place);
-        for &place in lon.iter().chain(lat).chain([flux]).chain(&own).chain(index) {
+        for &place in lon.iter().chain(lat).chain([flux]).chain(unfitted_flux).chain(&own).chain(index) {
             let name = &table.names[place];
             if table.names.iter().filter(|other| *other == name).count() > 1 {
                 let found = format!("several columns `{}`", displayed(name));
@@ -261,13 +264,29 @@ impl Reader<'_> {
             let expected = "the unit in the column's name, or none";
             require_unit(&column, unit_hz).map_err(refuse(&column, expected))?;
         }
+        let jy_of = |column: &(&str, Vec<String>)| {
+            let expected = "a flux density in Jy or mJy, as the column's name says";
+            flux_jy(column).map_err(refuse(column, expected))
+        };
+        let flux_unit_jy = jy_of(&of_flux)?;
+        if let Some(place) = *unfitted_flux {
+            let column = table.units_of(place, &FLUX_WORDS);
+            if jy_of(&column)? != flux_unit_jy {
+                let expected =
+                    format!("the unit of `{}`, in place of which it is used", displayed(of_flux.0));
+                return Err(self.content_error(
+                    1,
+                    format!("another unit of `{}`", displayed(column.0)),
+                    expected,
+                ));
+            }
+        }
         Ok(Units {
             angle_deg: [
                 angle(lon, Some(15.0), "deg, rad, arcmin, arcsec or hours, as the column's name says")?,
                 angle(lat, None, "deg, rad, arcmin or arcsec, as the column's name says")?,
             ],
-            flux_jy: flux_jy(&of_flux)
-                .map_err(refuse(&of_flux, "a flux density in Jy or mJy, as the column's name says"))?,
+            flux_jy: flux_unit_jy,
         })
     }
 
@@ -278,7 +297,10 @@ impl Reader<'_> {
         let found = match bytes.trim_ascii_start().starts_with(b"<") {
             true => "an XML document (VOTable)",
             false => match text_of(&bytes) {
-                Ok(text) => return Ok(text),
+                Ok(text) if !text.contains(BY_BYTES) => return Ok(text),
+                Ok(_) => {
+                    "a table of CDS or AAS whose columns are ranges of bytes (astropy.io.ascii reads it, and writes CSV)"
+                }
                 Err(form) => form,
             },
         };
@@ -353,7 +375,9 @@ impl Reader<'_> {
             let value = number_of(cell(place), table.separator).filter(|value| good(*value));
             value.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(cell(place))), expected))
         };
-        let flux = number(columns.flux, "a flux density above 0", |flux| flux > 0.0)?;
+        let flux_place =
+            columns.unfitted_flux.filter(|_| is_blank(cell(columns.flux))).unwrap_or(columns.flux);
+        let flux = number(flux_place, "a flux density above 0", |flux| flux > 0.0)?;
         if units.flux_jy * flux > FLUX_JY_MAX {
             let found = format!("{flux:e} {}", if units.flux_jy < 1.0 { "mJy" } else { "Jy" });
             return Err(self.content_error(line, found, format!("at most {FLUX_JY_MAX:e} Jy")));
@@ -540,6 +564,17 @@ mod tests {
         let indices: Vec<_> = read.sources.iter().map(|source| source.index).collect();
         assert_eq!(indices, [Some(-0.7), None, None]);
         assert!(read.sources.iter().all(|source| source.at_hz == 200e6));
+        // The flux of the fit, or the wide-band one where there is none, both at 200 MHz.
+        let fitted = "Name,ra,dec,int_flux_wide,alpha,int_flux_fit_200\nA,10,-20,1.5,-0.7,1.25\nB,11,-21,0.5,,\nC,12,-22,0.4,NaN,NaN\n";
+        let fluxes = Catalogue::read(file(fitted.as_bytes()).path()).unwrap().sources;
+        let fluxes: Vec<_> = fluxes.iter().map(|source| (source.flux_jy, source.at_hz)).collect();
+        assert_eq!(fluxes, [(1.25, 200e6), (0.5, 200e6), (0.4, 200e6)]);
+        let other = fitted.replace("int_flux_wide", "int_flux_wide (mJy)");
+        let said = Catalogue::read(file(other.as_bytes()).path()).unwrap_err().to_string();
+        assert!(
+            said.contains("another unit of `int_flux_wide (mJy)`, expected the unit of `int_flux_fit_200`"),
+            "{said}"
+        );
         let said = read.to_string();
         for part in ["3 sources", "equatorial", "`Fintwide` (Jy) at 200", "2.4000e0 Jy", "`alpha` of 1"] {
             assert!(said.contains(part), "{part}: {said}");

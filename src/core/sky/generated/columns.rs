@@ -55,6 +55,8 @@ pub(super) struct Columns {
     pub places: [Vec<usize>; 2],
     /// Column of the flux.
     pub flux: usize,
+    /// Column of the wide-band flux at the same frequency, for sources whose flux is not fitted.
+    pub unfitted_flux: Option<usize>,
     /// Frequency of the flux, Hz; NaN if each source has its own in `frequency_place`.
     pub flux_hz: f64,
     /// Column with each flux's frequency, and its unit, Hz.
@@ -62,6 +64,10 @@ pub(super) struct Columns {
     /// Column of spectral indices.
     pub index: Option<usize>,
 }
+
+/// GLEAM's names of its flux densities at 200 MHz: of spectra that are fitted, and of the wide band.
+const FITTED: [&str; 2] = ["intfluxfit200", "fintfit200"];
+const WIDE: [&str; 2] = ["intfluxwide", "fintwide"];
 
 /// Converts a name to lower case without punctuation, except decimal points.
 pub(super) fn normalise(name: &str) -> String {
@@ -117,7 +123,9 @@ impl Columns {
         };
         let own = flux_hz.is_nan();
         let frequency_place = hz.filter(|_| own);
-        Ok(Self { frame, places, flux, flux_hz, frequency_place, index })
+        let is_fitted = FITTED.iter().any(|name| normalised_names[flux].starts_with(name));
+        let unfitted_flux = one_of(&WIDE).filter(|_| is_fitted);
+        Ok(Self { frame, places, flux, unfitted_flux, flux_hz, frequency_place, index })
     }
 }
 
@@ -133,7 +141,7 @@ fn flux_of(names: &[String], has_index: bool, has_frequency: bool, is_vlssr: boo
     if let Some(own) = at(&["flux154mhz"]) {
         return Some((own, COUNTS_HZ));
     }
-    let wide = at(&["intfluxfit200", "fintfit200", "intfluxwide", "fintwide"]);
+    let wide = at(&[FITTED, WIDE].concat());
     if let Some(wide) = wide.filter(|_| has_index) {
         return Some((wide, GLEAM_WIDE_HZ));
     }
