@@ -516,6 +516,20 @@ fn a_column_is_of_the_channel_that_it_names() {
         notes.iter().any(|note| note.contains("3 columns") && note.contains("`T`, the first")),
         "{notes:?}"
     );
+    // One that is chosen, and nothing else of it is believed.
+    let chosen = |column| SkyConfig { column: Some(column), ..SkyConfig::default() };
+    let own = |frequency_hz| SkyChannel { frequency_hz, is_dark_accepted: false, is_file_shared: false };
+    let read = |column| read_sky(&path, &own(3e6), &chosen(column)).map(|map| map.values()[0]);
+    write(["I_ML", "I_MEAN", "I_RMS"]);
+    assert_eq!((read(0).unwrap(), read(1).unwrap()), (1e5, 2e5));
+    let options = ReadOptions { column: Some(1), ..ReadOptions::default() };
+    assert!(read_notes(&path, &options).unwrap().iter().all(|note| !note.contains("columns")));
+    for (column, said) in [(2, "I_RMS"), (3, "no map column 3 (counted from 0); expected one of its 3")] {
+        let found = read(column).unwrap_err().to_string();
+        assert!(found.contains(said), "{found}");
+    }
+    write(["T_1MHz", "T_3MHz", "T_10MHz"]);
+    assert!(read(2).unwrap_err().to_string().contains("TTYPE3 is 10 MHz; expected 3 MHz"));
 }
 
 #[test]

@@ -32,6 +32,11 @@ keys! {
         #[only_with("sky.file")]
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday frame: Option<Frame> = None;
+        /// Column of the map files, from 0 without a column of pixel numbers; by default that of the channel's frequency, or else the
+        /// first that may be a temperature.
+        #[only_with("sky.file")]
+        #[serde(skip_serializing_if = "Option::is_none")]
+        expert column: Option<usize> = None;
         /// What to do if the FREQ of a map file is not the channel's: "must-match" refuses it, `{ spectral_index = -2.5 }` scales
         /// it by (nu / FREQ)^index.
         #[only_with("sky.file")]

@@ -117,7 +117,7 @@ impl fmt::Display for MapOutline {
 /// Returns the options for reading the map files of a sky for a channel at `frequency_hz`.
 #[must_use]
 pub fn sky_options(config: &SkyConfig, frequency_hz: f64) -> ReadOptions {
-    ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), ..ReadOptions::default() }
+    ReadOptions { frame_if_missing: config.frame, frequency_hz: Some(frequency_hz), column: config.column }
 }
 
 /// Reads the map of a sky, in K, for a channel. Every pixel must be a temperature, and the mean 1e-16 or more unless the sky may be dark.

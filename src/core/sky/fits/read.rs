@@ -133,9 +133,10 @@ pub fn read_notes(path: &Path, options: &ReadOptions) -> Result<Vec<String>, Fit
         }
         let (_, column) = choose_columns(table, explicit, chosen)?;
         let columns = table.maps_like(column, explicit);
-        if columns > 1 && column_frequency(header, number)?.is_none() {
+        if columns > 1 && options.column.is_none() && column_frequency(header, number)?.is_none() {
             notes.push(format!(
-                "the table has {columns} columns and does not say their frequencies; `{}`, the first that may be a temperature, is used",
+                "the table has {columns} columns and does not say their frequencies; `{}`, the first that may be a temperature, is used \
+                 (sky.column chooses another)",
                 column.name
             ));
         }
