@@ -250,6 +250,15 @@ fn predict_takes_only_a_map_of_its_frequency() {
     write_map(&file, &map, &WriteOptions { cards, ..WriteOptions::default() }).unwrap();
     let sky = ["predict", "--sky", file.to_str().unwrap()];
     let at = |freq: &'static str| [&sky[..], &["--at", "0", "--pair", "1-2", "--freq-hz", freq]].concat();
+    // Another text of the header counts where there is no FREQ.
+    let band = vec![lunarray::sky::fits::Card::text("BAND", "3 MHz", "")];
+    let named = folder.path().join("band.fits");
+    write_map(&named, &map, &WriteOptions { cards: band, ..WriteOptions::default() }).unwrap();
+    let of_band =
+        |freq| at(freq).into_iter().map(|word| if word == sky[2] { named.to_str().unwrap() } else { word });
+    said(&of_band("3MHz").collect::<Vec<_>>());
+    let told = complaint(&of_band("10MHz").collect::<Vec<_>>());
+    assert!(told.contains("BAND is '3 MHz'; expected 10 MHz"), "{told}");
     said(&at("3MHz"));
     let told = complaint(&at("10MHz"));
     assert!(

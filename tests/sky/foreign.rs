@@ -145,3 +145,19 @@ fn files_of_others_are_read_or_refused_as_is_right() {
     let found: BTreeSet<String> = found.filter(|name| !BESIDE.contains(&name.as_str())).collect();
     assert_eq!(found, listed, "each file has a verdict");
 }
+
+#[test]
+fn points_are_described_as_they_are_understood() {
+    let place = Workplace::new(PIPELINE);
+    let points = place.file("points.csv", b"name,ra,dec,S74,alpha\nA,10,20,3,0.7\nB,11,21,4,0.8\n");
+    let set = format!("sky.points='{points}'");
+    let output = lunarray(&["check", &place.pipeline, "--set", &set]);
+    let told = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap()).concat();
+    for part in [
+        "sky.points: ",
+        "2 sources, equatorial positions, flux `S74` (Jy) at 74 MHz, 7.0000e0 Jy together",
+        "2 of 2 spectral indices `alpha` are above 0",
+    ] {
+        assert!(told.contains(part), "{part}: {told}");
+    }
+}

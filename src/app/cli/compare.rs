@@ -65,7 +65,7 @@ pub(super) fn execute(args: &CompareArgs) -> CommandResult {
         && (map_hz - truth_hz).abs() > 1e-6 * truth_hz
     {
         let [map, truth] = [map_hz, truth_hz].map(|hz| Dimension::Frequency.show(hz));
-        print_notes([format!("the map is at {map}, the truth at {truth} (FREQ)")]);
+        print_notes([format!("the map is at {map}, the truth at {truth}, as their headers say")]);
     }
     if let Some(l_max) = args.band_limit {
         truth = truth.band_limited(map.nside(), l_max)?;

@@ -11,7 +11,7 @@ use super::output::{CommandError, CommandResult, Completion, print_json_line, pr
 use crate::array::Array;
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
-use crate::sky::fits::{MapFile, ReadOptions, read_notes, read_whole_map_file};
+use crate::sky::fits::{MapFile, ReadOptions, check_frequency, read_notes, read_whole_map_file};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::{Dimension, Pair, echo};
 
@@ -70,6 +70,10 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
     let array = Array::new(&config.array)?;
     let options = ReadOptions { frequency_hz: args.freq_hz, ..args.maps.options() };
     let MapFile { map, frequency_hz: map_hz, .. } = read_whole_map_file(&args.sky, &options)?;
+    if let (None, Some(freq_hz)) = (map_hz, args.freq_hz) {
+        // What other texts of its header say.
+        check_frequency(&args.sky, freq_hz, &options)?;
+    }
     print_notes(read_notes(&args.sky, &options)?);
     let directions = map.directions_ecliptic();
     let area_sr = pixel_area_sr(map.nside());
@@ -124,7 +128,10 @@ impl PredictArgs {
             return Ok(());
         };
         let [found, wanted] = [map_hz, freq_hz].map(|hz| Dimension::Frequency.show(hz));
-        Err(format!("freq_hz = {wanted}: expected {found}, the frequency of {} (FREQ)", self.sky.display()))
+        Err(format!(
+            "freq_hz = {wanted}: expected {found}, the frequency of {}, as its header says",
+            self.sky.display()
+        ))
     }
 }
 

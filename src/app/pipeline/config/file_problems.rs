@@ -11,6 +11,7 @@ use crate::imaging::{Regulariser, read_power};
 use crate::sky::fits::{
     FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
+use crate::sky::generated::describe_catalogue;
 use crate::sky::{AddedSky, SkyConfig};
 use crate::units::InvalidValue;
 
@@ -110,8 +111,11 @@ impl Plan {
         for (key, path, options) in priors.chain(models) {
             add_line(key, MapOutline::read(path, &options).ok().map(|outline| outline.to_string()));
         }
-        let catalogue = sky.added.as_ref().and_then(|added| added.catalogue_understood().ok().flatten());
-        add_line("sky.added.catalogue", catalogue);
+        let added = sky.added.as_ref().and_then(|added| added.catalogue.as_ref());
+        for (key, path) in [("sky.added.catalogue", added), ("sky.points", sky.points.as_ref())] {
+            let described = path.and_then(|path| describe_catalogue(path).ok());
+            add_line(key, described.map(|(catalogue, _)| catalogue));
+        }
         lines
     }
 }

@@ -16,7 +16,7 @@ use crate::pipeline::config::{Config, PipelineError, Plan};
 use crate::response::model::DirectSum;
 use crate::runtime::{Graph, Link};
 use crate::sky::fits::{read_notes, read_sky, sky_notes as map_notes};
-use crate::sky::generated::generate;
+use crate::sky::generated::{AddedSkyError, describe_catalogue, generate};
 use crate::sky::{Frame, SkyMap};
 use crate::units::ChannelId;
 
@@ -79,8 +79,9 @@ pub fn sky_notes(plan: &Plan) -> Result<Vec<String>, PipelineError> {
         let options = map.prior_options(&spacecraft.channels_hz, channel);
         add(path, read_notes(path, &options).unwrap_or_default());
     }
-    if let Some(added) = &sky.added {
-        notes.extend(added.note()?);
+    let catalogue = sky.added.as_ref().and_then(|added| added.catalogue.as_ref());
+    for path in catalogue.into_iter().chain(&sky.points) {
+        notes.extend(describe_catalogue(path).map_err(AddedSkyError::from)?.1);
     }
     notes.extend(plan.coarse_sky_note());
     Ok(notes)

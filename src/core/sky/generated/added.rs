@@ -33,25 +33,7 @@ impl AddedSky {
     /// # Errors
     /// [`AddedSkyError::Catalogue`] if it cannot.
     pub fn check(&self) -> Result<(), AddedSkyError> {
-        self.catalogue_understood().map(drop)
-    }
-
-    /// Describes the catalogue as it was understood, if there is one.
-    ///
-    /// # Errors
-    /// [`AddedSkyError::Catalogue`] if it cannot be read.
-    pub fn catalogue_understood(&self) -> Result<Option<String>, AddedSkyError> {
-        let understood = |path| Ok(Catalogue::read(path)?.to_string());
-        self.catalogue.as_deref().map(understood).transpose()
-    }
-
-    /// A note on what the catalogue may mean otherwise, if there is one.
-    ///
-    /// # Errors
-    /// [`AddedSkyError::Catalogue`] if it cannot be read.
-    pub fn note(&self) -> Result<Option<String>, AddedSkyError> {
-        let catalogue = self.catalogue.as_deref().map(Catalogue::read).transpose()?;
-        Ok(catalogue.and_then(|catalogue| catalogue.note()))
+        Ok(self.catalogue.as_deref().map_or(Ok(()), |path| Catalogue::read(path).map(drop))?)
     }
 
     /// Adds the components to a map, on ecliptic axes, at `nside` or at the nside of the map if that is finer.

@@ -32,7 +32,7 @@ pub use added::AddedSkyError;
 pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};
 #[doc(hidden)]
-pub use points::{CataloguePoint, read_catalogue};
+pub use points::{CataloguePoint, describe_catalogue, read_catalogue};
 #[doc(hidden)]
 pub use sources::{CatalogueSource, catalogue};
 

@@ -45,6 +45,15 @@ pub fn read_catalogue(path: &Path, index: f64) -> Result<Vec<CataloguePoint>, Ca
     Ok(sources.into_iter().map(point).collect())
 }
 
+/// Describes a table as it is understood, and notes what it may mean otherwise.
+///
+/// # Errors
+/// As [`read_catalogue`].
+pub fn describe_catalogue(path: &Path) -> Result<(String, Option<String>), CatalogueError> {
+    let catalogue = Catalogue::read(path)?;
+    Ok((catalogue.to_string(), catalogue.note()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
