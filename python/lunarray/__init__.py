@@ -26,6 +26,8 @@ from ._native import VERSION as __version__
 from ._native import ConfigurationError, Error
 from ._native import inspect as _inspect
 from ._predict import predict
+from ._table import from_table
+from ._uvdata import from_uvdata
 
 __all__ = [
     "Array",
@@ -37,6 +39,8 @@ __all__ = [
     "Replay",
     "Run",
     "State",
+    "from_table",
+    "from_uvdata",
     "inspect",
     "open",
     "predict",

@@ -60,6 +60,24 @@ class NativeDownlink:
     def autos(self) -> tuple[NDArray[np.uint8], _Floats]: ...
     def positions(self, times_s: _Floats) -> _Floats: ...
 
+class NativeWriter:
+    def __init__(self, path: _Path, description: str) -> None: ...
+    def write(
+        self,
+        start_ticks: int,
+        step_ticks: int,
+        positions_m: _Floats,
+        channel: NDArray[np.uint16],
+        i: NDArray[np.uint8],
+        j: NDArray[np.uint8],
+        time_ticks: NDArray[np.int64],
+        duration_ticks: NDArray[np.uint32],
+        value_k_sr: NDArray[np.complex64],
+        weight: NDArray[np.float32],
+        flags: NDArray[np.uint8],
+    ) -> None: ...
+    def finish(self) -> None: ...
+
 class NativeArray:
     def __init__(self, pipeline: Optional[_Path] = None, overrides: Sequence[str] = ...) -> None: ...
     @property

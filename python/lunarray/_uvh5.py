@@ -137,11 +137,11 @@ def write_uvh5(downlink, path, channel, phase_centre):
     made, rows = to_uvdata(downlink, channel, phase_centre)
     with writing(path, downlink.path, b"\x89HDF", "UVH5") as unfinished:
         made.write_uvh5(unfinished, run_check=False)
-        add_truth(h5py, unfinished, rows)
+        add_truth(h5py, unfinished, rows, downlink.instrument)
     return len(rows)
 
 
-def add_truth(h5py, path, rows):
+def add_truth(h5py, path, rows, instrument):
     """Adds what UVH5 has no place for."""
     with h5py.File(path, "a") as file:
         beside = file.create_group("lunarray")
@@ -149,6 +149,8 @@ def add_truth(h5py, path, rows):
             "In the order of the file's visibilities: positions of antennas 1 and 2, m, Moon-centred ecliptic axes; middle of "
             "each integration, s since the mission's epoch; inverse variance of the real part, (K sr)^-2"
         )
+        for name in ("name", "epoch_tai_s", "moon_radius_m", "antenna", "noiseless"):
+            beside.attrs[name] = instrument[name]
         beside["position_1_m"] = rows["r_i_m"]
         beside["position_2_m"] = rows["r_j_m"]
         beside["time_s"] = rows["time_s"]

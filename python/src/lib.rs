@@ -10,6 +10,7 @@ mod error;
 mod ground;
 mod maps;
 mod wait;
+mod writer;
 
 use std::ffi::OsString;
 
@@ -44,6 +45,8 @@ mod native {
     use super::ground::NativeGround;
     #[pymodule_export]
     use super::maps::{analysis, compare, read_map};
+    #[pymodule_export]
+    use super::writer::NativeWriter;
     #[pymodule_export]
     use super::{frequency_hz, run_command};
 

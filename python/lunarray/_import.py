@@ -1,0 +1,188 @@
+"""Visibilities that other programs made, written as a downlink, which the ground makes maps of."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from ._downlink import Downlink
+from ._native import Error, NativeWriter
+from ._tracks import Track, interpolated
+from ._values import numbers
+from ._write import writing
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+
+#: Maximum number of antennas, and the longest integration that is told, s: those of the format. Maps take the middle.
+ANTENNAS_MAX = 64
+INTEGRATION_S_MAX = 4294.0
+
+#: Disagreement of baselines with positions that is an error: a part of the length (aberration is 1e-4), and wavelengths.
+MISMATCH, MISMATCH_WAVELENGTHS = 1e-3, 0.1
+
+#: Error of interpolated positions, wavelengths: 0.004 degrees of phase.
+TOLERANCE_WAVELENGTHS = 1e-5
+
+#: The flag of what was flagged: the format's bit of interference.
+FLAGGED = 1
+
+
+def jansky_per_k_sr(frequency_hz):
+    """2 k nu^2 / c^2: from K sr to Jy, for both polarisations."""
+    return 2 * 1.380649e-23 * (np.asarray(frequency_hz) / SPEED_OF_LIGHT_M_S) ** 2 * 1e26
+
+
+def galactic_noise_k_sr(frequency_hz, width_hz, time_s):
+    """Standard deviation of the real part of a visibility of antennas that see all of a sky of 180 K (nu / 180 MHz)^-2.6: the
+    radiometer equation."""
+    power_k_sr = 4 * np.pi * 180.0 * (frequency_hz / 180e6) ** -2.6
+    return power_k_sr / np.sqrt(2 * width_hz * time_s)
+
+
+@dataclass
+class Part:
+    """Visibilities of some channels at some times: arrays of a row an integration of a pair; values a column a channel.
+
+    ``first`` and ``second`` are antennas, from 0, of the visibility <E_first conj(E_second)>. ``weight`` is the inverse variance of the
+    real part, (K sr)^-2; ``baseline_m`` is r_second - r_first as the data have it, which positions have to meet."""
+
+    frequency_hz: np.ndarray
+    width_hz: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    epoch_tai_s: float
+    time_s: np.ndarray
+    duration_s: np.ndarray
+    value_k_sr: np.ndarray
+    weight: np.ndarray
+    flagged: np.ndarray
+    baseline_m: np.ndarray | None = None
+
+
+@dataclass
+class Instrument:
+    """What the file says of itself."""
+
+    name: str
+    antennas: int
+    moon_radius_m: float
+    antenna: str = "Isotropic"
+    noiseless: bool = False
+
+
+def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: list[Part], track: Track) -> Downlink:
+    """Writes the parts, with the positions of ``track`` (times from the epoch of the first part)."""
+    if not 2 <= instrument.antennas <= ANTENNAS_MAX:
+        raise Error(
+            f"{instrument.antennas} antennas: expected 2 to {ANTENNAS_MAX}, the limit of the downlink's format; of a UVData object "
+            "select(antenna_nums=..) leaves some"
+        )
+    epoch_tai_s = parts[0].epoch_tai_s
+    channels = np.unique(np.concatenate([np.stack([p.frequency_hz, p.width_hz], axis=1) for p in parts]), axis=0)
+    rows = _joined([_rows(part, channels, epoch_tai_s) for part in parts])
+    if len(rows["time"]) == 0:
+        raise Error("found no cross-correlation: expected visibilities of two antennas")
+    tolerance_m = TOLERANCE_WAVELENGTHS * SPEED_OF_LIGHT_M_S / channels[:, 0].max()
+    segments = list(track.segments(tolerance_m, rows["duration"].max() * 1e-6))
+    starts = np.array([start for start, _, _ in segments])
+    for part in parts:
+        _require_baselines(part, part.time_s + (part.epoch_tai_s - epoch_tai_s), segments, starts)
+    if (np.diff(starts) <= 0).any():
+        raise Error("positions at times less than 2 us apart do not agree: expected those of one motion")
+    # The ground takes the latest segment that begins before the middle.
+    segment = np.searchsorted(starts, rows["time"] + rows["duration"] // 2, side="right") - 1
+    order = np.lexsort((rows["time"], rows["j"], rows["i"], rows["channel"], segment))
+    rows = {name: np.ascontiguousarray(column[order]) for name, column in rows.items()}
+    edges = np.searchsorted(segment[order], np.arange(len(segments) + 1))
+    description = json.dumps(
+        {
+            "name": instrument.name[:100],
+            "epoch_tai_s": epoch_tai_s,
+            "moon_radius_m": instrument.moon_radius_m,
+            "satellites": instrument.antennas,
+            "channels_hz": channels[:, 0].tolist(),
+            "widths_hz": channels[:, 1].tolist(),
+            "antenna": instrument.antenna,
+            "noiseless": instrument.noiseless,
+        }
+    )
+    columns = ("channel", "i", "j", "time", "duration", "value", "weight", "flag")
+    with writing(path, "", b"\x09\x01", "downlink") as unfinished:
+        writer = NativeWriter(unfinished, description)
+        for (start, step, places), low, high in zip(segments, edges[:-1], edges[1:]):
+            writer.write(start, step, places, *(rows[name][low:high] for name in columns))
+        writer.finish()
+    return Downlink(path)
+
+
+def _require_baselines(part, time_s, segments, starts):
+    """Requires that baselines are those of the positions, for up to a thousand integrations."""
+    if part.baseline_m is None:
+        return
+    for row in np.unique(np.linspace(0, len(time_s) - 1, 1000).astype(int)):
+        i, j, t_s = part.first[row], part.second[row], time_s[row]
+        places = interpolated(segments[np.searchsorted(starts, t_s * 1e6, side="right") - 1], t_s)
+        expected = places[j] - places[i]
+        off_m = np.linalg.norm(part.baseline_m[row] - expected)
+        limit_m = MISMATCH * np.linalg.norm(expected) + MISMATCH_WAVELENGTHS * SPEED_OF_LIGHT_M_S / part.frequency_hz.max()
+        if off_m > limit_m:
+            raise Error(
+                f"the baseline r_2 - r_1 of antennas {i + 1} and {j + 1} (in the order of their numbers) at t = {t_s} s is {off_m:.3g} m "
+                f"from that of the positions, {np.linalg.norm(expected):.6g} m long: expected less than {limit_m:.3g} m"
+            )
+
+
+def _rows(part, channels, epoch_tai_s):
+    """Cross-correlations as the format holds them: a row a visibility, the lower antenna first."""
+    cross = part.first != part.second
+    first, second = part.first[cross], part.second[cross]
+    duration_s = part.duration_s[cross]
+    if not (duration_s > 0).all():
+        raise Error(f"an integration of {duration_s.min()} s: expected positive times")
+    count = len(part.frequency_hz)
+    value = part.value_k_sr[cross].copy()
+    swapped = first > second
+    value[swapped] = value[swapped].conj()
+    bad = part.flagged[cross] | ~np.isfinite(value) | ~(part.weight[cross] > 0) | ~np.isfinite(part.weight[cross])
+    value[bad] = 0
+    weight = np.where(bad, 1.0, part.weight[cross])
+    # The middle, which decides, to half a tick.
+    duration = np.rint(np.minimum(duration_s, INTEGRATION_S_MAX) * 1e6).astype(np.int64)
+    middle = np.rint((part.time_s[cross] + (part.epoch_tai_s - epoch_tai_s)) * 2e6).astype(np.int64)
+    duration += (middle - duration) % 2
+    known = {tuple(channel): k for k, channel in enumerate(channels)}
+    index = np.array([known[channel] for channel in zip(part.frequency_hz, part.width_hz)], dtype=np.uint16)
+    return {
+        "channel": np.tile(index, len(first)),
+        "i": np.repeat(np.minimum(first, second).astype(np.uint8), count),
+        "j": np.repeat(np.maximum(first, second).astype(np.uint8), count),
+        "time": np.repeat((middle - duration) // 2, count),
+        "duration": np.repeat(duration.astype(np.uint32), count),
+        "value": value.astype(np.complex64).ravel(),
+        "weight": weight.astype(np.float32).ravel(),
+        "flag": np.where(bad, FLAGGED, 0).astype(np.uint8).ravel(),
+    }
+
+
+def _joined(tables):
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def epoch_of(start_tai_s: float) -> float:
+    """The epoch of data that have none: the last whole second before they begin."""
+    return float(math.floor(start_tai_s))
+
+
+def noise_of(noise_jy: Any, frequency_hz: np.ndarray) -> np.ndarray | None:
+    """The stated standard deviation, K sr, by channel."""
+    if noise_jy is None:
+        return None
+    found = np.broadcast_to(numbers(noise_jy, "Jy", "noise_jy"), frequency_hz.shape)
+    if not (found > 0).all():
+        raise Error(f"noise_jy = {noise_jy}: expected positive Jy, one number or one for each channel")
+    return found / jansky_per_k_sr(frequency_hz)

@@ -1,0 +1,145 @@
+"""Visibilities of CSV and Parquet files as a downlink; see ``from_table``."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from ._array import MOON_RADIUS_M
+from ._baselines import of_baselines
+from ._downlink import Downlink
+from ._import import Instrument, Part, epoch_of, galactic_noise_k_sr, jansky_per_k_sr, write_downlink
+from ._native import Error
+from ._tracks import Track
+from ._values import hertz, number
+from ._write import needed
+
+POSITIONS = tuple(f"{axis}_{end}_m" for end in "ij" for axis in "xyz")
+BASELINES = ("u_m", "v_m", "w_m")
+NEEDED = ("dt_s", "i", "j")
+OTHERS = ("tai_s", "time_s", "re_k_sr", "im_k_sr", "re_jy", "im_jy", "weight", "flag", "frequency_hz", *POSITIONS, *BASELINES)
+
+
+def from_table(
+    table: str | PathLike[str],
+    out: str | PathLike[str],
+    frequency_hz: float | str | None = None,
+    width_hz: float | str | None = None,
+    epoch_tai_s: float | None = None,
+    moon_radius_m: float = MOON_RADIUS_M,
+) -> Downlink:
+    """Writes visibilities of a CSV or Parquet file as a downlink file ``out``, of which :func:`replay` makes maps.
+
+    Columns are those of ``lunarray export visibilities`` and ``Downlink.write_parquet``, in any order; others are ignored: ``tai_s`` (or
+    ``time_s`` and ``epoch_tai_s``), middle of the integration, and its length ``dt_s``; ``i`` and ``j``, antennas from 1, at most 64;
+    ``x_i_m`` .. ``z_j_m``, m in Moon-centred ecliptic axes, or ``u_m``, ``v_m``, ``w_m``, r_i - r_j on these axes with nothing hidden by
+    the Moon; ``re_k_sr`` and ``im_k_sr``, or ``re_jy`` and ``im_jy``, of V = sum of T exp(-2 pi i (nu / c) n . (r_i - r_j)). Optional:
+    ``weight``, (K sr)^-2 (else that of a sky of 180 K (nu / 180 MHz)^-2.6), ``flag`` (0: good), ``frequency_hz`` (else the argument;
+    Parquet of ``write_parquet`` says it). ``width_hz`` is that of channels, 8 kHz if nothing says another. Parquet needs pyarrow
+    (``pip install lunarray[parquet]``).
+    """
+    path = os.fspath(table)
+    columns, about = _columns(path)
+    missing = [name for name in NEEDED if name not in columns]
+    units = [unit for unit in ("k_sr", "jy") if {f"re_{unit}", f"im_{unit}"} <= set(columns)]
+    if missing or not units:
+        wanted = ", ".join(missing) or "re_k_sr and im_k_sr, or re_jy and im_jy"
+        raise Error(f"{path}: found the columns {', '.join(sorted(columns))}; expected {wanted}, too")
+    count = len(columns["dt_s"])
+    if count == 0:
+        raise Error(f"{path}: expected at least one row")
+    given = about.get("epoch_tai_s", None) if epoch_tai_s is None else number(epoch_tai_s, "s", "epoch_tai_s")
+    given, time_s = _times(path, columns, given)
+    each_hz = columns.get("frequency_hz")
+    if each_hz is None:
+        said = about.get("frequency_hz") if frequency_hz is None else hertz(frequency_hz)
+        if said is None:
+            raise Error(f"{path}: nothing says the frequency: expected frequency_hz = .., or a column of this name")
+        each_hz = np.full(count, said)
+    width = hertz(width_hz) if width_hz is not None else about.get("width_hz", 8e3)
+    antennas = np.stack([columns["i"], columns["j"]])
+    if (antennas != np.rint(antennas)).any() or antennas.min() < 1 or antennas.max() > 255:
+        raise Error(f"{path}: antennas from {antennas.min():g} to {antennas.max():g}: expected whole numbers from 1")
+    first, second = antennas.astype(int) - 1
+    value = columns[f"re_{units[0]}"] + 1j * columns[f"im_{units[0]}"]
+    value = value if units[0] == "k_sr" else value / jansky_per_k_sr(each_hz)
+    weight = columns["weight"] if "weight" in columns else galactic_noise_k_sr(each_hz, width, columns["dt_s"]) ** -2.0
+    flagged = columns["flag"] != 0 if "flag" in columns else np.zeros(count, bool)
+    baseline_m = -np.stack([columns[name] for name in BASELINES], axis=1) if set(BASELINES) <= set(columns) else None
+    parts = []
+    for channel_hz in np.unique(each_hz):
+        rows = each_hz == channel_hz
+        tables = (value[rows, None], weight[rows, None], flagged[rows, None], None if baseline_m is None else baseline_m[rows])
+        times = (given, time_s[rows], columns["dt_s"][rows])
+        parts.append(Part(np.array([channel_hz]), np.array([width]), first[rows], second[rows], *times, *tables))
+    size = max(int(antennas.max()), int(about.get("satellites", 0)))
+    radius_m = float(about.get("moon_radius_m", number(moon_radius_m, "m", "moon_radius_m")))
+    if set(POSITIONS) <= set(columns):
+        places = np.stack([columns[name] for name in POSITIONS], axis=1)
+        track = Track(np.tile(time_s, 2), np.concatenate([first, second]), places.reshape(-1, 2, 3).swapaxes(0, 1).reshape(-1, 3), size)
+    elif baseline_m is not None:
+        track, radius_m = of_baselines(parts, [part.time_s for part in parts], size)
+    else:
+        raise Error(f"{path}: expected positions in {', '.join(POSITIONS)}, or baselines in {', '.join(BASELINES)}")
+    name = str(about.get("name", os.path.splitext(os.path.basename(path))[0]))
+    instrument = Instrument(name, size, radius_m, str(about.get("antenna", "Isotropic")), bool(about.get("noiseless", False)))
+    return write_downlink(out, instrument, parts, track)
+
+
+def _times(path, columns, epoch_tai_s):
+    """The epoch, and middles of integrations after it, s."""
+    if "time_s" in columns and (epoch_tai_s is not None or "tai_s" in columns):
+        if epoch_tai_s is None:
+            # To the microsecond to which the columns have it.
+            epoch_tai_s = float(np.round(np.median(columns["tai_s"] - columns["time_s"]), 6))
+        return epoch_tai_s, columns["time_s"]
+    if "tai_s" not in columns:
+        raise Error(f"{path}: expected a column tai_s (s since 1958-01-01, TAI), or time_s and the argument epoch_tai_s")
+    epoch_tai_s = epoch_of((columns["tai_s"] - columns["dt_s"] / 2).min()) if epoch_tai_s is None else epoch_tai_s
+    return epoch_tai_s, columns["tai_s"] - epoch_tai_s
+
+
+def _columns(path):
+    """Columns of numbers by name, and what the file says of itself."""
+    try:
+        with open(path, "rb") as file:
+            magic = file.read(4)
+    except OSError as error:
+        raise Error(f"{path}: {error.strerror}") from error
+    wanted = {*NEEDED, *OTHERS}
+    if magic == b"PAR1":
+        return _parquet(path, wanted)
+    with open(path, newline="", encoding="utf-8", errors="replace") as file:
+        names = [name.strip() for name in next(csv.reader(file), [])]
+    used = [k for k, name in enumerate(names) if name in wanted]
+    if len(set(names)) != len(names) or not used:
+        raise Error(f"{path}: its first line is {','.join(names)[:100]!r}: expected the names of columns, each once")
+    try:
+        numbers = np.loadtxt(path, delimiter=",", skiprows=1, usecols=used, ndmin=2, encoding="utf-8")
+    except ValueError as error:
+        raise Error(f"{path}: {error}; expected numbers in every row") from error
+    return {names[k]: np.ascontiguousarray(numbers[:, n]) for n, k in enumerate(used)}, {}
+
+
+def _parquet(path, wanted):
+    pa = needed("pyarrow", "parquet")
+    parquet = needed("pyarrow.parquet", "parquet")
+    try:
+        file = parquet.ParquetFile(path)
+        found = file.read(columns=[name for name in file.schema_arrow.names if name in wanted])
+    except (pa.ArrowException, OSError) as error:
+        raise Error(f"{path}: pyarrow cannot read it: {error}") from error
+    columns: dict[str, Any] = {}
+    for name in found.column_names:
+        columns[name] = np.asarray(found[name].to_numpy(), float)
+    said = {key.decode(): value.decode() for key, value in (file.schema_arrow.metadata or {}).items() if key.startswith(b"lunarray.")}
+    about: dict[str, Any] = json.loads(said["lunarray.instrument"]) if "lunarray.instrument" in said else {}
+    if "lunarray.frequency_hz" in said:
+        about["frequency_hz"] = float(said["lunarray.frequency_hz"])
+        about["width_hz"] = about["widths_hz"][int(said["lunarray.channel"])] if "widths_hz" in about else 8e3
+    return columns, about
