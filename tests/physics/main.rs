@@ -9,6 +9,7 @@ mod departures;
 mod forward;
 mod general;
 mod geometry;
+mod lunar;
 mod oem;
 mod patterns;
 mod propagated;
