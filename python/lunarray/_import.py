@@ -63,6 +63,11 @@ class Part:
     flagged: np.ndarray
     baseline_m: np.ndarray | None = None
 
+    def __post_init__(self):
+        for name in ("frequency_hz", "width_hz", "epoch_tai_s", "time_s", "duration_s"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise Error(f"{name}: found {getattr(self, name)}; expected finite numbers")
+
 
 @dataclass
 class Instrument:
@@ -175,6 +180,8 @@ def _joined(tables):
 
 def epoch_of(start_tai_s: float) -> float:
     """The epoch of data that have none: the last whole second before they begin."""
+    if not math.isfinite(start_tai_s):
+        raise Error(f"data begin at {start_tai_s}: expected finite numbers as times and integration times")
     return float(math.floor(start_tai_s))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from ._import import SPEED_OF_LIGHT_M_S
 from ._native import Error
 from ._tracks import Track
-from ._uvh5 import ECLIPTIC_TO_ICRS
+from ._uvh5 import ECLIPTIC_TO_ICRS, offline
 from ._write import needed
 
 
@@ -32,7 +32,7 @@ def unprojected(data, k):
     if all(data.phase_center_catalog[n]["cat_type"] == "unprojected" for n in np.unique(data.phase_center_id_array)):
         return data
     found = data.copy()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), offline():
         warnings.simplefilter("ignore", UserWarning)
         found.unproject_phase()
     return found

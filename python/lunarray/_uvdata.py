@@ -25,7 +25,7 @@ from ._import import (
 from ._native import Error
 from ._stokes import in_k_sr, total_intensity
 from ._tracks import Track
-from ._uvh5 import ECLIPTIC_TO_ICRS, axes
+from ._uvh5 import ECLIPTIC_TO_ICRS, axes, offline
 from ._values import numbers, seconds
 from ._write import needed
 
@@ -101,7 +101,7 @@ def _read(uv):
     path = os.fspath(uv)
     if not os.path.exists(path):
         raise Error(f"{path}: expected a file or folder that is there")
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), offline():
         # That uvw do not match one position an antenna: positions are compared with them below.
         warnings.simplefilter("ignore", UserWarning)
         try:

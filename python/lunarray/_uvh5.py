@@ -5,7 +5,7 @@ V = sum of T exp(+2 pi i (nu / c) n . (r_j - r_i)), with the same value. Data ar
 exp(-2 pi i (nu / c) s . (r_j - r_i)); u points east, v north, w to s, in ICRS.
 """
 
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 
@@ -26,6 +26,17 @@ ECLIPTIC_TO_ICRS = np.array(
         [0.0, np.sin(OBLIQUITY), np.cos(OBLIQUITY)],
     ]
 )
+
+
+@contextmanager
+def offline():
+    """Nothing is fetched: what the Earth's rotation is predicted to be serves for sidereal times, which have no meaning here."""
+    from astropy.utils import iers
+
+    with ExitStack() as stack:
+        for name, value in {"auto_download": False, "auto_max_age": None, "iers_degraded_accuracy": "ignore"}.items():
+            stack.enter_context(iers.conf.set_temp(name, value))
+        yield
 
 
 def axes(phase_centre):
@@ -60,7 +71,6 @@ def to_uvdata(downlink, channel, phase_centre):
     pyuvdata = needed("pyuvdata", "uvh5")
     from astropy.coordinates import EarthLocation
     from astropy.time import Time
-    from astropy.utils import iers
 
     phase_centre = centre_of(phase_centre)
     ra_deg, dec_deg = phase_centre
@@ -82,11 +92,7 @@ def to_uvdata(downlink, channel, phase_centre):
     from_1958_days = (downlink.instrument["epoch_tai_s"] + rows["time_s"]) / 86400.0
     start = Time("1958-01-01", scale="tai")
     times = Time(start.jd1, start.jd2 + from_1958_days, format="jd", scale="tai").utc.jd
-    # Nothing is fetched: what the Earth's rotation is predicted to be then serves for sidereal times, which have no meaning here.
-    offline = {"auto_download": False, "auto_max_age": None, "iers_degraded_accuracy": "ignore"}
-    with ExitStack() as stack:
-        for name, value in offline.items():
-            stack.enter_context(iers.conf.set_temp(name, value))
+    with offline():
         telescope = pyuvdata.Telescope.new(
             name="lunarray",
             # UVH5 has telescopes on the Earth: a place on its equator stands for the Moon's orbit.

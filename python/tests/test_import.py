@@ -359,6 +359,10 @@ def test_what_cannot_be_taken_is_told(far, tmp_path):
         lunarray.from_uvdata(high, tmp_path / "v.ccsds", pol_convention="sum")
     with pytest.raises(lunarray.Error, match="expected data phased to directions"):
         lunarray.from_uvdata(data, tmp_path / "v.ccsds", pol_convention="sum", positions="uvw")
+    timeless = data.copy()
+    timeless.integration_time = timeless.integration_time * np.nan
+    with pytest.raises(lunarray.Error, match="expected finite numbers"):
+        lunarray.from_uvdata(timeless, tmp_path / "v.ccsds", pol_convention="sum")
     moved = data.copy()
     moved.uvw_array = 1.1 * moved.uvw_array
     with pytest.raises(lunarray.Error, match="baselines of uvw and of antenna positions differ"):
