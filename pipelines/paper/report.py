@@ -1,15 +1,22 @@
 #!/usr/bin/env python3
-"""Prints the tables of docs/paper.md from the results of the studies of this folder; the words of that page are written by hand.
+"""Makes what docs/paper.md shows, sheet by sheet: runs commands, prints tables and times, draws pictures. Its words are by hand.
 
-Run from the top of the checkout after the runs and studies that the page names; needs Python with Pillow, and healpy for noise maps:
+From the top of the checkout, with `lunarray` in PATH and Python with Pillow and healpy:
 
-    python3 pipelines/paper/report.py
+    python3 pipelines/paper/report.py               # tables and pictures of what is in out/
+    python3 pipelines/paper/report.py --make        # runs what is not there yet, for many hours
+    python3 pipelines/paper/report.py --make 15 19  # only sheets whose title has one of these numbers
 
-Pictures that the page shows go beside it, into docs/, in 128 colours and at most 1,200 pixels wide.
+ULSA's absorbed maps at 3 and 10 MHz, ulsa_3mhz.fits and ulsa_10mhz.fits (HEALPix, K, Galactic), are expected in the working directory.
+Pictures go into docs/, in 128 colours and at most 1,200 pixels wide.
 """
 
 import json
 import math
+import re
+import resource
+import subprocess
+import sys
 from pathlib import Path
 
 OUT = Path("out")
@@ -47,40 +54,19 @@ def picture(path, name, what):
     return f"\n![{what}]({name})\n"
 
 
-def missing(command):
-    return f"Not made here yet: `{command}`.\n"
-
-
-
-FIGURE = "lunarray figure {} pipelines/paper-10mhz.toml"
-
-
-def figure(name, text, command=None, what=""):
-    numbers = load(f"figures/{name}.json")
-    if numbers is None:
-        return missing(command or FIGURE.format(name))
-    return text(numbers) + picture(f"figures/{name}.png", f"paper-{name}.png", what or name)
-
-
-SKY = "lunarray sky pipelines/paper-10mhz.toml --freq-hz 10e6 --nside 256 --out out/sky-10mhz.fits --sources out/sources-10mhz.csv"
-DIFFUSE = ("lunarray sky pipelines/paper-10mhz.toml --set sky.generated.point_sources=false --freq-hz 10e6 --nside 256 "
-           "--out out/diffuse-10mhz.fits")
-CUTOUT = "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"
-FULL_SKY = ("lunarray run pipelines/paper-10mhz.toml --set spacecraft.duration_s=30000 --set products.frame=ecliptic "
-            "--set products.smooth_fwhm_deg=1.3 --out out/full-sky")
+def figure(name, text, what=""):
+    return text(load(f"figures/{name}.json")) + picture(f"figures/{name}.png", f"paper-{name}.png", what or name)
 
 
 def full_sky():
-    return picture("full-sky/10.000MHz/input.png", "paper-sky.png", "the sky at 10 MHz") or missing(FULL_SKY)
+    return picture("full-sky/10.000MHz/input.png", "paper-sky.png", "the sky at 10 MHz")
 
 
 def counts():
     fluxes = {}
     for mhz in (3, 10, 30):
-        path = OUT / f"sources-{mhz}mhz.csv"
-        if not path.exists():
-            return missing(SKY.replace("10mhz", f"{mhz}mhz").replace("10e6", f"{mhz}e6"))
-        fluxes[mhz] = [float(line.split(",")[3]) for line in path.read_text().splitlines()[1:]]
+        lines = (OUT / f"sources-{mhz}mhz.csv").read_text().splitlines()[1:]
+        fluxes[mhz] = [float(line.split(",")[3]) for line in lines]
     # Franzen et al. 2019: log10(S^2.5 dN/dS) = sum a_k (log10 S)^k, integrated in ln S by the midpoint rule.
     a = [3.52, 0.307, -0.388, -0.0404, 0.0351, 0.00600]
 
@@ -151,9 +137,6 @@ def uvw(n):
 
 def coverage():
     n = load("figures/coverage.json")
-    command = "lunarray figure coverage pipelines/paper-10mhz.toml --set spacecraft.channels_hz=[10e6,3e6]"
-    if n is None:
-        return missing(command)
     rows = [
         [f"{band['latitude_deg'][0]:g} to {band['latitude_deg'][1]:g}", f"{band['pair_h']:,.0f}",
          f"{band['shortest_wavelengths']:.2f}", f"{band['uv_filled']:.2f}"]
@@ -161,7 +144,7 @@ def coverage():
     ]
     head = ["degrees from the ecliptic", "pair hours at 10 MHz", "shortest projected, wavelengths", "uv filled"]
     least, mean, most = (1 / share for share in reversed(n["first_over_channel"][1]))
-    return f"`{command}`\n\n" + table(head, rows) + f"\nHours at 3 MHz over those at 10: {mean:.2f} ({least:.2f} to {most:.2f}).\n"
+    return table(head, rows) + f"\nHours at 3 MHz over those at 10: {mean:.2f} ({least:.2f} to {most:.2f}).\n"
 
 
 def beam_row(n):
@@ -203,16 +186,12 @@ def powers():
     means = {}
     for case in ("no-reflection", "flat-mirror", "sphere"):
         found = load(f"fig6-power/case-{case}/autos.json")
-        if found is None:
-            return missing("lunarray study pipelines/paper/fig6-power.toml")
         means[case] = sum(auto["mean_k_sr"] for auto in found) / len(found)
     return "".join(f"{case}: {100 * (mean / means['no-reflection'] - 1):+.2f} %\n" for case, mean in means.items()) + "\n"
 
 
 def latitudes(name):
     study = load(f"{name}/study.json")
-    if study is None:
-        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows, head = [], []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
@@ -224,28 +203,33 @@ def latitudes(name):
 
 
 def thinned(name, nside, visibilities_all):
-    """Rows of traces by thinning, Tr Sigma_n scaled to all data; the crossing is on straight lines in logarithms."""
-    study, found, rows = load(f"{name}/study.json"), {}, []
-    for case in (study or {}).get("cases", []):
+    """Rows of traces by thinning, Tr Sigma_n scaled to all data. What thinning adds to a trace goes as one over the number of
+    visibilities, so that two thinnings give that of all data; the crossing is on straight lines in logarithms."""
+    found, rows = {}, []
+    for case in load(f"{name}/study.json")["cases"]:
         channel = case["figures"]["channels"][0]
         thin = int(case["figures"]["name"].split("thin = ")[1].split(",")[0])
         t2 = channel["power"]["input_k2"][0] / (4 * math.pi)
         traces = channel["diagnostics"]["traces"]
         n, s = traces["sigma_n_k2"]["value"] * channel["visibilities"] / visibilities_all, traces["sigma_s"]["value"]
-        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, math.log(n / (t2 * s)), t2 * s))
-    for thin, points in found.items():
+        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, t2 * s))
+    named = {thin: "all" if thin == 1 else f"one in {thin}" for thin in found}
+    if 10 in found and 40 in found:
+        named[0] = "all, from 10 and 40"
+        found[0] = [(a[0], *[x - 9 / 30 * (y - x) for x, y in zip(a[1:], b[1:])]) for a, b in zip(found[10], found[40])]
+    for key, points in found.items():
         crossing = None
-        for (e, *_, above, _), (e2, *_, above2, _) in zip(points, points[1:]):
-            if above > 0 > above2:
+        for (e, n, _, ts), (e2, n2, _, ts2) in zip(points, points[1:]):
+            if n > ts > 0 and n2 < ts2:
+                above, above2 = math.log(n / ts), math.log(n2 / ts2)
                 crossing = e * (e2 / e) ** (above / (above - above2))
-        data = "all" if thin == 1 else f"one in {thin}"
-        for e, n, s, _, ts in points:
-            rows.append([f"{nside}, {data}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.1e}")])
+        for e, n, s, ts in points:
+            rows.append([f"{nside}, {named[key]}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.2e}")])
     return rows
 
 
 def pixel_traces():
-    rows = thinned("fig15-nside8", 8, 569_208) + thinned("fig15-pixels", 16, 2_034_350)
+    rows = thinned("fig15-nside8", 8, 566_823) + thinned("fig15-pixels", 16, 2_034_350)
     return table(["nside, data", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing"], rows)
 
 
@@ -253,48 +237,53 @@ def pixel_traces():
 PATCHES = ("120,0", "120,30", "120,60")
 
 
-def patch_command(k):
-    folder = "out/data-10mhz/10.000MHz"
-    return (f"lunarray cutout {folder}/input.fits {folder}/map.fits --frame ecliptic --centre {PATCHES[k]} --subtract-fwhm 5 "
-            f"--out out/patch-10-{k + 1}.png --json > out/patch-10-{k + 1}.json")
-
-
 def patches():
+    """Input, map without noise and with the noise-only map added, all smoothed, less scales above 5 degrees."""
+    import healpy
+    from PIL import Image
+
     rows, shown = [], ""
-    for k, centre in enumerate(PATCHES):
-        found = load(f"patch-10-{k + 1}.json")
-        if found is None:
-            return missing(patch_command(k))
-        truth, ours = found["pieces"]
-        rows.append([centre, show(truth["rms_k"]), show(ours["rms_k"]), f"{ours['correlation']:.3f}"])
-        shown += picture(f"patch-10-{k + 1}.png", f"paper-patch-10-{k + 1}.png", centre)
-    return table(["centre, ecliptic deg", "rms of the input, K", "of the map, K", "correlation"], rows) + shown
+    for case in load("fig13-14-patches/study.json")["cases"]:
+        mhz = case["figures"]["channels"][0]["frequency_hz"] / 1e6
+        folder = OUT / "fig13-14-patches" / case["folder"] / f"{mhz:.3f}MHz"
+        clean, noise = (healpy.read_map(folder / f"{name}-smooth.fits", dtype=float) for name in ("map", "noise"))
+        healpy.write_map(folder / "with-noise.fits", clean + noise, dtype=float, coord="E", column_units="K", overwrite=True)
+        panels = [folder / name for name in ("input-smooth.fits", "map-smooth.fits", "with-noise.fits")]
+        strips = []
+        for k, centre in enumerate(PATCHES):
+            out = OUT / f"patch-{mhz:g}-{k + 1}.png"
+            command = ["lunarray", "cutout", *panels, "--frame", "ecliptic", "--centre", centre, "--subtract-fwhm", "5", "--json"]
+            found = subprocess.run([*command, "--out", out], check=True, capture_output=True).stdout
+            truth, *ours = json.loads(found)["pieces"]
+            rows.append([f"{mhz:g}", centre, *[show(piece["rms_k"]) for piece in (truth, *ours)],
+                         *[f"{piece['correlation']:.3f}" for piece in ours]])
+            strips.append(Image.open(out).convert("RGB"))
+        whole = Image.new("RGB", (strips[0].width, sum(strip.height for strip in strips)))
+        for k, strip in enumerate(strips):
+            whole.paste(strip, (0, k * strip.height))
+        whole.save(OUT / f"patches-{mhz:g}.png")
+        shown += picture(f"patches-{mhz:g}.png", f"paper-patches-{mhz:g}mhz.png", f"{mhz:g} MHz")
+    head = ["MHz", "centre, ecliptic deg", "rms of the input, K", "of the map", "with noise", "correlation", "with noise"]
+    return table(head, rows) + shown
 
 
 def maps():
     rows = []
     for name, noise in (("paper-10mhz", "10"), ("paper-3mhz", "3")):
         summary = load(f"{name}/summary.json")
-        if summary is None:
-            continue
         channel = summary["channels"][0]
         rho = channel["rho_noise_subtracted"] or channel["rho"]
         rows.append(
             [noise, f"{channel['visibilities']:,}", *[at(rho, l) for l in (8, 16, 32, 64, 96, 128)],
              f"{channel['noise_rms_k']:.2e}", f"{summary['report']['elapsed_s'] / 60:.1f}"]
         )
-    if not rows:
-        return "Not made here yet.\n"
     head = ["MHz", "visibilities", *[f"rho_{l}" for l in (8, 16, 32, 64, 96, 128)], "noise, K rms", "minutes"]
     return table(head, rows)
 
 
 def uniformity():
-    command = "lunarray study pipelines/noise/realisations.toml"
     maps = sorted((OUT / "realisations").glob("case-*/10.000MHz/realisations/noise-*.fits"))
     maps += (OUT / "realisations").glob("case-*/10.000MHz/noise.fits")
-    if not maps:
-        return missing(command)
     import healpy
     import numpy as np
 
@@ -314,13 +303,11 @@ def uniformity():
         rows.append([f"l >= {least}", f"{np.sqrt(variance.mean()):.2e}", f"{100 * scatter:.1f}", f"{100 * own:.1f}",
                      *[f"{np.sqrt(x):.3f}" for x in inside]])
     head = ["noise at", "rms, K", "scatter, %", "its own, %", *[f"{low} to {high} deg" for low, high in bands]]
-    return f"`{command}`\n\n" + table(head, rows)
+    return table(head, rows)
 
 
 def traces(name="fig15-traces"):
     study = load(f"{name}/study.json")
-    if study is None:
-        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
@@ -341,8 +328,6 @@ def traces(name="fig15-traces"):
 
 def point_beams(name):
     study = load(f"{name}/study.json")
-    if study is None:
-        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows, head = [], []
 
     def told(widths):
@@ -361,8 +346,6 @@ def point_beams(name):
 
 def correlation(name, ls, head, key="rho"):
     study = load(f"{name}/study.json")
-    if study is None:
-        return missing(f"lunarray study pipelines/paper/{name}.toml")
     rows = []
     for case in study["cases"]:
         channel = case["figures"]["channels"][0]
@@ -373,8 +356,6 @@ def correlation(name, ls, head, key="rho"):
 
 def rows_of_b(key, wanted):
     study = load("fig16-17-rows/study.json")
-    if study is None:
-        return missing("lunarray study pipelines/paper/fig16-17-rows.toml")
     ls = (4, 8, 12, 16, 24, 32)
     rows = []
     for case in study["cases"]:
@@ -388,11 +369,13 @@ def rows_of_b(key, wanted):
     return table(["rows, limit", "visibilities", *[f"{name}_{l}" for l in ls]], rows)
 
 
+# Degrees of the tables of Fig. 16 and 17 by harmonics.
+HARMONIC_LS = (4, 8, 12, 16, 24, 32, 64, 96, 128, 150)
+
+
 def sensitivity():
     """Fig. 19: noise maps after post-processing, less scales above 10 degrees, of one visibility in `thin`."""
     study = load("fig19-sensitivity/study.json")
-    if study is None:
-        return missing("lunarray study pipelines/paper/fig19-sensitivity.toml")
     import healpy
     import numpy as np
 
@@ -409,50 +392,95 @@ def sensitivity():
         jansky = 5 * 2 * BOLTZMANN * (channel["frequency_hz"] / LIGHT) ** 2 / 1e-26 * area / math.sqrt(thin)
         rows.append([f"{mhz:g}", show(small.std() / math.sqrt(thin)), f"{channel['beam']['fwhm_deg']:.2f}", show(area),
                      *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise)]])
+    rows.sort(key=lambda row: float(row[0]))
     head = ["MHz", "noise, K rms", "beam, deg", "beam, sr", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales"]
     return table(head, rows)
 
 
+PIPELINE = "pipelines/paper-10mhz.toml"
+
+
+def study(name, folder="pipelines/paper"):
+    return {f"{name}/study.json": f"lunarray study {folder}/{name}.toml"}
+
+
+def drawn(name, rest=""):
+    return {f"figures/{name}.json": f"lunarray figure {name} {PIPELINE}{rest}"}
+
+
+def sky(mhz, nside=256, rest=""):
+    return f"lunarray sky {PIPELINE} --freq-hz {mhz}e6 --nside {nside}{rest}"
+
+
+# A sheet: its title, what each command makes, and what is printed of it.
+SHEETS = [
+    ("Fig. 1: a patch, and N(>S)",
+     {f"sources-{mhz}mhz.csv": sky(mhz, 256, f" --out out/sky-{mhz}mhz.fits --sources out/sources-{mhz}mhz.csv") for mhz in (3, 10, 30)}
+     | {"diffuse-10mhz.fits": sky(10, 256, " --set sky.generated.point_sources=false --out out/diffuse-10mhz.fits"),
+        "patch.png": "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"}, counts),
+    ("Fig. 2: the full sky",
+     {"full-sky/summary.json": f"lunarray run {PIPELINE} --set spacecraft.duration_s=30000 --set products.frame=ecliptic "
+                               "--set products.smooth_fwhm_deg=1.3 --out out/full-sky"}, full_sky),
+    ("Fig. 3: q0 against R and R_2", drawn("spacing"), lambda: figure("spacing", spacing)),
+    ("Fig. 4: time by baseline length", drawn("pair-time"), lambda: figure("pair-time", pair_time)),
+    ("Fig. 4: time by direction (Sect. 4.4)", drawn("coverage", " --set spacecraft.channels_hz=[10e6,3e6]"), coverage),
+    ("Fig. 5: density of u, v, w", drawn("uvw"), lambda: figure("uvw", uvw)),
+    ("Fig. 6: the sky reflected by the Moon",
+     study("fig6-power") | study("fig6-reflection"),
+     lambda: powers() + latitudes("fig6-reflection")),
+    ("Fig. 7: a row of B", drawn("rows", " --pair 5-6 --at 4.1736d"), lambda: figure("rows", beam_row)),
+    ("Fig. 8: waterfalls of one pair", drawn("waterfall", " --pair 1-4 --at 6.65d"), lambda: figure("waterfall", waterfall)),
+    ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
+     {f"paper-{mhz}mhz/summary.json": f"lunarray run pipelines/paper-{mhz}mhz.toml" for mhz in (10, 3)}, maps),
+    ("Fig. 9: by basis and R", study("fig9-basis"), lambda: latitudes("fig9-basis")),
+    ("Fig. 9: is the noise uniform?", study("realisations", "pipelines/noise"), uniformity),
+    ("Fig. 11: a prior of 5 degrees",
+     {"sky-10mhz-512.fits": sky(10, 512, " --out out/sky-10mhz-512.fits")} | study("fig11-prior"),
+     lambda: correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
+    ("Fig. 12: a wrong prior",
+     {"sky-10mhz-64.fits": sky(10, 64, " --out out/sky-10mhz-64.fits"),
+      "wrong-10mhz-64.fits": "lunarray sky --like out/sky-10mhz-64.fits --correlation 0.8 --out out/wrong-10mhz-64.fits"}
+     | study("fig12-wrong-prior"), lambda: latitudes("fig12-wrong-prior")),
+    ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", study("fig13-14-patches"), patches),
+    ("Fig. 15: traces against epsilon",
+     study("fig15-nside8") | study("fig15-pixels") | study("fig15-traces"), lambda: pixel_traces() + "\n" + traces()),
+    ("Fig. 16: rows at centres and averaged, rho_l without noise", study("fig16-17-rows"), lambda: rows_of_b("rho", "no noise")),
+    ("Fig. 16: at nside 32", study("fig16-nside32"),
+     lambda: correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
+    ("Fig. 16: at nside 64", study("fig16-nside64"),
+     lambda: correlation("fig16-nside64", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows")),
+    ("Fig. 17: the same, SNR_l with thermal noise", study("fig16-17-rows"), lambda: rows_of_b("snr", "thermal noise")),
+    ("Fig. 16 and 17: by harmonics at nside 64", study("fig16-17-harmonics"),
+     lambda: correlation("fig16-17-harmonics", HARMONIC_LS, "limit")
+     + "\n" + correlation("fig16-17-harmonics", HARMONIC_LS, "limit", "snr")),
+    ("Fig. 18: rho_l without noise, for epsilon from 1e-9 to 1", study("fig18-epsilon"),
+     lambda: correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
+    ("Fig. 18: SNR_l", study("fig18-snr"), lambda: correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
+    ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"), sensitivity),
+    ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
+    ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
+    ("Fig. 20: N_b and Sigma_b",
+     drawn("sub-pixel") | {"sub-pixel-matrix.png": "python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits"},
+     lambda: figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")),
+]
+
+
 def main():
-    study = "`lunarray study pipelines/paper/{}.toml`"
-    parts = [
-        ("Fig. 1: a patch, and N(>S)", f"`{SKY}`, 3 and 30 MHz alike; `{DIFFUSE}`, `{CUTOUT}`", counts()),
-        ("Fig. 2: the full sky", f"`{FULL_SKY}`", full_sky()),
-        ("Fig. 3: q0 against R and R_2", f"`{FIGURE.format('spacing')}`", figure("spacing", spacing)),
-        ("Fig. 4: time by baseline length", f"`{FIGURE.format('pair-time')}`", figure("pair-time", pair_time)),
-        ("Time by direction (Sect. 4.4)", "", coverage()),
-        ("Fig. 5: density of u, v, w", f"`{FIGURE.format('uvw')}`", figure("uvw", uvw)),
-        ("Fig. 6: the sky reflected by the Moon", study.format("fig6-reflection"), powers() + latitudes("fig6-reflection")),
-        ("Fig. 7: a row of B", f"`{FIGURE.format('rows')} --pair 5-6 --at 4.1736d`", figure("rows", beam_row)),
-        ("Fig. 8: waterfalls of one pair",
-         f"`{FIGURE.format('waterfall')} --pair 1-4 --at 6.65d`",
-         figure("waterfall", waterfall)),
-        ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
-         "`lunarray run pipelines/paper-10mhz.toml`, `lunarray run pipelines/paper-3mhz.toml`", maps()),
-        ("By basis and R", study.format("fig9-basis"), latitudes("fig9-basis")),
-        ("Is the noise uniform?", "", uniformity()),
-        ("Fig. 11: a prior of 5 degrees", study.format("fig11-prior"),
-         correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
-        ("Fig. 12: a wrong prior", study.format("fig12-wrong-prior"), latitudes("fig12-wrong-prior")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", f"`{patch_command(0)}` and so on", patches()),
-        ("Fig. 15: traces against epsilon", study.format("fig15-pixels"),
-         pixel_traces() + "\n" + traces()),
-        ("Fig. 16: rows at centres and averaged, rho_l without noise", study.format("fig16-17-rows"), rows_of_b("rho", "no noise")),
-        ("At nside 32", study.format("fig16-nside32"), correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
-        ("At nside 64", study.format("fig16-nside64"),
-         correlation("fig16-nside64", (8, 16, 24, 32, 64, 80, 96, 128), "limit, rows")),
-        ("Fig. 17: the same, SNR_l with thermal noise", study.format("fig16-17-rows"), rows_of_b("snr", "thermal noise")),
-        ("Fig. 18: rho_l without noise, and SNR_l, for epsilon from 1e-9 to 1", study.format("fig18-epsilon"),
-         correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
-        ("Fig. 18: SNR_l", study.format("fig18-snr"), correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
-        ("Fig. 19: sensitivity against frequency", study.format("fig19-sensitivity"), sensitivity()),
-        ("FWHM after post-processing", study.format("beams"), point_beams("beams")),
-        ("FWHM at nside 64", study.format("beams-nside64"), point_beams("beams-nside64")),
-        ("Fig. 20 and the appendix: N_b and Sigma_b", f"`{FIGURE.format('sub-pixel')}`; the formulas: `sub_pixel.py`",
-         figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")),
-    ]
-    for title, command, text in parts:
-        print(f"## {title}\n\n{command}\n\n{text}" if command else f"## {title}\n\n{text}")
+    make = "--make" in sys.argv
+    wanted = {word for word in sys.argv[1:] if word.isdigit()}
+    for title, commands, text in SHEETS:
+        if wanted and not wanted & set(re.findall(r"\d+", title)):
+            continue
+        print(f"## {title}\n\n" + "\n".join(f"`{command}`" for command in commands.values()), flush=True)
+        for product, command in commands.items():
+            if make and not (OUT / product).exists():
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                subprocess.run(command, shell=True, check=True, stdout=subprocess.DEVNULL)
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+                print(f"\n{product}: {used / 60:.1f} minutes of processor time", flush=True)
+        absent = [product for product in commands if not (OUT / product).exists()]
+        print("\n" + ("not made here yet: " + ", ".join(absent) + "\n" if absent else text()), flush=True)
 
 
 if __name__ == "__main__":
