@@ -373,28 +373,29 @@ def rows_of_b(key, wanted):
 HARMONIC_LS = (4, 8, 12, 16, 24, 32, 64, 96, 128, 150)
 
 
-def sensitivity():
-    """Fig. 19: noise maps after post-processing, less scales above 10 degrees, of one visibility in `thin`."""
-    study = load("fig19-sensitivity/study.json")
+def five_sigma(folder, removed_deg, thin=1):
+    """A row of Fig. 19: the noise map after post-processing, less scales above `removed_deg`, of one visibility in `thin`."""
     import healpy
     import numpy as np
 
-    thin, rows = 16, []
-    for case in study["cases"]:
-        folder = OUT / "fig19-sensitivity" / case["folder"]
-        channel = json.loads((folder / "summary.json").read_text())["channels"][0]
-        mhz = channel["frequency_hz"] / 1e6
-        noise = healpy.read_map(folder / f"{mhz:.3f}MHz/noise-smooth.fits", dtype=float)
-        small = noise - healpy.smoothing(noise, fwhm=math.radians(10), iter=1)
-        sine = healpy.pix2vec(healpy.get_nside(noise), np.arange(noise.size))[2]
-        area = channel["beam"]["area_sr"]
-        # Noise falls as the root of the number of visibilities.
-        jansky = 5 * 2 * BOLTZMANN * (channel["frequency_hz"] / LIGHT) ** 2 / 1e-26 * area / math.sqrt(thin)
-        rows.append([f"{mhz:g}", show(small.std() / math.sqrt(thin)), f"{channel['beam']['fwhm_deg']:.2f}", show(area),
-                     *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise)]])
-    rows.sort(key=lambda row: float(row[0]))
-    head = ["MHz", "noise, K rms", "beam, deg", "beam, sr", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales"]
-    return table(head, rows)
+    channel = json.loads((folder / "summary.json").read_text())["channels"][0]
+    mhz, beam = channel["frequency_hz"] / 1e6, channel["beam"]
+    noise = healpy.read_map(folder / f"{mhz:.3f}MHz/noise-smooth.fits", dtype=float)
+    small = noise - healpy.smoothing(noise, fwhm=math.radians(removed_deg), iter=1)
+    sine = healpy.pix2vec(healpy.get_nside(noise), np.arange(noise.size))[2]
+    # Noise falls as the root of the number of visibilities.
+    jansky = 5 * 2 * BOLTZMANN * (channel["frequency_hz"] / LIGHT) ** 2 / 1e-26 * beam["area_sr"] / math.sqrt(thin)
+    return [f"{mhz:g}", show(small.std() / math.sqrt(thin)), f"{beam['fwhm_deg']:.2f}",
+            *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise)]]
+
+
+def sensitivity():
+    def rows(name, *how):
+        cases = load(f"{name}/study.json")["cases"]
+        return sorted((five_sigma(OUT / name / case["folder"], *how) for case in cases), key=lambda row: float(row[0]))
+
+    head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales"]
+    return table(head, rows("fig19-sensitivity", 10, 16)) + "\nAt nside 64:\n\n" + table(head, rows("fig13-14-patches", 5))
 
 
 PIPELINE = "pipelines/paper-10mhz.toml"
@@ -456,7 +457,7 @@ SHEETS = [
     ("Fig. 18: rho_l without noise, for epsilon from 1e-9 to 1", study("fig18-epsilon"),
      lambda: correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
     ("Fig. 18: SNR_l", study("fig18-snr"), lambda: correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
-    ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"), sensitivity),
+    ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity") | study("fig13-14-patches"), sensitivity),
     ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
     ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
     ("Fig. 20: N_b and Sigma_b",
