@@ -5,7 +5,7 @@ From the top of the checkout, with `lunarray` in PATH and Python with Pillow and
 
     python3 pipelines/paper/report.py               # tables and pictures of what is in out/
     python3 pipelines/paper/report.py --make        # runs what is not there yet, for many hours
-    python3 pipelines/paper/report.py --make 15 19  # only sheets whose title has one of these numbers
+    python3 pipelines/paper/report.py --make 15 19  # only the sheets of these figures
 
 ULSA's absorbed maps at 3 and 10 MHz, ulsa_3mhz.fits and ulsa_10mhz.fits (HEALPix, K, Galactic), are expected in the working directory.
 Pictures go into docs/, in 128 colours and at most 1,200 pixels wide.
@@ -470,7 +470,7 @@ def main():
     make = "--make" in sys.argv
     wanted = {word for word in sys.argv[1:] if word.isdigit()}
     for title, commands, text in SHEETS:
-        if wanted and not wanted & set(re.findall(r"\d+", title)):
+        if wanted and not wanted & set(re.findall(r"\d+", title.split(":")[0])):
             continue
         print(f"## {title}\n\n" + "\n".join(f"`{command}`" for command in commands.values()), flush=True)
         for product, command in commands.items():
