@@ -220,7 +220,7 @@ def thinned(name, nside, visibilities_all):
     for key, points in found.items():
         crossing = None
         for (e, n, _, ts), (e2, n2, _, ts2) in zip(points, points[1:]):
-            if n > ts > 0 and n2 < ts2:
+            if n > ts > 0 and 0 < n2 < ts2:
                 above, above2 = math.log(n / ts), math.log(n2 / ts2)
                 crossing = e * (e2 / e) ** (above / (above - above2))
         for e, n, s, ts in points:

@@ -656,6 +656,7 @@ fn a_frequency_in_other_words_counts() {
         &["FREQ    = '10 MHz'", "FREQ_REF= 408.0 / MHz"][..],
         &["FREQMIN = 9E6", "FREQMAX = 11E6", "FREQRES = 24E3 / Hz", "FREQ_BW = '408 kHz'", "NFREQ   = 3"],
         &["OBS_FREQ= 22E6 / width of a channel, Hz"],
+        &["SAMPFREQ= 2E8 / Hz", "DFREQ   = 1E5 / Hz", "CALFREQ = '408 MHz'"],
     ] {
         write(others, &[]);
         assert_eq!(
@@ -664,6 +665,10 @@ fn a_frequency_in_other_words_counts() {
             "{others:?}"
         );
     }
+    // A reference beside columns that say their own.
+    let reference = [&["COORDSYS= 'G'", "NU_REF  = '408 MHz'"][..], &["NSIDE   = 1"]];
+    foreign_map(&path, reference[0], reference[1], &[("T_10MHz", "K", [3e5; 12])]);
+    assert!(read(10e6).is_ok() && read(408e6).is_err());
     write(&["FREQ_OBS= '22 MHz'", "FREQ_REF= '408 MHz'"], &[]);
     assert!(read(10e6).is_ok() && noted("its header says '22 MHz' in FREQ_OBS"));
     write(&[], &["COMMENT   from 22 MHz and 408 MHz"]);

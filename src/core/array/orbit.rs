@@ -313,11 +313,14 @@ impl Array {
         self.formation.as_ref()
     }
 
-    /// Least distance of two daughters whose arcs differ by `arc_m`, anywhere on their orbits, m; 0 if there is no such bound.
+    /// Least distance of two daughters whose arcs differ by `arc_m`, anywhere on their orbits, m; 0 if there is no such bound, as beyond a
+    /// quarter of an ellipse.
     #[must_use]
     pub(crate) fn distance_m_min(&self, arc_m: f64) -> f64 {
-        let (axis_m, e) = (self.orbit_radius_m, self.shape.map_or(0.0, |shape| shape.eccentricity));
-        let cross_track_ratio = self.shape.map_or(0.0, |shape| shape.cross_track_ratio);
+        let axis_m = self.orbit_radius_m;
+        let Some(Shape { eccentricity: e, cross_track_ratio, .. }) = self.shape else {
+            return 2.0 * axis_m * (0.5 * arc_m / axis_m).sin().abs();
+        };
         // The true anomaly is slowest at the apoapsis, r = a (1 + e), by dnu / dM = a^2 sqrt(1 - e^2) / r^2.
         let angle = arc_m.abs() / axis_m;
         let along = angle * (1.0 - e * e).sqrt() / (1.0 + e).powi(2);

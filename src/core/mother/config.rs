@@ -65,7 +65,7 @@ keys! {
         /// Maximum baseline that is correlated; 0 for no limit; one value, or one per channel.
         expert baseline_wavelengths_max: PerChannel<f64> = PerChannel::All(0.0);
         /// Model of the visibilities: "direct" sums over pixels, "harmonic" on a circle, "general" harmonics anywhere, or
-        /// "auto", by cost: harmonics only where the map holds all degrees that baselines see, or sky.l_max is set.
+        /// "auto", by cost: harmonics where they hold all degrees that baselines see, or with sky.l_max, sky.points or averages.
         expert model: ModelChoice = ModelChoice::default();
         /// Average visibilities over their integrations, instead of taking the middle.
         expert smear_integrations: bool = false;

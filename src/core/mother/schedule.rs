@@ -97,9 +97,10 @@ fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     let arc_m = |n: u8, t_s: f64| formation.arc_m(n.into(), t_s).0;
     let next = |t_s: &f64| Some(formation.next_turnaround_s(*t_s)).filter(|turn_s| *turn_s < end_s);
     let instants = std::iter::successors(Some(start_s), next).take(TURNAROUNDS_MAX);
-    let arcs_m = instants.chain([end_s]).map(|t_s| (arc_m(pair.i, t_s) - arc_m(pair.j, t_s)).abs());
+    // Bounds rise and fall once with the arc.
+    let bound_m = |t_s: f64| array.distance_m_min(arc_m(pair.i, t_s) - arc_m(pair.j, t_s));
     // Beyond the rounding of positions.
-    (1.0 - 1e-9) * array.distance_m_min(arcs_m.fold(f64::INFINITY, f64::min))
+    (1.0 - 1e-9) * instants.chain([end_s]).map(bound_m).fold(f64::INFINITY, f64::min)
 }
 
 /// Maximum number of turnarounds considered in a window; the paper's formation has at most one.

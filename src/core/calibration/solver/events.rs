@@ -77,7 +77,7 @@ pub enum InstrumentEvent {
         /// Fraction of the signal that no gains explain.
         unexplained: f64,
     },
-    /// The model is of another frequency than the data.
+    /// The data are of another frequency than the model, or all baselines of another length.
     WrongFrequency {
         /// First pass of this state.
         pass: u64,
@@ -85,10 +85,10 @@ pub enum InstrumentEvent {
         channel: usize,
         /// Fraction of the signal that no gains explain.
         unexplained: f64,
-        /// Frequency of the data over that of the model.
+        /// Frequency of the data over that of the model, or length of the baselines over that of their positions.
         ratio: f64,
     },
-    /// The sky has a source that the model lacks.
+    /// The sky has a source that the model lacks, or has too faint.
     MissingSource {
         /// First pass of this state.
         pass: u64,
@@ -213,12 +213,12 @@ impl fmt::Display for InstrumentEvent {
             ),
             Self::WrongFrequency { pass, channel, ratio, .. } => write!(
                 f,
-                "pass {pass}: the data of channel {channel} are of another frequency than its model: about {ratio:.3} times that"
+                "pass {pass}: the data of channel {channel} are as if its frequency, or all baselines, were about {ratio:.2} times what is stated"
             ),
             Self::MissingSource { pass, channel, position_deg: [longitude, latitude], flux_jy, .. } => {
                 write!(
                     f,
-                    "pass {pass}: the model of channel {channel} lacks a source of {flux_jy:.2e} Jy at ecliptic longitude {longitude:.1}, \
+                    "pass {pass}: the sky of channel {channel} has {flux_jy:.2e} Jy more than the model at ecliptic longitude {longitude:.1}, \
                  latitude {latitude:.1} deg"
                 )
             }

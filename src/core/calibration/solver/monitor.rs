@@ -16,6 +16,7 @@
 //!
 //! If the phases of most daughters relative to the reference change by the same amount, the reference itself changed.
 
+use std::collections::BTreeSet;
 use std::f64::consts::{PI, TAU};
 
 use num_complex::Complex64;
@@ -65,11 +66,13 @@ pub fn instrument_events(solutions: &[PassSolution]) -> Vec<InstrumentEvent> {
         attribute_to_reference(&mut solution_changes, solution.reference as usize - 1);
     }
     let mut events = Vec::new();
+    let mut named = BTreeSet::new();
     for (index, solution) in solutions.iter().enumerate() {
         let of_solution: Vec<&Change> = changes.iter().filter(|change| change.solution == index).collect();
         let before = index.checked_sub(1).map(|previous| &solutions[previous]);
         add_step_events(&of_solution, before, solution, &mut events);
         add_state_events(before, solution, &mut events);
+        add_model_events(before, solution, &mut named, &mut events);
         add_disturbance_events(solution, &mut events);
     }
     events
@@ -283,9 +286,27 @@ fn add_state_events(
             events.push(InstrumentEvent::GainDrift { pass, daughter: number, channels });
         }
     }
-    for channel in (0..channels).filter(|c| !is_disturbed(*c)) {
-        let verdict = solution.models[channel];
-        if before.is_some_and(|before| before.models[channel].is_like(verdict)) {
+}
+
+/// Adds onsets of verdicts on models; what is wrong is told once for each channel and kind if it is found later. `named` has these.
+fn add_model_events(
+    before: Option<&PassSolution>,
+    solution: &PassSolution,
+    named: &mut BTreeSet<(usize, bool)>,
+    events: &mut Vec<InstrumentEvent>,
+) {
+    let (pass, disturbed) = (solution.pass, disturbed_channels(solution));
+    for (channel, verdict) in solution.models.iter().copied().enumerate() {
+        let fault = match verdict {
+            ModelVerdict::Wrong { fault, .. } => fault,
+            _ => None,
+        };
+        if disturbed.get(channel) == Some(&true) {
+            continue;
+        }
+        let is_named =
+            fault.is_some_and(|fault| named.insert((channel, matches!(fault, ModelFault::Source { .. }))));
+        if !is_named && before.is_some_and(|before| before.models[channel].is_like(verdict)) {
             continue;
         }
         match verdict {

@@ -78,11 +78,13 @@ pub struct Workload {
 }
 
 impl Workload {
-    /// Whether baselines see degrees of the sky that its map does not determine, and no band limit was asked for. Harmonics leave them
+    /// Whether baselines see degrees of the sky that harmonics do not have, and no band limit was asked for. Harmonics leave them
     /// out, so that their choice would change what is simulated.
     fn is_beyond_map(&self) -> bool {
         let seen = l_max_of_fringes(self.baseline_wavelengths_max);
-        self.l_max == 0 && !self.has_points && seen > SkyConfig::l_max_determined(self.sky_nside)
+        self.l_max == 0
+            && !self.has_points
+            && seen > l_max_of_sky(self.baseline_wavelengths_max, self.sky_nside)
     }
 }
 
@@ -126,7 +128,7 @@ impl ModelPlan {
     pub fn new(choice: ModelChoice, load: Workload) -> Self {
         let u_max = load.baseline_wavelengths_max;
         let l_max = match load.l_max {
-            0 => default_l_max(u_max).min(SkyConfig::l_max_determined(load.sky_nside)),
+            0 => l_max_of_sky(u_max, load.sky_nside),
             // Coefficients that the map does not determine are refused later, where they are computed.
             configured => configured,
         };
@@ -188,6 +190,11 @@ impl ModelPlan {
             bytes,
         }
     }
+}
+
+/// Band limit of harmonics: that which baselines need, at most 1024, or that the map determines.
+fn l_max_of_sky(u_max: f64, nside: usize) -> usize {
+    default_l_max(u_max).min(SkyConfig::l_max_determined(nside))
 }
 
 /// Band limit that baselines need, at most 1024.
@@ -255,6 +262,8 @@ mod tests {
                 "{nside} {is_on_circle}"
             );
         }
+        // Harmonics end at 1024: 170 wavelengths see 1138, which nside 512 holds.
+        assert_eq!(plan(load(2.6e7, 512, 170.0)), ModelKind::Direct);
         // What is asked for, and points beside a map that need not hold them.
         assert_eq!(plan(Workload { l_max: 144, ..load(2.6e7, 64, 31.3) }), ModelKind::Harmonic);
         assert_eq!(plan(Workload { has_points: true, ..load(2.6e7, 64, 31.3) }), ModelKind::Harmonic);

@@ -9,10 +9,31 @@ use crate::units::{Dimension, echo};
 const FREQUENCY_KEYS: [&str; 5] = ["FREQ", "FREQUENCY", "OBSFREQ", "RESTFRQ", "RESTFREQ"];
 /// Lowest frequency of a map, Hz: the number of a band or of gigahertz is less.
 const FREQUENCY_HZ_MIN: f64 = 1e4;
-/// Parts of other keywords of frequency, and those of keywords that are about ends, widths and steps of bands.
-const FREQUENCY_WORDS: [&str; 5] = ["FREQ", "NU_REF", "NUREF", "REF_NU", "REFNU"];
-const BAND_WORDS: [&str; 12] =
-    ["MIN", "MAX", "LO", "HI", "WID", "RES", "STEP", "DEL", "INC", "BW", "UNIT", "TYPE"];
+/// Other keywords of a map's frequency, without blanks and underscores.
+const OTHER_FREQUENCY_KEYS: [&str; 16] = [
+    "NUREF",
+    "REFNU",
+    "REFFREQ",
+    "FREQREF",
+    "CENTFREQ",
+    "CENFREQ",
+    "CENTERFREQ",
+    "CENTREFREQ",
+    "CFREQ",
+    "FREQCENT",
+    "FREQ0",
+    "OBSFREQ",
+    "FREQOBS",
+    "MAPFREQ",
+    "MAPFREQUENCY",
+    "SKYFREQ",
+];
+/// Parts of keywords of frequency, and those of keywords that are about ends, widths and steps of bands, samples and signals.
+const FREQUENCY_WORDS: [&str; 3] = ["FREQ", "NUREF", "REFNU"];
+const BAND_WORDS: [&str; 15] = [
+    "MIN", "MAX", "LO", "HI", "WID", "RES", "STEP", "DEL", "INC", "BW", "UNIT", "TYPE", "DFREQ", "SAMP",
+    "CAL",
+];
 const FREQUENCY_UNIT_KEYS: [&str; 3] = ["FREQUNIT", "FREQ_UNI", "UNITFREQ"];
 
 /// Relative difference up to which two frequencies count as equal, as headers may lose digits.
@@ -97,8 +118,9 @@ pub(super) fn is_other_quantity(name: &str) -> bool {
     name.split(|c: char| !c.is_ascii_alphabetic()).any(|word| OTHER_WORDS.contains(&word))
 }
 
-/// Frequency of a column, from its own metadata ([`column_frequency`]) or else from FREQ in either header; `None` if not stated.
-/// Columns count from 1, as in keywords. FREQ must be the frequency of a column, if columns state theirs.
+/// Frequency of a column, from its own metadata ([`column_frequency`]), or else from FREQ in either header, or else the only one of other
+/// keywords; `None` if not stated. Columns count from 1, as in keywords. FREQ must be the frequency of a column, if columns state theirs;
+/// others may be a reference.
 pub(super) fn stated_frequency(
     header: &Header,
     column: usize,
@@ -115,7 +137,11 @@ pub(super) fn stated_frequency(
             return Err(contradiction(of_file, own));
         }
     }
-    Ok(own.or(of_file))
+    let mut others = other_frequencies(header).filter(|(card, _)| {
+        OTHER_FREQUENCY_KEYS.contains(&card.key.to_ascii_uppercase().replace([' ', '_'], "").as_str())
+    });
+    let other = others.next().filter(|first| others.all(|(_, other)| is_same_hz(other.hz, first.1.hz)));
+    Ok(own.or(of_file).or(other.map(|(_, found)| found)))
 }
 
 /// Frequency in the metadata of a column: FREQn, its name (such as `10MHz`), or the comment of the name.
@@ -132,8 +158,7 @@ pub(super) fn column_frequency(
     Ok(name.or_else(|| hz_in(&card.comment)).map(|hz| stated(card, hz)))
 }
 
-/// Frequency in FREQ of either header, in keywords like it, or of an axis of frequency, which must not contradict each other; else the
-/// only one in other keywords of frequency.
+/// Frequency in FREQ of either header, in keywords like it, or of an axis of frequency, which must not contradict each other.
 fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProblem> {
     let mut known: Option<StatedFrequency> = None;
     let axes = header.cards().iter().filter_map(|card| match (card.key.strip_prefix("CTYPE"), &card.value) {
@@ -149,15 +174,13 @@ fn file_frequency(header: &Header) -> Result<Option<StatedFrequency>, FitsProble
         }
         known.get_or_insert(found);
     }
-    let mut others = other_frequencies(header);
-    let other = others.next().filter(|first| others.all(|(_, other)| is_same_hz(other.hz, first.1.hz)));
-    Ok(known.or(other.map(|(_, found)| found)))
+    Ok(known)
 }
 
 /// Frequencies in keywords that are no others' standard, such as NU_REF of Planck's component maps, CENTFREQ and OBS_FREQ.
 fn other_frequencies(header: &Header) -> impl Iterator<Item = (&Card, StatedFrequency)> {
     header.cards().iter().filter_map(|card| {
-        let key = card.key.to_ascii_uppercase();
+        let key = card.key.to_ascii_uppercase().replace([' ', '_'], "");
         let has = |words: &[&str]| words.iter().any(|word| key.contains(word));
         let is_column = key.strip_prefix("FREQ").is_some_and(|rest| matches!(rest.parse(), Ok(1..=999)));
         if !has(&FREQUENCY_WORDS) || has(&BAND_WORDS) || is_column || is_width(&card.comment) {
@@ -187,8 +210,8 @@ fn key_unit_hz(key: &str) -> Option<f64> {
     unit_hz(key.strip_prefix("FREQ")?.trim_start_matches('_'))
 }
 
-/// The frequencies in texts of the headers: BAND, EXTNAME, OBJECT, TCOMM of the column, comments, history, and keywords of frequency that
-/// contradict each other. Widths are none.
+/// The frequencies in texts of the headers: BAND, EXTNAME, OBJECT, TCOMM of the column, comments, history, and other keywords of
+/// frequency. Widths are none.
 pub(super) fn quoted_frequencies(header: &Header, column: usize) -> Vec<QuotedFrequency> {
     let of_column = format!("TCOMM{column}");
     let of_cards = header.cards().iter().filter_map(|card| match &card.value {
