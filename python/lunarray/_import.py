@@ -22,10 +22,11 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 ANTENNAS_MAX = 64
 INTEGRATION_S_MAX = 4294.0
 
-#: Disagreement of baselines with positions that is an error: a part of the length (aberration is 1e-4), and wavelengths.
-MISMATCH, MISMATCH_WAVELENGTHS = 1e-3, 0.1
+#: Disagreement of baselines with positions that is an error, wavelengths, after a turn of all of a phase centre in a day, rad: aberration
+#: turns those that pyuvdata phases by up to 2e-4.
+MISMATCH_WAVELENGTHS, TURN_RAD = 0.1, 3e-4
 
-#: Error of interpolated positions, wavelengths: 0.004 degrees of phase.
+#: Misfit of the file's polynomials to positions at the times of data, wavelengths: 0.004 degrees of phase.
 TOLERANCE_WAVELENGTHS = 1e-5
 
 #: The flag of what was flagged: the format's bit of interference.
@@ -49,7 +50,8 @@ class Part:
     """Visibilities of some channels at some times: arrays of a row an integration of a pair; values a column a channel.
 
     ``first`` and ``second`` are antennas, from 0, of the visibility <E_first conj(E_second)>. ``weight`` is the inverse variance of the
-    real part, (K sr)^-2; ``baseline_m`` is r_second - r_first as the data have it, which positions have to meet."""
+    real part, (K sr)^-2; ``baseline_m`` is r_second - r_first as the data have it, which positions have to meet, by the axes of the phase
+    centre of number ``centre``."""
 
     frequency_hz: np.ndarray
     width_hz: np.ndarray
@@ -62,6 +64,7 @@ class Part:
     weight: np.ndarray
     flagged: np.ndarray
     baseline_m: np.ndarray | None = None
+    centre: np.ndarray | None = None
 
     def __post_init__(self):
         for name in ("frequency_hz", "width_hz", "epoch_tai_s", "time_s", "duration_s"):
@@ -95,12 +98,17 @@ def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: lis
     tolerance_m = TOLERANCE_WAVELENGTHS * SPEED_OF_LIGHT_M_S / channels[:, 0].max()
     segments = list(track.segments(tolerance_m, rows["duration"].max() * 1e-6))
     starts = np.array([start for start, _, _ in segments])
-    for part in parts:
-        _require_baselines(part, part.time_s + (part.epoch_tai_s - epoch_tai_s), segments, starts)
     if (np.diff(starts) <= 0).any():
         raise Error("positions at times less than 2 us apart do not agree: expected those of one motion")
     # The ground takes the latest segment that begins before the middle.
-    segment = np.searchsorted(starts, rows["time"] + rows["duration"] // 2, side="right") - 1
+    middle = rows["time"] + rows["duration"] // 2
+    segment = np.searchsorted(starts, middle, side="right") - 1
+    ends = np.array([start + step * (len(places) - 1) for start, step, places in segments])
+    uncovered = (segment < 0) | (middle > ends[segment])
+    if uncovered.any():
+        raise Error(f"no positions at t = {middle[uncovered].min() * 1e-6} s: expected positions at all times of data")
+    for part in parts:
+        _require_baselines(part, part.time_s + (part.epoch_tai_s - epoch_tai_s), segments, starts)
     order = np.lexsort((rows["time"], rows["j"], rows["i"], rows["channel"], segment))
     rows = {name: np.ascontiguousarray(column[order]) for name, column in rows.items()}
     edges = np.searchsorted(segment[order], np.arange(len(segments) + 1))
@@ -126,20 +134,44 @@ def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: lis
 
 
 def _require_baselines(part, time_s, segments, starts):
-    """Requires that baselines are those of the positions, for up to a thousand integrations."""
+    """Requires that baselines are those of the positions, but for one small turn of all of a phase centre in a day."""
     if part.baseline_m is None:
         return
-    for row in np.unique(np.linspace(0, len(time_s) - 1, 1000).astype(int)):
-        i, j, t_s = part.first[row], part.second[row], time_s[row]
-        places = interpolated(segments[np.searchsorted(starts, t_s * 1e6, side="right") - 1], t_s)
-        expected = places[j] - places[i]
-        off_m = np.linalg.norm(part.baseline_m[row] - expected)
-        limit_m = MISMATCH * np.linalg.norm(expected) + MISMATCH_WAVELENGTHS * SPEED_OF_LIGHT_M_S / part.frequency_hz.max()
-        if off_m > limit_m:
-            raise Error(
-                f"the baseline r_2 - r_1 of antennas {i + 1} and {j + 1} (in the order of their numbers) at t = {t_s} s is {off_m:.3g} m "
-                f"from that of the positions, {np.linalg.norm(expected):.6g} m long: expected less than {limit_m:.3g} m"
-            )
+    rows = np.flatnonzero(part.first != part.second)
+    if len(rows) == 0:
+        return
+    t_s, i, j, found_m = time_s[rows], part.first[rows], part.second[rows], part.baseline_m[rows]
+    segment = np.searchsorted(starts, t_s * 1e6, side="right") - 1
+    expected_m = np.empty((len(rows), 3))
+    for number in np.unique(segment):
+        mine = np.flatnonzero(segment == number)
+        one, at_s = segments[number], t_s[mine]
+        expected_m[mine] = interpolated(one, at_s, j[mine]) - interpolated(one, at_s, i[mine])
+    centre = np.zeros(len(rows)) if part.centre is None else part.centre[rows]
+    off_m = _without_turns(found_m - expected_m, expected_m, np.stack([centre, np.floor(t_s / 86400)], axis=1))
+    off = np.linalg.norm(off_m, axis=1) * part.frequency_hz.max() / SPEED_OF_LIGHT_M_S
+    worst = np.argmax(off)
+    if not off[worst] <= MISMATCH_WAVELENGTHS:
+        raise Error(
+            f"the baseline r_2 - r_1 of antennas {i[worst] + 1} and {j[worst] + 1} (in the order of their numbers) at t = {t_s[worst]} s "
+            f"is {off[worst]:.3g} wavelengths from that of the positions, {np.linalg.norm(expected_m[worst]):.6g} m long, more than any "
+            f"other: expected less than {MISMATCH_WAVELENGTHS}, or one turn of all by less than {TURN_RAD} rad; check times and axes of "
+            "the positions"
+        )
+
+
+def _without_turns(off_m, baseline_m, groups):
+    """Differences of baselines without the turn, if it is small, that explains most of them in each group of rows."""
+    _, group = np.unique(groups, axis=0, return_inverse=True)
+    group = group.ravel()
+    order = np.argsort(group, kind="stable")
+    first = np.searchsorted(group[order], np.arange(group.max() + 1))
+    e_m = baseline_m[order]
+    squares = (e_m**2).sum(axis=1)[:, None, None] * np.eye(3) - e_m[:, :, None] * e_m[:, None, :]
+    inverse = np.linalg.pinv(np.add.reduceat(squares, first), rcond=1e-9, hermitian=True)
+    turn = np.einsum("gab,gb->ga", inverse, np.add.reduceat(np.cross(e_m, off_m[order]), first))
+    turn[~(np.linalg.norm(turn, axis=1) <= TURN_RAD)] = 0.0
+    return off_m - np.cross(turn[group], baseline_m)
 
 
 def _rows(part, channels, epoch_tai_s):

@@ -104,11 +104,51 @@ class Track:
         return start, step, places.reshape(len(node_s), -1)
 
 
-def interpolated(segment, t_s):
-    """Positions of a segment at a time, as the ground interpolates them: a row an antenna."""
+def interpolated(segment, t_s, antenna):
+    """Positions of antennas at times by a segment, as the ground interpolates them: a row a time."""
     start, step, places = segment
     steps = (t_s * 1e6 - start) / step
-    first = int(np.clip(np.floor(steps) - (NODES // 2 - 1), 0, len(places) - NODES))
-    node = np.arange(NODES)
-    factors = np.where(np.eye(NODES, dtype=bool), 1.0, (steps - first - node) / (node[:, None] - node + np.eye(NODES)))
-    return (factors.prod(axis=1) @ places[first : first + NODES]).reshape(-1, 3)
+    first = np.clip(np.floor(steps) - (NODES // 2 - 1), 0, len(places) - NODES).astype(int)
+    factors = _lagrange(steps - first, np.tile(np.arange(float(NODES)), (len(t_s), 1)))
+    nodes = places.reshape(len(places), -1, 3)
+    return sum(factors[:, [k]] * nodes[first + k, antenna] for k in range(NODES))
+
+
+def between(times_s, position_m, t_s):
+    """Positions of all antennas at other times, by polynomials through the eight nearest samples, and how unsure they are, m, without what
+    antennas have in common: how far those through the six nearest are, and the nearest sample is from its eight neighbours'."""
+    count = min(NODES, len(times_s))
+    found, fewer = (_through(times_s, position_m, t_s, nodes) for nodes in (count, max(count - 2, 1)))
+    unsure_m = _apart_m(fewer - found)
+    half = NODES // 2
+    inner = np.arange(half, len(times_s) - half)
+    if len(inner):
+        others = inner[:, None] + np.delete(np.arange(-half, half + 1), half)
+        factors = _lagrange(times_s[inner], times_s[others])
+        predicted = sum(factors[:, k, None, None] * position_m[others[:, k]] for k in range(NODES))
+        rough_m = np.zeros(len(times_s))
+        rough_m[inner] = _apart_m(predicted - position_m[inner])
+        unsure_m = np.maximum(unsure_m, rough_m[np.searchsorted(0.5 * (times_s[1:] + times_s[:-1]), t_s)])
+    return found, unsure_m
+
+
+def _apart_m(off_m):
+    """The largest difference of an antenna from the mean of all, by time."""
+    return np.linalg.norm(off_m - off_m.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+
+
+def _through(times_s, position_m, t_s, count):
+    edges_s = 0.5 * (times_s[1:] + times_s[:-1]) if count % 2 else times_s
+    first = np.clip(np.searchsorted(edges_s, t_s, side="right") - count // 2, 0, len(times_s) - count)
+    factors = _lagrange(t_s, times_s[first[:, None] + np.arange(count)])
+    return sum(factors[:, k, None, None] * position_m[first + k] for k in range(count))
+
+
+def _lagrange(t, nodes):
+    """Factors of the values at nodes, a row a time, of the polynomials through them."""
+    factors = np.ones(nodes.shape)
+    for k in range(nodes.shape[1]):
+        for other in range(nodes.shape[1]):
+            if other != k:
+                factors[:, k] *= (t - nodes[:, other]) / (nodes[:, k] - nodes[:, other])
+    return factors

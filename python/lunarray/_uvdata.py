@@ -24,10 +24,13 @@ from ._import import (
 )
 from ._native import Error
 from ._stokes import in_k_sr, total_intensity
-from ._tracks import Track
+from ._tracks import Track, between
 from ._uvh5 import ECLIPTIC_TO_ICRS, axes, offline
 from ._values import numbers, seconds
 from ._write import needed
+
+#: Uncertainty of interpolated positions that is an error, wavelengths.
+INTERPOLATION_WAVELENGTHS = 0.01
 
 #: How far below its mean radius the Moon's ground reaches, m.
 MOON_RELIEF_M = 12e3
@@ -87,7 +90,9 @@ def from_uvdata(
             raise Error(f'positions = {positions!r}: expected "uvw", an Array, or times and positions')
         track, radius_m = of_baselines(parts, times_s, len(wanted))
     else:
-        track, radius_m = _given(positions, times_s, epochs[0], wanted, np.sort(np.asarray(data[0].telescope.antenna_numbers)))
+        all_antennas = np.unique(np.concatenate([np.asarray(one.telescope.antenna_numbers) for one in data]))
+        highest_hz = max(part.frequency_hz.max() for part in parts)
+        track, radius_m = _given(positions, np.unique(np.concatenate(times_s)), epochs[0], wanted, all_antennas, highest_hz)
     name = str(getattr(data[0].telescope, "name", "") or "imported")
     return write_downlink(out, Instrument(name, len(wanted), radius_m), parts, track)
 
@@ -155,6 +160,7 @@ def _part(data, wanted, epoch_tai_s, noise_jy, pol_convention, on_moon):
         samples / noise**2,
         flagged,
         None if on_moon else _baselines_m(data),
+        np.asarray(data.phase_center_id_array),
     )
 
 
@@ -186,19 +192,19 @@ def _baselines_m(data):
     return found
 
 
-def _given(positions, times_s, epoch_tai_s, wanted, all_antennas):
+def _given(positions, unique_s, epoch_tai_s, wanted, all_antennas, highest_hz):
     """The track of positions that a caller gives, and the Moon's radius."""
     if isinstance(positions, Array):
         if positions.epoch_tai_s is None:
             raise Error("an array without an epoch: expected (t, xyz) with astropy.time.Time, or an array of a pipeline")
-        unique_s = np.unique(np.concatenate(times_s))
         places = positions.positions(unique_s + (epoch_tai_s - positions.epoch_tai_s))
         radius_m = positions.moon_radius_m
     else:
-        unique_s, places = _table(positions, times_s, epoch_tai_s)
+        places = _of_table(positions, unique_s, epoch_tai_s, highest_hz)
         radius_m = MOON_RADIUS_M
     count = places.shape[1]
     if count == len(all_antennas):
+        # Pyuvdata's check has it that the telescope has all antennas with data.
         places = places[:, np.searchsorted(all_antennas, wanted)]
     elif count != len(wanted):
         raise Error(
@@ -211,22 +217,31 @@ def _given(positions, times_s, epoch_tai_s, wanted, all_antennas):
     return Track.of_all(unique_s, places), radius_m
 
 
-def _table(positions, times_s, epoch_tai_s):
-    """Times, s, and positions of a pair (t, xyz)."""
+def _of_table(positions, unique_s, epoch_tai_s, highest_hz):
+    """Positions at times of data, s, by a pair (t, xyz)."""
     try:
         t, xyz = positions
     except (TypeError, ValueError) as error:
         raise Error(f'positions = {positions!r}: expected "uvw", an Array, or times and positions') from error
-    unique_s, places = seconds(t, epoch_tai_s, "times"), numbers(xyz, "m", "positions")
-    if unique_s.ndim != 1 or places.ndim != 3 or (len(places), places.shape[2]) != (len(unique_s), 3) or (np.diff(unique_s) <= 0).any():
+    times_s, places = seconds(t, epoch_tai_s, "times"), numbers(xyz, "m", "positions")
+    if times_s.ndim != 1 or places.ndim != 3 or (len(places), places.shape[2]) != (len(times_s), 3) or (np.diff(times_s) <= 0).any():
         raise Error(
-            f"times of shape {unique_s.shape} and positions of shape {places.shape}: expected increasing times, and positions of shape "
+            f"times of shape {times_s.shape} and positions of shape {places.shape}: expected increasing times, and positions of shape "
             "(times, antennas, 3)"
         )
-    first_s, last_s = min(each.min() for each in times_s), max(each.max() for each in times_s)
-    if not unique_s[0] <= first_s <= last_s <= unique_s[-1]:
+    if len(times_s) == 0 or not times_s[0] <= unique_s[0] <= unique_s[-1] <= times_s[-1]:
         raise Error(
-            f"data from t = {first_s} s to {last_s} s, positions from {unique_s[0]} s to {unique_s[-1]} s: expected positions at all times "
-            "of data"
+            f"data from t = {unique_s[0]} s to {unique_s[-1]} s, positions from {times_s[:1]} s to {times_s[-1:]} s: expected positions at "
+            "all times of data"
         )
-    return unique_s, places
+    found, unsure_m = between(times_s, places, unique_s)
+    worst = np.argmax(unsure_m)
+    unsure = unsure_m[worst] * highest_hz / SPEED_OF_LIGHT_M_S
+    if unsure > INTERPOLATION_WAVELENGTHS:
+        after = np.clip(np.searchsorted(times_s, unique_s[worst]), 1, len(times_s) - 1)
+        raise Error(
+            f"positions every {times_s[after] - times_s[after - 1]:.6g} s are too far apart, or rounded: interpolated at t = "
+            f"{unique_s[worst]} s, baselines are uncertain by {unsure:.2g} wavelengths; expected closer times or more digits, for less than "
+            f"{INTERPOLATION_WAVELENGTHS}"
+        )
+    return found
