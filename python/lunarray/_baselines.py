@@ -1,5 +1,7 @@
 """Positions whose differences are given baselines."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ._import import MISMATCH_WAVELENGTHS, SPEED_OF_LIGHT_M_S
@@ -7,9 +9,25 @@ from ._native import Error
 from ._tracks import Track
 
 
-def of_baselines(parts, times_s, antennas):
+def with_baselines(parts):
+    """The parts without what is flagged in all channels or has no baseline, which need not be those of any positions."""
+    found = []
+    for part in parts:
+        rows = part.good_pairs() & np.isfinite(part.baseline_m).all(axis=1)
+        names = ("first", "second", "time_s", "duration_s", "value_k_sr", "weight", "flagged", "baseline_m")
+        centre = None if part.centre is None else part.centre[rows]
+        if rows.any():
+            found.append(replace(part, **{name: getattr(part, name)[rows] for name in names}, centre=centre))
+    if not found:
+        raise Error("no visibility of two antennas with finite uvw that is not flagged: expected at least one")
+    return found
+
+
+def of_baselines(parts, antennas):
     """The track of positions whose differences are the baselines, about a place from which the Moon is small, and its radius."""
-    time_s = np.concatenate(times_s)
+    # To the format's half ticks, as the track has them: antennas of one integration belong together.
+    time_s = np.concatenate([part.time_s + (part.epoch_tai_s - parts[0].epoch_tai_s) for part in parts])
+    time_s = np.rint(time_s * 2e6) / 2e6
     first, second = (np.concatenate([getattr(part, name) for part in parts]) for name in ("first", "second"))
     baseline_m = np.concatenate([part.baseline_m for part in parts])
     order = np.lexsort((second, first, time_s))

@@ -70,6 +70,11 @@ class Part:
         for name in ("frequency_hz", "width_hz", "epoch_tai_s", "time_s", "duration_s"):
             if not np.isfinite(getattr(self, name)).all():
                 raise Error(f"{name}: found {getattr(self, name)}; expected finite numbers")
+        self.flagged = self.flagged | ~np.isfinite(self.value_k_sr) | ~(self.weight > 0) | ~np.isfinite(self.weight)
+
+    def good_pairs(self):
+        """Rows of two antennas with a good channel."""
+        return (self.first != self.second) & ~self.flagged.all(axis=1)
 
 
 @dataclass
@@ -111,6 +116,7 @@ def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: lis
         _require_baselines(part, part.time_s + (part.epoch_tai_s - epoch_tai_s), segments, starts)
     order = np.lexsort((rows["time"], rows["j"], rows["i"], rows["channel"], segment))
     rows = {name: np.ascontiguousarray(column[order]) for name, column in rows.items()}
+    _require_once(rows, channels)
     edges = np.searchsorted(segment[order], np.arange(len(segments) + 1))
     description = json.dumps(
         {
@@ -133,11 +139,26 @@ def write_downlink(path: str | PathLike[str], instrument: Instrument, parts: lis
     return Downlink(path)
 
 
+def _require_once(rows, channels):
+    """Requires that no visibility is there twice, of rows in the order of the file."""
+    same = np.all([np.diff(rows[name]) == 0 for name in ("channel", "i", "j")], axis=0)
+    # In half ticks. Julian dates tell times to 40 us.
+    middle = 2 * rows["time"] + rows["duration"]
+    twice = np.flatnonzero(same & (np.diff(middle) < np.minimum(2000, rows["duration"][1:])))
+    if len(twice):
+        k = twice[0]
+        raise Error(
+            f"the visibility of antennas {rows['i'][k] + 1} and {rows['j'][k] + 1} (in the order of their numbers) at t = "
+            f"{middle[k] * 5e-7} s and {channels[rows['channel'][k], 0]} Hz is there twice: expected each once; UVData.__add__ joins "
+            "polarisations of two files in one object"
+        )
+
+
 def _require_baselines(part, time_s, segments, starts):
     """Requires that baselines are those of the positions, but for one small turn of all of a phase centre in a day."""
     if part.baseline_m is None:
         return
-    rows = np.flatnonzero(part.first != part.second)
+    rows = np.flatnonzero(part.good_pairs() & np.isfinite(part.baseline_m).all(axis=1))
     if len(rows) == 0:
         return
     t_s, i, j, found_m = time_s[rows], part.first[rows], part.second[rows], part.baseline_m[rows]
@@ -185,7 +206,7 @@ def _rows(part, channels, epoch_tai_s):
     value = part.value_k_sr[cross].copy()
     swapped = first > second
     value[swapped] = value[swapped].conj()
-    bad = part.flagged[cross] | ~np.isfinite(value) | ~(part.weight[cross] > 0) | ~np.isfinite(part.weight[cross])
+    bad = part.flagged[cross]
     value[bad] = 0
     weight = np.where(bad, 1.0, part.weight[cross])
     # The middle, which decides, to half a tick.
@@ -221,7 +242,9 @@ def noise_of(noise_jy: Any, frequency_hz: np.ndarray) -> np.ndarray | None:
     """The stated standard deviation, K sr, by channel."""
     if noise_jy is None:
         return None
-    found = np.broadcast_to(numbers(noise_jy, "Jy", "noise_jy"), frequency_hz.shape)
+    found = numbers(noise_jy, "Jy", "noise_jy")
+    if found.ndim > 1 or found.size not in (1, len(frequency_hz)):
+        raise Error(f"noise_jy of shape {found.shape}: expected one number, or one for each of {len(frequency_hz)} channels")
     if not (found > 0).all():
         raise Error(f"noise_jy = {noise_jy}: expected positive Jy, one number or one for each channel")
     return found / jansky_per_k_sr(frequency_hz)

@@ -7,7 +7,7 @@ import numpy as np
 from ._import import SPEED_OF_LIGHT_M_S
 from ._native import Error
 from ._tracks import Track
-from ._uvh5 import ECLIPTIC_TO_ICRS, offline
+from ._uvh5 import ECLIPTIC_TO_ICRS
 from ._write import needed
 
 
@@ -23,6 +23,7 @@ def unprojected(data, k):
     baseline_m = np.array([places[j] - places[i] for i, j in zip(data.ant_1_array, data.ant_2_array)])
     # Lengths do not depend on axes.
     off_m = np.abs(np.linalg.norm(baseline_m, axis=1) - np.linalg.norm(data.uvw_array, axis=1))
+    off_m[data.flag_array.all(axis=(1, 2)) | ~np.isfinite(off_m)] = 0.0
     limit_m = 0.1 * SPEED_OF_LIGHT_M_S / np.max(data.freq_array)
     if off_m.max() > limit_m:
         raise Error(
@@ -32,7 +33,7 @@ def unprojected(data, k):
     if all(data.phase_center_catalog[n]["cat_type"] == "unprojected" for n in np.unique(data.phase_center_id_array)):
         return data
     found = data.copy()
-    with warnings.catch_warnings(), offline():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found.unproject_phase()
     return found

@@ -28,8 +28,9 @@ def total_intensity(data, pol_convention):
             )
         factor = 2.0 if stated == "sum" else 1.0
     values = factor * data.data_array[:, :, used].mean(axis=2)
-    # Of sums of two polarisations both halves count.
-    return values, data.flag_array[:, :, used].any(axis=2), data.nsample_array[:, :, used].mean(axis=2)
+    samples = data.nsample_array[:, :, used]
+    # Of sums of two polarisations both halves count, and one without samples has no value.
+    return values, data.flag_array[:, :, used].any(axis=2) | ~(samples > 0).all(axis=2), samples.mean(axis=2)
 
 
 def in_k_sr(values, data, frequency_hz):
@@ -37,5 +38,8 @@ def in_k_sr(values, data, frequency_hz):
     units = {"jy": jansky_per_k_sr(frequency_hz), "k str": np.ones(len(frequency_hz))}
     per_k_sr = units.get(str(data.vis_units).lower())
     if per_k_sr is None:
-        raise Error(f'vis_units = {data.vis_units!r}: expected calibrated data, "Jy" or "K str"')
+        raise Error(
+            f'vis_units = {data.vis_units!r}: expected calibrated data, "Jy" or "K str"; of a measurement set of another program that is '
+            'calibrated in Jy: data = UVData.from_file(.., data_column="CORRECTED_DATA"), then data.vis_units = "Jy"'
+        )
     return values / per_k_sr

@@ -21,6 +21,17 @@ STEP_MAX = 4_294_000_000
 GAP_S = 60.0
 
 
+#: How far below its mean radius the Moon's ground reaches, m.
+MOON_RELIEF_M = 12e3
+
+
+def require_above_ground(position_m, radius_m):
+    """Requires that positions, a row each, are as far from the Moon's centre as its ground."""
+    low_m = np.linalg.norm(position_m, axis=-1).min()
+    if low_m < radius_m - MOON_RELIEF_M:
+        raise Error(f"a position {low_m / 1e3:.3f} km from the Moon's centre: expected metres from there, and none below the ground")
+
+
 class Track:
     """Positions of antennas (from 0) at times, s: a row for each. Of rows with the same antenna and time one counts."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ._array import MOON_RADIUS_M, Array
-from ._baselines import of_baselines
+from ._baselines import of_baselines, with_baselines
 from ._downlink import Downlink
 from ._import import (
     SPEED_OF_LIGHT_M_S,
@@ -24,16 +24,13 @@ from ._import import (
 )
 from ._native import Error
 from ._stokes import in_k_sr, total_intensity
-from ._tracks import Track, between
+from ._tracks import Track, between, require_above_ground
 from ._uvh5 import ECLIPTIC_TO_ICRS, axes, offline
 from ._values import numbers, seconds
 from ._write import needed
 
 #: Uncertainty of interpolated positions that is an error, wavelengths.
 INTERPOLATION_WAVELENGTHS = 0.01
-
-#: How far below its mean radius the Moon's ground reaches, m.
-MOON_RELIEF_M = 12e3
 
 
 def from_uvdata(
@@ -49,31 +46,46 @@ def from_uvdata(
     ``uv`` is a file that pyuvdata reads (UVH5, UVFITS, a measurement set), a ``UVData``, or a list of these, with one array. Values are in
     Jy or K str, by pyuvdata's convention V = sum of T exp(+2 pi i (nu / c) n . (r_2 - r_1)); ``conjugate`` for the opposite. The total
     intensity is taken, of XX and YY or RR and LL by ``pol_convention``: "sum" (I = XX + YY, as pyuvsim has it) or "avg"
-    (I = (XX + YY) / 2), if the data do not say which. Antennas, at most 64, are numbered in the order of theirs.
+    (I = (XX + YY) / 2), if the data do not say which; one of the two alone is taken as half of an unpolarised sky. Antennas, at most 64,
+    are numbered in the order of theirs. Each visibility may be there once. Files of a list are in memory together.
 
     ``positions``: by default those of antennas on the Moon (needs lunarsky), or those in a file that ``Downlink.write_uvh5`` made. Of
     antennas that move: an :class:`Array` of a pipeline, or ``(t, xyz)``, ``t`` an ``astropy.time.Time`` and ``xyz`` of shape (times,
-    antennas, 3), m in Moon-centred ecliptic axes; data are then phased to a direction (ICRS). ``"uvw"`` takes baselines as they are, with
-    nothing hidden by the Moon.
+    antennas, 3), m in Moon-centred ecliptic axes, interpolated by eight samples; times too far apart for 0.01 wavelengths are refused.
+    Data are then phased to a direction (ICRS), and their uvw have to be those of the positions to 0.1 wavelengths, beside one turn of all
+    of a day by up to 3e-4 rad (aberration). ``"uvw"`` takes baselines of what is not flagged as they are, with nothing hidden by the Moon.
 
-    Weights are ``nsample_array`` times the inverse variance of ``noise_jy``, the standard deviation of the real part for one sample (one
-    number, or one by channel); if not given, that of antennas that see all of a sky of 180 K (nu / 180 MHz)^-2.6. What is flagged stays
-    so. Maps take antennas as isotropic. Needs pyuvdata, and h5py or python-casacore by the format (``pip install lunarray[moon]``).
+    Weights are ``nsample_array`` times the inverse variance of ``noise_jy``, the standard deviation of the real part of the total intensity
+    for one sample (one number, or one by channel); if not given, that of antennas that see all of a sky of 180 K (nu / 180 MHz)^-2.6. What
+    is flagged, or of which a polarisation has no samples, is flagged. Maps take antennas as isotropic. Needs pyuvdata, and h5py or
+    python-casacore by the format (``pip install lunarray[moon]``).
     """
     needed("pyuvdata", "moon")
     given = uv if isinstance(uv, (list, tuple)) else [uv]
     if not given:
         raise Error("no data: expected files or UVData objects")
+    with offline():
+        return _made(given, out, positions, noise_jy, pol_convention, conjugate)
+
+
+def _made(given, out, positions, noise_jy, pol_convention, conjugate):
     read = [_read(one) for one in given]
     own = [truth for _, truth in read]
     if positions is None and all(truth is not None for truth in own):
         from ._own import of_own
 
+        said = {"conjugate": conjugate or None, "noise_jy": noise_jy, "pol_convention": pol_convention}
+        if any(value is not None for value in said.values()):
+            names = ", ".join(name for name, value in said.items() if value is not None)
+            raise Error(f"{names}: a file of write_uvh5 says this itself: expected no such argument")
         parts, track, instrument = of_own([data for data, _ in read], own)
         return write_downlink(out, instrument, parts, track)
     data = [_conjugated(one) if conjugate else one for one, _ in read]
     wanted = np.unique(np.concatenate([np.concatenate([one.ant_1_array, one.ant_2_array]) for one in data]))
     on_moon = positions is None
+    if isinstance(positions, str) and any(type(one.telescope.location).__name__ == "MoonLocation" for one in data):
+        # Pyuvdata turns their uvw about w, by up to 5e-3 rad.
+        raise Error(f"positions = {positions!r}: a telescope is on the Moon; expected no positions, which takes its antennas'")
     if on_moon:
         from ._moon import unprojected
 
@@ -88,7 +100,8 @@ def from_uvdata(
     elif isinstance(positions, str):
         if positions != "uvw":
             raise Error(f'positions = {positions!r}: expected "uvw", an Array, or times and positions')
-        track, radius_m = of_baselines(parts, times_s, len(wanted))
+        parts = with_baselines(parts)
+        track, radius_m = of_baselines(parts, len(wanted))
     else:
         all_antennas = np.unique(np.concatenate([np.asarray(one.telescope.antenna_numbers) for one in data]))
         highest_hz = max(part.frequency_hz.max() for part in parts)
@@ -102,11 +115,13 @@ def _read(uv):
     from pyuvdata import UVData
 
     if isinstance(uv, UVData):
+        if uv.data_array is None or uv.flag_array is None or uv.nsample_array is None:
+            raise Error("a UVData of metadata alone: expected one with visibilities, flags and samples")
         return uv, None
     path = os.fspath(uv)
     if not os.path.exists(path):
         raise Error(f"{path}: expected a file or folder that is there")
-    with warnings.catch_warnings(), offline():
+    with warnings.catch_warnings():
         # That uvw do not match one position an antenna: positions are compared with them below.
         warnings.simplefilter("ignore", UserWarning)
         try:
@@ -137,7 +152,7 @@ def _part(data, wanted, epoch_tai_s, noise_jy, pol_convention, on_moon):
     from astropy.time import Time
 
     frequency_hz = np.asarray(data.freq_array, float)
-    width_hz = np.broadcast_to(np.asarray(data.channel_width, float), frequency_hz.shape)
+    width_hz = np.broadcast_to(np.abs(np.asarray(data.channel_width, float)), frequency_hz.shape)
     values, flagged, samples = total_intensity(data, pol_convention)
     values = in_k_sr(values, data, frequency_hz)
     if not on_moon:
@@ -174,9 +189,10 @@ def _require_phased(data):
     used = set(np.unique(data.phase_center_id_array).tolist())
     for number in used:
         centre = data.phase_center_catalog[number]
-        if centre["cat_type"] != "sidereal" or centre["cat_frame"] not in ("icrs", "fk5"):
+        frame, epoch = centre["cat_frame"], centre.get("cat_epoch")
+        if centre["cat_type"] != "sidereal" or not (frame == "icrs" or (frame == "fk5" and epoch in (None, 2000.0))):
             raise Error(
-                f"phase centre {centre['cat_name']!r} is of type {centre['cat_type']!r} in the frame {centre['cat_frame']!r}: expected "
+                f"phase centre {centre['cat_name']!r} is of type {centre['cat_type']!r} in the frame {frame!r} of {epoch}: expected "
                 'data phased to directions, UVData.phase(.., phase_frame="icrs"), so that baselines have known axes'
             )
 
@@ -204,16 +220,13 @@ def _given(positions, unique_s, epoch_tai_s, wanted, all_antennas, highest_hz):
         radius_m = MOON_RADIUS_M
     count = places.shape[1]
     if count == len(all_antennas):
-        # Pyuvdata's check has it that the telescope has all antennas with data.
         places = places[:, np.searchsorted(all_antennas, wanted)]
     elif count != len(wanted):
         raise Error(
             f"positions of {count} antennas: expected those of {len(all_antennas)}, all of the data's telescope, or of {len(wanted)}, "
             "those with data"
         )
-    low_m = np.linalg.norm(places, axis=2).min()
-    if low_m < radius_m - MOON_RELIEF_M:
-        raise Error(f"a position {low_m / 1e3:.3f} km from the Moon's centre: expected metres from there, and none below the ground")
+    require_above_ground(places, radius_m)
     return Track.of_all(unique_s, places), radius_m
 
 
@@ -241,7 +254,7 @@ def _of_table(positions, unique_s, epoch_tai_s, highest_hz):
         after = np.clip(np.searchsorted(times_s, unique_s[worst]), 1, len(times_s) - 1)
         raise Error(
             f"positions every {times_s[after] - times_s[after - 1]:.6g} s are too far apart, or rounded: interpolated at t = "
-            f"{unique_s[worst]} s, baselines are uncertain by {unsure:.2g} wavelengths; expected closer times or more digits, for less than "
-            f"{INTERPOLATION_WAVELENGTHS}"
+            f"{unique_s[worst]} s, baselines are uncertain by {unsure:.2g} wavelengths; expected closer times or more digits, for less "
+            f"than {INTERPOLATION_WAVELENGTHS}"
         )
     return found

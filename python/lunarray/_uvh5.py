@@ -5,6 +5,7 @@ V = sum of T exp(+2 pi i (nu / c) n . (r_j - r_i)), with the same value. Data ar
 exp(-2 pi i (nu / c) s . (r_j - r_i)); u points east, v north, w to s, in ICRS.
 """
 
+import warnings
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
@@ -30,12 +31,15 @@ ECLIPTIC_TO_ICRS = np.array(
 
 @contextmanager
 def offline():
-    """Nothing is fetched: what the Earth's rotation is predicted to be serves for sidereal times, which have no meaning here."""
+    """Nothing is fetched: what the Earth's rotation is predicted to be serves for sidereal times, which have no meaning here. Of dates
+    beyond known leap seconds nothing is said."""
     from astropy.utils import iers
 
     with ExitStack() as stack:
         for name, value in {"auto_download": False, "auto_max_age": None, "iers_degraded_accuracy": "ignore"}.items():
             stack.enter_context(iers.conf.set_temp(name, value))
+        stack.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", message='ERFA function .* yielded .*"dubious year')
         yield
 
 

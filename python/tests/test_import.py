@@ -329,6 +329,10 @@ def test_tables_that_are_exported_come_back(small, tmp_path, kind):
             (tmp_path / "v").write_text("\n".join(",".join(line[k] for k in kept) for line in lines))
         found = lunarray.from_table(tmp_path / "v", tmp_path / "v.ccsds", frequency_hz="3MHz")
     expected, rows = sorted_rows(downlink.visibilities(1)), sorted_rows(found.visibilities(0))
+    assert expected["flag"].any()
+    if "uvw" in kind:
+        # What is flagged has no baselines that count.
+        expected = expected[expected["flag"] == 0]
     for name in ("time_s", "dt_s", "i", "j"):
         np.testing.assert_array_equal(rows[name], expected[name])
     good = expected["flag"] == 0
@@ -358,7 +362,7 @@ def test_what_cannot_be_taken_is_told(far, tmp_path):
     with pytest.raises(lunarray.Error, match="frequency_hz"):
         lunarray.from_uvdata(high, tmp_path / "v.ccsds", pol_convention="sum")
     with pytest.raises(lunarray.Error, match="expected data phased to directions"):
-        lunarray.from_uvdata(data, tmp_path / "v.ccsds", pol_convention="sum", positions="uvw")
+        lunarray.from_uvdata(data, tmp_path / "v.ccsds", pol_convention="sum", positions=lunarray.Array())
     timeless = data.copy()
     timeless.integration_time = timeless.integration_time * np.nan
     with pytest.raises(lunarray.Error, match="expected finite numbers"):
