@@ -170,14 +170,15 @@ fn a_source_that_the_model_lacks_is_named_with_its_place_and_flux() {
             .iter()
             .filter(|event| event["event"] == "missing-source" && event["channel"] == channel)
             .collect();
-        let others = ["wrong-model", "wrong-frequency", "wrong-strength", "dead"];
+        // A pass may have too few short baselines for a name.
+        let others = ["wrong-frequency", "wrong-strength", "dead"];
         let is_other = |event: &&serde_json::Value| others.iter().any(|name| event["event"] == *name);
         assert!(!named.is_empty() && !events.iter().any(|event| is_other(&event)), "{events:?}");
         for event in named {
             let [longitude, latitude] = [0, 1].map(|k| event["position_deg"][k].as_f64().unwrap());
             let flux_jy = event["flux_jy"].as_f64().unwrap();
-            // Baselines of 400 wavelengths have fringes of 0.14 deg; amplitudes have an error of 10 %, squared.
-            assert!((longitude - 130.0).abs() < 0.15 && (latitude - 35.0).abs() < 0.15, "{event}");
+            // Baselines of 60 wavelengths have fringes of 1 deg; amplitudes have an error of 10 %, squared.
+            assert!((longitude - 130.0).abs() < 0.3 && (latitude - 35.0).abs() < 0.3, "{event}");
             assert!((flux_jy / 1e6).ln().abs() < 0.3, "{event}");
         }
     }
