@@ -10,9 +10,15 @@ from ._tracks import Track
 
 
 def with_baselines(parts):
-    """The parts without what is flagged in all channels or has no baseline, which need not be those of any positions."""
+    """The parts without what is flagged in all channels or has no baseline, which need not be those of any positions, and with one time,
+    of the format's half ticks, for integrations that are not a microsecond apart."""
+    offsets_s = [part.epoch_tai_s - parts[0].epoch_tai_s for part in parts]
+    times_s = np.unique(np.concatenate([part.time_s + offset_s for part, offset_s in zip(parts, offsets_s)]))
+    firsts_s = times_s[np.diff(times_s, prepend=-np.inf) > 1e-6]
     found = []
-    for part in parts:
+    for part, offset_s in zip(parts, offsets_s):
+        together_s = firsts_s[np.searchsorted(firsts_s, part.time_s + offset_s, side="right") - 1]
+        part = replace(part, time_s=np.rint(together_s * 2e6) / 2e6 - offset_s)
         rows = part.good_pairs() & np.isfinite(part.baseline_m).all(axis=1)
         names = ("first", "second", "time_s", "duration_s", "value_k_sr", "weight", "flagged", "baseline_m")
         centre = None if part.centre is None else part.centre[rows]
@@ -25,7 +31,6 @@ def with_baselines(parts):
 
 def of_baselines(parts, antennas):
     """The track of positions whose differences are the baselines, about a place from which the Moon is small, and its radius."""
-    # To the format's half ticks, as the track has them: antennas of one integration belong together.
     time_s = np.concatenate([part.time_s + (part.epoch_tai_s - parts[0].epoch_tai_s) for part in parts])
     time_s = np.rint(time_s * 2e6) / 2e6
     first, second = (np.concatenate([getattr(part, name) for part in parts]) for name in ("first", "second"))

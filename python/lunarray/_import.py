@@ -164,9 +164,9 @@ def _require_baselines(part, time_s, segments, starts):
     t_s, i, j, found_m = time_s[rows], part.first[rows], part.second[rows], part.baseline_m[rows]
     segment = np.searchsorted(starts, t_s * 1e6, side="right") - 1
     expected_m = np.empty((len(rows), 3))
-    for number in np.unique(segment):
-        mine = np.flatnonzero(segment == number)
-        one, at_s = segments[number], t_s[mine]
+    order = np.argsort(segment, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(segment[order])) + 1):
+        one, at_s = segments[segment[mine[0]]], t_s[mine]
         expected_m[mine] = interpolated(one, at_s, j[mine]) - interpolated(one, at_s, i[mine])
     centre = np.zeros(len(rows)) if part.centre is None else part.centre[rows]
     off_m = _without_turns(found_m - expected_m, expected_m, np.stack([centre, np.floor(t_s / 86400)], axis=1))
@@ -185,12 +185,11 @@ def _without_turns(off_m, baseline_m, groups):
     """Differences of baselines without the turn, if it is small, that explains most of them in each group of rows."""
     _, group = np.unique(groups, axis=0, return_inverse=True)
     group = group.ravel()
-    order = np.argsort(group, kind="stable")
-    first = np.searchsorted(group[order], np.arange(group.max() + 1))
-    e_m = baseline_m[order]
-    squares = (e_m**2).sum(axis=1)[:, None, None] * np.eye(3) - e_m[:, :, None] * e_m[:, None, :]
-    inverse = np.linalg.pinv(np.add.reduceat(squares, first), rcond=1e-9, hermitian=True)
-    turn = np.einsum("gab,gb->ga", inverse, np.add.reduceat(np.cross(e_m, off_m[order]), first))
+    e = baseline_m.T
+    squares = np.array([[np.bincount(group, e[a] * e[b]) for a in range(3)] for b in range(3)]).transpose(2, 0, 1)
+    matrix = np.trace(squares, axis1=1, axis2=2)[:, None, None] * np.eye(3) - squares
+    side = np.stack([np.bincount(group, component) for component in np.cross(baseline_m, off_m).T], axis=1)
+    turn = np.einsum("gab,gb->ga", np.linalg.pinv(matrix, rcond=1e-9, hermitian=True), side)
     turn[~(np.linalg.norm(turn, axis=1) <= TURN_RAD)] = 0.0
     return off_m - np.cross(turn[group], baseline_m)
 
