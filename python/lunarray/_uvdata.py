@@ -85,7 +85,7 @@ def _made(given, out, positions, noise_jy, pol_convention, conjugate):
     on_moon = positions is None
     if isinstance(positions, str) and any(type(one.telescope.location).__name__ == "MoonLocation" for one in data):
         # Pyuvdata turns their uvw about w, by up to 5e-3 rad.
-        raise Error(f"positions = {positions!r}: a telescope is on the Moon; expected no positions, which takes its antennas'")
+        raise Error(f"positions = {positions!r}: a telescope is on the Moon; expected none, for the positions of its antennas")
     if on_moon:
         from ._moon import unprojected
 
@@ -237,14 +237,15 @@ def _of_table(positions, unique_s, epoch_tai_s, highest_hz):
     except (TypeError, ValueError) as error:
         raise Error(f'positions = {positions!r}: expected "uvw", an Array, or times and positions') from error
     times_s, places = seconds(t, epoch_tai_s, "times"), numbers(xyz, "m", "positions")
-    if times_s.ndim != 1 or places.ndim != 3 or (len(places), places.shape[2]) != (len(times_s), 3) or (np.diff(times_s) <= 0).any():
+    fit = times_s.ndim == 1 and places.ndim == 3 and (len(places), places.shape[2]) == (len(times_s), 3) and len(times_s) > 0
+    if not fit or (np.diff(times_s) <= 0).any():
         raise Error(
             f"times of shape {times_s.shape} and positions of shape {places.shape}: expected increasing times, and positions of shape "
             "(times, antennas, 3)"
         )
-    if len(times_s) == 0 or not times_s[0] <= unique_s[0] <= unique_s[-1] <= times_s[-1]:
+    if not times_s[0] <= unique_s[0] <= unique_s[-1] <= times_s[-1]:
         raise Error(
-            f"data from t = {unique_s[0]} s to {unique_s[-1]} s, positions from {times_s[:1]} s to {times_s[-1:]} s: expected positions at "
+            f"data from t = {unique_s[0]} s to {unique_s[-1]} s, positions from {times_s[0]} s to {times_s[-1]} s: expected positions at "
             "all times of data"
         )
     found, unsure_m = between(times_s, places, unique_s)

@@ -371,6 +371,9 @@ def test_what_cannot_be_taken_is_told(far, tmp_path):
     moved.uvw_array = 1.1 * moved.uvw_array
     with pytest.raises(lunarray.Error, match="baselines of uvw and of antenna positions differ"):
         lunarray.from_uvdata(moved, tmp_path / "v.ccsds", pol_convention="sum")
+    # Of what is flagged they do not matter.
+    moved.flag_array[:] = True
+    assert lunarray.from_uvdata(moved, tmp_path / "flagged.ccsds", pol_convention="sum").visibilities(0)["flag"].all()
     with pytest.raises(lunarray.Error, match="expected a file or folder that is there"):
         lunarray.from_uvdata(tmp_path / "none", tmp_path / "v.ccsds")
     with pytest.raises(lunarray.Error, match="pyuvdata cannot read it"):

@@ -1,7 +1,5 @@
 """What imports of visibilities refuse, and what they make good: satellites on circles, whose places are known at all times."""
 
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -252,7 +250,7 @@ def test_uvw_of_antennas_on_the_moon_are_not_taken_as_they_are(tmp_path):
 
     data = satellites(20.0 * np.arange(10))
     data.telescope.location = MoonLocation.from_selenodetic(170, 0, 0)
-    with pytest.raises(lunarray.Error, match="a telescope is on the Moon; expected no positions"):
+    with pytest.raises(lunarray.Error, match="a telescope is on the Moon; expected none"):
         lunarray.from_uvdata(data, tmp_path / "v", positions="uvw")
 
 
