@@ -169,7 +169,7 @@ fn the_page_has_the_numbers_of_its_commands() {
     let place = Workplace::new(SMALL);
     let (numbers, _) = figure(&place, "spacing", &["pipelines/paper-10mhz.toml"]);
     let curves = numbers["curves"].as_array().unwrap();
-    for (ratio, k) in [(2, 10), (3, 20), (4, 30), (6, 50), (10, 90)] {
+    for (ratio, k) in [(2, 10), (3, 20), (6, 50)] {
         let q0 = curves.iter().map(|curve| format!(" {:.4} |", curve["q0"][k].as_f64().unwrap()));
         let row = format!("| {ratio} |{}", q0.collect::<String>());
         assert!(page.contains(&row), "docs/paper.md lacks {row}");
