@@ -1,9 +1,12 @@
 """Visibilities that other programs made: values, directions and maps, by pyuvsim, lunarsky and healpy."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import healpy
+import mpi4py
 import numpy as np
 import pytest
 import yaml
@@ -55,7 +58,11 @@ def simulated(folder, catalogue, times, span_days):
     }
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
     code = "import pyuvsim, sys; pyuvsim.run_uvsim(sys.argv[1])"
-    ran = subprocess.run([sys.executable, "-W", "ignore", "-c", code, folder / "settings.yaml"], capture_output=True, text=True)
+    # mpi4py looks for the library of the package mpich beside the interpreter, which may see other environments' packages.
+    libmpi = Path(mpi4py.__file__).parents[3] / "libmpi.so.12"
+    environment = {**os.environ, **({"MPI4PY_LIBMPI": str(libmpi)} if libmpi.exists() else {})}
+    words = [sys.executable, "-W", "ignore", "-c", code, folder / "settings.yaml"]
+    ran = subprocess.run(words, capture_output=True, text=True, env=environment)
     assert (folder / "far.uvh5").exists(), ran.stderr
     return folder / "far.uvh5"
 
