@@ -105,6 +105,22 @@ impl Iteration {
     }
 }
 
+/// Solves a system for one right-hand side from zero. `product` multiplies by the matrix, `precondition` in place by the preconditioner.
+pub(in crate::imaging) fn solve_one(
+    b: &[f64],
+    rule: StoppingRule,
+    product: &dyn Fn(&[f64]) -> Vec<f64>,
+    precondition: &dyn Fn(&mut [f64]),
+) -> (Vec<f64>, Convergence) {
+    let mut iteration = Iteration::new(b, vec![0.0; b.len()], None, precondition);
+    while iteration.needs_step(rule) {
+        let along = product(&iteration.direction);
+        iteration.step(&along, precondition);
+    }
+    let convergence = iteration.convergence(rule);
+    (iteration.x, convergence)
+}
+
 impl System<'_> {
     /// Multiplies several vectors by `BtN^-1B + R`.
     fn apply(&self, x: &[&[f64]]) -> Vec<Vec<f64>> {

@@ -9,7 +9,7 @@ mod traces;
 mod vectors;
 mod watch;
 
-pub(super) use conjugate_gradients::System;
+pub(super) use conjugate_gradients::{System, solve_one};
 pub use conjugate_gradients::{Convergence, StoppingRule};
 pub use error::SolveError;
 pub use fit::Fit;

@@ -10,12 +10,10 @@ use serde::Serialize;
 use std::sync::Arc;
 
 use super::find::PatchData;
+use crate::imaging::solver::{Convergence, StoppingRule, solve_one};
 use crate::numerics::fft_length;
 
-/// Residual of the normal equations, relative to the right-hand side, in the preconditioner's norm.
-const RESIDUAL_MAX: f64 = 1e-4;
-/// Maximum iterations.
-const ITERATIONS_MAX: usize = 50;
+const RULE: StoppingRule = StoppingRule { residual_max: 1e-4, iterations_max: 50 };
 /// The least part of the noise's variance that counts as that of a sky, in standard deviations of the image's variance.
 const SIGNIFICANT: f64 = 5.0;
 
@@ -115,10 +113,9 @@ impl PatchData<'_> {
         let pixel_sigma_jy = (excess / squared_beam).sqrt();
         let r = pixel_sigma_jy.powi(-2);
         let filter = Filter::new(grid.side, beam, self.sums.weight);
-        let precondition = |x: &[f64]| {
-            let mut z = filter.divide(x, r);
-            z.iter_mut().zip(&inside).filter(|(_, inside)| !**inside).for_each(|(z, _)| *z = 0.0);
-            z
+        let precondition = |x: &mut [f64]| {
+            let z = filter.divide(x, r);
+            x.iter_mut().zip(&z).zip(&inside).for_each(|((x, z), inside)| *x = if *inside { *z } else { 0.0 });
         };
         let product = |x: &[f64]| {
             let mut values = self.transform.forward(x);
@@ -127,27 +124,10 @@ impl PatchData<'_> {
             y.iter_mut().zip(x).for_each(|(y, x)| *y += r * x);
             y
         };
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let mut residual: Vec<f64> = image_jy.iter().map(|value| self.sums.weight * value).collect();
-        let mut direction = precondition(&residual);
-        let mut norm = dot(&residual, &direction);
-        let first = norm;
-        let mut x = vec![0.0; residual.len()];
-        let mut iterations = 0;
-        while iterations < ITERATIONS_MAX && norm > RESIDUAL_MAX * RESIDUAL_MAX * first {
-            let along = product(&direction);
-            let step = norm / dot(&direction, &along);
-            x.iter_mut().zip(&direction).for_each(|(x, d)| *x += step * d);
-            residual.iter_mut().zip(&along).for_each(|(r, a)| *r -= step * a);
-            let next = precondition(&residual);
-            let next_norm = dot(&residual, &next);
-            let beta = next_norm / norm;
-            norm = next_norm;
-            direction.iter_mut().zip(&next).for_each(|(d, z)| *d = z + beta * *d);
-            iterations += 1;
-        }
-        let residual = (norm / first).sqrt();
-        Some(SmoothMap { pixel_jy: x, report: SmoothReport { pixel_sigma_jy, iterations, residual } })
+        let right: Vec<f64> = image_jy.iter().map(|value| self.sums.weight * value).collect();
+        let (pixel_jy, Convergence { iterations, residual, .. }) =
+            solve_one(&right, RULE, &product, &precondition);
+        Some(SmoothMap { pixel_jy, report: SmoothReport { pixel_sigma_jy, iterations, residual } })
     }
 }
 
