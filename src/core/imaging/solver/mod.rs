@@ -9,8 +9,8 @@ mod traces;
 mod vectors;
 mod watch;
 
-pub(super) use conjugate_gradients::{System, solve_one};
 pub use conjugate_gradients::{Convergence, StoppingRule};
+pub(super) use conjugate_gradients::{System, solve_one};
 pub use error::SolveError;
 pub use fit::Fit;
 pub(super) use fit::FitInputs;

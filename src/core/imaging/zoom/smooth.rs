@@ -115,7 +115,10 @@ impl PatchData<'_> {
         let filter = Filter::new(grid.side, beam, self.sums.weight);
         let precondition = |x: &mut [f64]| {
             let z = filter.divide(x, r);
-            x.iter_mut().zip(&z).zip(&inside).for_each(|((x, z), inside)| *x = if *inside { *z } else { 0.0 });
+            x.iter_mut()
+                .zip(&z)
+                .zip(&inside)
+                .for_each(|((x, z), inside)| *x = if *inside { *z } else { 0.0 });
         };
         let product = |x: &[f64]| {
             let mut values = self.transform.forward(x);

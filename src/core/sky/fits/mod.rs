@@ -11,6 +11,7 @@ mod error;
 mod frequency;
 mod header;
 mod image;
+mod keywords;
 mod metadata;
 mod read;
 mod table;
