@@ -200,8 +200,9 @@ fn what_needs_a_circle_is_refused_for_ellipses() {
         "spacecraft.ninth.on=true",
     ] {
         let said = fail(&["check", &place.pipeline, "--set", set]);
-        let (key, _) = set.split_once('=').unwrap();
-        let told = format!("{key} = ");
+        let (key, value) = set.split_once('=').unwrap();
+        let shown = if value == "true" { value.to_owned() } else { format!("{value:?}") };
+        let told = format!("{key} = {shown}");
         assert!(said.contains(&told) && said.contains("needs a common circle"), "{set}: {said}");
     }
 }

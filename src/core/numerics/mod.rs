@@ -15,4 +15,5 @@ pub(crate) mod wigner;
 pub(crate) use fft_length::fft_length;
 pub(crate) use lagrange::lagrange_weights;
 pub use real::Real;
+pub(crate) use statistics::SIGMA_OF_MEDIAN;
 pub use statistics::{median, percentiles};

@@ -1,5 +1,8 @@
 //! Order statistics.
 
+/// A standard deviation of normal numbers, in medians of their moduli.
+pub(crate) const SIGMA_OF_MEDIAN: f64 = 1.4826;
+
 /// The median (the upper one of an even number of values); `None` without values.
 pub fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;

@@ -9,7 +9,7 @@ use super::error::ProductsError;
 use super::pictures::{BeamMark, ColourScale, Palette, Patch as PatchPicture, Scaling, draw_patches};
 use crate::files::write_atomically;
 use crate::imaging::zoom::{ImageNoise, Patch, PointSource, SmoothReport, Zoom, ZoomBeam, place_errors};
-use crate::numerics::median;
+use crate::numerics::{SIGMA_OF_MEDIAN, median};
 use crate::sky::fits::{Card, image_bytes};
 use crate::sky::{Cutout, Frame, PlaneProjection};
 use crate::units::Dimension;
@@ -17,8 +17,6 @@ use crate::units::vector::{Vec3, dot};
 
 /// Side of the squares in which noise is measured, in beams.
 const NOISE_BEAMS: f64 = 40.0;
-/// A standard deviation of normal numbers, in medians of their moduli.
-const SIGMA_OF_MEDIAN: f64 = 1.4826;
 /// Pixels of the picture.
 const PICTURE_PIXELS: usize = 600;
 /// Greatest distance of a source from the one that it is identified with, in beams.

@@ -56,6 +56,13 @@ pub(super) fn is_of_strength_zero(problem: &str, set: &Table) -> bool {
 }
 
 impl Config {
+    /// The value of a key as a file has it.
+    pub(super) fn shown(&self, key: &str) -> String {
+        let set = Table::try_from(self).unwrap_or_default();
+        let default = || flat_keys().into_iter().find(|known| known.path == key)?.default;
+        value_of(&set, key).cloned().or_else(default).map_or_else(String::new, |value| value.to_string())
+    }
+
     /// Keys of `sections` (of all sections if the list is empty) that differ from their defaults and have no effect.
     pub(super) fn without_effect(&self, sections: &[&str]) -> Problems {
         let mut found = Problems::default();

@@ -1,5 +1,6 @@
 //! The configuration of a whole pipeline, with its checks and hashes.
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -174,6 +175,13 @@ impl Config {
         }
     }
 
+    /// Requires that `good` holds of a key, whose value a message then has.
+    fn require(&self, checks: &mut Checks, key: &str, good: bool, expected: impl Into<Cow<'static, str>>) {
+        if !good {
+            checks.require(key, self.shown(key), false, expected);
+        }
+    }
+
     /// Requires settings that are possible for satellites that do not share a circular orbit.
     fn check_orbits(&self, checks: &mut Checks) {
         if self.array.is_circle() {
@@ -183,35 +191,20 @@ impl Config {
         let visibilities = spacecraft.fidelity == Fidelity::Visibilities;
         let is_general = spacecraft.model != ModelChoice::Harmonic;
         let isotropic = spacecraft.antenna == Antenna::Isotropic;
-        for (key, value, good, expected) in [
-            ("map.engine", "\"harmonic\"", map.method() != Method::Harmonic, "\"pixel\", or map.refine,"),
-            ("spacecraft.fidelity", "\"samples\"", visibilities, "\"visibilities\""),
-            ("spacecraft.model", "\"harmonic\"", is_general, "\"auto\", \"general\" or \"direct\""),
-            (
-                "spacecraft.antenna",
-                "(dipoles)",
-                isotropic || map.refine.is_on(),
-                "\"isotropic\", or map.refine,",
-            ),
-            (
-                "spacecraft.moon_temperature_k",
-                "(above 0, with dipoles)",
-                isotropic || spacecraft.moon_temperature_k == 0.0,
-                "0",
-            ),
-            (
-                "spacecraft.moon_reflection",
-                "(above 0, with dipoles)",
-                isotropic || spacecraft.moon_reflection == 0.0,
-                "0",
-            ),
-            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
+        for (key, good, expected) in [
+            ("map.engine", map.method() != Method::Harmonic, "\"pixel\", or map.refine,"),
+            ("spacecraft.fidelity", visibilities, "\"visibilities\""),
+            ("spacecraft.model", is_general, "\"auto\", \"general\" or \"direct\""),
+            ("spacecraft.antenna", isotropic || map.refine.is_on(), "\"isotropic\", or map.refine,"),
+            ("spacecraft.moon_temperature_k", isotropic || spacecraft.moon_temperature_k == 0.0, "0"),
+            ("spacecraft.moon_reflection", isotropic || spacecraft.moon_reflection == 0.0, "0"),
+            ("spacecraft.ninth.on", !spacecraft.ninth.on, "false"),
         ] {
             let expected = format!(
                 "{expected} with array.kepler, array.oem, array.stations, array.propagate, array.eccentricity or array.cross_track_ratio: the \
                      other needs a common circle"
             );
-            checks.require(key, value, good, expected);
+            self.require(checks, key, good, expected);
         }
         let reflection = spacecraft.moon_reflection;
         let is_possible = reflection == 0.0 || !self.array.is_on_surface();
@@ -219,10 +212,10 @@ impl Config {
         checks.require("spacecraft.moon_reflection", reflection, is_possible, expected);
         let is_possible = isotropic || !self.array.is_on_surface();
         let expected = "\"isotropic\" with array.stations: dipoles are normal to an orbit";
-        checks.require("spacecraft.antenna", "(dipoles)", is_possible, expected);
+        self.require(checks, "spacecraft.antenna", is_possible, expected);
         let is_possible = !self.map.refine.is_on() || !self.array.is_on_surface();
-        let expected = "none with array.stations: refined maps from the ground have not been validated";
-        checks.require("map.refine", "(set)", is_possible, expected);
+        let expected = "0 with array.stations: refined maps from the ground have not been validated";
+        self.require(checks, "map.refine.passes_max", is_possible, expected);
         let rate = self.downlink.rate_bits_per_s_max;
         let is_possible = rate == 0.0 || !self.array.is_on_surface();
         let expected = "0 with array.stations: they observe while the Earth is hidden, and a relay that is not simulated takes the data";
@@ -241,15 +234,15 @@ impl Config {
         let spacecraft = &self.spacecraft;
         let is_direct = is_sampled || matches!(spacecraft.model, ModelChoice::Direct | ModelChoice::General);
         let is_flat = spacecraft.moon_reflection == 0.0 || spacecraft.moon_mirror == MoonMirror::Flat;
-        for (key, value, good, expected) in [
-            ("spacecraft.model", "(other)", is_direct, "\"direct\" or \"general\""),
-            ("spacecraft.moon_temperature_k", "(above 0)", spacecraft.moon_temperature_k == 0.0, "0"),
-            ("spacecraft.moon_mirror", "\"sphere\"", is_flat, "\"flat\""),
+        for (key, good, expected) in [
+            ("spacecraft.model", is_direct, "\"direct\" or \"general\""),
+            ("spacecraft.moon_temperature_k", spacecraft.moon_temperature_k == 0.0, "0"),
+            ("spacecraft.moon_mirror", is_flat, "\"flat\""),
         ] {
             let expected = format!(
                 "{expected} with instrument.tilt_along_deg, tilt_radial_deg, pattern, pattern_by_frequency or antenna_files"
             );
-            checks.require(key, value, good, expected);
+            self.require(checks, key, good, expected);
         }
         // A flat mirror's image is seen from below, where an antenna that leans away from the Moon has another response.
         let leans = !self.instrument.tilt_radial_deg.is_none() || self.instrument.antenna_files.is_some();
@@ -266,30 +259,17 @@ impl Config {
         let key_of_sources = if self.sky.moving.is_empty() { "sky.points" } else { "sky.moving" };
         let spacecraft = &self.spacecraft;
         let is_plain = spacecraft.antenna != Antenna::DipoleNormal || self.array.is_circle();
-        for (key, value, good, expected) in [
-            (
-                "spacecraft.fidelity",
-                "\"samples\"",
-                spacecraft.fidelity == Fidelity::Visibilities,
-                "\"visibilities\"",
-            ),
-            ("spacecraft.ninth.on", "true", !spacecraft.ninth.on, "false"),
-            ("spacecraft.moon_reflection", "(above 0)", spacecraft.moon_reflection == 0.0, "0"),
-            (
-                "spacecraft.antenna",
-                "\"dipole-normal\"",
-                is_plain,
-                "another antenna, or daughters on one circle,",
-            ),
-            ("instrument", "(errors of antennas)", !self.instrument.has_own_antennas(), "ideal antennas"),
+        for (key, good, expected) in [
+            ("spacecraft.fidelity", spacecraft.fidelity == Fidelity::Visibilities, "\"visibilities\""),
+            ("spacecraft.ninth.on", !spacecraft.ninth.on, "false"),
+            ("spacecraft.moon_reflection", spacecraft.moon_reflection == 0.0, "0"),
+            ("spacecraft.antenna", is_plain, "another antenna, or daughters on one circle,"),
         ] {
-            checks.require(
-                key,
-                value,
-                good,
-                format!("{expected} with {key_of_sources}, which is not simulated otherwise"),
-            );
+            let expected = format!("{expected} with {key_of_sources}, which is not simulated otherwise");
+            self.require(checks, key, good, expected);
         }
+        let expected = format!("ideal antennas with {key_of_sources}, which is not simulated otherwise");
+        checks.require("instrument", "(errors of antennas)", !self.instrument.has_own_antennas(), expected);
     }
 
     /// Requires that the van Vleck correction is for the daughters' quantiser.

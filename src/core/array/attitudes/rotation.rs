@@ -1,5 +1,6 @@
 //! Rotations as unit quaternions, and interpolation among them.
 
+use crate::numerics::lagrange_weights;
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale};
 
 /// A rotation: vector part and scalar part of a quaternion of length 1.
@@ -73,9 +74,7 @@ pub(super) fn interpolated(times_s: &[f64], rotations: &[Rotation], at_s: f64) -
     let from = rotations[nearest];
     let back = from.inverse();
     let mut turn_rad = [0.0; 3];
-    for (k, rotation) in rotations.iter().enumerate() {
-        let factor = |j: usize| (at_s - times_s[j]) / (times_s[k] - times_s[j]);
-        let weight: f64 = (0..times_s.len()).filter(|j| *j != k).map(factor).product();
+    for (rotation, weight) in rotations.iter().zip(lagrange_weights(times_s, at_s)) {
         turn_rad = add(turn_rad, scale(weight, back.times(*rotation).vector_rad()));
     }
     from.times(Rotation::about(turn_rad))

@@ -8,6 +8,7 @@ use super::estimates::{Counts, DaughterEstimate, GainEstimate, GainState};
 use super::fit::Unexplained;
 use super::robust_fit::RobustFit;
 use super::stability::Excess;
+use crate::numerics::median;
 
 /// Coverage: errors must stay within this many stated standard deviations. Angles wrap, and at low signal-to-noise
 /// the phase error of a gain exceeds the Cramer-Rao bound.
@@ -89,10 +90,9 @@ impl GainAssessment<'_> {
         if self.config.amplitude_scale == AmplitudeScale::UnitMean {
             return 0.0;
         }
-        let mut fractions = self.unexplained.by_gain[c * satellites..(c + 1) * satellites].to_vec();
-        fractions.sort_unstable_by(f64::total_cmp);
+        let fractions = self.unexplained.by_gain[c * satellites..(c + 1) * satellites].to_vec();
         // Errors below the noise of single daughters may be significant in the sum over all pairs.
-        0.25 * fractions.get(satellites / 2).copied().unwrap_or(0.0).max(self.unexplained.by_channel[c])
+        0.25 * median(fractions).unwrap_or(0.0).max(self.unexplained.by_channel[c])
     }
 
     /// Variance of a gain's logarithm due to errors of the model: the persistent error that was detected; if the daughter's residuals

@@ -1,6 +1,6 @@
 //! Visibilities of a map by spherical harmonics, for pairs on one circular orbit.
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use num_complex::Complex64;
@@ -57,7 +57,7 @@ impl Circle {
         let pairs: Vec<&PairOrientation> = pairs.iter().flatten().filter(within).collect();
         let longest_m = pairs.iter().map(|pair| pair.baseline_m).fold(0.0, f64::max);
         let long = || pairs.iter().filter(|pair| pair.baseline_m >= 0.5 * longest_m);
-        let inclination_deg = median(long().map(|pair| prograde_rad(pair).to_degrees()).collect())?;
+        let inclination_deg = median(long().map(|pair| pair.prograde_rad().to_degrees()).collect())?;
         Some(Self {
             inclination_deg: (inclination_deg / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG,
             radius_m: (median(long().map(|pair| pair.radius_m).collect())? / RADIUS_STEP_M).round()
@@ -67,7 +67,7 @@ impl Circle {
 
     /// Whether a pair is on the circle, to within a negligible phase.
     fn contains(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
-        let tilt_rad = (prograde_rad(pair) - self.inclination_rad()).abs();
+        let tilt_rad = (pair.prograde_rad() - self.inclination_rad()).abs();
         let off_rad = tilt_rad + pair.radius_difference_m.abs() / pair.baseline_m;
         (pair.radius_m - self.radius_m).abs() <= RADIUS_STEP_M
             && off_rad * TAU * (pair.baseline_m / wavelength_m + 1.0) <= PHASE_RAD_MAX
@@ -76,11 +76,6 @@ impl Circle {
     fn inclination_rad(&self) -> f64 {
         self.inclination_deg.to_radians()
     }
-}
-
-/// Inclination of a pair's plane, rad, taken as prograde.
-fn prograde_rad(pair: &PairOrientation) -> f64 {
-    pair.inclination_rad.min(PI - pair.inclination_rad)
 }
 
 /// Longest baseline of the tables for a map, wavelengths.
@@ -254,7 +249,7 @@ mod tests {
                 *alm.get_mut(l, m) = Complex64::new(stream.random::<f64>() - 0.5, im);
             }
         }
-        *alm.get_mut(0, 0) = (10.0 * (4.0 * PI).sqrt()).into();
+        *alm.get_mut(0, 0) = (10.0 * (4.0 * std::f64::consts::PI).sqrt()).into();
         let values = Transform::new(nside, 24).unwrap().synthesis(&alm).unwrap();
         SkyMap::new(Frame::Ecliptic, values).unwrap()
     }

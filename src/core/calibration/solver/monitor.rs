@@ -26,6 +26,7 @@ use super::estimates::{GainEstimate, GainState};
 use super::events::InstrumentEvent;
 use super::solution::PassSolution;
 use super::verdict::ModelVerdict;
+use crate::numerics::SIGMA_OF_MEDIAN;
 
 /// Threshold of a step, in standard deviations, which are raised to at least the scatter from pass to pass (see `inflate_sigmas`).
 const JUMP_SIGMAS: f64 = 6.0;
@@ -134,7 +135,7 @@ fn inflate_sigmas(changes: &mut [Change], select: impl Fn(&mut Change) -> &mut V
             let list = &sizes[&(daughter, *channel)];
             // A median of fewer than three values says nothing about outliers.
             if list.len() >= 3 {
-                *sigma = sigma.max(1.4826 * list[list.len() / 2]);
+                *sigma = sigma.max(SIGMA_OF_MEDIAN * list[list.len() / 2]);
             }
         }
     }

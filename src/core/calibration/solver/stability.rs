@@ -12,6 +12,7 @@ use num_complex::Complex64;
 use super::layout::{ParameterLayout, ParameterValues};
 use super::part_gains::{PairPart, fit_part};
 use super::sums::ModelledBlock;
+use crate::numerics::median;
 
 /// Number of parts of an interval.
 const PARTS: usize = 32;
@@ -417,10 +418,8 @@ const HIDDEN_PART: f64 = 0.25;
 
 /// Variance of a phase's change that may be hidden by changes of most other daughters.
 fn hidden_variance(changing: &[(usize, Scatter)], satellites: usize) -> f64 {
-    let mut variances: Vec<f64> = changing.iter().map(|(_, scatter)| scatter.variance[1]).collect();
-    variances.sort_unstable_by(f64::total_cmp);
-    let median = variances.get(variances.len() / 2).copied().unwrap_or(0.0);
-    if 2 * changing.len() > satellites { HIDDEN_PART * median } else { 0.0 }
+    let variances = changing.iter().map(|(_, scatter)| scatter.variance[1]).collect();
+    if 2 * changing.len() > satellites { HIDDEN_PART * median(variances).unwrap_or(0.0) } else { 0.0 }
 }
 
 /// Chi-square (two degrees of freedom) of a certain jump: noise reaches it at fewer than one of a hundred million

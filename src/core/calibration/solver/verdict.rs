@@ -7,6 +7,7 @@ use super::config::{AmplitudeScale, CalibrationMode, SolverConfig};
 use super::diagnosis::ModelFault;
 use super::estimates::{DaughterEstimate, GainEstimate, GainState};
 use super::sums::PairSums;
+use crate::numerics::median;
 
 /// Verdict on the model of a channel.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Encode, Decode)]
@@ -117,15 +118,10 @@ fn unexplained_if_wrong(gains: &[&GainEstimate], model_error: f64, least: f64) -
     let fractions =
         gains.iter().zip(&drifts).map(|(gain, by_drift)| gain.unexplained - DRIFT_MARGIN * by_drift);
     // The median over daughters: a single daughter may have another problem.
-    let fraction = model_error.max(upper_median(fractions.collect()));
+    let fraction = model_error.max(median(fractions.collect()).unwrap_or(0.0));
     let most_fit_poorly = count > 0 && 2 * poor > count;
-    let by_drift = upper_median(drifts);
+    let by_drift = median(drifts).unwrap_or(0.0);
     (most_fit_poorly || fraction > least.max(BLURRED_FRACTION * by_drift)).then_some(fraction)
-}
-
-fn upper_median(mut values: Vec<f64>) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// Twice the logarithm of the likelihood ratio from which amplitudes have a factor in common. Independent amplitudes of eight

@@ -148,12 +148,10 @@ pub(in crate::imaging) fn nearest_circle(
     use std::f64::consts::PI;
     let orientation = |at: TimedPair| PairOrientation::of_pair(at.r_i_m, at.r_j_m).ok();
     let found: Vec<PairOrientation> = (0..count).filter_map(|k| orientation(at(k))).collect();
-    // If satellite j leads, the normal of the pair's plane is reversed.
-    let prograde = |pair: &PairOrientation| pair.inclination_rad.min(PI - pair.inclination_rad);
     let mean = |value: &dyn Fn(&PairOrientation) -> f64| {
         found.iter().map(value).sum::<f64>() / found.len().max(1) as f64
     };
-    let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&prograde));
+    let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&PairOrientation::prograde_rad));
     let inclination_deg = (orbit_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     let mean_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
     // Positions are untrusted: the circle must lie above the surface and be larger than the longest baseline.

@@ -46,10 +46,8 @@ pub(in crate::imaging) const RADIUS_STEP_M: f64 = 100.0;
 pub fn nominal_orbit(placed: &PlacedVisibilities, limits: GeometryLimits) -> Option<NominalOrbit> {
     let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
     let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of_pair(r_i_m, r_j_m).ok())?;
-    // If satellite j leads, the normal of the pair's plane is reversed; orbits are assumed prograde.
-    let inclination_rad = found.inclination_rad.min(std::f64::consts::PI - found.inclination_rad);
     let inclination_deg =
-        (inclination_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
+        (found.prograde_rad().to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     Some(NominalOrbit {
         inclination_rad: inclination_deg.to_radians(),
         radius_m: (found.radius_m / RADIUS_STEP_M).round() * RADIUS_STEP_M,

@@ -155,7 +155,7 @@ pub struct Samples {
     pub gibbs: bool,
 }
 
-/// A map as likely as the map itself: a draw from the posterior.
+/// A draw from the posterior of the map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sample {
     /// The map, K.

@@ -19,7 +19,7 @@ pub struct StoppingRule {
 pub struct Convergence {
     /// Number of products with BtN^-1B.
     pub iterations: usize,
-    /// `sqrt(r.Mr / b.Mb)`, M the preconditioner, r the residual, b the right-hand side.
+    /// `sqrt(r.Mr / b.Mb)`: r the residual, b the right-hand side, M the preconditioner, which approximates the inverse of the matrix.
     pub residual: f64,
     /// Whether the target residual was reached before the iteration limit or an interruption.
     pub converged: bool,
@@ -279,7 +279,7 @@ mod tests {
         assert!(products[0] == 0 && products[1] == 1 && products[2] > 5 && products[3] > 5, "{products:?}");
         let converged: Vec<bool> = found.iter().map(|one| one.converged).collect();
         assert_eq!(converged, [true, true, true, true, false]);
-        // The matrix is that of the right-hand side.
+        // The solution satisfies `(A + 0.5 I) x = b`.
         let mut again = vec![0.0; ORDER];
         matrix.apply(&together[3], &mut again);
         for (k, (y, x)) in again.iter().zip(&together[3]).enumerate() {

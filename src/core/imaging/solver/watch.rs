@@ -80,7 +80,7 @@ struct WatchState {
 pub struct NamedWatch<'a> {
     watch: &'a SolveWatch,
     name: &'a str,
-    /// Whether the solution continues after the run was cancelled, within the time limit.
+    /// Whether it is of a final map, which may still begin after the run was cancelled, for few iterations and within the time limit.
     has_priority: bool,
 }
 
@@ -145,7 +145,7 @@ impl<'a> NamedWatch<'a> {
         self.has_priority
     }
 
-    /// Sets whether the solution is of a final map, which continues after cancellation (the default), or of an intermediate one.
+    /// Sets whether the solution is of a final map (the default), which may still begin after cancellation, or of an intermediate one.
     #[must_use]
     pub fn with_priority(self, has_priority: bool) -> Self {
         Self { has_priority, ..self }

@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::averaging::Row;
 use super::points::{PointFit, PointSource, RowSums, subtract};
 use super::transform::{PatchTransform, PixelGrid};
-use crate::numerics::median;
+use crate::numerics::{SIGMA_OF_MEDIAN, median};
 
 /// Sources must exceed the noise at least by this factor.
 const THRESHOLD_MIN: f64 = 5.0;
@@ -29,8 +29,6 @@ const SOURCES_MAX: usize = 1000;
 const STEPS: usize = 2;
 /// Sources nearer to each other than this, in beams, are one.
 const APART_BEAMS: f64 = 0.6;
-/// A standard deviation of normal numbers, in medians of their moduli.
-const SIGMA_OF_MEDIAN: f64 = 1.4826;
 
 /// The sources of a patch, and what is left.
 #[derive(Clone, Debug)]

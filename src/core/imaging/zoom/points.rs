@@ -7,15 +7,14 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 
 use super::averaging::Row;
+use crate::imaging::solver::{StoppingRule, solve_one};
 use crate::numerics::trigonometry::sin_cos;
 
 /// Rows whose sums are made together; sums of such blocks are added in order, so that results do not depend on threads.
 const BLOCK: usize = 2048;
 
-/// Residual of the normal equations of a step at which the step is good enough.
-const STEP_RESIDUAL: f64 = 1e-3;
-/// Maximum products of a step.
-const STEP_PRODUCTS: usize = 12;
+/// When a step is good enough.
+const STEP: StoppingRule = StoppingRule { residual_max: 1e-3, iterations_max: 12 };
 /// Greatest motion of a position in one step, in beams.
 const STEP_BEAMS: f64 = 0.5;
 
@@ -157,37 +156,19 @@ pub struct PointFit<'a> {
 impl PointFit<'_> {
     /// Moves sources towards the least squares, given the residuals of the rows. Unknowns are flux, l and m of each.
     pub fn step(&self, sources: &mut [PointSource], residuals: &[Complex64]) {
-        let mut residual = self.normal_product(sources, None, residuals);
         let blocks: Vec<[[f64; 2]; 2]> =
             sources.iter().map(|source| self.sums.covariance(&bounded(source, self.sums))).collect();
-        let precondition = |r: &[f64]| -> Vec<f64> {
-            let of_source = |(r, block): (&[f64], &[[f64; 2]; 2])| {
-                [
-                    r[0] / self.sums.weight,
-                    block[0][0] * r[1] + block[0][1] * r[2],
-                    block[1][0] * r[1] + block[1][1] * r[2],
-                ]
-            };
-            r.chunks_exact(3).zip(&blocks).flat_map(of_source).collect()
-        };
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let mut direction = precondition(&residual);
-        let mut square = dot(&residual, &direction);
-        let (first, mut change) = (square, vec![0.0; residual.len()]);
-        for _ in 0..STEP_PRODUCTS {
-            if square.is_nan() || square <= STEP_RESIDUAL * STEP_RESIDUAL * first {
-                break;
+        let precondition = |r: &mut [f64]| {
+            for (r, block) in r.chunks_exact_mut(3).zip(&blocks) {
+                let [l, m] = [r[1], r[2]];
+                r[0] /= self.sums.weight;
+                r[1] = block[0][0] * l + block[0][1] * m;
+                r[2] = block[1][0] * l + block[1][1] * m;
             }
-            let product = self.normal_product(sources, Some(&direction), &[]);
-            let length = square / dot(&direction, &product);
-            change.iter_mut().zip(&direction).for_each(|(x, d)| *x += length * d);
-            residual.iter_mut().zip(&product).for_each(|(r, p)| *r -= length * p);
-            let next = precondition(&residual);
-            let next_square = dot(&residual, &next);
-            let beta = next_square / square;
-            square = next_square;
-            direction.iter_mut().zip(&next).for_each(|(d, z)| *d = z + beta * *d);
-        }
+        };
+        let product = |x: &[f64]| self.normal_product(sources, Some(x), &[]);
+        let right = self.normal_product(sources, None, residuals);
+        let (change, _) = solve_one(&right, STEP, &product, &precondition);
         for (source, change) in sources.iter_mut().zip(change.chunks_exact(3)) {
             if change.iter().any(|value| !value.is_finite()) {
                 continue;

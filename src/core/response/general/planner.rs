@@ -10,6 +10,7 @@ use super::classes::Classes;
 use super::plan::{ObservationDetails, POSITION_STEP_S_MAX, RowNode, RowPlan, Track, has_known_motion};
 use super::view::{Axes, PairView, euler_angles, transported};
 use super::{RowsError, RowsRefusal, RowsSetup, TimedPair};
+use crate::numerics::lagrange_weights;
 use crate::units::vector::{Vec3, add, dot, norm, scale, sub};
 
 /// Gap in a pair's data that ends a track, s: polynomials do not extend over times without data.
@@ -364,10 +365,8 @@ fn positions(known: &[&TimedPair], time_s: f64) -> [Vec3; 2] {
         after.saturating_sub(INTERPOLATION_TIMES / 2).min(known.len().saturating_sub(INTERPOLATION_TIMES));
     let near = &known[first..(first + INTERPOLATION_TIMES).min(known.len())];
     let mut out = [[0.0; 3]; 2];
-    for (k, at) in near.iter().enumerate() {
-        let others = near.iter().enumerate().filter(|(other, _)| *other != k);
-        let weight: f64 =
-            others.map(|(_, other)| (time_s - other.time_s) / (at.time_s - other.time_s)).product();
+    let times_s: Vec<f64> = near.iter().map(|at| at.time_s).collect();
+    for (at, weight) in near.iter().zip(lagrange_weights(&times_s, time_s)) {
         out = [add(out[0], scale(weight, at.r_i_m)), add(out[1], scale(weight, at.r_j_m))];
     }
     out

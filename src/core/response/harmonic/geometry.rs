@@ -136,6 +136,11 @@ impl GeometryRefusal {
 const BASELINE_M_MIN: f64 = 1e-3;
 
 impl PairOrientation {
+    /// Inclination of the pair's plane, rad, of a prograde orbit: where satellite j leads, the plane's normal is reversed.
+    pub(crate) fn prograde_rad(&self) -> f64 {
+        self.inclination_rad.min(std::f64::consts::PI - self.inclination_rad)
+    }
+
     /// Computes the orientation of a pair at these positions (m, Moon-centred, ecliptic axes).
     ///
     /// # Errors
