@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use lunarray::pipeline::{ConfigSource, GroupSize, GroupStep, MapStep, Plan, RunSummary, run_in_groups};
+use lunarray::pipeline::{ConfigSource, GroupSize, JobEvent, MapStep, Plan, RunSummary, run_in_groups};
 use lunarray::runtime::Cancel;
 use lunarray::units::ChannelId;
 use serde_json::Value;
@@ -197,8 +197,8 @@ fn a_ground_is_told_when_its_sums_will_outgrow_memory() {
 }
 
 /// The only reading of a group.
-fn mapped(group: usize) -> GroupStep {
-    GroupStep::Map(MapStep { group, part: 0, parts: 1 })
+fn mapped(group: usize) -> JobEvent {
+    JobEvent::Map(MapStep::whole(group))
 }
 
 /// All files but `summary.json`, which has times.
@@ -235,10 +235,10 @@ fn a_run_in_groups_goes_on_where_it_was_cancelled() {
     assert!(expected.len() > 6, "{:?}", expected.keys());
     let groups = plan.run_groups(GroupSize::Channels(1), None).unwrap();
     let steps = [
-        GroupStep::Simulate(0),
-        GroupStep::Simulate(1),
-        GroupStep::Simulate(2),
-        GroupStep::Merge,
+        JobEvent::Simulate(0),
+        JobEvent::Simulate(1),
+        JobEvent::Simulate(2),
+        JobEvent::Merge,
         mapped(0),
         mapped(1),
         mapped(2),
@@ -292,7 +292,7 @@ fn other_settings_begin_anew() {
     run_in_groups(&second, &groups, folder.path(), &Cancel::default(), &mut |step, _| seen.push(step))
         .unwrap();
     // The downlink is the same; no map is. Skies, which take a while, are told as well.
-    let of_channel = |number: u16| [GroupStep::Sky(ChannelId(number)), mapped(number.into())];
+    let of_channel = |number: u16| [JobEvent::Sky(ChannelId(number)), mapped(number.into())];
     assert_eq!(seen, [of_channel(0), of_channel(1)].concat());
     let expected = tempfile::tempdir().unwrap();
     lunarray::pipeline::run(&second, expected.path(), &Cancel::default(), &mut |_| {}).unwrap();

@@ -9,7 +9,7 @@ use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
 
 use super::common::process::{signal, start};
-use super::common::workplace::{SMALL, Workplace, fail, json, succeed};
+use super::common::workplace::{SMALL, Workplace, fail, json, lunarray, succeed};
 
 /// Two epsilons and two limits of the baselines, each in cases of its own.
 const STUDY: &str = r#"
@@ -354,4 +354,52 @@ fn the_first_signal_ends_a_study_in_order() {
     assert!(rest.iter().any(|line| line.contains("repeat the command to go on")), "{rest:?}");
     let summary: Value = serde_json::from_slice(&bytes(format!("{out}/study.json"))).unwrap();
     assert!(summary["cancelled"] == true && !summary["cases"].as_array().unwrap().is_empty());
+}
+
+/// Two seeds, each with a downlink of its own, and two solutions that share the sums.
+const TWO_DOWNLINKS: &str = r#"
+pipeline = "pipeline.toml"
+set = ["products.pictures=false"]
+[[axis]]
+key = "seed"
+values = [1, 2]
+[[axis]]
+key = "map.epsilon"
+values = [1e-6, 1e-2]
+"#;
+
+#[test]
+fn what_is_kept_is_used_only_if_it_is_whole_and_of_the_same_downlink() {
+    let place = Workplace::new(SMALL);
+    let study = place.file("study.toml", TWO_DOWNLINKS.as_bytes());
+    let maps = |out: &str| {
+        let folders = ["1-epsilon-0.000001", "1-epsilon-0.01", "2-epsilon-0.000001", "2-epsilon-0.01"];
+        folders.map(|folder| bytes(format!("{out}/case-seed-{folder}/3.000MHz/map.fits")))
+    };
+    let [plain, kept] = ["plain", "kept"].map(|name| place.path(name));
+    succeed(&["study", &study, "--out", &plain]);
+    let expected = maps(&plain);
+    succeed(&["study", &study, "--out", &kept, "--keep"]);
+    assert!(maps(&kept) == expected, "each downlink has a state of its own");
+    // Only downlinks stay, and they are cut as by a process that was killed.
+    let mut cut = 0;
+    for entry in std::fs::read_dir(&kept).unwrap().map(|entry| entry.unwrap()) {
+        if entry.file_type().unwrap().is_dir() {
+            std::fs::remove_dir_all(entry.path()).unwrap();
+        } else if entry.path().extension().is_some_and(|ending| ending == "ccsds") {
+            let file = std::fs::OpenOptions::new().write(true).open(entry.path()).unwrap();
+            file.set_len(file.metadata().unwrap().len() / 2).unwrap();
+            cut += 1;
+        }
+    }
+    assert_eq!(cut, 2);
+    succeed(&["study", &study, "--out", &kept, "--keep"]);
+    assert!(maps(&kept) == expected, "a downlink that was cut is simulated again");
+    // Whole ones are not.
+    let whole = |name: &str| bytes(format!("{kept}/case-seed-{name}/case.json"));
+    std::fs::remove_file(format!("{kept}/case-seed-1-epsilon-0.01/case.json")).unwrap();
+    let output = lunarray(&["study", &study, "--out", &kept, "--keep"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success() && said.contains("mapping") && !said.contains("simulating"), "{said}");
+    assert!(!whole("1-epsilon-0.01").is_empty() && maps(&kept) == expected);
 }

@@ -16,7 +16,7 @@ use crate::downlink::transport::socket::ListenStatus;
 use crate::imaging::ChannelGroup;
 use crate::imaging::{SolutionClock, SolveWatch, Solving, SolvingPart};
 use crate::pipeline::{
-    CalibrateProgress, ChannelCost, GroupStep, INTEGRATE, MERGE, Plan, READ, RunChanges, RunGroups, RunView,
+    CalibrateProgress, ChannelCost, INTEGRATE, JobEvent, MERGE, Plan, READ, RunChanges, RunGroups, RunView,
 };
 use crate::runtime::Cancel;
 use crate::units::ChannelId;
@@ -224,45 +224,47 @@ impl GroupSteps {
     }
 
     /// Logs a step that begins, and shows the progress of its graph, if it has one.
-    pub(super) fn watch(&mut self, step: GroupStep, view: Option<RunView>, interrupt: &Interrupt) {
+    pub(super) fn watch(&mut self, event: JobEvent, view: Option<RunView>, interrupt: &Interrupt) {
         // The bar of the previous step ends first.
         self.progress = None;
-        self.begin(step);
+        self.begin(event);
         let Some(view) = view else { return };
         interrupt.arm_or_note();
-        let (stage, total) = match step {
-            GroupStep::Simulate(_) => (INTEGRATE, self.windows),
-            GroupStep::Merge => (MERGE, 0),
-            GroupStep::Map(_) | GroupStep::Sky(_) => (READ, 0),
+        let (stage, total) = match event {
+            JobEvent::Simulate(_) => (INTEGRATE, self.windows),
+            JobEvent::Merge => (MERGE, 0),
+            _ => (READ, 0),
         };
         self.progress = Some(Progress::watch(view, stage, total, interrupt.cancel()));
     }
 
     /// Logs a step that begins.
-    fn begin(&mut self, step: GroupStep) {
+    fn begin(&mut self, event: JobEvent) {
         let RunGroups { simulated, mapped } = &self.groups;
-        let (what, number, of, part) = match step {
-            GroupStep::Simulate(number) => ("simulated", number, simulated.len(), number),
-            GroupStep::Merge => ("merged", simulated.len(), simulated.len(), simulated.len()),
-            GroupStep::Map(step) => ("mapped", step.group, mapped.len(), simulated.len() + 1 + step.group),
-            GroupStep::Sky(channel) => return self.log_sky(channel),
+        let (what, number, of, part, group) = match event {
+            JobEvent::Simulate(number) => {
+                ("simulated", number, simulated.len(), number, simulated.get(number))
+            }
+            JobEvent::Merge => ("merged", simulated.len(), simulated.len(), simulated.len(), None),
+            JobEvent::Map(step) => {
+                let group = mapped.get(step.number).map(|group| &group.channels);
+                ("mapped", step.number, mapped.len(), simulated.len() + 1 + step.number, group)
+            }
+            JobEvent::Sky(channel) => return self.log_sky(channel),
+            // Events of cases of a study.
+            JobEvent::Calibrate(..) | JobEvent::Realise(_) => return,
         };
         let left_s = self.parts.begin(part);
-        let group = match step {
-            GroupStep::Simulate(number) => simulated.get(number),
-            GroupStep::Map(step) => mapped.get(step.group).map(|group| &group.channels),
-            GroupStep::Merge | GroupStep::Sky(_) => None,
-        };
         let channels: Vec<String> = group.into_iter().flatten().map(ToString::to_string).collect();
         let (left, listed) = (time_left(left_s), channels.join(", "));
-        let text = match step {
-            GroupStep::Simulate(_) => {
+        let text = match event {
+            JobEvent::Simulate(_) => {
                 format!("group {} of {of}: simulating channels {listed}{left}", number + 1)
             }
-            GroupStep::Merge | GroupStep::Sky(_) => format!("the downlink of all channels{left}"),
-            GroupStep::Map(step) => {
+            JobEvent::Map(step) => {
                 format!("group {} of {of}: mapping channels {listed}{step}{left}", number + 1)
             }
+            _ => format!("the downlink of all channels{left}"),
         };
         let fields =
             json!({ "what": what, "number": number + 1, "of": of, "channels": channels, "left_s": left_s });

@@ -32,7 +32,7 @@ use crate::files::{ProtectedInputs, is_same_name};
 use crate::frames::Instrument;
 use crate::ground::{ARCHIVE_BYTES_MAX, Collector, Ground, GroundConfig, GroundError, WAIT_BYTES};
 use crate::pipeline::{
-    Config, ConfigSource, GroundSource, GroupSize, MemoryAdvice, MemoryLimit, PipelineError, READ,
+    Config, ConfigSource, GroundSource, GroupSize, JobEvent, MemoryAdvice, MemoryLimit, PipelineError, READ,
     RunSummary, SettingsOrigin, channel_groups, main_products, replay, replay_in_groups, use_threads,
 };
 
@@ -353,8 +353,9 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
     let events = args.events.start(config, "ground", &main_products(config, &args.out))?;
     let mut parts = Parts::new(groups.iter().map(|group| group.channels.len() as f64));
     let mut progress = None;
-    let result = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |step, handles| {
-        let number = step.group;
+    let result = replay_in_groups(&args.files, config, &groups, &args.out, cancel, &mut |event, view| {
+        let (JobEvent::Map(step), Some(view)) = (event, view) else { return };
+        let number = step.number;
         if number == 0 {
             interrupt.arm_or_note();
         }
@@ -369,8 +370,8 @@ fn in_groups(args: &ReplayArgs, config: &Config, size: GroupSize) -> CommandResu
         });
         let left = time_left(left_s);
         say("group", &fields, format_args!("group {} of {of}: channels {listed}{step}{left}", number + 1));
-        events.watch(&handles);
-        progress = Some(Progress::watch(handles, READ, 0, cancel));
+        events.watch(&view);
+        progress = Some(Progress::watch(view, READ, 0, cancel));
     });
     drop(progress);
     let result = result.map_err(CommandError::from);

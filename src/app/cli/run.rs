@@ -123,8 +123,8 @@ fn in_groups(args: &RunArgs, plan: &Plan, size: GroupSize, out: &Path) -> Comman
     let groups = plan.run_groups(size, args.pipeline.memory_limit())?;
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
-    let result = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |step, view| {
-        steps.watch(step, view, &interrupt);
+    let result = run_in_groups(plan, &groups, out, interrupt.cancel(), &mut |event, view| {
+        steps.watch(event, view, &interrupt);
     });
     drop(steps);
     let Some(summary) = result? else {

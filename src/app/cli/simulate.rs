@@ -163,8 +163,8 @@ fn in_groups(args: &SimulateArgs, plan: &Plan, size: GroupSize, out: &Path) -> C
     let groups = RunGroups { simulated, mapped: Vec::new() };
     let interrupt = Interrupt::default();
     let mut steps = GroupSteps::new(plan, &groups);
-    let result = simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |step, view| {
-        steps.watch(step, view, &interrupt);
+    let result = simulate_in_groups(plan, &groups.simulated, out, interrupt.cancel(), &mut |event, view| {
+        steps.watch(event, view, &interrupt);
     });
     drop(steps);
     let reports = result?;

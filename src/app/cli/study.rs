@@ -12,7 +12,7 @@ use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::{CalibrateLines, Progress};
 use crate::files::ProtectedInputs;
 use crate::pipeline::{
-    INTEGRATE, MemoryLimit, READ, Segment, Study, StudyStep, StudySummary, run_study, use_threads,
+    INTEGRATE, JobEvent, MemoryLimit, READ, Segment, Study, StudySummary, run_study, use_threads,
 };
 use crate::products::{Crossing, EpsilonChoice, EpsilonChoices};
 
@@ -69,34 +69,36 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     let interrupt = Interrupt::default();
     let mut progress: Option<Progress> = None;
     let mut gains: Option<(usize, CalibrateLines)> = None;
-    let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |number, step| {
+    let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |event, view| {
         interrupt.arm_or_note();
-        let case = &study.cases[number];
-        let (of, label) = (study.cases.len(), case.label());
-        let begin = |what: &str| {
+        let of = study.cases.len();
+        let begin = |number: usize, what: &str| {
+            let label = study.cases[number].label();
             let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
             say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
         };
-        let (handles, what, stage, total) = match step {
-            StudyStep::Calibrate(calibration) => {
+        let (number, what, stage, total) = match event {
+            JobEvent::Calibrate(number, calibration) => {
                 drop(progress.take());
                 if gains.as_ref().is_none_or(|(case, _)| *case != number) {
-                    begin("calibrating");
+                    begin(number, "calibrating");
                     gains = Some((number, CalibrateLines::new()));
                 }
                 gains.iter_mut().for_each(|(_, lines)| lines.show(&calibration));
                 return;
             }
-            StudyStep::Simulate(handles) => {
-                (handles, "simulating for", INTEGRATE, case.plan.progress_windows())
+            JobEvent::Simulate(number) => {
+                (number, "simulating for", INTEGRATE, study.cases[number].plan.progress_windows())
             }
-            StudyStep::Map(handles) => (handles, "mapping", READ, 0),
-            StudyStep::Realise(handles) => (handles, "noise of", READ, 0),
+            JobEvent::Map(step) => (step.number, "mapping", READ, 0),
+            JobEvent::Realise(number) => (number, "noise of", READ, 0),
+            // The channels of a case are not in groups.
+            JobEvent::Sky(_) | JobEvent::Merge => return,
         };
         // The bar of the previous step ends first.
         drop(progress.take());
-        begin(what);
-        progress = Some(Progress::watch(handles, stage, total, interrupt.cancel()));
+        begin(number, what);
+        progress = view.map(|view| Progress::watch(view, stage, total, interrupt.cancel()));
     })?;
     drop(progress);
     if summary.cancelled {

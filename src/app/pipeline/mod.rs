@@ -27,10 +27,9 @@ pub use graph::{
 pub(crate) use graph::{Change, RunChanges};
 #[doc(hidden)]
 pub use jobs::{
-    BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, GroupStep, GroupStepWatcher,
-    GroupWatcher, MERGE, MapStep, PowerSpread, RealisationSpread, Study, StudyCase, StudyError, StudyStep,
-    StudySummary, StudyWatcher, ZoomCentre, ZoomJob, ZoomReport, bound, channel_groups, joint_channels,
-    replay_in_groups, run_in_groups, run_study, sample_state, simulate_in_groups, solve_state,
-    solve_states_jointly, with_gains, zoom_downlink,
+    BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, JobEvent, JobWatcher, MERGE, MapStep,
+    PowerSpread, RealisationSpread, Study, StudyCase, StudyError, StudySummary, ZoomCentre, ZoomJob,
+    ZoomReport, bound, channel_groups, joint_channels, replay_in_groups, run_in_groups, run_study,
+    sample_state, simulate_in_groups, solve_state, solve_states_jointly, with_gains, zoom_downlink,
 };
 pub use jobs::{CalibrateJob, Mission, calibrate};

@@ -1,10 +1,10 @@
-//! Summary of a finished case of a study, and the markers that tell which steps of a job are done.
+//! Summary of a finished case of a study, and the step that makes it.
 
-use std::fs;
 use std::path::Path;
 
 use serde::Serialize;
 
+use super::step::Step;
 use super::study_file::StudyCase;
 use crate::products::RunFigures;
 
@@ -22,7 +22,7 @@ pub struct CaseSummary {
 }
 
 /// Name of the marker of a finished case.
-pub(super) const MARKER: &str = "case.json";
+const MARKER: &str = "case.json";
 
 /// Content of the marker of a finished case: everything that decides its result. If it differs, the case is run again.
 #[derive(Serialize)]
@@ -33,8 +33,12 @@ struct CaseMarker {
     config: serde_json::Value,
 }
 
-/// The text of the marker of a case.
-pub(super) fn marker_of(case: &StudyCase) -> Vec<u8> {
+/// The step that makes the products of a case.
+pub(super) fn step_of(case: &StudyCase, out: &Path) -> Step<'static> {
+    Step::Marked(out.join(case.folder()).join(MARKER), marker_of(case))
+}
+
+fn marker_of(case: &StudyCase) -> Vec<u8> {
     let config = &case.plan.config;
     let mut value = serde_json::to_value(config).unwrap_or_default();
     if let Some(sections) = value.as_object_mut() {
@@ -48,14 +52,4 @@ pub(super) fn marker_of(case: &StudyCase) -> Vec<u8> {
     }
     let (space_hash, ground_hash) = (config.space_hash(), config.ground_hash());
     serde_json::to_vec_pretty(&CaseMarker { space_hash, ground_hash, config: value }).unwrap_or_default()
-}
-
-/// Whether a step of a job is done: its marker is there, with the text of what decides its result.
-pub(super) fn is_marked(marker: &Path, text: impl AsRef<[u8]>) -> bool {
-    fs::read(marker).is_ok_and(|found| found == text.as_ref())
-}
-
-/// Hash of what decides the result of a step.
-pub(super) fn key_of(text: impl AsRef<[u8]>) -> u64 {
-    crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, text.as_ref())
 }

@@ -9,9 +9,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use super::case::{is_marked, key_of};
-use super::group_steps::{GroupStep, GroupStepWatcher, MapStep};
+use super::event::{JobEvent, JobWatcher, MapStep};
 use super::simulation_groups::simulate_in_groups;
+use super::step::{Outcome, Step, key_of};
 use crate::downlink::FileSource;
 use crate::ground::{Collector, Ground, GroundConfig, WAIT_BYTES};
 use crate::imaging::ChannelGroup;
@@ -22,12 +22,9 @@ use crate::pipeline::graph::run::{
     FinishedGraph, collect_summary, lock_products, run_ground, write_settings, write_summary,
 };
 use crate::pipeline::graph::summary::GroupRecord;
-use crate::pipeline::graph::{RunScope, RunSummary, RunView, downlink_file, space_segment};
-use crate::products::{Truth, write_product};
+use crate::pipeline::graph::{RunScope, RunSummary, downlink_file, space_segment};
+use crate::products::Truth;
 use crate::runtime::Cancel;
-
-/// Callback that receives the step and the handles of its graph before each reading of the files.
-pub type GroupWatcher<'a> = &'a mut dyn FnMut(MapStep, RunView);
 
 /// Divides the channels of the instrument that `files` describe into groups, in order.
 ///
@@ -74,7 +71,7 @@ pub fn replay_in_groups(
     groups: &[MapGroup],
     out: &Path,
     cancel: &Cancel,
-    watch: GroupWatcher<'_>,
+    watch: JobWatcher<'_>,
 ) -> Result<RunSummary, PipelineError> {
     let _lock = lock_products(config, out)?;
     let job = GroupedReplay { scope: RunScope::Ground, files, config, groups, out };
@@ -97,7 +94,7 @@ impl GroupedReplay<'_> {
         &self,
         truth: &dyn Fn(&ChannelGroup) -> Result<Truth, PipelineError>,
         cancel: &Cancel,
-        watch: GroupWatcher<'_>,
+        watch: JobWatcher<'_>,
     ) -> Result<RunSummary, PipelineError> {
         let Self { scope, config, groups, out, .. } = *self;
         let mut done: Vec<GroupRecord> = Vec::new();
@@ -111,7 +108,7 @@ impl GroupedReplay<'_> {
                 continue;
             }
             let finished =
-                self.read_group(MapStep { group: number, part: 0, parts: *parts }, truth, cancel, watch)?;
+                self.read_group(MapStep { number, part: 0, parts: *parts }, truth, cancel, watch)?;
             let autocorrelations = finished.autocorrelation_count();
             let mut reading = collect_summary(scope, config, out, finished)?;
             if number > 0 {
@@ -165,10 +162,10 @@ impl GroupedReplay<'_> {
         mut step: MapStep,
         truth: &dyn Fn(&ChannelGroup) -> Result<Truth, PipelineError>,
         cancel: &Cancel,
-        watch: GroupWatcher<'_>,
+        watch: JobWatcher<'_>,
     ) -> Result<FinishedGraph, PipelineError> {
         let Self { files, config, groups, out, .. } = *self;
-        let group = &groups[step.group].channels;
+        let group = &groups[step.number].channels;
         let mut part = (step.parts > 1).then(|| SumPart::first(step.parts, out));
         loop {
             let next = part.as_ref().and_then(SumPart::next);
@@ -176,7 +173,7 @@ impl GroupedReplay<'_> {
                 GroundConfig { group: Some(group.clone()), part: part.take(), ..config.ground(WAIT_BYTES) };
             let (source, ground) = (FileSource::open(files)?, Ground::new(&settings)?);
             let truth = if next.is_some() { Truth::unknown() } else { truth(group)? };
-            let mut on_start = |handles| watch(step, handles);
+            let mut on_start = |view| watch(JobEvent::Map(step), Some(view));
             let finished = run_ground(truth, source, config, ground, out, cancel, &mut on_start)?;
             if next.is_none() || cancel.is_cancelled() {
                 return Ok(finished);
@@ -216,7 +213,7 @@ pub fn run_in_groups(
     groups: &RunGroups,
     out: &Path,
     cancel: &Cancel,
-    watch: GroupStepWatcher<'_>,
+    watch: JobWatcher<'_>,
 ) -> Result<Option<RunSummary>, PipelineError> {
     let config = &plan.config;
     let _lock = lock_products(config, out)?;
@@ -224,25 +221,23 @@ pub fn run_in_groups(
     let RunGroups { simulated, mapped } = groups;
     let file = out.join(downlink_file(config.downlink.format));
     let marker = out.join(SIMULATED);
-    if !is_marked(&marker, downlink_key(plan, &file)) {
+    let outcome = Step::Downlink(marker.clone(), config, &file).run(|| {
         let reports = simulate_in_groups(plan, simulated, &file, cancel, watch)?;
-        if reports.last().is_some_and(|report| report.cancelled) {
-            return Ok(None);
-        }
-        write_product(&marker, downlink_key(plan, &file))?;
+        Ok(Outcome::of(reports.last().is_some_and(|report| report.cancelled)))
+    })?;
+    if outcome.is_cancelled() {
+        return Ok(None);
     }
     let watch = RefCell::new(watch);
     let truth = |group: &ChannelGroup| {
         group.iter().try_fold(Truth::unknown(), |truth, &channel| {
-            (watch.borrow_mut())(GroupStep::Sky(channel), None);
+            (watch.borrow_mut())(JobEvent::Sky(channel), None);
             Ok(truth.with(channel, &space_segment::sky(plan, channel)?, config.map_shape())?)
         })
     };
     let files = [file];
     let job = GroupedReplay { scope: RunScope::Whole, files: &files, config, groups: mapped, out };
-    let summary = job.run(&truth, cancel, &mut |step, handles| {
-        (watch.borrow_mut())(GroupStep::Map(step), Some(handles));
-    })?;
+    let summary = job.run(&truth, cancel, &mut |event, view| (watch.borrow_mut())(event, view))?;
     let summary = write_summary(summary, out)?;
     if !summary.cancelled {
         let _ = fs::remove_file(&marker);
@@ -250,15 +245,8 @@ pub fn run_in_groups(
     Ok(Some(summary))
 }
 
-/// Name of the marker file of a complete simulated downlink; it contains the downlink's key.
+/// Name of the marker of a complete simulated downlink.
 const SIMULATED: &str = ".simulated";
-
-/// Text that identifies a downlink by version, settings and length.
-fn downlink_key(plan: &Plan, file: &Path) -> String {
-    let config = &plan.config;
-    let bytes = fs::metadata(file).map_or(0, |found| found.len());
-    format!("{} {:016x} {:?} {bytes}", env!("CARGO_PKG_VERSION"), config.space_hash(), config.downlink)
-}
 
 /// Name of the file that keeps the record of a mapped group.
 fn record_name(group: &ChannelGroup) -> String {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::step::Outcome;
 use crate::downlink::FileSource;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::Samples;
@@ -51,20 +52,20 @@ pub(in crate::pipeline) fn noise_file(out: &Path, frequency_hz: f64, number: usi
 }
 
 impl NoiseMaps<'_> {
-    /// Makes the maps, with as many realisations per reading as memory allows; `false` if it was cancelled.
+    /// Makes the maps, with as many realisations per reading as memory allows.
     pub(in crate::pipeline) fn make(
         &self,
         cancel: &Cancel,
         watch: OnStart<'_>,
-    ) -> Result<bool, PipelineError> {
+    ) -> Result<Outcome, PipelineError> {
         let mut number = 2;
         for seeds in self.seeds.chunks(self.realisations_per_reading()) {
-            if !self.make_in_one_reading(number, seeds, cancel, watch)? {
-                return Ok(false);
+            if self.make_in_one_reading(number, seeds, cancel, watch)?.is_cancelled() {
+                return Ok(Outcome::Cancelled);
             }
             number += seeds.len();
         }
-        Ok(true)
+        Ok(Outcome::Done)
     }
 
     /// Number of realisations that fit into memory beside the other sums; at least one.
@@ -89,7 +90,7 @@ impl NoiseMaps<'_> {
         seeds: &[u64],
         cancel: &Cancel,
         watch: OnStart<'_>,
-    ) -> Result<bool, PipelineError> {
+    ) -> Result<Outcome, PipelineError> {
         let config = self.config;
         let mut graph = Graph::new();
         let source = FileSource::open(&[self.file.to_owned()])?;
@@ -101,7 +102,7 @@ impl NoiseMaps<'_> {
         let setup = config.solver(solving.clone())?;
         graph.sink("noise maps", sums, NoiseMapSolver { setup, out: self.out.to_owned(), first });
         watch(RunView { solving, ..RunView::without_ground(&graph) });
-        Ok(!start_single_process(graph, &config.runtime, cancel)?.cancelled)
+        Ok(Outcome::of(start_single_process(graph, &config.runtime, cancel)?.cancelled))
     }
 }
 

@@ -5,8 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::case::key_of;
-use super::group_steps::{GroupStep, GroupStepWatcher};
+use super::event::{JobEvent, JobWatcher};
+use super::step::{Outcome, Step, key_of};
 use crate::downlink::Recorder;
 use crate::imaging::ChannelGroup;
 use crate::mother::{Merger, SpoolReader, SpoolWriter};
@@ -49,7 +49,7 @@ pub fn simulate_in_groups(
     groups: &[ChannelGroup],
     file: &Path,
     cancel: &Cancel,
-    watch: GroupStepWatcher<'_>,
+    watch: JobWatcher<'_>,
 ) -> Result<Vec<Report>, PipelineError> {
     let key = plan.spool_key();
     run::write_truth(plan, file)?;
@@ -58,28 +58,28 @@ pub fn simulate_in_groups(
     let mut reports = Vec::new();
     for (number, group) in groups.iter().enumerate() {
         let path = spool_path(file, group);
-        if SpoolReader::open(&path, key)?.is_some() {
-            continue;
-        }
-        let writer = SpoolWriter::create(&path, key, plan.windows.len())?;
-        let mut graph = Graph::new();
-        let mut sky = |channel: ChannelId| {
-            watch(GroupStep::Sky(channel), None);
-            space_segment::sky(plan, channel)
-        };
-        let skies: Vec<Option<SkyMap>> = (0..plan.schedules.len())
-            .map(|channel| ChannelId(channel as u16))
-            .map(|channel| group.contains(&channel).then(|| sky(channel)).transpose())
-            .collect::<Result<_, _>>()?;
-        let present: Vec<Option<&SkyMap>> = skies.iter().map(Option::as_ref).collect();
-        let frames = space_segment::add_integration(&mut graph, plan, &present)?;
-        drop(skies);
-        graph.sink(SPOOL, frames, writer);
-        watch(GroupStep::Simulate(number), Some(RunView::without_ground(&graph)));
-        let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
-        let is_cancelled = report.cancelled;
-        reports.push(report);
-        if is_cancelled {
+        let outcome = Step::Spool(&path, key).run(|| {
+            let writer = SpoolWriter::create(&path, key, plan.windows.len())?;
+            let mut graph = Graph::new();
+            let mut sky = |channel: ChannelId| {
+                watch(JobEvent::Sky(channel), None);
+                space_segment::sky(plan, channel)
+            };
+            let skies: Vec<Option<SkyMap>> = (0..plan.schedules.len())
+                .map(|channel| ChannelId(channel as u16))
+                .map(|channel| group.contains(&channel).then(|| sky(channel)).transpose())
+                .collect::<Result<_, _>>()?;
+            let present: Vec<Option<&SkyMap>> = skies.iter().map(Option::as_ref).collect();
+            let frames = space_segment::add_integration(&mut graph, plan, &present)?;
+            drop(skies);
+            graph.sink(SPOOL, frames, writer);
+            watch(JobEvent::Simulate(number), Some(RunView::without_ground(&graph)));
+            let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
+            let outcome = Outcome::of(report.cancelled);
+            reports.push(report);
+            Ok(outcome)
+        })?;
+        if outcome.is_cancelled() {
             return Ok(reports);
         }
     }
@@ -101,7 +101,7 @@ pub fn simulate_in_groups(
     let bytes = space_segment::add_downlink(&mut graph, plan, frames)?;
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
-    watch(GroupStep::Merge, Some(RunView::without_ground(&graph)));
+    watch(JobEvent::Merge, Some(RunView::without_ground(&graph)));
     let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
     if !report.cancelled {
         remove_spools(groups, file)?;

@@ -9,17 +9,19 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::calibrate::{CalibrateJob, CalibrateProgress, calibrate, with_gains};
-use super::case::{CaseSummary, MARKER, is_marked, key_of, marker_of};
+use super::calibrate::{CalibrateJob, calibrate, with_gains};
+use super::case::{CaseSummary, step_of};
+use super::event::{JobEvent, JobWatcher, MapStep};
 use super::noise_maps::NoiseMaps;
 use super::realisations::{RealisationSpread, SpreadProducts, spreads, spreads_csv};
+use super::step::{Outcome, Step, key_of};
 use super::study_file::{Study, StudyCase};
 use crate::calibration::solver::SolverConfig;
 use crate::downlink::{FileSource, Recorder};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
 use crate::pipeline::graph::run::{DownlinkSinks, lock_folder, replay_with_truth, simulate_skies};
-use crate::pipeline::graph::{RunView, downlink_file, space_segment};
+use crate::pipeline::graph::{downlink_file, space_segment};
 use crate::products::{
     Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, create_folder, crossings,
     draw_epsilons, draw_runs, epsilon_choices, epsilons_csv, runs_csv, spectra_csv, write_product,
@@ -29,22 +31,6 @@ use crate::sky::SkyMap;
 
 /// Number of visibilities between checkpoints of a shared state: a minute's work or more.
 const CHECKPOINT_EVERY: u64 = 20_000_000;
-
-/// A step of a study, for one case.
-#[derive(Clone, Debug)]
-pub enum StudyStep {
-    /// Simulate the downlink that the case shares with others.
-    Simulate(RunView),
-    /// Calibrate the data.
-    Calibrate(CalibrateProgress),
-    /// Map the data.
-    Map(RunView),
-    /// Map additional noise realisations.
-    Realise(RunView),
-}
-
-/// Callback that receives the number of the case, from 0, and each step before it runs.
-pub type StudyWatcher<'a> = &'a mut dyn FnMut(usize, StudyStep);
 
 /// Results of a study.
 #[derive(Clone, Debug, Serialize)]
@@ -81,7 +67,7 @@ struct StudyRun<'a> {
     study: &'a Study,
     out: &'a Path,
     cancel: &'a Cancel,
-    watch: StudyWatcher<'a>,
+    watch: JobWatcher<'a>,
 }
 
 /// Runs the cases of a study that are not finished in `out`, and writes tables and curves of all cases.
@@ -96,7 +82,7 @@ pub fn run_study(
     out: &Path,
     keep: bool,
     cancel: &Cancel,
-    watch: StudyWatcher<'_>,
+    watch: JobWatcher<'_>,
 ) -> Result<StudySummary, PipelineError> {
     create_folder(out)?;
     let _lock = lock_folder(out)?;
@@ -105,13 +91,18 @@ pub fn run_study(
     let mut pending: Vec<usize> = (0..study.cases.len()).filter(pending).collect();
     let mut is_cancelled = false;
     while let (Some(&first), false) = (pending.first(), is_cancelled) {
-        let key = downlink_key(&study.cases[first].plan.config);
+        let config = &study.cases[first].plan.config;
+        let key = downlink_key(config);
         let (group, rest): (Vec<usize>, Vec<usize>) =
             pending.iter().partition(|&&k| downlink_key(&study.cases[k].plan.config) == key);
-        let file = out.join(format!("downlink-{key:016x}.{}", extension(&study.cases[first].plan.config)));
-        is_cancelled = !run.make_group(&group, &file, keep)?;
+        let file = out.join(format!("downlink-{key:016x}.{}", extension(config)));
+        let marker = file.with_added_extension("simulated");
+        let downlink = Step::Downlink(marker.clone(), config, &file);
+        is_cancelled = run.make_group(&group, &downlink, &file, keep)?.is_cancelled();
         if !is_cancelled && !keep {
-            fs::remove_file(&file).map_err(ProductsError::write(&file))?;
+            for path in [&file, &marker] {
+                fs::remove_file(path).map_err(ProductsError::write(path))?;
+            }
         }
         pending = rest;
     }
@@ -126,7 +117,7 @@ fn extension(config: &Config) -> &'static str {
 }
 
 fn is_done(case: &StudyCase, out: &Path) -> bool {
-    is_marked(&out.join(case.folder()).join(MARKER), marker_of(case))
+    matches!(step_of(case, out).is_done(), Ok(true))
 }
 
 /// Hash of the settings that decide the downlink.
@@ -134,11 +125,12 @@ fn downlink_key(config: &Config) -> u64 {
     key_of(serde_json::to_vec(&(config.space_hash(), &config.downlink)).unwrap_or_default())
 }
 
-/// Hash of the settings that decide the sums of a downlink.
+/// Hash of the settings that decide the sums, so that each downlink has states of its own.
 fn sums_key(case: &StudyCase) -> u64 {
     let config = &case.plan.config;
     let (map, solver) = (&config.map, case.calibrated.then_some(&config.calibrate));
     let sums = (
+        downlink_key(config),
         map.sum_settings(),
         &map.beyond_files,
         map.snapshot_every_s,
@@ -158,23 +150,32 @@ struct LastTruth {
 }
 
 impl StudyRun<'_> {
-    /// Runs the cases of one downlink; `false` if it was cancelled.
-    fn make_group(&mut self, group: &[usize], file: &Path, keep: bool) -> Result<bool, PipelineError> {
+    /// Runs the cases of one downlink.
+    fn make_group(
+        &mut self,
+        group: &[usize],
+        downlink: &Step<'_>,
+        file: &Path,
+        keep: bool,
+    ) -> Result<Outcome, PipelineError> {
         let cases = &self.study.cases;
         let plan = &cases[group[0]].plan;
         let skies = space_segment::skies(plan)?;
-        if !file.exists() {
+        let outcome = downlink.run(|| {
             let recorder = Some(Recorder::create(file)?);
             let sinks = DownlinkSinks { file: Some(file.to_owned()), recorder, socket: None };
             let watch = &mut self.watch;
-            let report = simulate_skies(plan, &skies, sinks, self.cancel, &mut |handles| {
-                watch(group[0], StudyStep::Simulate(handles));
+            let report = simulate_skies(plan, &skies, sinks, self.cancel, &mut |view| {
+                watch(JobEvent::Simulate(group[0]), Some(view));
             })?;
             if report.cancelled {
                 // The downlink is incomplete.
                 let _ = fs::remove_file(file);
-                return Ok(false);
             }
+            Ok(Outcome::of(report.cancelled))
+        })?;
+        if outcome.is_cancelled() {
+            return Ok(outcome);
         }
         let mut left = group.to_vec();
         let mut last = None;
@@ -187,7 +188,7 @@ impl StudyRun<'_> {
             let map = &cases[first].plan.config.map;
             let is_shared = same.len() > 1 && map.snapshot_every_s == 0.0;
             let gains = if cases[first].calibrated {
-                let Some(gains) = self.calibrate(first, file)? else { return Ok(false) };
+                let Some(gains) = self.calibrate(first, file)? else { return Ok(Outcome::Cancelled) };
                 Some(gains)
             } else {
                 None
@@ -197,8 +198,9 @@ impl StudyRun<'_> {
                 let files = if number == 0 || !is_shared { &[file.to_owned()][..] } else { &[] };
                 let inputs =
                     CaseInputs { file, files, gains: gains.as_deref(), state: is_shared.then_some(&state) };
-                if !self.map(k, inputs, &skies, &mut last)? {
-                    return Ok(false);
+                let outcome = step_of(&cases[k], self.out).run(|| self.map(k, inputs, &skies, &mut last))?;
+                if outcome.is_cancelled() {
+                    return Ok(outcome);
                 }
             }
             if !keep && state.exists() {
@@ -206,7 +208,7 @@ impl StudyRun<'_> {
             }
             left = rest;
         }
-        Ok(true)
+        Ok(Outcome::Done)
     }
 
     /// Calibrates a downlink with the settings of a case, in a subfolder of its products. Returns the path of the gains; `None` if it
@@ -223,20 +225,20 @@ impl StudyRun<'_> {
             models: self.study.models.clone(),
             model_files: &self.study.model_files,
             out: &out,
-            watch: &mut |progress| watch(number, StudyStep::Calibrate(progress)),
+            watch: &mut |progress| watch(JobEvent::Calibrate(number, progress), None),
         };
         let summary = calibrate(job, self.cancel)?;
         Ok((!summary.cancelled).then(|| out.join("gains.json")))
     }
 
-    /// Maps a case; `false` if it was cancelled.
+    /// Maps a case.
     fn map(
         &mut self,
         number: usize,
         inputs: CaseInputs<'_>,
         skies: &[SkyMap],
         last: &mut Option<LastTruth>,
-    ) -> Result<bool, PipelineError> {
+    ) -> Result<Outcome, PipelineError> {
         let CaseInputs { file, files, gains, state } = inputs;
         let case = &self.study.cases[number];
         let with_gains = gains.map(|gains| with_gains(&case.plan.config, gains.to_owned()));
@@ -255,29 +257,14 @@ impl StudyRun<'_> {
         };
         let source = FileSource::open(files)?;
         let watch = &mut self.watch;
-        let summary =
-            replay_with_truth(truth, source, config, ground, &folder, self.cancel, &mut |handles| {
-                watch(number, StudyStep::Map(handles));
-            })?;
-        if summary.cancelled || !self.map_noise_realisations(number, config, file)? {
-            return Ok(false);
+        let summary = replay_with_truth(truth, source, config, ground, &folder, self.cancel, &mut |view| {
+            watch(JobEvent::Map(MapStep::whole(number)), Some(view));
+        })?;
+        if summary.cancelled {
+            return Ok(Outcome::Cancelled);
         }
-        write_product(&folder.join(MARKER), marker_of(case))?;
-        Ok(true)
-    }
-
-    /// Maps the additional noise realisations of a case; `false` if it was cancelled.
-    fn map_noise_realisations(
-        &mut self,
-        number: usize,
-        config: &Config,
-        file: &Path,
-    ) -> Result<bool, PipelineError> {
-        let case = &self.study.cases[number];
-        let out = self.out.join(case.folder());
-        let maps = NoiseMaps { config, file, out: &out, seeds: &case.noise_seeds };
-        let watch = &mut self.watch;
-        maps.make(self.cancel, &mut |handles| watch(number, StudyStep::Realise(handles)))
+        let maps = NoiseMaps { config, file, out: &folder, seeds: &case.noise_seeds };
+        maps.make(self.cancel, &mut |view| watch(JobEvent::Realise(number), Some(view)))
     }
 }
 
