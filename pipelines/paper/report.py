@@ -206,55 +206,39 @@ def latitudes(name):
     return table(["case", "mean, K", *head], rows)
 
 
-# Visibilities of all data with b < 2 b_p, by nside: some 700 a pixel, so that equal thinnings have equal numbers a pixel.
-ALL_DATA = {8: ("fig15-nside8", 566_823), 16: ("fig15-pixels", 2_034_350), 32: ("fig15-nside32", 8_671_988)}
-
-
-def traces_by_thinning(nside):
-    """Points of epsilon, Tr Sigma_n scaled to all data by the number of visibilities, Tr Sigma_s and T² Tr Sigma_s, by thinning."""
-    (name, visibilities_all), found = ALL_DATA[nside], {}
+def thinned(name, nside, visibilities_all):
+    """Rows of traces by thinning, Tr Sigma_n scaled to all data. What thinning adds to a trace goes as one over the number of
+    visibilities, so that two thinnings give that of all data; the crossing is on straight lines in logarithms."""
+    found, rows = {}, []
     for case in load(f"{name}/study.json")["cases"]:
         channel = case["figures"]["channels"][0]
-        named = re.search("thin = ([0-9]+)", case["figures"]["name"])
+        thin = int(case["figures"]["name"].split("thin = ")[1].split(",")[0])
         t2 = channel["power"]["input_k2"][0] / (4 * math.pi)
         traces = channel["diagnostics"]["traces"]
         n, s = traces["sigma_n_k2"]["value"] * channel["visibilities"] / visibilities_all, traces["sigma_s"]["value"]
-        found.setdefault(int(named[1]) if named else 200, []).append((channel["diagnostics"]["epsilon"], n, s, t2 * s))
-    return {thin: sorted(points) for thin, points in found.items()}
+        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, t2 * s))
+    named = {thin: "all" if thin == 1 else f"one in {thin}" for thin in found}
+    if 10 in found and 40 in found:
+        named[0] = "all, from 10 and 40"
+        found[0] = [(a[0], *[x - 9 / 30 * (y - x) for x, y in zip(a[1:], b[1:])]) for a, b in zip(found[10], found[40])]
+    for key, points in found.items():
+        crossing = None
+        for (e, n, _, ts), (e2, n2, _, ts2) in zip(points, points[1:]):
+            if n > ts > 0 and 0 < n2 < ts2:
+                above, above2 = math.log(n / ts), math.log(n2 / ts2)
+                crossing = e * (e2 / e) ** (above / (above - above2))
+        for e, n, s, ts in points:
+            rows.append([f"{nside}, {named[key]}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.2e}")])
+    return rows
 
 
 def pixel_traces():
-    """What thinning adds to a trace goes roughly as one over the number of visibilities, so that two thinnings give that of all data; where
-    there is one, it is scaled as the same thinning is at the next smaller nside. The crossing is on straight lines in logarithms."""
-    found = {nside: traces_by_thinning(nside) for nside in ALL_DATA}
-    for nside in (8, 16):
-        found[nside]["from 10 and 40"] = [
-            (a[0], *[x - 9 / 30 * (y - x) for x, y in zip(a[1:], b[1:])]) for a, b in zip(found[nside][10], found[nside][40])]
-    for nside, smaller, whole in ((16, 8, 1), (32, 8, 1), (32, 16, "from 10 and 40")):
-        found[nside][f"from 200 as at nside {smaller}"] = [
-            (a[0], *[x * y / z for x, y, z in zip(a[1:], b[1:], c[1:])])
-            for a, b, c in zip(found[nside][200], found[smaller][whole], found[smaller][200])]
-    rows = []
-    for nside, thinnings in found.items():
-        for thin, points in thinnings.items():
-            crossing = None
-            for (e, n, _, ts), (e2, n2, _, ts2) in zip(points, points[1:]):
-                if n > ts > 0 and 0 < n2 < ts2:
-                    above, above2 = math.log(n / ts), math.log(n2 / ts2)
-                    crossing = e * (e2 / e) ** (above / (above - above2))
-            named = thin if isinstance(thin, str) else "all" if thin == 1 else f"one in {thin}"
-            for e, n, s, ts in points:
-                rows.append([f"{nside}, {named}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.2e}")])
+    rows = thinned("fig15-nside8", 8, 566_823) + thinned("fig15-pixels", 16, 2_034_350)
     return table(["nside, data", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing"], rows)
 
 
 # Ecliptic longitude and latitude of the paper's patches.
 PATCHES = ("120,0", "120,30", "120,60")
-
-
-def map_folders():
-    """Folders of the maps of full size without a prior, by MHz."""
-    return {mhz: OUT / f"maps-{mhz}mhz" / load(f"maps-{mhz}mhz/study.json")["cases"][0]["folder"] for mhz in (10, 3)}
 
 
 def patches():
@@ -263,8 +247,9 @@ def patches():
     from PIL import Image
 
     rows, shown = [], ""
-    for mhz, case in map_folders().items():
-        folder = case / f"{mhz:.3f}MHz"
+    for mhz in (10, 3):
+        case = load(f"patches-{mhz}mhz/study.json")["cases"][0]
+        folder = OUT / f"patches-{mhz}mhz" / case["folder"] / f"{mhz:.3f}MHz"
         clean, noise = (healpy.read_map(folder / f"{name}-smooth.fits", dtype=float) for name in ("map", "noise"))
         healpy.write_map(folder / "with-noise.fits", clean + noise, dtype=float, coord="E", column_units="K", overwrite=True)
         panels = [folder / name for name in ("input-smooth.fits", "map-smooth.fits", "with-noise.fits")]
@@ -287,16 +272,17 @@ def patches():
 
 
 def maps():
-    import healpy
-
-    rows, ls = [], (4, 8, 12, 16, 20, 64, 128, 150)
-    for mhz, case in map_folders().items():
-        channel = json.loads((case / "summary.json").read_text())["channels"][0]
-        clean, noise = (healpy.read_map(case / f"{mhz:.3f}MHz/{name}.fits", dtype=float) for name in ("map", "noise"))
-        rows.append([f"{mhz}", f"{channel['visibilities']:,}", *[at(channel["rho"], l) for l in ls], f"{noise.std():.2e}",
-                     f"{100 * (clean < 0).mean():.2f}, {100 * (clean + noise < 0).mean():.2f}"])
-    head = ["MHz", "visibilities", *[f"rho_{l}" for l in ls], "noise, K rms", "% of pixels negative: without, with noise"]
-    return table(head, rows) + "\n" + latitudes("maps-10mhz") + "\n" + latitudes("maps-3mhz")
+    rows = []
+    for name, noise in (("paper-10mhz", "10"), ("paper-3mhz", "3")):
+        summary = load(f"{name}/summary.json")
+        channel = summary["channels"][0]
+        rho = channel["rho_noise_subtracted"] or channel["rho"]
+        rows.append(
+            [noise, f"{channel['visibilities']:,}", *[at(rho, l) for l in (8, 16, 32, 64, 96, 128)],
+             f"{channel['noise_rms_k']:.2e}", f"{summary['report']['elapsed_s'] / 60:.1f}"]
+        )
+    head = ["MHz", "visibilities", *[f"rho_{l}" for l in (8, 16, 32, 64, 96, 128)], "noise, K rms", "minutes"]
+    return table(head, rows)
 
 
 def uniformity():
@@ -432,24 +418,25 @@ def sky(mhz, nside=256, rest=""):
 
 def sheets(ulsa):
     """Title, what each command makes, and what is printed of it."""
-    def under(mhz, sources="true"):
+    def under(mhz):
         path = ulsa / f"ulsa_{mhz}mhz.fits"
-        return f" --set sky.file={path} --set 'sky.added={{small_scales=true,sources={sources}}}'" if path.exists() else ""
+        return f" --set sky.file={path} --set 'sky.added={{small_scales=true,sources=true}}'" if path.exists() else ""
 
     short = f"lunarray run {PIPELINE} --set spacecraft.duration_s=30000"
-    full_size = study("maps-10mhz", under(10)) | study("maps-3mhz", under(3))
-    priors = {
-        "full-sky/summary.json": f"{short} --set products.frame=ecliptic --set products.smooth_fwhm_deg=1.3{under(10)} --out out/full-sky",
-        "sky-10mhz-64.fits": "cp out/full-sky/10.000MHz/input.fits out/sky-10mhz-64.fits",
-        "wrong-10mhz-64.fits": "lunarray sky --like out/sky-10mhz-64.fits --correlation 0.8 --out out/wrong-10mhz-64.fits",
-    }
+    full_sky_run = {
+        "full-sky/summary.json": f"{short} --set products.frame=ecliptic --set products.smooth_fwhm_deg=1.3{under(10)} --out out/full-sky"}
+    priors = full_sky_run | {
+        "right-prior.fits": "cp out/full-sky/10.000MHz/input.fits out/right-prior.fits",
+        "wrong-prior.fits": "lunarray sky --like out/right-prior.fits --correlation 0.8 --out out/wrong-prior.fits"}
+    patched = {
+        f"patches-{mhz}mhz/study.json": f"lunarray study pipelines/paper/fig13-14-patches.toml{more}{under(mhz)} --out out/patches-{mhz}mhz"
+        for mhz, more in ((10, ""), (3, " --set spacecraft.channels_hz=[3e6] --set map.epsilon=1e-6"))}
     return [
         ("Fig. 1: a patch, and N(>S)",
          {f"sources-{mhz}mhz.csv": sky(mhz, 256, f" --out out/sky-{mhz}mhz.fits --sources out/sources-{mhz}mhz.csv") for mhz in (3, 10, 30)}
          | {"diffuse-10mhz.fits": sky(10, 256, " --set sky.generated.point_sources=false --out out/diffuse-10mhz.fits"),
             "patch.png": "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"}, counts),
-        ("Fig. 2: the full sky",
-         {name: priors[name] for name in ("full-sky/summary.json",)}, full_sky),
+        ("Fig. 2: the full sky", full_sky_run, full_sky),
         ("Fig. 3: q0 against R and R_2", drawn("spacing"), lambda: figure("spacing", spacing)),
         ("Fig. 4: time by baseline length", drawn("pair-time"), lambda: figure("pair-time", pair_time)),
         ("Fig. 4: time by direction (Sect. 4.4)", drawn("coverage", " --set spacecraft.channels_hz=[10e6,3e6]"), coverage),
@@ -460,14 +447,21 @@ def sheets(ulsa):
         ("Fig. 7: a row of B", drawn("rows", " --pair 5-6 --at 4.1736d"), lambda: figure("rows", beam_row)),
         ("Fig. 8: waterfalls of one pair", drawn("waterfall", " --pair 1-4 --at 6.65d"), lambda: figure("waterfall", waterfall)),
         ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
-         priors | full_size, maps),
+         {f"paper-{mhz}mhz/summary.json": f"lunarray run pipelines/paper-{mhz}mhz.toml" for mhz in (10, 3)}, maps),
         ("Fig. 9: by basis and R", study("fig9-basis"), lambda: latitudes("fig9-basis")),
         ("Fig. 9: is the noise uniform?", study("realisations", folder="pipelines/noise"), uniformity),
-        ("Fig. 11 and 12: a prior of 5 degrees, and a wrong one", priors | full_size,
-         lambda: correlation("maps-10mhz", (2, 4, 8, 12, 16, 32, 64, 128), "case") + "\n" + latitudes("maps-10mhz")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", priors | full_size, patches),
+        ("Fig. 9, 11 and 12: under the paper's sky at nside 32", priors | study("fig9-12-nside32", under(10)),
+         lambda: correlation("fig9-12-nside32", (2, 4, 8, 12, 16, 20, 32, 64), "case") + "\n" + latitudes("fig9-12-nside32")),
+        ("Fig. 11: a prior of 5 degrees",
+         {"sky-10mhz-512.fits": sky(10, 512, " --out out/sky-10mhz-512.fits")} | study("fig11-prior"),
+         lambda: correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
+        ("Fig. 12: a wrong prior",
+         {"sky-10mhz-64.fits": sky(10, 64, " --out out/sky-10mhz-64.fits"),
+          "wrong-10mhz-64.fits": "lunarray sky --like out/sky-10mhz-64.fits --correlation 0.8 --out out/wrong-10mhz-64.fits"}
+         | study("fig12-wrong-prior"), lambda: latitudes("fig12-wrong-prior")),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", patched, patches),
         ("Fig. 15: traces against epsilon",
-         study("fig15-nside8") | study("fig15-pixels") | study("fig15-nside32") | study("fig15-traces"),
+         study("fig15-nside8") | study("fig15-pixels") | study("fig15-traces"),
          lambda: pixel_traces() + "\n" + traces()),
         ("Fig. 16: rows at centres and averaged, rho_l without noise", study("fig16-17-rows"), lambda: rows_of_b("rho", "no noise")),
         ("Fig. 16: at nside 32", study("fig16-nside32"),
@@ -491,7 +485,7 @@ def sheets(ulsa):
              "sky-10mhz.fits": sky(10, 256, " --out out/sky-10mhz.fits"),
              "sub-pixel-matrix.png": "python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits",
              "sigma-b-8.txt": "python3 pipelines/paper/sub_pixel.py map 8 out/sky-10mhz.fits 2000 > out/sigma-b-8.txt",
-             "sigma-b-16.txt": "python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits 6000 > out/sigma-b-16.txt"},
+             "sigma-b-16.txt": "python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits 3000 > out/sigma-b-16.txt"},
          lambda: figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")
          + "".join((OUT / f"sigma-b-{nside}.txt").read_text() for nside in (8, 16))),
         ("R from the data: limits of Fig. 16 and 17", study("limits-data"),
