@@ -378,7 +378,8 @@ HARMONIC_LS = (4, 8, 12, 16, 24, 32, 64, 96, 128, 150)
 
 
 def five_sigma(folder, removed_deg, thin=1):
-    """A row of Fig. 19: the noise map after post-processing, less scales above `removed_deg`, of one visibility in `thin`."""
+    """A row of Fig. 19: the noise map after post-processing, less scales above `removed_deg`, of one visibility in `thin`; last at the
+    degrees alone that the shortest projected baseline, 100 m cos 30 deg, reaches at the poles."""
     import healpy
     import numpy as np
 
@@ -387,17 +388,20 @@ def five_sigma(folder, removed_deg, thin=1):
     noise = healpy.read_map(folder / f"{mhz:.3f}MHz/noise-smooth.fits", dtype=float)
     small = noise - healpy.smoothing(noise, fwhm=math.radians(removed_deg), iter=1)
     sine = healpy.pix2vec(healpy.get_nside(noise), np.arange(noise.size))[2]
+    alm = healpy.map2alm(noise, iter=1)
+    least = 2 * math.pi * 100 * math.cos(math.radians(30)) * channel["frequency_hz"] / LIGHT
+    reached = healpy.alm2map(np.where(healpy.Alm.getlm(healpy.Alm.getlmax(alm.size))[0] < int(least), 0, alm), healpy.get_nside(noise))
     # Noise falls as the root of the number of visibilities.
     jansky = 5 * 2 * BOLTZMANN * (channel["frequency_hz"] / LIGHT) ** 2 / 1e-26 * beam["area_sr"] / math.sqrt(thin)
     return [f"{mhz:g}", show(small.std() / math.sqrt(thin)), f"{beam['fwhm_deg']:.2f}",
-            *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise)]]
+            *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise, reached)]]
 
 
 def sensitivity(name, removed_deg):
     """Fig. 19 from one visibility in 16."""
     cases = load(f"{name}/study.json")["cases"]
     rows = sorted((five_sigma(OUT / name / case["folder"], removed_deg, 16) for case in cases), key=lambda row: float(row[0]))
-    head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales"]
+    head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales", "at degrees reached"]
     return table(head, rows)
 
 
@@ -510,10 +514,9 @@ def make(product, command, times):
 
 
 def told(made):
-    """Processor and elapsed minutes, machine, and whether the sky was ULSA's."""
-    minutes = [f"{sum(made_of[key] for made_of in made) / 60:.1f}" for key in ("processor_s", "elapsed_s")]
-    under = "ULSA" if any("sky.file" in made_of["command"] for made_of in made) else "generated"
-    return [*minutes, under, "; ".join(sorted({made_of["machine"] for made_of in made}))]
+    """Minutes of processor time and elapsed, and the sky, if it is ULSA's."""
+    used, elapsed = (sum(one[key] for one in made) / 60 for key in ("processor_s", "elapsed_s"))
+    return f"{used:.1f} ({elapsed:.1f} elapsed)" + (", ULSA" if any("sky.file" in one["command"] for one in made) else "")
 
 
 def main():
@@ -523,7 +526,7 @@ def main():
     parser.add_argument("--ulsa", type=Path, default=Path("."), metavar="DIR", help="folder of ulsa_3mhz.fits and ulsa_10mhz.fits")
     args = parser.parse_args()
     OUT.mkdir(exist_ok=True)
-    times, timed = json.loads(TIMES.read_text()) if TIMES.exists() else {}, []
+    times, timed = json.loads(TIMES.read_text()) if TIMES.exists() else {}, {}
     for title, commands, text in sheets(args.ulsa):
         if args.figures and not set(args.figures) & set(re.findall(r"\d+", title.split(":")[0])):
             continue
@@ -533,11 +536,13 @@ def main():
                 make(product, command, times)
         known = [times[product] for product in commands if product in times]
         if len(known) == len(commands):
-            timed.append([title.split(":")[0], *told(known)])
-            print("{1} minutes of processor time, {2} elapsed, {3} sky; {4}".format(*timed[-1]), flush=True)
+            timed.setdefault("; ".join(sorted({one["machine"] for one in known})), []).append(f"{title}: {told(known)}")
+            print(f"Minutes of processor time: {told(known)}", flush=True)
         absent = [product for product in commands if not (OUT / product).exists()]
         print("\n" + ("not made here yet: " + ", ".join(absent) + "\n" if absent else text()), flush=True)
-    print("## Times\n\n" + table(["sheet", "minutes of processor time", "elapsed", "sky", "machine"], timed))
+    print("## Times\n\nMinutes of processor time (and elapsed):\n")
+    for name, sheets_of in timed.items():
+        print(f"{name}: " + "; ".join(sheets_of) + ".\n")
 
 
 if __name__ == "__main__":
