@@ -397,11 +397,12 @@ def five_sigma(folder, removed_deg, thin=1):
             *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise, reached)]]
 
 
-def sensitivity(name, removed_deg):
-    """Fig. 19 from one visibility in 16."""
-    cases = load(f"{name}/study.json")["cases"]
-    rows = sorted((five_sigma(OUT / name / case["folder"], removed_deg, 16) for case in cases), key=lambda row: float(row[0]))
-    head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales", "at degrees reached"]
+def sensitivity(names, *how):
+    """Fig. 19 of all cases of some studies."""
+    cases = [OUT / name / case["folder"] for name in names for case in load(f"{name}/study.json")["cases"]]
+    rows = sorted((five_sigma(case, *how) for case in cases), key=lambda row: float(row[0]))
+    head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales",
+            "at degrees reached"]
     return table(head, rows)
 
 
@@ -480,8 +481,8 @@ def sheets(ulsa):
          lambda: correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
         ("Fig. 18: SNR_l", study("fig18-snr", under(10)),
          lambda: correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
-        ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"), lambda: sensitivity("fig19-sensitivity", 10)),
-        ("Fig. 19: at nside 64", study("fig19-nside64"), lambda: sensitivity("fig19-nside64", 5)),
+        ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"), lambda: sensitivity(["fig19-sensitivity"], 10, 16)),
+        ("Fig. 19: all data at nside 64", patched, lambda: sensitivity(["patches-10mhz", "patches-3mhz"], 5)),
         ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
         ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
         ("Fig. 20: N_b and Sigma_b",
