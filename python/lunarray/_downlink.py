@@ -101,6 +101,31 @@ class Downlink:
 
         return write_uvh5(self, path, channel, phase_centre)
 
+    def write_uvfits(
+        self, path: str | PathLike[str], channel: int = 0, phase_centre: tuple[float, float] = (266.405, -28.936)
+    ) -> int:
+        """Writes the good visibilities of a channel as UVFITS; returns their number.
+
+        Values, baselines and samples are those of :meth:`write_uvh5`; what that has in its group is in the extension LUNARRAY, of which
+        :func:`from_uvdata` takes positions and weights. Replaces a FITS file, and nothing else. Needs pyuvdata
+        (``pip install lunarray[uvh5]``).
+        """
+        from ._uvfits import write_uvfits
+
+        return write_uvfits(self, path, channel, phase_centre)
+
+    def write_ms(
+        self, path: str | PathLike[str], channel: int = 0, phase_centre: tuple[float, float] = (266.405, -28.936)
+    ) -> int:
+        """Writes the good visibilities of a channel as a measurement set (version 2), a new folder; returns their number.
+
+        As :meth:`write_uvfits`, with a subtable LUNARRAY. Measurement sets of pyuvdata have no Stokes I: XX and YY are both it, by
+        I = (XX + YY) / 2 (``pol_convention = "avg"``). Needs pyuvdata (``pip install lunarray[uvh5]``) and python-casacore.
+        """
+        from ._uvfits import write_ms
+
+        return write_ms(self, path, channel, phase_centre)
+
     def write_calh5(self, path: str | PathLike[str], solutions: str | PathLike[str]) -> int:
         """Writes gains of ``solutions.csv`` as calh5, which pyuvdata's ``UVCal`` reads; returns the number of solutions.
 

@@ -128,16 +128,26 @@ def _read(uv):
             data = UVData.from_file(path, ignore_single_chan=False)
         except (ValueError, OSError, KeyError) as error:
             raise Error(f"{path}: pyuvdata cannot read it: {error}") from error
-    if os.path.isfile(path):
-        import h5py
+    return data, _beside(path)
 
-        if h5py.is_hdf5(path):
-            with h5py.File(path) as file:
-                if "lunarray" in file:
-                    beside = file["lunarray"]
-                    truth = {name: beside[name][()] for name in ("position_1_m", "position_2_m", "time_s", "weight")}
-                    return data, {**truth, **beside.attrs}
-    return data, None
+
+def _beside(path):
+    """What a file of ``Downlink.write_uvh5``, ``write_uvfits`` or ``write_ms`` has beside the format; None if it is of another program."""
+    from ._uvfits import ms_truth, uvfits_truth
+
+    if os.path.isdir(path):
+        return ms_truth(path)
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        with open(path, "rb") as file:
+            return uvfits_truth(path) if file.read(9) == b"SIMPLE  =" else None
+    with h5py.File(path) as file:
+        if "lunarray" not in file:
+            return None
+        beside = file["lunarray"]
+        truth = {name: beside[name][()] for name in ("position_1_m", "position_2_m", "time_s", "weight")}
+        return {**truth, **beside.attrs}
 
 
 def _start_tai_s(data):

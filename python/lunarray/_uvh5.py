@@ -70,8 +70,9 @@ def samples(rows):
     return (each / best if best > 0 else each).astype(np.float32)
 
 
-def to_uvdata(downlink, channel, phase_centre):
-    """The good visibilities of a channel as a ``pyuvdata.UVData``, and the rows that they are, in order."""
+def to_uvdata(downlink, channel, phase_centre, polarisations=("pI",)):
+    """The good visibilities of a channel as a ``pyuvdata.UVData``, and the rows that they are, in order. Each polarisation is the
+    total intensity: of an unpolarised sky XX and YY both are, by I = (XX + YY) / 2."""
     pyuvdata = needed("pyuvdata", "uvh5")
     from astropy.coordinates import EarthLocation
     from astropy.time import Time
@@ -96,6 +97,10 @@ def to_uvdata(downlink, channel, phase_centre):
     from_1958_days = (downlink.instrument["epoch_tai_s"] + rows["time_s"]) / 86400.0
     start = Time("1958-01-01", scale="tai")
     times = Time(start.jd1, start.jd2 + from_1958_days, format="jd", scale="tai").utc.jd
+
+    def of_each(values):
+        return np.repeat(values.reshape(-1, 1, 1), len(polarisations), axis=2)
+
     with offline():
         telescope = pyuvdata.Telescope.new(
             name="lunarray",
@@ -111,7 +116,7 @@ def to_uvdata(downlink, channel, phase_centre):
         ra, dec = np.radians(phase_centre)
         made = pyuvdata.UVData.new(
             freq_array=np.array([frequency_hz]),
-            polarization_array=["pI"],
+            polarization_array=list(polarisations),
             times=times,
             antpairs=np.stack([rows["i"], rows["j"]], axis=1).astype(int),
             do_blt_outer=False,
@@ -119,9 +124,10 @@ def to_uvdata(downlink, channel, phase_centre):
             channel_width=np.array([downlink.instrument["widths_hz"][channel]]),
             telescope=telescope,
             update_telescope_from_known=False,
-            data_array=data.reshape(-1, 1, 1),
-            flag_array=np.zeros((len(rows), 1, 1), bool),
-            nsample_array=samples(rows).reshape(-1, 1, 1),
+            data_array=of_each(data),
+            flag_array=np.zeros((len(rows), 1, len(polarisations)), bool),
+            nsample_array=of_each(samples(rows)),
+            **({} if polarisations == ("pI",) else {"pol_convention": "avg"}),
             phase_center_catalog={
                 0: {
                     "cat_name": "centre",
@@ -151,17 +157,27 @@ def write_uvh5(downlink, path, channel, phase_centre):
     return len(rows)
 
 
+#: What stands beside the visibilities.
+TRUTH_ABOUT = (
+    "In the order of the file's visibilities: positions of antennas 1 and 2, m, Moon-centred ecliptic axes; middle of each integration, s "
+    "since the mission's epoch; inverse variance of the real part, (K sr)^-2"
+)
+
+
+def truth_of(rows, instrument):
+    """Columns and attributes of what the formats have no place for."""
+    names = {"position_1_m": "r_i_m", "position_2_m": "r_j_m", "time_s": "time_s", "weight": "weight"}
+    attributes = {name: instrument[name] for name in ("name", "epoch_tai_s", "moon_radius_m", "antenna", "noiseless")}
+    return {name: rows[field] for name, field in names.items()}, attributes
+
+
 def add_truth(h5py, path, rows, instrument):
     """Adds what UVH5 has no place for."""
+    columns, attributes = truth_of(rows, instrument)
     with h5py.File(path, "a") as file:
         beside = file.create_group("lunarray")
-        beside.attrs["about"] = (
-            "In the order of the file's visibilities: positions of antennas 1 and 2, m, Moon-centred ecliptic axes; middle of "
-            "each integration, s since the mission's epoch; inverse variance of the real part, (K sr)^-2"
-        )
-        for name in ("name", "epoch_tai_s", "moon_radius_m", "antenna", "noiseless"):
-            beside.attrs[name] = instrument[name]
-        beside["position_1_m"] = rows["r_i_m"]
-        beside["position_2_m"] = rows["r_j_m"]
-        beside["time_s"] = rows["time_s"]
-        beside["weight"] = rows["weight"]
+        beside.attrs["about"] = TRUTH_ABOUT
+        for name, value in attributes.items():
+            beside.attrs[name] = value
+        for name, values in columns.items():
+            beside[name] = values

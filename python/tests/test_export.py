@@ -103,6 +103,42 @@ def test_a_sky_predicted_from_the_exported_baselines_is_what_was_exported(exact,
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["uvfits", "ms"])
+def test_uvfits_and_measurement_sets_have_the_visibilities_of_uvh5(exact, tmp_path, kind):
+    """As pyuvdata reads them back, and as an import takes them: positions and weights are those of the downlink."""
+    from pyuvdata import UVData
+
+    if kind == "ms":
+        pytest.importorskip("casacore")
+    downlink = lunarray.open(exact[1].downlink)
+    downlink.write_uvh5(tmp_path / "a.uvh5", 0)
+    path = tmp_path / f"a.{kind}"
+    count = getattr(downlink, f"write_{kind}")(path, 0)
+    expected, found = (
+        UVData.from_file(str(name), ignore_single_chan=False, run_check_acceptability=False) for name in (tmp_path / "a.uvh5", path)
+    )
+    assert found.Nblts == count == expected.Nblts > 1000
+    assert (found.get_pols(), found.vis_units) == ((["xx", "yy"] if kind == "ms" else ["pI"]), "Jy")
+    # UVFITS holds single precision of values, and seconds of light in uvw: 2^-24 of the largest.
+    for values in (found.data_array[:, :, k] for k in range(found.Npols)):
+        np.testing.assert_allclose(values, expected.data_array[:, :, 0], atol=1e-6 * np.abs(expected.data_array).max())
+    np.testing.assert_allclose(found.uvw_array, expected.uvw_array, atol=1e-6 * np.abs(expected.uvw_array).max())
+    again = lunarray.from_uvdata(path, tmp_path / "again.ccsds")
+    before, after = (np.sort(v[v["flag"] == 0], order=["time_s", "i", "j"]) for v in (downlink.visibilities(0), again.visibilities(0)))
+    for name in ("time_s", "dt_s", "i", "j"):
+        np.testing.assert_array_equal(after[name], before[name])
+    np.testing.assert_allclose(after["weight"], before["weight"], rtol=1e-6)
+    # 1e-5 wavelengths of 100 m, the tolerance that imports state.
+    np.testing.assert_allclose(after["r_i_m"], before["r_i_m"], atol=1.5e-3)
+    np.testing.assert_allclose(after["value_k_sr"], before["value_k_sr"], atol=1e-6 * np.abs(before["value_k_sr"]).max())
+    other = tmp_path / f"other.{kind}"
+    other.write_text("mine")
+    with pytest.raises(lunarray.Error, match="is there"):
+        getattr(downlink, f"write_{kind}")(other, 0)
+    assert other.read_text() == "mine"
+
+
+@pytest.mark.filterwarnings("ignore")
 def test_uvh5_has_the_weights(small, tmp_path):
     """nsample_array times integration_time is in proportion to the inverse variance, as the format defines both."""
     from pyuvdata import UVData
