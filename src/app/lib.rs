@@ -4,6 +4,8 @@
 
 // They panic when nobody reads any more; `cli/output.rs` has what does not.
 #![warn(clippy::print_stdout, clippy::print_stderr)]
+// A browser tab has pipelines, but no commands.
+#![cfg_attr(target_family = "wasm", allow(dead_code, unused_imports))]
 
 use lunarray_core::{
     array, calibration, daughters, downlink, files, frames, ground, imaging, mother, numerics, products,
@@ -16,9 +18,11 @@ pub mod prelude;
 
 pub mod figures;
 
-#[cfg(feature = "serve")]
+#[cfg(all(feature = "serve", not(target_family = "wasm")))]
 pub mod serve;
 
+#[cfg(not(target_family = "wasm"))]
 pub mod bench;
 
+#[cfg(not(target_family = "wasm"))]
 pub mod cli;

@@ -32,5 +32,6 @@ mod run;
 mod sample;
 mod schema;
 mod start_up;
+mod stepwise;
 mod study;
 mod zoom;

@@ -67,3 +67,14 @@ fn a_page_that_stays_open_takes_no_more_memory() {
     let seconds = of("LUNARRAY_PAGE_S", "30");
     drive(&python, "page_memory.py", &[place.pipeline(), &file, &place.path(""), &seconds]);
 }
+
+/// `.ci/tab` makes the tab's program.
+#[test]
+#[ignore = "needs LUNARRAY_PYTHON, LUNARRAY_TAB and chromium"]
+fn a_browser_tab_makes_the_map_of_the_program() {
+    let python = python();
+    require_browser();
+    let book = std::env::var("LUNARRAY_TAB").expect("LUNARRAY_TAB names the site with tab/lunarray_tab.wasm");
+    let place = Place::new();
+    drive(&python, "tab.py", &[&book, &place.path(""), pictures().to_str().unwrap()]);
+}

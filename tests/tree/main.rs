@@ -22,7 +22,7 @@ use std::path::Path;
 use source::{File, ModulePath, parse};
 
 /// Folders (and files) of `src/core/` and then of `src/app/`, each after all that it may use.
-const ORDER: [&str; 23] = [
+const ORDER: [&str; 24] = [
     "units",
     "numerics",
     "files",
@@ -45,6 +45,7 @@ const ORDER: [&str; 23] = [
     "serve",
     "bench",
     "cli",
+    "tab",
     "main",
 ];
 const SPACECRAFT: [&str; 2] = ["daughters", "mother"];

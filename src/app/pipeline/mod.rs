@@ -18,8 +18,8 @@ pub use config::{
 pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, RunGroups, Segment};
 #[doc(hidden)]
 pub use graph::{
-    BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, downlink_file,
-    main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
+    BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, StepwiseRun,
+    downlink_file, main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
 };
 pub use graph::{
     CalibrateSummary, Destination, GroundSource, OnStart, RunSummary, RunView, replay, run, simulate,

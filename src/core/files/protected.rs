@@ -1,7 +1,7 @@
 //! Protection of files that must not be replaced.
 
 use std::collections::BTreeMap;
-use std::fs::{self, Metadata};
+use std::fs;
 use std::io;
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -24,7 +24,10 @@ impl ProtectedInputs {
     pub fn of<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Self {
         let keys: Vec<FileKey> = paths.into_iter().filter_map(|path| key_of(path.as_ref())).collect();
         let mut protected = PROTECTED.lock().unwrap_or_else(PoisonError::into_inner);
-        keys.iter().for_each(|key| *protected.entry(*key).or_default() += 1);
+        for key in &keys {
+            // Elsewhere than on Unix it is no number.
+            *protected.entry(ToOwned::to_owned(key)).or_default() += 1;
+        }
         Self(keys)
     }
 }
@@ -44,7 +47,7 @@ impl Drop for ProtectedInputs {
 #[cfg(unix)]
 fn key_of(path: &Path) -> Option<FileKey> {
     use std::os::unix::fs::MetadataExt;
-    fs::metadata(path).ok().filter(Metadata::is_file).map(|found| (found.dev(), found.ino()))
+    fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|found| (found.dev(), found.ino()))
 }
 
 #[cfg(not(unix))]

@@ -9,6 +9,7 @@ pub(super) mod run;
 mod sample_summary;
 pub(crate) mod sampling;
 pub(crate) mod space_segment;
+mod stepwise;
 pub(super) mod summary;
 mod view;
 
@@ -21,6 +22,7 @@ pub use run::{
 pub use sample_summary::{BlockSummary, SampleCounts, SampleSummary};
 pub use sampling::sample_stages;
 pub use space_segment::{INTEGRATE, sky_notes};
+pub use stepwise::StepwiseRun;
 pub use summary::{RunScope, RunSummary};
 pub use view::RunView;
 pub(crate) use view::{Change, RunChanges};

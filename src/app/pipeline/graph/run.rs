@@ -14,7 +14,9 @@ use super::view::RunView;
 use super::{ground_segment, space_segment};
 use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
-use crate::downlink::transport::socket::{Listening, SocketError, SocketSink, SocketSource};
+#[cfg(not(target_family = "wasm"))]
+use crate::downlink::transport::socket::SocketSource;
+use crate::downlink::transport::socket::{Listening, SocketError, SocketSink};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
 use crate::files::FolderLock;
 use crate::ground::{Ground, WAIT_BYTES};
@@ -51,6 +53,7 @@ impl<S: GroundSource> GroundSource for PacedSource<S> {
     }
 }
 
+#[cfg(not(target_family = "wasm"))]
 impl GroundSource for SocketSource {
     fn listening(&self) -> Option<Listening> {
         Some(SocketSource::listening(self))
@@ -331,7 +334,9 @@ impl Config {
     }
 
     /// Resolution and processing of the maps, for a comparison with the input sky.
-    pub(in crate::pipeline) fn map_shape(&self) -> MapShape {
+    #[must_use]
+    #[doc(hidden)]
+    pub fn map_shape(&self) -> MapShape {
         let Self { map, products, .. } = self;
         let l_max = map.is_harmonic().then(|| map.degree());
         MapShape { nside: map.nside, l_max, processing: products.processing() }

@@ -116,7 +116,20 @@ pub(in crate::pipeline) fn add_integration(
     plan: &Plan,
     skies: &[Option<&SkyMap>],
 ) -> Result<Link<GroundFrame>, PipelineError> {
-    let Plan { config, array, instrument, schedules, windows } = plan;
+    // A window itself is small; its visibilities are not.
+    let windows = graph.source("observe", 1, Observer::new(plan.windows.clone()));
+    Ok(graph.stage(INTEGRATE, plan.config.runtime.queue_capacity, windows, integrator(plan, skies)?))
+}
+
+/// The stage that simulates visibilities of the channels that have a sky.
+///
+/// # Errors
+/// An invalid model.
+pub(in crate::pipeline) fn integrator(
+    plan: &Plan,
+    skies: &[Option<&SkyMap>],
+) -> Result<Integrator, PipelineError> {
+    let Plan { config, array, instrument, schedules, .. } = plan;
     let models = models::build(plan, skies)?;
     let noise = NoiseModel {
         seed: config.spacecraft.thermal_noise.then_some(config.seed),
@@ -130,12 +143,8 @@ pub(in crate::pipeline) fn add_integration(
         flag_earth: config.spacecraft.flag_earth,
     };
     let integrator =
-        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options)
-            .with_errors(plan.instrument_errors())
-            .with_moving(plan.moving_sky()?);
-    // A window itself is small; its visibilities are not.
-    let windows = graph.source("observe", 1, Observer::new(windows.clone()));
-    Ok(graph.stage(INTEGRATE, config.runtime.queue_capacity, windows, integrator))
+        Integrator::new(Arc::clone(array), models, instrument.clone(), schedules.clone(), options);
+    Ok(integrator.with_errors(plan.instrument_errors()).with_moving(plan.moving_sky()?))
 }
 
 /// Adds the stages from the frames of all channels to the bytes of the downlink.
@@ -206,8 +215,13 @@ fn add_transmitter(
 ) -> Result<Link<Vec<u8>>, PipelineError> {
     let config = &plan.config;
     let capacity = config.runtime.queue_capacity;
-    let paced = |bytes_per_s| PacedLink { array: Arc::clone(&plan.array), bytes_per_s };
-    let store = Store::new(&config.spacecraft, config.downlink.payload_bytes_per_s().map(paced));
-    let passes = graph.stage("store", capacity, frames, store);
+    let passes = graph.stage("store", capacity, frames, store(plan));
     Ok(graph.stage("transmit", capacity, passes, Transmitter::new(&config.downlink)?))
+}
+
+/// The onboard store.
+pub(in crate::pipeline) fn store(plan: &Plan) -> Store {
+    let config = &plan.config;
+    let paced = |bytes_per_s| PacedLink { array: Arc::clone(&plan.array), bytes_per_s };
+    Store::new(&config.spacecraft, config.downlink.payload_bytes_per_s().map(paced))
 }

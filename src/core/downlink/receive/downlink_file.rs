@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Chain, Cursor, IsTerminal, Read};
+use std::io::{self, BufRead, BufReader, Chain, Cursor, Read};
 use std::path::Path;
 
 use flate2::read::MultiGzDecoder;
@@ -67,7 +67,7 @@ impl DownlinkFile {
         // A terminal ends, and so does a serial line, which is one; /dev/zero does not.
         #[cfg(unix)]
         if std::os::unix::fs::FileTypeExt::is_char_device(&file.metadata()?.file_type())
-            && !file.is_terminal()
+            && !io::IsTerminal::is_terminal(&file)
         {
             let reason = "a device, which may be endless; expected a file or a pipe";
             return Err(io::Error::new(io::ErrorKind::InvalidInput, reason));

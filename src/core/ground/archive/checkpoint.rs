@@ -199,16 +199,21 @@ pub(super) fn read_from<T>(
 fn decode(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {
     let limit = bytes.len().saturating_mul(MEMORY_PER_BYTE);
     match usize::BITS - limit.leading_zeros() {
-        0..=20 => decode_within::<{ 1 << 20 }>(bytes),
-        21..=22 => decode_within::<{ 1 << 22 }>(bytes),
-        23..=24 => decode_within::<{ 1 << 24 }>(bytes),
-        25..=26 => decode_within::<{ 1 << 26 }>(bytes),
-        27..=28 => decode_within::<{ 1 << 28 }>(bytes),
-        29..=30 => decode_within::<{ 1 << 30 }>(bytes),
-        31..=32 => decode_within::<{ 1 << 32 }>(bytes),
-        33..=34 => decode_within::<{ 1 << 34 }>(bytes),
-        _ => decode_within::<{ 1 << 36 }>(bytes),
+        0..=20 => decode_within::<{ power_of_two(20) }>(bytes),
+        21..=22 => decode_within::<{ power_of_two(22) }>(bytes),
+        23..=24 => decode_within::<{ power_of_two(24) }>(bytes),
+        25..=26 => decode_within::<{ power_of_two(26) }>(bytes),
+        27..=28 => decode_within::<{ power_of_two(28) }>(bytes),
+        29..=30 => decode_within::<{ power_of_two(30) }>(bytes),
+        31..=32 => decode_within::<{ power_of_two(32) }>(bytes),
+        33..=34 => decode_within::<{ power_of_two(34) }>(bytes),
+        _ => decode_within::<{ power_of_two(36) }>(bytes),
     }
+}
+
+/// 2^`bits`, or what addresses can reach.
+const fn power_of_two(bits: u32) -> usize {
+    if bits < usize::BITS { 1 << bits } else { usize::MAX }
 }
 
 fn decode_within<const LIMIT: usize>(bytes: &[u8]) -> Result<(ArchiveHead, usize), DecodeError> {

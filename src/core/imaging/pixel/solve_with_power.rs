@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use faer::linalg::matmul::matmul;
-use faer::{Accum, Mat, Par};
+use faer::{Accum, Mat, get_global_parallelism};
 
 use super::solve::{PixelSolution, point_response};
 use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
@@ -21,7 +21,7 @@ pub const POWER_NSIDE_MAX: usize = 32;
 /// Degrees per nside, as for harmonic maps.
 const DEGREES_PER_NSIDE: f64 = 2.5;
 /// First number of the draws of Gibbs sampling: those of plain samples are below.
-const GIBBS: usize = 1 << 40;
+const GIBBS: u64 = 1 << 40;
 /// Rows of the matrix that are multiplied at once.
 const ROWS_AT_ONCE: usize = 512;
 
@@ -132,7 +132,8 @@ impl PixelPosterior<'_> {
         let whole = unknowns(&analysis(self.map_k, l_max, &AnalysisOptions::default())?.alm);
         let [_, dipole_k @ ..] = moments_k(&whole, l_max);
         let drawn = |which: usize| -> Result<Sample, SolveError> {
-            let mut drawn = if samples.gibbs { self.gibbs(which) } else { self.draw(self.factors, which) };
+            let mut drawn =
+                if samples.gibbs { self.gibbs(which) } else { self.draw(self.factors, which as u64) };
             let mut map = (self.to_pixels)(&drawn)?;
             add(&mut map, self.map_k);
             add(&mut drawn, &whole);
@@ -158,9 +159,9 @@ impl PixelPosterior<'_> {
     }
 
     /// A draw from the posterior with the R of these factors, its mean taken off.
-    fn draw(&self, factors: &Factors<'_>, which: usize) -> Vec<f64> {
+    fn draw(&self, factors: &Factors<'_>, which: u64) -> Vec<f64> {
         let count = self.right.len();
-        let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which as u64]);
+        let mut stream = random_stream(3, StreamKind::Probe, [count as u64, which]);
         let factor = self.found.noise_factor();
         let mut draw: Vec<f64> =
             (0..count).map(|_| StandardNormal.sample(&mut stream)).map(|w: f64| factor * w).collect();
@@ -176,7 +177,7 @@ impl PixelPosterior<'_> {
             let factors = Factors::new(self.blocks, r);
             let mut sky = self.right.to_vec();
             factors.solve(&mut sky);
-            add(&mut sky, &self.draw(&factors, GIBBS + 16 * which + turn));
+            add(&mut sky, &self.draw(&factors, GIBBS + 16 * which as u64 + turn));
             sky
         });
         subtract(&mut sky, 1.0, &self.found.solution);
@@ -209,9 +210,23 @@ fn projected(sums: &PixelSums, harmonics: &Mat<f64>) -> Mat<f64> {
         let rows = ROWS_AT_ONCE.min(pixels - first);
         let of_rows = Mat::from_fn(rows, pixels, |row, column| sums.normal.get(first + row, column));
         let mut product = Mat::zeros(rows, count);
-        matmul(product.as_mut(), Accum::Replace, of_rows.as_ref(), harmonics.as_ref(), 1.0, Par::rayon(0));
+        matmul(
+            product.as_mut(),
+            Accum::Replace,
+            of_rows.as_ref(),
+            harmonics.as_ref(),
+            1.0,
+            get_global_parallelism(),
+        );
         let part = harmonics.subrows(first, rows);
-        matmul(matrix.as_mut(), Accum::Add, part.transpose(), product.as_ref(), 1.0, Par::rayon(0));
+        matmul(
+            matrix.as_mut(),
+            Accum::Add,
+            part.transpose(),
+            product.as_ref(),
+            1.0,
+            get_global_parallelism(),
+        );
     }
     matrix
 }

@@ -33,18 +33,24 @@
 //! reach require an explicit option. With [`Stations`] a connection must begin with the line `token TOKEN` of a station, and
 //! is reported under its name.
 
+#[cfg(not(target_family = "wasm"))]
 mod accept;
 mod answers;
 mod config;
+#[cfg(not(target_family = "wasm"))]
 mod connection;
+#[cfg(not(target_family = "wasm"))]
 mod datagrams;
 mod error;
 mod instrument_filter;
+#[cfg(not(target_family = "wasm"))]
 mod listener;
 mod preamble;
 mod report;
 mod sink;
+#[cfg(not(target_family = "wasm"))]
 mod slots;
+#[cfg(not(target_family = "wasm"))]
 mod source;
 mod stations;
 mod stream_receiver;
@@ -54,6 +60,7 @@ pub use answers::HeldAnswers;
 pub use config::ListenConfig;
 pub use error::SocketError;
 pub use instrument_filter::InstrumentCheck;
+#[cfg(not(target_family = "wasm"))]
 pub use listener::{ListenLimits, NoteHandler};
 pub use report::{
     ConnectionEnd, DatagramReport, ListenNote, ListenReport, ListenStatus, Listening, SenderReport,
@@ -61,6 +68,7 @@ pub use report::{
 };
 
 pub use sink::{SendOptions, SocketSink};
+#[cfg(not(target_family = "wasm"))]
 pub use source::SocketSource;
 pub use stations::Stations;
 pub use url::{ListenUrl, TcpUrl};
