@@ -4,7 +4,8 @@ use lunarray::pipeline::{ConfigSource, Plan, StepwiseRun};
 use lunarray::prelude::*;
 use lunarray::sky::fits::{ReadOptions, read_map};
 
-const KEYS: [&str; 5] = [
+const KEYS: [&str; 6] = [
+    "sky.nside=32",
     "spacecraft.channels_hz=[3e6]",
     "spacecraft.every_nth_integration=60",
     "spacecraft.baseline_wavelengths_max=8",

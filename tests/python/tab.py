@@ -19,8 +19,7 @@ import numpy as np
 from browser import Browser
 
 PATIENCE_S = 600  # On however busy a machine.
-# Sines and cosines of wasm32 (musl's) and of the system (glibc's) differ in their last bits: 1e-16 of positions of 1e3 wavelengths. Sums are
-# kept to 2^-33 or so of their size, and the map is solved to residuals of 1e-6 of its right side.
+# Sines and cosines of wasm32 and of the system differ in their last bits. To be measured: a first guess.
 TOLERANCE = 1e-4
 
 
