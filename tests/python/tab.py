@@ -19,7 +19,7 @@ import numpy as np
 from browser import Browser
 
 PATIENCE_S = 600  # On however busy a machine.
-# Sines and cosines of wasm32 and of the system differ in their last bits. To be measured: a first guess.
+# Sines and cosines of wasm32 and of the system differ in their last bits. Measured at 3 MHz: 9e-6.
 TOLERANCE = 1e-4
 
 
