@@ -2,7 +2,7 @@
 
 Reads a JSON object from standard input: `visibilities` (a table of `lunarray export visibilities`), `channel` (of summary.json), `folder` (of
 the channel's products), `l_max`, `moon_radius_m`, `samples` (folder of
-`lunarray sample`), `fine` (nside of the pixels over which rows are summed) and `beyond` (whether pixels have more degrees than the map). Writes for each product the value of the program over that of the matrices, or their difference.
+`lunarray sample`), `fine` (nside of the pixels over which rows are summed) and `beyond` (whether pixels have more degrees than the map); or `given`, an R by degree (epsilon with an exponent or C_l), of which the map alone is compared. Writes for each product the value of the program over that of the matrices, or their difference.
 Nothing but C_l and the factor of the noise is taken from the program.
 """
 
@@ -49,6 +49,17 @@ for part in np.array_split(rows, max(1, len(rows) // 400)):
     weight = part["weight"]
     normal += (b.conj().T @ (weight[:, None] * b)).real
     right += (b.conj().T @ (weight * (part["re_k_sr"] + 1j * part["im_k_sr"]))).real
+
+given = asked.get("given")
+if given:
+    # R by degree, as set: the product's map alone.
+    r = given["epsilon"] / np.array(given["power_k2"])[degree] if "power_k2" in given else None
+    if r is None:
+        r = given["epsilon"] * np.linalg.eigvalsh(normal)[-1] * (degree + 1.0) ** given["exponent"]
+    expected = harmonics(channel["nside"])[0] @ np.linalg.solve(normal + np.diag(r), right)
+    found = healpy.read_map(f"{asked['folder']}/map.fits", dtype=float)
+    print(json.dumps({"map": (np.std(found - expected) / np.std(expected)).item()}))
+    sys.exit()
 
 power, factor = np.array(channel["sky_power"]["power_k2"]), channel["sky_power"]["noise_factor"]
 r = (factor**2 / power)[degree]

@@ -17,7 +17,7 @@ use super::sums::{
     refined_sums,
 };
 use crate::frames::PlacedVisibilities;
-use crate::imaging::circle::{HarmonicEngine, HarmonicSums};
+use crate::imaging::circle::{HarmonicEngine, HarmonicSums, OrderBlocks};
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};
 use crate::imaging::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
@@ -206,15 +206,28 @@ impl VisibilityArchive {
                 SnapshotCircle { engine: circle_engine(&self.setup, orbit)?, summed: 0 }
             }
         };
-        for run in self.held[circle.summed..].chunk_by(|a, b| a.at.pair == b.at.pair && a.band == b.band) {
-            for block in run.chunks(BLOCK) {
-                let _ = circle.engine.add(&placed(&self.setup, block))?;
-            }
-        }
+        sum_on_circle(&self.setup, &self.held[circle.summed..], &mut circle.engine)?;
         circle.summed = self.held.len();
         let sums = circle.engine.sums();
         self.circle = Some(circle);
         Ok(sums)
+    }
+
+    /// Blocks of the normal matrix over harmonics up to `l_max` on the nearest circle.
+    ///
+    /// # Errors
+    /// The engine refuses the setup.
+    pub(in crate::imaging) fn order_blocks(
+        &mut self,
+        l_max: usize,
+    ) -> Result<OrderBlocks, AccumulationError> {
+        self.sort();
+        self.flush();
+        let setup = RefinedSetup { l_max, ..self.setup };
+        let (orbit, _) = nearest_circle(&setup, &|k| self.held[k].at, self.held.len());
+        let mut engine = circle_engine(&setup, orbit)?;
+        sum_on_circle(&setup, &self.held, &mut engine)?;
+        Ok(engine.into_sums().order_blocks())
     }
 
     /// The departures of the visibilities from their nearest circle.
@@ -366,6 +379,20 @@ impl VisibilityArchive {
         self.segments.clear();
         self.circle = None;
     }
+}
+
+/// Adds visibilities to the sums of a circle.
+fn sum_on_circle(
+    setup: &RefinedSetup,
+    held: &[ArchivedVisibility],
+    engine: &mut HarmonicEngine,
+) -> Result<(), AccumulationError> {
+    for run in held.chunk_by(|a, b| a.at.pair == b.at.pair && a.band == b.band) {
+        for block in run.chunks(BLOCK) {
+            let _ = engine.add(&placed(setup, block))?;
+        }
+    }
+    Ok(())
 }
 
 /// Converts visibilities of one pair and sub-band to a block for an engine.

@@ -3,8 +3,8 @@
 use super::posterior::Posterior;
 use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
-use crate::imaging::power::{Factors, PowerProblem, Samples, Uncertainty};
-use crate::imaging::regulariser::{Diagonal, Regulariser};
+use crate::imaging::power::{MapsWithPower, PowerProblem, Samples, Uncertainty};
+use crate::imaging::regulariser::Regulariser;
 use crate::imaging::solver::{Convergence, Diagnostics, FitInputs, NamedWatch, SolveError, StoppingRule};
 use crate::imaging::solver::{LargestEigenvalue, System, largest_eigenvalue_from, normalised, random_vector};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, traces};
@@ -163,20 +163,7 @@ fn solve_with_power(
         power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
         numbers: 2.0 * visibilities as f64,
     };
-    let found = problem.solve(start.map(|[map, _]| map.as_slice()), rule, watch)?;
-    let factors = Factors::new(&blocks, &found.regularisation);
-    let regularisation = Diagonal::ByDegree(found.regularisation.clone());
-    let precondition = |v: &mut [f64]| factors.solve(v);
-    let system = System { sums, regularisation, precondition: &precondition };
-    let noise = match start {
-        Some([_, noise]) if noise.len() == right.len() => noise.clone(),
-        _ => vec![0.0; right.len()],
-    };
-    let mut columns = [found.solution.clone(), noise];
-    let convergence = {
-        let task = watch.start("map and noise map", rule.residual_max);
-        system.solve(&[&right, sums.noise_right_hand_side()], &mut columns, &[rule, rule], &task)
-    };
+    let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
     let [solved, noise] = columns;
     let mut whole = solved.clone();
     if let Some(prior) = prior {

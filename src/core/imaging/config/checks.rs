@@ -2,7 +2,6 @@
 
 use super::{EngineKind, MapConfig, Method, PIXEL_ENGINE_NSIDE_MAX, RefineConfig, RegulariserChoice};
 use crate::imaging::circle::L_MAX;
-use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::sky::TEMPERATURE_K_MAX;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue};
@@ -121,32 +120,6 @@ impl MapConfig {
             checks.require("regulariser.file", "[]", !files.is_empty(), "at least one table");
         }
         let is_identity = regulariser == RegulariserChoice::Identity;
-        let is_by_degree = !is_identity && regulariser != RegulariserChoice::Data;
-        let found = match &regulariser {
-            RegulariserChoice::Data => "data",
-            RegulariserChoice::Identity => "identity",
-            RegulariserChoice::Degree(_) => "degree",
-            RegulariserChoice::File(_) => "file",
-        };
-        checks.require(
-            "regulariser",
-            found,
-            is_identity || !self.is_matrix_free(),
-            "\"identity\", or no such key, with map.matrix = \"free\"",
-        );
-        checks.require(
-            "regulariser",
-            found,
-            !is_by_degree || self.engine == EngineKind::Harmonic,
-            "\"data\" or \"identity\" without map.engine = \"harmonic\"",
-        );
-        let is_small = self.engine == EngineKind::Harmonic || self.nside <= POWER_NSIDE_MAX;
-        checks.require(
-            "regulariser",
-            found,
-            regulariser != RegulariserChoice::Data || is_small,
-            "\"identity\" with the pixel engine beyond nside 32; or map.engine = \"harmonic\"",
-        );
         let beams = self.beams_deg.len();
         let is_valid = beams <= BEAMS_MAX && (beams == 0 || !self.holds_visibilities());
         checks.require(

@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 use crate::frames::Instrument;
 use crate::imaging::antennas::AntennasConfig;
 use crate::imaging::anywhere::AssumedInstrument;
-use crate::imaging::pixel::POWER_NSIDE_MAX;
 use crate::imaging::{AccumulationError, PixelEngine};
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
@@ -119,9 +118,8 @@ keys! {
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday epsilon: Option<PerChannel<f64>> = None;
         /// Regulariser R: "data", 1 / C_l estimated from the data (default); "identity", epsilon W_max I, the paper's (default
-        /// with epsilon, matrix = "free" or pixels beyond nside 32); with the engine "harmonic" also { degree =
-        /// 2.0 }, epsilon W_max (l + 1)^2, or { file = ["cl.csv"] }, epsilon / C_l from tables of l and C_l (K^2), one per
-        /// channel. W_max is the largest eigenvalue of the normal matrix.
+        /// with epsilon); { degree = 2.0 }, epsilon W_max (l + 1)^2; or { file = ["cl.csv"] }, epsilon / C_l from tables of l
+        /// and C_l (K^2), one per channel. W_max is the largest eigenvalue of the normal matrix.
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday regulariser: Option<RegulariserChoice> = None;
         /// Tables of the sky's C_l (K^2), one per channel, such as sky-power.csv of an earlier map: what the sky has beyond the
@@ -153,10 +151,10 @@ keys! {
         /// Seed of the noise-only companion map.
         expert companion_seed: u64 = 1;
         /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser"#)]
         expert residual_max: f64 = 1e-4;
         /// Maximum number of iterations of a solution.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free""#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser"#)]
         expert iterations_max: usize = 300;
         /// Random probes for the traces of a final map's covariances; 0 for no traces. Up to 3072 unknowns (nside 16, or l_max
         /// 54) traces are exact, with any number above 0.
@@ -237,13 +235,11 @@ impl MapConfig {
         self.engine == EngineKind::Harmonic
     }
 
-    /// The choice of R: from the data unless set otherwise. The default is the identity if epsilon is set, if the normal matrix is not
-    /// computed, or if there are too many pixels for an R from the data.
+    /// The choice of R: from the data unless set otherwise. The default is the identity if epsilon is set.
     #[must_use]
     #[doc(hidden)]
     pub fn regulariser(&self) -> RegulariserChoice {
-        let is_large = self.engine != EngineKind::Harmonic && self.nside > POWER_NSIDE_MAX;
-        let is_identity = self.is_matrix_free() || self.epsilon.is_some() || is_large;
+        let is_identity = self.epsilon.is_some();
         let default = if is_identity { RegulariserChoice::Identity } else { RegulariserChoice::Data };
         self.regulariser.clone().unwrap_or(default)
     }

@@ -1,6 +1,8 @@
 //! Estimates of what a map over pixels takes.
 
+use super::solve_with_power::POWER_NSIDE_MAX;
 use crate::imaging::anywhere::REFINED_VISIBILITY_BYTES;
+use crate::imaging::circle::harmonic_cost;
 use crate::imaging::cost::{BASIS_VECTORS, ChannelData, EngineCost, iterations, over_maps, solved_together};
 use crate::imaging::rates::{
     AVERAGE_ELEMENT_S, CENTRE_ELEMENT_S, CHOLESKY_MULTIPLY_ADDS_PER_S, EXACT_ELEMENT_S,
@@ -10,7 +12,8 @@ use crate::imaging::{MapConfig, PixelEngine, RegulariserChoice};
 use crate::response::pixel::{PixelMethod, RowProducts};
 use crate::sky::healpix::pixel_count;
 
-/// Iterations without a matrix in units of those of the harmonic engine, whose preconditioner they lack (55 to 90 with 31 windows).
+/// Iterations without a matrix in units of those of the harmonic engine: with the identity they lack its preconditioner (55 to 90 with 31
+/// windows), with R from the data there are rounds, draws and errors.
 const FREE_ITERATIONS: f64 = 2.0;
 
 /// Multiply-adds of a dense solution with R from the data in units of the cube of the number of pixels, and full matrices that it holds.
@@ -35,7 +38,9 @@ pub(super) fn stored(map: &MapConfig, solutions: u64) -> EngineCost {
     let pixels = pixel_count(nside) as f64;
     // Two real rows of B per visibility, and half of a symmetric matrix.
     let visibility_multiply_adds = pixels * pixels;
-    let from_data = f64::from(u8::from(map.regulariser() == RegulariserChoice::Data));
+    // Beyond that nside products are iterated.
+    let is_dense = map.regulariser() == RegulariserChoice::Data && nside <= POWER_NSIDE_MAX;
+    let from_data = f64::from(u8::from(is_dense));
     let [factorised, inverted] = [pixels.powi(3) / 6.0, from_data * DATA_CUBES * pixels.powi(3)];
     let solution_s = factorised / CHOLESKY_MULTIPLY_ADDS_PER_S + inverted / RANK_K_MULTIPLY_ADDS_PER_S;
     EngineCost {
@@ -64,13 +69,22 @@ pub(super) fn matrix_free(map: &MapConfig, data: ChannelData) -> EngineCost {
     let products: f64 = over_maps(data, of_map).iter().sum();
     let elements = products * visibilities * pixels;
     let threads = rayon::current_num_threads();
+    // The sums of the nearest circle, whose blocks precondition, before rows are computed.
+    let circle_bytes = if map.regulariser() == RegulariserChoice::Identity {
+        0.0
+    } else {
+        let circle = harmonic_cost(map, ChannelData { solutions: 1, ..data });
+        circle.sums_bytes + circle.copy_bytes + circle.other_bytes
+    };
     let held = visibilities * REFINED_VISIBILITY_BYTES as f64;
     EngineCost {
         sums_bytes: held,
         // An intermediate map is solved from a copy.
         copy_bytes: held,
-        other_bytes: RowProducts::memory_bytes(map.nside, solved_together(map), threads) as f64
-            + 8.0 * pixels * BASIS_VECTORS[0],
+        other_bytes: circle_bytes.max(
+            RowProducts::memory_bytes(map.nside, solved_together(map), threads) as f64
+                + 8.0 * pixels * BASIS_VECTORS[0],
+        ),
         visibility_s: 0.0,
         solving_s: elements * element_s(map) / cores(),
         visibility_multiply_adds: 0.0,

@@ -5,13 +5,15 @@ use std::path::Path;
 
 use super::cost;
 use super::matrix_free::MatrixFreeVisibilities;
+use super::projected::{averaged_blocks, degree_max};
 use super::solve::{PixelExtras, PixelSolution, solve_pixels_with};
+use super::solve_by_degree::{PixelEquations, SolvedByDegree};
 use super::solve_matrix_free::solve_matrix_free;
-use super::solve_with_power::solve_pixels_with_power;
+use super::solve_with_power::{POWER_NSIDE_MAX, solve_pixels_with_power};
 use super::{PixelEngine, PixelSetup, PixelSums};
 use crate::frames::PlacedVisibilities;
 use crate::imaging::anywhere::{ArchiveUse, ArchivedSums, SegmentFolder, VisibilityArchive};
-use crate::imaging::circle::HarmonicSums;
+use crate::imaging::circle::{HarmonicRequest, HarmonicSums};
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
 use crate::imaging::request::{MapRequest, SolvedMap};
@@ -90,9 +92,18 @@ impl MapEquations for PixelSums {
 
     fn solve(self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
         let (prior, beams, watch) = (request.prior.as_deref(), &request.beam_pixels()[..], request.watch);
-        let solved = match request.regulariser {
-            Regulariser::Data => solve_pixels_with_power(&self, prior, request.samples(), beams, watch)
-                .map(|(solved, errors)| solved.into_map(Some(errors))),
+        let solved = match &request.regulariser {
+            Regulariser::Data if request.nside <= POWER_NSIDE_MAX => {
+                solve_pixels_with_power(&self, prior, request.samples(), beams, watch)
+                    .map(|(solved, errors)| solved.into_map(Some(errors)))
+            }
+            regulariser if *regulariser != Regulariser::default() => {
+                let equations = PixelEquations { sums: &*self, blocks: &averaged_blocks(&self) };
+                let settings = HarmonicRequest::of(&request);
+                equations
+                    .solve(settings, regulariser, prior, None, beams, watch)
+                    .map(|solved| solved.solution.into_map(solved.uncertainty))
+            }
             _ => {
                 let extras = PixelExtras { probes: request.probes(), beams };
                 solve_pixels_with(*self, request.epsilon, prior, extras, watch).map(|map| map.into_map(None))
@@ -108,6 +119,22 @@ impl MapEquations for PixelSums {
 
     fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {
         Err("sums over pixels")
+    }
+}
+
+impl MatrixFreeVisibilities {
+    /// Solves with an R that depends on the degree, with the blocks of the nearest circle as preconditioner.
+    fn solve_by_degree(
+        mut self: Box<Self>,
+        request: &MapRequest<'_>,
+        start: Option<[Vec<f64>; 2]>,
+    ) -> Result<SolvedByDegree, SolveError> {
+        let order_blocks = self.archive.order_blocks(degree_max(self.nside))?;
+        let sums = self.into_sums()?;
+        let equations = PixelEquations { sums: &sums, blocks: &order_blocks.blocks() };
+        let (settings, regulariser) = (HarmonicRequest::of(request), &request.regulariser);
+        let prior = request.prior.as_deref();
+        equations.solve(settings, regulariser, prior, start.as_ref(), &[], request.watch)
     }
 }
 
@@ -171,22 +198,28 @@ impl MapEquations for MatrixFreeVisibilities {
     }
 
     fn solve(self: Box<Self>, request: MapRequest<'_>) -> Result<Option<SolvedMap>, SolveError> {
-        let sums = self.into_sums()?;
         // A final solution starts from zero, so that its bits do not depend on intermediate maps.
         let start = request.last.take().filter(|_| !request.is_final);
-        let (prior, rule) = (request.prior.as_deref(), request.setup.rule);
-        let (solved, unknowns) =
-            match solve_matrix_free(&sums, request.epsilon, prior, start, rule, request.watch) {
-                Err(SolveError::Interrupted) => return Ok(None),
-                solved => solved?,
-            };
+        let solved = if request.regulariser == Regulariser::default() {
+            let (prior, rule) = (request.prior.as_deref(), request.setup.rule);
+            let sums = self.into_sums()?;
+            solve_matrix_free(&sums, request.epsilon, prior, start, rule, request.watch)
+                .map(|(solution, unknowns)| SolvedByDegree { solution, unknowns, uncertainty: None })
+        } else {
+            self.solve_by_degree(&request, start)
+        };
+        let SolvedByDegree { solution, unknowns, uncertainty } = match solved {
+            Err(SolveError::Interrupted) => return Ok(None),
+            Err(SolveError::NoPower) if !request.is_final => return Ok(None),
+            solved => solved?,
+        };
         if request.is_stopped() {
             return Ok(None);
         }
         if !request.is_final {
             *request.last = Some(unknowns);
         }
-        Ok(Some(solved.into_map(None)))
+        Ok(Some(solution.into_map(uncertainty)))
     }
 
     fn into_harmonic(self: Box<Self>) -> Result<Box<HarmonicSums>, &'static str> {

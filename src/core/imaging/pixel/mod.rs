@@ -12,7 +12,9 @@ mod cost;
 mod exact;
 mod matrix_free;
 mod method;
+mod projected;
 mod solve;
+mod solve_by_degree;
 mod solve_matrix_free;
 mod solve_with_power;
 mod sums;
@@ -24,7 +26,7 @@ pub use matrix_free::{MatrixFreeSums, MatrixFreeVisibilities};
 pub(super) use method::{MatrixFreeMaps, PixelMaps};
 pub use solve::{PixelExtras, PixelSolution, solve_pixels, solve_pixels_with};
 pub use solve_matrix_free::solve_matrix_free;
-pub use solve_with_power::{POWER_NSIDE_MAX, solve_pixels_with_power};
+pub use solve_with_power::solve_pixels_with_power;
 pub use sums::PixelSums;
 pub use tiles::{ColumnBlock, SymmetricTiles, TILE};
 

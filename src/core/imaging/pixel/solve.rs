@@ -147,7 +147,7 @@ pub fn solve_pixels_with(
 }
 
 /// The product of `BtN^-1B` and a sky that is 1 K in one pixel.
-pub(super) fn point_response(sums: &PixelSums, pixel: usize) -> Result<PointBeam, SolveError> {
+pub(super) fn point_response(sums: &dyn NormalSums, pixel: usize) -> Result<PointBeam, SolveError> {
     let pixels = sums.unknowns();
     let mut point = vec![0.0; pixels];
     *point.get_mut(pixel).ok_or(SolveError::NoPixel { pixel, pixels })? = 1.0;

@@ -5,21 +5,19 @@ use std::borrow::Cow;
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, get_global_parallelism};
 
+use super::projected::Harmonics;
 use super::solve::{PixelSolution, point_response};
-use crate::imaging::circle::{coefficients, degrees, moments, moments_k, resolution_deg, sample, unknowns};
+use crate::imaging::circle::{degrees, moments, moments_k, resolution_deg, sample, unknowns};
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Samples, Uncertainty};
 use crate::imaging::solver::{Diagnostics, NamedWatch, PointBeam, SolveError};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, subtract};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
-use crate::sky::harmonics::{AnalysisOptions, Transform, analysis};
-use crate::sky::healpix::pixel_area_sr;
+use crate::sky::harmonics::{AnalysisOptions, analysis};
 use crate::units::{StreamKind, random_stream};
 use rand_distr::{Distribution, StandardNormal};
 
 /// Maximum nside: 6561 harmonics, and matrices of 1.6 GB in addition to the sums.
-pub const POWER_NSIDE_MAX: usize = 32;
-/// Degrees per nside, as for harmonic maps.
-const DEGREES_PER_NSIDE: f64 = 2.5;
+pub(super) const POWER_NSIDE_MAX: usize = 32;
 /// First number of the draws of Gibbs sampling: those of plain samples are below.
 const GIBBS: u64 = 1 << 40;
 /// Rows of the matrix that are multiplied at once.
@@ -42,14 +40,10 @@ pub fn solve_pixels_with_power(
     let right = right_hand_side(sums, prior_k)?;
     // p.(2 b - A p), with b - A p in `right`.
     let predicted = prior_k.map_or(0.0, |prior_k| dot(prior_k, &sums.right) + dot(prior_k, &right));
-    let l_max = (DEGREES_PER_NSIDE * nside as f64) as usize;
-    let transform = Transform::new(nside, l_max)?;
-    let to_pixels = |x: &[f64]| transform.synthesis(&coefficients(x, l_max)).map_err(SolveError::from);
-    // The transpose of `to_pixels`; the adjoint transform includes the area of a pixel.
-    let area_sr = pixel_area_sr(nside);
-    let from_pixels = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
-        Ok(unknowns(&transform.adjoint(map)?).into_iter().map(|x| x / area_sr).collect())
-    };
+    let transform = Harmonics::new(nside)?;
+    let l_max = transform.l_max();
+    let to_pixels = |x: &[f64]| transform.to_pixels(x);
+    let from_pixels = |map: &[f64]| transform.from_pixels(map);
     let degrees: Vec<usize> = degrees(l_max).collect();
     let harmonics = harmonics(&to_pixels, pixels, degrees.len())?;
     if !watch.may_continue() {

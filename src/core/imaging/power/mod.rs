@@ -30,7 +30,7 @@ use faer::{Mat, Side};
 use serde::Serialize;
 
 pub(super) use blocks::{Block, Factors, multiply, value};
-pub(super) use rounds::{FoundPower, PowerProblem};
+pub(super) use rounds::{FoundPower, MapsWithPower, PowerProblem};
 pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 
 use self::blocks::{evidence, largest_diagonal};

@@ -8,7 +8,7 @@ use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, dot};
+use crate::imaging::solver::{Convergence, NamedWatch, SolveError, StoppingRule, System, dot};
 
 /// Maximum number of rounds.
 const ROUNDS_MAX: usize = 6;
@@ -54,6 +54,14 @@ pub(in crate::imaging) struct FoundPower {
     pub(super) covariance: Mat<f64>,
     /// Degree of each unknown.
     pub(super) degrees: Vec<usize>,
+}
+
+/// The map and the noise map for the estimated power.
+pub(in crate::imaging) struct MapsWithPower {
+    pub(in crate::imaging) found: FoundPower,
+    /// Unknowns of the map, without its prior, and of the noise map.
+    pub(in crate::imaging) columns: [Vec<f64>; 2],
+    pub(in crate::imaging) convergence: Vec<Convergence>,
 }
 
 impl FoundPower {
@@ -165,6 +173,29 @@ impl PowerProblem<'_> {
             }
             fit = next.fit;
         }
+    }
+
+    /// Estimates the power, then solves for the map and the noise map, from earlier ones of the same size if there are any.
+    pub(in crate::imaging) fn solve_maps(
+        &self,
+        start: Option<&[Vec<f64>; 2]>,
+        rule: StoppingRule,
+        watch: NamedWatch<'_>,
+    ) -> Result<MapsWithPower, SolveError> {
+        let found = self.solve(start.map(|[map, _]| map.as_slice()), rule, watch)?;
+        let factors = Factors::new(self.blocks, &found.regularisation);
+        let regularisation = Diagonal::ByDegree(found.regularisation.clone());
+        let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
+        let noise = match start {
+            Some([_, noise]) if noise.len() == self.right.len() => noise.clone(),
+            _ => vec![0.0; self.right.len()],
+        };
+        let mut columns = [found.solution.clone(), noise];
+        let task = watch.start("map and noise map", rule.residual_max);
+        let right = [self.right, self.sums.noise_right_hand_side()];
+        let convergence = system.solve(&right, &mut columns, &[rule, rule], &task);
+        drop(task);
+        Ok(MapsWithPower { found, columns, convergence })
     }
 
     /// The power of `fit`, of which `x` is the solution, with its uncertainty.

@@ -23,6 +23,9 @@ pub struct Diagnostics {
     /// Maximum degree of a harmonic map; absent for a pixel map.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub l_max: Option<usize>,
+    /// Whether pixels are solved for by their harmonics, so that errors include the sky's degrees beyond these.
+    #[serde(skip)]
+    pub is_of_pixels: bool,
     /// Convergence of the map; absent after a factorisation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub convergence: Option<Convergence>,

@@ -1,0 +1,227 @@
+//! Pixel maps whose R depends on the degree, by products alone: R from the data, a power of the degree, or a table of C_l.
+//!
+//! The unknowns x are those of harmonics up to 2.5 nside, and the map is `Y x`: then `Y'AY` stands for A, and R is diagonal. Blocks near
+//! `Y'AY` precondition, and say together with draws how much of each degree the data decide.
+
+use super::projected::{Harmonics, Projected};
+use super::solve::{PixelSolution, point_response};
+use crate::imaging::NormalSums;
+use crate::imaging::circle::{HarmonicRequest, Posterior, unknowns};
+use crate::imaging::power::{Block, Factors, MapsWithPower, PowerProblem, Uncertainty};
+use crate::imaging::regulariser::{Diagonal, Regulariser};
+use crate::imaging::solver::{Convergence, Diagnostics, NamedWatch, PointBeam, SolveError, System};
+use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, random_vector};
+use crate::imaging::solver::{add, check_request, dot, right_hand_side};
+use crate::sky::harmonics::{AnalysisOptions, analysis};
+use crate::sky::healpix::pixel_area_sr;
+
+/// Relative change of W_max at which it has converged, as of harmonic maps: it only scales R.
+const W_MAX_TOLERANCE: f64 = 1e-3;
+
+/// The equations of a map over pixels, and blocks near theirs over harmonics.
+pub(super) struct PixelEquations<'a> {
+    pub(super) sums: &'a (dyn NormalSums + Sync),
+    pub(super) blocks: &'a [Block<'a>],
+}
+
+/// A pixel map whose R depends on the degree.
+pub(super) struct SolvedByDegree {
+    pub(super) solution: PixelSolution,
+    /// Unknowns of the map, without its prior, and of the noise map: a start for more data.
+    pub(super) unknowns: [Vec<f64>; 2],
+    /// Errors, with R from the data.
+    pub(super) uncertainty: Option<Uncertainty>,
+}
+
+/// The unknowns of map and noise map, and the R that they have.
+struct Columns {
+    columns: [Vec<f64>; 2],
+    convergence: Vec<Convergence>,
+    regularisation: Diagonal,
+    diagnostics: Diagnostics,
+    uncertainty: Option<Uncertainty>,
+}
+
+/// The projected equations with the prior map that was taken off.
+struct Problem<'a> {
+    projected: &'a Projected<'a>,
+    blocks: &'a [Block<'a>],
+    request: HarmonicRequest,
+    prior_k: Option<&'a [f64]>,
+    watch: NamedWatch<'a>,
+}
+
+impl PixelEquations<'_> {
+    /// Solves for the map, the noise map and beams at `beams`.
+    ///
+    /// # Errors
+    /// There is no data, the prior has another size, a table of power ends before the map's degrees, or numbers are not finite;
+    /// [`SolveError::Interrupted`].
+    pub(super) fn solve(
+        &self,
+        request: HarmonicRequest,
+        regulariser: &Regulariser,
+        prior_k: Option<&[f64]>,
+        start: Option<&[Vec<f64>; 2]>,
+        beams: &[usize],
+        watch: NamedWatch<'_>,
+    ) -> Result<SolvedByDegree, SolveError> {
+        let is_of_data = *regulariser == Regulariser::Data;
+        check_request(self.sums, if is_of_data { 1.0 } else { request.epsilon })?;
+        let harmonics = Harmonics::new(request.nside)?;
+        let projected = Projected {
+            pixels: self.sums,
+            right: harmonics.from_pixels(&right_hand_side(self.sums, prior_k)?)?,
+            noise: harmonics.from_pixels(self.sums.noise_right_hand_side())?,
+            harmonics: &harmonics,
+        };
+        let problem = Problem { projected: &projected, blocks: self.blocks, request, prior_k, watch };
+        let solved = if is_of_data { problem.with_power(start) } else { problem.with(regulariser, start) }?;
+        if solved.columns[0].iter().all(|x| *x == 0.0) && !watch.may_continue() {
+            return Err(SolveError::Interrupted);
+        }
+        let beams = problem.beams(&solved.regularisation, beams)?;
+        let solution = PixelSolution {
+            map_k: problem.whole(&solved.columns[0])?,
+            noise_k: harmonics.to_pixels(&solved.columns[1])?,
+            beams,
+            diagnostics: solved.diagnostics.with_convergence(&solved.convergence),
+        };
+        Ok(SolvedByDegree { solution, unknowns: solved.columns, uncertainty: solved.uncertainty })
+    }
+}
+
+impl Problem<'_> {
+    fn l_max(&self) -> usize {
+        self.projected.harmonics.l_max()
+    }
+
+    fn diagnostics(&self) -> Diagnostics {
+        Diagnostics { l_max: Some(self.l_max()), is_of_pixels: true, ..Diagnostics::default() }
+    }
+
+    /// The map of unknowns, with its prior.
+    fn whole(&self, x: &[f64]) -> Result<Vec<f64>, SolveError> {
+        let mut map_k = self.projected.harmonics.to_pixels(x)?;
+        if let Some(prior_k) = self.prior_k {
+            add(&mut map_k, prior_k);
+        }
+        Ok(map_k)
+    }
+
+    /// Solves with R from the data.
+    fn with_power(&self, start: Option<&[Vec<f64>; 2]>) -> Result<Columns, SolveError> {
+        let (projected, rule, watch) = (self.projected, self.request.rule, self.watch);
+        let degrees: Vec<usize> = crate::imaging::circle::degrees(self.l_max()).collect();
+        let counts = projected.counts();
+        let problem = PowerProblem {
+            sums: projected,
+            blocks: self.blocks,
+            degrees: &degrees,
+            right: &projected.right,
+            power: counts.power - self.predicted_power()?,
+            numbers: 2.0 * counts.visibilities as f64,
+        };
+        let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
+        let errors = || -> Result<Uncertainty, SolveError> {
+            let whole = analysis(&self.whole(&columns[0])?, self.l_max(), &AnalysisOptions::default())?;
+            let posterior = Posterior {
+                sums: projected,
+                blocks: self.blocks,
+                found: &found,
+                right: &projected.right,
+                solved: &columns[0],
+                whole: &unknowns(&whole.alm),
+                nside: self.request.nside,
+                rule,
+                watch,
+            };
+            let mut errors = posterior.uncertainty(self.request.samples, &|x| projected.apply_all(x))?;
+            // A pixel holds the mean of a sky that has more than the degrees solved for.
+            let beyond_k2 = found.power.variance_beyond_k2(self.request.nside);
+            errors.sigma_k.iter_mut().for_each(|sigma_k| *sigma_k = sigma_k.hypot(beyond_k2.sqrt()));
+            Ok(errors)
+        };
+        let uncertainty = watch.has_priority().then(errors).transpose()?;
+        Ok(Columns {
+            columns,
+            convergence,
+            regularisation: Diagonal::ByDegree(found.regularisation),
+            diagnostics: self.diagnostics(),
+            uncertainty,
+        })
+    }
+
+    /// The part of `V'N^-1V` that the prior p explains, `p.(2 b - A p)`.
+    fn predicted_power(&self) -> Result<f64, SolveError> {
+        let Some(prior_k) = self.prior_k else { return Ok(0.0) };
+        let left = right_hand_side(self.projected.pixels, self.prior_k)?;
+        Ok(dot(prior_k, self.projected.pixels.right_hand_side()) + dot(prior_k, &left))
+    }
+
+    /// Solves with an R that is given.
+    fn with(&self, regulariser: &Regulariser, start: Option<&[Vec<f64>; 2]>) -> Result<Columns, SolveError> {
+        let HarmonicRequest { epsilon, nside, rule, .. } = self.request;
+        let projected = self.projected;
+        // That of a table does not depend on W_max.
+        let has_w_max = matches!(regulariser, Regulariser::Power(_));
+        let largest = has_w_max.then(|| {
+            let task = self.watch.start("largest eigenvalue", W_MAX_TOLERANCE);
+            largest_eigenvalue_from(
+                random_vector(projected.unknowns()),
+                projected,
+                W_MAX_TOLERANCE,
+                &mut |needs_step, step, change| task.report_step(needs_step, step, change),
+            )
+        });
+        let w_max = largest.as_ref().map(|LargestEigenvalue { value, .. }| *value);
+        let regularisation = regulariser.diagonal(epsilon, w_max.unwrap_or(0.0), self.l_max())?;
+        let of_degree: Vec<f64> = (0..=self.l_max()).map(|l| regularisation.at(l)).collect();
+        let factors = Factors::new(self.blocks, &of_degree);
+        let system = System {
+            sums: projected,
+            regularisation: regularisation.clone(),
+            precondition: &|v| factors.solve(v),
+        };
+        let unknowns = projected.unknowns();
+        let mut columns = match start {
+            Some(start) if start.iter().all(|x| x.len() == unknowns) => start.clone(),
+            _ => [vec![0.0; unknowns], vec![0.0; unknowns]],
+        };
+        let task = self.watch.start("map and noise map", rule.residual_max);
+        let convergence =
+            system.solve(&[&projected.right, &projected.noise], &mut columns, &[rule, rule], &task);
+        drop(task);
+        let diagnostics = Diagnostics {
+            epsilon: Some(epsilon),
+            w_max: w_max.map(|w_max| w_max * pixel_area_sr(nside)),
+            w_max_iterations: largest.map_or(0, |largest| largest.iterations),
+            ..self.diagnostics()
+        };
+        Ok(Columns { columns, convergence, regularisation, diagnostics, uncertainty: None })
+    }
+
+    /// The maps of skies that are 1 K in one pixel.
+    fn beams(&self, regularisation: &Diagonal, pixels: &[usize]) -> Result<Vec<PointBeam>, SolveError> {
+        if pixels.is_empty() {
+            return Ok(Vec::new());
+        }
+        let Projected { pixels: sums, harmonics, .. } = *self.projected;
+        let of_degree: Vec<f64> = (0..=self.l_max()).map(|l| regularisation.at(l)).collect();
+        let factors = Factors::new(self.blocks, &of_degree);
+        let system = System {
+            sums: self.projected,
+            regularisation: regularisation.clone(),
+            precondition: &|v| factors.solve(v),
+        };
+        let beam = |&pixel: &usize| {
+            let right = harmonics.from_pixels(&point_response(sums, pixel)?.map_k)?;
+            let mut beam = [vec![0.0; right.len()]];
+            let rule = self.request.rule;
+            let task = self.watch.start(&format!("beam at pixel {pixel}"), rule.residual_max);
+            system.solve(&[&right], &mut beam, &[rule], &task);
+            Ok(PointBeam { pixel, map_k: harmonics.to_pixels(&beam[0])? })
+        };
+        pixels.iter().map(beam).collect()
+    }
+}
