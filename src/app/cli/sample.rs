@@ -71,8 +71,8 @@ pub(super) fn execute(args: &SampleArgs) -> CommandResult {
     let regulariser = config.map.regulariser();
     if regulariser != RegulariserChoice::Data {
         return Err(format!(
-            "{}: samples need R from the data, and these settings choose another R (map.regulariser, map.epsilon, map.refine, map.matrix, or \
-             pixels beyond nside 32): expected --set map.regulariser=data, or settings that allow it",
+            "{}: samples need R from the data, and these settings choose another R (map.regulariser or \
+             map.epsilon): expected --set map.regulariser=data",
             args.state.display()
         )
         .into());

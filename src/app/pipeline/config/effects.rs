@@ -160,7 +160,8 @@ mod tests {
             ),
             (
                 "map.iterations_max = 7",
-                "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"free\"",
+                "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"free\" or \
+                 map.regulariser",
             ),
             (
                 "daughters.bits = 2",

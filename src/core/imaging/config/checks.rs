@@ -133,7 +133,7 @@ impl MapConfig {
             let found = format!("[{longitude_deg}, {latitude_deg}]");
             checks.require("beams_deg", found, good, "ecliptic longitude and latitude, degrees");
         }
-        if !is_identity {
+        if !is_identity && !self.holds_visibilities() {
             let expected = "0 unless map.regulariser = \"identity\": traces are those of R = epsilon W_max I";
             checks.require("trace_probes", self.trace_probes, self.trace_probes == 0, expected);
         }
