@@ -44,7 +44,7 @@ impl Harmonics {
     }
 
     /// `Y' map`.
-    pub(super) fn from_pixels(&self, map: &[f64]) -> Result<Vec<f64>, SolveError> {
+    pub(super) fn harmonics_of(&self, map: &[f64]) -> Result<Vec<f64>, SolveError> {
         // The adjoint transform includes the area of a pixel.
         let area_sr = pixel_area_sr(self.transform.nside());
         Ok(unknowns(&self.transform.adjoint(map)?).into_iter().map(|x| x / area_sr).collect())
@@ -76,7 +76,7 @@ impl NormalSums for Projected<'_> {
         let maps: Vec<Vec<f64>> = x.iter().map(|x| self.harmonics.to_pixels(x).unwrap_or_default()).collect();
         let maps: Vec<&[f64]> = maps.iter().map(Vec::as_slice).collect();
         let products = self.pixels.apply_all(&maps);
-        products.iter().map(|map| self.harmonics.from_pixels(map).unwrap_or_default()).collect()
+        products.iter().map(|map| self.harmonics.harmonics_of(map).unwrap_or_default()).collect()
     }
 
     fn right_hand_side(&self) -> &[f64] {
@@ -221,7 +221,7 @@ mod tests {
             let map = harmonics.to_pixels(&unit).unwrap();
             let product: Vec<f64> =
                 (0..pixels).map(|p| (0..pixels).map(|q| element(p, q) * map[q]).sum()).collect();
-            harmonics.from_pixels(&product).unwrap()
+            harmonics.harmonics_of(&product).unwrap()
         };
         let dense: Vec<Vec<f64>> = (0..count).map(column).collect();
         let mut seen = 0;

@@ -71,8 +71,8 @@ impl PixelEquations<'_> {
         let harmonics = Harmonics::new(request.nside)?;
         let projected = Projected {
             pixels: self.sums,
-            right: harmonics.from_pixels(&right_hand_side(self.sums, prior_k)?)?,
-            noise: harmonics.from_pixels(self.sums.noise_right_hand_side())?,
+            right: harmonics.harmonics_of(&right_hand_side(self.sums, prior_k)?)?,
+            noise: harmonics.harmonics_of(self.sums.noise_right_hand_side())?,
             harmonics: &harmonics,
         };
         let problem = Problem { projected: &projected, blocks: self.blocks, request, prior_k, watch };
@@ -215,7 +215,7 @@ impl Problem<'_> {
             precondition: &|v| factors.solve(v),
         };
         let beam = |&pixel: &usize| {
-            let right = harmonics.from_pixels(&point_response(sums, pixel)?.map_k)?;
+            let right = harmonics.harmonics_of(&point_response(sums, pixel)?.map_k)?;
             let mut beam = [vec![0.0; right.len()]];
             let rule = self.request.rule;
             let task = self.watch.start(&format!("beam at pixel {pixel}"), rule.residual_max);

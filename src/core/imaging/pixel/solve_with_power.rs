@@ -43,7 +43,7 @@ pub fn solve_pixels_with_power(
     let transform = Harmonics::new(nside)?;
     let l_max = transform.l_max();
     let to_pixels = |x: &[f64]| transform.to_pixels(x);
-    let from_pixels = |map: &[f64]| transform.from_pixels(map);
+    let harmonics_of = |map: &[f64]| transform.harmonics_of(map);
     let degrees: Vec<usize> = degrees(l_max).collect();
     let harmonics = harmonics(&to_pixels, pixels, degrees.len())?;
     if !watch.may_continue() {
@@ -55,7 +55,7 @@ pub fn solve_pixels_with_power(
     }
     let places = vec![(0..degrees.len()).collect()];
     let blocks = [Block { matrix: Cow::Owned(matrix), degrees: degrees.clone(), places }];
-    let right = from_pixels(&right)?;
+    let right = harmonics_of(&right)?;
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
     let problem = PowerProblem {
@@ -69,7 +69,7 @@ pub fn solve_pixels_with_power(
     let found = problem.solve_blocks()?;
     let factors = Factors::new(&blocks, &found.regularisation);
     let solved = |map: &[f64]| -> Result<Vec<f64>, SolveError> {
-        let mut x = from_pixels(map)?;
+        let mut x = harmonics_of(map)?;
         factors.solve(&mut x);
         to_pixels(&x)
     };
