@@ -490,7 +490,8 @@ def sheets(ulsa):
              "sky-10mhz.fits": sky(10, 256, " --out out/sky-10mhz.fits"),
              "sub-pixel-matrix.png": "python3 pipelines/paper/sub_pixel.py matrix 8 out/sky-10mhz.fits",
              "sigma-b-8.txt": "python3 pipelines/paper/sub_pixel.py map 8 out/sky-10mhz.fits 2000 > out/sigma-b-8.txt",
-             "sigma-b-16.txt": "python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits 3000 > out/sigma-b-16.txt"},
+             "sigma-b-16.txt": "python3 pipelines/paper/sub_pixel.py map 16 out/sky-10mhz.fits 3000 > out/sigma-b-16.part && "
+             "mv out/sigma-b-16.part out/sigma-b-16.txt"},
          lambda: figure("sub-pixel", sub_pixel) + picture("sub-pixel-matrix.png", "paper-sub-pixel-matrix.png", "N_b")
          + "".join((OUT / f"sigma-b-{nside}.txt").read_text() for nside in (8, 16))),
         ("R from the data: limits of Fig. 16 and 17", study("limits-data"),

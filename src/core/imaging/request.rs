@@ -15,8 +15,7 @@ use crate::units::{ChannelId, PerChannel};
 pub struct SolverSetup {
     /// epsilon of R = epsilon W_max I.
     pub epsilon: PerChannel<f64>,
-    /// Regulariser R by channel. The last one also holds for all further channels; the identity if there is none. Pixel maps support R from
-    /// the data and the identity.
+    /// Regulariser R by channel. The last one also holds for all further channels; the identity if there is none.
     pub regularisers: Vec<Regulariser>,
     /// Ecliptic longitudes and latitudes, degrees, for which the effective beam of a final map is computed.
     pub beams_deg: Vec<[f64; 2]>,
@@ -28,7 +27,7 @@ pub struct SolverSetup {
     pub prior_hz: Vec<Option<f64>>,
     /// Assumed reflectivity of the Moon: visibilities are divided by 1 plus this.
     pub moon_reflection: f64,
-    /// Stopping rule of iterative solutions: harmonic maps, and matrix-free pixel maps.
+    /// Stopping rule of iterative solutions: harmonic maps, and pixel maps without a matrix or whose R depends on the degree.
     pub rule: StoppingRule,
     /// Stopping rule of the refinement of a harmonic map.
     pub refine: RefineRule,

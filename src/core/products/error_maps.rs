@@ -52,7 +52,7 @@ pub(super) fn limits(diagnostics: &Diagnostics, refinement: Option<&Refinement>)
     match (refinement, diagnostics.convergence) {
         (Some(_), _) => "degrees up to l_max; too small far off a circle: lunarray sample",
         (None, Some(_)) if diagnostics.is_of_pixels => {
-            "all degrees, also those beyond the map's; may be too small for few data: lunarray sample"
+            "all degrees; may be too small for few data: lunarray sample"
         }
         (None, Some(_)) => "degrees up to l_max; may be too small for few data: lunarray sample",
         (None, None) => "all degrees, also those beyond the map's",

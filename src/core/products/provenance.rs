@@ -71,7 +71,12 @@ impl Provenance {
                 cards.push(Card::text("ROWS", &rows, "of B: average over pixels, or centre"));
                 if let Some(convergence) = solution.diagnostics.convergence {
                     let products = i64::try_from(convergence.iterations).unwrap_or(i64::MAX);
-                    cards.push(Card::integer("PRODUCTS", products, "with rows of B made again"));
+                    let with = if map.is_matrix_free() {
+                        "with rows of B made again"
+                    } else {
+                        "with the normal matrix"
+                    };
+                    cards.push(Card::integer("PRODUCTS", products, with));
                     cards.push(Card::real("RESIDUAL", convergence.residual, "of the equations, relative"));
                 }
             }

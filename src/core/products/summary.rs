@@ -174,14 +174,10 @@ impl fmt::Display for ChannelSummary {
         }
         if let Some(refinement) = &self.refinement {
             write!(f, "\n             {refinement}")?;
-        } else if let Diagnostics { convergence: Some(convergence), l_max: None, .. } = self.diagnostics {
-            // Matrix-free pixel maps; a direct solution has no residual.
+        } else if let Some(convergence) = self.diagnostics.convergence_of_pixels() {
             let Convergence { iterations, residual, converged } = convergence;
             let warning = if converged { "" } else { ": not converged, increase map.iterations_max" };
-            write!(
-                f,
-                "\n             {iterations} matrix-free iterations, residual {residual:.1e}{warning}"
-            )?;
+            write!(f, "\n             {iterations} iterations, residual {residual:.1e}{warning}")?;
         }
         if let Some((fwhm_deg, noise_jy)) =
             self.beam.as_ref().and_then(|beam| Some((beam.fwhm_deg?, beam.noise_rms_jy?)))

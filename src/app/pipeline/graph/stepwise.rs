@@ -10,7 +10,7 @@ use crate::pipeline::config::{PipelineError, Plan};
 use crate::runtime::{BoxError, Outlet, Stage};
 use crate::sky::SkyMap;
 
-/// A run whose stages are those of [`run`](super::run()), without the ones that write files. Its maps have the bits that `run` writes.
+/// A run whose stages are those of [`run`](super::run()), without the ones that write files. Its final maps have the bits that `run` writes.
 pub struct StepwiseRun {
     windows: std::vec::IntoIter<ObservingWindow>,
     count: usize,

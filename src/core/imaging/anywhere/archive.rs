@@ -22,6 +22,11 @@ use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, ref
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};
 use crate::imaging::{AccumulationError, Added, NormalEngine, Refusal, SumCounts};
 use crate::response::general::TimedPair;
+use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::vector::{norm, sub};
+
+/// Longest baseline of blocks on a circle, wavelengths: just below what the circle's engine takes.
+const CIRCLE_WAVELENGTHS_MAX: f64 = 9_999.0;
 
 /// Memory of a visibility while it is stored, sorted and used for refinement, bytes, including spare capacity of arrays.
 pub const REFINED_VISIBILITY_BYTES: u64 = 400;
@@ -223,7 +228,12 @@ impl VisibilityArchive {
     ) -> Result<OrderBlocks, AccumulationError> {
         self.sort();
         self.flush();
-        let setup = RefinedSetup { l_max, ..self.setup };
+        let lengths_m = self.held.iter().map(|held| norm(sub(held.at.r_i_m, held.at.r_j_m)));
+        // Tables grow with the longest baseline, and a circle takes a bounded one. Blocks only precondition.
+        let longest_m = (1.001 * lengths_m.fold(1.0, f64::max))
+            .min(CIRCLE_WAVELENGTHS_MAX * SPEED_OF_LIGHT_M_S / self.setup.frequency_hz);
+        let setup =
+            RefinedSetup { l_max, baseline_m_max: self.setup.baseline_m_max.min(longest_m), ..self.setup };
         let (orbit, _) = nearest_circle(&setup, &|k| self.held[k].at, self.held.len());
         let mut engine = circle_engine(&setup, orbit)?;
         sum_on_circle(&setup, &self.held, &mut engine)?;

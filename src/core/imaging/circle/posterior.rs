@@ -22,7 +22,7 @@ const GIBBS: u64 = 1 << 40;
 
 /// The equations of a map with R from the data, solved.
 pub(in crate::imaging) struct Posterior<'a> {
-    /// Equations on one circle.
+    /// Equations over harmonics: of one circle, or projected from pixels.
     pub(in crate::imaging) sums: &'a dyn NormalSums,
     /// Blocks near their matrix.
     pub(in crate::imaging) blocks: &'a [Block<'a>],

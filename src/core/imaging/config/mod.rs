@@ -151,10 +151,10 @@ keys! {
         /// Seed of the noise-only companion map.
         expert companion_seed: u64 = 1;
         /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser"#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser or map.nside > 32"#)]
         expert residual_max: f64 = 1e-4;
         /// Maximum number of iterations of a solution.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser"#)]
+        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser or map.nside > 32"#)]
         expert iterations_max: usize = 300;
         /// Random probes for the traces of a final map's covariances; 0 for no traces. Up to 3072 unknowns (nside 16, or l_max
         /// 54) traces are exact, with any number above 0.

@@ -57,6 +57,9 @@ pub(super) fn stored(map: &MapConfig, solutions: u64) -> EngineCost {
     }
 }
 
+/// Longest baseline for which blocks are estimated, b_p.
+const BLOCKS_BP_MAX: f64 = 100.0;
+
 /// Stored visibilities and matrix products, each of which computes a row per visibility for the map and its noise map together.
 pub(super) fn matrix_free(map: &MapConfig, data: ChannelData) -> EngineCost {
     let pixels = pixel_count(map.nside) as f64;
@@ -73,6 +76,8 @@ pub(super) fn matrix_free(map: &MapConfig, data: ChannelData) -> EngineCost {
     let circle_bytes = if map.regulariser() == RegulariserChoice::Identity {
         0.0
     } else {
+        // Blocks reach as far as the data; a limit far beyond them says nothing.
+        let map = &MapConfig { baseline_bp_max: map.baseline_bp_max.min(BLOCKS_BP_MAX), ..map.clone() };
         let circle = harmonic_cost(map, ChannelData { solutions: 1, ..data });
         circle.sums_bytes + circle.copy_bytes + circle.other_bytes
     };

@@ -109,6 +109,9 @@ impl MapEquations for PixelSums {
                 solve_pixels_with(*self, request.epsilon, prior, extras, watch).map(|map| map.into_map(None))
             }
         };
+        if request.is_stopped() {
+            return Ok(None);
+        }
         match solved {
             Err(SolveError::Interrupted) => Ok(None),
             // The first data, or forged data, may not determine a map. A later snapshot has more data, so only a final failure is an error.

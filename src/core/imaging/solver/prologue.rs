@@ -15,12 +15,12 @@ pub struct Diagnostics {
     /// epsilon of `R = epsilon W_max I`; absent if R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub epsilon: Option<f64>,
-    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent if R is from the data.
+    /// W_max, the largest eigenvalue of `BtN^-1B`, K^-2; absent if R is from the data, or, of pixel maps, a table.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub w_max: Option<f64>,
     /// Number of Lanczos iterations for W_max.
     pub w_max_iterations: usize,
-    /// Maximum degree of a harmonic map; absent for a pixel map.
+    /// Maximum degree solved for; absent for a pixel map whose R is the identity, or from the data up to nside 32.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub l_max: Option<usize>,
     /// Whether pixels are solved for by their harmonics, so that errors include the sky's degrees beyond these.
@@ -44,6 +44,11 @@ pub struct Diagnostics {
 }
 
 impl Diagnostics {
+    /// That of a pixel map which was iterated; a direct solution has none.
+    pub(crate) fn convergence_of_pixels(&self) -> Option<Convergence> {
+        self.convergence.filter(|_| self.l_max.is_none() || self.is_of_pixels)
+    }
+
     /// Diagnostics of a map up to `l_max` with R from the data.
     pub(in crate::imaging) fn of_power(l_max: usize, convergence: &[Convergence]) -> Self {
         Self { l_max: Some(l_max), ..Self::default() }.with_convergence(convergence)
