@@ -247,7 +247,7 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
     let args = ["simulate", &place.pipeline, "--out", &place.path("x"), "--set", tilts[0]];
     let said = common::workplace::fail(&args);
     assert!(
-        said.contains("spacecraft.model = (other): expected \"direct\" or \"general\" with instrument.tilt"),
+        said.contains("spacecraft.model = \"auto\": expected \"direct\" or \"general\" with instrument.tilt"),
         "{said}"
     );
 }
