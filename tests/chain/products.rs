@@ -146,6 +146,23 @@ fn headers_and_summaries_say_how_a_map_was_made() {
 }
 
 #[test]
+fn a_pixel_map_that_is_iterated_says_whether_it_has_converged() {
+    let folder = tempfile::tempdir().unwrap();
+    for (matrix, iterations, said) in [
+        ("stored", "300", "iterations, residual"),
+        ("stored", "1", ": not converged, increase map.iterations_max"),
+        ("free", "1", ": not converged, increase map.iterations_max"),
+    ] {
+        let [matrix, iterations] = [("matrix", matrix), ("iterations_max", iterations)]
+            .map(|(key, value)| format!("map.{key}={value}"));
+        let keys = ["map.engine=pixel", "map.regulariser={degree=2.0}", &matrix, &iterations];
+        let ran = run(folder.path(), &keys[2..].join(""), &keys);
+        assert!(ran.printed.contains(said), "{matrix}: {}", ran.printed);
+        assert_eq!(ran.printed.contains("not converged"), iterations.ends_with("=1"), "{}", ran.printed);
+    }
+}
+
+#[test]
 #[ignore = "needs LUNARRAY_PYTHON"]
 fn post_processing_is_of_map_noise_input_and_curves() {
     let folder = tempfile::tempdir().unwrap();

@@ -239,6 +239,7 @@ mod tests {
             "",
             "map.l_max = 0",
             "map.matrix = \"free\"\nmap.iterations_max = 7",
+            "map.engine = \"pixel\"\nmap.nside = 64\nmap.iterations_max = 7",
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
             format!("array = {{ {ORBITS}, altitude_m = 300e3, moon_radius_m = 1.7e6 }}").as_str(),
         ] {
