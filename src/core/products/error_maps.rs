@@ -92,6 +92,17 @@ fn quantile(sorted: &[f64], share: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::imaging::Convergence;
+
+    #[test]
+    fn limits_fit_into_a_line_of_a_header() {
+        let convergence = Some(Convergence { iterations: 1, residual: 0.0, converged: true });
+        for (convergence, is_of_pixels) in [(convergence, true), (convergence, false), (None, true)] {
+            let diagnostics = Diagnostics { convergence, is_of_pixels, ..Diagnostics::default() };
+            let found = limits(&diagnostics, None);
+            assert!(found.len() <= 68, "{found}");
+        }
+    }
 
     #[test]
     fn quantiles_are_those_of_evenly_spread_values() {
