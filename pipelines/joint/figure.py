@@ -1,11 +1,11 @@
-"""What total powers and neighbouring channels bring: rho_l at 10 MHz of four maps, and what is left to 1.
+"""What total powers and neighbouring channels bring: rho_l at 10 MHz of four maps, and what is left to 1. Needs matplotlib.
 
     lunarray simulate bring.toml --out bring.ccsds
     lunarray replay bring.ccsds --map bring.toml --state all --out alone
     lunarray replay bring.ccsds --map bring.toml --channels 3 --state one --out one-map
-    lunarray joint one --out powers
-    lunarray joint all --no-powers --out channels
-    lunarray joint all --out both
+    lunarray joint one --count 8 --out powers
+    lunarray joint all --no-powers --count 8 --out channels
+    lunarray joint all --count 8 --out both
     lunarray sky bring.toml --freq-hz 1e7 --nside 64 --out sky.fits
     python figure.py lunarray sky.fits bring.png {alone,powers,channels,both}/10.000MHz/map.fits
 """
