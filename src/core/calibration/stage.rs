@@ -343,9 +343,9 @@ impl Calibrator {
         self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
-        if let Some([outside, inside]) = self.bursts.divided(&placed) {
-            self.ledger.add_left_out(VisibilityReason::Burst, inside.len() as u64);
-            placed = outside;
+        if let Some(divided) = self.bursts.divided(&placed) {
+            self.ledger.add_left_out(VisibilityReason::Burst, divided.left_out.len() as u64);
+            placed = divided.used;
         }
         Ok(Some(placed))
     }

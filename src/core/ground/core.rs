@@ -10,7 +10,7 @@ use super::live_view::{Activity, LiveViewWriter};
 use super::pass_gate::{PassGate, PassObserver};
 use super::promises::SenderPromises;
 use super::{Collector, CollectorStep, DeliveredPacket, Delivery, GroundConfig, GroundError, GroundOutcome};
-use crate::calibration::{BurstChoice, BurstSearch, Calibrator, MissingPackets};
+use crate::calibration::{BurstChoice, BurstSearch, Calibrator, DividedBlock, MissingPackets};
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::downlink::{CucTime, PacketHeader, PacketKind};
@@ -298,14 +298,19 @@ impl Ground {
     fn end_pass(&mut self) -> Result<(), GroundError> {
         let Some(instrument) = self.collector.instrument() else { return Ok(()) };
         let search =
-            BurstSearch { moon_radius_m: instrument.moon_radius_m, epoch_tai_s: instrument.epoch_tai_s };
+            BurstSearch { moon_radius_m: instrument.moon_radius_m, epoch_tai_s: instrument.epoch_tai_s, choice: self.outcome.bursts.choice() };
         let bursts = self.outcome.bursts.clone();
         for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
-            let Some([outside, inside]) = bursts.divided(&placed) else { continue };
-            let removed = if is_used { self.accumulator.remove(&inside)?.visibilities } else { 0 };
+            let Some(DividedBlock { used, left_out, as_received, peeled }) = bursts.divided(&placed) else { continue };
+            let mut removed = 0;
+            if is_used {
+                removed += self.accumulator.remove(&left_out)?.visibilities;
+                removed += self.accumulator.remove(&as_received)?.visibilities;
+                removed = removed.saturating_sub(self.accumulator.put_back(&peeled)?.visibilities);
+            }
             self.outcome.ledger.reflag(VisibilityReason::Burst, removed);
             if let Some((archive, sent)) = self.archive.as_mut().zip(sent) {
-                archive.reflag(sent, &outside, removed);
+                archive.reflag(sent, &used, removed);
             }
         }
         Ok(())

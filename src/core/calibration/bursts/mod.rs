@@ -5,9 +5,11 @@
 
 mod detect;
 mod locate;
+mod peel;
 
 pub use detect::{BurstSearch, find_bursts};
 pub(super) use locate::{Sample, locate};
+pub use peel::LightCurve;
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -22,6 +24,9 @@ use crate::units::{ChannelId, Dimension};
 /// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
 const BURSTS_MAX: usize = 1 << 18;
 
+/// Maximum number of cells of all light curves, 64 MB. Bursts beyond it are left out.
+const CELLS_MAX: usize = 1 << 23;
+
 /// What is done with bursts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -33,6 +38,8 @@ pub enum BurstChoice {
     Flag,
     /// Bursts are reported, and their visibilities are used like others.
     Keep,
+    /// The flux of each burst by time is fitted and subtracted, with its error; what a point source does not explain stays out.
+    Peel,
 }
 
 impl BurstChoice {
@@ -71,6 +78,9 @@ pub struct FoundBurst {
     /// six degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
+    /// What is subtracted; absent if the burst is flagged or kept.
+    #[serde(skip)]
+    pub light_curve: Option<LightCurve>,
 }
 
 impl FoundBurst {
@@ -80,10 +90,17 @@ impl FoundBurst {
         self.until_s - self.from_s
     }
 
+    /// Length of what stays out of the sums, if bursts are peeled or flagged, s.
+    #[must_use]
+    pub fn left_out_s(&self) -> f64 {
+        self.light_curve.as_ref().map_or(self.length_s(), LightCurve::unexplained_s)
+    }
+
     /// Whether the values are those of a burst. Checkpoints are untrusted.
     #[must_use]
     pub fn is_sound(&self, channels: usize) -> bool {
         usize::from(self.channel) < channels && self.from_s.is_finite() && self.length_s() >= 0.0
+            && self.light_curve.as_ref().is_none_or(LightCurve::is_sound)
     }
 
     /// Whether visibility `k` of a block lies in the burst.
@@ -125,7 +142,7 @@ const LISTED_MAX: usize = 1000;
 /// Summary of the bursts of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BurstSummary {
-    /// Whether their visibilities are left out.
+    /// What is done with their visibilities.
     pub action: BurstChoice,
     /// Number of bursts, counted in each channel.
     pub found: u64,
@@ -140,7 +157,7 @@ fn first_bursts<S: Serializer>(bursts: &[FoundBurst], serializer: S) -> Result<S
     serializer.collect_seq(bursts.iter().take(LISTED_MAX))
 }
 
-/// Time of the bursts in a channel: what is lost, if they are left out.
+/// Time of the bursts in a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct BurstHours {
     /// Frequency, Hz.
@@ -149,6 +166,8 @@ pub struct BurstHours {
     pub found: u64,
     /// Total length, h.
     pub hours: f64,
+    /// What of it is left out of the map, h.
+    pub hours_left_out: f64,
 }
 
 impl BurstSummary {
@@ -157,10 +176,13 @@ impl BurstSummary {
     pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
         let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
         for burst in &bursts {
-            let empty = BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0 };
+            let empty = BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0, hours_left_out: 0.0 };
             let channel = channels.entry(burst.channel).or_insert(empty);
             channel.found += 1;
             channel.hours += burst.length_s() / 3600.0;
+            if action != BurstChoice::Keep {
+                channel.hours_left_out += burst.left_out_s() / 3600.0;
+            }
         }
         let found = bursts.len() as u64;
         (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
@@ -169,11 +191,15 @@ impl BurstSummary {
 
 impl fmt::Display for BurstSummary {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let what = if self.action == BurstChoice::Flag { "left out" } else { "kept in the maps" };
+        let what = match self.action {
+            BurstChoice::Flag => "left out",
+            BurstChoice::Peel => "subtracted",
+            BurstChoice::Off | BurstChoice::Keep => "kept in the maps",
+        };
         write!(f, "{} bursts, {what}:", self.found)?;
-        for BurstHours { frequency_hz, found, hours } in &self.channels {
+        for BurstHours { frequency_hz, found, hours, hours_left_out } in &self.channels {
             let hz = Dimension::Frequency.show(*frequency_hz);
-            write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours")?;
+            write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours, {hours_left_out:.2} left out")?;
         }
         Ok(())
     }
@@ -195,10 +221,18 @@ struct BurstTable {
     starts: BTreeMap<u16, Vec<(f64, usize)>>,
     /// Length of the longest burst, s.
     longest_s: f64,
+    /// Number of cells of all light curves.
+    cells: usize,
 }
 
 impl BurstTable {
-    fn add(&mut self, burst: FoundBurst) {
+    fn add(&mut self, mut burst: FoundBurst) {
+        let cells = burst.light_curve.as_ref().map_or(0, LightCurve::cells);
+        if self.cells + cells > CELLS_MAX {
+            burst.light_curve = None;
+        } else {
+            self.cells += cells;
+        }
         self.longest_s = self.longest_s.max(burst.length_s());
         let starts = self.starts.entry(burst.channel).or_default();
         let at = starts.partition_point(|(from_s, _)| *from_s <= burst.from_s);
@@ -228,12 +262,6 @@ impl FoundBursts {
 
     fn table(&self) -> MutexGuard<'_, BurstTable> {
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Whether visibilities in a burst are left out.
-    #[must_use]
-    pub fn flags(&self) -> bool {
-        self.choice == BurstChoice::Flag
     }
 
     /// What is done with bursts.
@@ -284,22 +312,59 @@ impl FoundBursts {
         table.bursts.get(table.earlier + seen..).unwrap_or_default().to_vec()
     }
 
-    /// Divides a block into the visibilities outside all bursts and those in one; `None` if all are outside, or bursts are kept.
+    /// Divides a block by what bursts do to its visibilities; `None` if all are outside, or bursts are kept.
     #[must_use]
-    pub fn divided(&self, placed: &PlacedVisibilities) -> Option<[PlacedVisibilities; 2]> {
-        if !self.flags() {
+    pub fn divided(&self, placed: &PlacedVisibilities) -> Option<DividedBlock> {
+        if matches!(self.choice, BurstChoice::Off | BurstChoice::Keep) {
             return None;
         }
         let table = self.table();
         let bursts = table.about(placed);
-        let in_burst = |k: usize| bursts.iter().any(|burst| burst.holds(placed, k));
-        if bursts.is_empty() || !(0..placed.len()).any(in_burst) {
+        let is_in_burst = |k: usize| bursts.iter().any(|burst| burst.holds(placed, k));
+        if bursts.is_empty() || !(0..placed.len()).any(is_in_burst) {
             return None;
         }
-        let mut parts = [placed.without_visibilities(), placed.without_visibilities()];
-        (0..placed.len()).for_each(|k| parts[usize::from(in_burst(k))].push_from(placed, k));
-        Some(parts)
+        let mut divided = DividedBlock {
+            used: placed.clone(),
+            left_out: placed.without_visibilities(),
+            as_received: placed.without_visibilities(),
+            peeled: placed.without_visibilities(),
+        };
+        let mut is_left_out = vec![false; placed.len()];
+        for (k, is_left_out) in is_left_out.iter_mut().enumerate() {
+            for burst in bursts.iter().filter(|burst| burst.holds(placed, k)) {
+                let curve = burst.light_curve.as_ref();
+                match curve.and_then(|curve| curve.without_burst(&divided.used, k)) {
+                    Some((value, weight)) if !*is_left_out => {
+                        (divided.used.value_k_sr[k], divided.used.weight[k]) = (value, weight);
+                    }
+                    _ => *is_left_out = true,
+                }
+            }
+            if *is_left_out {
+                divided.left_out.push_from(placed, k);
+            } else if is_in_burst(k) {
+                divided.as_received.push_from(placed, k);
+                divided.peeled.push_from(&divided.used, k);
+            }
+        }
+        let mut used = placed.without_visibilities();
+        (0..placed.len()).filter(|k| !is_left_out[*k]).for_each(|k| used.push_from(&divided.used, k));
+        Some(DividedBlock { used, ..divided })
     }
+}
+
+/// A block whose visibilities lie, in part, in bursts.
+#[derive(Clone, Debug)]
+pub struct DividedBlock {
+    /// What a map uses, in the order of the block.
+    pub used: PlacedVisibilities,
+    /// What it does not use.
+    pub left_out: PlacedVisibilities,
+    /// Those used ones that lie in a burst, as they were received.
+    pub as_received: PlacedVisibilities,
+    /// The same without their bursts.
+    pub peeled: PlacedVisibilities,
 }
 
 #[cfg(test)]

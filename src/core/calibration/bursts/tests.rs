@@ -16,7 +16,7 @@ const FREQUENCY_HZ: f64 = 1e7;
 const STEP_S: f64 = 10.0;
 /// Rms of a visibility of the steady sky, K sr: as at 8 to 32 wavelengths of the generated sky at 10 MHz.
 const STEADY_K_SR: f64 = 4e4;
-const SEARCH: BurstSearch = BurstSearch { moon_radius_m: 1_737_100.0, epoch_tai_s: 2.178e9 };
+const SEARCH: BurstSearch = BurstSearch { moon_radius_m: 1_737_100.0, epoch_tai_s: 2.178e9, choice: BurstChoice::Peel };
 
 /// Visibilities of a pass of 3000 s from `from_s` on: Gaussian noise in place of a steady sky, independent from one to the next, and a
 /// source of power `k_sr(t)`.
@@ -165,10 +165,11 @@ fn visibilities_of_a_burst_are_divided_from_others() {
         positions_deg: vec![[0.0, 0.0]],
         position_sigma_deg: 1.0,
         name: None,
+        light_curve: None,
     };
     // Integrations of 1 s at 1e5, 1e5 + 10, ...: one ends in the burst, one lies in it, one begins in it.
     bursts.add(burst(1e5 + 10.2, 1e5 + 29.7));
-    let [outside, inside] = bursts.divided(&blocks[0]).unwrap();
+    let DividedBlock { used: outside, left_out: inside, .. } = bursts.divided(&blocks[0]).unwrap();
     assert_eq!(inside.time_s, [1e5 + 10.0, 1e5 + 20.0, 1e5 + 30.0]);
     assert_eq!(outside.len() + 3, blocks[0].len());
     let kept = FoundBursts { choice: BurstChoice::Keep, ..bursts.clone() };

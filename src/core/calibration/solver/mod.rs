@@ -70,6 +70,7 @@ mod tests;
 mod verdict;
 
 pub use bound::{DaughterBound, GainBound, bounds};
+pub(super) use dense::DenseFactor;
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
 pub use diagnosis::ModelFault;

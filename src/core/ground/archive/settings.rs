@@ -18,6 +18,7 @@ pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>
         BurstChoice::Off => {}
         BurstChoice::Flag => settings.push(("calibration.bursts".to_owned(), "flag".to_owned())),
         BurstChoice::Keep => settings.push(("calibration.bursts".to_owned(), "keep".to_owned())),
+        BurstChoice::Peel => settings.push(("calibration.bursts".to_owned(), "peel".to_owned())),
     }
     if let Some(path) = &config.calibration.gains_file {
         settings.push(("calibration.gains_file".to_owned(), checksum(path)?));

@@ -279,6 +279,22 @@ impl Accumulator {
         Ok(removed)
     }
 
+    /// Adds visibilities in place of removed ones, without posting to the ledger.
+    ///
+    /// # Errors
+    /// As [`Self::remove`].
+    pub fn put_back(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
+        let short = self.usable(placed)?;
+        if short.is_empty() {
+            return Ok(Added::default());
+        }
+        let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
+        let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
+        let added = state.sums.add(&short)?;
+        self.accumulated += added.visibilities;
+        Ok(added)
+    }
+
     /// Sets the first and last mission time, s, of the data in each channel, and drops channels without a span.
     pub fn retain_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
         for (slot, channel) in self.channels.iter_mut().zip(0..) {
