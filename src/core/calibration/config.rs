@@ -43,9 +43,9 @@ keys! {
         expert quantiser_bits: u32 = 0;
         /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
         expert sub_bands: usize = 1;
-        /// Bursts of point sources, such as the Sun's, that are found in a pass: "flag" leaves their visibilities out of the sums, "peel" subtracts their fitted flux with its error, "keep"
-        /// only reports them, "off" does not look for any. A steady source that the Moon uncovers for less than a quarter of a pass, and that
-        /// outshines the rest, is taken for a burst.
+        /// Bursts of point sources, such as the Sun's, that are found in a pass: "flag" leaves their visibilities out of the sums, "peel"
+        /// subtracts their fitted flux and lowers weights by its error, "keep" only reports them, "off" does not look for any. A steady
+        /// source that the Moon uncovers for less than a quarter of a pass, and that outshines the rest, is taken for a burst.
         #[serde(skip_serializing_if = "BurstChoice::is_off")]
         expert bursts: BurstChoice = BurstChoice::Off;
     }

@@ -27,7 +27,9 @@ pub use autos::{AUTOS_MAX, AutoTable};
 #[doc(hidden)]
 pub use blocks::{BlockKey, Completeness, MissingPackets, ReceivedBlocks};
 #[doc(hidden)]
-pub use bursts::{BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve, find_bursts};
+pub use bursts::{
+    BurstChoice, BurstSearch, BurstSummary, DividedBlock, FoundBurst, FoundBursts, LightCurve, find_bursts,
+};
 #[doc(hidden)]
 pub use config::{CalibrationConfig, CalibrationHook};
 pub use error::CalibrationError;

@@ -297,11 +297,16 @@ impl Ground {
     /// Judges the visibilities of the open pass, and takes those in bursts out of the sums.
     fn end_pass(&mut self) -> Result<(), GroundError> {
         let Some(instrument) = self.collector.instrument() else { return Ok(()) };
-        let search =
-            BurstSearch { moon_radius_m: instrument.moon_radius_m, epoch_tai_s: instrument.epoch_tai_s, choice: self.outcome.bursts.choice() };
+        let search = BurstSearch {
+            moon_radius_m: instrument.moon_radius_m,
+            epoch_tai_s: instrument.epoch_tai_s,
+            choice: self.outcome.bursts.choice(),
+        };
         let bursts = self.outcome.bursts.clone();
         for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
-            let Some(DividedBlock { used, left_out, as_received, peeled }) = bursts.divided(&placed) else { continue };
+            let Some(DividedBlock { used, left_out, as_received, peeled }) = bursts.divided(&placed) else {
+                continue;
+            };
             let mut removed = 0;
             if is_used {
                 removed += self.accumulator.remove(&left_out)?.visibilities;

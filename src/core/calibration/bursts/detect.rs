@@ -18,9 +18,9 @@ use std::collections::BTreeMap;
 use std::f64::consts::LN_2;
 use std::ops::Range;
 
+use super::locate::{KnownBody, Sample, locate};
 use super::peel::BurstRow;
 use super::{BurstChoice, FoundBurst, LightCurve};
-use super::locate::{KnownBody, Sample, locate};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::numerics::{median, percentiles};
 use crate::response::pixel::PairGeometry;

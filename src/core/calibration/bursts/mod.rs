@@ -99,7 +99,9 @@ impl FoundBurst {
     /// Whether the values are those of a burst. Checkpoints are untrusted.
     #[must_use]
     pub fn is_sound(&self, channels: usize) -> bool {
-        usize::from(self.channel) < channels && self.from_s.is_finite() && self.length_s() >= 0.0
+        usize::from(self.channel) < channels
+            && self.from_s.is_finite()
+            && self.length_s() >= 0.0
             && self.light_curve.as_ref().is_none_or(LightCurve::is_sound)
     }
 
@@ -176,7 +178,8 @@ impl BurstSummary {
     pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
         let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
         for burst in &bursts {
-            let empty = BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0, hours_left_out: 0.0 };
+            let empty =
+                BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0, hours_left_out: 0.0 };
             let channel = channels.entry(burst.channel).or_insert(empty);
             channel.found += 1;
             channel.hours += burst.length_s() / 3600.0;

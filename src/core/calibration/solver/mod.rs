@@ -70,9 +70,9 @@ mod tests;
 mod verdict;
 
 pub use bound::{DaughterBound, GainBound, bounds};
-pub(super) use dense::DenseFactor;
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
+pub(super) use dense::DenseFactor;
 pub use diagnosis::ModelFault;
 pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierFractions};
 pub use events::InstrumentEvent;
