@@ -145,6 +145,18 @@ fn a_burst_of_the_sun_is_found_and_left_out() {
         (3600.0 * hours - (number("until_s") - number("from_s"))).abs() < 1e-6 && hours < 0.15,
         "{found}"
     );
+    // The Sun was in sight, and what is behind the Moon was not: from 300 km above it covers 0.24 of the sky; of 48 directions
+    // some three lie at its edge.
+    let by_direction: Vec<f64> = found["channels"][0]["hours_left_out_by_direction"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|hours| hours.as_f64().unwrap())
+        .collect();
+    assert_eq!((by_direction.len(), found["channels"][0]["hours_left_out"].as_f64()), (48, Some(hours)));
+    let seen = by_direction.iter().sum::<f64>() / (48.0 * hours);
+    assert!((seen - 0.76).abs() < 0.06, "{by_direction:?}");
+
     let reasons = &flagged["ledger"]["flagged"];
     let left_out = reasons["burst of a point source"].as_u64().unwrap();
     assert!(left_out > 100, "{reasons}");
@@ -161,6 +173,48 @@ fn a_burst_of_the_sun_is_found_and_left_out() {
         let bytes = |run: &str| std::fs::read(place.path(&format!("{run}/10.000MHz/{name}"))).unwrap();
         assert!(bytes("flag") == bytes("never"), "{name}");
     }
+}
+
+#[test]
+fn a_burst_is_subtracted_with_its_error() {
+    let place = Workplace::new(MISSION);
+    let run = |name: &str, more: &[&str]| {
+        json(&[&["run", &place.pipeline, "--out", &place.path(name)], more].concat())
+    };
+    let quiet = run("quiet", &[]);
+    let peel = ["--set", BURST, "--set", "calibration.bursts=peel"];
+    let peeled = run("peel", &peel);
+    let [of_quiet, of_peeled] = [&quiet, &peeled].map(rho);
+    // Kept it costs more than 0.1, as above.
+    assert!((of_peeled - of_quiet).abs() < 0.01, "{of_quiet} {of_peeled}");
+    let hours = &peeled["bursts"]["channels"][0];
+    let number = |key: &str| hours[key].as_f64().unwrap();
+    assert!(number("hours") > 0.01 && number("hours_left_out") < 0.5 * number("hours"), "{hours}");
+
+    // A state subtracts the same from what arrives again, and gives the packets back: its sums are those that were added.
+    let (file, state) = (place.path("peel/downlink.ccsds"), place.path("state"));
+    let replay = |name: &str| {
+        let out = place.path(name);
+        let set = "calibration.bursts=peel";
+        json(&["replay", &file, "--map", &place.pipeline, "--set", set, "--state", &state, "--out", &out])
+    };
+    let [first, again] = ["first", "again"].map(replay);
+    let map = |name: &str| std::fs::read(place.path(&format!("{name}/10.000MHz/map.fits"))).unwrap();
+    assert!(map("first") == map("again") && first["ledger"] == again["ledger"]);
+    let report = json(&[
+        "retract",
+        &file,
+        "--state",
+        &state,
+        "--map",
+        &place.pipeline,
+        "--set",
+        "calibration.bursts=peel",
+        "--from-s",
+        "0",
+    ]);
+    assert_eq!(report["refused"], 0);
+    assert_eq!(report["accumulated"], first["ledger"]["accumulated"]);
 }
 
 #[test]

@@ -26,6 +26,7 @@ use crate::numerics::{median, percentiles};
 use crate::response::pixel::PairGeometry;
 use crate::sky::{ecliptic_deg, k_sr_per_jy};
 use crate::units::Pair;
+use crate::units::vector::Vec3;
 
 /// Ratio from which a bin is a detection.
 const RATIO: f64 = 8.0;
@@ -281,7 +282,18 @@ fn describe(
         positions_deg: located.directions.iter().map(|hat| ecliptic_deg(*hat)).collect(),
         position_sigma_deg: located.sigma_rad.to_degrees(),
         name: located.name.map(str::to_owned),
+        seen_from_m: seen_from_m(pairs, span_s),
         light_curve,
+    })
+}
+
+/// Where a daughter was in the middles of the three thirds of a span: at the nearest visibilities.
+fn seen_from_m(pairs: &[Vec<Entry>], [from_s, until_s]: [f64; 2]) -> [Vec3; 3] {
+    [1.0, 3.0, 5.0].map(|sixths| {
+        let t_s = from_s + sixths / 6.0 * (until_s - from_s);
+        let off_s = |entry: &&Entry| (entry.time_s() - t_s).abs();
+        let nearest = pairs.iter().flatten().min_by(|a, b| off_s(a).total_cmp(&off_s(b)));
+        nearest.map_or([0.0; 3], |entry| entry.block.r_i_m[entry.k])
     })
 }
 

@@ -18,7 +18,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use bincode::{Decode, Encode};
 use serde::{Deserialize, Serialize, Serializer};
 
+use crate::array::hidden_by_moon;
 use crate::frames::PlacedVisibilities;
+use crate::sky::healpix::pixel_directions;
+use crate::units::constants::MOON_RADIUS_M;
+use crate::units::vector::Vec3;
 use crate::units::{ChannelId, Dimension};
 
 /// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
@@ -78,6 +82,9 @@ pub struct FoundBurst {
     /// six degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
+    /// Where a daughter was in the first, the second and the last third, m.
+    #[serde(skip)]
+    pub seen_from_m: [Vec3; 3],
     /// What is subtracted; absent if the burst is flagged or kept.
     #[serde(skip)]
     pub light_curve: Option<LightCurve>,
@@ -138,6 +145,9 @@ impl fmt::Display for FoundBurst {
     }
 }
 
+/// Nside of the directions of a summary: the Moon covers a third of the sky.
+const NSIDE: usize = 2;
+
 /// Maximum number of bursts that a summary lists.
 const LISTED_MAX: usize = 1000;
 
@@ -160,7 +170,7 @@ fn first_bursts<S: Serializer>(bursts: &[FoundBurst], serializer: S) -> Result<S
 }
 
 /// Time of the bursts in a channel.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BurstHours {
     /// Frequency, Hz.
     pub frequency_hz: f64,
@@ -170,22 +180,41 @@ pub struct BurstHours {
     pub hours: f64,
     /// What of it is left out of the map, h.
     pub hours_left_out: f64,
+    /// For how long of that each direction was in sight, h: HEALPix of nside 2, RING, ecliptic axes.
+    pub hours_left_out_by_direction: Vec<f64>,
+}
+
+impl BurstHours {
+    fn add(&mut self, burst: &FoundBurst, is_left_out: bool, hats: &[Vec3], moon_radius_m: f64) {
+        self.found += 1;
+        self.hours += burst.length_s() / 3600.0;
+        if !is_left_out {
+            return;
+        }
+        let hours = burst.left_out_s() / 3600.0;
+        self.hours_left_out += hours;
+        for (hat, lost) in hats.iter().zip(&mut self.hours_left_out_by_direction) {
+            let is_seen = |r_m: &&Vec3| !hidden_by_moon(**r_m, *hat, moon_radius_m);
+            *lost += hours * burst.seen_from_m.iter().filter(is_seen).count() as f64 / 3.0;
+        }
+    }
 }
 
 impl BurstSummary {
     /// The summary of some bursts; `None` if there are none.
     #[must_use]
     pub fn new(action: BurstChoice, bursts: Vec<FoundBurst>) -> Option<Self> {
+        let hats = pixel_directions(NSIDE);
         let mut channels: BTreeMap<u16, BurstHours> = BTreeMap::new();
         for burst in &bursts {
-            let empty =
-                BurstHours { frequency_hz: burst.frequency_hz, found: 0, hours: 0.0, hours_left_out: 0.0 };
-            let channel = channels.entry(burst.channel).or_insert(empty);
-            channel.found += 1;
-            channel.hours += burst.length_s() / 3600.0;
-            if action != BurstChoice::Keep {
-                channel.hours_left_out += burst.left_out_s() / 3600.0;
-            }
+            let channel = channels.entry(burst.channel).or_insert_with(|| BurstHours {
+                frequency_hz: burst.frequency_hz,
+                found: 0,
+                hours: 0.0,
+                hours_left_out: 0.0,
+                hours_left_out_by_direction: vec![0.0; hats.len()],
+            });
+            channel.add(burst, action != BurstChoice::Keep, &hats, MOON_RADIUS_M);
         }
         let found = bursts.len() as u64;
         (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
@@ -200,9 +229,16 @@ impl fmt::Display for BurstSummary {
             BurstChoice::Off | BurstChoice::Keep => "kept in the maps",
         };
         write!(f, "{} bursts, {what}:", self.found)?;
-        for BurstHours { frequency_hz, found, hours, hours_left_out } in &self.channels {
+        for BurstHours { frequency_hz, found, hours, hours_left_out, hours_left_out_by_direction } in
+            &self.channels
+        {
             let hz = Dimension::Frequency.show(*frequency_hz);
             write!(f, "\n  {hz}: {found} bursts, {hours:.2} hours, {hours_left_out:.2} left out")?;
+            let least = hours_left_out_by_direction.iter().copied().fold(f64::INFINITY, f64::min);
+            let most = hours_left_out_by_direction.iter().copied().fold(0.0, f64::max);
+            if most > 0.0 {
+                write!(f, " ({least:.2} to {most:.2} by direction)")?;
+            }
         }
         Ok(())
     }

@@ -167,6 +167,7 @@ fn visibilities_of_a_burst_are_divided_from_others() {
         positions_deg: vec![[0.0, 0.0]],
         position_sigma_deg: 1.0,
         name: None,
+        seen_from_m: [[2.0371e6, 0.0, 0.0]; 3],
         light_curve: None,
     };
     // Integrations of 1 s at 1e5, 1e5 + 10, ...: one ends in the burst, one lies in it, one begins in it.
