@@ -343,7 +343,7 @@ impl Calibrator {
         self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
-        if let Some(divided) = self.bursts.divided(&placed) {
+        if let Some(divided) = self.bursts.divided(&placed, 0) {
             self.ledger.add_left_out(VisibilityReason::Burst, divided.left_out.len() as u64);
             placed = divided.used;
         }

@@ -303,10 +303,11 @@ impl Ground {
             choice: self.outcome.bursts.choice(),
         };
         let bursts = self.outcome.bursts.clone();
+        // Those known before were applied when the visibilities arrived.
+        let known = bursts.len();
         for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
-            let Some(DividedBlock { used, left_out, as_received, peeled }) = bursts.divided(&placed) else {
-                continue;
-            };
+            let divided = bursts.divided(&placed, known);
+            let Some(DividedBlock { used, left_out, as_received, peeled }) = divided else { continue };
             let mut removed = 0;
             if is_used {
                 removed += self.accumulator.remove(&left_out)?.visibilities;

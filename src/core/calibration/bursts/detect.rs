@@ -283,6 +283,7 @@ fn describe(
         position_sigma_deg: located.sigma_rad.to_degrees(),
         name: located.name.map(str::to_owned),
         seen_from_m: seen_from_m(pairs, span_s),
+        moon_radius_m: search.moon_radius_m,
         light_curve,
     })
 }

@@ -21,7 +21,6 @@ use serde::{Deserialize, Serialize, Serializer};
 use crate::array::hidden_by_moon;
 use crate::frames::PlacedVisibilities;
 use crate::sky::healpix::pixel_directions;
-use crate::units::constants::MOON_RADIUS_M;
 use crate::units::vector::Vec3;
 use crate::units::{ChannelId, Dimension};
 
@@ -85,6 +84,9 @@ pub struct FoundBurst {
     /// Where a daughter was in the first, the second and the last third, m.
     #[serde(skip)]
     pub seen_from_m: [Vec3; 3],
+    /// Radius of the Moon, m.
+    #[serde(skip)]
+    pub moon_radius_m: f64,
     /// What is subtracted; absent if the burst is flagged or kept.
     #[serde(skip)]
     pub light_curve: Option<LightCurve>,
@@ -185,7 +187,7 @@ pub struct BurstHours {
 }
 
 impl BurstHours {
-    fn add(&mut self, burst: &FoundBurst, is_left_out: bool, hats: &[Vec3], moon_radius_m: f64) {
+    fn add(&mut self, burst: &FoundBurst, is_left_out: bool, hats: &[Vec3]) {
         self.found += 1;
         self.hours += burst.length_s() / 3600.0;
         if !is_left_out {
@@ -194,7 +196,7 @@ impl BurstHours {
         let hours = burst.left_out_s() / 3600.0;
         self.hours_left_out += hours;
         for (hat, lost) in hats.iter().zip(&mut self.hours_left_out_by_direction) {
-            let is_seen = |r_m: &&Vec3| !hidden_by_moon(**r_m, *hat, moon_radius_m);
+            let is_seen = |r_m: &&Vec3| !hidden_by_moon(**r_m, *hat, burst.moon_radius_m);
             *lost += hours * burst.seen_from_m.iter().filter(is_seen).count() as f64 / 3.0;
         }
     }
@@ -214,7 +216,7 @@ impl BurstSummary {
                 hours_left_out: 0.0,
                 hours_left_out_by_direction: vec![0.0; hats.len()],
             });
-            channel.add(burst, action != BurstChoice::Keep, &hats, MOON_RADIUS_M);
+            channel.add(burst, action != BurstChoice::Keep, &hats);
         }
         let found = bursts.len() as u64;
         (found > 0).then(|| Self { action, found, channels: channels.into_values().collect(), bursts })
@@ -279,8 +281,8 @@ impl BurstTable {
         self.bursts.push(burst);
     }
 
-    /// The bursts in the time of a block, and perhaps some beside it.
-    fn about(&self, placed: &PlacedVisibilities) -> Vec<&FoundBurst> {
+    /// The bursts in the time of a block, and perhaps some beside it, without the first `known`, in the order in which they were found.
+    fn about(&self, placed: &PlacedVisibilities, known: usize) -> Vec<&FoundBurst> {
         let starts = self.starts.get(&placed.channel.0).map(Vec::as_slice).unwrap_or_default();
         let Some((&first, &last)) = placed.time_s.first().zip(placed.time_s.last()) else {
             return Vec::new();
@@ -288,7 +290,10 @@ impl BurstTable {
         let half_s = 0.5 * placed.duration_s.iter().copied().fold(0.0, f32::max) as f64;
         let from = starts.partition_point(|(from_s, _)| *from_s < first - half_s - self.longest_s);
         let until = starts.partition_point(|(from_s, _)| *from_s <= last + half_s);
-        starts[from..until.max(from)].iter().map(|(_, index)| &self.bursts[*index]).collect()
+        let near = starts[from..until.max(from)].iter().map(|(_, index)| *index);
+        let mut indices: Vec<usize> = near.filter(|index| *index >= known).collect();
+        indices.sort_unstable();
+        indices.into_iter().map(|index| &self.bursts[index]).collect()
     }
 }
 
@@ -351,14 +356,15 @@ impl FoundBursts {
         table.bursts.get(table.earlier + seen..).unwrap_or_default().to_vec()
     }
 
-    /// Divides a block by what bursts do to its visibilities; `None` if all are outside, or bursts are kept.
+    /// Divides a block by what bursts do to its visibilities; `None` if all are outside, or bursts are kept. The first `known` bursts have been
+    /// subtracted from it already.
     #[must_use]
-    pub fn divided(&self, placed: &PlacedVisibilities) -> Option<DividedBlock> {
+    pub fn divided(&self, placed: &PlacedVisibilities, known: usize) -> Option<DividedBlock> {
         if matches!(self.choice, BurstChoice::Off | BurstChoice::Keep) {
             return None;
         }
         let table = self.table();
-        let bursts = table.about(placed);
+        let bursts = table.about(placed, known);
         let is_in_burst = |k: usize| bursts.iter().any(|burst| burst.holds(placed, k));
         if bursts.is_empty() || !(0..placed.len()).any(is_in_burst) {
             return None;

@@ -154,7 +154,7 @@ fn visibilities_of_a_burst_are_divided_from_others() {
     let array = array();
     let blocks = pass(&array, 5, 1e5, [0.0, 0.0, 1.0], |_| 0.0);
     let bursts = FoundBursts::new(BurstChoice::Flag);
-    assert!(bursts.divided(&blocks[0]).is_none());
+    assert!(bursts.divided(&blocks[0], 0).is_none());
     let burst = |from_s: f64, until_s: f64| FoundBurst {
         channel: 0,
         frequency_hz: FREQUENCY_HZ,
@@ -168,15 +168,16 @@ fn visibilities_of_a_burst_are_divided_from_others() {
         position_sigma_deg: 1.0,
         name: None,
         seen_from_m: [[2.0371e6, 0.0, 0.0]; 3],
+        moon_radius_m: 1_737_100.0,
         light_curve: None,
     };
     // Integrations of 1 s at 1e5, 1e5 + 10, ...: one ends in the burst, one lies in it, one begins in it.
     bursts.add(burst(1e5 + 10.2, 1e5 + 29.7));
-    let DividedBlock { used: outside, left_out: inside, .. } = bursts.divided(&blocks[0]).unwrap();
+    let DividedBlock { used: outside, left_out: inside, .. } = bursts.divided(&blocks[0], 0).unwrap();
     assert_eq!(inside.time_s, [1e5 + 10.0, 1e5 + 20.0, 1e5 + 30.0]);
     assert_eq!(outside.len() + 3, blocks[0].len());
     let kept = FoundBursts { choice: BurstChoice::Keep, ..bursts.clone() };
-    assert!(kept.divided(&blocks[0]).is_none() && kept.since(0).len() == 1);
+    assert!(kept.divided(&blocks[0], 0).is_none() && kept.since(0).len() == 1);
     let sound = burst(2.0, 1.0);
     assert!(!sound.is_sound(1) && burst(1.0, 2.0).is_sound(1) && !burst(1.0, 2.0).is_sound(0));
 }
@@ -195,6 +196,30 @@ fn forged_values_and_times_find_nothing_and_do_no_harm() {
     assert!(found(&[]).is_empty());
     blocks.iter_mut().for_each(|block| block.value_k_sr.fill(Complex64::ZERO));
     assert!(found(&blocks).is_empty());
+}
+
+#[test]
+fn visibilities_that_arrive_later_are_peeled_once_by_each_burst() {
+    let array = array();
+    let n_hat = direction(10.0, 50.0);
+    let from_s = seen_from_s(&array, n_hat);
+    let k_sr = |t_s: f64| if (1000.0..1060.0).contains(&(t_s - from_s)) { 1e7 } else { 0.0 };
+    let blocks = pass(&array, 7, from_s, n_hat, k_sr);
+    let [burst] = &found(&blocks)[..] else { panic!() };
+    let bursts = FoundBursts::new(BurstChoice::Peel);
+    bursts.add(burst.clone());
+    let once = bursts.divided(&blocks[0], 0).unwrap();
+    assert!(once.peeled.value_k_sr.iter().all(|value| value.norm() < 1e6) && once.peeled.len() >= 6);
+    assert!(once.as_received.value_k_sr.iter().any(|value| value.norm() > 9e6));
+    assert!(bursts.divided(&once.used, 1).is_none());
+    // One that begins earlier is found later, in what the first left: in two steps or in one, for packets that are given back, the same bits.
+    let light_curve =
+        burst.light_curve.clone().map(|curve| LightCurve { from_s: curve.from_s - 20.0, ..curve });
+    bursts.add(FoundBurst { from_s: burst.from_s - 20.0, light_curve, ..burst.clone() });
+    let twice = bursts.divided(&once.used, 1).unwrap();
+    assert!(twice.used.value_k_sr.iter().any(|value| value.norm() > 9e6));
+    let both = bursts.divided(&blocks[0], 0).unwrap();
+    assert_eq!((both.used.value_k_sr, both.used.weight), (twice.used.value_k_sr, twice.used.weight));
 }
 
 /// Middle and length of an integration, s, baseline along the source in wavelengths, visibility, weight, and the steady sky's variance.

@@ -16,9 +16,9 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA09";
+const MAGIC: &[u8; 8] = b"LNRSTA10";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 09; earlier versions lack data: make a new state with `lunarray rebuild`, or \
+const VERSION: &str = "a checkpoint of version 10; earlier versions lack data: make a new state with `lunarray rebuild`, or \
 replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
@@ -467,13 +467,13 @@ mod tests {
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
             let mut old = written(head);
-            old[..8].copy_from_slice(b"LNRSTA08");
+            old[..8].copy_from_slice(b"LNRSTA09");
             let body = old.len() - 8;
             let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
             old[body..].copy_from_slice(&crc.to_le_bytes());
             let said = read_back(&old).unwrap_err().to_string();
             assert!(
-                said.contains("version 09") && said.contains("replay the files into a new folder"),
+                said.contains("version 10") && said.contains("replay the files into a new folder"),
                 "{said}"
             );
         });
