@@ -347,6 +347,7 @@ mod tests {
         for _ in 0..20 {
             let mut block = |pair| PlacedVisibilities {
                 pair,
+                weight: vec![1.0; 800],
                 time_s: (0..800).map(|k| 10.0 * f64::from(k)).collect(),
                 // The level of each pair is its own.
                 value_k_sr: (0..800)
