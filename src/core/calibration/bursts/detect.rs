@@ -8,9 +8,10 @@
 //!   4^-x. The median of n pairs exceeds it if more than half of them do: for the least number of pairs, six or seven, with probability
 //!   35 * 4^(-4 x) at most, which is 2e-18 for x = 8. A mission of 30 channels has some 4e7 bins in 5000 passes: one of 1e10 missions has a
 //!   false alarm, as far as its sky is Gaussian.
-//! - **Powers.** A visibility's variance, P_i P_j / (2 dnu dt), has the powers of its daughters. Their rise above the running median of
-//!   a quarter of an hour, median over pairs, is the statistic. A power is known to 0.4 % after 8 s of 8 kHz, so that a rise of 5 % is twelve
-//!   standard deviations. It does not depend on gains and phases. Weights without powers (of other instruments) never rise.
+//! - **Powers.** A visibility's variance, P_i P_j / (2 dnu dt), has the powers of its daughters. Their rise, median over pairs, above the
+//!   medians of the seven minutes before and of those after is the statistic: the Moon's limb makes slopes and steps, which rise above
+//!   one of them only. A power is known to 0.4 % after 8 s of 8 kHz, so that a rise of 5 % is twelve standard deviations. It does not
+//!   depend on gains and phases. Weights without powers (of other instruments) never rise.
 //!
 //! Neither holds where one source outshines the rest: the Moon uncovers and hides it, and a short sight of it is taken for a burst.
 
@@ -37,14 +38,20 @@ const RATIO_OF_EDGES: f64 = 1.0;
 /// Rise of the powers from which a bin is a detection, and down to which bins beside one belong to the burst.
 const RISES: [f64; 2] = [0.05, 0.01];
 
-/// The same in units of the scatter of the rises in the pass.
+/// The same in units of the scatter of the powers in the pass.
 const SCATTERS: [f64; 2] = [8.0, 3.0];
 
-/// Time to either side that the running median of the powers is of, s. Longer bursts have to be found in visibilities.
+/// Time to either side that a median of the powers is of, s. Longer bursts have to be found in visibilities.
 const LEVEL_S: f64 = 450.0;
+
+/// Least number of bins with powers on either side. At the ends of a pass powers are not judged.
+const LEVEL_BINS_MIN: usize = 3;
 
 /// Least number of pairs in a bin. Half of the six pairs of four daughters, or less of more, have the same daughter.
 const PAIRS_MIN: usize = 6;
+
+/// The same for powers: a direction takes three.
+const PAIRS_OF_POWERS_MIN: usize = 3;
 
 /// Least number of visibilities of a pair, for its quartile.
 const VISIBILITIES_MIN: usize = 8;
@@ -140,7 +147,7 @@ struct Bins {
     width_s: f64,
     /// Median over pairs of the mean ratio; 0 in a bin of too few pairs.
     ratios: Vec<f64>,
-    /// Rise of the powers; 0 in a bin of too few pairs.
+    /// Rise of the powers; 0 in a bin of too few pairs, and at the ends.
     rises: Vec<f64>,
     /// Rises of a detection, and of the bins beside it.
     limits: [f64; 2],
@@ -159,20 +166,27 @@ impl Bins {
         let spacing_s = median(pairs.iter().filter_map(spacing).collect())?;
         let width_s = (2.0 * spacing_s).max(BIN_S[0]);
         let count = ((last_s - first_s) / width_s).floor();
-        if pairs.len() < PAIRS_MIN || width_s > BIN_S[1] || !(0.0..BINS_MAX).contains(&count) {
+        if pairs.len() < PAIRS_OF_POWERS_MIN || width_s > BIN_S[1] || !(0.0..BINS_MAX).contains(&count) {
             return None;
         }
         let mut bins = Self { first_s, width_s, ratios: Vec::new(), rises: Vec::new(), limits: RISES };
-        bins.ratios = bins.medians(pairs, count as usize + 1, |entry| entry.ratio);
-        let powers = bins.medians(pairs, count as usize + 1, |entry| entry.power);
+        let count = count as usize + 1;
+        bins.ratios = bins.medians(pairs, count, PAIRS_MIN, |entry| entry.ratio);
+        let powers = bins.medians(pairs, count, PAIRS_OF_POWERS_MIN, |entry| entry.power);
         bins.rises = bins.rises_of(&powers);
-        let scatter = 1.48 * median(bins.rises.iter().map(|rise| rise.abs()).collect()).unwrap_or(0.0);
+        let scatter = scatter_of(&powers);
         bins.limits = [0, 1].map(|k| RISES[k].max(SCATTERS[k] * scatter));
         Some(bins)
     }
 
     /// Median over pairs of the mean of a value in each bin; 0 in a bin of too few pairs.
-    fn medians(&self, pairs: &[Vec<Entry>], bins: usize, value: impl Fn(&Entry) -> f64) -> Vec<f64> {
+    fn medians(
+        &self,
+        pairs: &[Vec<Entry>],
+        bins: usize,
+        pairs_min: usize,
+        value: impl Fn(&Entry) -> f64,
+    ) -> Vec<f64> {
         let mut means: Vec<Vec<f64>> = vec![Vec::new(); bins];
         for pair in pairs {
             let mut sums: BTreeMap<usize, [f64; 2]> = BTreeMap::new();
@@ -184,17 +198,21 @@ impl Bins {
                 means[bin].push(sum / number);
             }
         }
-        let median = |means: Vec<f64>| if means.len() < PAIRS_MIN { None } else { lower_median(means) };
+        let median = |means: Vec<f64>| if means.len() < pairs_min { None } else { lower_median(means) };
         means.into_iter().map(|means| median(means).unwrap_or(0.0)).collect()
     }
 
-    /// Powers over their running median, less 1.
+    /// Powers over the larger of the medians before and after, less 1.
     fn rises_of(&self, powers: &[f64]) -> Vec<f64> {
         let reach = (LEVEL_S / self.width_s).ceil() as usize;
+        let level = |near: &[f64]| {
+            let known: Vec<f64> = near.iter().copied().filter(|power| *power > 0.0).collect();
+            if known.len() < LEVEL_BINS_MIN { None } else { median(known) }
+        };
         let rise = |bin: usize| {
-            let near = &powers[bin.saturating_sub(reach)..(bin + reach + 1).min(powers.len())];
-            let level = median(near.iter().copied().filter(|power| *power > 0.0).collect())?;
-            (powers[bin] > 0.0).then(|| powers[bin] / level - 1.0)
+            let before = level(&powers[bin.saturating_sub(reach)..bin])?;
+            let after = level(&powers[bin + 1..(bin + 1 + reach).min(powers.len())])?;
+            (powers[bin] > 0.0).then(|| powers[bin] / before.max(after) - 1.0)
         };
         (0..powers.len()).map(|bin| rise(bin).unwrap_or(0.0)).collect()
     }
@@ -229,13 +247,21 @@ impl Bins {
         self.rises[range].iter().any(|rise| *rise > self.limits[0])
     }
 
-    /// Bins of a range, the brightest first.
+    /// Bins of a range, the brightest first: by what shows the burst, and visibilities before powers, as they have the position.
     fn brightest(&self, range: Range<usize>) -> Vec<usize> {
-        let by = if self.has_power(range.clone()) { &self.rises } else { &self.ratios };
-        let mut bins: Vec<usize> = range.filter(|bin| self.ratios[*bin] > 0.0).collect();
+        let is_visible = self.ratios[range.clone()].iter().any(|ratio| *ratio > RATIO);
+        let by = if is_visible { &self.ratios } else { &self.rises };
+        let mut bins: Vec<usize> = range.filter(|bin| by[*bin] > 0.0).collect();
         bins.sort_by(|a, b| by[*b].total_cmp(&by[*a]));
         bins
     }
+}
+
+/// Standard deviation of powers, each compared with the mean of its neighbours: of Gaussian ones, whose variance the mean halves.
+fn scatter_of(powers: &[f64]) -> f64 {
+    let off = |near: &[f64]| (near[1] - 0.5 * (near[0] + near[2])).abs();
+    let known = powers.windows(3).filter(|near| near.iter().all(|power| *power > 0.0));
+    1.4826 * (2.0_f64 / 3.0).sqrt() * median(known.map(off).collect()).unwrap_or(0.0)
 }
 
 /// The median; the lower one of an even number of values, so that half of them have to exceed it.

@@ -52,7 +52,7 @@ const SIGMA_RAD_MAX: f64 = 0.1;
 /// Directions of equal likelihood that are reported.
 const REPORTED_MAX: usize = 4;
 
-/// Twice the logarithm of a likelihood within which 99 % of positions, of two parameters, lie.
+/// Twice the logarithm of a likelihood, with the scatter found, within which 99 % of positions, of two parameters, lie.
 const WITHIN: f64 = 9.21;
 
 /// A visibility for the search.
@@ -124,11 +124,12 @@ pub(in crate::calibration) fn locate(
     let best = search.all_sky();
     let (largest, longest) = (best.first()?.twice_log, search.lengths().last().copied()?.max(1.0));
     let first = search.direction(best.first()?);
-    let sigma_rad = search.scatter(first) * search.information(first, longest).sqrt().recip();
+    let scatter = search.scatter(first);
+    let sigma_rad = scatter * search.information(first, longest).sqrt().recip();
     let [power_k_sr, power_sigma_k_sr] = search.power(first)?;
     let mut directions: Vec<Vec3> = Vec::new();
     let apart = |a: Vec3, b: Vec3| norm(sub(a, b));
-    for place in best.iter().filter(|place| largest - place.twice_log < WITHIN) {
+    for place in best.iter().filter(|place| largest - place.twice_log < WITHIN * scatter * scatter) {
         let hat = search.direction(place);
         let is_other = directions.iter().all(|other| apart(*other, hat) > 5.0 * sigma_rad + longest.recip());
         if is_other && directions.len() < REPORTED_MAX {

@@ -25,8 +25,8 @@ const CELLS_MAX: usize = 256;
 /// Shortest cell, s.
 const CELL_S_MIN: f64 = 0.5;
 
-/// Mean squared residual, in units of that of noise and steady sky, up to which a cell is explained. Its mean over six pairs, the least, is
-/// above 3 with a probability of 3e-4, if all are exponential; over 28 of 4e-13.
+/// Mean squared residual, in units of that of noise and steady sky, up to which a cell is explained. Its mean over three pairs, the least, is
+/// above 3 with a probability of 6e-3, if all are exponential; over 28 of 4e-13.
 const RESIDUAL_MAX: f64 = 3.0;
 
 /// Information of the prior in units of the largest cell's: a cell that no pair sees has a power of 0 with a variance that no weight survives.
