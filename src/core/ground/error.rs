@@ -32,10 +32,10 @@ pub enum GroundError {
         /// Count of one of the packets.
         count: u64,
     },
-    /// Visibilities whose positions have changed since they were added.
+    /// Visibilities whose positions or bursts have changed since they were added.
     #[error(
-        "packet {count}: the ephemeris has changed since the packet was added to the sums; expected the same ephemeris: nothing \
-        was changed"
+        "packet {count}: the ephemeris, or the table of bursts, has changed since the packet was added to the sums; expected the \
+        same: nothing was changed"
     )]
     EphemerisChanged {
         /// Count of the packet.

@@ -288,7 +288,8 @@ impl Retraction {
 }
 
 const DIFFERENT_CONTENT: &str = "its content differs from the packet in the state";
-const EPHEMERIS_CHANGED: &str = "the ephemeris has changed since the packet was added to the sums";
+const EPHEMERIS_CHANGED: &str =
+    "the ephemeris, or the table of bursts, has changed since the packet was added to the sums";
 
 fn damaged(path: &Path, found: &str, expected: &'static str) -> GroundError {
     GroundError::Damaged { path: path.to_owned(), found: found.to_owned(), expected }
