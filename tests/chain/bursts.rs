@@ -239,6 +239,37 @@ fn a_state_knows_its_bursts_and_gives_their_packets_back() {
     assert_eq!(report["accumulated"], once["ledger"]["accumulated"]);
 }
 
+/// A downlink in two files, divided after a part of its packets.
+fn divided(place: &Workplace, file: &str, part: f64) -> [String; 2] {
+    let bytes = std::fs::read(file).unwrap();
+    let mut starts = vec![0];
+    while let Some(&at) = starts.last().filter(|at| **at < bytes.len()) {
+        starts.push(at + 7 + usize::from(bytes[at + 4]) * 256 + usize::from(bytes[at + 5]));
+    }
+    let (first, second) = bytes.split_at(starts[(part * starts.len() as f64) as usize]);
+    [place.file("first.ccsds", first), place.file("second.ccsds", second)]
+}
+
+#[test]
+fn two_sessions_of_a_pass_find_its_burst_once_and_give_its_packets_back() {
+    for choice in ["calibration.bursts=peel", "calibration.bursts=keep"] {
+        let place = Workplace::new(MISSION);
+        let file = place.simulate("bursts.ccsds", &["--set", BURST]);
+        let state = place.path("state");
+        let common = ["--state", &state, "--map", &place.pipeline, "--set", choice];
+        // The burst lies in the last pass, whose packets are those of its pairs, one after the other.
+        let files = divided(&place, &file, 0.8);
+        for (file, name) in files.iter().zip(["first", "second"]) {
+            let summary = json(&[&["replay", file, "--out", &place.path(name)], &common[..]].concat());
+            assert_eq!(summary["bursts"]["found"], 1, "{choice} {name}");
+        }
+        for file in &files {
+            let report = json(&[&["retract", file, "--from-s", "0"], &common[..]].concat());
+            assert_eq!(report["refused"], 0, "{choice} {report}");
+        }
+    }
+}
+
 #[test]
 fn bursts_are_not_looked_for_unless_asked() {
     let place = Workplace::new(MISSION);

@@ -67,7 +67,9 @@ impl BurstWatch {
         let mut disturbed = Vec::new();
         for blocks in channels.into_values() {
             let placed: Vec<&PlacedVisibilities> = blocks.iter().map(|block| &block.placed).collect();
-            let found: Vec<FoundBurst> = find_bursts(search, &placed);
+            let mut found: Vec<FoundBurst> = find_bursts(search, &placed);
+            // By a session that had the first visibilities of the pass.
+            found.retain(|burst| !bursts.knows(burst));
             let has_new = found.into_iter().filter(|burst| bursts.add(burst.clone())).count() > 0;
             if has_new {
                 disturbed.extend(blocks);

@@ -324,6 +324,15 @@ impl FoundBursts {
         has_room
     }
 
+    /// Whether a burst of the table has the peak of another in its time. What was subtracted leaves its power in the weights.
+    #[must_use]
+    pub fn knows(&self, burst: &FoundBurst) -> bool {
+        let table = self.table();
+        let starts = table.starts.get(&burst.channel).map(Vec::as_slice).unwrap_or_default();
+        let until = starts.partition_point(|(from_s, _)| *from_s <= burst.peak_s);
+        starts[..until].iter().any(|(_, index)| table.bursts[*index].until_s > burst.peak_s)
+    }
+
     /// Resumes with the bursts of earlier sessions.
     pub fn resume(&self, bursts: Vec<FoundBurst>) {
         let mut table = self.table();
