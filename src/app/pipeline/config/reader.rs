@@ -284,7 +284,14 @@ impl<'a> KeyLocator<'a> {
     }
 
     pub(in crate::pipeline) fn add_override(&mut self, key: &str, text: &str) {
-        self.overrides.insert(key.to_owned(), shortened(text, SHOWN_MAX));
+        let text = shortened(text, SHOWN_MAX);
+        // Problems of an element are told of its list.
+        let Some((list, _)) = key.split_once('[') else {
+            self.overrides.insert(key.to_owned(), text);
+            return;
+        };
+        let of_list = self.overrides.entry(list.to_owned()).or_insert_with(String::new);
+        *of_list = if of_list.is_empty() { text } else { format!("{of_list}, --set {text}") };
     }
 
     /// Prefix of a message: the override or the line that sets the key.

@@ -63,13 +63,15 @@ pub enum ConfigError {
     /// A `--set` that is not `key=value`.
     #[error("--set {0}: expected key=value, for example --set map.nside=32")]
     Override(String),
-    /// A `--set` with a key below a value.
-    #[error("--set {key}: `{part}` is not a section")]
-    NotASection {
+    /// A `--set` with a key below a value, or of an element that is not there.
+    #[error("--set {key}: `{part}` {found}")]
+    NotThere {
         /// Full key.
         key: String,
-        /// The part of the key that is not a section.
+        /// The part of the key that is not there.
         part: String,
+        /// What is there.
+        found: String,
     },
     /// Syntax errors, unknown keys, wrong types and invalid values, all together.
     #[error("{origin}: {problems}")]
@@ -303,16 +305,74 @@ fn apply_override<'a>(table: &mut toml::Table, text: &'a str) -> Result<&'a str,
     if last.is_empty() || sections.split('.').count() > DEPTH_MAX {
         return Err(invalid());
     }
+    let no_list = || "is no element: the file has no such list; set the whole one first".to_owned();
     let mut section = table;
     for part in sections.split('.').filter(|part| !part.is_empty()) {
-        let next = section.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        section = next.as_table_mut().ok_or_else(|| ConfigError::NotASection {
-            key: shortened(key, SHOWN_MAX),
-            part: shortened(part, SHOWN_MAX),
-        })?;
+        let (name, element) = element_of(part);
+        if element.is_some() && !section.contains_key(name) {
+            return Err(not_there(key, part, no_list()));
+        }
+        let place = section.entry(name).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        let place = at(place, element).map_err(|found| not_there(key, part, found))?;
+        let found = format!("is {}, not a section", kind_of(place));
+        section = place.as_table_mut().ok_or_else(|| not_there(key, part, found))?;
     }
-    section.insert(last.to_owned(), value);
+    let (name, element) = element_of(last);
+    match section.get_mut(name) {
+        Some(place) => *at(place, element).map_err(|found| not_there(key, last, found))? = value,
+        None if element.is_some() => return Err(not_there(key, last, no_list())),
+        None => drop(section.insert(name.to_owned(), value)),
+    }
     Ok(key)
+}
+
+fn not_there(key: &str, part: &str, found: String) -> ConfigError {
+    ConfigError::NotThere { key: shortened(key, SHOWN_MAX), part: shortened(part, SHOWN_MAX), found }
+}
+
+/// The name and the index of `name[index]`, an element of a list.
+fn element_of(part: &str) -> (&str, Option<usize>) {
+    let found = part.strip_suffix(']').and_then(|part| part.split_once('['));
+    match found.map(|(name, index)| (name, index.parse())) {
+        Some((name, Ok(index))) => (name, Some(index)),
+        _ => (part, None),
+    }
+}
+
+/// A value, or an element of it; what is there instead if it has no such element.
+fn at(place: &mut toml::Value, element: Option<usize>) -> Result<&mut toml::Value, String> {
+    let Some(element) = element else { return Ok(place) };
+    let kind = kind_of(place);
+    let toml::Value::Array(list) = place else {
+        return Err(format!("is no element: this is {kind}, not a list"));
+    };
+    let count = list.len();
+    list.get_mut(element).ok_or_else(|| match count {
+        0 => "is no element: the list is empty".to_owned(),
+        _ => format!("is no element: the list has [0] to [{}]", count - 1),
+    })
+}
+
+fn kind_of(value: &toml::Value) -> &'static str {
+    match value {
+        toml::Value::String(_) => "a text",
+        toml::Value::Integer(_) | toml::Value::Float(_) => "a number",
+        toml::Value::Boolean(_) => "true or false",
+        toml::Value::Datetime(_) => "a date",
+        toml::Value::Array(_) => "a list",
+        toml::Value::Table(_) => "a section",
+    }
+}
+
+/// The number at a path of settings, such as `array.kepler[0].eccentricity`.
+pub(in crate::pipeline) fn number_at(config: &Config, key: &str) -> Option<f64> {
+    let mut place = toml::Value::try_from(config).ok()?;
+    for part in key.split('.') {
+        let (name, element) = element_of(part);
+        place = place.as_table_mut()?.remove(name)?;
+        place = std::mem::replace(at(&mut place, element).ok()?, toml::Value::Boolean(false));
+    }
+    place.as_float().or_else(|| Some(place.as_integer()? as f64))
 }
 
 #[cfg(test)]
@@ -385,6 +445,14 @@ mod tests {
             ("=8", "expected key=value"),
             ("seed.more=1", "--set seed.more: `seed` is not a section"),
             (
+                "map.epsilon[0]=1",
+                "--set map.epsilon[0]: `epsilon[0]` is no element: the file has no such list",
+            ),
+            ("array.kepler[0].eccentricity=0.1", "`kepler[0]` is no element: the file has no such list"),
+            ("seed[0]=1", "--set seed[0]: `seed[0]` is no element: this is a number, not a list"),
+            ("spacecraft.channels_hz[3]=1e6", "`channels_hz[3]` is no element: the list has [0] to [2]"),
+            ("spacecraft.channels_hz[0].low=1e6", "`channels_hz[0]` is a number, not a section"),
+            (
                 "map.nsides=8",
                 "--set map.nsides=8: map.nsides: no such key; did you mean nside? [map] has antennas, ",
             ),
@@ -393,6 +461,23 @@ mod tests {
             let told = with(&["seed=5", bad]).unwrap_err().to_string();
             assert!(told.contains(part), "{bad}: {told}");
         }
+    }
+
+    #[test]
+    fn overrides_reach_elements_of_lists() {
+        let text = "[array]\nsatellites = 3\nkepler = [{ mean_anomaly_deg = 1 }, { mean_anomaly_deg = 2 }, { mean_anomaly_deg = 3 }]";
+        let overrides = [
+            "array.kepler[1].eccentricity=0.05",
+            "spacecraft.channels_hz=[1e6, 3e6]",
+            "spacecraft.channels_hz[1]=5e6",
+        ];
+        let source =
+            ConfigSource { overrides: overrides.map(str::to_owned).to_vec(), ..ConfigSource::default() };
+        let found = source.parse_text(text).unwrap();
+        let eccentricities: Vec<f64> = found.array.kepler.iter().map(|one| one.eccentricity).collect();
+        assert_eq!(eccentricities[1], 0.05);
+        assert!(eccentricities[0] != 0.05 && eccentricities[2] != 0.05);
+        assert_eq!(found.spacecraft.channels_hz, [1e6, 5e6]);
     }
 
     /// The problems of a text with overrides, as lines.
