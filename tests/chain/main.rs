@@ -10,6 +10,7 @@ mod bursts;
 mod calibrate;
 mod coded;
 mod command_line;
+mod design;
 mod ending;
 mod ephemerides;
 mod figures;

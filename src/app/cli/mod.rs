@@ -11,6 +11,7 @@ mod check;
 mod compare;
 mod corrupt;
 mod cutout;
+mod design;
 #[cfg(all(test, feature = "serve"))]
 #[allow(clippy::unwrap_used, clippy::panic)] // A test fails by panicking.
 mod documented;
@@ -34,6 +35,7 @@ mod output;
 mod predict;
 mod printable_text;
 mod progress;
+mod proposal;
 mod rebuild;
 mod recalibrate;
 mod replay;
@@ -128,6 +130,8 @@ enum Command {
     Bench(bench::BenchArgs),
     Sky(sky::SkyArgs),
     Study(study::StudyArgs),
+    Design(design::DesignArgs),
+    Proposal(proposal::ProposalArgs),
     Explain(explain::ExplainArgs),
     Config(explain::ConfigArgs),
     Completions(shell::CompletionsArgs),
@@ -268,6 +272,8 @@ pub fn run_command(words: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Bench(args) => bench::execute(&args),
         Command::Sky(args) => sky::execute(&args),
         Command::Study(args) => study::execute(&args),
+        Command::Design(args) => design::execute(&args),
+        Command::Proposal(args) => proposal::execute(&args),
         Command::Explain(args) => explain::explain(&args),
         Command::Config(args) => explain::config(&args),
         Command::Completions(args) => shell::completions(&args, Cli::command()),

@@ -12,7 +12,7 @@ use super::output::{CommandResult, print_json_line, print_notes, print_text};
 use super::progress::{CalibrateLines, Progress};
 use crate::files::ProtectedInputs;
 use crate::pipeline::{
-    INTEGRATE, JobEvent, MemoryLimit, READ, Segment, Study, StudySummary, run_study, use_threads,
+    INTEGRATE, JobEvent, MemoryLimit, READ, RunView, Segment, Study, StudySummary, run_study, use_threads,
 };
 use crate::products::{Crossing, EpsilonChoice, EpsilonChoices};
 
@@ -67,40 +67,11 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     }
     let out = args.out.clone().map_or_else(|| default_out(&study.name), Ok)?;
     let interrupt = Interrupt::default();
-    let mut progress: Option<Progress> = None;
-    let mut gains: Option<(usize, CalibrateLines)> = None;
+    let mut lines = StudyLines::default();
     let summary = run_study(&study, &out, args.keep, interrupt.cancel(), &mut |event, view| {
-        interrupt.arm_or_note();
-        let of = study.cases.len();
-        let begin = |number: usize, what: &str| {
-            let label = study.cases[number].label();
-            let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
-            say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
-        };
-        let (number, what, stage, total) = match event {
-            JobEvent::Calibrate(number, calibration) => {
-                drop(progress.take());
-                if gains.as_ref().is_none_or(|(case, _)| *case != number) {
-                    begin(number, "calibrating");
-                    gains = Some((number, CalibrateLines::new()));
-                }
-                gains.iter_mut().for_each(|(_, lines)| lines.show(&calibration));
-                return;
-            }
-            JobEvent::Simulate(number) => {
-                (number, "simulating for", INTEGRATE, study.cases[number].plan.progress_windows())
-            }
-            JobEvent::Map(step) => (step.number, "mapping", READ, 0),
-            JobEvent::Realise(number) => (number, "noise of", READ, 0),
-            // The channels of a case are not in groups.
-            JobEvent::Sky(_) | JobEvent::Merge => return,
-        };
-        // The bar of the previous step ends first.
-        drop(progress.take());
-        begin(number, what);
-        progress = view.map(|view| Progress::watch(view, stage, total, interrupt.cancel()));
+        lines.show(&study, event, view, &interrupt);
     })?;
-    drop(progress);
+    drop(lines);
     if summary.cancelled {
         let done = summary.cases.len();
         print_notes([format!(
@@ -113,6 +84,53 @@ pub(super) fn execute(args: &StudyArgs) -> CommandResult {
     } else {
         print_text(&format!("{}\nTables, curves and products are in {}", table(&summary), out.display()))
     })
+}
+
+/// Shows the steps of a study.
+#[derive(Default)]
+pub(super) struct StudyLines {
+    progress: Option<Progress>,
+    gains: Option<(usize, CalibrateLines)>,
+}
+
+impl StudyLines {
+    pub(super) fn show(
+        &mut self,
+        study: &Study,
+        event: JobEvent,
+        view: Option<RunView>,
+        interrupt: &Interrupt,
+    ) {
+        interrupt.arm_or_note();
+        let of = study.cases.len();
+        let begin = |number: usize, what: &str| {
+            let label = study.cases[number].label();
+            let fields = json!({ "number": number + 1, "of": of, "what": what, "label": label });
+            say("case", &fields, format_args!("case {} of {of}: {what} {label}", number + 1));
+        };
+        let (number, what, stage, total) = match event {
+            JobEvent::Calibrate(number, calibration) => {
+                drop(self.progress.take());
+                if self.gains.as_ref().is_none_or(|(case, _)| *case != number) {
+                    begin(number, "calibrating");
+                    self.gains = Some((number, CalibrateLines::new()));
+                }
+                self.gains.iter_mut().for_each(|(_, lines)| lines.show(&calibration));
+                return;
+            }
+            JobEvent::Simulate(number) => {
+                (number, "simulating for", INTEGRATE, study.cases[number].plan.progress_windows())
+            }
+            JobEvent::Map(step) => (step.number, "mapping", READ, 0),
+            JobEvent::Realise(number) => (number, "noise of", READ, 0),
+            // The channels of a case are not in groups.
+            JobEvent::Sky(_) | JobEvent::Merge => return,
+        };
+        // The bar of the previous step ends first.
+        drop(self.progress.take());
+        begin(number, what);
+        self.progress = view.map(|view| Progress::watch(view, stage, total, interrupt.cancel()));
+    }
 }
 
 /// Lines on the power that imperfect instruments preserve, one per case and channel.

@@ -73,6 +73,7 @@ struct ChannelMaps {
     pair_s: Vec<f64>,
     visibilities: Vec<f64>,
     shortest_square_m2: Vec<f64>,
+    longest_square_m2: Vec<f64>,
     cells: Vec<[u64; WORDS]>,
 }
 
@@ -83,6 +84,7 @@ impl ChannelMaps {
             pair_s: vec![0.0; pixels],
             visibilities: vec![0.0; pixels],
             shortest_square_m2: vec![f64::INFINITY; pixels],
+            longest_square_m2: vec![0.0; pixels],
             cells: vec![[0; WORDS]; pixels],
         }
     }
@@ -92,6 +94,7 @@ impl ChannelMaps {
             self.pair_s[k] += other.pair_s[k];
             self.visibilities[k] += other.visibilities[k];
             self.shortest_square_m2[k] = self.shortest_square_m2[k].min(other.shortest_square_m2[k]);
+            self.longest_square_m2[k] = self.longest_square_m2[k].max(other.longest_square_m2[k]);
             self.cells[k].iter_mut().zip(other.cells[k]).for_each(|(to, from)| *to |= from);
         }
     }
@@ -136,6 +139,7 @@ fn add(maps: &mut [ChannelMaps], plan: &Plan, directions: &[Direction], sample: 
                 let along_m = dot(baseline_m, direction.n_hat);
                 let across_m2 = square_m2 - along_m * along_m;
                 maps.shortest_square_m2[k] = maps.shortest_square_m2[k].min(across_m2);
+                maps.longest_square_m2[k] = maps.longest_square_m2[k].max(across_m2);
                 let u = direction.axes.map(|axis| per_m * dot(baseline_m, axis));
                 for sign in [1.0, -1.0] {
                     let [x, y] = u.map(|u| {
@@ -158,7 +162,30 @@ fn is_inside(cell: usize) -> bool {
     coordinate(cell % CELLS).hypot(coordinate(cell / CELLS)) < 1.0
 }
 
-pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureError> {
+/// Coverage of one channel over the whole sky.
+pub(super) struct WholeCoverage {
+    /// Shortest and longest projected baseline that maps use, m.
+    pub projected_m: [f64; 2],
+    /// Observing time of pairs in the best direction over that in the worst.
+    pub most_over_least: f64,
+}
+
+/// Coverage of each channel; `None` where no baseline is short enough for the map.
+pub(super) fn whole_coverage(plan: &Plan) -> Vec<Option<WholeCoverage>> {
+    let extreme = |values: &[f64], take: fn(f64, f64) -> f64| values.iter().copied().reduce(take);
+    let of_channel = |maps: &ChannelMaps| {
+        let shortest_m2 = extreme(&maps.shortest_square_m2, f64::min).filter(|found| found.is_finite())?;
+        let longest_m2 = extreme(&maps.longest_square_m2, f64::max)?;
+        let [least, most] = [f64::min, f64::max].map(|take| extreme(&maps.pair_s, take));
+        let projected_m = [shortest_m2.max(0.0).sqrt(), longest_m2.sqrt()];
+        Some(WholeCoverage { projected_m, most_over_least: most? / least? })
+    };
+    let (_, maps) = gathered(plan);
+    maps.iter().map(of_channel).collect()
+}
+
+/// The directions, and the coverage of each in each channel.
+fn gathered(plan: &Plan) -> (Vec<Direction>, Vec<ChannelMaps>) {
     let directions: Vec<Direction> = pixel_directions(NSIDE).into_iter().map(with_axes).collect();
     let empty = || -> Vec<ChannelMaps> {
         (0..plan.schedules.len()).map(|k| ChannelMaps::new(limit_m(plan, k), directions.len())).collect()
@@ -170,6 +197,11 @@ pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureErro
         |maps, sample| add(maps, plan, &directions, sample),
         |maps, other| maps.iter_mut().zip(&other).for_each(|(to, from)| to.merge(from)),
     );
+    (directions, maps)
+}
+
+pub(super) fn make(plan: &Plan, folder: &Path) -> Result<FigureParts, FigureError> {
+    let (directions, maps) = gathered(plan);
     if let Some(bare) = maps.iter().find(|maps| maps.pair_s.iter().all(|&s| s == 0.0)) {
         return Err(FigureError::NoBaseline { limit_m: bare.limit_m });
     }

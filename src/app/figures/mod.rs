@@ -9,6 +9,7 @@ mod error;
 mod exposure;
 mod output;
 mod pair_time;
+mod proposal;
 mod request;
 mod rows;
 mod spacing;
@@ -20,6 +21,9 @@ use std::path::Path;
 
 pub use error::FigureError;
 pub use output::FigureFiles;
+pub use proposal::{
+    ProposalColumn, ProposalValue, ValueSource, proposal, proposal_csv, proposal_latex, proposal_markdown,
+};
 pub use request::{FIGURES, FigureRequest};
 
 use crate::pipeline::Plan;

@@ -31,6 +31,7 @@ mod power;
 pub mod rates;
 mod regulariser;
 mod request;
+mod sensitivity;
 mod solver;
 mod stage;
 #[doc(hidden)]
@@ -61,6 +62,8 @@ pub use power::{Sample, Samples, SkyPower, Uncertainty};
 pub use regulariser::Regulariser;
 #[doc(hidden)]
 pub use request::SolverSetup;
+#[doc(hidden)]
+pub use sensitivity::{DegreeSensitivity, SensitivitySums};
 #[doc(hidden)]
 pub use solver::{
     Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, PointBeam, STORED_MAX, SolutionClock,

@@ -62,8 +62,8 @@ pub use publisher::{ProductsReport, ProductsWatch, Publisher};
 pub use run_pictures::draw_runs;
 #[doc(hidden)]
 pub use runs::{
-    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, PowerFigures, RunFigures, TraceFigures,
-    crossings, runs_csv, spectra_csv,
+    BeamFigures, ChannelFigures, Crossing, DiagnosticFigures, MeasuredModes, PowerFigures, RunFigures,
+    TraceFigures, crossings, runs_csv, spectra_csv,
 };
 pub use summary::ChannelSummary;
 #[doc(hidden)]

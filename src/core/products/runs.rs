@@ -36,6 +36,9 @@ pub struct ChannelFigures {
     pub noise_rms_k: f64,
     /// Whether the visibilities contain thermal noise.
     pub thermal_noise: bool,
+    /// Measured modes by degree, if R is from the data.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sky_power: Option<MeasuredModes>,
     /// Regularisation and traces.
     pub diagnostics: DiagnosticFigures,
     /// Correlation with the input, rho_l.
@@ -53,6 +56,13 @@ pub struct ChannelFigures {
     /// Power relative to an ideal instrument, in a study of errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub power_kept: Option<PowerKept>,
+}
+
+/// Measured modes by degree from l = 0: the parts of Tr A (A + R)^-1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MeasuredModes {
+    /// Of each degree, at most 2 l + 1.
+    pub decided: Vec<f64>,
 }
 
 /// Power of a map relative to the map of an ideal instrument, by degree from l = 0.
@@ -362,6 +372,7 @@ pub(super) mod tests {
             mean_k: 9.5,
             noise_rms_k: 0.5,
             thermal_noise: true,
+            sky_power: None,
             diagnostics: DiagnosticFigures {
                 epsilon: Some(epsilon),
                 w_max: Some(2.0),

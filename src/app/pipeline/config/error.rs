@@ -73,6 +73,16 @@ pub enum PipelineError {
     /// A patch cannot be imaged.
     #[error(transparent)]
     Zoom(#[from] crate::imaging::zoom::ZoomError),
+    /// A search without an array within its limits.
+    #[error(
+        "none of {trials} arrays is possible, the best of them as {reason}; expected wider [limits], other ranges, or more evaluations"
+    )]
+    NoDesign {
+        /// Number of arrays that were tried.
+        trials: usize,
+        /// Why one of them cannot be.
+        reason: String,
+    },
     /// No data for any map.
     #[error(
         "no visibility of a pair could be used, so there is no map; see {} and, for a downlink, `lunarray inspect`\n{ledger}",

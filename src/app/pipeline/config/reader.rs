@@ -290,7 +290,7 @@ impl<'a> KeyLocator<'a> {
             self.overrides.insert(key.to_owned(), text);
             return;
         };
-        let of_list = self.overrides.entry(list.to_owned()).or_insert_with(String::new);
+        let of_list = self.overrides.entry(list.to_owned()).or_default();
         *of_list = if of_list.is_empty() { text } else { format!("{of_list}, --set {text}") };
     }
 

@@ -443,7 +443,7 @@ mod tests {
         for (bad, part) in [
             ("map.nside", "expected key=value"),
             ("=8", "expected key=value"),
-            ("seed.more=1", "--set seed.more: `seed` is not a section"),
+            ("seed.more=1", "--set seed.more: `seed` is a number, not a section"),
             (
                 "map.epsilon[0]=1",
                 "--set map.epsilon[0]: `epsilon[0]` is no element: the file has no such list",
@@ -465,7 +465,9 @@ mod tests {
 
     #[test]
     fn overrides_reach_elements_of_lists() {
-        let text = "[array]\nsatellites = 3\nkepler = [{ mean_anomaly_deg = 1 }, { mean_anomaly_deg = 2 }, { mean_anomaly_deg = 3 }]";
+        let one = "{ semi_major_axis_m = 2e6, eccentricity = 0.01, inclination_deg = 30, node_longitude_deg = 0, periapsis_deg = 0, \
+                   mean_anomaly_deg = 0 }";
+        let text = format!("[array]\nsatellites = 3\nkepler = [{one}, {one}, {one}]");
         let overrides = [
             "array.kepler[1].eccentricity=0.05",
             "spacecraft.channels_hz=[1e6, 3e6]",
@@ -473,10 +475,29 @@ mod tests {
         ];
         let source =
             ConfigSource { overrides: overrides.map(str::to_owned).to_vec(), ..ConfigSource::default() };
-        let found = source.parse_text(text).unwrap();
+        let found = source.parse_text(&text).unwrap();
         let eccentricities: Vec<f64> = found.array.kepler.iter().map(|one| one.eccentricity).collect();
-        assert_eq!(eccentricities[1], 0.05);
-        assert!(eccentricities[0] != 0.05 && eccentricities[2] != 0.05);
+        assert_eq!(eccentricities, [0.01, 0.05, 0.01]);
+        assert_eq!(number_at(&found, "array.kepler[1].eccentricity"), Some(0.05));
+        assert_eq!(number_at(&found, "array.satellites"), Some(3.0));
+        for key in ["array.kepler[3].eccentricity", "array.kepler", "array.nothing", "name"] {
+            assert_eq!(number_at(&found, key), None, "{key}");
+        }
+        for (set, told) in [
+            (
+                "array.kepler[1].eccentricity=abc",
+                "--set array.kepler[1].eccentricity=abc: array.kepler: invalid type: string \"abc\"",
+            ),
+            (
+                "array.kepler[1].excentricity=0.1",
+                "--set array.kepler[1].excentricity=0.1: array.kepler: unknown field `excentricity`",
+            ),
+            ("array.kepler[3].eccentricity=0.1", "`kepler[3]` is no element: the list has [0] to [2]"),
+        ] {
+            let source = ConfigSource { overrides: vec![set.to_owned()], ..ConfigSource::default() };
+            let error = source.parse_text(&text).unwrap_err().to_string();
+            assert!(error.contains(told), "{error}");
+        }
         assert_eq!(found.spacecraft.channels_hz, [1e6, 5e6]);
     }
 

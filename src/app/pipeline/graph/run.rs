@@ -379,21 +379,29 @@ pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), P
 
 /// Writes all settings of a run beside its products, as a pipeline file that repeats the run.
 pub(in crate::pipeline) fn write_settings(config: &Config, out: &Path) -> Result<(), PipelineError> {
-    let path = out.join(SETTINGS);
-    let settings = toml::to_string_pretty(config)
-        .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
     let version = env!("CARGO_PKG_VERSION");
-    let text = format!(
-        "# All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were \
-         given.\n\n{settings}"
+    let head = format!(
+        "All settings of this run, by lunarray {version}: `lunarray run {SETTINGS}` repeats it. Paths of files are as they were given."
     );
+    write_pipeline(config, &head, &out.join(SETTINGS))
+}
+
+/// Writes all settings as a pipeline file, after a line on what they are.
+pub(in crate::pipeline) fn write_pipeline(
+    config: &Config,
+    head: &str,
+    path: &Path,
+) -> Result<(), PipelineError> {
+    let settings = toml::to_string_pretty(config)
+        .map_err(|error| ProductsError::Encode { path: path.to_owned(), reason: error.to_string() })?;
+    let text = format!("# {head}\n\n{settings}");
     // If the run was started from this very file, it is not rewritten.
     let has_same_length =
-        fs::metadata(&path).is_ok_and(|found| found.is_file() && found.len() == text.len() as u64);
-    if has_same_length && fs::read(&path).is_ok_and(|found| found == text.as_bytes()) {
+        fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() == text.len() as u64);
+    if has_same_length && fs::read(path).is_ok_and(|found| found == text.as_bytes()) {
         return Ok(());
     }
-    Ok(write_product(&path, text)?)
+    Ok(write_product(path, text)?)
 }
 
 /// Locks a folder for maps; an error if an input file of the configuration lies where a product would be written.

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::calibration::solver::{CalibrationMode, DaughterBound, bounds};
 use crate::frames::{ObservingWindow, PlacedVisibilities};
+use crate::mother::Schedule;
 use crate::pipeline::config::{PipelineError, Plan};
 use crate::response::model::{DaughterPosition, DirectSum, ModelError, VisibilityModel};
 use crate::sky::SkyMap;
@@ -88,7 +89,12 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
             plan.instrument.response,
         );
         for pair in &pairs {
-            let block = observation(plan, &mut sky, (channel, *pair), window)?;
+            let width_hz = plan.instrument.channels[channel].width_hz;
+            // Standard deviation of the real or imaginary part.
+            let sigma =
+                |[p_i, p_j]: [f64; 2], duration_s: f64| (p_i * p_j / (2.0 * width_hz * duration_s)).sqrt();
+            let schedule = &plan.schedules[channel];
+            let block = observation(plan, &mut sky, (channel, *pair), (schedule, window), &sigma)?;
             if !block.is_empty() {
                 placed.push(block);
             }
@@ -101,16 +107,16 @@ pub fn bound(plan: &Plan, maps: &[SkyMap], pass: usize) -> Result<BoundSummary, 
     Ok(BoundSummary { pass: pass as u64, span_s, daughters })
 }
 
-/// Times, positions and weights of a pair's visibilities in a window; the values are zero. The weights follow from the powers of
-/// the daughters.
-fn observation(
+/// Times, positions and weights of a pair's visibilities in a window; the values are zero. `sigma_k_sr` gives their noise from the powers
+/// of both daughters, K sr, and the duration, s.
+pub(super) fn observation(
     plan: &Plan,
     sky: &mut DirectSum,
     (channel, pair): (usize, Pair),
-    window: ObservingWindow,
+    (schedule, window): (&Schedule, ObservingWindow),
+    sigma_k_sr: &dyn Fn([f64; 2], f64) -> f64,
 ) -> Result<PlacedVisibilities, ModelError> {
-    let band = plan.instrument.channels[channel];
-    let integrations = plan.schedules[channel].integrations(&plan.array, window, pair);
+    let integrations = schedule.integrations(&plan.array, window, pair);
     let mut times = Vec::with_capacity(integrations.len());
     let mut durations_s = Vec::with_capacity(integrations.len());
     let mut daughters = Vec::with_capacity(2 * integrations.len());
@@ -128,15 +134,15 @@ fn observation(
     sky.predict_powers(&daughters, &mut powers)?;
     let positions_m =
         |side: usize| daughters.iter().skip(side).step_by(2).map(|daughter| daughter.r_m).collect();
-    // Variance of the real or imaginary part: P_i P_j / (2 bandwidth duration). Without power the sky is hidden.
+    // Without power the sky is hidden.
     let weight = powers.chunks(2).zip(&durations_s).map(|(pair_powers, duration_s)| {
-        let variance = pair_powers[0] * pair_powers[1] / (2.0 * band.width_hz * duration_s);
+        let variance = sigma_k_sr([pair_powers[0], pair_powers[1]], *duration_s).powi(2);
         if variance > 0.0 { variance.recip() } else { 0.0 }
     });
     Ok(PlacedVisibilities {
         channel: ChannelId(channel as u16),
         band: 0,
-        frequency_hz: band.frequency_hz,
+        frequency_hz: schedule.frequency_hz,
         pair,
         value_k_sr: vec![Complex64::ZERO; times.len()],
         time_s: times,

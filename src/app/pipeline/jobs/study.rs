@@ -20,7 +20,9 @@ use crate::calibration::solver::SolverConfig;
 use crate::downlink::{FileSource, Recorder};
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::pipeline::config::{Config, PipelineError};
-use crate::pipeline::graph::run::{DownlinkSinks, lock_folder, replay_with_truth, simulate_skies};
+use crate::pipeline::graph::run::{
+    DownlinkSinks, lock_folder, replay_with_truth, simulate_skies, write_settings,
+};
 use crate::pipeline::graph::{downlink_file, space_segment};
 use crate::products::{
     Crossing, EpsilonChoices, MapShape, ProductsError, RunFigures, Truth, create_folder, crossings,
@@ -250,6 +252,8 @@ impl StudyRun<'_> {
             _ => Truth::new(skies, shape)?,
         };
         *last = Some(LastTruth { shape, truth: truth.clone() });
+        create_folder(&folder)?;
+        write_settings(config, &folder)?;
         let settings = config.ground(WAIT_BYTES);
         let ground = match state {
             Some(state) => Ground::open(state, &settings, CHECKPOINT_EVERY)?,

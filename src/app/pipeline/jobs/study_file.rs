@@ -20,19 +20,19 @@ const FILE_BYTES_MAX: u64 = 1 << 20;
 /// Maximum length of the name of a case's folder, without `case-`.
 const FOLDER_CHARACTERS_MAX: usize = 100;
 
-/// Errors in a study file or its cases.
+/// Errors in a study or design file, or its cases.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum StudyError {
     /// The file cannot be read.
-    #[error("cannot read the study {}: {source}", path.display())]
+    #[error("cannot read {}: {source}", path.display())]
     Read {
         /// Path.
         path: PathBuf,
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The content is not a valid study.
+    /// The content is not valid.
     #[error("{}: {found}; expected {expected}", path.display())]
     File {
         /// Path.
@@ -111,7 +111,7 @@ impl Draft {
     }
 }
 
-fn invalid(path: &Path, found: String, expected: &'static str) -> StudyError {
+pub(super) fn invalid(path: &Path, found: String, expected: &'static str) -> StudyError {
     StudyError::File { path: path.to_owned(), found, expected }
 }
 
@@ -364,7 +364,10 @@ fn resolve_path(study: &Path, named: &Path) -> PathBuf {
 }
 
 /// The plan of a case. The frequencies of `model_files`, the maps to calibrate with, are checked before anything is simulated.
-fn case_plan(source: &ConfigSource, model_files: Option<&Vec<PathBuf>>) -> Result<Plan, PipelineError> {
+pub(super) fn case_plan(
+    source: &ConfigSource,
+    model_files: Option<&Vec<PathBuf>>,
+) -> Result<Plan, PipelineError> {
     let plan = source.load().map_err(PipelineError::from).and_then(Plan::new)?;
     if let Some(files) = model_files {
         check_frequencies(files, &plan.config.spacecraft.channels_hz)?;
@@ -395,12 +398,12 @@ fn read_models(paths: &[PathBuf]) -> Result<(Vec<SkyMap>, u64), StudyError> {
     Ok((maps, crc_fast::checksum(crc_fast::CrcAlgorithm::Crc64Nvme, &checksums)))
 }
 
-fn read_study(path: &Path) -> Result<String, StudyError> {
+pub(super) fn read_study(path: &Path) -> Result<String, StudyError> {
     read_text(path, FILE_BYTES_MAX).map_err(|source| match source.kind() {
         ErrorKind::FileTooLarge => StudyError::File {
             path: path.to_owned(),
             found: source.to_string(),
-            expected: "a study, at most a megabyte",
+            expected: "at most a megabyte",
         },
         _ => StudyError::Read { path: path.to_owned(), source },
     })
