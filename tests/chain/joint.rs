@@ -4,7 +4,7 @@ use std::path::Path;
 
 use lunarray::imaging::joint::{JointMap, JointRequest, PowerPriors, PowerSample, solve_jointly};
 use lunarray::imaging::{SolveWatch, StoppingRule};
-use lunarray::pipeline::{ConfigSource, joint_channels};
+use lunarray::pipeline::{ConfigSource, SumsPlace, joint_channels};
 use lunarray::sky::fits::{WriteOptions, write_map};
 use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
@@ -78,6 +78,13 @@ fn channels_see_together_what_one_misses() {
     assert!(std::fs::metadata(format!("{joint}/spectra.fits")).unwrap().len() > 0);
     let said = fail(&["joint", &state, "--at", "12MHz", "--out", &place.path("beyond")]);
     assert!(said.contains("between 5.000 and 10.000 MHz"), "{said}");
+    // Sums that memory does not hold are on disk, and a state is then read channel by channel; maps have the same bytes.
+    let small = place.path("small");
+    succeed(&["joint", &state, "--at", "8.5MHz", "--count", "4", "--memory-max", "1MB", "--out", &small]);
+    for file in ["5.000MHz/map.fits", "10.000MHz/map.fits", "spectra.fits"] {
+        let [a, b] = [&joint, &small].map(|folder| std::fs::read(format!("{folder}/{file}")).unwrap());
+        assert!(a == b, "{file}");
+    }
     // An iteration that may not go on says so, where people and where programs look.
     let (short, cut) = (place.path("cut"), ["--set", "map.iterations_max=1", "--count", "2", "--out"]);
     let said = succeed(&[&["joint", &state], &cut[..], &[&short]].concat());
@@ -112,12 +119,14 @@ fn perturb(powers: &mut [PowerSample]) {
 fn map_with(state: &str, change: &dyn Fn(&mut [PowerSample])) -> JointMap {
     let folder = Path::new(state);
     let config = ConfigSource::default().with_state_settings(folder).unwrap().load_ground().unwrap();
-    let mut channels = joint_channels(&[(folder, config)], true).unwrap();
-    change(&mut channels[0].powers);
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: vec![0.0] };
     let rule = StoppingRule { residual_max: 1e-4, iterations_max: 300 };
     let request = JointRequest { rule, samples: 8, at_hz: Vec::new(), powers: Some(priors) };
-    solve_jointly(channels, &request, &SolveWatch::default()).unwrap().maps.remove(0)
+    let place = SumsPlace { limit: None, folder };
+    let watch = SolveWatch::default();
+    let mut channels = joint_channels(&[(folder, config)], &request, place, &watch).unwrap();
+    change(&mut channels[0].powers);
+    solve_jointly(channels, &request, &watch).unwrap().maps.remove(0)
 }
 
 #[test]

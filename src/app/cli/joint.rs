@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
-use super::arguments::{StateMapArgs, frequency_hz, output_path};
+use super::arguments::{StateMapArgs, frequency_hz, output_path, size_bytes};
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_text};
 use super::progress::while_solving;
 use crate::files::write_atomically;
@@ -13,7 +13,7 @@ use crate::imaging::SolveWatch;
 use crate::imaging::joint::{
     Agreement, Correlation, JointMap, JointRequest, JointSolution, PowerAgreement, PowerPriors, SpectralMaps,
 };
-use crate::pipeline::{solve_states_jointly, use_threads};
+use crate::pipeline::{MemoryLimit, SumsPlace, solve_states_jointly, use_threads};
 use crate::products::pictures::{ColourScale, MapPanel, Palette, Sampling, Scaling, View, draw_map};
 use crate::sky::Frame;
 use crate::sky::fits::{Card, Column, WriteOptions, write_columns};
@@ -56,6 +56,10 @@ pub(super) struct JointArgs {
     /// Part of the powers that is not the sky, receiver noise and the Moon's emission, K sr: one value, or one for each channel in order of frequency.
     #[arg(long, value_name = "K_SR", default_value = "0", value_delimiter = ',')]
     power_constant_k_sr: Vec<f64>,
+    /// Maximum memory, with a unit, such as 8GB; by default what the machine has available. Sums that it does not hold are kept in the output
+    /// folder while the command runs.
+    #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
+    memory_max: Option<u64>,
     /// Output folder.
     #[arg(short, long, value_name = "DIR", value_parser = output_path())]
     out: PathBuf,
@@ -130,7 +134,9 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
         powers: args.priors(),
     };
     let watch = SolveWatch::default();
-    let solved = while_solving(&watch, || solve_states_jointly(&states, &request, &watch))?;
+    let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
+    let place = SumsPlace { limit, folder: &args.out };
+    let solved = while_solving(&watch, || solve_states_jointly(&states, &request, place, &watch))?;
     let report = write(&args.out, &solved, args.priors())?;
     if args.json {
         print_json_line(&report)?;

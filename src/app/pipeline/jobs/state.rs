@@ -2,16 +2,13 @@
 
 use std::path::Path;
 
-use crate::frames::{AntennaResponse, AutoPower, Instrument};
 use crate::ground::archive::REMEMBERED;
 use crate::ground::{Ground, GroundError, WAIT_BYTES};
-use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, PowerSample, solve_jointly};
-use crate::imaging::{REFINED, Regulariser, RegulariserChoice, Snapshot, SolveError, StoppingRule};
+use crate::imaging::{REFINED, Regulariser, RegulariserChoice};
 use crate::imaging::{Samples, Solution, SolveWatch, Solver, SolverSetup};
 use crate::pipeline::config::{Config, ConfigSource, PipelineError};
 use crate::runtime::{Outlet, Stage};
 use crate::units::PerChannel;
-use crate::units::vector::Vec3;
 
 impl ConfigSource {
     /// Adds the settings of the state in `folder`, so that the user need not repeat them; overrides of this source take precedence.
@@ -183,68 +180,6 @@ pub fn sample_state(
 ) -> Result<(), PipelineError> {
     let setup = SolverSetup { samples, ..config.solver(watch.clone())? };
     solve_sums(folder, config, setup, found)
-}
-
-/// Solves for the maps of several channels jointly, from one or more states. `request` makes the joint request from the first state's
-/// stopping rule. The states are unchanged.
-///
-/// # Errors
-/// As [`joint_channels`] and [`solve_jointly`].
-pub fn solve_states_jointly(
-    states: &[(&Path, Config)],
-    request: &dyn Fn(StoppingRule) -> JointRequest,
-    watch: &SolveWatch,
-) -> Result<JointSolution, PipelineError> {
-    let (_, first) = states.first().ok_or(SolveError::NoData)?;
-    let request = request(first.solver(watch.clone())?.rule);
-    let channels = joint_channels(states, request.powers.is_some())?;
-    Ok(solve_jointly(channels, &request, watch)?)
-}
-
-/// The channels of one or more states, with their total powers if `with_powers`.
-///
-/// # Errors
-/// As [`solve_state`]; sums of another engine than the harmonic one; total powers of dipoles.
-pub fn joint_channels(
-    states: &[(&Path, Config)],
-    with_powers: bool,
-) -> Result<Vec<JointChannel>, PipelineError> {
-    let mut channels = Vec::new();
-    for (folder, config) in states {
-        let (sums, all_powers) = Ground::sums_and_powers_in(folder, &config.ground(WAIT_BYTES))?;
-        for Snapshot { instrument, channel, nside, data, .. } in sums {
-            let channel = instrument.channels.get(usize::from(channel.0));
-            let frequency_hz = channel.map_or(0.0, |channel| channel.frequency_hz);
-            let not_harmonic = |found| SolveError::NotHarmonic { frequency_hz, found };
-            let sums = data.into_harmonic().map_err(not_harmonic)?;
-            let powers = match with_powers {
-                true => powers_of(&all_powers, &instrument, frequency_hz)?,
-                false => Vec::new(),
-            };
-            channels.push(JointChannel { frequency_hz, nside, sums, powers });
-        }
-    }
-    Ok(channels)
-}
-
-/// The total powers of the daughters at a frequency.
-fn powers_of(
-    all: &[(AutoPower, Vec3)],
-    instrument: &Instrument,
-    frequency_hz: f64,
-) -> Result<Vec<PowerSample>, SolveError> {
-    let of_daughters = all
-        .iter()
-        .filter(|(power, _)| power.frequency_hz == frequency_hz && power.daughter < instrument.satellites);
-    let sample = |&(AutoPower { daughter, time_s, power_k_sr, sigma_k_sr, .. }, r_m): &(AutoPower, Vec3)| {
-        PowerSample { daughter, time_s, r_m, power_k_sr, sigma_k_sr }
-    };
-    let powers: Vec<PowerSample> = of_daughters.map(sample).collect();
-    let has_pattern = instrument.response == AntennaResponse::DipoleNormal;
-    if has_pattern && !powers.is_empty() {
-        return Err(SolveError::PowersOfDipoles { frequency_hz });
-    }
-    Ok(powers)
 }
 
 /// Reads the sums of a state, and solves for the map of every channel.

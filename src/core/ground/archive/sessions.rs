@@ -3,12 +3,12 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::checkpoint;
+use super::checkpoint::{self, ArchiveHead};
 use super::folder::{StateFolder, checkpoints};
 use super::open_archive::OpenArchive;
 use super::recovery::{SETTINGS, kept_settings, packets_folder, require_saved};
 use super::store::Archive;
-use crate::frames::AutoPower;
+use crate::frames::{AutoPower, Instrument};
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
@@ -127,6 +127,17 @@ impl Ground {
         }
     }
 
+    /// The instrument of an archive, from its newest usable checkpoint; `None` if that has received no description of it.
+    ///
+    /// # Errors
+    /// A folder without a usable checkpoint, or in use.
+    #[doc(hidden)]
+    pub fn instrument_in(folder: &Path) -> Result<Option<Instrument>, GroundError> {
+        let of_head = |path: &Path| head_at(path, |head| head.collector.instrument().cloned());
+        let (found, _) = StateFolder::open_to_read(folder)?.load(false, of_head)?;
+        found.ok_or_else(|| GroundError::without_checkpoint(folder))
+    }
+
     /// Like [`Ground::settings_in`], without a lock, for ranks before they open the folder together.
     ///
     /// # Errors
@@ -189,8 +200,12 @@ impl Ground {
 }
 
 fn settings_at(path: &Path) -> Result<Vec<(String, String)>, GroundError> {
+    head_at(path, |head| head.settings)
+}
+
+fn head_at<T>(path: &Path, choose: impl FnOnce(ArchiveHead) -> T) -> Result<T, GroundError> {
     checkpoint::read(path, |head, engines| {
         std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
-        Ok(head.settings)
+        Ok(choose(head))
     })
 }

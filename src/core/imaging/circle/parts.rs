@@ -13,7 +13,7 @@ use super::grid::Grids;
 use super::quanta::{ExactNode, Quanta};
 use super::stored::{StoredBlock, StoredTori, TorusPart};
 use super::sums::HarmonicSums;
-use super::tori::Tori;
+use super::tori::{NodeSums, Tori};
 use crate::files::write_at;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::{AccumulationError, SumCounts};
@@ -24,12 +24,27 @@ impl StoredTori {
     fn append(&mut self, grids: &Grids, quanta: Quanta, exact: ExactTori) -> io::Result<()> {
         let has_data = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
         let filled = exact.nodes.iter().enumerate().filter(|(_, node)| has_data(node));
-        let nodes: Arc<Vec<usize>> = Arc::new(filled.map(|(index, _)| index).collect());
+        self.reserve(grids, filled.map(|(index, _)| index).collect());
+        let held = exact.nodes.into_iter().flatten().filter(|node| !node.is_empty()).collect::<Vec<_>>();
+        let written: Vec<[Vec<usize>; 2]> = held
+            .into_par_iter()
+            .enumerate()
+            .map(|(index, node)| self.write_node(grids, quanta, index, node))
+            .collect::<io::Result<_>>()?;
+        for (used, part) in written.iter().flat_map(|parts| parts.iter().zip([0, 1])) {
+            used.iter().for_each(|&alpha| self.parts[part].alphas[alpha] = true);
+        }
+        Ok(())
+    }
+
+    /// Assigns places in the file to the blocks of the share of `grids`, with these nodes.
+    fn reserve(&mut self, grids: &Grids, nodes: Vec<usize>) {
         if let (Some(&first), Some(&last)) = (nodes.first(), nodes.last()) {
             let reached = if self.reached.is_empty() { first..last + 1 } else { self.reached.clone() };
             self.reached = reached.start.min(first)..reached.end.max(last + 1);
         }
-        for part in [TorusPart::Weights, TorusPart::Right] {
+        let nodes = Arc::new(nodes);
+        for part in TorusPart::BOTH {
             let (points, row) = (part.points(grids), part.row(grids));
             let stored = &mut self.parts[part as usize];
             stored.blocks.resize(points.div_ceil(ALPHAS), StoredBlock::default());
@@ -42,16 +57,27 @@ impl StoredTori {
                 }
             }
         }
-        let held = exact.nodes.into_iter().flatten().filter(|node| !node.is_empty()).collect::<Vec<_>>();
-        let written: Vec<[Vec<usize>; 2]> = held
-            .into_par_iter()
-            .enumerate()
-            .map(|(index, node)| self.write_node(grids, quanta, index, node))
-            .collect::<io::Result<_>>()?;
-        for (used, part) in written.iter().flat_map(|parts| parts.iter().zip([0, 1])) {
-            used.iter().for_each(|&alpha| self.parts[part].alphas[alpha] = true);
+    }
+
+    /// Writes complete sums to a new file in a folder.
+    fn of_memory(grids: &Grids, tori: &Tori, folder: &Path) -> io::Result<Self> {
+        let mut stored = Self::create(folder)?;
+        let filled: Vec<(usize, &NodeSums)> =
+            tori.nodes.iter().enumerate().filter_map(|(index, node)| Some((index, node.as_ref()?))).collect();
+        stored.reserve(grids, filled.iter().map(|(index, _)| *index).collect());
+        for part in TorusPart::BOTH {
+            let row = part.row(grids);
+            for (number, block) in stored.parts[part as usize].blocks.iter().enumerate() {
+                let first = number * ALPHAS * row;
+                for (index, (_, node)) in filled.iter().enumerate() {
+                    let bytes: &[u8] =
+                        bytemuck::cast_slice(&node.part(part)[first..first + block.alphas * row]);
+                    write_at(&stored.file, bytes, block.offset + (index * bytes.len()) as u64)?;
+                }
+            }
+            stored.parts[part as usize].alphas = tori.alphas(grids, part);
         }
-        Ok(())
+        Ok(stored)
     }
 
     /// Writes the `index`-th node with data, and returns its alphas with data, by part.
@@ -125,6 +151,22 @@ impl SumPart {
     /// The share of an engine for this part.
     pub(in crate::imaging) fn ranks(&self) -> Ranks {
         Ranks::single_with_share(self.share)
+    }
+}
+
+impl HarmonicSums {
+    /// The same sums in an unnamed file in a folder, where every product reads them, in place of memory. Sums of several ranks, and those
+    /// that are on disk already, stay as they are.
+    ///
+    /// # Errors
+    /// The system's, in particular a full disk.
+    pub(in crate::imaging) fn on_disk(mut self, folder: &Path) -> Result<Self, AccumulationError> {
+        if self.tori.stored.is_none() && !self.ranks.is_distributed() {
+            let store_error = |source| AccumulationError::Store { folder: folder.to_owned(), source };
+            let stored = StoredTori::of_memory(&self.grids, &self.tori, folder).map_err(store_error)?;
+            self.tori = Tori::on_disk(stored);
+        }
+        Ok(self)
     }
 }
 

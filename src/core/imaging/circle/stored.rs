@@ -18,6 +18,8 @@ pub(super) enum TorusPart {
 }
 
 impl TorusPart {
+    pub(super) const BOTH: [Self; 2] = [Self::Weights, Self::Right];
+
     /// Number of points of the grid in alpha.
     pub(super) fn points(self, grids: &Grids) -> usize {
         match self {

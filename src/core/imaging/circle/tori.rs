@@ -44,7 +44,7 @@ impl NodeSums {
         Self { weights: vec![0.0; grids.weights_len()], right: vec![0.0; grids.right_len()] }
     }
 
-    fn part(&self, part: TorusPart) -> &[f32] {
+    pub(super) fn part(&self, part: TorusPart) -> &[f32] {
         match part {
             TorusPart::Weights => &self.weights,
             TorusPart::Right => &self.right,

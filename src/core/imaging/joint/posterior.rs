@@ -33,6 +33,28 @@ pub struct JointRequest {
     pub powers: Option<PowerPriors>,
 }
 
+impl JointRequest {
+    /// Checks the request against the frequencies of the channels, before minutes of work.
+    ///
+    /// # Errors
+    /// There is one channel without total powers, or two of one frequency; or a frequency is outside the range of the channels.
+    pub fn check(&self, channels_hz: &[f64], with_powers: bool) -> Result<(), SolveError> {
+        let mut frequencies_hz = channels_hz.to_vec();
+        frequencies_hz.sort_by(f64::total_cmp);
+        frequencies_hz.dedup();
+        let fewest = if self.powers.is_some() && with_powers { 1 } else { 2 };
+        let (channels, frequencies) = (channels_hz.len(), frequencies_hz.len());
+        if frequencies < fewest || frequencies < channels {
+            return Err(SolveError::FewChannels { channels, frequencies });
+        }
+        let ends_hz = [frequencies_hz[0], frequencies_hz[frequencies - 1]];
+        match self.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
+            Some(&frequency_hz) => Err(SolveError::BeyondChannels { frequency_hz, ends_hz }),
+            None => Ok(()),
+        }
+    }
+}
+
 /// A map at one frequency.
 #[derive(Clone, Debug, PartialEq)]
 pub struct JointMap {

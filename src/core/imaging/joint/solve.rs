@@ -1,16 +1,17 @@
 //! Estimates the correlation between channels, then solves for all channels together.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use super::posterior::{Equations, JointMap, JointRequest, Posterior};
 use super::powers::{PowerRows, PowerSample};
 use super::prior::{Correlation, FREE, Prior, View};
 use super::spectrum::SpectralMaps;
 use super::sums::{ScaledBlocks, joint_blocks, scaled_blocks};
-use crate::imaging::circle::{HarmonicSums, degrees};
+use crate::imaging::circle::{HarmonicSums, OrderBlocks, degrees};
 use crate::imaging::power::{Block, FoundPower, PowerProblem, SkyPower, value};
 use crate::imaging::solver::{Convergence, NamedWatch, SolveError, SolveWatch, StoppingRule};
-use crate::imaging::{NormalSums, SumCounts};
+use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 
 /// Correlation lengths of the initial grid.
 const LENGTHS: [f64; 5] = [0.5, 1.0, 2.0, 4.0, 8.0];
@@ -24,16 +25,55 @@ const OWN_SHARE_RANGE: [f64; 2] = [1e-7, 0.999];
 /// Prior power of the free degrees in units of that of l = 2.
 const FREE_FACTORS: [f64; FREE] = [1e6, 1e4];
 
-/// The sums of a channel.
+/// A channel with its own solution.
 pub struct JointChannel {
     /// Frequency, Hz.
     pub frequency_hz: f64,
     /// nside of its map.
     pub nside: usize,
-    /// Normal equations over harmonics.
-    pub sums: Box<HarmonicSums>,
     /// Total powers of its daughters, by daughter and time.
     pub powers: Vec<PowerSample>,
+    sums: HarmonicSums,
+    blocks: OrderBlocks,
+    alone: SingleChannel,
+}
+
+impl JointChannel {
+    /// Solves for the map of a channel alone, from its normal equations over harmonics.
+    ///
+    /// # Errors
+    /// There is no data, or no angular power fits them.
+    pub fn new(
+        (frequency_hz, nside): (f64, usize),
+        sums: HarmonicSums,
+        powers: Vec<PowerSample>,
+        rule: StoppingRule,
+        watch: &SolveWatch,
+    ) -> Result<Self, SolveError> {
+        let blocks = sums.order_blocks();
+        let name = format!("{:.3} MHz", frequency_hz / 1e6);
+        let alone =
+            SingleChannel::solve(&sums, &blocks.blocks(), rule, watch.named(&name).with_priority(true))?;
+        Ok(Self { frequency_hz, nside, powers, sums, blocks, alone })
+    }
+
+    /// Bytes of its sums, which are in memory unless they were moved to disk.
+    #[must_use]
+    pub fn sums_bytes(&self) -> u64 {
+        self.sums.weight_bytes()
+    }
+
+    /// Moves its sums into an unnamed file in a folder, which disappears with the process. Every product then reads them.
+    ///
+    /// # Errors
+    /// The system's, in particular a full disk.
+    pub fn with_sums_on_disk(self, folder: &Path) -> Result<Self, AccumulationError> {
+        Ok(Self { sums: self.sums.on_disk(folder)?, ..self })
+    }
+
+    fn l_max(&self) -> usize {
+        self.sums.setup().l_max
+    }
 }
 
 /// A joint solution.
@@ -70,51 +110,27 @@ pub fn solve_jointly(
     watch: &SolveWatch,
 ) -> Result<JointSolution, SolveError> {
     // `Prior` needs decreasing l_max.
-    channels.sort_by(|a, b| {
-        let l_max = |channel: &JointChannel| channel.sums.setup().l_max;
-        l_max(b).cmp(&l_max(a)).then(a.frequency_hz.total_cmp(&b.frequency_hz))
-    });
-    let mut frequencies_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
-    let all_hz = frequencies_hz.clone();
-    frequencies_hz.sort_by(f64::total_cmp);
-    frequencies_hz.dedup();
-    let has_powers = request.powers.is_some() && channels.iter().any(|channel| !channel.powers.is_empty());
-    if frequencies_hz.len() < if has_powers { 1 } else { 2 } || frequencies_hz.len() < channels.len() {
-        return Err(SolveError::FewChannels { channels: channels.len(), frequencies: frequencies_hz.len() });
-    }
-    // Checked before minutes of work.
-    let ends_hz = [frequencies_hz[0], frequencies_hz[frequencies_hz.len() - 1]];
-    if let Some(&frequency_hz) = request.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
-        return Err(SolveError::BeyondChannels { frequency_hz, ends_hz });
-    }
-    let sums: Vec<&HarmonicSums> = channels.iter().map(|channel| &*channel.sums).collect();
-    let order_blocks: Vec<_> = sums.iter().map(|sums| sums.order_blocks()).collect();
-    let blocks: Vec<Vec<Block<'_>>> = order_blocks.iter().map(|blocks| blocks.blocks()).collect();
-    let mut singles = Vec::new();
-    for ((sums, blocks), frequency_hz) in sums.iter().zip(&blocks).zip(&all_hz) {
-        let name = format!("{:.3} MHz", frequency_hz / 1e6);
-        singles.push(SingleChannel::solve(
-            sums,
-            blocks,
-            request.rule,
-            watch.named(&name).with_priority(true),
-        )?);
-    }
-    let noise_factors: Vec<f64> = singles.iter().map(|single| single.power.noise_factor).collect();
-    let scale = singles.iter().map(SingleChannel::scale).collect();
+    channels.sort_by(|a, b| b.l_max().cmp(&a.l_max()).then(a.frequency_hz.total_cmp(&b.frequency_hz)));
+    let all_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
+    let has_powers = channels.iter().any(|channel| !channel.powers.is_empty());
+    request.check(&all_hz, has_powers)?;
+    let blocks: Vec<Vec<Block<'_>>> = channels.iter().map(|channel| channel.blocks.blocks()).collect();
+    let singles = || channels.iter().map(|channel| &channel.alone);
+    let noise_factors: Vec<f64> = singles().map(|single| single.power.noise_factor).collect();
+    let scale = singles().map(SingleChannel::scale).collect();
     let initial = Prior::new(all_hz, scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
     let watch = watch.named("all channels").with_priority(true);
     let likeness = if channels.len() > 1 {
         let scaled = scaled_blocks(&initial, &blocks, &noise_factors, &[]);
-        let rights: Vec<Vec<f64>> = singles.iter().map(|single| single.right.clone()).collect();
+        let rights: Vec<Vec<f64>> = singles().map(|single| single.right.clone()).collect();
         Some(most_likely(&initial, &scaled, &rights, watch)?)
     } else {
         None
     };
     let prior = initial.with_correlation(likeness.unwrap_or(initial.likeness))?;
-    let rows = power_rows(&channels, &singles, request)?;
+    let rows = power_rows(&channels, request)?;
     let sums: Vec<&(dyn NormalSums + Sync)> =
-        sums.iter().map(|sums| *sums as &(dyn NormalSums + Sync)).collect();
+        channels.iter().map(|channel| &channel.sums as &(dyn NormalSums + Sync)).collect();
     let equations = Equations { prior: &prior, sums: &sums, blocks: &blocks, noise_factors: &noise_factors };
     let (joint, scaled, start) = equations.with_powers(&rows, request, watch)?;
     let posterior = Posterior::new(&joint, &scaled, request, start.as_deref(), watch)?;
@@ -125,15 +141,14 @@ pub fn solve_jointly(
     let nside_of = |view: &View| {
         let own = channels.iter().find(|channel| channel.frequency_hz == view.frequency_hz);
         // Between channels the coarser neighbour has the same l_max.
-        let similar =
-            own.or_else(|| channels.iter().find(|channel| channel.sums.setup().l_max == view.l_max));
+        let similar = own.or_else(|| channels.iter().find(|channel| channel.l_max() == view.l_max));
         similar.map_or(1, |channel| channel.nside)
     };
     let mut maps = Vec::new();
     for (index, view) in views.iter().enumerate() {
         let mut map = posterior.map(view, nside_of(view))?;
         if index < prior.channels() {
-            let SingleChannel { solution, power, .. } = &singles[index];
+            let SingleChannel { solution, power, .. } = &channels[index].alone;
             map.agreement = Some(posterior.agreement(index, (solution, power), view));
             map.powers = posterior.agreement_of_powers(index, view);
         }
@@ -150,7 +165,6 @@ pub fn solve_jointly(
 /// The rows of total powers of each channel; `None` if it has none.
 fn power_rows(
     channels: &[JointChannel],
-    singles: &[SingleChannel],
     request: &JointRequest,
 ) -> Result<Vec<Option<PowerRows>>, SolveError> {
     let Some(priors) = &request.powers else { return Ok(channels.iter().map(|_| None).collect()) };
@@ -158,13 +172,13 @@ fn power_rows(
     if constants.len() != 1 && constants.len() != channels.len() {
         return Err(SolveError::PowerConstants { found: constants.len(), channels: channels.len() });
     }
-    let of_channel = |(channel, single): (&JointChannel, &SingleChannel)| {
+    let of_channel = |channel: &JointChannel| {
         let below = channels.iter().filter(|other| other.frequency_hz < channel.frequency_hz).count();
         let constant_k_sr = constants[below.min(constants.len() - 1)];
         let moon_radius_m = channel.sums.setup().moon_radius_m;
-        PowerRows::new(&channel.powers, moon_radius_m, &single.power, priors, constant_k_sr)
+        PowerRows::new(&channel.powers, moon_radius_m, &channel.alone.power, priors, constant_k_sr)
     };
-    Ok(channels.iter().zip(singles).map(of_channel).collect())
+    Ok(channels.iter().map(of_channel).collect())
 }
 
 impl SingleChannel {

@@ -202,11 +202,12 @@ impl Accumulator {
         part: RankShare,
     ) -> Result<Self, AccumulationError> {
         let mut channels = Vec::new();
-        for has_engine in state.channels {
-            channels.push(match has_engine {
-                true => Some(ChannelState::new(self.config.load_sums(from, folder, (part, &self.share))?)),
-                false => None,
-            });
+        for (channel, has_engine) in (0..).map(ChannelId).zip(state.channels) {
+            let sums =
+                has_engine.then(|| self.config.load_sums(from, folder, (part, &self.share))).transpose()?;
+            // Sums of other groups are read, because they have no length of their own, and dropped.
+            let is_kept = self.group.as_ref().is_none_or(|group| group.contains(&channel));
+            channels.push(sums.filter(|_| is_kept).map(ChannelState::new));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }

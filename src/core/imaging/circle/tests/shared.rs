@@ -43,6 +43,10 @@ fn sums_on_disk_have_the_bits_of_those_in_memory() {
         assert_eq!(sums.matrix_product_flops(), whole.matrix_product_flops());
         assert!(sums.failure().is_none());
     }
+    let folder = tempfile::tempdir().unwrap();
+    let moved = engine(&blocks).into_sums().on_disk(folder.path()).unwrap();
+    assert!(moved.tori.nodes.is_empty() && all(&moved) == all(&whole));
+    assert_eq!(moved.matrix_product_flops(), whole.matrix_product_flops());
     // One of the readings has other data.
     let other = in_parts(3, |number| blocks[..blocks.len() - usize::from(number == 1)].to_vec());
     assert!(matches!(other, Err(AccumulationError::Mismatch { .. })));
