@@ -21,6 +21,7 @@ from typing import Any as _Any
 from ._array import Array
 from ._chain import Ground, Replay, Run, State, replay, run
 from ._downlink import Downlink, open
+from ._joint import Joint, JointMap, joint
 from ._map import Map, read_map
 from ._native import VERSION as __version__
 from ._native import ConfigurationError, Error
@@ -35,6 +36,8 @@ __all__ = [
     "Downlink",
     "Error",
     "Ground",
+    "Joint",
+    "JointMap",
     "Map",
     "Replay",
     "Run",
@@ -42,6 +45,7 @@ __all__ = [
     "from_table",
     "from_uvdata",
     "inspect",
+    "joint",
     "open",
     "predict",
     "read_map",

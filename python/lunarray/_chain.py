@@ -151,16 +151,20 @@ class State:
         epsilon: float | Iterable[float] | None = None,
         map: str | PathLike[str] | None = None,
         set: Settings = None,
+        samples: int = 0,
     ) -> list[Map]:
         """Maps of the sums, without new data; the state stays as it is.
 
         ``epsilon`` is one regularisation or a list of them, each for all channels; that of the settings if not given. Settings on
-        which the sums depend are those of the state; ``map`` and ``set`` give others, such as ``map.prior_k``.
+        which the sums depend are those of the state; ``map`` and ``set`` give others, such as ``map.prior_k``. Each map has as many
+        posterior ``samples`` as asked for, with R from the data (no ``epsilon``).
         """
+        if samples and epsilon is not None:
+            raise _native.Error("samples need R from the data, which has no epsilon: expected one of the two")
         if isinstance(epsilon, Iterator):
             epsilon = list(epsilon)
         values = [] if epsilon is None else numbers(epsilon, "", "epsilon").ravel().tolist()
-        found = _native.solve_state(self.path, map, overrides(set), values)
+        found = _native.solve_state(self.path, map, overrides(set), values, samples)
         return [Map(**one) for one in found]
 
 

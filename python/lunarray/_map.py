@@ -42,6 +42,10 @@ class Map:
     ``pixels`` and ``noise`` (a map of noise alone) are K in HEALPix RING order, ecliptic coordinates. ``rho_l`` is the correlation
     with the true sky by degree where that is known, else None. ``diagnostics`` has the regularisation and how the solution
     converged, ``span_s`` first and last time of the data.
+
+    Where R is from the data, ``sigma`` is the standard deviation of every pixel (K), ``mean_sigma`` that of the map's mean (K), and
+    ``resolution_deg`` by pixel the root of the solid angle that the data tell apart; else they are None. ``samples`` are maps
+    drawn from the posterior (sample, pixel), if they were asked for.
     """
 
     def __init__(
@@ -58,6 +62,7 @@ class Map:
         noise: NDArray[np.float64],
         diagnostics: str,
         rho_l: NDArray[np.float64] | None,
+        errors: dict[str, Any] | None = None,
     ) -> None:
         self.channel = channel
         self.frequency_hz = frequency_hz
@@ -70,6 +75,11 @@ class Map:
         self.noise = noise
         self.diagnostics: dict[str, Any] = json.loads(diagnostics)
         self.rho_l = rho_l
+        known = errors or {}
+        self.sigma: NDArray[np.float64] | None = known.get("sigma")
+        self.mean_sigma: float | None = known.get("mean_sigma")
+        self.resolution_deg: NDArray[np.float64] | None = known.get("resolution_deg")
+        self.samples: NDArray[np.float64] = known.get("samples", np.empty((0, pixels.size)))
 
     def __repr__(self):
         what = "final map" if self.is_final else f"snapshot {self.number}"

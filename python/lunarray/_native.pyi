@@ -51,7 +51,16 @@ def solve_state(
     map: Optional[_Path] = None,
     overrides: Sequence[str] = ...,
     epsilons: Sequence[float] = ...,
+    samples: int = 0,
 ) -> list[dict[str, Any]]: ...
+def joint(
+    folders: Sequence[_Path],
+    scratch: _Path,
+    settings: tuple[Optional[_Path], Sequence[str]],
+    at_hz: Sequence[float],
+    samples: int,
+    priors: Optional[tuple[tuple[float, float, float], Sequence[float]]],
+) -> tuple[str, list[tuple[_Floats, _Floats]], Optional[tuple[float, dict[str, _Floats]]]]: ...
 
 class NativeDownlink:
     def __init__(self, path: _Path) -> None: ...

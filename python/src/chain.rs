@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use lunarray::downlink::FileSource;
 use lunarray::ground::{Ground, WAIT_BYTES};
-use lunarray::imaging::SolveWatch;
+use lunarray::imaging::{RegulariserChoice, Samples, SolveWatch};
 use lunarray::pipeline::{
     self, Config, ConfigSource, INTEGRATE, MemoryLimit, Plan, RunView, Segment, SettingsOrigin, use_threads,
 };
@@ -122,25 +122,38 @@ pub(crate) fn run<'py>(
     Ok((summary, dicts(py, maps.take())?, folder))
 }
 
-/// Maps of the sums in a state.
+/// Maps of the sums in a state; with samples R is from the data.
 #[pyfunction]
-#[pyo3(signature = (folder, map=None, overrides=Vec::new(), epsilons=Vec::new()))]
+#[pyo3(signature = (folder, map=None, overrides=Vec::new(), epsilons=Vec::new(), samples=0))]
 pub(crate) fn solve_state(
     py: Python<'_>,
     folder: PathBuf,
     map: Option<PathBuf>,
     overrides: Vec<String>,
     epsilons: Vec<f64>,
+    samples: usize,
 ) -> PyResult<Vec<Bound<'_, PyDict>>> {
     let cancel = Cancel::new();
     let watch = SolveWatch::new(cancel.clone());
     let found = wait(py, &cancel, move || {
         let config = ground_config(map, overrides, Some(&folder), &[], &mut Vec::new())?;
         use_threads(&config.runtime)?;
+        if samples > 0 && config.map.regulariser() != RegulariserChoice::Data {
+            let expected = "expected set={\"map.regulariser\": \"data\"}, and no map.epsilon";
+            return Err(format!(
+                "samples need R from the data, and these settings choose another R: {expected}"
+            )
+            .into());
+        }
         let mut found = Vec::new();
-        pipeline::solve_state(&folder, &config, &epsilons, &watch, &mut |solution| {
-            found.push(MapData::new(&solution));
-        })?;
+        let mut take = |solution| found.push(MapData::new(&solution));
+        match samples {
+            0 => pipeline::solve_state(&folder, &config, &epsilons, &watch, &mut take)?,
+            count => {
+                let samples = Samples { count, gibbs: false };
+                pipeline::sample_state(&folder, &config, samples, &watch, &mut take)?;
+            }
+        }
         Ok(found)
     })?;
     dicts(py, found)

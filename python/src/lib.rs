@@ -8,6 +8,7 @@ mod chain;
 mod downlink;
 mod error;
 mod ground;
+mod joint;
 mod maps;
 mod wait;
 mod writer;
@@ -43,6 +44,8 @@ mod native {
     use super::error::{ConfigurationError, Error};
     #[pymodule_export]
     use super::ground::NativeGround;
+    #[pymodule_export]
+    use super::joint::joint;
     #[pymodule_export]
     use super::maps::{analysis, compare, read_map};
     #[pymodule_export]

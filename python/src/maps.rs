@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use lunarray::imaging::Solution;
+use lunarray::imaging::{Solution, Uncertainty};
 use lunarray::products::{MapViewer, PublishedMap};
 use lunarray::runtime::Cancel;
 use lunarray::sky::fits::{ReadOptions, check_frequency, read_whole_map};
 use lunarray::sky::harmonics::{self, AnalysisOptions};
 use lunarray::sky::{Frame, SkyMap};
 use num_complex::Complex64;
-use numpy::{PyArray1, PyReadonlyArray1};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -32,6 +32,28 @@ pub(crate) struct MapData {
     diagnostics: String,
     /// rho_l, where the true sky is known.
     rho: Option<Vec<f64>>,
+    /// With R from the data.
+    errors: Option<MapErrors>,
+}
+
+/// Errors of a map, and maps drawn from its posterior.
+#[derive(Clone, Debug)]
+struct MapErrors {
+    sigma_k: Vec<f64>,
+    resolution_deg: Vec<f64>,
+    mean_sigma_k: f64,
+    samples_k: Vec<Vec<f64>>,
+}
+
+impl MapErrors {
+    fn new(found: &Uncertainty) -> Self {
+        Self {
+            sigma_k: found.sigma_k.clone(),
+            resolution_deg: found.resolution_deg.clone(),
+            mean_sigma_k: found.mean_sigma_k,
+            samples_k: found.samples.iter().map(|sample| sample.map_k.clone()).collect(),
+        }
+    }
 }
 
 impl MapData {
@@ -50,6 +72,7 @@ impl MapData {
             noise_k: solution.noise_k.clone(),
             diagnostics: serde_json::to_string(&solution.diagnostics).unwrap_or_default(),
             rho: None,
+            errors: solution.uncertainty.as_ref().map(MapErrors::new),
         }
     }
 
@@ -67,6 +90,18 @@ impl MapData {
         dict.set_item("noise", PyArray1::from_vec(py, self.noise_k))?;
         dict.set_item("diagnostics", self.diagnostics)?;
         dict.set_item("rho_l", self.rho.map(|rho| PyArray1::from_vec(py, rho)))?;
+        let errors = match self.errors {
+            Some(MapErrors { sigma_k, resolution_deg, mean_sigma_k, samples_k }) => {
+                let errors = PyDict::new(py);
+                errors.set_item("sigma", PyArray1::from_vec(py, sigma_k))?;
+                errors.set_item("resolution_deg", PyArray1::from_vec(py, resolution_deg))?;
+                errors.set_item("mean_sigma", mean_sigma_k)?;
+                errors.set_item("samples", PyArray2::from_vec2(py, &samples_k)?)?;
+                Some(errors)
+            }
+            None => None,
+        };
+        dict.set_item("errors", errors)?;
         Ok(dict)
     }
 }

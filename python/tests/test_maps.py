@@ -94,6 +94,69 @@ def test_a_state_is_solved_without_new_data_or_settings(small, tmp_path):
         lunarray.State(tmp_path / "nix")
 
 
+@pytest.fixture(scope="module")
+def harmonic_state(tmp_path_factory):
+    """A state of two channels over harmonics, with total powers."""
+    folder = tmp_path_factory.mktemp("joint")
+    settings = {
+        "spacecraft.channels_hz": [5e6, 10e6],
+        # Enough windows that coverage is even, which standard deviations assume.
+        "spacecraft.every_nth_window": 60,
+        "spacecraft.baseline_wavelengths_max": 8.0,
+        "spacecraft.auto_powers": True,
+        "map.engine": "harmonic",
+        "map.nside": 4,
+        "products.pictures": False,
+    }
+    made = lunarray.run(set=settings, out=folder / "out", progress=None)
+    list(lunarray.replay(made.downlink, set={"map.engine": "harmonic", "map.nside": 4}, state=folder / "state"))
+    return str(folder / "state")
+
+
+def test_maps_have_errors_and_samples(harmonic_state, small):
+    drawn = lunarray.State(harmonic_state).solve(samples=40)
+    for found in drawn:
+        assert found.samples.shape == (40, 192) and found.sigma.shape == found.resolution_deg.shape == (192,)
+        # 40 samples: their standard deviation is right to 1 / sqrt(80) of itself, of the median pixel to less.
+        scatter = (found.samples - found.pixels).std(axis=0) / found.sigma
+        assert 0.75 < np.median(scatter) < 1.25
+        # The scatter of means has the same accuracy: four of its standard deviations.
+        assert abs((found.samples.mean(axis=1) - found.pixels.mean()).std() / found.mean_sigma - 1) < 4 / np.sqrt(80)
+    assert lunarray.State(harmonic_state).solve()[0].samples.shape == (0, 192)
+    # The identity has no errors.
+    assert small.maps[0].sigma is None and small.maps[0].mean_sigma is None
+    with pytest.raises(lunarray.Error, match="samples need R from the data"):
+        lunarray.State(harmonic_state).solve(samples=2, set={"map.regulariser": "identity"})
+    with pytest.raises(lunarray.Error, match="expected one of the two"):
+        lunarray.State(harmonic_state).solve(samples=2, epsilon=1e-4)
+
+
+def test_channels_are_mapped_together(harmonic_state, tmp_path):
+    state = lunarray.State(harmonic_state)
+    found = lunarray.joint(state, at="7MHz", samples=4)
+    assert [one.frequency_hz for one in found.maps] == [5e6, 7e6, 10e6] and found.converged
+    command = ["joint", harmonic_state, "--at", "7MHz", "--count", "4", "--out", str(tmp_path / "joint")]
+    assert lunarray._native.run_command(["lunarray", *command]) == 0
+    for one in found.maps:
+        pixels, _ = lunarray.read_map(tmp_path / "joint" / f"{one.frequency_hz / 1e6:.3f}MHz" / "map.fits")
+        # Files have single precision.
+        assert (pixels == one.pixels.astype(np.float32)).all() and (one.sigma > 0).all() and one.mean_sigma > 0
+    # Between channels there are no data to agree with.
+    assert [one.agreement is None for one in found.maps] == [False, True, False]
+    assert found.maps[0].powers["rows"] > 0 and found.index.shape == (192,) and found.curvature.size == 0
+    assert found.reference_hz == pytest.approx(np.sqrt(5e6 * 10e6))
+    without = lunarray.joint([harmonic_state], samples=2, powers=False)
+    assert without.maps[0].powers is None
+    for wrong, message in (
+        ({"at": 12e6}, "between 5.000 and 10.000 MHz"),
+        ({"samples": 1}, "expected 2 to 1000"),
+        ({"power_priors": [0.1]}, "expected three"),
+        ({"power_constant_k_sr": [1.0, 2.0, 3.0]}, "3"),
+    ):
+        with pytest.raises(lunarray.Error, match=message):
+            lunarray.joint(state, **wrong)
+
+
 def test_settings_that_are_wrong_are_told_together():
     with pytest.raises(lunarray.ConfigurationError) as raised:
         lunarray.run(set={"map.nside": 7, "map.epsilom": 1, "sky.file": "a \"b\" \\ c.fits"})

@@ -278,3 +278,37 @@ fn healpy_reads_samples() {
         assert_eq!(read, map(&folder, name), "{name}");
     }
 }
+
+/// 24 visibilities of 3.3 to 3.9 wavelengths for 121 coefficients: the sky that the data leave open must not run away with the map.
+#[test]
+fn a_map_of_few_data_stays_near_the_sky() {
+    let place = Workplace::new(
+        r#"
+name = "few"
+[spacecraft]
+channels_hz = [10e6]
+every_nth_window = 300
+every_nth_integration = 4
+baseline_wavelengths_max = 3.9
+[map]
+engine = "harmonic"
+nside = 4
+[products]
+pictures = false
+"#,
+    );
+    let out = place.path("out");
+    succeed(&["run", &place.pipeline, "--out", &out]);
+    let folder = format!("{out}/10.000MHz");
+    let compared = json(&["compare", &format!("{folder}/map.fits"), &format!("{folder}/input.fits")]);
+    let monopole = |name: &str| compared[name][0].as_f64().unwrap().sqrt();
+    let ratio = monopole("cl_map") / monopole("cl_truth");
+    // A mean that is hardly measured, and structure of at most the sky's own power: its map has rms 1.7e5 K about a mean of 3.8e5 K.
+    assert!((0.5..2.0).contains(&ratio), "{ratio}");
+    let structure = |name: &str| -> f64 {
+        let spectrum: Vec<f64> =
+            compared[name].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
+        (1..=8).map(|l| (2 * l + 1) as f64 * spectrum[l]).sum()
+    };
+    assert!(structure("cl_map") < 2.0 * structure("cl_truth"), "{compared}");
+}

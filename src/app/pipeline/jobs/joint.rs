@@ -54,33 +54,56 @@ pub fn joint_channels(
     place: SumsPlace<'_>,
     watch: &SolveWatch,
 ) -> Result<Vec<JointChannel>, PipelineError> {
-    let mut instruments = Vec::new();
-    for (folder, _) in states {
-        instruments.push(Ground::instrument_in(folder)?);
+    let mut of_states = Vec::new();
+    for (folder, config) in states {
+        of_states.push(MappedChannels::new(Ground::channels_in(folder)?, config));
     }
-    let mapped = |(instrument, (_, config)): (&Option<Instrument>, &(&Path, Config))| {
-        let numbers = (0..).map(ChannelId).zip(instrument.iter().flat_map(|known| &known.channels));
-        let mapped = numbers.filter(|(number, _)| config.map.is_mapped(*number));
-        mapped.map(|(number, channel)| (number, channel.frequency_hz)).collect::<Vec<_>>()
-    };
-    let of_states: Vec<_> = instruments.iter().zip(states).map(mapped).collect();
-    let frequencies_hz: Vec<f64> = of_states.iter().flatten().map(|(_, hz)| *hz).collect();
-    // Powers are not known yet: with them one channel suffices.
+    let mut frequencies_hz: Vec<f64> =
+        of_states.iter().flat_map(|channels| channels.frequencies_hz.iter().copied()).collect();
+    // Channels of one frequency are no error yet, if one of them has no data; powers are not known yet: with them one channel suffices.
+    frequencies_hz.sort_by(f64::total_cmp);
+    frequencies_hz.dedup();
     request.check(&frequencies_hz, request.powers.is_some())?;
     let bytes_max = place.limit.map(|limit| (SUMS_SHARE * limit.bytes as f64) as u64);
     let mut kept = KeptChannels { channels: Vec::new(), held_bytes: 0, bytes_max, folder: place.folder };
-    for ((folder, config), channels) in states.iter().zip(&of_states) {
+    for ((folder, config), MappedChannels { with_sums, others, .. }) in states.iter().zip(of_states) {
         let ground = config.ground(WAIT_BYTES);
-        let mut left = &channels[..];
-        while !left.is_empty() {
+        let mut left = &with_sums[..];
+        loop {
             let (group, later) = left.split_at(kept.next_count().min(left.len()));
             left = later;
-            let group: ChannelGroup = group.iter().map(|(number, _)| *number).collect();
-            let ground = GroundConfig { group: Some(group), ..ground.clone() };
-            kept.read(folder, &ground, request, watch)?;
+            let mut group: ChannelGroup = group.iter().copied().collect();
+            if left.is_empty() {
+                group.extend(&others);
+            }
+            kept.read(folder, &GroundConfig { group: Some(group), ..ground.clone() }, request, watch)?;
+            if left.is_empty() {
+                break;
+            }
         }
     }
     Ok(kept.channels)
+}
+
+/// The channels of a state that are mapped.
+struct MappedChannels {
+    frequencies_hz: Vec<f64>,
+    with_sums: Vec<ChannelId>,
+    /// Those without sums in the checkpoint; packets of the raw archive may still add some.
+    others: Vec<ChannelId>,
+}
+
+impl MappedChannels {
+    fn new(found: Option<(Instrument, Vec<bool>)>, config: &Config) -> Self {
+        let (channels, has_sums) = found
+            .map_or_else(Default::default, |(instrument, has_sums)| (instrument.frequencies_hz(), has_sums));
+        let mapped: Vec<(ChannelId, f64)> =
+            (0..).map(ChannelId).zip(channels).filter(|(number, _)| config.map.is_mapped(*number)).collect();
+        let frequencies_hz = mapped.iter().map(|(_, hz)| *hz).collect();
+        let has = |number: &ChannelId| has_sums.get(usize::from(number.0)).copied().unwrap_or(false);
+        let (with_sums, others) = mapped.into_iter().map(|(number, _)| number).partition(has);
+        Self { frequencies_hz, with_sums, others }
+    }
 }
 
 /// The channels read so far.

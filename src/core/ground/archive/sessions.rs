@@ -127,13 +127,18 @@ impl Ground {
         }
     }
 
-    /// The instrument of an archive, from its newest usable checkpoint; `None` if that has received no description of it.
+    /// The instrument of an archive, and whether each channel has sums, from its newest usable checkpoint; `None` if that has received no
+    /// description of it.
     ///
     /// # Errors
     /// A folder without a usable checkpoint, or in use.
     #[doc(hidden)]
-    pub fn instrument_in(folder: &Path) -> Result<Option<Instrument>, GroundError> {
-        let of_head = |path: &Path| head_at(path, |head| head.collector.instrument().cloned());
+    pub fn channels_in(folder: &Path) -> Result<Option<(Instrument, Vec<bool>)>, GroundError> {
+        let of_head = |path: &Path| {
+            head_at(path, |head| {
+                Some((head.collector.instrument()?.clone(), head.accumulator.has_sums().to_vec()))
+            })
+        };
         let (found, _) = StateFolder::open_to_read(folder)?.load(false, of_head)?;
         found.ok_or_else(|| GroundError::without_checkpoint(folder))
     }

@@ -8,8 +8,8 @@ use faer::{Mat, Side};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
+use super::FoundPower;
 use super::knots::{FREE, Knots};
-use super::{FoundPower, PowerFit};
 use crate::units::{StreamKind, random_stream};
 
 /// Turns of each sample: one repairs what the Gaussian of the evidence is wrong in, and a second what is left.
@@ -29,11 +29,13 @@ impl FoundPower {
         let mut stream = random_stream(5, StreamKind::Probe, [self.solution.len() as u64, number]);
         let knots = self.fit.knots.clone();
         let mut theta = moved(&self.fit.theta, &self.covariance, 1.0, &mut stream);
-        let mut sky = draw(&PowerFit::new(knots.clone(), theta.clone()).regularisation());
+        let mut draw =
+            |theta: &[f64]| draw(&knots.power(theta).into_iter().map(f64::recip).collect::<Vec<f64>>());
+        let mut sky = draw(&theta);
         for _ in 0..TURNS {
             let squares = self.squares(&sky);
             theta = given_sky(&knots, theta, &squares, &mut stream);
-            sky = draw(&PowerFit::new(knots.clone(), theta.clone()).regularisation());
+            sky = draw(&theta);
         }
         sky
     }

@@ -74,6 +74,11 @@ impl Knots {
         (0..=self.l_max).map(of_degree).collect()
     }
 
+    /// C_l for l = 0 ..= l_max.
+    pub(super) fn power(&self, theta: &[f64]) -> Vec<f64> {
+        self.log_power(theta).into_iter().map(f64::exp).collect()
+    }
+
     /// The prior of the parameters.
     pub(super) fn hyperprior(&self, theta: &[f64]) -> Hyperprior {
         let mut prior = Hyperprior {

@@ -49,6 +49,10 @@ const STEP_MAX: f64 = 2.0;
 /// Maximum number of halvings of a step without gain.
 const HALVINGS: usize = 8;
 
+/// Maximum `V'N^-1V` that the sky's structure may be expected to give, in units of what the data have. Rounds of data that leave most of the
+/// sky open could otherwise run away: a larger sky makes a larger map, which makes a larger sky.
+const EXPECTED_MAX: f64 = 30.0;
+
 /// The angular power of the sky (minus the prior map), estimated from the data, with its uncertainty. R is 1 / C_l.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SkyPower {
@@ -198,6 +202,32 @@ pub(in crate::imaging) struct PowerFit {
     theta: Vec<f64>,
     /// C_l, K^2.
     power: Vec<f64>,
+    limit: ExpectedLimit,
+}
+
+/// The traces of the normal matrix by degree, and the `V'N^-1V` that the structure of the sky may be expected to give.
+#[derive(Clone, Debug)]
+struct ExpectedLimit {
+    traces: Vec<f64>,
+    max: f64,
+}
+
+impl ExpectedLimit {
+    fn new(blocks: &[Block<'_>], l_max: usize, data_power: f64) -> Self {
+        let mut traces = vec![0.0; l_max + 1];
+        for block in blocks {
+            for (k, l) in block.degrees.iter().enumerate() {
+                traces[*l] += block.places.len() as f64 * block.matrix[(k, k)];
+            }
+        }
+        Self { traces, max: EXPECTED_MAX * data_power }
+    }
+
+    /// Whether the data can come from structure of this power. Mean and dipole are free.
+    fn allows(&self, power: &[f64]) -> bool {
+        let expected: f64 = self.traces.iter().zip(power).skip(FREE).map(|(trace, c)| trace * c).sum();
+        expected <= self.max
+    }
 }
 
 /// The data and matrix of a fit.
@@ -211,17 +241,25 @@ pub(super) struct BlockData<'a> {
 }
 
 impl PowerFit {
-    fn new(knots: Knots, theta: Vec<f64>) -> Self {
-        let power = knots.log_power(&theta).into_iter().map(f64::exp).collect();
-        Self { knots, theta, power }
+    fn new(knots: Knots, theta: Vec<f64>, limit: ExpectedLimit) -> Self {
+        let power = knots.power(&theta);
+        Self { knots, theta, power, limit }
     }
 
-    /// Starts with `C_l` proportional to `(l + 1)^-2` and the maximum-likelihood amplitude.
-    pub(super) fn begin(blocks: &[Block<'_>], l_max: usize, right: &[f64]) -> Result<Self, SolveError> {
+    /// Starts with `C_l` proportional to `(l + 1)^-2` and the maximum-likelihood amplitude, of data with this `V'N^-1V`.
+    pub(super) fn begin(
+        blocks: &[Block<'_>],
+        l_max: usize,
+        right: &[f64],
+        data_power: f64,
+    ) -> Result<Self, SolveError> {
         let unit = largest_diagonal(blocks).recip();
+        // At the smallest amplitude no coefficient has more than a thousandth of its noise.
+        let limit = ExpectedLimit::new(blocks, l_max, data_power.max(right.len() as f64));
         let of = |decade: i32| {
             let knots = Knots::new(l_max, (unit * 10.0_f64.powi(decade)).ln());
-            let fit = Self::new(knots.clone(), knots.start());
+            let fit = Self::new(knots.clone(), knots.start(), limit.clone());
+            limit.allows(&fit.power).then_some(())?;
             Some((value(blocks, &fit.power, right)?, fit))
         };
         let best = DECADES.filter_map(of).max_by(|(a, _), (b, _)| a.total_cmp(b));
@@ -253,6 +291,9 @@ impl PowerFit {
         let power: Vec<f64> = log_power.iter().map(|ln| ln.exp()).collect();
         let correction: f64 =
             data.gradient_correction.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
+        if !self.limit.allows(&power) {
+            return None;
+        }
         Some(value(data.blocks, &power, data.right)? + correction + self.knots.hyperprior(theta).value)
     }
 
@@ -293,7 +334,7 @@ impl PowerFit {
             });
             let Some((found, theta)) = improved else { break };
             let gain = found - best;
-            (best, fit) = (found, Self::new(fit.knots, theta));
+            (best, fit) = (found, Self::new(fit.knots, theta, fit.limit));
             if gain < GAIN_MIN {
                 break;
             }

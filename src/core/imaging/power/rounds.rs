@@ -80,7 +80,7 @@ impl PowerProblem<'_> {
     pub(in crate::imaging) fn solve_blocks(&self) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
         let gradient_correction = vec![0.0; l_max + 1];
-        let mut fit = PowerFit::begin(self.blocks, l_max, self.right)?;
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.power)?;
         let mut factor = 1.0;
         for round in 1.. {
             let right = self.right_divided_by(factor);
@@ -119,8 +119,8 @@ impl PowerProblem<'_> {
         // |V - B x|^2 = V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
         let regularised: f64 = x.iter().zip(self.degrees).map(|(x, l)| r[*l] * x * x).sum();
         let residual = self.power - dot(x, self.right) - regularised;
-        // The few degrees of freedom that the solution takes are neglected.
-        (residual / self.numbers).max(1.0).sqrt()
+        // The few degrees of freedom that the solution takes are neglected. No solution fits worse than an empty sky.
+        (residual.min(self.power) / self.numbers).max(1.0).sqrt()
     }
 
     /// Estimates the power in rounds, from the initial solution `start`.
@@ -134,7 +134,7 @@ impl PowerProblem<'_> {
         watch: NamedWatch<'_>,
     ) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
-        let mut fit = PowerFit::begin(self.blocks, l_max, self.right)?;
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.power)?;
         let mut x = [match start {
             Some(start) if start.len() == self.right.len() => start.to_vec(),
             _ => vec![0.0; self.right.len()],

@@ -45,7 +45,13 @@ struct Iteration {
     products: usize,
     /// Whether rounding errors prevent further progress.
     is_stuck: bool,
+    /// An earlier solution with a smaller residual, and its square.
+    best: Option<(f64, Vec<f64>)>,
 }
+
+/// Growth of the squared residual since its smallest value at which an iteration ends: the matrix is not positive definite within its accuracy,
+/// as of few data that leave most of the sky open. Residuals of one that is may rise for a while, by far less.
+const GROWTH_MAX: f64 = 1e6;
 
 impl Iteration {
     /// Starts from the initial guess `x` and its product with the matrix; `None` if the guess is zero.
@@ -63,7 +69,7 @@ impl Iteration {
         let direction = preconditioned(&residual);
         let residual_square = dot(&residual, &direction);
         let products = usize::from(product.is_some());
-        Self { x, residual, direction, residual_square, right_square, products, is_stuck: false }
+        Self { x, residual, direction, residual_square, right_square, products, is_stuck: false, best: None }
     }
 
     /// The residual relative to the right-hand side; 0 if that is zero.
@@ -71,7 +77,8 @@ impl Iteration {
         if self.right_square <= 0.0 {
             0.0
         } else {
-            (self.residual_square.max(0.0) / self.right_square).sqrt()
+            // A negative square, of a preconditioner that is not positive definite, is no convergence.
+            (self.residual_square.abs() / self.right_square).sqrt()
         }
     }
 
@@ -89,14 +96,35 @@ impl Iteration {
             return;
         }
         let step = self.residual_square / curvature;
+        let before = self.x.clone();
         self.x.iter_mut().zip(&self.direction).for_each(|(x, d)| *x += step * d);
         subtract(&mut self.residual, step, product);
         let mut z = self.residual.clone();
         precondition(&mut z);
         let next = dot(&self.residual, &z);
         let beta = next / self.residual_square;
+        self.keep_best(next, before);
         self.residual_square = next;
         self.direction.iter_mut().zip(&z).for_each(|(d, z)| *d = z + beta * *d);
+    }
+
+    /// Keeps the solution before a step after which the square of the residual is `next`, if it is the best so far and the step makes it worse.
+    fn keep_best(&mut self, next: f64, before: Vec<f64>) {
+        let least = self.best.as_ref().map_or(f64::INFINITY, |(square, _)| *square);
+        if !(next < self.residual_square) && self.residual_square < least {
+            self.best = Some((self.residual_square, before));
+        }
+        // Negative squares come from a preconditioner that is not positive definite.
+        self.is_stuck |= !(next >= 0.0) || next > GROWTH_MAX * least.min(self.residual_square);
+    }
+
+    /// Returns to the best solution.
+    fn settle(&mut self) {
+        if let Some((square, x)) =
+            self.best.take_if(|(square, _)| !(self.residual_square <= *square && self.residual_square >= 0.0))
+        {
+            (self.residual_square, self.x) = (square, x);
+        }
     }
 
     fn convergence(&self, rule: StoppingRule) -> Convergence {
@@ -117,6 +145,7 @@ pub(in crate::imaging) fn solve_one(
         let along = product(&iteration.direction);
         iteration.step(&along, precondition);
     }
+    iteration.settle();
     let convergence = iteration.convergence(rule);
     (iteration.x, convergence)
 }
@@ -130,7 +159,7 @@ impl System<'_> {
     }
 
     /// Solves for each right-hand side `b` by its own rule, from the initial guesses in `x`, which then hold the solutions. An interrupted
-    /// iteration leaves its last solution. Products are computed together, but each solution has the bits that it would have alone.
+    /// iteration, or one that does not converge, leaves its best solution. Products are computed together, but each solution has the bits that it would have alone.
     pub(in crate::imaging) fn solve(
         &self,
         b: &[&[f64]],
@@ -169,6 +198,7 @@ impl System<'_> {
                 iteration.step(product, self.precondition);
             }
         }
+        iterations.iter_mut().for_each(Iteration::settle);
         let convergence = iterations.iter().zip(rules).map(|(one, rule)| one.convergence(*rule)).collect();
         x.iter_mut().zip(iterations).for_each(|(x, iteration)| *x = iteration.x);
         convergence
@@ -186,10 +216,11 @@ mod tests {
 
     const ORDER: usize = 40;
 
-    /// A symmetric matrix with eigenvalues from 1 to 40 that records the number of vectors in each product.
+    /// A symmetric matrix with eigenvalues from 1 (or another) to 40 that records the number of vectors in each product.
     #[derive(Default)]
     struct TestMatrix {
         products: Mutex<Vec<usize>>,
+        first: Option<f64>,
     }
 
     impl NormalSums for TestMatrix {
@@ -203,7 +234,8 @@ mod tests {
                 let twice = 2.0 * x.iter().sum::<f64>() / ORDER as f64;
                 x.iter().map(|x| x - twice).collect::<Vec<f64>>()
             };
-            let scaled: Vec<f64> = mirrored(x).iter().enumerate().map(|(k, x)| (k + 1) as f64 * x).collect();
+            let eigenvalue = |k: usize| if k == 0 { self.first.unwrap_or(1.0) } else { (k + 1) as f64 };
+            let scaled: Vec<f64> = mirrored(x).iter().enumerate().map(|(k, x)| eigenvalue(k) * x).collect();
             y.copy_from_slice(&mirrored(&scaled));
         }
 
@@ -288,6 +320,35 @@ mod tests {
     }
 
     /// Ranks whose processors round differently would stop at different iterations.
+    /// With an eigenvalue of -1e-4 iterations run away; they leave the best solution that they had, and do not say that they converged.
+    #[test]
+    fn a_matrix_that_is_not_positive_definite_leaves_the_best_solution() {
+        let b: Vec<f64> = (0..ORDER).map(|k| (0.7 * k as f64).sin()).collect();
+        let watch = SolveWatch::default();
+        let solved = |iterations_max: usize| {
+            let matrix = TestMatrix { first: Some(-1e-4), ..TestMatrix::default() };
+            let system =
+                System { sums: &matrix, regularisation: Diagonal::Uniform(0.0), precondition: &|_| {} };
+            let mut x = [vec![0.0; ORDER]];
+            let rule = StoppingRule { residual_max: 1e-12, iterations_max };
+            let task = watch.named("x").start("map", 1e-12);
+            let found = system.solve(&[&b], &mut x, &[rule], &task)[0];
+            let mut residual = vec![0.0; ORDER];
+            matrix.apply(&x[0], &mut residual);
+            subtract(&mut residual, 1.0, &b);
+            (found, (dot(&residual, &residual) / dot(&b, &b)).sqrt())
+        };
+        let mut least = f64::INFINITY;
+        for iterations_max in 1..=3 * ORDER {
+            let (found, residual) = solved(iterations_max);
+            assert!(!found.converged && residual <= 1.0, "{iterations_max}: {residual} {found:?}");
+            // The residual that is said is that of the solution; rounding errors accumulate.
+            assert!((residual - found.residual).abs() < 1e-6, "{residual} {found:?}");
+            assert!(found.residual <= least, "{iterations_max}: {} {least}", found.residual);
+            least = found.residual;
+        }
+    }
+
     #[test]
     fn ranks_end_a_column_together() {
         let wave = |f: f64| (0..ORDER).map(|k| (f * k as f64).sin()).collect::<Vec<f64>>();

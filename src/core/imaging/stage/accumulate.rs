@@ -28,6 +28,14 @@ pub struct AccumulatorState {
     channels: Vec<bool>,
 }
 
+impl AccumulatorState {
+    /// Whether each channel has sums.
+    #[must_use]
+    pub fn has_sums(&self) -> &[bool] {
+        &self.channels
+    }
+}
+
 /// The time span of a channel without data.
 const NO_SPAN_S: [f64; 2] = [f64::INFINITY, f64::NEG_INFINITY];
 
