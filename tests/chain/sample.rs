@@ -303,12 +303,12 @@ pictures = false
     let compared = json(&["compare", &format!("{folder}/map.fits"), &format!("{folder}/input.fits")]);
     let monopole = |name: &str| compared[name][0].as_f64().unwrap().sqrt();
     let ratio = monopole("cl_map") / monopole("cl_truth");
-    // A mean that is hardly measured, and structure of at most the sky's own power: its map has rms 1.7e5 K about a mean of 3.8e5 K.
+    // The mean is hardly measured, and structure may be as large as its stated error, five times the sky's; without a bound both were 1e5 times.
     assert!((0.5..2.0).contains(&ratio), "{ratio}");
     let structure = |name: &str| -> f64 {
         let spectrum: Vec<f64> =
             compared[name].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
         (1..=8).map(|l| (2 * l + 1) as f64 * spectrum[l]).sum()
     };
-    assert!(structure("cl_map") < 2.0 * structure("cl_truth"), "{compared}");
+    assert!(structure("cl_map") < 25.0 * structure("cl_truth"), "{compared}");
 }
