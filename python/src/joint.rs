@@ -18,6 +18,8 @@ use crate::wait::wait;
 type Priors = ([f64; 3], Vec<f64>);
 /// Pixels of a map and their standard deviations, K.
 type MapArrays<'py> = (Bound<'py, PyArray1<f64>>, Bound<'py, PyArray1<f64>>);
+/// Reference frequency, Hz, and index and curvature with their standard deviations by pixel.
+type Spectra<'py> = (f64, Bound<'py, PyDict>);
 
 /// Joint maps of the channels of states: their description as JSON, their pixels and standard deviations, and spectra, with their frequency.
 #[pyfunction]
@@ -29,7 +31,7 @@ pub(crate) fn joint<'py>(
     at_hz: Vec<f64>,
     samples: usize,
     priors: Option<Priors>,
-) -> PyResult<(String, Vec<MapArrays<'py>>, Option<(f64, Bound<'py, PyDict>)>)> {
+) -> PyResult<(String, Vec<MapArrays<'py>>, Option<Spectra<'py>>)> {
     let cancel = Cancel::new();
     let watch = SolveWatch::new(cancel.clone());
     let found = wait(py, &cancel, move || {

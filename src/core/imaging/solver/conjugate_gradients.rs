@@ -111,18 +111,19 @@ impl Iteration {
     /// Keeps the solution before a step after which the square of the residual is `next`, if it is the best so far and the step makes it worse.
     fn keep_best(&mut self, next: f64, before: Vec<f64>) {
         let least = self.best.as_ref().map_or(f64::INFINITY, |(square, _)| *square);
-        if !(next < self.residual_square) && self.residual_square < least {
+        let is_worse = next.is_nan() || next >= self.residual_square;
+        if is_worse && self.residual_square < least {
             self.best = Some((self.residual_square, before));
         }
         // Negative squares come from a preconditioner that is not positive definite.
-        self.is_stuck |= !(next >= 0.0) || next > GROWTH_MAX * least.min(self.residual_square);
+        let limit = GROWTH_MAX * least.min(self.residual_square);
+        self.is_stuck |= next.is_nan() || next < 0.0 || next > limit;
     }
 
     /// Returns to the best solution.
     fn settle(&mut self) {
-        if let Some((square, x)) =
-            self.best.take_if(|(square, _)| !(self.residual_square <= *square && self.residual_square >= 0.0))
-        {
+        let is_best = |square: f64| (0.0..=square).contains(&self.residual_square);
+        if let Some((square, x)) = self.best.take().filter(|(square, _)| !is_best(*square)) {
             (self.residual_square, self.x) = (square, x);
         }
     }
