@@ -8,7 +8,10 @@ import tempfile
 from os import PathLike
 from typing import Any, Iterable, Iterator
 
+import numpy as np
+
 from . import _native
+from ._array import EPOCH, MOON_RADIUS_M, Array
 from ._map import Map
 from ._progress import Progress, progress_of
 from ._settings import Settings, overrides
@@ -40,20 +43,46 @@ def run(
     seed: int | None = None,
     out: str | PathLike[str] | None = None,
     progress: Progress = None,
+    array: Array | None = None,
+    epoch: str | np.datetime64 = EPOCH,
 ) -> Run:
     """Runs the whole chain: sky, spacecraft, downlink, ground, maps. As ``lunarray run``.
 
     ``pipeline`` is a file (the quicklook if not given), ``set`` replaces some of its settings, ``out`` is the folder of the products
-    (out/NAME if not given). Terminals and notebooks show how far it is, unless ``progress=False``. A function as ``progress`` is
-    called some times a second with what each stage has done so far; an exception in it ends the run, as Ctrl-C does: in order, with
-    products of the data so far.
+    (out/NAME if not given). An ``array`` of given positions takes the place of the pipeline's, for as long as they are known, from
+    ``epoch`` (their time 0, UTC) on; its OEM files stay in ``out``/orbits.
+
+    Terminals and notebooks show how far it is, unless ``progress=False``. A function as ``progress`` is called some times a second
+    with what each stage has done so far; an exception in it ends the run, as Ctrl-C does: in order, with products of the data so far.
     """
+    settings = overrides(set)
+    if array is not None:
+        if out is None:
+            raise _native.Error("out is not given: expected the folder of the products, in which the array's orbits are kept, too")
+        settings = [*orbits_of(array, epoch, os.path.join(os.fspath(out), "orbits")), *settings]
     shown = progress_of(progress)
     try:
-        return Run(*_native.run(pipeline, overrides(set), seed, out, shown))
+        return Run(*_native.run(pipeline, settings, seed, out, shown))
     finally:
         if shown is not None:
             shown.close()
+
+
+def orbits_of(array: Array, epoch: str | np.datetime64, folder: str) -> list[str]:
+    """Settings of a mission of an array of given positions, which it writes as OEM files."""
+    paths = array.write_oem(folder, epoch)
+    first_s, last_s = array.known_s
+    if first_s > 0.0:
+        raise _native.Error(f"the array's positions begin at {first_s} s: expected time 0, when the mission begins, among them")
+    if array.moon_radius_m != MOON_RADIUS_M:
+        raise _native.Error(f"the array's Moon has a radius of {array.moon_radius_m} m: expected {MOON_RADIUS_M} m in a mission")
+    settings = {
+        "array.oem": [os.path.abspath(path) for path in paths],
+        "array.satellites": array.satellites,
+        "array.oem_epoch": f"{np.datetime64(epoch, 's')}Z",
+        "spacecraft.duration_s": last_s,
+    }
+    return overrides(settings)
 
 
 class Replay:

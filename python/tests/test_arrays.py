@@ -139,3 +139,41 @@ def test_odd_tables_of_positions_are_refused():
     ]:
         with pytest.raises(lunarray.Error, match=text):
             lunarray.Array.from_positions(times, positions)
+
+
+def test_a_mission_of_given_positions_flies_them(tmp_path):
+    # Three satellites on planes of their own, which no setting of the formation makes.
+    t = np.arange(-1200.0, 86400.0 + 1201.0, 60.0)
+    phase = 7.7e-4 * t[:, None] + np.array([0.0, 6e-5, 1.4e-4])
+    tilt = np.radians([30.0, 30.0005, 30.001])
+    xyz = 2.037e6 * np.stack([np.cos(phase), np.sin(phase) * np.cos(tilt), np.sin(phase) * np.sin(tilt)], axis=-1)
+    mine = lunarray.Array.from_positions(t, xyz)
+    settings = {
+        "spacecraft.channels_hz": [3e6],
+        "spacecraft.every_nth_integration": [1],
+        "spacecraft.every_nth_window": 1,
+        "map.nside": 2,
+        "map.engine": "pixel",
+        "products.pictures": False,
+    }
+    made = lunarray.run(set=settings, out=tmp_path / "mission", array=mine, epoch="2030-06-01T12:00:00", progress=False)
+    sent = lunarray.open(made.downlink)
+    seen = sent.visibilities(0)
+    assert sent.satellites == 3 and len(seen) > 0 and (seen["time_s"] < 86400).all()
+    # UTC is 37 s behind TAI.
+    assert sent.epoch == np.datetime64("2030-06-01T12:00:37")
+    # Files have micrometres, and packets parts of a millimetre.
+    assert np.abs(sent.ephemeris(seen["time_s"]) - mine.positions(seen["time_s"])).max() < 1e-3
+    # Angular velocity times radius, by the formula.
+    with open(tmp_path / "mission" / "orbits" / "sat2.oem") as file:
+        state = np.array(file.readlines()[-1].split()[1:], dtype=float)
+    assert np.linalg.norm(state[3:]) == pytest.approx(7.7e-4 * 2.037e3, rel=1e-5)
+    for wrong, message in (
+        ({"out": None}, "out is not given"),
+        ({"array": lunarray.Array.from_positions(t[30:], xyz[30:])}, "begin at 600.0 s: expected time 0"),
+        ({"array": lunarray.Array()}, "the array is a pipeline's"),
+        ({"array": lunarray.Array.from_positions(t, xyz, 1.7e6)}, "radius of 1700000.0 m"),
+        ({"epoch": "2016-06-01"}, "after the last leap second"),
+    ):
+        with pytest.raises(lunarray.Error, match=message):
+            lunarray.run(**{"set": settings, "out": tmp_path / "wrong", "array": mine, "progress": False, **wrong})
