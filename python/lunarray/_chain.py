@@ -188,6 +188,8 @@ class State:
         which the sums depend are those of the state; ``map`` and ``set`` give others, such as ``map.prior_k``. Each map has as many
         posterior ``samples`` as asked for, with R from the data (no ``epsilon``).
         """
+        if not 0 <= samples <= 10_000:
+            raise _native.Error(f"samples = {samples}: expected 0 to 10000")
         if samples and epsilon is not None:
             raise _native.Error("samples need R from the data, which has no epsilon: expected one of the two")
         if isinstance(epsilon, Iterator):

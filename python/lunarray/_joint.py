@@ -77,8 +77,8 @@ def joint(
     frequencies = [at] if isinstance(at, str) or np.ndim(at) == 0 else list(at)
     at_hz = [hertz(one) for one in frequencies]
     priors = numbers(power_priors, "", "power_priors").ravel().tolist()
-    if len(priors) != 3:
-        raise _native.Error(f"power_priors has {len(priors)} values: expected three, of gain, offset and slope")
+    if len(priors) != 3 or not all(0 <= prior <= 10 for prior in priors):
+        raise _native.Error(f"power_priors = {priors}: expected three values of 0 to 10, of gain, offset and slope")
     constant = numbers(power_constant_k_sr, "K sr", "power_constant_k_sr").ravel().tolist()
     chosen = (tuple(priors), constant) if powers else None
     text, arrays, spectra = _native.joint(folders, scratch, (map, overrides(set)), at_hz, samples, chosen)

@@ -79,7 +79,7 @@ class Map:
         self.sigma: NDArray[np.float64] | None = known.get("sigma")
         self.mean_sigma: float | None = known.get("mean_sigma")
         self.resolution_deg: NDArray[np.float64] | None = known.get("resolution_deg")
-        self.samples: NDArray[np.float64] = known.get("samples", np.empty((0, pixels.size)))
+        self.samples: NDArray[np.float64] = np.reshape(known.get("samples", []), (-1, pixels.size))
 
     def __repr__(self):
         what = "final map" if self.is_final else f"snapshot {self.number}"

@@ -127,6 +127,8 @@ def test_maps_have_errors_and_samples(harmonic_state, small):
     assert small.maps[0].sigma is None and small.maps[0].mean_sigma is None
     with pytest.raises(lunarray.Error, match="samples need R from the data"):
         lunarray.State(harmonic_state).solve(samples=2, set={"map.regulariser": "identity"})
+    with pytest.raises(lunarray.Error, match="expected 0 to 10000"):
+        lunarray.State(harmonic_state).solve(samples=-1)
     with pytest.raises(lunarray.Error, match="expected one of the two"):
         lunarray.State(harmonic_state).solve(samples=2, epsilon=1e-4)
 
@@ -151,7 +153,8 @@ def test_channels_are_mapped_together(harmonic_state, tmp_path):
         ({"at": 12e6}, "between 5.000 and 10.000 MHz"),
         ({"samples": 1}, "expected 2 to 1000"),
         ({"power_priors": [0.1]}, "expected three"),
-        ({"power_constant_k_sr": [1.0, 2.0, 3.0]}, "3"),
+        ({"power_priors": [0.1, -1.0, 0.0]}, "expected three"),
+        ({"power_constant_k_sr": [1.0, 2.0, 3.0]}, "power-constant"),
     ):
         with pytest.raises(lunarray.Error, match=message):
             lunarray.joint(state, **wrong)

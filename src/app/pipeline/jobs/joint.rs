@@ -58,16 +58,26 @@ pub fn joint_channels(
     for (folder, config) in states {
         of_states.push(MappedChannels::new(Ground::channels_in(folder)?, config));
     }
+    // Two channels of one frequency are an error if both have sums. Powers are not known yet: with them one channel suffices.
     let mut frequencies_hz: Vec<f64> =
-        of_states.iter().flat_map(|channels| channels.frequencies_hz.iter().copied()).collect();
-    // Channels of one frequency are no error yet, if one of them has no data; powers are not known yet: with them one channel suffices.
-    frequencies_hz.sort_by(f64::total_cmp);
-    frequencies_hz.dedup();
+        of_states.iter().flat_map(|state| state.hz_with_sums.clone()).collect();
+    for hz in of_states.iter().flat_map(|state| &state.other_hz) {
+        if !frequencies_hz.contains(hz) {
+            frequencies_hz.push(*hz);
+        }
+    }
     request.check(&frequencies_hz, request.powers.is_some())?;
     let bytes_max = place.limit.map(|limit| (SUMS_SHARE * limit.bytes as f64) as u64);
-    let mut kept = KeptChannels { channels: Vec::new(), held_bytes: 0, bytes_max, folder: place.folder };
+    let mut kept = KeptChannels {
+        channels: Vec::new(),
+        held_bytes: 0,
+        largest_bytes: 0,
+        bytes_max,
+        folder: place.folder,
+    };
     for ((folder, config), MappedChannels { with_sums, others, .. }) in states.iter().zip(of_states) {
         let ground = config.ground(WAIT_BYTES);
+        kept.largest_bytes = 0;
         let mut left = &with_sums[..];
         loop {
             let (group, later) = left.split_at(kept.next_count().min(left.len()));
@@ -87,7 +97,8 @@ pub fn joint_channels(
 
 /// The channels of a state that are mapped.
 struct MappedChannels {
-    frequencies_hz: Vec<f64>,
+    hz_with_sums: Vec<f64>,
+    other_hz: Vec<f64>,
     with_sums: Vec<ChannelId>,
     /// Those without sums in the checkpoint; packets of the raw archive may still add some.
     others: Vec<ChannelId>,
@@ -99,10 +110,11 @@ impl MappedChannels {
             .map_or_else(Default::default, |(instrument, has_sums)| (instrument.frequencies_hz(), has_sums));
         let mapped: Vec<(ChannelId, f64)> =
             (0..).map(ChannelId).zip(channels).filter(|(number, _)| config.map.is_mapped(*number)).collect();
-        let frequencies_hz = mapped.iter().map(|(_, hz)| *hz).collect();
         let has = |number: &ChannelId| has_sums.get(usize::from(number.0)).copied().unwrap_or(false);
-        let (with_sums, others) = mapped.into_iter().map(|(number, _)| number).partition(has);
-        Self { frequencies_hz, with_sums, others }
+        let (with_sums, others): (Vec<_>, Vec<_>) = mapped.into_iter().partition(|(number, _)| has(number));
+        let (with_sums, hz_with_sums) = with_sums.into_iter().unzip();
+        let (others, other_hz) = others.into_iter().unzip();
+        Self { hz_with_sums, other_hz, with_sums, others }
     }
 }
 
@@ -111,14 +123,16 @@ struct KeptChannels<'a> {
     channels: Vec<JointChannel>,
     /// Bytes of the sums in memory.
     held_bytes: u64,
+    /// Bytes of the largest sums of the state that is read.
+    largest_bytes: u64,
     bytes_max: Option<u64>,
     folder: &'a Path,
 }
 
 impl KeptChannels<'_> {
-    /// Number of channels to read at once: the first alone, and then as many as memory holds if they are like the largest before.
+    /// Number of channels to read at once: the first of a state alone, and then as many as memory holds if they are like the largest before.
     fn next_count(&self) -> usize {
-        let largest = self.channels.iter().map(JointChannel::sums_bytes).max().unwrap_or(0);
+        let largest = self.largest_bytes;
         match self.bytes_max {
             None => usize::MAX,
             Some(_) if largest == 0 => 1,
@@ -155,6 +169,7 @@ impl KeptChannels<'_> {
 
     fn keep(&mut self, channel: JointChannel) -> Result<(), PipelineError> {
         let bytes = channel.sums_bytes();
+        self.largest_bytes = self.largest_bytes.max(bytes);
         // The next channel needs memory to be read.
         let needed = self.held_bytes + bytes + READING * bytes;
         let is_held = self.bytes_max.is_none_or(|bytes_max| needed <= bytes_max);

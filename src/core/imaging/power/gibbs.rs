@@ -8,8 +8,8 @@ use faer::{Mat, Side};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::FoundPower;
 use super::knots::{FREE, Knots};
+use super::{ExpectedLimit, FoundPower};
 use crate::units::{StreamKind, random_stream};
 
 /// Turns of each sample: one repairs what the Gaussian of the evidence is wrong in, and a second what is left.
@@ -34,7 +34,7 @@ impl FoundPower {
         let mut sky = draw(&theta);
         for _ in 0..TURNS {
             let squares = self.squares(&sky);
-            theta = given_sky(&knots, theta, &squares, &mut stream);
+            theta = given_sky((&knots, &self.fit.limit), theta, &squares, &mut stream);
             sky = draw(&theta);
         }
         sky
@@ -59,14 +59,20 @@ fn moved(theta: &[f64], covariance: &Mat<f64>, scale: f64, stream: &mut impl Rng
 }
 
 /// Logarithm of the density of parameters given the sums of squares of coefficients by degree.
-fn log_density(knots: &Knots, theta: &[f64], squares: &[f64]) -> f64 {
+fn log_density((knots, limit): (&Knots, &ExpectedLimit), theta: &[f64], squares: &[f64]) -> f64 {
     let term = |(l, ln): (usize, f64)| -0.5 * ((2 * l + 1) as f64 * ln + squares[l] * (-ln).exp());
     let of_sky: f64 = knots.log_power(theta).into_iter().enumerate().skip(FREE).map(term).sum();
-    of_sky + knots.hyperprior(theta).value
+    of_sky + knots.hyperprior(theta).value + limit.value(&knots.power(theta))
 }
 
 /// Parameters drawn given the sky, by Metropolis' walk from `theta`.
-fn given_sky(knots: &Knots, mut theta: Vec<f64>, squares: &[f64], stream: &mut impl Rng) -> Vec<f64> {
+fn given_sky(
+    prior: (&Knots, &ExpectedLimit),
+    mut theta: Vec<f64>,
+    squares: &[f64],
+    stream: &mut impl Rng,
+) -> Vec<f64> {
+    let (knots, _) = prior;
     // Fisher's information of coefficients that are known: half of each.
     let mut precision = knots.hyperprior(&theta).precision;
     for l in FREE..squares.len() {
@@ -79,10 +85,10 @@ fn given_sky(knots: &Knots, mut theta: Vec<f64>, squares: &[f64], stream: &mut i
     let Ok(factor) = precision.llt(Side::Lower) else { return theta };
     let covariance = faer::linalg::solvers::DenseSolveCore::inverse(&factor);
     let scale = STEP / (theta.len() as f64).sqrt();
-    let mut here = log_density(knots, &theta, squares);
+    let mut here = log_density(prior, &theta, squares);
     for _ in 0..WALK {
         let there = moved(&theta, &covariance, scale, stream);
-        let found = log_density(knots, &there, squares);
+        let found = log_density(prior, &there, squares);
         if stream.random::<f64>().ln() < found - here {
             (theta, here) = (there, found);
         }
@@ -101,9 +107,11 @@ mod tests {
         let knots = Knots::new(4, 1.0);
         assert_eq!(knots.count(), 2);
         let squares = [0.0, 0.0, 9.0, 4.0, 2.0];
+        let limit = ExpectedLimit { traces: Vec::new(), max: f64::INFINITY };
         let mut stream = random_stream(9, StreamKind::Probe, [1, 2]);
-        let draws: Vec<f64> =
-            (0..DRAWS).map(|_| given_sky(&knots, vec![1.0, 0.0], &squares, &mut stream)[1]).collect();
+        let draws: Vec<f64> = (0..DRAWS)
+            .map(|_| given_sky((&knots, &limit), vec![1.0, 0.0], &squares, &mut stream)[1])
+            .collect();
         // Inverse gamma densities of l = 2, 3, 4 with ln C_l on the line between knots at l + 1 = 3 and 6, times the prior by hand: level,
         // fall, and the edge at which it may not rise.
         let density = |a: f64, b: f64| -> f64 {

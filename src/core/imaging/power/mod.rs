@@ -49,9 +49,11 @@ const STEP_MAX: f64 = 2.0;
 /// Maximum number of halvings of a step without gain.
 const HALVINGS: usize = 8;
 
-/// Maximum `V'N^-1V` that the sky's structure may be expected to give, in units of what the data have. Rounds of data that leave most of the
-/// sky open could otherwise run away: a larger sky makes a larger map, which makes a larger sky.
+/// `V'N^-1V` up to which structure may be expected, in units of what the data have. Rounds of data that leave most of the sky open could
+/// otherwise run away: a larger sky makes a larger map, which makes a larger sky. Beyond it a narrow Gaussian prior in the logarithm sets in.
 const EXPECTED_MAX: f64 = 30.0;
+/// Standard deviation of that prior: a wall that is smooth enough for Newton's steps.
+const EXPECTED_SIGMA: f64 = 1e-3;
 
 /// The angular power of the sky (minus the prior map), estimated from the data, with its uncertainty. R is 1 / C_l.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
@@ -205,7 +207,8 @@ pub(in crate::imaging) struct PowerFit {
     limit: ExpectedLimit,
 }
 
-/// The traces of the normal matrix by degree, and the `V'N^-1V` that the structure of the sky may be expected to give.
+/// A soft limit of the power: the `V'N^-1V` that structure of the sky makes the data expect is the sum of C_l times the traces of the normal
+/// matrix by degree. Mean and dipole are free.
 #[derive(Clone, Debug)]
 struct ExpectedLimit {
     traces: Vec<f64>,
@@ -220,14 +223,32 @@ impl ExpectedLimit {
                 traces[*l] += block.places.len() as f64 * block.matrix[(k, k)];
             }
         }
+        traces.iter_mut().take(FREE).for_each(|trace| *trace = 0.0);
         Self { traces, max: EXPECTED_MAX * data_power }
     }
 
-    /// Whether the data can come from structure of this power. Mean and dipole are free.
-    fn allows(&self, power: &[f64]) -> bool {
-        let expected: f64 = self.traces.iter().zip(power).skip(FREE).map(|(trace, c)| trace * c).sum();
-        expected <= self.max
+    /// How far the logarithm of the expectation is above the limit, in standard deviations; 0 if it is not.
+    fn excess(&self, power: &[f64]) -> f64 {
+        let expected: f64 = self.traces.iter().zip(power).map(|(trace, c)| trace * c).sum();
+        if expected > self.max { (expected / self.max).ln() / EXPECTED_SIGMA } else { 0.0 }
     }
+
+    /// The logarithm of the prior.
+    fn value(&self, power: &[f64]) -> f64 {
+        -0.5 * self.excess(power).powi(2)
+    }
+
+    /// Derivatives of the excess with respect to ln C_l.
+    fn slopes(&self, power: &[f64]) -> Vec<f64> {
+        let terms: Vec<f64> = self.traces.iter().zip(power).map(|(trace, c)| trace * c).collect();
+        let expected: f64 = terms.iter().sum();
+        terms.iter().map(|term| term / (expected * EXPECTED_SIGMA)).collect()
+    }
+}
+
+/// `V'N^-1V` of data divided by a factor, at least what as many coefficients as unknowns would make of noise alone.
+fn expected_power(data_power: f64, factor: f64, unknowns: usize) -> f64 {
+    (data_power / factor.powi(2)).max(unknowns as f64)
 }
 
 /// The data and matrix of a fit.
@@ -246,6 +267,12 @@ impl PowerFit {
         Self { knots, theta, power, limit }
     }
 
+    /// The same for data whose noise is larger by `factor`, and which are divided by it; `data_power` is their `V'N^-1V` before.
+    pub(super) fn with_noise_factor(mut self, data_power: f64, factor: f64, unknowns: usize) -> Self {
+        self.limit.max = EXPECTED_MAX * expected_power(data_power, factor, unknowns);
+        self
+    }
+
     /// Starts with `C_l` proportional to `(l + 1)^-2` and the maximum-likelihood amplitude, of data with this `V'N^-1V`.
     pub(super) fn begin(
         blocks: &[Block<'_>],
@@ -254,13 +281,11 @@ impl PowerFit {
         data_power: f64,
     ) -> Result<Self, SolveError> {
         let unit = largest_diagonal(blocks).recip();
-        // At the smallest amplitude no coefficient has more than a thousandth of its noise.
-        let limit = ExpectedLimit::new(blocks, l_max, data_power.max(right.len() as f64));
+        let limit = ExpectedLimit::new(blocks, l_max, expected_power(data_power, 1.0, right.len()));
         let of = |decade: i32| {
             let knots = Knots::new(l_max, (unit * 10.0_f64.powi(decade)).ln());
             let fit = Self::new(knots.clone(), knots.start(), limit.clone());
-            limit.allows(&fit.power).then_some(())?;
-            Some((value(blocks, &fit.power, right)?, fit))
+            Some((value(blocks, &fit.power, right)? + limit.value(&fit.power), fit))
         };
         let best = DECADES.filter_map(of).max_by(|(a, _), (b, _)| a.total_cmp(b));
         best.map(|(_, fit)| fit).ok_or(SolveError::NoPower)
@@ -291,13 +316,11 @@ impl PowerFit {
         let power: Vec<f64> = log_power.iter().map(|ln| ln.exp()).collect();
         let correction: f64 =
             data.gradient_correction.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
-        if !self.limit.allows(&power) {
-            return None;
-        }
-        Some(value(data.blocks, &power, data.right)? + correction + self.knots.hyperprior(theta).value)
+        let prior = self.knots.hyperprior(theta).value + self.limit.value(&power);
+        Some(value(data.blocks, &power, data.right)? + correction + prior)
     }
 
-    /// Gradient and Fisher information of the objective.
+    /// Gradient and Fisher information of the objective. The information leaves out the limit, which is no knowledge of the sky.
     fn derivatives(&self, data: BlockData<'_>) -> Option<(Vec<f64>, Mat<f64>)> {
         let found = evidence(data.blocks, &self.knots, &self.power, data.right)?;
         let prior = self.knots.hyperprior(&self.theta);
@@ -308,7 +331,21 @@ impl PowerFit {
                 gradient[knot] += share * of_degree;
             }
         }
+        self.limit_slopes().iter().zip(&mut gradient).for_each(|(slope, gradient)| {
+            *gradient -= self.limit.excess(&self.power) * slope;
+        });
         Some((gradient, found.fisher + prior.precision))
+    }
+
+    /// Derivatives of the limit's excess with respect to the parameters; 0 below it.
+    fn limit_slopes(&self) -> Vec<f64> {
+        let mut slopes = vec![0.0; self.theta.len()];
+        if self.limit.excess(&self.power) > 0.0 {
+            for (l, slope) in self.limit.slopes(&self.power).iter().enumerate().skip(FREE) {
+                self.knots.weights(l).iter().for_each(|(knot, share)| slopes[*knot] += share * slope);
+            }
+        }
+        slopes
     }
 
     /// Maximises the objective by Newton's iteration.
@@ -316,7 +353,11 @@ impl PowerFit {
         let mut fit = self.clone();
         let mut best = fit.objective(&fit.theta, data).ok_or(SolveError::NoPower)?;
         for _ in 0..STEPS_MAX {
-            let (gradient, information) = fit.derivatives(data).ok_or(SolveError::NoPower)?;
+            let (gradient, mut information) = fit.derivatives(data).ok_or(SolveError::NoPower)?;
+            let slopes = fit.limit_slopes();
+            for (j, a) in slopes.iter().enumerate() {
+                slopes.iter().enumerate().for_each(|(k, b)| information[(j, k)] += a * b);
+            }
             let Ok(factor) = information.llt(Side::Lower) else { break };
             let covariance = factor.inverse();
             let mut step: Vec<f64> = (0..gradient.len())

@@ -86,7 +86,7 @@ impl PowerProblem<'_> {
             let right = self.right_divided_by(factor);
             let data =
                 BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
-            fit = fit.maximised(data)?;
+            fit = fit.with_noise_factor(self.power, factor, self.right.len()).maximised(data)?;
             let regularisation = fit.regularisation();
             let factors = Factors::new(self.blocks, &regularisation);
             let mut solution = self.right.to_vec();
@@ -119,7 +119,8 @@ impl PowerProblem<'_> {
         // |V - B x|^2 = V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
         let regularised: f64 = x.iter().zip(self.degrees).map(|(x, l)| r[*l] * x * x).sum();
         let residual = self.power - dot(x, self.right) - regularised;
-        // The few degrees of freedom that the solution takes are neglected. No solution fits worse than an empty sky.
+        // The few degrees of freedom that the solution takes are neglected. The exact solution fits no worse than an empty sky; one that is
+        // far from it may, and counts as that.
         (residual.min(self.power) / self.numbers).max(1.0).sqrt()
     }
 
@@ -221,7 +222,9 @@ impl PowerProblem<'_> {
         x: &[f64],
         (factor, ratio): (f64, &[f64]),
     ) -> Result<FoundPower, SolveError> {
-        self.of_round(fit, x, (factor, ratio), &|data| fit.maximised(data))
+        self.of_round(fit, x, (factor, ratio), &|data| {
+            fit.clone().with_noise_factor(self.power, factor, self.right.len()).maximised(data)
+        })
     }
 
     fn of_round(

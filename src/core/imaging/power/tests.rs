@@ -347,3 +347,28 @@ fn the_variance_beyond_is_that_of_pixels_of_a_falling_sky() {
     // 7,680 pixels tell a variance to 2 %; a pixel is no disc: 12 % by healpy.
     assert!((ratio - 1.0).abs() < 0.15, "{ratio}");
 }
+
+/// The power of data stays below its limit, which changes no bit of an ordinary estimate.
+#[test]
+fn the_power_is_at_most_what_the_data_may_come_from() {
+    let a = random_normal(7, ORDER + 20);
+    let (right, sky) = observed(&a, &power(40.0), &mut normal(8));
+    let (blocks, degrees) = (block(&a), degrees());
+    let sums = Dense { matrix: a.clone(), right: right.clone() };
+    let found = |right: &[f64], power: f64| {
+        let (blocks, degrees, numbers) = (&blocks[..], &degrees[..], f64::INFINITY);
+        let problem = PowerProblem { sums: &sums, blocks, degrees, right, power, numbers };
+        problem.solve_blocks().unwrap().power.power_k2
+    };
+    let expected = |power: &[f64]| -> f64 {
+        degrees.iter().enumerate().filter(|(_, l)| **l >= FREE).map(|(k, l)| a[(k, k)] * power[*l]).sum()
+    };
+    let true_power: f64 = (0..ORDER).map(|k| sky[k] * right[k]).sum();
+    let ordinary = found(&right, true_power);
+    assert!(ordinary == found(&right, 1e300) && expected(&ordinary) < 30.0 * true_power);
+    // Right-hand sides that no data of this power can have, as a map that runs away gives them.
+    let wild: Vec<f64> = right.iter().map(|b| 100.0 * b).collect();
+    assert!(expected(&found(&wild, 1e300)) > 1e3 * true_power);
+    let limited = expected(&found(&wild, true_power));
+    assert!(limited < 1.5 * 30.0 * true_power, "{limited} {true_power}");
+}

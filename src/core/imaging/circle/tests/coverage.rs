@@ -8,6 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use super::super::sigma::pixel_sigma_k;
 use super::*;
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem};
+use crate::imaging::solver::dot;
 use crate::sky::harmonics::{Transform, synthesis};
 use crate::units::{StreamKind, random_stream};
 
@@ -135,8 +136,8 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
     let blocks: Vec<Block<'_>> = order_blocks.blocks().into_iter().zip(&wide_blocks).map(cut).collect();
     // As much signal as noise at the last degree.
     let level = ((l_max + 1) as f64).powi(3) / order_blocks.diagonal(l_max);
-    let power = |l: usize| level * ((l + 1) as f64).powi(-3);
-    let little: Vec<f64> = (0..=l_max + BEYOND).map(|l| 1e-8 / power(l)).collect();
+    let power_of = |l: usize| level * ((l + 1) as f64).powi(-3);
+    let little: Vec<f64> = (0..=l_max + BEYOND).map(|l| 1e-8 / power_of(l)).collect();
     let noise_factors = Factors::new(&wide_blocks, &little);
     let (sky_degrees, map_degrees): (Vec<usize>, Vec<usize>) =
         (degrees(l_max + BEYOND).collect(), degrees(l_max).collect());
@@ -144,23 +145,27 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
     let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
     let mut held: Vec<Held> = LOOKED_AT.iter().map(|_| Held::default()).collect();
     for number in 0..skies as u64 {
-        let structure = |l: usize| if l <= sky_l_max { power(l).sqrt() } else { 0.0 };
+        let structure = |l: usize| if l <= sky_l_max { power_of(l).sqrt() } else { 0.0 };
         let mut sky: Vec<f64> = sky_degrees.iter().map(|l| structure(*l) * normal()).collect();
         // Far more than the power of structure.
-        sky[0] = 1e3 * power(2).sqrt();
+        sky[0] = 1e3 * power_of(2).sqrt();
         // A (A + r)^-1 A equals A for measured modes.
         let mut data: Vec<f64> = sky.iter().map(|_| normal()).collect();
         noise_factors.solve_upper(&mut data);
         data.iter_mut().zip(&sky).for_each(|(noise, sky)| *noise += sky);
+        let values = data.clone();
         wide.multiply(&mut data);
+        // V'N^-1V of values in the column space.
+        let power = dot(&values, &data);
         let right = lower(&data, l_max);
         let sought = PowerProblem {
             sums: &sums,
             blocks: &blocks,
             degrees: &map_degrees,
             right: &right,
-            power: 0.0,
-            numbers: 1.0,
+            power,
+            // So many that residuals are noise.
+            numbers: f64::INFINITY,
         };
         let found = sought.solve_blocks().unwrap();
         let factors = Factors::new(&blocks, &found.regularisation);
@@ -178,7 +183,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             held[1 + place].count(off[place] / column[place].sqrt());
         }
         for (held, l) in held[3..7].iter_mut().zip(looked_at) {
-            held.count((found.power.power_k2[l] / power(l)).ln() / found.power.sigma_ln[l]);
+            held.count((found.power.power_k2[l] / power_of(l)).ln() / found.power.sigma_ln[l]);
         }
         let drawn =
             Drawn { found: &found, factors: &factors, blocks: &blocks, right: &right, l_max, looked_at };
