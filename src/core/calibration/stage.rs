@@ -343,11 +343,16 @@ impl Calibrator {
         self.ledger.add_left_out(VisibilityReason::NoEphemeris, placing.without_ephemeris);
         self.post_flagged(placing.flagged);
         self.calibrate(&mut placed)?;
-        if let Some(divided) = self.bursts.divided(&placed, 0) {
-            self.ledger.add_left_out(VisibilityReason::Burst, divided.left_out.len() as u64);
-            placed = divided.used;
-        }
+        self.take_bursts_out(&mut placed, 0);
         Ok(Some(placed))
+    }
+
+    /// Takes bursts out of visibilities, except the first `known`, which have been taken out already.
+    pub(crate) fn take_bursts_out(&self, placed: &mut PlacedVisibilities, known: usize) {
+        if let Some(divided) = self.bursts.divided(placed, known) {
+            self.ledger.add_left_out(VisibilityReason::Burst, divided.left_out.len() as u64);
+            *placed = divided.used;
+        }
     }
 
     fn calibrate(&mut self, placed: &mut PlacedVisibilities) -> Result<(), CalibrationError> {

@@ -16,7 +16,8 @@ use crate::units::ChannelId;
 /// Time without data between two passes, s.
 const GAP_S: f64 = 600.0;
 
-/// Maximum number of visibilities that are kept, some 30 MB: a pass of 30 channels has 160,000. Beyond it those of the pass so far are judged without the rest.
+/// Maximum number of visibilities that are kept, some 30 MB: a pass of 30 channels has 160,000. Beyond it those of the pass so far are
+/// judged without the rest.
 const VISIBILITIES_MAX: usize = 1 << 18;
 
 /// A block of visibilities, and the packet that brought it.

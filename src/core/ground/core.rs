@@ -267,12 +267,17 @@ impl Ground {
     ) -> Result<(), GroundError> {
         let mut draft = RecordDraft::new(frame.as_ref());
         let placed = placed(&mut self.calibrator, frame)?;
-        if let Some(placed) = placed {
+        if let Some(mut placed) = placed {
+            if self.burst_watch.is_ended_by(&placed) {
+                let known = self.outcome.bursts.len();
+                self.end_pass()?;
+                // Of the same pass, if there was no room for it.
+                if let PlacedFrame::Visibilities(placed) = &mut placed {
+                    self.calibrator.take_bursts_out(placed, known);
+                }
+            }
             draft.offer(&placed);
             self.live_view_writer.add(&placed);
-            if self.burst_watch.is_ended_by(&placed) {
-                self.end_pass()?;
-            }
             let watched = match &placed {
                 PlacedFrame::Visibilities(placed)
                     if self.outcome.bursts.choice() != BurstChoice::Off

@@ -18,7 +18,8 @@ pub enum GroundError {
     SeparateSolutions,
     /// Gains that are found from the data, where they have to be known.
     #[error(
-        "calibration.hook = \"solve\": expected \"identity\" or \"antenna-gains\", as with --calibration and the gains that `lunarray calibrate` found"
+        "calibration.hook = \"solve\": expected \"identity\" or \"antenna-gains\", as with --calibration and the gains that \
+        `lunarray calibrate` found"
     )]
     GainsFromData,
     /// Changed gains for packets that no file has.
@@ -31,6 +32,16 @@ pub enum GroundError {
         missing: usize,
         /// Count of one of the packets.
         count: u64,
+    },
+    /// Packets from which bursts were subtracted that were fitted with other gains.
+    #[error(
+        "{packets} packets of visibilities whose gains change lie in bursts, whose flux was fitted with the old gains \
+        (calibration.bursts = \"peel\"); expected none: make a new state with the new gains by \
+        `lunarray rebuild` or `replay`; nothing was changed"
+    )]
+    PeeledWithOldGains {
+        /// Number of packets.
+        packets: usize,
     },
     /// Visibilities whose positions or bursts have changed since they were added.
     #[error(

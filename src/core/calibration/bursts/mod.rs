@@ -1,7 +1,7 @@
 //! Bursts of point sources, such as the Sun's, found in the visibilities of a pass.
 //!
-//! [`find_bursts`] sees all visibilities of a pass in one channel; [`FoundBursts`] is the table of what was found, which leaves visibilities
-//! that arrive later out as well.
+//! [`find_bursts`] sees all visibilities of a pass in one channel; [`FoundBursts`] is the table of what was found, which leaves
+//! visibilities that arrive later out as well.
 
 mod detect;
 mod locate;
@@ -27,8 +27,8 @@ use crate::units::{ChannelId, Dimension};
 /// Maximum number of bursts in a table, some 60 MB: 24 a day in 30 channels for a year. Later ones stay in the maps.
 const BURSTS_MAX: usize = 1 << 18;
 
-/// Maximum number of cells of all light curves, 64 MB. Bursts beyond it are left out.
-const CELLS_MAX: usize = 1 << 23;
+/// Maximum memory of all light curves. Bursts beyond it are left out.
+const CURVES_BYTES_MAX: usize = 1 << 26;
 
 /// What is done with bursts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -102,7 +102,8 @@ impl FoundBurst {
     /// Length of what stays out of the sums, if bursts are peeled or flagged, s.
     #[must_use]
     pub fn left_out_s(&self) -> f64 {
-        self.light_curve.as_ref().map_or(self.length_s(), LightCurve::unexplained_s)
+        // The last cell may reach beyond the end.
+        self.light_curve.as_ref().map_or(self.length_s(), |curve| curve.unexplained_s().min(self.length_s()))
     }
 
     /// Whether the values are those of a burst. Checkpoints are untrusted.
@@ -147,7 +148,7 @@ impl fmt::Display for FoundBurst {
     }
 }
 
-/// Nside of the directions of a summary: the Moon covers a third of the sky.
+/// Nside of the directions of a summary: the Moon covers a quarter of the sky.
 const NSIDE: usize = 2;
 
 /// Maximum number of bursts that a summary lists.
@@ -262,17 +263,17 @@ struct BurstTable {
     starts: BTreeMap<u16, Vec<(f64, usize)>>,
     /// Length of the longest burst, s.
     longest_s: f64,
-    /// Number of cells of all light curves.
-    cells: usize,
+    /// Memory of all light curves.
+    curves_bytes: usize,
 }
 
 impl BurstTable {
     fn add(&mut self, mut burst: FoundBurst) {
-        let cells = burst.light_curve.as_ref().map_or(0, LightCurve::cells);
-        if self.cells + cells > CELLS_MAX {
+        let bytes = burst.light_curve.as_ref().map_or(0, LightCurve::bytes);
+        if self.curves_bytes + bytes > CURVES_BYTES_MAX {
             burst.light_curve = None;
         } else {
-            self.cells += cells;
+            self.curves_bytes += bytes;
         }
         self.longest_s = self.longest_s.max(burst.length_s());
         let starts = self.starts.entry(burst.channel).or_default();
@@ -331,6 +332,15 @@ impl FoundBursts {
         let starts = table.starts.get(&burst.channel).map(Vec::as_slice).unwrap_or_default();
         let until = starts.partition_point(|(from_s, _)| *from_s <= burst.peak_s);
         starts[..until].iter().any(|(_, index)| table.bursts[*index].until_s > burst.peak_s)
+    }
+
+    /// Whether a burst is subtracted from visibilities of a channel in a span of time.
+    #[must_use]
+    pub fn subtracts_in(&self, channel: ChannelId, [from_s, until_s]: [f64; 2]) -> bool {
+        let is_in = |burst: &FoundBurst| {
+            burst.channel == channel.0 && burst.until_s > from_s && burst.from_s < until_s
+        };
+        self.choice == BurstChoice::Peel && self.table().bursts.iter().any(is_in)
     }
 
     /// Resumes with the bursts of earlier sessions.

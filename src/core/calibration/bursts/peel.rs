@@ -8,6 +8,9 @@
 //! instead would mix pairs, so that they no longer were sums over visibilities.
 //!
 //! Where the residuals are above what noise and steady sky have, the source is not a point or is elsewhere: such cells are left out.
+//! Residuals of visibilities from which the Moon hides the direction are judged by themselves. What the fit has not seen is left out too.
+
+use std::cmp::Ordering;
 
 use bincode::{Decode, Encode};
 use num_complex::Complex64;
@@ -17,6 +20,7 @@ use crate::calibration::solver::DenseFactor;
 use crate::frames::PlacedVisibilities;
 use crate::numerics::median;
 use crate::response::beacon::plane_wave;
+use crate::units::Pair;
 use crate::units::vector::{Vec3, norm, sub};
 
 /// Maximum number of cells of a burst, for the fit's time and memory.
@@ -25,12 +29,24 @@ const CELLS_MAX: usize = 256;
 /// Shortest cell, s.
 const CELL_S_MIN: f64 = 0.5;
 
-/// Mean squared residual, in units of that of noise and steady sky, up to which a cell is explained. Its mean over three pairs, the least, is
-/// above 3 with a probability of 6e-3, if all are exponential; over 28 of 4e-13.
+/// Mean squared residual, in units of that of noise and steady sky, up to which a cell is explained. Its mean over three pairs, the least,
+/// is above 3 with a probability of 6e-3, if all are exponential; over 28 of 4e-13. At the Moon's limb a mean is of less: of one pair, 0.05.
 const RESIDUAL_MAX: f64 = 3.0;
 
-/// Information of the prior in units of the largest cell's: a cell that no pair sees has a power of 0 with a variance that no weight survives.
+/// Information of the prior in units of the largest cell's: the power of a cell that no pair sees is 0 with a variance 1e9 times the least.
 const PRIOR: f64 = 1e-9;
+
+/// Maximum number of spans of a fit: a pass of the default array has some hundreds of packets in a channel.
+const SPANS_MAX: usize = 1 << 12;
+
+/// The visibilities of a block in the fit: those of a pair from the first to the last.
+#[derive(Clone, Debug, PartialEq, Encode, Decode)]
+pub(super) struct FittedSpan {
+    pair: Pair,
+    band: u16,
+    from_s: f64,
+    until_s: f64,
+}
 
 /// The power of a burst by time, in cells of equal length.
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
@@ -47,6 +63,8 @@ pub struct LightCurve {
     pub power_k_sr: Vec<f32>,
     /// Its variance, (K sr)^2; infinite where a point source does not explain the visibilities.
     pub variance_k2_sr2: Vec<f32>,
+    /// What it was fitted to, by pair, band and start.
+    pub(super) fitted: Vec<FittedSpan>,
 }
 
 /// A visibility of a burst, for the fit.
@@ -72,6 +90,20 @@ fn duration_s(block: &PlacedVisibilities, k: usize) -> f64 {
     block.duration_s.get(k).copied().map_or(0.0, f64::from).max(1e-3)
 }
 
+/// The spans of rows, which follow each other by block.
+fn spans_of(rows: &[BurstRow]) -> Vec<FittedSpan> {
+    let of_block = rows.chunk_by(|a, b| std::ptr::eq(a.block, b.block));
+    let span = |rows: &[BurstRow]| {
+        let times_s = rows.iter().map(|row| row.block.time_s[row.k]);
+        let [from_s, until_s] =
+            times_s.fold([f64::INFINITY, f64::NEG_INFINITY], |[a, b], t_s| [a.min(t_s), b.max(t_s)]);
+        FittedSpan { pair: rows[0].block.pair, band: rows[0].block.band, from_s, until_s }
+    };
+    let mut spans: Vec<FittedSpan> = of_block.map(span).collect();
+    spans.sort_by(|a, b| (a.pair, a.band).cmp(&(b.pair, b.band)).then(a.from_s.total_cmp(&b.from_s)));
+    spans
+}
+
 impl LightCurve {
     /// Fits the powers from `from_s` to `until_s`; `None` if the rows do not determine them.
     pub(super) fn fit(
@@ -85,8 +117,15 @@ impl LightCurve {
         let cell_s = usual_s.max((until_s - from_s) / CELLS_MAX as f64).max(CELL_S_MIN);
         let cells = (((until_s - from_s) / cell_s).ceil() as usize).clamp(1, CELLS_MAX);
         let blank = vec![0.0_f32; cells];
-        let mut curve =
-            Self { hat, moon_radius_m, from_s, cell_s, power_k_sr: blank.clone(), variance_k2_sr2: blank };
+        let mut curve = Self {
+            hat,
+            moon_radius_m,
+            from_s,
+            cell_s,
+            power_k_sr: blank.clone(),
+            variance_k2_sr2: blank,
+            fitted: spans_of(rows),
+        };
         let (mut matrix, mut powers) = (vec![0.0; cells * cells], vec![0.0; cells]);
         for row in rows {
             let Some(fringe) = curve.fringe(row.block, row.k) else { continue };
@@ -115,21 +154,28 @@ impl LightCurve {
         curve.is_sound().then_some(curve)
     }
 
-    /// Gives cells an infinite variance whose residuals are too large.
+    /// Gives cells an infinite variance that no visibility is in, or whose residuals are too large: of the visibilities that see the source,
+    /// or of those from which the Moon hides it.
     fn leave_out_unexplained(&mut self, rows: &[BurstRow]) {
-        let mut sums = vec![[0.0; 2]; self.power_k_sr.len()];
+        let mut sums = vec![[[0.0; 2]; 2]; self.power_k_sr.len()];
         for row in rows {
-            let Some(fringe) = self.fringe(row.block, row.k) else { continue };
-            let [power_k_sr, variance] = self.mean(row.block, row.k);
-            let residual = row.block.value_k_sr[row.k] - fringe * power_k_sr;
-            let ratio = residual.norm_sqr() / (row.variance_k2_sr2(1.0) + variance);
+            let value = row.block.value_k_sr[row.k];
+            let (kind, ratio) = match self.fringe(row.block, row.k) {
+                Some(fringe) => {
+                    let [power_k_sr, variance] = self.mean(row.block, row.k);
+                    let residual = value - fringe * power_k_sr;
+                    (0, residual.norm_sqr() / (row.variance_k2_sr2(1.0) + variance))
+                }
+                None => (1, value.norm_sqr() / row.variance_k2_sr2(1.0)),
+            };
             for (cell, share) in self.shares(row.block, row.k) {
-                sums[cell][0] += share * ratio;
-                sums[cell][1] += share;
+                let [sum, number] = &mut sums[cell][kind];
+                (*sum, *number) = (*sum + share * ratio, *number + share);
             }
         }
-        for (variance, [sum, number]) in self.variance_k2_sr2.iter_mut().zip(sums) {
-            let is_explained = sum <= RESIDUAL_MAX * number;
+        for (variance, [seen, hidden]) in self.variance_k2_sr2.iter_mut().zip(sums) {
+            let has_rows = seen[1] + hidden[1] > 0.0;
+            let is_explained = has_rows && [seen, hidden].iter().all(|[sum, n]| *sum <= RESIDUAL_MAX * n);
             if !is_explained {
                 *variance = f32::INFINITY;
             }
@@ -163,10 +209,27 @@ impl LightCurve {
         mean
     }
 
-    /// Visibility `k` of a block without the burst, and its weight; `None` if the burst is not known well enough to subtract it.
+    /// Whether visibility `k` of a block was in the fit.
+    fn is_fitted_to(&self, block: &PlacedVisibilities, k: usize) -> bool {
+        let (key, time_s) = ((block.pair, block.band), block.time_s[k]);
+        let is_before = |span: &FittedSpan| match (span.pair, span.band).cmp(&key) {
+            Ordering::Less => true,
+            Ordering::Equal => span.from_s <= time_s,
+            Ordering::Greater => false,
+        };
+        let next = self.fitted.partition_point(is_before);
+        let last = self.fitted[..next].last();
+        last.is_some_and(|span| (span.pair, span.band) == key && time_s <= span.until_s)
+    }
+
+    /// Visibility `k` of a block without the burst, and its weight; `None` if the burst is not known well enough to subtract it, or the
+    /// visibility was not in the fit, which has not judged it.
     pub(super) fn without_burst(&self, block: &PlacedVisibilities, k: usize) -> Option<(Complex64, f64)> {
-        let Some(fringe) = self.fringe(block, k) else { return Some((block.value_k_sr[k], block.weight[k])) };
         let [power_k_sr, variance] = self.mean(block, k);
+        if variance.is_infinite() || !self.is_fitted_to(block, k) {
+            return None;
+        }
+        let Some(fringe) = self.fringe(block, k) else { return Some((block.value_k_sr[k], block.weight[k])) };
         let weight = (block.weight[k].recip() + variance).recip();
         (weight > 0.0).then(|| (block.value_k_sr[k] - fringe * power_k_sr, weight))
     }
@@ -181,6 +244,11 @@ impl LightCurve {
         self.power_k_sr.len()
     }
 
+    /// Memory of the cells and spans.
+    pub(super) fn bytes(&self) -> usize {
+        self.cells() * 2 * size_of::<f32>() + self.fitted.len() * size_of::<FittedSpan>()
+    }
+
     /// Whether the values are those of a light curve. Checkpoints are untrusted.
     pub(super) fn is_sound(&self) -> bool {
         let is_time = |s: f64| s.is_finite();
@@ -190,6 +258,7 @@ impl LightCurve {
             && is_time(self.cell_s)
             && self.cell_s >= CELL_S_MIN
             && (1..=CELLS_MAX).contains(&self.cells())
+            && self.fitted.len() <= SPANS_MAX
             && self.variance_k2_sr2.len() == self.cells()
             && self.power_k_sr.iter().all(|power| power.is_finite())
             && self.variance_k2_sr2.iter().all(|variance| *variance >= 0.0)

@@ -11,7 +11,7 @@ use crate::array::{Array, hidden_by_moon, jupiter_hat_by_date, sun_hat_by_date};
 use crate::response::beacon::plane_wave;
 use crate::sky::k_sr_per_jy;
 use crate::units::all_pairs;
-use crate::units::vector::{Vec3, direction, norm, sub};
+use crate::units::vector::{Vec3, add, direction, dot, norm, scale, sub, unit};
 
 const FREQUENCY_HZ: f64 = 1e7;
 const STEP_S: f64 = 10.0;
@@ -208,11 +208,25 @@ fn visibilities_that_arrive_later_are_peeled_once_by_each_burst() {
     let [burst] = &found(&blocks)[..] else { panic!() };
     let bursts = FoundBursts::new(BurstChoice::Peel);
     bursts.add(burst.clone());
+    // What the fit has not seen is left out: of another sub-band, and after the pair's last.
+    let other_band = PlacedVisibilities { band: 1, ..blocks[0].clone() };
+    let unseen = bursts.divided(&other_band, 0).unwrap();
+    assert!(unseen.peeled.is_empty() && unseen.left_out.len() >= 6);
+    let mut early = blocks[0].without_visibilities();
+    (0..103).for_each(|k| early.push_from(&blocks[0], k));
+    let fitted: Vec<_> = [&early].into_iter().chain(&blocks[1..]).collect();
+    let [of_early] = &find_bursts(SEARCH, &fitted)[..] else { panic!() };
+    let of_part = FoundBursts::new(BurstChoice::Peel);
+    of_part.add(of_early.clone());
+    let parts = of_part.divided(&blocks[0], 0).unwrap();
+    assert!(!parts.peeled.is_empty() && parts.peeled.time_s.iter().all(|t_s| *t_s <= early.time_s[102]));
+    assert!(parts.left_out.time_s.contains(&blocks[0].time_s[103]));
     let once = bursts.divided(&blocks[0], 0).unwrap();
     assert!(once.peeled.value_k_sr.iter().all(|value| value.norm() < 1e6) && once.peeled.len() >= 6);
     assert!(once.as_received.value_k_sr.iter().any(|value| value.norm() > 9e6));
     assert!(bursts.divided(&once.used, 1).is_none());
-    // One that begins earlier is found later, in what the first left: in two steps or in one, for packets that are given back, the same bits.
+    // One that begins earlier is found later, in what the first left: in two steps or in one, for packets that are given back, the same
+    // bits.
     let light_curve =
         burst.light_curve.clone().map(|curve| LightCurve { from_s: curve.from_s - 20.0, ..curve });
     bursts.add(FoundBurst { from_s: burst.from_s - 20.0, light_curve, ..burst.clone() });
@@ -220,6 +234,52 @@ fn visibilities_that_arrive_later_are_peeled_once_by_each_burst() {
     assert!(twice.used.value_k_sr.iter().any(|value| value.norm() > 9e6));
     let both = bursts.divided(&blocks[0], 0).unwrap();
     assert_eq!((both.used.value_k_sr, both.used.weight), (twice.used.value_k_sr, twice.used.weight));
+}
+
+#[test]
+fn where_the_moon_hides_the_fitted_direction_the_burst_is_left_out_too() {
+    let array = array();
+    let n_hat = direction(10.0, 50.0);
+    let is_hidden =
+        |n: u8, t_s: f64, hat: Vec3| hidden_by_moon(array.position_m(n.into(), t_s), hat, 1_737_100.0);
+    let seen_s = seen_from_s(&array, n_hat);
+    let sets_s =
+        (0..900).map(|k| seen_s + 10.0 * f64::from(k)).find(|t_s| is_hidden(0, *t_s, n_hat)).unwrap();
+    let from_s = sets_s - 1500.0;
+    // Each integration of 1 s fills a cell.
+    let span_s = [sets_s - 60.5, sets_s + 120.5];
+    let k_sr = |t_s: f64| if (span_s[0]..span_s[1]).contains(&t_s) { 1e7 } else { 0.0 };
+    let blocks = pass(&array, 11, from_s, n_hat, k_sr);
+    let is_in = |t_s: f64| t_s + 0.5 > span_s[0] && t_s - 0.5 < span_s[1];
+    let ks: Vec<usize> = (0..300).filter(|k| is_in(blocks[0].time_s[*k])).collect();
+    let row = |block, k| BurstRow { block, k, steady_k2_sr2: STEADY_K_SR * STEADY_K_SR };
+    let rows: Vec<BurstRow> =
+        blocks.iter().flat_map(|block| ks.iter().map(move |k| row(block, *k))).collect();
+    // Half a degree towards the Moon: it sets earlier.
+    let moon_hat = unit(scale(-1.0, array.position_m(0, sets_s)));
+    let across_hat = unit(sub(moon_hat, scale(dot(n_hat, moon_hat), n_hat)));
+    let (sin, cos) = 0.5_f64.to_radians().sin_cos();
+    let off_hat = add(scale(cos, n_hat), scale(sin, across_hat));
+    let curve = |hat| LightCurve::fit(&rows, hat, span_s, 1_737_100.0).unwrap();
+    let (right, off) = (curve(n_hat), curve(off_hat));
+    let [mut bright_behind, mut used_after] = [0; 2];
+    for (block, &k) in blocks.iter().flat_map(|block| ks.iter().map(move |k| (block, k))) {
+        let (t_s, pair) = (block.time_s[k], block.pair);
+        let hides = |hat| [pair.i, pair.j].iter().any(|n| is_hidden(*n, t_s, hat));
+        bright_behind += i32::from(hides(off_hat) && block.value_k_sr[k].norm() > 5e6);
+        // A cell has at most 28 visibilities, whose mean square is at most 3 times the steady sky's: of one, 84 times.
+        for curve in [&right, &off] {
+            let used = curve.without_burst(block, k);
+            assert!(used.is_none_or(|(value, _)| value.norm() < 9.2 * STEADY_K_SR), "{pair} {t_s}");
+        }
+        // Behind the Moon for all daughters, nothing is lost: the mean of 28 exceeds 3 with a probability of 4e-13.
+        if (0..8).all(|n| is_hidden(n, t_s, n_hat)) {
+            let unchanged = Some((block.value_k_sr[k], block.weight[k]));
+            assert_eq!(right.without_burst(block, k), unchanged, "{pair} {t_s}");
+            used_after += 1;
+        }
+    }
+    assert!(bright_behind >= 10 && used_after >= 28, "{bright_behind} {used_after}");
 }
 
 /// Middle and length of an integration, s, baseline along the source in wavelengths, visibility, weight, and the steady sky's variance.
@@ -272,6 +332,9 @@ fn a_light_curve_is_that_of_dense_least_squares() {
     // Where the Moon hides the source, nothing is subtracted.
     let behind = PlacedVisibilities { r_i_m: vec![[0.0, 0.0, -2e6]], ..blocks[0].clone() };
     assert_eq!(curve.without_burst(&behind, 0), Some((behind.value_k_sr[0], behind.weight[0])));
+    // A cell without visibilities is not explained.
+    let longer = LightCurve::fit(&rows, [0.0, 0.0, 1.0], [0.0, 12.0], 1e6).unwrap();
+    assert_eq!((longer.cells(), longer.unexplained_s()), (6, 6.0));
     // A source elsewhere leaves more than noise.
     let mut bright = blocks.clone();
     bright.iter_mut().for_each(|block| block.value_k_sr[0] *= 30.0);

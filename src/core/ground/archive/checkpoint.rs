@@ -18,8 +18,8 @@ use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA10";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 10; earlier versions lack data: make a new state with `lunarray rebuild`, or \
-replay the files into a new folder";
+const VERSION: &str = "a checkpoint of version 10; version 09 lacks light curves of bursts, earlier ones lack more: make a new state \
+with `lunarray rebuild`, or replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
 

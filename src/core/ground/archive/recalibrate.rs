@@ -51,7 +51,7 @@ impl Ground {
     ///
     /// # Errors
     /// Errors of [`Ground::open`] and [`Ground::retract`]; packets whose gains change and that are in no file; channels whose
-    /// first data would change.
+    /// first data would change; packets from which bursts were subtracted.
     #[doc(hidden)]
     pub fn recalibrate(
         folder: &Path,
@@ -71,6 +71,11 @@ impl Ground {
         let journal = ground.archive.as_mut().map(|archive| std::mem::take(&mut archive.journal));
         let journal = journal.unwrap_or_default();
         let due = packets_to_change(&ground, &journal, &gains);
+        let peeled = due.iter().filter_map(|sent| journal.visibilities.get(sent));
+        let peeled = peeled.filter(|record| is_peeled(&ground, record, new.calibration.sub_bands)).count();
+        if peeled > 0 {
+            return Err(GroundError::PeeledWithOldGains { packets: peeled });
+        }
         let report = Recalibrated {
             unchanged: (journal.visibilities.len() - due.len()) as u64,
             ..Recalibrated::default()
@@ -119,6 +124,13 @@ fn packets_to_change(
     };
     let changed = journal.visibilities.iter().filter(|(_, record)| is_due(record));
     changed.map(|(sent, _)| *sent).collect()
+}
+
+/// Whether a light curve, which was fitted with the gains of a state, applies to visibilities of a packet.
+fn is_peeled(ground: &Ground, record: &JournalRecord, sub_bands: usize) -> bool {
+    let channel = usize::from(record.entry.channel.0) / sub_bands.max(1);
+    let span_s = [record.entry.start, record.entry.end].map(|time| time.seconds());
+    ground.calibrator.bursts().subtracts_in(ChannelId(channel as u16), span_s)
 }
 
 /// The first packet in the order of sending that is in the sums of each channel. Its positions define the channel's orbit.
