@@ -44,8 +44,10 @@ fn estimates_are_those_of_dense_equations() {
     let sets = [&sets[..], &more].concat();
     // Settings of a proposal come from files.
     let text = THREE.replace("satellites = 3", "satellites = 4").replace("[600, 1500]", "[600, 1200, 1700]");
-    let pipeline =
-        place.file("four.toml", text.replace("every_nth_window = 20", "every_nth_window = 6").as_bytes());
+    let pipeline = text
+        .replace("every_nth_window = 20", "every_nth_window = 6")
+        .replace("[map]\nnside = 4", "[map]\nnside = 8");
+    let pipeline = place.file("four.toml", pipeline.as_bytes());
     let downlink = place.simulate("four.ccsds", &sets);
     let (table, sky) = (place.path("visibilities.csv"), place.path("sky.fits"));
     succeed(&["export", "visibilities", &downlink, "--channel", "0", "--out", &table]);
@@ -222,7 +224,16 @@ fn designs_that_cannot_be_made_say_why() {
         ("from = 300.0", "from = 3e3", "array.arcs_m from 3000 to 3000; expected two numbers, from below to"),
         ("[2, 8]", "[2, 19]", "degrees = [2, 19]; expected the first and the last degree, from 1 to 18"),
         ("closest_m_min", "closest", "unknown field `closest`"),
-        ("closest_m_min = 50", "closest_m_min = 5e4", "none of 4 arrays is possible"),
+        (
+            "closest_m_min = 50",
+            "closest_m_min = 5e4",
+            "none of 4 arrays is possible: 4 as, for example, two satellites come as close as",
+        ),
+        ("array.arcs_m", "array.satellites", "expected a number that is not whole"),
+        ("array.arcs_m", "seed", "expected a number of [array] or [spacecraft]"),
+        ("array.arcs_m", "spacecraft.channels_hz[0]", "other than a channel"),
+        ("array.arcs_m", "array.breathing.span_m_max", "expected array.arcs_m, which replaces the spacings"),
+        ("degrees", "name = \"\"\ndegrees", "name = \"\"; expected 1 to 53 bytes"),
         ("pipeline.toml", "none.toml", "none.toml"),
     ] {
         let text = good.replace(from, to);
@@ -230,6 +241,14 @@ fn designs_that_cannot_be_made_say_why() {
         let error = fail(&["design", &file, "--out", &place.path("out"), "--no-check"]);
         assert!(error.contains(told), "{to}: {error}");
     }
+    // What was tried is told.
+    assert_eq!(trials(&place.path("out")).len(), 4);
+    // At 30 MHz, 4.93 wavelengths are 49 m, and no two satellites come closer than 100 m.
+    let text = format!("set = [\"spacecraft.channels_hz=[30e6]\"]\n{good}");
+    let file = place.file("wrong.toml", text.as_bytes());
+    let error = fail(&["design", &file, "--out", &place.path("out"), "--no-check"]);
+    let told = "measures: nothing is measured at l = 2 at 30 MHz by baselines below";
+    assert!(error.contains(told), "{error}");
     let text = format!("check = [\"map.nside=5\"]\n{good}");
     let error = fail(&["design", &place.file("wrong.toml", text.as_bytes()), "--out", &place.path("out")]);
     assert!(error.contains("map.nside"), "{error}");

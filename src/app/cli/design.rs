@@ -12,10 +12,11 @@ use super::output::{CommandResult, print_json_line, print_text};
 use super::study::StudyLines;
 use crate::files::ProtectedInputs;
 use crate::pipeline::{
-    Design, DesignObjective, DesignStep, DesignSummary, MemoryLimit, Segment, run_design, use_threads,
+    Design, DesignObjective, DesignRuns, DesignStep, DesignSummary, MemoryLimit, NotCompared, run_design,
+    use_threads,
 };
 
-/// Search spacings, orbits or other settings of an array for less noise at chosen degrees.
+/// Search spacings, orbits or other settings of array and spacecraft for less noise at chosen degrees.
 ///
 /// The design file (TOML) names a pipeline to start from, settings with their ranges in the units of their keys, and limits:
 ///
@@ -25,8 +26,10 @@ use crate::pipeline::{
 /// check = ["seed=7", "spacecraft.thin=300"]: settings of the runs that check the result; by default another sky, noise and epoch
 ///
 /// It lowers the geometric mean of 1 / SNR_l, or, with objective = "modes", the modes that are not measured; both follow from positions and
-/// weights, for a map with R from the sky's own power. Values spread over the ranges come first, then steps of each from the best; ranges of a
-/// factor of ten or more are searched in logarithms. The orbital period and that of the node follow altitude and inclination.
+/// weights of baselines below 4.9 wavelengths, for a map with R from the sky's own power; longer ones add little at these degrees. Values spread
+/// over the ranges come first, then steps of each from the best; ranges of a factor of ten or more are searched in logarithms. The orbital
+/// period and that of the node follow altitude and inclination. Off one circle, distances are taken at 64 instants of each orbit, or of 256
+/// orbits of a mission with more: satellites may come closer between them.
 ///
 /// Leaves design.toml, the pipeline of the design, design.json and trials.csv, and what a study of start and design leaves, both with the
 /// settings of the check, which the search has not seen.
@@ -46,7 +49,7 @@ pub(super) struct DesignArgs {
     /// Do not run start and design to check the result.
     #[arg(long)]
     no_check: bool,
-    /// Maximum memory of a run, by the estimate, with a unit, such as 8GB or 16GiB; by default what the machine has available.
+    /// Maximum memory of a run that checks the result, by the estimate, with a unit, such as 8GB or 16GiB; by default what the machine has available.
     #[arg(long, value_name = "SIZE", value_parser = size_bytes)]
     memory_max: Option<u64>,
     /// Print the result as one JSON object.
@@ -59,12 +62,12 @@ pub(super) fn execute(args: &DesignArgs) -> CommandResult {
     let _inputs =
         ProtectedInputs::of(design.plan.config.input_files().into_iter().chain([args.design.clone()]));
     let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
-    design.plan.cost().require_memory(Segment::Whole, limit)?;
+    let runs = if args.no_check { DesignRuns::Without } else { DesignRuns::Within(limit) };
     use_threads(&design.plan.config.runtime)?;
     let out = args.out.clone().map_or_else(|| default_out(&design.name), Ok)?;
     let interrupt = Interrupt::default();
     let (mut lines, mut shown) = (StudyLines::default(), f64::INFINITY);
-    let summary = run_design(&design, &out, !args.no_check, interrupt.cancel(), &mut |step| match step {
+    let summary = run_design(&design, &out, runs, interrupt.cancel(), &mut |step| match step {
         DesignStep::Trial(number, trial, least) => {
             interrupt.arm_or_note();
             if least < shown || number % 25 == 0 {
@@ -110,12 +113,24 @@ fn report(summary: &DesignSummary) -> String {
         lines.push("It was not checked by runs.".to_owned());
         return lines.join("\n");
     };
-    lines.push(format!(
-        "noise relative to the sky: {} +- {:.1} % by runs with {}",
-        change(check.noise_ratio),
-        100.0 * check.noise_ratio * check.noise_sigma,
-        check.settings.join(", ")
-    ));
+    let settings = check.settings.join(", ");
+    lines.push(match check.noise_ratio.zip(check.noise_sigma) {
+        Some((ratio, sigma)) => {
+            let percent = 100.0 * ratio * sigma;
+            format!("noise relative to the sky: {} +- {percent:.1} % by runs with {settings}", change(ratio))
+        }
+        None => format!("runs with {settings} have no SNR_l to compare"),
+    });
+    for NotCompared { frequency_hz, l } in &check.not_compared {
+        let degrees = l.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
+        lines.push(format!(
+            "not compared, as SNR_l is not known: {:.3} MHz, l = {degrees}",
+            frequency_hz / 1e6
+        ));
+    }
+    if check.by_degree.is_empty() {
+        return lines.join("\n");
+    }
     lines.push(format!("{:>9} {:>4} {:>9}  {:<17}  {}", "MHz", "l", "noise", "rho_l", "measured modes"));
     for degree in &check.by_degree {
         let pair = |values: [Option<f64>; 2], decimals: usize| {

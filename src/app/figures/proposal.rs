@@ -7,11 +7,11 @@ use serde::Serialize;
 use super::coverage::{WholeCoverage, whole_coverage};
 use super::error::FigureError;
 use crate::array::earth_in_sight_s;
-use crate::imaging::DegreeSensitivity;
+use crate::imaging::{DegreeSensitivity, EngineKind};
 use crate::pipeline::{ArraySensitivity, ConfigSource, Plan, SENSITIVITY_L_MAX, breathing_m_s_per_year};
 use crate::products::{ChannelFigures, RunFigures};
-use crate::units::PerChannel;
 use crate::units::constants::{DAY_S, SPEED_OF_LIGHT_M_S};
+use crate::units::{ChannelId, PerChannel};
 
 /// Where a value is from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -152,14 +152,14 @@ fn channel_values(
         let (longest_m, _) = projected_m(1)?;
         Some(((SPEED_OF_LIGHT_M_S / frequency_hz / longest_m).to_degrees(), Estimated))
     };
-    let [sent, all] = [plan, whole].map(|plan| plan.visibilities()[channel].sent);
+    let (mapped, all) = (plan.visibilities()[channel].mapped, whole.visibilities()[channel].sent);
     let mut values = vec![
         row("frequency", "MHz", Some((frequency_hz / 1e6, Set))),
-        row("part of the visibilities in the map", "%", Some((100.0 * sent / all, Estimated))),
+        row("part of the visibilities in the map", "%", Some((100.0 * mapped / all, Estimated))),
         row(
             "visibilities",
             "",
-            Some(figures.map_or((sent, Estimated), |figures| (figures.visibilities as f64, Measured))),
+            Some(figures.map_or((mapped, Estimated), |figures| (figures.visibilities as f64, Measured))),
         ),
         row("shortest projected baseline", "m", projected_m(0)),
         row("longest projected baseline", "m", projected_m(1)),
@@ -187,10 +187,16 @@ fn estimates(
     degrees: &[usize],
 ) -> Result<Vec<DegreeSensitivity>, FigureError> {
     let is_measured = figures.is_some_and(|figures| figures.snr.is_some() && figures.sky_power.is_some());
-    if is_measured || degrees.iter().all(|l| *l > SENSITIVITY_L_MAX) {
+    // Beyond the map's degrees nothing is known.
+    let map = &plan.config.map;
+    let l_max = if map.engine == EngineKind::Harmonic { map.degree() } else { 3 * map.nside - 1 };
+    let is_mapped = map.is_mapped(ChannelId(channel as u16));
+    if is_measured || !is_mapped || degrees.iter().all(|l| *l > SENSITIVITY_L_MAX.min(l_max)) {
         return Ok(Vec::new());
     }
-    Ok(ArraySensitivity::new(plan, channel)?.of(plan)?)
+    let mut found = ArraySensitivity::new(plan, channel)?.of(plan)?;
+    found.truncate(l_max + 1);
+    Ok(found)
 }
 
 fn degree_values(
@@ -199,6 +205,7 @@ fn degree_values(
     estimate: Option<&DegreeSensitivity>,
 ) -> [ProposalValue; 3] {
     use ValueSource::{Estimated, Measured};
+    let estimate = estimate.filter(|estimate| estimate.is_measured());
     let of = |curve: Option<&Vec<Option<f64>>>| Some((curve?.get(l).copied()??, Measured));
     let rho = figures.and_then(|figures| of(figures.rho.as_ref()));
     let snr = figures.and_then(|figures| of(figures.snr.as_ref()));
@@ -267,7 +274,7 @@ fn mark(source: ValueSource) -> &'static str {
 }
 
 const KEY: &str = "c: follows from the orbits; e: estimated without a map; m: measured in a simulated run; without a letter: a setting. \
-                   Noise, rho, SNR and measured modes are those of the part of the visibilities in the map. Resolution is the FWHM of the effective beam, estimated as the wavelength over the longest projected baseline.";
+                   Baselines, coverage, noise, rho, SNR and measured modes are those of the part of the visibilities in the map, data and times of the whole mission. Resolution is the FWHM of the effective beam, estimated as the wavelength over the longest projected baseline.";
 
 /// The table as Markdown, a row a quantity.
 #[must_use]

@@ -28,10 +28,10 @@ pub(crate) use graph::{Change, RunChanges};
 #[doc(hidden)]
 pub use jobs::{
     ArraySensitivity, BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, Design, DesignCheck,
-    DesignObjective, DesignStep, DesignSummary, JobEvent, JobWatcher, MERGE, MapStep, PowerSpread,
-    RealisationSpread, SENSITIVITY_L_MAX, Study, StudyCase, StudyError, StudySummary, SumsPlace, ZoomCentre,
-    ZoomJob, ZoomReport, bound, breathing_m_s_per_year, channel_groups, joint_channels, replay_in_groups,
-    run_design, run_in_groups, run_study, sample_state, simulate_in_groups, solve_state,
-    solve_states_jointly, with_gains, zoom_downlink,
+    DesignObjective, DesignRuns, DesignStep, DesignSummary, JobEvent, JobWatcher, MERGE, MapStep,
+    NotCompared, PowerSpread, RealisationSpread, SENSITIVITY_L_MAX, Study, StudyCase, StudyError,
+    StudySummary, SumsPlace, ZoomCentre, ZoomJob, ZoomReport, bound, breathing_m_s_per_year, channel_groups,
+    joint_channels, replay_in_groups, run_design, run_in_groups, run_study, sample_state, simulate_in_groups,
+    solve_state, solve_states_jointly, with_gains, zoom_downlink,
 };
 pub use jobs::{CalibrateJob, Mission, calibrate};

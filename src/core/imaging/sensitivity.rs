@@ -38,13 +38,22 @@ impl DegreeSensitivity {
         self.response().max(0.0).sqrt()
     }
 
+    /// Whether anything is measured beyond the rounding of single precision.
+    #[must_use]
+    pub fn is_measured(&self) -> bool {
+        self.response() >= RESPONSE_MIN
+    }
+
     /// The noise relative to the sky after correction for the response: 1 / SNR_l. Infinite if nothing is measured.
     #[must_use]
     pub fn relative_noise(&self) -> f64 {
         let kept = self.response() * self.sky_k2.sqrt();
-        if kept > 0.0 { self.noise_k2.sqrt() / kept } else { f64::INFINITY }
+        if self.is_measured() { self.noise_k2.sqrt() / kept } else { f64::INFINITY }
     }
 }
+
+/// Least response that is told from rounding.
+const RESPONSE_MIN: f64 = 1e-6;
 
 /// Rows of B that are added together.
 const ROWS_AT_ONCE: usize = 256;
@@ -192,9 +201,10 @@ mod tests {
         assert!((found[0].noise_k2 / (kept * kept / a) - 1.0).abs() < 1e-5, "{found:?}");
         // After correction for the response the noise is that of the datum: 1 / sqrt(A C_0).
         assert!((found[0].relative_noise() * (a * 3.0).sqrt() - 1.0).abs() < 1e-5, "{found:?}");
-        assert!(found[1].measured.abs() < 1e-6, "{found:?}");
+        assert!(found[1].measured.abs() < 1e-6 && !found[1].is_measured(), "{found:?}");
+        assert!(found[1].relative_noise().is_infinite(), "{found:?}");
         sums.clear();
-        assert!(sums.solve(&[3.0, 1.0]).unwrap()[0].relative_noise() > 1e3);
+        assert!(sums.solve(&[3.0, 1.0]).unwrap()[0].relative_noise().is_infinite());
     }
 
     /// A plane wave of k b = x has sum_m |b_lm|^2 = 4 pi (2 l + 1) j_l(x)^2: without noise to speak of, R far above A gives measured modes C_l

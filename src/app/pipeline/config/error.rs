@@ -75,13 +75,16 @@ pub enum PipelineError {
     Zoom(#[from] crate::imaging::zoom::ZoomError),
     /// A search without an array within its limits.
     #[error(
-        "none of {trials} arrays is possible, the best of them as {reason}; expected wider [limits], other ranges, or more evaluations"
+        "none of {trials} arrays is possible: {reasons}. Expected wider [limits], other ranges, or more evaluations; all are in {}",
+        table.display()
     )]
     NoDesign {
         /// Number of arrays that were tried.
         trials: usize,
-        /// Why one of them cannot be.
-        reason: String,
+        /// The commonest reasons, how many arrays have each, and an example.
+        reasons: String,
+        /// Path of the table of arrays.
+        table: std::path::PathBuf,
     },
     /// No data for any map.
     #[error(

@@ -28,4 +28,4 @@ pub use reference::{KeyDescription, Shown, key_descriptions, reference};
 pub use sections::Config;
 pub(super) use sections::is_folder_name;
 pub use source::{ConfigError, ConfigSource, QUICKLOOK};
-pub(super) use source::{has_sections, number_at, study_key};
+pub(super) use source::{has_sections, is_whole_at, number_at, study_key};

@@ -366,13 +366,23 @@ fn kind_of(value: &toml::Value) -> &'static str {
 
 /// The number at a path of settings, such as `array.kepler[0].eccentricity`.
 pub(in crate::pipeline) fn number_at(config: &Config, key: &str) -> Option<f64> {
+    let value = value_at(config, key)?;
+    value.as_float().or_else(|| Some(value.as_integer()? as f64))
+}
+
+/// Whether a setting is a whole number.
+pub(in crate::pipeline) fn is_whole_at(config: &Config, key: &str) -> bool {
+    value_at(config, key).is_some_and(|value| value.is_integer())
+}
+
+fn value_at(config: &Config, key: &str) -> Option<toml::Value> {
     let mut place = toml::Value::try_from(config).ok()?;
     for part in key.split('.') {
         let (name, element) = element_of(part);
         place = place.as_table_mut()?.remove(name)?;
         place = std::mem::replace(at(&mut place, element).ok()?, toml::Value::Boolean(false));
     }
-    place.as_float().or_else(|| Some(place.as_integer()? as f64))
+    Some(place)
 }
 
 #[cfg(test)]
@@ -480,6 +490,7 @@ mod tests {
         assert_eq!(eccentricities, [0.01, 0.05, 0.01]);
         assert_eq!(number_at(&found, "array.kepler[1].eccentricity"), Some(0.05));
         assert_eq!(number_at(&found, "array.satellites"), Some(3.0));
+        assert!(is_whole_at(&found, "array.satellites") && !is_whole_at(&found, "array.altitude_m"));
         for key in ["array.kepler[3].eccentricity", "array.kepler", "array.nothing", "name"] {
             assert_eq!(number_at(&found, key), None, "{key}");
         }

@@ -1,5 +1,6 @@
 //! Search for an array with less noise at some degrees, and its check by runs that the search has not seen.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Serialize;
@@ -11,11 +12,13 @@ use super::study::run_study;
 use super::study_file::{Study, StudyCase, case_plan};
 use crate::array::NodeMotion;
 use crate::imaging::DegreeSensitivity;
-use crate::pipeline::config::{PipelineError, Plan};
+use crate::pipeline::config::{MemoryLimit, PipelineError, Plan};
+use crate::pipeline::cost::Segment;
 use crate::pipeline::graph::RunView;
 use crate::pipeline::graph::run::write_pipeline;
-use crate::products::{ChannelFigures, RunFigures, create_folder, write_product};
+use crate::products::{ChannelFigures, ProductsError, RunFigures, create_folder, write_product};
 use crate::runtime::Cancel;
+use crate::units::InvalidValue;
 use crate::units::constants::YEAR_S;
 use crate::units::vector::{norm, sub};
 
@@ -58,12 +61,25 @@ pub struct DesignSummary {
 pub struct DesignCheck {
     /// The settings of both.
     pub settings: Vec<String>,
-    /// Noise relative to the sky, 1 / SNR_l, of the design over that of the start: geometric mean over degrees and channels.
-    pub noise_ratio: f64,
+    /// Noise relative to the sky, 1 / SNR_l, of the design over that of the start: geometric mean over the compared degrees and channels; absent
+    /// if there are none.
+    pub noise_ratio: Option<f64>,
     /// Its relative standard deviation, as each noise-only map is one realisation of 2 l + 1 modes a degree.
-    pub noise_sigma: f64,
-    /// Each degree of each channel.
+    pub noise_sigma: Option<f64>,
+    /// Each compared degree of each channel.
     pub by_degree: Vec<CheckedDegree>,
+    /// Degrees of the search without SNR_l in both maps.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub not_compared: Vec<NotCompared>,
+}
+
+/// Degrees of a channel that are not compared.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct NotCompared {
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+    /// Degrees l.
+    pub l: Vec<usize>,
 }
 
 /// One degree of the maps of start and design.
@@ -93,22 +109,31 @@ pub enum DesignStep<'a> {
 /// Callback that receives each step.
 pub type DesignWatcher<'a> = &'a mut dyn FnMut(DesignStep<'_>);
 
-/// Searches a design; writes `design.toml`, the pipeline of the best one, and `trials.csv` into `out`, and, if `checks`, what a study of start
+/// The runs that check a design.
+#[derive(Clone, Copy, Debug)]
+pub enum DesignRuns {
+    /// None.
+    Without,
+    /// Those of start and design, if the memory of each is within a limit.
+    Within(Option<MemoryLimit>),
+}
+
+/// Searches a design; writes `design.toml`, the pipeline of the best one, and `trials.csv` into `out`, and, with `runs`, what a study of start
 /// and design writes; `design.json` has what is returned.
 ///
 /// # Errors
-/// As [`run_study`]; no array within the limits.
+/// As [`run_study`]; a start of which nothing is measured; no array within the limits; runs that need more memory than their limit.
 pub fn run_design(
     design: &Design,
     out: &Path,
-    checks: bool,
+    runs: DesignRuns,
     cancel: &Cancel,
     watch: DesignWatcher<'_>,
 ) -> Result<DesignSummary, PipelineError> {
     create_folder(out)?;
-    if checks {
-        // An invalid setting of the check is told before a search of minutes.
-        check_study(design, &[])?;
+    if let DesignRuns::Within(limit) = runs {
+        // What prevents the check is told before a search of minutes.
+        check_study(design, &[], limit)?;
     }
     let channels = 0..design.plan.schedules.len();
     let estimators: Result<Vec<_>, PipelineError> =
@@ -121,10 +146,17 @@ pub fn run_design(
         start: 1.0,
         cancel,
     };
-    search.start = search.objective(&design.plan)?;
-    let best = search.find(watch)?;
+    search.start = search.objective(&design.plan)?.map_err(|found| InvalidValue {
+        key: "degrees".to_owned(),
+        value: format!("{:?}", design.degrees),
+        expected: format!("degrees and channels that the array to start from measures: {found}").into(),
+    })?;
+    let table = out.join("trials.csv");
+    let best = search.find(watch);
+    write_product(&table, trials_csv(&search.parameters, &search.trials))?;
+    let (trials, reasons) = (search.trials.len(), reasons(&search.trials));
+    let best = best?.ok_or(PipelineError::NoDesign { trials, reasons, table })?;
     let settings = settings(design, &best.values);
-    write_product(&out.join("trials.csv"), trials_csv(&search.parameters, &search.trials))?;
     let mut config = design.source(&settings).load()?;
     config.name = format!("{}-design", design.name);
     let version = env!("CARGO_PKG_VERSION");
@@ -135,23 +167,45 @@ pub fn run_design(
         cancelled: cancel.is_cancelled(),
         objective: design.objective,
         degrees: design.degrees,
-        trials: search.trials.len(),
+        trials,
         best,
         settings,
         check: None,
     };
-    if checks && !summary.cancelled {
-        let study = check_study(design, &summary.settings)?;
+    write_summary(&summary, out)?;
+    if let (DesignRuns::Within(limit), false) = (runs, summary.cancelled) {
+        let study = check_study(design, &summary.settings, limit)?;
         let found = run_study(&study, out, false, cancel, &mut |event, view| {
             watch(DesignStep::Check(&study, event, Box::new(view)));
         })?;
         summary.cancelled = found.cancelled;
         if let [start, designed] = &found.cases[..] {
-            summary.check = compared([&start.figures, &designed.figures], design);
+            summary.check = Some(compared([&start.figures, &designed.figures], design));
         }
+        write_summary(&summary, out)?;
     }
-    write_product(&out.join("design.json"), serde_json::to_vec_pretty(&summary).unwrap_or_default())?;
     Ok(summary)
+}
+
+fn write_summary(summary: &DesignSummary, out: &Path) -> Result<(), PipelineError> {
+    let path = out.join("design.json");
+    let json = serde_json::to_vec_pretty(summary)
+        .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
+    Ok(write_product(&path, json)?)
+}
+
+/// The commonest reasons of refusal, with counts and an example of each.
+fn reasons(trials: &[DesignTrial]) -> String {
+    let mut by_kind = BTreeMap::new();
+    for reason in trials.iter().filter_map(|trial| trial.refused.as_deref()) {
+        // Reasons that differ in numbers are one.
+        let kind: String = reason.chars().filter(|character| character.is_alphabetic()).collect();
+        by_kind.entry(kind).or_insert((0, reason)).0 += 1;
+    }
+    let mut commonest: Vec<(usize, &str)> = by_kind.into_values().collect();
+    commonest.sort_by_key(|(count, _)| std::cmp::Reverse(*count));
+    let told = commonest.iter().take(3).map(|(count, reason)| format!("{count} as, for example, {reason}"));
+    told.collect::<Vec<_>>().join("; ")
 }
 
 struct Search<'a> {
@@ -166,26 +220,44 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
-    /// What is lowered, for a plan: the geometric mean over channels.
-    fn objective(&mut self, plan: &Plan) -> Result<f64, PipelineError> {
+    /// What is lowered, for a plan: the geometric mean over channels; or what is not measured.
+    fn objective(&mut self, plan: &Plan) -> Result<Result<f64, String>, PipelineError> {
         let [first, last] = self.design.degrees;
         let mut sum = 0.0;
-        for estimator in &mut self.estimators {
-            let found = estimator.of(plan)?;
-            sum += objective(self.design.objective, &found[first..=last]).ln();
+        for (estimator, channel) in self.estimators.iter_mut().zip(&plan.instrument.channels) {
+            let degrees = &estimator.of(plan)?[first..=last];
+            let Some(value) = objective(self.design.objective, degrees) else {
+                let unmeasured = degrees.iter().find(|degree| !degree.is_measured());
+                let (l, longest_m) =
+                    (unmeasured.map_or(first, |degree| degree.l), estimator.baseline_m_max(plan));
+                let mhz = channel.frequency_hz / 1e6;
+                return Ok(Err(format!(
+                    "nothing is measured at l = {l} at {mhz} MHz by baselines below {longest_m:.1} m, the longest of estimates"
+                )));
+            };
+            sum += value.ln();
         }
-        Ok((sum / self.estimators.len() as f64).exp())
+        Ok(Ok((sum / self.estimators.len() as f64).exp()))
     }
 
-    /// Tries a point of the unit cube; returns its ratio, infinite outside the limits.
+    /// Tries a point of the unit cube; returns its ratio, infinite if it is refused.
     fn attempt(&mut self, point: &[f64], watch: DesignWatcher<'_>) -> Result<f64, PipelineError> {
-        let values: Vec<f64> =
+        let values =
             point.iter().zip(&self.parameters).map(|(x, parameter)| value_of(parameter, *x)).collect();
+        self.attempt_values(values, watch)
+    }
+
+    fn attempt_values(&mut self, values: Vec<f64>, watch: DesignWatcher<'_>) -> Result<f64, PipelineError> {
         let source = self.design.source(&settings(self.design, &values));
         let plan = case_plan(&source, None).map_err(|error| error.to_string());
         let plan = plan.and_then(|plan| outside(&plan, &self.design.limits).map_or(Ok(plan), Err));
-        let (ratio, refused) = match plan {
-            Ok(plan) => (Some(self.objective(&plan)? / self.start), None),
+        let found = match plan {
+            Ok(plan) => self.objective(&plan)?,
+            Err(reason) => Err(reason),
+        };
+        let (ratio, refused) = match found.map(|value| value / self.start) {
+            Ok(ratio) if ratio.is_finite() && ratio > 0.0 => (Some(ratio), None),
+            Ok(ratio) => (None, Some(format!("its estimate over that of the start is {ratio}"))),
             Err(reason) => (None, Some(reason)),
         };
         self.trials.push(DesignTrial { values, ratio, refused });
@@ -202,12 +274,14 @@ impl Search<'_> {
 
     /// Tries the start and spread points, a third of all trials; then, from the best of them, each parameter up and down by steps that are
     /// halved when none helps.
-    fn find(&mut self, watch: DesignWatcher<'_>) -> Result<DesignTrial, PipelineError> {
+    fn find(&mut self, watch: DesignWatcher<'_>) -> Result<Option<DesignTrial>, PipelineError> {
         let of_start = self.parameters.iter().zip(&self.design.start_values);
+        let start: Vec<f64> = of_start.map(|(one, value)| value.clamp(one.from, one.to)).collect();
+        let of_start = self.parameters.iter().zip(&start);
         let mut best: Vec<f64> = of_start.map(|(parameter, value)| place_of(parameter, *value)).collect();
-        let mut least = self.attempt(&best, watch)?;
+        let mut least = self.attempt_values(start, watch)?;
         while self.trials.len() < self.design.evaluations / 3 && !self.is_over() {
-            let point = spread(self.design.seed % (1 << 20) + self.trials.len() as u64, best.len());
+            let point = spread(self.design.seed, self.trials.len() as u64, best.len());
             let found = self.attempt(&point, watch)?;
             if found < least {
                 (best, least) = (point, found);
@@ -231,34 +305,44 @@ impl Search<'_> {
                 step *= 0.5;
             }
         }
-        let ratio = |trial: &&DesignTrial| trial.ratio.unwrap_or(f64::INFINITY);
-        let best = self.trials.iter().min_by(|a, b| ratio(a).total_cmp(&ratio(b)));
-        match best {
-            Some(best) if best.ratio.is_some() => Ok(best.clone()),
-            other => {
-                let reason = other.and_then(|trial| trial.refused.clone()).unwrap_or_default();
-                Err(PipelineError::NoDesign { trials: self.trials.len(), reason })
-            }
-        }
+        let possible = self.trials.iter().filter_map(|trial| Some((trial.ratio?, trial)));
+        Ok(possible.min_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, trial)| trial.clone()))
     }
 }
 
-/// Point `number` of an even sequence in the unit cube: multiples of powers of the generalised golden ratio, x^(count + 1) = x + 1.
-fn spread(number: u64, count: usize) -> Vec<f64> {
+/// Point `number` of an even sequence in the unit cube: multiples of powers of the generalised golden ratio, x^(count + 1) = x + 1, from a random
+/// point of the seed.
+fn spread(seed: u64, number: u64, count: usize) -> Vec<f64> {
     let mut ratio = 2.0_f64;
     for _ in 0..50 {
         ratio = (1.0 + ratio).powf(1.0 / (count + 1) as f64);
     }
-    (1..=count).map(|k| (0.5 + number as f64 * ratio.powi(-(k as i32))).fract()).collect()
+    let place = |k: usize| (offset(seed, k as u64) + number as f64 * ratio.powi(-(k as i32))).fract();
+    (1..=count).map(place).collect()
 }
 
-/// What is lowered, of some degrees of a channel.
-fn objective(objective: DesignObjective, degrees: &[DegreeSensitivity]) -> f64 {
+/// Number `k` of a seed, 0 to 1, by SplitMix64 (Steele et al. 2014).
+fn offset(seed: u64, k: u64) -> f64 {
+    let mixed = seed.wrapping_add(k.wrapping_mul(0x9e37_79b9_7f4a_7c15));
+    let mixed = (mixed ^ (mixed >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    ((mixed ^ (mixed >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+}
+
+/// What is lowered, of some degrees of a channel; `None` if it is not a positive number, as at a degree of which nothing is measured.
+fn objective(objective: DesignObjective, degrees: &[DegreeSensitivity]) -> Option<f64> {
     let sum = |of: fn(&DegreeSensitivity) -> f64| degrees.iter().map(of).sum::<f64>();
-    match objective {
-        DesignObjective::Noise => (sum(|degree| degree.relative_noise().ln()) / degrees.len() as f64).exp(),
-        DesignObjective::Modes => sum(|degree| (2 * degree.l + 1) as f64 - degree.measured),
-    }
+    let (value, is_measured) = match objective {
+        DesignObjective::Noise => (
+            (sum(|degree| degree.relative_noise().ln()) / degrees.len() as f64).exp(),
+            degrees.iter().all(DegreeSensitivity::is_measured),
+        ),
+        DesignObjective::Modes => (
+            sum(|degree| (2 * degree.l + 1) as f64 - degree.measured),
+            degrees.iter().any(DegreeSensitivity::is_measured),
+        ),
+    };
+    (is_measured && value.is_finite() && value > 0.0).then_some(value)
 }
 
 /// Whether a range is searched in logarithms.
@@ -266,11 +350,22 @@ fn is_wide(parameter: &DesignParameter) -> bool {
     parameter.from > 0.0 && parameter.to / parameter.from >= 10.0
 }
 
-/// The value at `x` of 0 to 1 of the range, to four digits, as no array is built to more.
+/// The value at `x` of 0 to 1 of the range, rounded by up to 1e-4 of the value where the range is searched in logarithms, else of the range.
 fn value_of(parameter: &DesignParameter, x: f64) -> f64 {
     let DesignParameter { from, to, .. } = parameter;
-    let value = if is_wide(parameter) { from * (to / from).powf(x) } else { from + x * (to - from) };
-    format!("{value:.3e}").parse().unwrap_or(value)
+    let value = match is_wide(parameter) {
+        true => {
+            let value = from * (to / from).powf(x);
+            format!("{value:.4e}").parse().unwrap_or(value)
+        }
+        false => {
+            let (value, digits) = (from + x * (to - from), (1e-4 * (to - from)).log10().floor());
+            let (unit, decimals) = (10_f64.powf(digits), (-digits).max(0.0) as usize);
+            let value = if digits > 0.0 { (value / unit).round() * unit } else { value };
+            format!("{value:.decimals$}").parse().unwrap_or(value)
+        }
+    };
+    value.clamp(*from, *to)
 }
 
 /// Where a value is in the range, 0 to 1.
@@ -328,13 +423,32 @@ fn outside(plan: &Plan, limits: &DesignLimits) -> Option<String> {
     (keeping > limit).then(|| format!("breathing takes {keeping:.2} m/s a year"))
 }
 
-/// The least and the greatest distance of two satellites, m: in the middle of each window and, of a formation, at its turnarounds.
+/// Orbits of a mission, and places on each, at which distances off one circle are taken.
+const ORBITS_MAX: f64 = 256.0;
+const PHASES: usize = 64;
+
+/// The least and the greatest distance of two satellites, m: on one circle at the turnarounds of the formation, else at 64 instants of each orbit,
+/// or of 256 orbits of a mission with more, observed or not.
 fn distances_m(plan: &Plan) -> [f64; 2] {
     let array = &plan.array;
-    let middles = plan.windows.iter().map(|window| 0.5 * (window.start.seconds() + window.end.seconds()));
-    let turns = array.formation().map(|formation| [0.0, 0.5 * formation.period_s()]);
+    let instants_s: Vec<f64> = match array.formation() {
+        // Arcs are linear in time between these.
+        Some(formation) => vec![0.0, 0.5 * formation.period_s()],
+        None => {
+            let (orbit_s, duration_s) = (array.orbital_period_s(), plan.config.spacecraft.duration_s);
+            let orbits = (duration_s / orbit_s).ceil().clamp(1.0, ORBITS_MAX) as usize;
+            let step_s = (duration_s - orbit_s).max(0.0) / (orbits - 1).max(1) as f64;
+            // Breathing off the circle turns in between, and narrowest first at half its period.
+            let turn_s = 0.5 * plan.config.array.breathing.period_s;
+            let turns = (!plan.config.array.has_own_orbits() && turn_s < duration_s).then_some(turn_s);
+            let starts = (0..orbits).map(|k| k as f64 * step_s).chain(turns);
+            let phases =
+                |start_s: f64| (0..PHASES).map(move |k| start_s + k as f64 * orbit_s / PHASES as f64);
+            starts.flat_map(phases).filter(|t_s| *t_s <= duration_s).collect()
+        }
+    };
     let mut found = [f64::INFINITY, 0.0_f64];
-    for t_s in middles.chain(turns.into_iter().flatten()) {
+    for t_s in instants_s {
         let places: Vec<_> = (0..array.satellites()).map(|n| array.position_m(n, t_s)).collect();
         for (k, first) in places.iter().enumerate() {
             for second in &places[k + 1..] {
@@ -357,13 +471,19 @@ pub fn breathing_m_s_per_year(plan: &Plan) -> Option<f64> {
     Some(2.0 * YEAR_S / formation.period_s() * 2.0 / 3.0 * drifts.fold(0.0, f64::max))
 }
 
-/// The study of start and design with the settings of the check.
-fn check_study(design: &Design, settings: &[String]) -> Result<Study, PipelineError> {
+/// The study of start and design with the settings of the check, each within a limit of memory.
+fn check_study(
+    design: &Design,
+    settings: &[String],
+    limit: Option<MemoryLimit>,
+) -> Result<Study, PipelineError> {
     let case = |(family, label, settings): (usize, &str, &[String])| {
         let source = design.source(&[settings, design.check.as_slice()].concat());
+        let plan = case_plan(&source, None)?;
+        plan.cost().require_memory(Segment::Whole, limit)?;
         Ok(StudyCase {
             labels: vec![label.to_owned()],
-            plan: case_plan(&source, None)?,
+            plan,
             overrides: source.overrides,
             calibrated: false,
             noise_seeds: Vec::new(),
@@ -382,23 +502,44 @@ fn check_study(design: &Design, settings: &[String]) -> Result<Study, PipelineEr
     })
 }
 
-/// Compares the maps of start and design at the degrees of the search; `None` if SNR_l is not known.
-fn compared(runs: [&RunFigures; 2], design: &Design) -> Option<DesignCheck> {
+/// Compares the maps of start and design at the degrees of the search, where both have SNR_l.
+fn compared(runs: [&RunFigures; 2], design: &Design) -> DesignCheck {
     let [first, last] = design.degrees;
-    let mut by_degree = Vec::new();
-    for (start, designed) in runs[0].channels.iter().zip(&runs[1].channels) {
-        by_degree.extend((first..=last).filter_map(|l| checked([start, designed], l)));
+    let (mut by_degree, mut not_compared) = (Vec::new(), Vec::new());
+    let is_at = |a_hz: f64, b_hz: f64| (a_hz / b_hz - 1.0).abs() < 1e-9;
+    // A run has no figures of a channel without a map, and the check may have other channels.
+    let mut channels_hz = design.plan.config.spacecraft.channels_hz.clone();
+    for channel in runs.iter().flat_map(|run| &run.channels) {
+        if !channels_hz.iter().any(|hz| is_at(*hz, channel.frequency_hz)) {
+            channels_hz.push(channel.frequency_hz);
+        }
+    }
+    for frequency_hz in channels_hz {
+        let maps = runs.map(|run| run.channels.iter().find(|map| is_at(map.frequency_hz, frequency_hz)));
+        let mut without = Vec::new();
+        for l in first..=last {
+            let [start, designed] = maps;
+            match start.zip(designed).and_then(|(start, designed)| checked([start, designed], l)) {
+                Some(degree) => by_degree.push(degree),
+                None => without.push(l),
+            }
+        }
+        if !without.is_empty() {
+            not_compared.push(NotCompared { frequency_hz, l: without });
+        }
     }
     let count = by_degree.len() as f64;
     let ln = by_degree.iter().map(|degree| degree.noise_ratio.ln()).sum::<f64>() / count;
     // The logarithm of an amplitude from 2 l + 1 modes has a variance of 1 / (2 (2 l + 1)), in each of both.
     let variance: f64 = by_degree.iter().map(|degree| 1.0 / (2 * degree.l + 1) as f64).sum();
-    (count > 0.0).then(|| DesignCheck {
+    let of_any = |value: f64| (count > 0.0).then_some(value);
+    DesignCheck {
         settings: design.check.clone(),
-        noise_ratio: ln.exp(),
-        noise_sigma: variance.sqrt() / count,
+        noise_ratio: of_any(ln.exp()),
+        noise_sigma: of_any(variance.sqrt() / count),
         by_degree,
-    })
+        not_compared,
+    }
 }
 
 fn checked(maps: [&ChannelFigures; 2], l: usize) -> Option<CheckedDegree> {
@@ -424,4 +565,58 @@ fn trials_csv(parameters: &[&DesignParameter], trials: &[DesignTrial]) -> String
         text.push_str(&format!("{},{ratio},\"{refused}\"\n", values.join(",")));
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_rounded_within_their_range() {
+        for (from, to) in
+            [(1234.5678, 1234.6789), (0.012_345, 0.067_891), (12_345.67, 987_654.3), (-3.3, 4e6)]
+        {
+            let parameter = DesignParameter { key: String::new(), from, to };
+            for k in 0..=1000 {
+                let x = f64::from(k) / 1000.0;
+                let value = value_of(&parameter, x);
+                assert!((from..=to).contains(&value), "{value}");
+                // Steps of the search are at least 1e-3 of the range, or of ln(to / from) >= 2.3.
+                assert!((place_of(&parameter, value) - x).abs() <= 1.01e-4, "{from} {to} {x} {value}");
+            }
+        }
+    }
+
+    #[test]
+    fn seeds_share_no_points() {
+        let points = |seed: u64| (0..500).map(move |n| spread(seed, n, 2));
+        for point in points(0) {
+            assert!(point.iter().all(|x| (0.0..1.0).contains(x)));
+            let is_near = |other: Vec<f64>| point.iter().zip(&other).all(|(a, b)| (a - b).abs() < 1e-9);
+            assert!(!points(1).any(is_near));
+        }
+    }
+
+    /// Two satellites of a + and - eccentricity e on one line of apsides: their radii differ by 2 a e at the apsides.
+    #[test]
+    fn distances_off_the_circle_are_those_of_whole_orbits() {
+        let one = |periapsis_deg: f64, anomaly_deg: f64| {
+            format!(
+                "{{ semi_major_axis_m = 2037.1e3, eccentricity = 0.01, inclination_deg = 30.0, node_longitude_deg = 0.0, \
+                 periapsis_deg = {periapsis_deg}, mean_anomaly_deg = {anomaly_deg} }}"
+            )
+        };
+        let overrides = vec![
+            "array.satellites=2".to_owned(),
+            format!("array.kepler=[{}, {}]", one(0.0, 0.0), one(180.0, 180.0)),
+            "spacecraft.duration_s=1e5".to_owned(),
+        ];
+        let source = crate::pipeline::config::ConfigSource { overrides, ..Default::default() };
+        let [closest_m, span_m] = distances_m(&case_plan(&source, None).unwrap());
+        // Relative to their mean they move on an ellipse of 2 a e by 4 a e, from the first to the second of which they are apart.
+        let ae_m = 2037.1e3 * 0.01;
+        // 64 phases miss an extreme by up to (2 pi / 128)^2 / 2 = 0.12 %, of four times as much across; terms of e^2 are 1 %.
+        assert!((closest_m / (2.0 * ae_m) - 1.0).abs() < 0.02, "{closest_m}");
+        assert!((span_m / (4.0 * ae_m) - 1.0).abs() < 0.02, "{span_m}");
+    }
 }

@@ -6,10 +6,12 @@ use serde::{Deserialize, Serialize};
 
 use super::sensitivity::SENSITIVITY_L_MAX;
 use super::study_file::{StudyError, case_plan, invalid, read_study};
-use crate::pipeline::config::{Config, ConfigSource, Plan, is_folder_name, number_at};
+use crate::pipeline::config::{Config, ConfigSource, Plan, is_folder_name, is_whole_at, number_at};
 
 const VALUES_MAX: usize = 64;
 const EVALUATIONS_MAX: usize = 10_000;
+/// Longest name: the pipeline of the result appends `-design` to it.
+const NAME_BYTES_MAX: usize = 60 - "-design".len();
 /// The setting that is searched as a whole: a value for each arc, in ascending order.
 const ARCS: &str = "array.arcs_m";
 
@@ -123,19 +125,20 @@ impl Design {
             .map_err(|error| invalid(path, error.to_string().trim_end().to_owned(), expected))?;
         file.require_valid().map_err(|(found, expected)| invalid(path, found, expected))?;
         let stem = path.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-        let name = file.name.unwrap_or(stem);
-        if !is_folder_name(&name) {
-            let expected = "1 to 60 bytes, without slashes and control characters";
+        let name = file.name.clone().unwrap_or(stem);
+        if name.is_empty() || name.len() > NAME_BYTES_MAX || !is_folder_name(&name) {
+            let expected = "1 to 53 bytes, without slashes and control characters";
             return Err(invalid(path, format!("name = {name:?}"), expected));
         }
         let folder = path.parent().unwrap_or(Path::new(""));
         let start = ConfigSource {
-            file: file.pipeline.map(|pipeline| folder.join(pipeline)),
-            overrides: [file.set, extra.to_vec()].concat(),
+            file: file.pipeline.as_ref().map(|pipeline| folder.join(pipeline)),
+            overrides: [file.set.as_slice(), extra].concat(),
             seed: None,
         };
         let plan = case_plan(&start, None)
             .map_err(|error| StudyError::Case { label: "start".to_owned(), source: Box::new(error) })?;
+        file.require_effect(&plan).map_err(|(found, expected)| invalid(path, found, expected))?;
         let mut start_values = Vec::new();
         for DesignParameter { key, .. } in &file.parameter {
             let found = values_at(&plan, key).ok_or_else(|| {
@@ -226,6 +229,54 @@ impl DesignFile {
             return Err((format!("{:?}", self.limits), "limits that are not negative"));
         }
         Ok(())
+    }
+
+    /// What was found and expected instead, of the first parameter or limit that tells nothing of the estimates of a plan.
+    fn require_effect(&self, plan: &Plan) -> Result<(), (String, &'static str)> {
+        let keys: Vec<&str> = self.parameter.iter().map(|one| one.key.as_str()).collect();
+        for key in &keys {
+            let found = || format!("key = {key:?}");
+            let section = key.split('.').next().unwrap_or_default();
+            if !["array", "spacecraft"].contains(&section) || key.starts_with("spacecraft.channels_hz") {
+                let expected = "a number of [array] or [spacecraft] other than a channel: all estimates are of one sky, its channels and \
+                                the map's own settings";
+                return Err((found(), expected));
+            }
+            if is_whole_at(&plan.config, key) {
+                let expected = "a number that is not whole: a search takes steps between; vary whole ones by `lunarray study`";
+                return Err((found(), expected));
+            }
+            if let Some(expected) = replacement(key, &keys, &plan.config) {
+                return Err((format!("{key} has no effect here"), expected));
+            }
+        }
+        if self.limits.keeping_m_s_per_year_max.is_some() && plan.array.formation().is_none() {
+            let expected = "that limit only of satellites on one circle, whose breathing is known";
+            return Err(("keeping_m_s_per_year_max without a formation".to_owned(), expected));
+        }
+        Ok(())
+    }
+}
+
+/// Keys that others replace, and those others.
+fn replacement(key: &str, keys: &[&str], config: &Config) -> Option<&'static str> {
+    let has_arcs = keys.contains(&ARCS) || !config.array.arcs_m.is_empty();
+    let has_orbit = ["array.altitude_m", "array.inclination_deg"].iter().any(|key| keys.contains(key));
+    match key {
+        "array.orbital_period_s" | "array.precession_period_s" if has_orbit => Some(
+            "array.altitude_m and array.inclination_deg, from which the periods follow, or the periods alone",
+        ),
+        "array.breathing.first_spacing_m_min"
+        | "array.breathing.second_spacing_m_min"
+        | "array.breathing.span_m_max"
+            if has_arcs =>
+        {
+            Some("array.arcs_m, which replaces the spacings, or the spacings alone")
+        }
+        key if key.starts_with("array.arcs_m[") && keys.contains(&ARCS) => {
+            Some("array.arcs_m for all arcs, or some of its elements")
+        }
+        _ => None,
     }
 }
 

@@ -22,7 +22,9 @@ mod zoom;
 pub use bound::{BoundSummary, bound};
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
 pub use case::CaseSummary;
-pub use design::{DesignCheck, DesignStep, DesignSummary, breathing_m_s_per_year, run_design};
+pub use design::{
+    DesignCheck, DesignRuns, DesignStep, DesignSummary, NotCompared, breathing_m_s_per_year, run_design,
+};
 pub use design_file::{Design, DesignObjective};
 pub use event::{JobEvent, JobWatcher, MapStep};
 pub use groups::{channel_groups, replay_in_groups, run_in_groups};
