@@ -154,7 +154,7 @@ def test_channels_are_mapped_together(harmonic_state, tmp_path):
         ({"samples": 1}, "expected 2 to 1000"),
         ({"power_priors": [0.1]}, "expected three"),
         ({"power_priors": [0.1, -1.0, 0.0]}, "expected three"),
-        ({"power_constant_k_sr": [1.0, 2.0, 3.0]}, "power-constant"),
+        ({"power_constant_k_sr": [1.0, 2.0, 3.0]}, "3 constants of the total powers"),
     ):
         with pytest.raises(lunarray.Error, match=message):
             lunarray.joint(state, **wrong)
