@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn thinned_estimates_are_those_of_all_visibilities() {
-        let plan = plan(&[]);
+        let plan = plan(&["spacecraft.every_nth_integration=1"]);
         let mut estimator = ArraySensitivity::new(&plan, 0).unwrap();
         let all = estimator.of_at_most(&plan, f64::INFINITY).unwrap();
         let thinned = estimator.of_at_most(&plan, 1.0 + VISIBILITIES_MAX / 6.0).unwrap();
