@@ -1,9 +1,11 @@
-//! Errors of a pipeline.
+//! Errors of a configuration and of a pipeline.
+
+use std::path::PathBuf;
 
 use thiserror::Error;
 
 use super::memory::MemoryLimit;
-use super::source::ConfigError;
+use super::problems::Problems;
 use crate::array::ArrayError;
 use crate::frames::{SampleReason, VisibilityReason};
 use crate::response::MeasuredAntennasError;
@@ -11,6 +13,69 @@ use crate::runtime::{LedgerImbalance, RuntimeError};
 use crate::sky::MapError;
 use crate::sky::fits::FitsError;
 use crate::units::bytes_text;
+
+/// Maximum length of a pipeline file, bytes; a hundred times that of a file with every key.
+pub(super) const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// Errors of reading and checking a configuration.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read the pipeline file {}: {source}", path.display())]
+    Read {
+        /// Path.
+        path: PathBuf,
+        /// The system's error.
+        source: std::io::Error,
+    },
+    /// The file is not text.
+    #[error(
+        "{}, line {line}: not text in UTF-8; expected a pipeline file (TOML). `lunarray inspect` and `replay` read a downlink, and sky.file names a map",
+        path.display()
+    )]
+    NotText {
+        /// Path.
+        path: PathBuf,
+        /// Line of the first byte that is no text, counted from 1.
+        line: usize,
+    },
+    /// The file is a study.
+    #[error("{}: a study, with {key}; expected a pipeline file: run it by `lunarray study {}`", path.display(), path.display())]
+    Study {
+        /// Path.
+        path: PathBuf,
+        /// A key that only studies have.
+        key: &'static str,
+    },
+    /// The file is too long for a pipeline file.
+    #[error("{}: more than {FILE_BYTES_MAX} bytes; expected a pipeline file, which has some thousand", path.display())]
+    TooLong {
+        /// Path.
+        path: PathBuf,
+    },
+    /// A `--set` that is not `key=value`.
+    #[error("--set {0}: expected key=value, for example --set map.nside=32")]
+    Override(String),
+    /// A `--set` with a key below a value, or of an element that is not there.
+    #[error("--set {key}: `{part}` {found}")]
+    NotThere {
+        /// Full key.
+        key: String,
+        /// The part of the key that is not there.
+        part: String,
+        /// What is there.
+        found: String,
+    },
+    /// Syntax errors, unknown keys, wrong types and invalid values, all together.
+    #[error("{origin}: {problems}")]
+    Values {
+        /// Path of the file, or name of the embedded default.
+        origin: String,
+        /// The problems.
+        problems: Problems,
+    },
+}
 
 /// Errors that prevent or end a run of a pipeline.
 #[derive(Debug, Error)]

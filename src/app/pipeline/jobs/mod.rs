@@ -5,6 +5,7 @@ mod calibrate;
 mod case;
 mod design;
 mod design_file;
+mod design_limits;
 mod event;
 mod groups;
 mod joint;
@@ -22,10 +23,9 @@ mod zoom;
 pub use bound::{BoundSummary, bound};
 pub use calibrate::{CalibrateJob, CalibrateProgress, CalibrateWatcher, calibrate, with_gains};
 pub use case::CaseSummary;
-pub use design::{
-    DesignCheck, DesignRuns, DesignStep, DesignSummary, NotCompared, breathing_m_s_per_year, run_design,
-};
+pub use design::{DesignCheck, DesignRuns, DesignStep, DesignSummary, NotCompared, run_design};
 pub use design_file::{Design, DesignObjective};
+pub use design_limits::breathing_m_s_per_year;
 pub use event::{JobEvent, JobWatcher, MapStep};
 pub use groups::{channel_groups, replay_in_groups, run_in_groups};
 pub use joint::{SumsPlace, joint_channels, solve_states_jointly};
