@@ -9,7 +9,7 @@ use lunarray::sky::fits::{WriteOptions, write_map};
 use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
 
-use crate::common::workplace::{Workplace, fail, json, succeed};
+use crate::common::workplace::{Workplace, fail, json, maps, succeed};
 
 const PIPELINE: &str = r#"
 name = "joint"
@@ -92,6 +92,94 @@ fn channels_see_together_what_one_misses() {
     let header = std::fs::read(format!("{short}/10.000MHz/map.fits")).unwrap();
     let header = String::from_utf8_lossy(&header[..8640]).into_owned();
     assert!(header.contains("CONVERGD=                    F"), "{header}");
+}
+
+/// Settings of joint maps that differ from the defaults; constants of powers are by channel, and those of the command by frequency.
+const JOINT: &str = r#"
+[joint]
+on = true
+at_hz = ["8.5MHz"]
+count = 3
+power_priors_percent = [5.0, 2.0, 3.0]
+power_constant_k_sr = [2e4, 0.0, 1e4]
+"#;
+
+/// A few windows of three channels with total powers.
+fn few_windows(section: &str) -> Workplace {
+    let channels = "[10.0e6, 5.0e6, 7.0e6]\nauto_powers = true\nauto_integration_s = 60.0";
+    let pipeline = PIPELINE.replace("[5.0e6, 7.0e6, 10.0e6]", channels).replace("nside = 8", "nside = 4");
+    Workplace::new(&format!(
+        "{}{section}",
+        pipeline.replace("every_nth_window = 120", "every_nth_window = 400")
+    ))
+}
+
+/// Requires that a run leaves the joint maps that `joint` makes of a state of the same downlink. Returns the number of maps' files.
+fn require_maps_of_the_state(place: &Workplace, command: &[&str]) -> usize {
+    let [out, state, joint, alone] = ["run", "state", "joint", "alone"].map(|name| place.path(name));
+    let summary = json(&["run", &place.pipeline, "--out", &out]);
+    let downlink = format!("{out}/downlink.ccsds");
+    succeed(&["replay", &downlink, "--map", &place.pipeline, "--state", &state, "--out", &alone]);
+    let expected = json(&[&["joint", &state, "--out", &joint], command].concat()).to_string();
+    let expected: Value = serde_json::from_str(&expected.replace(&joint, &format!("{out}/joint"))).unwrap();
+    assert_eq!(summary["joint"], expected);
+    let written = std::fs::read(format!("{out}/joint/joint.json")).unwrap();
+    assert_eq!(serde_json::from_slice::<Value>(&written).unwrap(), expected);
+    let [ours, theirs] = [format!("{out}/joint"), joint].map(|folder| maps(&folder));
+    assert!(ours == theirs, "{:?} {:?}", ours.keys(), theirs.keys());
+    ours.len()
+}
+
+#[test]
+fn joint_maps_of_a_run_are_those_of_its_state() {
+    let place = few_windows(JOINT);
+    let command =
+        ["--at", "8.5MHz", "--count", "3", "--power-priors", "5,2,3", "--power-constant-k-sr", "0,1e4,2e4"];
+    // Those of three channels, of 8.5 MHz, and spectra.
+    assert_eq!(require_maps_of_the_state(&place, &command), 5);
+    // Joint maps of an earlier run do not stay beside those of a later one.
+    let between = place.path("run/joint/8.500MHz");
+    assert!(Path::new(&between).exists());
+    let found = json(&["run", &place.pipeline, "--set", "joint.at_hz=[]", "--out", &place.path("run")]);
+    assert!(found["joint"]["maps"][0]["powers"]["rows"].as_u64().unwrap() > 0, "{found}");
+    assert!(!Path::new(&between).exists());
+    // A wrong number of constants is found before sums are read, that is before a channel of the state is missed.
+    let said =
+        fail(&["joint", &place.path("state"), "--power-constant-k-sr", "0,1", "--out", &place.path("no")]);
+    assert!(said.contains("2 constants of the total powers for 3 channels"), "{said}");
+}
+
+#[test]
+fn joint_maps_of_a_run_may_leave_out_powers() {
+    let place = few_windows("[joint]\non = true\npowers = false");
+    assert_eq!(require_maps_of_the_state(&place, &["--no-powers"]), 4);
+}
+
+#[test]
+fn joint_maps_that_cannot_be_made_are_refused() {
+    let place = few_windows(JOINT);
+    let refused = |more: &[&str], expected: &str| {
+        let said = fail(&[&["run", &place.pipeline, "--out", &place.path("refused")], more].concat());
+        assert!(said.contains(expected), "{more:?}: {said}");
+    };
+    refused(&["--groups", "1"], "--groups: found joint.on = true, expected false; `lunarray joint`");
+    refused(&["--set", "joint.at_hz=[12MHz]"], "between 5.000 and 10.000 MHz");
+    refused(&["--set", "joint.count=1"], "joint.count = 1: expected 2 to 1000");
+    refused(&["--set", "joint.power_constant_k_sr=[1.0, 2.0]"], "one value, or 3, one for each channel");
+    refused(&["--set", "joint.on=false"], "joint.count = 3 has an effect only with joint.on = true");
+    refused(
+        &["--set", "spacecraft.auto_powers=false"],
+        "has an effect only with spacecraft.auto_powers = true",
+    );
+    refused(&["--set", "spacecraft.antenna='dipole-normal'"], "total powers of dipoles");
+    refused(
+        &["--set", "map.engine='pixel'"],
+        "joint.on = true has an effect only with map.engine = \"harmonic\"",
+    );
+    refused(&["--set", "map.refine.passes_max=2"], "joint.on = true has an effect only");
+    let one = few_windows("[joint]\non = true\npowers = false");
+    let said = fail(&["run", &one.pipeline, "--set", "map.channels=[1]", "--out", &one.path("one")]);
+    assert!(said.contains("[joint]: a joint map of 1 channels"), "{said}");
 }
 
 /// Gains of 10 %, and offsets and slopes of 1 % of the power, each for every pass of a daughter; evenly spread numbers of unit variance.

@@ -187,6 +187,7 @@ fn a_snapshot_that_determines_no_map_waits_for_more() {
             iteration_folder: None,
             trace_probes: 0,
             samples: Samples::default(),
+            kept: None,
             watch: SolveWatch::default(),
         };
         let mut maps = Outlet::collect();

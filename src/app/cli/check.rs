@@ -89,7 +89,12 @@ fn checked(args: &CheckArgs) -> Result<(Plan, Cost), CommandError> {
         return Err(Box::new(ConfigError::Values { origin: args.pipeline.source().origin(), problems }));
     }
     let ranks = usize::from(args.ranks);
-    plan.config.require_shareable(ranks)?;
+    plan.config.require_shareable_run(ranks)?;
+    if plan.config.joint.on {
+        print_notes([
+            "joint maps are not in the estimates of memory and run time; sums that memory does not hold then go to disk, in OUT/joint",
+        ]);
+    }
     print_notes(sky_notes(&plan)?);
     let cost = plan.cost_with_ranks(ranks).on_nodes(args.pipeline.memory_limit());
     cost.require_finite()?;

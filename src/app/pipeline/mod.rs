@@ -19,7 +19,7 @@ pub use cost::{ChannelCost, Cost, GroupSize, MapGroup, MemoryAdvice, RankCost, R
 #[doc(hidden)]
 pub use graph::{
     BlockSummary, CalibrateRound, INTEGRATE, READ, RunScope, SampleCounts, SampleSummary, StepwiseRun,
-    downlink_file, main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
+    SumsPlace, downlink_file, main_products, run_with_ranks, sample_stages, sky_notes, use_threads,
 };
 pub use graph::{
     CalibrateSummary, Destination, GroundSource, OnStart, RunSummary, RunView, replay, run, simulate,
@@ -30,7 +30,7 @@ pub use jobs::{
     ArraySensitivity, BoundSummary, CalibrateProgress, CalibrateWatcher, CaseSummary, Design, DesignCheck,
     DesignObjective, DesignRuns, DesignStep, DesignSummary, JobEvent, JobWatcher, MERGE, MapStep,
     NotCompared, PowerSpread, RealisationSpread, SENSITIVITY_L_MAX, Study, StudyCase, StudyError,
-    StudySummary, SumsPlace, ZoomCentre, ZoomJob, ZoomReport, bound, breathing_m_s_per_year, channel_groups,
+    StudySummary, ZoomCentre, ZoomJob, ZoomReport, bound, breathing_m_s_per_year, channel_groups,
     joint_channels, replay_in_groups, run_design, run_in_groups, run_study, sample_state, simulate_in_groups,
     solve_state, solve_states_jointly, with_gains, zoom_downlink,
 };

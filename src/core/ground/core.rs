@@ -1,7 +1,7 @@
 //! The ground stage, which turns the bytes of a downlink into sums.
 
 use std::sync::atomic::Ordering;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use super::archive::{Archive, RecordDraft};
@@ -14,10 +14,11 @@ use crate::calibration::{BurstChoice, BurstSearch, Calibrator, DividedBlock, Mis
 use crate::downlink::transport::socket::HeldAnswers;
 use crate::downlink::wire::VisibilitiesOutline;
 use crate::downlink::{CucTime, PacketHeader, PacketKind};
-use crate::frames::{GroundFrame, Instrument, PlacedFrame, VisibilityReason};
+use crate::frames::{AutoPower, GroundFrame, Instrument, PlacedFrame, VisibilityReason};
 use crate::imaging::{Accumulator, Snapshot};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Outlet, Stage, Units};
+use crate::units::vector::Vec3;
 
 /// Pauses between attempts to write the last checkpoint of a session, as a shortage may pass.
 const LAST_CHECKPOINT_PAUSES: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
@@ -115,6 +116,23 @@ impl Ground {
     #[doc(hidden)]
     pub fn with_initial_snapshot(self) -> Self {
         Self { has_initial_snapshot: true, ..self }
+    }
+
+    /// Keeps the daughters' total powers with their positions in [`GroundOutcome::placed_autos`].
+    #[must_use]
+    #[doc(hidden)]
+    pub fn with_placed_autos(mut self) -> Self {
+        self.outcome.placed_autos = Some(Arc::default());
+        self
+    }
+
+    /// The daughters' total powers with their positions, where the ephemeris has them.
+    pub(super) fn placed_autos(&self) -> Vec<(AutoPower, Vec3)> {
+        let ephemeris = self.calibrator.ephemeris();
+        let place = |power: AutoPower| {
+            Some((power, ephemeris.position_at(power.time_s, usize::from(power.daughter))?))
+        };
+        self.calibrator.auto_powers().into_iter().filter_map(place).collect()
     }
 
     /// Calls `observer` on the thread of the stage after the gains of each pass are solved.
@@ -493,6 +511,9 @@ impl Stage for Ground {
         }
         self.show(Activity::Idle);
         store(&self.outcome.autos, self.calibrator.auto_powers());
+        if let Some(placed) = &self.outcome.placed_autos {
+            store(placed, self.placed_autos());
+        }
         Ok(self.accumulator.finish(out)?)
     }
 

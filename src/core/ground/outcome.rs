@@ -13,6 +13,7 @@ use crate::calibration::{Completeness, FoundBursts, SolvedGains};
 use crate::downlink::ReceptionCounters;
 use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
+use crate::units::vector::Vec3;
 
 /// The results of the ground stage other than its sums. Clones share them; they are complete once the stage has finished.
 #[derive(Clone, Debug, Default)]
@@ -25,6 +26,8 @@ pub struct GroundOutcome {
     pub reception: Arc<Mutex<ReceptionCounters>>,
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
+    /// Those with known positions, m, in the same order; `None` if nobody asked for them ([`Ground::with_placed_autos`](super::Ground)).
+    pub placed_autos: Option<Arc<Mutex<Vec<(AutoPower, Vec3)>>>>,
     /// The solved gains; `None` if gains are not solved for.
     pub gains: Option<SolvedGains>,
     /// The bursts of point sources found in any session.

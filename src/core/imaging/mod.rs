@@ -61,7 +61,7 @@ pub use power::{Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
 #[doc(hidden)]
-pub use request::SolverSetup;
+pub use request::{KeptSums, SolverSetup};
 #[doc(hidden)]
 pub use sensitivity::{DegreeSensitivity, SensitivitySums};
 #[doc(hidden)]

@@ -1,8 +1,10 @@
 //! Settings of the maps' solution, and the map that it gives.
 
 use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use super::anywhere::{AssumedInstrument, RefineRule, Refinement};
+use super::circle::HarmonicSums;
 use super::solver::{Diagnostics, NamedWatch, PointBeam, SolveWatch, StoppingRule};
 use super::{Regulariser, Samples, Uncertainty};
 use crate::frames::Instrument;
@@ -39,8 +41,26 @@ pub struct SolverSetup {
     pub trace_probes: usize,
     /// Number of posterior samples of a final map; with R from the data.
     pub samples: Samples,
+    /// Keeps the sums of final maps over harmonics after they are solved; `None` to free them.
+    pub kept: Option<KeptSums>,
     /// Receives progress and can interrupt a solution.
     pub watch: SolveWatch,
+}
+
+/// Sums of final maps over harmonics, each with its channel and nside, in the order in which they were solved. Clones share them.
+#[derive(Clone, Debug, Default)]
+pub struct KeptSums(Arc<Mutex<Vec<(ChannelId, usize, HarmonicSums)>>>);
+
+impl KeptSums {
+    pub(super) fn keep(&self, channel: ChannelId, nside: usize, sums: HarmonicSums) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push((channel, nside, sums));
+    }
+
+    /// Takes all that was kept.
+    #[must_use]
+    pub fn take(&self) -> Vec<(ChannelId, usize, HarmonicSums)> {
+        std::mem::take(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
 }
 
 impl SolverSetup {

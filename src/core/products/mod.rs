@@ -15,6 +15,7 @@ mod epsilons;
 mod error;
 mod error_maps;
 mod hips;
+mod joint;
 mod latitudes;
 pub mod pictures;
 mod point_beams;
@@ -50,6 +51,8 @@ pub use error::{create_folder, write_product};
 pub use error_maps::{ErrorMap, own_power_csv, told_vector};
 #[doc(hidden)]
 pub use hips::{Hips, HipsReport};
+#[doc(hidden)]
+pub use joint::{JOINT, JointMapReport, JointReport, write_joint};
 #[doc(hidden)]
 pub use latitudes::LatitudeError;
 #[doc(hidden)]

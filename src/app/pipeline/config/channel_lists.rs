@@ -4,11 +4,12 @@ use toml::{Table, Value};
 
 /// Keys that take one value, or a list with one for each channel. Keys of files are left out: a map of one frequency does not
 /// serve another.
-const KEYS: [[&str; 2]; 4] = [
+const KEYS: [[&str; 2]; 5] = [
     ["spacecraft", "every_nth_integration"],
     ["spacecraft", "baseline_wavelengths_max"],
     ["map", "epsilon"],
     ["map", "prior_k"],
+    ["joint", "power_constant_k_sr"],
 ];
 
 /// The frequencies of a table's channels, Hz; `None` if they are not a list of positive numbers.

@@ -233,6 +233,14 @@ pub enum PipelineError {
         /// Visibilities now.
         now: u64,
     },
+    /// Joint maps where sums are not in the memory of one process.
+    #[error(
+        "{with}: found joint.on = true, expected false; `lunarray joint` makes joint maps of a state, which `lunarray replay --state` leaves"
+    )]
+    NotJoint {
+        /// What does not go with it.
+        with: &'static str,
+    },
     /// A run that cannot be done group by group.
     #[error("--groups: found {found}, expected {expected}")]
     NotInGroups {

@@ -11,14 +11,15 @@ use crate::calibration::solver::SolverConfig;
 use crate::calibration::{CalibrationConfig, CalibrationHook, VanVleck};
 use crate::daughters::{DaughtersConfig, InstrumentConfig, NavigationConfig, Tones};
 use crate::downlink::DownlinkConfig;
-use crate::imaging::{EngineKind, MapConfig, Method, RegulariserChoice};
+use crate::imaging::joint::JointConfig;
+use crate::imaging::{EngineKind, MapConfig, Method, RegulariserChoice, SolveError, StoppingRule};
 use crate::mother::{Antenna, Fidelity, MoonMirror, SpacecraftConfig};
 use crate::products::ProductsConfig;
 use crate::response::model::ModelChoice;
 use crate::runtime::RuntimeConfig;
 use crate::sky::SkyConfig;
 use crate::units::time_scales::utc_text;
-use crate::units::{Checks, InvalidValue, keys};
+use crate::units::{ChannelId, Checks, InvalidValue, keys};
 
 keys! {
     /// A whole pipeline: the sky, the spacecraft and the ground.
@@ -52,6 +53,9 @@ keys! {
         section calibrate: SolverConfig = SolverConfig::default();
         /// How maps are made.
         section map: MapConfig = MapConfig::default();
+        /// Joint maps of the channels at the end of `lunarray run`.
+        #[only_with(r#"map.engine = "harmonic" and no map.refine.passes_max"#)]
+        section joint: JointConfig = JointConfig::default();
         /// Products besides the maps.
         section products: ProductsConfig = ProductsConfig::default();
         /// Queues and threads. They do not change a byte of the results.
@@ -102,6 +106,11 @@ impl Config {
         found.extend(spacecraft);
         found.extend(self.downlink.problems());
         found.extend(self.map.mismatches(channels));
+        let joint = self.joint.problems(channels);
+        match self.joint_problem() {
+            Some(problem) if joint.is_empty() => found.push(|| format!("[joint]: {problem}")),
+            _ => found.extend(joint),
+        }
         found.append(self.ground_value_problems());
         found.append(self.without_effect(&[]));
         found
@@ -165,6 +174,25 @@ impl Config {
         );
         checks.number("duration_s", duration_s, is_covered, expected);
         checks.finish()
+    }
+
+    /// Why the mapped channels have no joint maps, if so.
+    fn joint_problem(&self) -> Option<SolveError> {
+        let Self { joint, spacecraft, map, .. } = self;
+        let mapped = (0..).map(ChannelId).zip(&spacecraft.channels_hz);
+        let mapped: Vec<f64> =
+            mapped.filter(|(channel, _)| map.is_mapped(*channel)).map(|(_, hz)| *hz).collect();
+        let frequency_hz = mapped.first().copied().filter(|_| joint.on)?;
+        let rule = StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max };
+        let request = joint.request(rule, spacecraft.autos_s() > 0.0, vec![0.0]);
+        let has_pattern = spacecraft.antenna == Antenna::DipoleNormal;
+        match request.check(&mapped, true) {
+            Err(problem) => Some(problem),
+            Ok(()) if request.powers.is_some() && has_pattern => {
+                Some(SolveError::PowersOfDipoles { frequency_hz })
+            }
+            Ok(()) => None,
+        }
     }
 
     /// Replaces `map.engine = "auto"` by what the orbits allow.

@@ -67,13 +67,16 @@ impl Plan {
     /// Divides the channels into groups of the given size, or into groups that fit into memory.
     ///
     /// # Errors
-    /// A simulation of samples; a single channel that does not fit into memory.
+    /// A simulation of samples; joint maps; a single channel that does not fit into memory.
     #[doc(hidden)]
     pub fn run_groups(
         &self,
         size: GroupSize,
         limit: Option<MemoryLimit>,
     ) -> Result<RunGroups, PipelineError> {
+        if self.config.joint.on {
+            return Err(PipelineError::NotJoint { with: "--groups" });
+        }
         let mapped = map_groups(&self.instrument, &self.config, size, limit)?;
         Ok(RunGroups { simulated: self.simulation_groups(size, limit)?, mapped })
     }

@@ -9,7 +9,7 @@ use crate::imaging::MapConfig;
 use crate::imaging::Samples;
 use crate::imaging::anywhere::RefineRule;
 use crate::imaging::{
-    Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
+    KeptSums, Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
 };
 use crate::pipeline::config::{Config, PipelineError};
 use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
@@ -36,6 +36,11 @@ impl Config {
         }
     }
 
+    /// Stopping rule of iterative solutions.
+    pub(super) fn stopping_rule(&self) -> StoppingRule {
+        StoppingRule { residual_max: self.map.residual_max, iterations_max: self.map.iterations_max }
+    }
+
     /// Setup of the solver; `watch` reports its progress and ends it early.
     ///
     /// # Errors
@@ -52,12 +57,13 @@ impl Config {
             prior_k: map.prior_k.clone(),
             prior_maps,
             prior_hz,
-            rule: StoppingRule { residual_max: map.residual_max, iterations_max: map.iterations_max },
+            rule: self.stopping_rule(),
             refine: RefineRule { passes_max: map.refine.passes_max, residual_max: map.refine.residual_max },
             assumed: map.assumed().map_err(|error| PipelineError::Antennas("map.antennas.files", error))?,
             iteration_folder: None,
             trace_probes: map.trace_probes,
             samples: Samples::default(),
+            kept: None,
             watch,
         })
     }
@@ -78,6 +84,8 @@ pub(in crate::pipeline) struct MappingContext<'a> {
     pub(in crate::pipeline) viewers: MapWatch,
     /// State of the product files; `Some` if a failure to write them does not end the run.
     pub(in crate::pipeline) product_state: Option<ProductsWatch>,
+    /// Keeps the sums of the final maps.
+    pub(in crate::pipeline) kept: Option<KeptSums>,
 }
 
 /// Adds the ground segment to `graph`. Its only input is the bytes of the downlink.
@@ -91,11 +99,11 @@ pub(in crate::pipeline) fn add(
     ground: Ground,
     mapping: MappingContext<'_>,
 ) -> Result<SegmentOutcome, PipelineError> {
-    let MappingContext { out, truth, watch, viewers, product_state } = mapping;
+    let MappingContext { out, truth, watch, viewers, product_state, kept } = mapping;
     let outcome = SegmentOutcome { ground: ground.outcome(), channels: Arc::default() };
     let ranks = ground.ranks().clone();
     let iteration_folder = config.map.refine.is_on().then(|| out.to_owned());
-    let setup = SolverSetup { iteration_folder, ..config.solver(watch.with_ranks(&ranks))? };
+    let setup = SolverSetup { iteration_folder, kept, ..config.solver(watch.with_ranks(&ranks))? };
     if !ranks.is_first() {
         let sums = graph.stage(GROUND, 1, bytes, ground);
         let maps = graph.stage(SOLVE, 1, sums, Solver::new(setup));

@@ -3,6 +3,7 @@
 pub(super) mod calibrate_products;
 pub(super) mod found_solutions;
 pub(super) mod ground_segment;
+pub(super) mod joint;
 mod live_gains;
 pub(crate) mod models;
 pub(super) mod run;
@@ -14,6 +15,7 @@ pub(super) mod summary;
 mod view;
 
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
+pub use joint::SumsPlace;
 pub(crate) use run::SHUTDOWN;
 pub use run::{
     Destination, GroundSource, OnStart, READ, downlink_file, main_products, replay, run, run_with_ranks,

@@ -7,6 +7,7 @@ use std::time::Duration;
 use std::{fs, io};
 
 use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
+use super::joint::JointData;
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -20,10 +21,11 @@ use crate::downlink::transport::socket::{Listening, SocketError, SocketSink};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
 use crate::files::FolderLock;
 use crate::ground::{Ground, WAIT_BYTES};
-use crate::imaging::Method;
-use crate::imaging::SolveWatch;
+use crate::imaging::{KeptSums, Method, SolveWatch};
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
-use crate::products::{MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product};
+use crate::products::{
+    JOINT, MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product,
+};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
@@ -132,7 +134,7 @@ pub fn run_with_ranks(
     cancel: &Cancel,
     on_start: OnStart<'_>,
 ) -> Result<RunSummary, PipelineError> {
-    plan.config.require_shareable(ranks.share().count)?;
+    plan.config.require_shareable_run(ranks.share().count)?;
     let DownlinkConfig { link, rate_bits_per_s_max, .. } = &plan.config.downlink;
     if ranks.is_distributed() && (link.is_on() || *rate_bits_per_s_max > 0.0) {
         let found = "downlink.link with faults, or downlink.rate_bits_per_s_max";
@@ -164,13 +166,22 @@ pub fn run_with_ranks(
     let solving = SolveWatch::new(cancel.clone()).with_grace(grace.iterate);
     let ground =
         Ground::new(&plan.config.ground(WAIT_BYTES))?.with_cancel(cancel, grace.accumulate).with_ranks(ranks);
+    let kept = plan.config.joint.on.then(KeptSums::default);
+    let joint_sums = kept.clone();
+    let ground = if kept.is_some() { ground.with_placed_autos() } else { ground };
     let maps = MapWatch::default();
-    let mapping =
-        MappingContext { out, truth, watch: solving.clone(), viewers: maps.clone(), product_state: None };
+    let mapping = MappingContext {
+        out,
+        truth,
+        watch: solving.clone(),
+        viewers: maps.clone(),
+        product_state: None,
+        kept,
+    };
     let outcome = ground_segment::add(&mut graph, bytes, &plan.config, ground, mapping)?;
     let handles = RunView {
         metrics: graph.metrics(),
-        solving,
+        solving: solving.clone(),
         listening: None,
         ground: Some(outcome.ground.clone()),
         maps,
@@ -180,6 +191,9 @@ pub fn run_with_ranks(
     let report = start(graph, ranks, &plan.config.runtime, cancel)?;
     let samples = sample_summary(&counts, plan, &report)?;
     let finished = FinishedGraph { samples, ..FinishedGraph::new(report, outcome, None, cancel) };
+    if let Some(sums) = joint_sums {
+        return map_jointly(plan, out, finished, sums, (cancel, &solving));
+    }
     collect_and_write_summary(RunScope::Whole, ranks, &plan.config, out, finished)
 }
 
@@ -302,7 +316,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
     let maps = MapWatch::default();
     let products = is_service.then(ProductsWatch::default);
     let (viewers, product_state) = (maps.clone(), products.clone());
-    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, product_state };
+    let mapping = MappingContext { out, truth, watch: solving.clone(), viewers, product_state, kept: None };
     let outcome = ground_segment::add(&mut graph, bytes, config, ground, mapping)?;
     let handles = RunView {
         metrics: graph.metrics(),
@@ -331,6 +345,18 @@ impl Config {
             Method::Pixel | Method::MatrixFree => ("map.engine = \"pixel\"", "\"harmonic\""),
         };
         Err(PipelineError::NotShareable { found, expected })
+    }
+
+    /// Requires settings with which this number of ranks can share a whole run.
+    ///
+    /// # Errors
+    /// As [`Config::require_shareable`]; joint maps.
+    #[doc(hidden)]
+    pub fn require_shareable_run(&self, ranks: usize) -> Result<(), PipelineError> {
+        match self.joint.on && ranks > 1 {
+            true => Err(PipelineError::NotJoint { with: "--mpi" }),
+            false => self.require_shareable(ranks),
+        }
     }
 
     /// Resolution and processing of the maps, for a comparison with the input sky.
@@ -422,11 +448,11 @@ pub(in crate::pipeline) fn lock_folder(out: &Path) -> Result<FolderLock, Pipelin
     Ok(locked.map_err(ProductsError::write(out))?)
 }
 
-/// Whether a file lies in a channel's folder (`...MHz`) of `out`.
+/// Whether a file lies in a channel's folder (`...MHz`) of `out`, or of its joint maps.
 fn is_in_channel_folder(input: &Path, out: &Path) -> bool {
     let (Ok(input), Ok(out)) = (fs::canonicalize(input), fs::canonicalize(out)) else { return false };
     let Some(folder) = input.parent() else { return false };
-    folder.parent() == Some(out.as_path())
+    [&out, &out.join(JOINT)].into_iter().any(|products| folder.parent() == Some(products.as_path()))
         && folder.file_name().is_some_and(|name| name.to_string_lossy().ends_with("MHz"))
 }
 
@@ -519,6 +545,31 @@ fn collect_and_write_summary(
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
+}
+
+/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
+fn map_jointly(
+    plan: &Plan,
+    out: &Path,
+    finished: FinishedGraph,
+    sums: KeptSums,
+    (cancel, watch): (&Cancel, &SolveWatch),
+) -> Result<RunSummary, PipelineError> {
+    let placed = finished.outcome.ground.placed_autos.clone().unwrap_or_default();
+    let powers = std::mem::take(&mut *placed.lock().unwrap_or_else(PoisonError::into_inner));
+    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
+    if summary.cancelled || summary.channels.is_empty() {
+        return write_summary(summary, out);
+    }
+    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
+        Ok(found) => {
+            summary.cancelled = found.is_none();
+            summary.joint = found;
+            write_summary(summary, out)
+        }
+        // The maps of the channels are there.
+        Err(error) => write_summary(summary, out).and(Err(error)),
+    }
 }
 
 /// Collects the summary of a run, and writes the auto-correlations and gains.

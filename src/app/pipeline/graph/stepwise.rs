@@ -28,15 +28,16 @@ impl StepwiseRun {
     /// Makes the stages and the skies.
     ///
     /// # Errors
-    /// Samples, the ninth daughter, faults of the link or a refinement, for which `run` has more stages or files; those of `run`.
+    /// Samples, the ninth daughter, faults of the link, a refinement or joint maps, for which `run` has more stages or files; those of `run`.
     pub fn new(plan: &Plan) -> Result<Self, BoxError> {
         let config = &plan.config;
         if config.spacecraft.fidelity == Fidelity::Samples
             || config.spacecraft.ninth.on
             || config.downlink.link.is_on()
             || config.map.refine.is_on()
+            || config.joint.on
         {
-            let reason = "a run in steps has no samples, ninth daughter, link faults or refinement; expected none of these keys";
+            let reason = "a run in steps has no samples, ninth daughter, link faults, refinement or joint maps; expected none of these keys";
             return Err(reason.into());
         }
         let skies = skies(plan)?;

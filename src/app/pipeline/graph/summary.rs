@@ -17,7 +17,7 @@ use crate::downlink::transport::socket::ListenReport;
 use crate::frames::VisibilityReason;
 use crate::ground::SavingReport;
 use crate::pipeline::config::Config;
-use crate::products::{ChannelSummary, ProductsError, write_product};
+use crate::products::{ChannelSummary, JOINT, JointReport, ProductsError, write_product};
 use crate::runtime::{LedgerReport, Report, StageReport};
 
 /// Which part of the chain ran.
@@ -70,6 +70,9 @@ pub struct RunSummary {
     /// Bursts of point sources that were found; absent if there are none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub bursts: Option<BurstSummary>,
+    /// The joint maps; absent without any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub joint: Option<JointReport>,
     /// Throughput, times and queues of the stages; for the last reading, if the channels were mapped in groups.
     pub report: Report,
     /// Reports of the earlier readings.
@@ -105,6 +108,7 @@ impl RunSummary {
             saving: None,
             calibration: None,
             bursts: None,
+            joint: None,
             report,
             earlier_reports: Vec::new(),
         }
@@ -150,13 +154,10 @@ impl RunSummary {
             .map_err(|error| ProductsError::Encode { path: path.clone(), reason: error.to_string() })?;
         let previous = std::fs::read(&path).unwrap_or_default();
         write_product(&path, &text)?;
-        let ours: BTreeSet<&str> =
-            self.channels.iter().flat_map(|channel| &channel.files).map(String::as_str).collect();
+        let ours: BTreeSet<String> = product_files(&text).into_iter().collect();
         // If this run lacks maps, those of the previous run are kept.
         let is_complete = !self.lacks_maps();
-        for file in
-            product_files(&previous).iter().filter(|file| is_complete && !ours.contains(file.as_str()))
-        {
+        for file in product_files(&previous).iter().filter(|file| is_complete && !ours.contains(*file)) {
             let file = folder.join(file);
             // The file may no longer exist, and the folder may hold other files.
             let _ = std::fs::remove_file(&file);
@@ -250,12 +251,23 @@ fn file_checksum(path: &Path) -> std::io::Result<u64> {
     }
 }
 
-/// Files that a `summary.json` lists, restricted to the channels' folders, so that no other file can be removed.
+/// Files that a `summary.json` lists, restricted to the folders of channels and of joint maps, so that no other file can be removed.
 fn product_files(summary: &[u8]) -> Vec<String> {
     #[derive(Default, Deserialize)]
     #[serde(default)]
     struct Summary {
         channels: Vec<Channel>,
+        joint: Option<Joint>,
+    }
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct Joint {
+        maps: Vec<JointMap>,
+    }
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct JointMap {
+        folder: PathBuf,
     }
     #[derive(Default, Deserialize)]
     #[serde(default)]
@@ -268,7 +280,17 @@ fn product_files(summary: &[u8]) -> Vec<String> {
         let [folder, name] = parts[..] else { return false };
         folder.ends_with("MHz") && !name.is_empty() && !folder.contains('\\') && !name.contains('\\')
     };
-    summary.channels.into_iter().flat_map(|channel| channel.files).filter(is_product).collect()
+    let of_joint = |map: JointMap| {
+        let folder =
+            map.folder.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        ["map.fits", "map.png"].map(|name| format!("{folder}/{name}"))
+    };
+    let has_joint = summary.joint.is_some();
+    let maps = summary.joint.into_iter().flat_map(|joint| joint.maps).flat_map(of_joint);
+    let maps = maps.filter(is_product).map(|file| format!("{JOINT}/{file}"));
+    let others = ["spectra.fits", "joint.json"].into_iter().filter(|_| has_joint);
+    let of_channels = summary.channels.into_iter().flat_map(|channel| channel.files).filter(is_product);
+    of_channels.chain(maps).chain(others.map(|name| format!("{JOINT}/{name}"))).collect()
 }
 
 impl fmt::Display for RunSummary {
@@ -294,6 +316,9 @@ impl fmt::Display for RunSummary {
         writeln!(f, "Maps")?;
         for channel in &self.channels {
             writeln!(f, "{channel}")?;
+        }
+        if let Some(joint) = &self.joint {
+            writeln!(f, "\nJoint maps\n{joint}")?;
         }
         if self.lacks_maps() {
             write!(f, "Ended early, and maps are missing: runtime.grace_s left no time for them.")?;

@@ -369,6 +369,9 @@ pub(super) fn case_plan(
     model_files: Option<&Vec<PathBuf>>,
 ) -> Result<Plan, PipelineError> {
     let plan = source.load().map_err(PipelineError::from).and_then(Plan::new)?;
+    if plan.config.joint.on {
+        return Err(PipelineError::NotJoint { with: "a study" });
+    }
     if let Some(files) = model_files {
         check_frequencies(files, &plan.config.spacecraft.channels_hz)?;
     }

@@ -182,12 +182,7 @@ impl Ground {
         ground.advance(&mut out)?;
         ground.flush(&mut out)?;
         ground.accumulator.finish(&mut out)?;
-        let ephemeris = ground.calibrator.ephemeris();
-        let place = |power: AutoPower| {
-            Some((power, ephemeris.position_at(power.time_s, usize::from(power.daughter))?))
-        };
-        let powers = ground.calibrator.auto_powers().into_iter().filter_map(place).collect();
-        Ok((out.into_vec(), powers))
+        Ok((out.into_vec(), ground.placed_autos()))
     }
 
     /// Number of packets of visibilities in the archive.

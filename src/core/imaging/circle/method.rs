@@ -149,8 +149,10 @@ impl MapEquations for HarmonicSums {
             let settings = HarmonicRequest { epsilon, ..settings };
             beams = harmonic_beams(&self, settings, (&regulariser, w_max), &beam_pixels, watch)?;
         }
-        if !request.is_final {
-            *request.last = Some(unknowns);
+        match (&request.setup.kept, request.is_final) {
+            (_, false) => *request.last = Some(unknowns),
+            (Some(kept), true) => kept.keep(request.channel, request.nside, *self),
+            (None, true) => {}
         }
         Ok(Some(SolvedMap { map_k, noise_k, diagnostics, beams, refinement: None, uncertainty }))
     }

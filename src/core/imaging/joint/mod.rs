@@ -5,6 +5,7 @@
 //! them, and the spectral index of every pixel, each with errors. Total powers of the daughters, if there are any, take part as rows beside the
 //! visibilities (`powers`). No visibility is read again.
 
+mod config;
 mod disc;
 mod posterior;
 mod powers;
@@ -15,6 +16,7 @@ mod sums;
 #[cfg(test)]
 mod tests;
 
+pub use config::{JointConfig, PRIOR_PERCENT_MAX, SAMPLES_MAX};
 pub use posterior::{Agreement, JointMap, JointRequest};
 pub use powers::{PowerAgreement, PowerPriors, PowerSample};
 pub use prior::Correlation;

@@ -1,5 +1,7 @@
 //! The posterior of all channels: its mean, samples, and the maps of both; with total powers in rounds, in which their weights are found.
 
+use std::ops::RangeInclusive;
+
 use serde::Serialize;
 
 use super::powers::{PowerAgreement, PowerPriors, PowerRows, WeightedRows};
@@ -37,7 +39,7 @@ impl JointRequest {
     /// Checks the request against the frequencies of the channels, before minutes of work.
     ///
     /// # Errors
-    /// There is one channel without total powers, or two of one frequency; or a frequency is outside the range of the channels.
+    /// There is one channel without total powers, or two of one frequency; a frequency is outside the range of the channels.
     pub fn check(&self, channels_hz: &[f64], with_powers: bool) -> Result<(), SolveError> {
         let mut frequencies_hz = channels_hz.to_vec();
         frequencies_hz.sort_by(f64::total_cmp);
@@ -51,6 +53,18 @@ impl JointRequest {
         match self.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
             Some(&frequency_hz) => Err(SolveError::BeyondChannels { frequency_hz, ends_hz }),
             None => Ok(()),
+        }
+    }
+
+    /// Requires one constant of the total powers, or one for each of a number of channels in a range.
+    ///
+    /// # Errors
+    /// [`SolveError::PowerConstants`].
+    pub fn check_constants(&self, channels: RangeInclusive<usize>) -> Result<(), SolveError> {
+        let found = self.powers.as_ref().map_or(1, |priors| priors.constant_k_sr.len());
+        match found == 1 || channels.contains(&found) {
+            true => Ok(()),
+            false => Err(SolveError::PowerConstants { found, channels: *channels.end() }),
         }
     }
 }

@@ -62,6 +62,15 @@ pub struct PowerPriors {
     pub constant_k_sr: Vec<f64>,
 }
 
+impl PowerPriors {
+    /// Priors of gain, offset and slope in percent.
+    #[must_use]
+    pub fn of_percent(percent: [f64; 3], constant_k_sr: Vec<f64>) -> Self {
+        let [gain, offset, slope] = percent.map(|percent| percent / 100.0);
+        Self { gain, offset, slope, constant_k_sr }
+    }
+}
+
 /// How the powers of a channel take part in its map.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct PowerAgreement {

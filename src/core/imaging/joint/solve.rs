@@ -168,10 +168,8 @@ fn power_rows(
     request: &JointRequest,
 ) -> Result<Vec<Option<PowerRows>>, SolveError> {
     let Some(priors) = &request.powers else { return Ok(channels.iter().map(|_| None).collect()) };
+    request.check_constants(channels.len()..=channels.len())?;
     let constants = &priors.constant_k_sr;
-    if constants.len() != 1 && constants.len() != channels.len() {
-        return Err(SolveError::PowerConstants { found: constants.len(), channels: channels.len() });
-    }
     let of_channel = |channel: &JointChannel| {
         let below = channels.iter().filter(|other| other.frequency_hz < channel.frequency_hz).count();
         let constant_k_sr = constants[below.min(constants.len() - 1)];

@@ -120,7 +120,7 @@ pub enum SolveError {
     /// Total powers of antennas with a pattern.
     #[error(
         "{:.3} MHz: total powers of dipoles; expected isotropic antennas or three dipoles, as a pattern is not in the powers' rows: \
-         --no-powers leaves them out", frequency_hz / 1e6
+         --no-powers (joint.powers = false) leaves them out", frequency_hz / 1e6
     )]
     PowersOfDipoles {
         /// Frequency, Hz.
