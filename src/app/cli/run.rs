@@ -24,7 +24,7 @@ use crate::pipeline::{
 /// Without a pipeline file it runs the embedded quicklook: three channels over one precession period of the orbit, in
 /// about a minute. Writes, for each channel, snapshots as data arrive, the final map and a noise-only map (HEALPix FITS),
 /// and pictures of map, input and error; and the downlink file and summary.json. Ctrl-C ends it early, with maps of the
-/// data so far: runtime.grace_s limits the time for them.
+/// data so far: runtime.grace_s limits the time for them. With joint.on it ends with joint maps, unless it was ended early.
 ///
 /// Example: lunarray run pipelines/quicklook.toml --set map.nside=8 --out out/coarse
 #[derive(Debug, Args)]

@@ -339,6 +339,12 @@ mod tests {
             br#"{"channels": [{"files": ["3.000MHz/map.fits", "../MHz/x", "/MHz", "3.000MHz/../../x",
             "3.000MHz", "notes/x.txt"]}, {}], "more": 1}"#;
         assert_eq!(product_files(summary), ["3.000MHz/map.fits"]);
+        // The folders of joint maps are as the user wrote that of the run.
+        let summary =
+            br#"{"joint": {"maps": [{"folder": "a/b/joint/8.500MHz"}, {"folder": "../.."}, {"folder": "/etc"}]}}"#;
+        let expected =
+            ["joint/8.500MHz/map.fits", "joint/8.500MHz/map.png", "joint/spectra.fits", "joint/joint.json"];
+        assert_eq!(product_files(summary), expected);
         assert!(product_files(b"").is_empty() && product_files(b"[1]").is_empty());
     }
 }
