@@ -12,7 +12,9 @@ use crate::imaging::{
     KeptSums, Regulariser, RegulariserChoice, Solution, SolveWatch, Solver, SolverSetup, StoppingRule,
 };
 use crate::pipeline::config::{Config, PipelineError};
-use crate::products::{ChannelSummary, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth};
+use crate::products::{
+    ChannelSummary, MapShape, MapWatch, ProductsError, ProductsWatch, Provenance, Publisher, Truth,
+};
 use crate::runtime::{Graph, Link, Sink};
 use crate::sky::fits::read_prior;
 
@@ -34,6 +36,15 @@ impl Config {
             group: None,
             part: None,
         }
+    }
+
+    /// Resolution and processing of the maps, for a comparison with the input sky.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn map_shape(&self) -> MapShape {
+        let Self { map, products, .. } = self;
+        let l_max = map.is_harmonic().then(|| map.degree());
+        MapShape { nside: map.nside, l_max, processing: products.processing() }
     }
 
     /// Stopping rule of iterative solutions.

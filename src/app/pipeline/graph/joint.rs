@@ -2,11 +2,13 @@
 
 use std::path::Path;
 
+use super::run::{FinishedGraph, collect_summary, write_summary};
+use super::summary::{RunScope, RunSummary};
 use crate::frames::{AntennaResponse, AutoPower, Instrument};
 use crate::ground::GroundError;
 use crate::imaging::joint::{JointChannel, PowerSample, solve_jointly};
 use crate::imaging::{KeptSums, SolveError, SolveWatch};
-use crate::pipeline::config::{MemoryLimit, PipelineError, Plan};
+use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::products::{JOINT, JointReport, create_folder, write_joint};
 use crate::runtime::Cancel;
 use crate::units::vector::Vec3;
@@ -93,9 +95,9 @@ pub(in crate::pipeline) fn powers_of(
 }
 
 /// The data of joint maps that a run keeps.
-pub(in crate::pipeline) struct JointData {
-    pub(in crate::pipeline) sums: KeptSums,
-    pub(in crate::pipeline) powers: Vec<(AutoPower, Vec3)>,
+struct JointData {
+    sums: KeptSums,
+    powers: Vec<(AutoPower, Vec3)>,
 }
 
 impl JointData {
@@ -103,7 +105,7 @@ impl JointData {
     ///
     /// # Errors
     /// As [`solve_jointly`]; a file that cannot be written.
-    pub(in crate::pipeline) fn map(
+    fn map(
         self,
         plan: &Plan,
         out: &Path,
@@ -144,5 +146,43 @@ impl JointData {
         }
         let pictures = config.products.pictures.then_some(config.products.frame);
         Ok(Some(write_joint(&folder, &solved, request.powers, pictures)?))
+    }
+}
+
+/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
+pub(super) fn map_jointly(
+    plan: &Plan,
+    out: &Path,
+    finished: FinishedGraph,
+    sums: KeptSums,
+    (cancel, watch): (&Cancel, &SolveWatch),
+) -> Result<RunSummary, PipelineError> {
+    let powers = finished.take_placed_autos();
+    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
+    if summary.cancelled || summary.channels.is_empty() {
+        return write_summary(summary, out);
+    }
+    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
+        Ok(found) => {
+            summary.cancelled = found.is_none();
+            summary.joint = found;
+            write_summary(summary, out)
+        }
+        // The maps of the channels are there.
+        Err(error) => write_summary(summary, out).and(Err(error)),
+    }
+}
+
+impl Config {
+    /// Requires settings with which this number of ranks can share a whole run.
+    ///
+    /// # Errors
+    /// As [`Config::require_shareable`]; joint maps.
+    #[doc(hidden)]
+    pub fn require_shareable_run(&self, ranks: usize) -> Result<(), PipelineError> {
+        match self.joint.on && ranks > 1 {
+            true => Err(PipelineError::NotJoint { with: "--mpi" }),
+            false => self.require_shareable(ranks),
+        }
     }
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use std::{fs, io};
 
 use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
-use super::joint::JointData;
+use super::joint::map_jointly;
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -20,6 +20,7 @@ use crate::downlink::transport::socket::SocketSource;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
 use crate::files::FolderLock;
+use crate::frames::AutoPower;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::{KeptSums, Method, SolveWatch};
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
@@ -29,6 +30,7 @@ use crate::products::{
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
+use crate::units::vector::Vec3;
 
 /// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
@@ -346,27 +348,6 @@ impl Config {
         };
         Err(PipelineError::NotShareable { found, expected })
     }
-
-    /// Requires settings with which this number of ranks can share a whole run.
-    ///
-    /// # Errors
-    /// As [`Config::require_shareable`]; joint maps.
-    #[doc(hidden)]
-    pub fn require_shareable_run(&self, ranks: usize) -> Result<(), PipelineError> {
-        match self.joint.on && ranks > 1 {
-            true => Err(PipelineError::NotJoint { with: "--mpi" }),
-            false => self.require_shareable(ranks),
-        }
-    }
-
-    /// Resolution and processing of the maps, for a comparison with the input sky.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn map_shape(&self) -> MapShape {
-        let Self { map, products, .. } = self;
-        let l_max = map.is_harmonic().then(|| map.degree());
-        MapShape { nside: map.nside, l_max, processing: products.processing() }
-    }
 }
 
 /// The summary of samples; `None` without samples, or if stages were abandoned and may still be counting.
@@ -522,6 +503,14 @@ impl FinishedGraph {
         Self { report, outcome, listening, samples: None }
     }
 
+    /// Takes the total powers with their positions, if they were asked for.
+    pub(super) fn take_placed_autos(&self) -> Vec<(AutoPower, Vec3)> {
+        let placed = self.outcome.ground.placed_autos.as_ref();
+        placed.map_or_else(Vec::new, |placed| {
+            std::mem::take(&mut placed.lock().unwrap_or_else(PoisonError::into_inner))
+        })
+    }
+
     pub(in crate::pipeline) fn autocorrelation_count(&self) -> u64 {
         self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
     }
@@ -545,31 +534,6 @@ fn collect_and_write_summary(
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
-}
-
-/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
-fn map_jointly(
-    plan: &Plan,
-    out: &Path,
-    finished: FinishedGraph,
-    sums: KeptSums,
-    (cancel, watch): (&Cancel, &SolveWatch),
-) -> Result<RunSummary, PipelineError> {
-    let placed = finished.outcome.ground.placed_autos.clone().unwrap_or_default();
-    let powers = std::mem::take(&mut *placed.lock().unwrap_or_else(PoisonError::into_inner));
-    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
-    if summary.cancelled || summary.channels.is_empty() {
-        return write_summary(summary, out);
-    }
-    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
-        Ok(found) => {
-            summary.cancelled = found.is_none();
-            summary.joint = found;
-            write_summary(summary, out)
-        }
-        // The maps of the channels are there.
-        Err(error) => write_summary(summary, out).and(Err(error)),
-    }
 }
 
 /// Collects the summary of a run, and writes the auto-correlations and gains.
