@@ -15,6 +15,9 @@ use crate::frames::{AutoPower, VisibilityReason};
 use crate::runtime::Ledger;
 use crate::units::vector::Vec3;
 
+/// A total power, and where its daughter was, m.
+pub type PlacedPower = (AutoPower, Vec3);
+
 /// The results of the ground stage other than its sums. Clones share them; they are complete once the stage has finished.
 #[derive(Clone, Debug, Default)]
 pub struct GroundOutcome {
@@ -27,7 +30,7 @@ pub struct GroundOutcome {
     /// Auto-correlations, by channel, daughter and time.
     pub autos: Arc<Mutex<Vec<AutoPower>>>,
     /// Those with known positions, m, in the same order; `None` if nobody asked for them ([`Ground::with_placed_autos`](super::Ground)).
-    pub placed_autos: Option<Arc<Mutex<Vec<(AutoPower, Vec3)>>>>,
+    pub placed_autos: Option<Arc<Mutex<Vec<PlacedPower>>>>,
     /// The solved gains; `None` if gains are not solved for.
     pub gains: Option<SolvedGains>,
     /// The bursts of point sources found in any session.

@@ -24,9 +24,7 @@ use crate::frames::AutoPower;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::{KeptSums, Method, SolveWatch};
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
-use crate::products::{
-    JOINT, MapShape, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product,
-};
+use crate::products::{JOINT, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
