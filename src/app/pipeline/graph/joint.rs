@@ -2,8 +2,6 @@
 
 use std::path::Path;
 
-use super::run::{FinishedGraph, collect_summary, write_summary};
-use super::summary::{RunScope, RunSummary};
 use crate::frames::{AntennaResponse, AutoPower, Instrument};
 use crate::ground::GroundError;
 use crate::imaging::joint::{JointChannel, PowerSample, solve_jointly};
@@ -95,9 +93,9 @@ pub(in crate::pipeline) fn powers_of(
 }
 
 /// The data of joint maps that a run keeps.
-struct JointData {
-    sums: KeptSums,
-    powers: Vec<(AutoPower, Vec3)>,
+pub(super) struct JointData {
+    pub(super) sums: KeptSums,
+    pub(super) powers: Vec<(AutoPower, Vec3)>,
 }
 
 impl JointData {
@@ -105,7 +103,7 @@ impl JointData {
     ///
     /// # Errors
     /// As [`solve_jointly`]; a file that cannot be written.
-    fn map(
+    pub(super) fn map(
         self,
         plan: &Plan,
         out: &Path,
@@ -146,30 +144,6 @@ impl JointData {
         }
         let pictures = config.products.pictures.then_some(config.products.frame);
         Ok(Some(write_joint(&folder, &solved, request.powers, pictures)?))
-    }
-}
-
-/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
-pub(super) fn map_jointly(
-    plan: &Plan,
-    out: &Path,
-    finished: FinishedGraph,
-    sums: KeptSums,
-    (cancel, watch): (&Cancel, &SolveWatch),
-) -> Result<RunSummary, PipelineError> {
-    let powers = finished.take_placed_autos();
-    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
-    if summary.cancelled || summary.channels.is_empty() {
-        return write_summary(summary, out);
-    }
-    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
-        Ok(found) => {
-            summary.cancelled = found.is_none();
-            summary.joint = found;
-            write_summary(summary, out)
-        }
-        // The maps of the channels are there.
-        Err(error) => write_summary(summary, out).and(Err(error)),
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use std::{fs, io};
 
 use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
-use super::joint::map_jointly;
+use super::joint::JointData;
 use super::live_gains::GainsWriter;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
@@ -532,6 +532,30 @@ fn collect_and_write_summary(
     let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
     let ledger = outcome.ground.ledger.balanced_report()?;
     Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
+}
+
+/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
+fn map_jointly(
+    plan: &Plan,
+    out: &Path,
+    finished: FinishedGraph,
+    sums: KeptSums,
+    (cancel, watch): (&Cancel, &SolveWatch),
+) -> Result<RunSummary, PipelineError> {
+    let powers = finished.take_placed_autos();
+    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
+    if summary.cancelled || summary.channels.is_empty() {
+        return write_summary(summary, out);
+    }
+    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
+        Ok(found) => {
+            summary.cancelled = found.is_none();
+            summary.joint = found;
+            write_summary(summary, out)
+        }
+        // The maps of the channels are there.
+        Err(error) => write_summary(summary, out).and(Err(error)),
+    }
 }
 
 /// Collects the summary of a run, and writes the auto-correlations and gains.
