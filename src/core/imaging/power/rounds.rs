@@ -150,7 +150,7 @@ impl PowerProblem<'_> {
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
             if is_early {
-                rule = self.early_rule(&factors, factor, rule);
+                rule = early_rule(self.right, &factors, factor, rule);
             } else {
                 ratio = self.sampled_ratio(&regularisation, &factors, &ratio, watch);
             }
@@ -176,7 +176,8 @@ impl PowerProblem<'_> {
         }
     }
 
-    /// Estimates the power, then solves for the map and the noise map, from earlier ones of the same size if there are any.
+    /// Estimates the power, then solves for the map and the noise map, from earlier ones of the same size if there are any. Those of an
+    /// intermediate map stop when their error is a tenth of the map's posterior error.
     pub(in crate::imaging) fn solve_maps(
         &self,
         start: Option<&[Vec<f64>; 2]>,
@@ -194,7 +195,13 @@ impl PowerProblem<'_> {
         let mut columns = [found.solution.clone(), noise];
         let task = watch.start("map and noise map", rule.residual_max);
         let right = [self.right, self.sums.noise_right_hand_side()];
-        let convergence = system.solve(&right, &mut columns, &[rule, rule], &task);
+        let rules = if watch.has_priority() {
+            [rule; 2]
+        } else {
+            [(right[0], found.noise_factor()), (right[1], 1.0)]
+                .map(|(right, factor)| early_rule(right, &factors, factor, rule))
+        };
+        let convergence = system.solve(&right, &mut columns, &rules, &task);
         drop(task);
         Ok(MapsWithPower { found, columns, convergence })
     }
@@ -258,21 +265,6 @@ impl PowerProblem<'_> {
         })
     }
 
-    /// The stopping rule of an early solution: its error is a fraction of its posterior error, or as `rule` requires.
-    pub(in crate::imaging) fn early_rule(
-        &self,
-        factors: &Factors<'_>,
-        factor: f64,
-        rule: StoppingRule,
-    ) -> StoppingRule {
-        let mut solved = self.right.to_vec();
-        factors.solve(&mut solved);
-        // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
-        let posterior_error = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
-        // At least a tenth of the map, for any noise.
-        StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
-    }
-
     /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.
     pub(in crate::imaging) fn sampled_ratio(
         &self,
@@ -308,4 +300,20 @@ impl PowerProblem<'_> {
         };
         (0..traces.len()).map(of_degree).collect()
     }
+}
+
+/// The stopping rule of an early solution for `right`, or of an intermediate map: its error is a fraction of its posterior error, or as `rule`
+/// requires. `factor` is the scatter of the data in units of their noise.
+pub(in crate::imaging) fn early_rule(
+    right: &[f64],
+    factors: &Factors<'_>,
+    factor: f64,
+    rule: StoppingRule,
+) -> StoppingRule {
+    let mut solved = right.to_vec();
+    factors.solve(&mut solved);
+    // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
+    let posterior_error = factor * (right.len() as f64 / dot(right, &solved)).sqrt();
+    // At least a tenth of the map, for any noise.
+    StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
 }

@@ -83,6 +83,8 @@ impl Picture {
         let mut encoder = png::Encoder::new(&mut bytes, self.width as u32, self.height as u32);
         encoder.set_color(png::ColorType::Rgb);
         encoder.set_depth(png::BitDepth::Eight);
+        // Pictures of snapshots are written while maps are solved: speed counts more than size.
+        encoder.set_compression(png::Compression::Fast);
         encoder.set_source_srgb(png::SrgbRenderingIntent::Perceptual);
         for (keyword, text) in &self.texts {
             encoder.add_itxt_chunk(keyword.clone(), text.clone())?;

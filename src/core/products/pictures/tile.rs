@@ -21,6 +21,7 @@ pub fn tile_png(scale: &ColourScale, width: usize, values: &[f32]) -> Result<Vec
     let mut encoder = png::Encoder::new(&mut bytes, width as u32, (values.len() / width) as u32);
     encoder.set_color(png::ColorType::Rgba);
     encoder.set_depth(png::BitDepth::Eight);
+    encoder.set_compression(png::Compression::Fast);
     let written = encoder.write_header().and_then(|mut writer| {
         writer.write_image_data(&pixels)?;
         writer.finish()
