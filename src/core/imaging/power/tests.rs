@@ -317,6 +317,54 @@ fn rounds_converge_to_the_result_of_the_exact_matrix() {
     }
 }
 
+/// An intermediate map is within a tenth of its posterior error of the exact solution; a final one is solved further.
+#[test]
+fn an_intermediate_map_stops_at_a_tenth_of_its_error() {
+    let a = random_normal(13, 2 * ORDER);
+    let (right, _) = observed(&a, &power(40.0), &mut normal(14));
+    let (degrees, blocks) = (degrees(), pairs(&a));
+    let sums = Dense { matrix: a.clone(), right: right.clone() };
+    let problem = PowerProblem {
+        sums: &sums,
+        blocks: &blocks,
+        degrees: &degrees,
+        right: &right,
+        power: 0.0,
+        numbers: 1.0,
+    };
+    let rule = StoppingRule { residual_max: 1e-8, iterations_max: 400 };
+    let watch = SolveWatch::default();
+    let maps = |is_final| {
+        let watch = watch.named("test").with_priority(is_final);
+        let found = problem.solve_maps(None, rule, watch).unwrap();
+        let r = |i: usize| found.found.regularisation[degrees[i]];
+        let whole = Mat::from_fn(ORDER, ORDER, |i, j| a[(i, j)] + if i == j { r(i) } else { 0.0 });
+        let inverse = whole.llt(Side::Lower).unwrap().inverse();
+        // The rule is in the norm of the blocks: at worst they are this much larger than the matrix.
+        let block = |i: usize, j: usize| if i / 2 == j / 2 { whole[(i, j)] } else { 0.0 };
+        let root = Mat::from_fn(ORDER, ORDER, block).llt(Side::Lower).unwrap();
+        let ratio = (root.L().transpose() * &inverse * root.L()).self_adjoint_eigen(Side::Lower).unwrap();
+        let largest = ratio.S().column_vector()[ORDER - 1];
+        let exact = |i: usize| (0..ORDER).map(|j| inverse[(i, j)] * right[j]).sum::<f64>();
+        let errors = found.columns.map(|column| {
+            let off: Vec<f64> = (0..ORDER).map(|i| column[i] - exact(i)).collect();
+            let square: f64 =
+                (0..ORDER).map(|i| (0..ORDER).map(|j| off[i] * whole[(i, j)] * off[j]).sum::<f64>()).sum();
+            (square / (largest * ORDER as f64)).sqrt()
+        });
+        (errors, found.convergence)
+    };
+    let ([map, noise], early) = maps(false);
+    assert!(map < 0.1 && noise < 0.1, "{map} {noise}");
+    let ([map, noise], last) = maps(true);
+    // 1e-8 of a map of some hundred times its error.
+    assert!(map < 1e-5 && noise < 1e-5, "{map} {noise}");
+    for (early, last) in early.iter().zip(&last) {
+        assert!(early.converged && last.converged && early.residual > 1e-6, "{early:?} {last:?}");
+        assert!(early.iterations < last.iterations, "{early:?} {last:?}");
+    }
+}
+
 #[test]
 fn the_variance_beyond_is_that_of_pixels_of_a_falling_sky() {
     const NSIDE: usize = 4;
