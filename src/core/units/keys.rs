@@ -23,8 +23,8 @@ pub struct Key {
     pub level: Level,
     /// Its description, line by line.
     pub about: &'static [&'static str],
-    /// The condition under which it has an effect: comparisons of keys, joined by ` or ` and ` and `; empty if it always has one. A key that
-    /// begins with a dot is of the same section.
+    /// The condition under which it has an effect: comparisons of keys, joined by ` or ` and ` and `, which binds tighter; empty if it always
+    /// has one. A key that begins with a dot is of the same section.
     pub only_with: &'static str,
     /// The default; `None` for a key that is absent by default.
     pub default: fn() -> Option<toml::Value>,

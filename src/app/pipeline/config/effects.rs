@@ -45,7 +45,7 @@ pub fn condition_text(condition: &str) -> String {
             None => String::new(),
         },
         (None, Some(rest)) => format!("without {}", rest.replace(" or ", " or with ")),
-        (None, None) => format!("with {condition}"),
+        (None, None) => format!("with {}", condition.replace(" and no ", " and without ")),
     }
 }
 
@@ -99,10 +99,10 @@ fn value_of<'a>(table: &'a Table, path: &str) -> Option<&'a Value> {
     }
 }
 
-/// Whether a condition holds: of each part (joined by `and`) any comparison (joined by `or`): `key = value`, `key > number`, a key alone,
-/// which is true if the key differs from its default, or `no` and a key, if it does not.
+/// Whether a condition holds: of any part (joined by `or`) all comparisons (joined by `and`): `key = value`, `key > number`, a key alone, which
+/// is true if the key differs from its default, or `no` and one of them, if it does not hold.
 fn holds(condition: &str, set: &Table, keys: &[FlatKey]) -> bool {
-    condition.split(" and ").all(|part| part.split(" or ").any(|comparison| is_true(comparison, set, keys)))
+    condition.split(" or ").any(|part| part.split(" and ").all(|comparison| is_true(comparison, set, keys)))
 }
 
 fn is_true(comparison: &str, set: &Table, keys: &[FlatKey]) -> bool {
@@ -161,8 +161,20 @@ mod tests {
             (
                 "map.iterations_max = 7",
                 "map.iterations_max = 7 has an effect only with map.engine = \"harmonic\" or map.matrix = \"free\" or \
-                 map.regulariser or map.nside > 32",
+                 map.regulariser.degree or map.regulariser.file or map.nside > 32 and without map.epsilon and without \
+                 map.regulariser = \"identity\"",
             ),
+            // Solved directly: R from the data of few pixels, and the identity of any.
+            (
+                "map = { residual_max = 1e-6, regulariser = \"data\", nside = 32 }",
+                "or map.nside > 32 and without map.epsilon and without map.regulariser = \"identity\"",
+            ),
+            ("map = { residual_max = 1e-6, regulariser = \"identity\" }", "map.regulariser = \"identity\""),
+            (
+                "map = { residual_max = 1e-6, regulariser = \"identity\", nside = 64 }",
+                "map.regulariser = \"identity\"",
+            ),
+            ("map = { iterations_max = 7, epsilon = 1e-3, nside = 64 }", "map.regulariser = \"identity\""),
             (
                 "daughters.bits = 2",
                 "daughters.bits = 2 has an effect only with spacecraft.fidelity = \"samples\"",
@@ -240,6 +252,11 @@ mod tests {
             "map.l_max = 0",
             "map.matrix = \"free\"\nmap.iterations_max = 7",
             "map.engine = \"pixel\"\nmap.nside = 64\nmap.iterations_max = 7",
+            "map = { nside = 64, residual_max = 1e-6, regulariser = \"data\" }",
+            "map = { residual_max = 1e-6, regulariser = { degree = 2.0 }, epsilon = 1e-3 }",
+            "map = { residual_max = 1e-6, regulariser = { file = [\"cl.csv\"] } }",
+            "map = { residual_max = 1e-6, regulariser = \"identity\", matrix = \"free\" }",
+            "map = { residual_max = 1e-6, epsilon = 1e-3, engine = \"harmonic\" }",
             "map.engine = \"harmonic\"\nmap.l_max = 10\nmap.refine = { passes_max = 3, residual_max = 0.1 }",
             format!("array = {{ {ORBITS}, altitude_m = 300e3, moon_radius_m = 1.7e6 }}").as_str(),
         ] {
@@ -267,7 +284,11 @@ mod tests {
         for comparison in conditions.flat_map(|only| only.split(" and ")).flat_map(|part| part.split(" or "))
         {
             let words: Vec<&str> = comparison.strip_prefix("no ").unwrap_or(comparison).split(' ').collect();
-            assert!(keys.iter().any(|key| key.path == words[0]), "{comparison}");
+            // The choice of a regulariser is a value with a name of its own.
+            let of_key = |key: &FlatKey| {
+                words[0].strip_prefix(&key.path).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+            };
+            assert!(keys.iter().any(of_key), "{comparison}");
             assert!(matches!(words[1..], [] | ["=" | ">", _]), "{comparison}");
         }
     }

@@ -152,10 +152,16 @@ keys! {
         expert companion_seed: u64 = 1;
         /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm. With R from the data
         /// an intermediate map stops earlier, when its error is a tenth of its posterior error.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser or map.nside > 32"#)]
+        #[only_with(
+            "map.engine = \"harmonic\" or map.matrix = \"free\" or map.regulariser.degree or map.regulariser.file or \
+             map.nside > 32 and no map.epsilon and no map.regulariser = \"identity\""
+        )]
         expert residual_max: f64 = 1e-4;
         /// Maximum number of iterations of a solution.
-        #[only_with(r#"map.engine = "harmonic" or map.matrix = "free" or map.regulariser or map.nside > 32"#)]
+        #[only_with(
+            "map.engine = \"harmonic\" or map.matrix = \"free\" or map.regulariser.degree or map.regulariser.file or \
+             map.nside > 32 and no map.epsilon and no map.regulariser = \"identity\""
+        )]
         expert iterations_max: usize = 300;
         /// Random probes for the traces of a final map's covariances; 0 for no traces. Up to 3072 unknowns (nside 16, or l_max
         /// 54) traces are exact, with any number above 0.
