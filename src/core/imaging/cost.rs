@@ -134,7 +134,9 @@ mod tests {
         assert!(six > 6.0 * one, "{six} {one}");
         assert!(of(&map, 17.0, 1).solving_s > of(&map, 200.0, 1).solving_s);
         // Without a matrix, a map of half the data takes half the time of a product.
-        let free = MapConfig { matrix: MatrixKind::Free, iterations_max: 1, ..MapConfig::default() };
+        let regulariser = Some(RegulariserChoice::Identity);
+        let free =
+            MapConfig { matrix: MatrixKind::Free, iterations_max: 1, regulariser, ..MapConfig::default() };
         let [one, two] = [1, 2].map(|solutions| of(&free, 1e6, solutions).solving_s);
         assert!((two / one - 1.5).abs() < 1e-9);
     }

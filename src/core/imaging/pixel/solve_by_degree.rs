@@ -237,6 +237,8 @@ impl Problem<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
@@ -244,6 +246,7 @@ mod tests {
     use crate::imaging::pixel::solve_with_power::solve_pixels_with_power;
     use crate::imaging::pixel::{ColumnBlock, PixelSums, SymmetricTiles};
     use crate::imaging::{Samples, SolveWatch, StoppingRule, SumCounts};
+    use crate::runtime::Cancel;
     use crate::sky::healpix::{pixel_count, pixel_directions};
     use crate::units::vector::dot as along;
     use crate::units::{StreamKind, random_stream};
@@ -303,5 +306,28 @@ mod tests {
         // Rounds end when no knot of ln C_l changes by 0.1: the map changes by less than a tenth of its error, and sigma, which is by latitude
         // from few draws here, by less than a fifth.
         assert!(apart < 0.1 && (ratio - 1.0).abs() < 0.2, "{apart} {ratio}");
+    }
+
+    /// Where no time is left for a step there is no map, and a map from an earlier solution has no beams rather than beams of zeros.
+    #[test]
+    fn without_a_step_there_are_neither_maps_nor_beams() {
+        let nside = 4;
+        let sums = sums(nside, 100);
+        let equations = PixelEquations { sums: &sums, blocks: &averaged_blocks(&sums) };
+        let rule = StoppingRule { residual_max: 1e-6, iterations_max: 500 };
+        let request = HarmonicRequest { epsilon: 1e-3, nside, rule, samples: Samples::default(), probes: 0 };
+        let solve = |watch: &SolveWatch, start: Option<&[Vec<f64>; 2]>| {
+            equations.solve(request, &Regulariser::Power(2.0), None, start, &[5], watch.named("beams"))
+        };
+        let solved = solve(&SolveWatch::default(), None).unwrap();
+        let [beam] = &solved.solution.beams[..] else { panic!("{} beams", solved.solution.beams.len()) };
+        assert!(beam.pixel == 5 && beam.map_k[5] > 0.0);
+        let cancel = Cancel::new();
+        cancel.cancel();
+        let expired = SolveWatch::new(cancel).with_grace(Duration::ZERO);
+        assert!(matches!(solve(&expired, None), Err(SolveError::Interrupted)));
+        let hurried = solve(&expired, Some(&solved.unknowns)).unwrap();
+        assert!(hurried.solution.map_k.iter().any(|k| *k != 0.0));
+        assert!(hurried.solution.beams.is_empty());
     }
 }
