@@ -15,10 +15,10 @@ use crate::sky::healpix::pixel_count;
 /// Iterations without a matrix in units of those of the harmonic engine, whose preconditioner they lack: 55 to 90 with 31 windows.
 const FREE_ITERATIONS: f64 = 2.0;
 
-/// Products of a final map with R from the data (rounds for the sky's power with draws, the map, its noise map and errors) by frequency, MHz: the
-/// longer the shortest baselines are in wavelengths, the longer the first round takes. With the default array, from 17 and 121 windows, 73 at
-/// 1 MHz, 130 to 250 at 3, 306 at 5, 664 at 7, 816 to 992 at 10 and 1507 at 30 MHz (nside 8; 149 at nside 16 and 3 MHz). No solution of a
-/// round exceeds `map.iterations_max`.
+/// Products of a final map with R from the data (rounds for the sky's power with draws, the map, its noise map and errors) by frequency,
+/// MHz: the longer the shortest baselines are in wavelengths, the longer the first round takes. With the default array, from 17 and 121
+/// windows at nside 8: 73 at 1 MHz, 130 to 250 at 3, 306 at 5, 664 at 7, 816 to 992 at 10 and 1507 at 30 MHz; at nside 16: 149 and 270 at 3,
+/// 898 and 1080 at 10 MHz. No solution of a round exceeds `map.iterations_max`.
 const DATA_PRODUCTS_BY_MHZ: f64 = 70.0;
 const DATA_SOLUTIONS_MAX: f64 = 5.0;
 
@@ -182,7 +182,8 @@ mod tests {
         }
     }
 
-    /// The archive of a mission over a precession, baselines up to 2 b_p, with the noise of a receiver under this sky, and its number of windows.
+    /// The archive of a mission over a precession, with baselines up to 2 b_p and the noise of a receiver under this sky, and its number of
+    /// windows.
     fn observed(map: &MapConfig, frequency_hz: f64) -> (VisibilityArchive, usize) {
         let array = Array::new(&ArrayConfig::default()).unwrap();
         let sky = generate(&GeneratedSky::default(), frequency_hz, SKY_NSIDE, 5).unwrap();
