@@ -23,13 +23,19 @@ keys! {
         #[only_with(".on = true")]
         expert count: u64 = 16;
         /// Fit the daughters' total powers, too.
-        #[only_with(r#".on = true and spacecraft.auto_powers = true or spacecraft.fidelity = "samples""#)]
+        #[only_with(r#".on = true and spacecraft.auto_powers = true or .on = true and spacecraft.fidelity = "samples""#)]
         expert powers: bool = true;
         /// Standard deviations of gain, offset and slope of a power over a pass, percent of the power.
-        #[only_with(r#".on = true and spacecraft.auto_powers = true or spacecraft.fidelity = "samples" and .powers = true"#)]
+        #[only_with(
+            ".on = true and .powers = true and spacecraft.auto_powers = true or \
+             .on = true and .powers = true and spacecraft.fidelity = \"samples\""
+        )]
         expert power_priors_percent: [f64; 3] = [10.0, 1.0, 1.0];
         /// Part of the powers that is not the sky, receiver noise and the Moon's emission: one value, or one for each channel.
-        #[only_with(r#".on = true and spacecraft.auto_powers = true or spacecraft.fidelity = "samples" and .powers = true"#)]
+        #[only_with(
+            ".on = true and .powers = true and spacecraft.auto_powers = true or \
+             .on = true and .powers = true and spacecraft.fidelity = \"samples\""
+        )]
         expert power_constant_k_sr: PerChannel<f64> = PerChannel::All(0.0);
     }
 }
