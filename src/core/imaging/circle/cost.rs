@@ -9,11 +9,8 @@ use crate::imaging::{MapConfig, Method, RegulariserChoice};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 
 /// Products of a final map with R from the data in units of those with a given R: rounds for the sky's power, its errors and their samples.
+/// Intermediate maps take about as many as with a given R.
 const DATA_PRODUCTS: f64 = 2.0;
-
-/// The same for an intermediate map, which stops early: from the processor time of the quicklook's 15, whose noise maps took twice as many
-/// products to the end.
-const DATA_INTERMEDIATE: f64 = 0.5;
 
 /// Maps with products of their own in each iteration: the map and its noise map.
 const SOLVED: f64 = 2.0;
@@ -99,9 +96,8 @@ pub(in crate::imaging) fn harmonic_cost(map: &MapConfig, data: ChannelData) -> E
         |fraction: f64| ITERATIONS + SOLVED * iterations(fraction * windows).min(map.iterations_max as f64);
     let [intermediate, last] = over_maps(data, of_map);
     let from_data = map.regulariser() == RegulariserChoice::Data;
-    let [of_intermediate, of_last] = if from_data { [DATA_INTERMEDIATE, DATA_PRODUCTS] } else { [1.0; 2] };
-    let products = of_intermediate * intermediate
-        + of_last * last
+    let products = intermediate
+        + if from_data { DATA_PRODUCTS } else { 1.0 } * last
         + map.trace_probes as f64 * PROBE_APPLICATIONS
         // A beam takes half as many as the map and its noise map.
         + 0.5 * last * map.beams_deg.len() as f64;

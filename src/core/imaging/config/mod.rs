@@ -150,8 +150,7 @@ keys! {
         expert weight_max: f64 = 0.0;
         /// Seed of the noise-only companion map.
         expert companion_seed: u64 = 1;
-        /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm. With R from the data
-        /// an intermediate map stops earlier, when its error is a tenth of its posterior error.
+        /// Residual at which an iterative solution stops, relative to the right-hand side, in the preconditioner's norm.
         #[only_with(
             "map.engine = \"harmonic\" or map.matrix = \"free\" or map.regulariser.degree or map.regulariser.file or \
              map.nside > 32 and no map.epsilon and no map.regulariser = \"identity\""

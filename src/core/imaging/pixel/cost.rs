@@ -22,7 +22,7 @@ const FREE_ITERATIONS: f64 = 2.0;
 const DATA_PRODUCTS_BY_MHZ: f64 = 70.0;
 const DATA_SOLUTIONS_MAX: f64 = 5.0;
 
-/// Fraction of them that an intermediate map takes, which has no draws: 55 to 70 products at 3 MHz, with its noise map solved to the end.
+/// Fraction of them that an intermediate map takes, which has no draws: 55 to 70 products at 3 MHz.
 const DATA_INTERMEDIATE: f64 = 0.35;
 
 /// Multiply-adds of a dense solution with R from the data in units of the cube of the number of pixels, and full matrices that it holds.

@@ -150,7 +150,7 @@ impl PowerProblem<'_> {
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
             if is_early {
-                rule = early_rule(self.right, &factors, factor, rule);
+                rule = self.early_rule(&factors, factor, rule);
             } else {
                 ratio = self.sampled_ratio(&regularisation, &factors, &ratio, watch);
             }
@@ -176,8 +176,8 @@ impl PowerProblem<'_> {
         }
     }
 
-    /// Estimates the power, then solves for the map and the noise map, from earlier ones of the same size if there are any. Those of an
-    /// intermediate map stop when their error is a tenth of the map's posterior error.
+    /// Estimates the power, then solves for the map and the noise map, from earlier ones of the same size if there are any. The noise
+    /// map of an intermediate map has the map's absolute accuracy.
     pub(in crate::imaging) fn solve_maps(
         &self,
         start: Option<&[Vec<f64>; 2]>,
@@ -195,12 +195,7 @@ impl PowerProblem<'_> {
         let mut columns = [found.solution.clone(), noise];
         let task = watch.start("map and noise map", rule.residual_max);
         let right = [self.right, self.sums.noise_right_hand_side()];
-        let rules = if watch.has_priority() {
-            [rule; 2]
-        } else {
-            [(right[0], found.noise_factor()), (right[1], 1.0)]
-                .map(|(right, factor)| early_rule(right, &factors, factor, rule))
-        };
+        let rules = [rule, if watch.has_priority() { rule } else { noise_rule(right, &factors, rule) }];
         let convergence = system.solve(&right, &mut columns, &rules, &task);
         drop(task);
         Ok(MapsWithPower { found, columns, convergence })
@@ -265,6 +260,21 @@ impl PowerProblem<'_> {
         })
     }
 
+    /// The stopping rule of an early solution: its error is a fraction of its posterior error, or as `rule` requires.
+    pub(in crate::imaging) fn early_rule(
+        &self,
+        factors: &Factors<'_>,
+        factor: f64,
+        rule: StoppingRule,
+    ) -> StoppingRule {
+        let mut solved = self.right.to_vec();
+        factors.solve(&mut solved);
+        // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
+        let posterior_error = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
+        // At least a tenth of the map, for any noise.
+        StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
+    }
+
     /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.
     pub(in crate::imaging) fn sampled_ratio(
         &self,
@@ -302,18 +312,19 @@ impl PowerProblem<'_> {
     }
 }
 
-/// The stopping rule of an early solution for `right`, or of an intermediate map: its error is a fraction of its posterior error, or as `rule`
-/// requires. `factor` is the scatter of the data in units of their noise.
-pub(in crate::imaging) fn early_rule(
-    right: &[f64],
-    factors: &Factors<'_>,
-    factor: f64,
-    rule: StoppingRule,
-) -> StoppingRule {
-    let mut solved = right.to_vec();
-    factors.solve(&mut solved);
-    // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
-    let posterior_error = factor * (right.len() as f64 / dot(right, &solved)).sqrt();
-    // At least a tenth of the map, for any noise.
-    StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
+/// Largest relative residual of an intermediate noise map.
+const NOISE_RESIDUAL_MAX: f64 = 0.1;
+
+/// The stopping rule of an intermediate noise map, the second of two right-hand sides: a residual as large as that of the map, which is relative
+/// to a much larger right-hand side.
+fn noise_rule([map, noise]: [&[f64]; 2], factors: &Factors<'_>, rule: StoppingRule) -> StoppingRule {
+    let square = |right: &[f64]| {
+        let mut solved = right.to_vec();
+        factors.solve(&mut solved);
+        dot(right, &solved)
+    };
+    let ratio = (square(map) / square(noise)).sqrt();
+    // Without noise, or with a preconditioner that is not positive definite, it is not a number.
+    let residual_max = if ratio.is_finite() { rule.residual_max * ratio } else { rule.residual_max };
+    StoppingRule { residual_max: residual_max.min(NOISE_RESIDUAL_MAX).max(rule.residual_max), ..rule }
 }
