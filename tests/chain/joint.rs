@@ -167,12 +167,13 @@ fn joint_maps_that_cannot_be_made_are_refused() {
     };
     refused(&["--groups", "1"], "--groups: found joint.on = true, expected false; `lunarray joint`");
     refused(&["--set", "joint.at_hz=[12MHz]"], "between 5.000 and 7.000 MHz");
+    refused(&["--set", "joint.at_hz=[5.0002MHz]"], "at 5000000 and 5000200 Hz would have one folder");
     refused(&["--set", "joint.count=1"], "joint.count = 1: expected 2 to 1000");
     refused(&["--set", "joint.power_constant_k_sr=[1.0, 2.0]"], "one value, or 3, one for each channel");
     refused(&["--set", "joint.on=false"], "joint.count = 3 has an effect only with joint.on = true");
     refused(
         &["--set", "spacecraft.auto_powers=false"],
-        "has an effect only with spacecraft.auto_powers = true",
+        "has an effect only with joint.on = true and joint.powers = true and spacecraft.auto_powers = true or",
     );
     refused(&["--set", "spacecraft.antenna='dipole-normal'"], "total powers of dipoles");
     refused(
@@ -180,6 +181,7 @@ fn joint_maps_that_cannot_be_made_are_refused() {
         "joint.on = true has an effect only with map.engine = \"harmonic\"",
     );
     refused(&["--set", "map.refine.passes_max=2"], "joint.on = true has an effect only");
+    refused(&["--set", "map.moon_reflection=0.07"], "joint.on = true has an effect only");
     let one = few_windows("[joint]\non = true\npowers = false");
     let said = fail(&["run", &one.pipeline, "--set", "map.channels=[1]", "--out", &one.path("one")]);
     assert!(said.contains("[joint]: a joint map of 1 channels"), "{said}");

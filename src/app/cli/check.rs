@@ -92,7 +92,7 @@ fn checked(args: &CheckArgs) -> Result<(Plan, Cost), CommandError> {
     plan.config.require_shareable_run(ranks)?;
     if plan.config.joint.on {
         print_notes([
-            "joint maps are not in the estimates of memory and run time; sums that memory does not hold then go to disk, in OUT/joint",
+            "joint maps are not in the estimates of memory and run time; sums that the machine's memory does not hold then go to disk, in OUT/joint",
         ]);
     }
     print_notes(sky_notes(&plan)?);

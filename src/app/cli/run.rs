@@ -22,7 +22,7 @@ use crate::pipeline::{
 /// Run the whole chain: sky, spacecraft, downlink, ground segment, maps.
 ///
 /// Without a pipeline file it runs the embedded quicklook: three channels over one precession period of the orbit, in
-/// about a minute. Writes, for each channel, snapshots as data arrive, the final map and a noise-only map (HEALPix FITS),
+/// half a minute. Writes, for each channel, snapshots as data arrive, the final map and a noise-only map (HEALPix FITS),
 /// and pictures of map, input and error; and the downlink file and summary.json. Ctrl-C ends it early, with maps of the
 /// data so far: runtime.grace_s limits the time for them. With joint.on it ends with joint maps, unless it was ended early.
 ///

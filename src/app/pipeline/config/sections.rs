@@ -54,7 +54,9 @@ keys! {
         /// How maps are made.
         section map: MapConfig = MapConfig::default();
         /// Joint maps of the channels at the end of `lunarray run`.
-        #[only_with(r#"map.engine = "harmonic" and no map.refine.passes_max"#)]
+        #[only_with(
+            "map.engine = \"harmonic\" and no map.refine.passes_max and no map.moon_reflection and no map.prior_k and no map.prior_files"
+        )]
         section joint: JointConfig = JointConfig::default();
         /// Products besides the maps.
         section products: ProductsConfig = ProductsConfig::default();

@@ -131,17 +131,26 @@ impl JointData {
         let limit = MemoryLimit::of_machine().map(|limit| MemoryLimit { bytes: limit.bytes + held, ..limit });
         let mut kept = KeptChannels::new(SumsPlace { limit, folder: &folder }, 0);
         for (channel, nside, sums) in sums {
+            if cancel.is_cancelled() {
+                return Ok(None);
+            }
             let frequency_hz = frequency_hz(channel);
             let powers = match request.powers {
                 Some(_) => powers_of(&self.powers, instrument, frequency_hz)?,
                 None => Vec::new(),
             };
-            kept.keep(JointChannel::new((frequency_hz, nside), sums, powers, request.rule, watch)?)?;
+            let channel = JointChannel::new((frequency_hz, nside), sums, powers, request.rule, watch);
+            // A solution that was cut short may fail.
+            if cancel.is_cancelled() {
+                return Ok(None);
+            }
+            kept.keep(channel?)?;
         }
-        let solved = solve_jointly(kept.channels, &request, watch)?;
+        let solved = solve_jointly(kept.channels, &request, watch);
         if cancel.is_cancelled() {
             return Ok(None);
         }
+        let solved = solved?;
         let pictures = config.products.pictures.then_some(config.products.frame);
         Ok(Some(write_joint(&folder, &solved, request.powers, pictures)?))
     }

@@ -547,13 +547,14 @@ fn map_jointly(
     if summary.cancelled || summary.channels.is_empty() {
         return write_summary(summary, out);
     }
+    // The maps of the channels are there, whatever becomes of the joint ones; those of an earlier run go.
+    summary.write(out)?;
     match (JointData { sums, powers }).map(plan, out, cancel, watch) {
         Ok(found) => {
             summary.cancelled = found.is_none();
             summary.joint = found;
             write_summary(summary, out)
         }
-        // The maps of the channels are there.
         Err(error) => write_summary(summary, out).and(Err(error)),
     }
 }

@@ -322,6 +322,8 @@ impl fmt::Display for RunSummary {
         }
         if self.lacks_maps() {
             write!(f, "Ended early, and maps are missing: runtime.grace_s left no time for them.")?;
+        } else if self.cancelled && !self.report.cancelled {
+            write!(f, "Ended early, without joint maps: all other products are complete.")?;
         } else if self.cancelled {
             write!(f, "Ended early: all products hold the data so far.")?;
         }

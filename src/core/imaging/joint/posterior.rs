@@ -39,7 +39,8 @@ impl JointRequest {
     /// Checks the request against the frequencies of the channels, before minutes of work.
     ///
     /// # Errors
-    /// There is one channel without total powers, or two of one frequency; a frequency is outside the range of the channels.
+    /// There is one channel without total powers, or two of one frequency; a frequency is outside the range of the channels, or nearly that of
+    /// another map.
     pub fn check(&self, channels_hz: &[f64], with_powers: bool) -> Result<(), SolveError> {
         let mut frequencies_hz = channels_hz.to_vec();
         frequencies_hz.sort_by(f64::total_cmp);
@@ -50,8 +51,16 @@ impl JointRequest {
             return Err(SolveError::FewChannels { channels, frequencies });
         }
         let ends_hz = [frequencies_hz[0], frequencies_hz[frequencies - 1]];
-        match self.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
-            Some(&frequency_hz) => Err(SolveError::BeyondChannels { frequency_hz, ends_hz }),
+        if let Some(&frequency_hz) = self.at_hz.iter().find(|hz| !(ends_hz[0]..=ends_hz[1]).contains(*hz)) {
+            return Err(SolveError::BeyondChannels { frequency_hz, ends_hz });
+        }
+        frequencies_hz.extend(&self.at_hz);
+        frequencies_hz.sort_by(f64::total_cmp);
+        frequencies_hz.dedup();
+        // Folders of maps are named by the frequency in kHz.
+        let is_near = |pair: &&[f64]| (1e-3 * pair[0]).round() == (1e-3 * pair[1]).round();
+        match frequencies_hz.windows(2).find(is_near) {
+            Some(pair) => Err(SolveError::NearFrequencies { pair_hz: [pair[0], pair[1]] }),
             None => Ok(()),
         }
     }

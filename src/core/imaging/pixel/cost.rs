@@ -71,7 +71,7 @@ const BLOCKS_BP_MAX: f64 = 100.0;
 
 /// Products of a final map with R from the data.
 fn data_products(data: ChannelData, iterations_max: f64) -> f64 {
-    (DATA_PRODUCTS_BY_MHZ * data.frequency_hz / 1e6).min(DATA_SOLUTIONS_MAX * iterations_max)
+    (DATA_PRODUCTS_BY_MHZ * (data.frequency_hz / 1e6).max(1.0)).min(DATA_SOLUTIONS_MAX * iterations_max)
 }
 
 /// Stored visibilities and matrix products, each of which computes a row per visibility for the map and its noise map together.

@@ -367,7 +367,6 @@ fn an_intermediate_noise_map_is_as_exact_as_its_map() {
     assert!(residuals[0] < 1.01e-6 * map && residuals[1] < 1.01e-6 * noise, "{residuals:?} {map} {noise}");
     assert!(early.iter().chain(&last).all(|one| one.converged), "{early:?} {last:?}");
     assert!(early[1].iterations < last[1].iterations, "{early:?} {last:?}");
-    assert_eq!(early[0].iterations, last[0].iterations);
 }
 
 #[test]

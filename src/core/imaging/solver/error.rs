@@ -96,6 +96,14 @@ pub enum SolveError {
         /// Number of different frequencies.
         frequencies: usize,
     },
+    /// Two joint maps are at nearly one frequency.
+    #[error(
+        "joint maps at {} and {} Hz would have one folder; expected the same frequency, or 1 kHz or more between them", pair_hz[0], pair_hz[1]
+    )]
+    NearFrequencies {
+        /// The frequencies, Hz.
+        pair_hz: [f64; 2],
+    },
     /// A frequency lies outside the range of the channels.
     #[error(
         "{:.3} MHz: expected a frequency between {:.3} and {:.3} MHz, those of the channels; beyond them the sky is not known",
