@@ -14,6 +14,7 @@ use crate::pipeline::{sample_state, use_threads};
 use crate::products::{ErrorMap, own_power_csv, told_vector};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
+use crate::units::frequency_folder;
 
 /// Most samples: each is a map in memory.
 const COUNT_MAX: u64 = 10_000;
@@ -120,7 +121,7 @@ fn write(
     let channel = usize::from(solution.channel.0);
     let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |channel| channel.frequency_hz);
     let errors = solution.uncertainty.as_ref().ok_or("this map has no posterior to draw from")?;
-    let folder = args.out.join(format!("{:.3}MHz", frequency_hz / 1e6));
+    let folder = args.out.join(frequency_folder(frequency_hz));
     std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let save = |name: &str, map_k: &[f64]| {
         write_map(

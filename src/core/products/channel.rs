@@ -23,6 +23,7 @@ use crate::sky::fits::{Card, WriteOptions, write_map};
 use crate::sky::spectra::gaussian_beam;
 use crate::sky::{Comparison, Frame, InputSky, SkyMap, compare_with};
 use crate::units::constants::DAY_S;
+use crate::units::frequency_folder;
 
 /// Reciprocal of the fraction of the disk that products leave free, while a ground stage listens.
 const FREE_DIVISOR: u64 = 20;
@@ -56,7 +57,7 @@ impl ChannelFolder {
     ) -> Result<Self, ProductsError> {
         let channel = usize::from(solution.channel.0);
         let frequency_hz = solution.instrument.channels.get(channel).map_or(0.0, |c| c.frequency_hz);
-        let name = format!("{:.3}MHz", frequency_hz / 1e6);
+        let name = frequency_folder(frequency_hz);
         create_folder(&root.join(&name))?;
         Ok(Self {
             config: config.clone(),

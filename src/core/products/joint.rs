@@ -13,6 +13,7 @@ use crate::imaging::joint::{
 use crate::sky::Frame;
 use crate::sky::fits::{Card, Column, WriteOptions, write_columns};
 use crate::units::constants::HEALPIX_UNSEEN as UNSEEN;
+use crate::units::frequency_folder;
 
 /// Name of the folder of joint maps among the products of `run`.
 pub const JOINT: &str = "joint";
@@ -68,7 +69,7 @@ pub fn write_joint(
     let power_priors = priors.filter(|_| solved.maps.iter().any(|map| map.powers.is_some()));
     let mut maps = Vec::new();
     for map in &solved.maps {
-        let folder = out.join(format!("{:.3}MHz", map.frequency_hz / 1e6));
+        let folder = out.join(frequency_folder(map.frequency_hz));
         create_folder(&folder)?;
         write_map(&folder, map, power_priors.as_ref(), solved.convergence.converged)?;
         let report = map_report(&folder, map);

@@ -36,7 +36,7 @@ pub use keys::{Key, Level, keys};
 #[doc(hidden)]
 pub use per_channel::PerChannel;
 #[doc(hidden)]
-pub use quantity::{Dimension, bytes_text};
+pub use quantity::{Dimension, bytes_text, frequency_folder};
 #[doc(hidden)]
 pub use random::{StreamKind, random_stream};
 #[doc(hidden)]

@@ -127,6 +127,12 @@ pub fn bytes_text(bytes: f64) -> String {
     }
 }
 
+/// The name of the folder of products of a frequency, in MHz to the kHz.
+#[must_use]
+pub fn frequency_folder(frequency_hz: f64) -> String {
+    format!("{:.3}MHz", frequency_hz / 1e6)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

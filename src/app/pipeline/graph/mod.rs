@@ -1,6 +1,7 @@
 //! From a plan to a running graph: the stages of space and ground, and the summary of what they did.
 
 pub(super) mod calibrate_products;
+pub(super) mod finish;
 pub(super) mod found_solutions;
 pub(super) mod ground_segment;
 pub(super) mod joint;

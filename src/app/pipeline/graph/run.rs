@@ -1,34 +1,28 @@
 //! Running pipelines: the whole chain, the space segment alone, the ground segment alone.
 
 use std::path::{Path, PathBuf};
-use std::sync::PoisonError;
-use std::sync::atomic::Ordering;
 use std::time::Duration;
 use std::{fs, io};
 
-use super::ground_segment::{MappingContext, SOLVE, SegmentOutcome};
-use super::joint::JointData;
-use super::live_gains::GainsWriter;
+use super::finish::{FinishedGraph, collect_and_write_summary, map_jointly};
+use super::ground_segment::MappingContext;
 use super::sample_summary::{SampleCounts, SampleSummary};
 use super::summary::{RunScope, RunSummary};
 use super::view::RunView;
 use super::{ground_segment, space_segment};
-use crate::calibration::BurstSummary;
 use crate::downlink::link::LinkStage;
 #[cfg(not(target_family = "wasm"))]
 use crate::downlink::transport::socket::SocketSource;
 use crate::downlink::transport::socket::{Listening, SocketError, SocketSink};
 use crate::downlink::{DownlinkConfig, DownlinkError, FileSource, Format, PacedSource, Recorder};
 use crate::files::FolderLock;
-use crate::frames::AutoPower;
 use crate::ground::{Ground, WAIT_BYTES};
 use crate::imaging::{KeptSums, Method, SolveWatch};
 use crate::pipeline::config::{Config, PipelineError, Plan, SETTINGS};
-use crate::products::{JOINT, MapWatch, ProductsError, ProductsWatch, Truth, write_autos, write_product};
+use crate::products::{JOINT, MapWatch, ProductsError, ProductsWatch, Truth, write_product};
 use crate::ranks::Ranks;
 use crate::runtime::{Cancel, Graph, Link, Report, RuntimeConfig, Source};
 use crate::sky::SkyMap;
-use crate::units::vector::Vec3;
 
 /// A source of downlink bytes.
 pub trait GroundSource: Source<Out = Vec<u8>, Error = DownlinkError> {
@@ -190,7 +184,7 @@ pub fn run_with_ranks(
     on_start(handles);
     let report = start(graph, ranks, &plan.config.runtime, cancel)?;
     let samples = sample_summary(&counts, plan, &report)?;
-    let finished = FinishedGraph { samples, ..FinishedGraph::new(report, outcome, None, cancel) };
+    let finished = FinishedGraph::new(report, outcome, None, cancel).with_samples(samples);
     if let Some(sums) = joint_sums {
         return map_jointly(plan, out, finished, sums, (cancel, &solving));
     }
@@ -477,132 +471,6 @@ fn start(
     // The named stages save data: they may finish without a time limit.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     Ok(graph.run(cancel, if ranks.is_distributed() { RANK_SHUTDOWN } else { SHUTDOWN })?)
-}
-
-/// Results of a run that ended without a failure.
-pub(in crate::pipeline) struct FinishedGraph {
-    report: Report,
-    outcome: SegmentOutcome,
-    listening: Option<Listening>,
-    samples: Option<SampleSummary>,
-}
-
-impl FinishedGraph {
-    /// The results of a graph without samples. A run is also cancelled if its source had ended, but sums or maps lack data.
-    fn new(
-        mut report: Report,
-        outcome: SegmentOutcome,
-        listening: Option<Listening>,
-        cancel: &Cancel,
-    ) -> Self {
-        let left_data = outcome.ground.left_data.load(Ordering::Relaxed);
-        let lacks_maps = || report.stage(SOLVE).is_some_and(|solve| solve.items_out < solve.items_in);
-        report.cancelled |= cancel.is_cancelled() && (left_data || lacks_maps());
-        Self { report, outcome, listening, samples: None }
-    }
-
-    /// Takes the total powers with their positions, if they were asked for.
-    pub(super) fn take_placed_autos(&self) -> Vec<(AutoPower, Vec3)> {
-        let placed = self.outcome.ground.placed_autos.as_ref();
-        placed.map_or_else(Vec::new, |placed| {
-            std::mem::take(&mut placed.lock().unwrap_or_else(PoisonError::into_inner))
-        })
-    }
-
-    pub(in crate::pipeline) fn autocorrelation_count(&self) -> u64 {
-        self.outcome.ground.autos.lock().unwrap_or_else(PoisonError::into_inner).len() as u64
-    }
-}
-
-/// Collects the summary of a run; the first rank writes it.
-fn collect_and_write_summary(
-    segment: RunScope,
-    ranks: &Ranks,
-    config: &Config,
-    out: &Path,
-    finished: FinishedGraph,
-) -> Result<RunSummary, PipelineError> {
-    if ranks.is_distributed() && finished.report.cancelled {
-        return Err(PipelineError::RankInterrupted);
-    }
-    if ranks.is_first() {
-        return write_summary(collect_summary(segment, config, out, finished)?, out);
-    }
-    let FinishedGraph { report, outcome, .. } = finished;
-    let reception = outcome.ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = outcome.ground.ledger.balanced_report()?;
-    Ok(RunSummary::new(segment, config, report, ledger, reception, Vec::new()))
-}
-
-/// Makes the joint maps of a run that was not interrupted, and collects and writes its summary.
-fn map_jointly(
-    plan: &Plan,
-    out: &Path,
-    finished: FinishedGraph,
-    sums: KeptSums,
-    (cancel, watch): (&Cancel, &SolveWatch),
-) -> Result<RunSummary, PipelineError> {
-    let powers = finished.take_placed_autos();
-    let mut summary = collect_summary(RunScope::Whole, &plan.config, out, finished)?;
-    if summary.cancelled || summary.channels.is_empty() {
-        return write_summary(summary, out);
-    }
-    // The maps of the channels are there, whatever becomes of the joint ones; those of an earlier run go.
-    summary.write(out)?;
-    match (JointData { sums, powers }).map(plan, out, cancel, watch) {
-        Ok(found) => {
-            summary.cancelled = found.is_none();
-            summary.joint = found;
-            write_summary(summary, out)
-        }
-        Err(error) => write_summary(summary, out).and(Err(error)),
-    }
-}
-
-/// Collects the summary of a run, and writes the auto-correlations and gains.
-pub(in crate::pipeline) fn collect_summary(
-    segment: RunScope,
-    config: &Config,
-    out: &Path,
-    finished: FinishedGraph,
-) -> Result<RunSummary, PipelineError> {
-    let FinishedGraph { report, outcome, listening, samples } = finished;
-    let SegmentOutcome { ground, channels } = outcome;
-    let mut reception = ground.reception.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let channels = channels.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    let ledger = ground.ledger.balanced_report()?;
-    let listening = listening.map(|listening| listening.report());
-    if let Some(report) = &listening {
-        report.complete(&mut reception);
-    }
-    let mut autos = ground.autos.lock().unwrap_or_else(PoisonError::into_inner);
-    write_autos(&mut autos, out, config.products.pictures)?;
-    let mut summary = RunSummary::new(segment, config, report, ledger, reception, channels);
-    (summary.listening, summary.samples) = (listening, samples);
-    summary.completeness = ground.completeness.lock().unwrap_or_else(PoisonError::into_inner).clone();
-    summary.saving = ground.saving.report();
-    summary.bursts = BurstSummary::new(ground.bursts.choice(), ground.bursts.list());
-    let gains = ground.gains.as_ref().map(|gains| GainsWriter::new(config, out).write(gains));
-    summary.calibration = gains.transpose()?;
-    Ok(summary)
-}
-
-/// Writes the summary of a run.
-///
-/// # Errors
-/// A summary that cannot be written; a last checkpoint that could not be saved; no visibility for any map.
-pub(in crate::pipeline) fn write_summary(
-    summary: RunSummary,
-    out: &Path,
-) -> Result<RunSummary, PipelineError> {
-    let path = summary.write(out)?;
-    if let Some(reason) = summary.saving.as_ref().and_then(|saving| saving.unsaved.clone()) {
-        return Err(PipelineError::Unsaved { summary: path, reason });
-    }
-    if summary.channels.is_empty() && !summary.cancelled {
-        return Err(PipelineError::NoMap { summary: path, ledger: Box::new(summary.ledger) });
-    }
-    Ok(summary)
 }
 
 /// Starts the configured number of worker threads. Call it once, before anything runs.

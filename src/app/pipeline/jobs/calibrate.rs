@@ -23,7 +23,7 @@ use crate::sky::SkyMap;
 use crate::sky::fits::{ReadOptions, check_frequencies, read_whole_map};
 use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::spectra::auto_cl;
-use crate::units::InvalidValue;
+use crate::units::{InvalidValue, frequency_folder};
 
 /// Option that names the maps of the known sky, for error messages.
 const MODEL: &str = "--model";
@@ -345,7 +345,7 @@ fn make_maps(
         return Ok(Vec::new());
     }
     let read = |channel: &crate::frames::Channel| {
-        let path = folder.join(format!("{:.3}MHz", channel.frequency_hz / 1e6)).join("map.fits");
+        let path = folder.join(frequency_folder(channel.frequency_hz)).join("map.fits");
         Ok(read_whole_map(&path, &ReadOptions::default())?)
     };
     instrument.channels.iter().map(read).collect()

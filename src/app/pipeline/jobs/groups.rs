@@ -18,9 +18,8 @@ use crate::imaging::ChannelGroup;
 use crate::imaging::circle::SumPart;
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError, Plan};
 use crate::pipeline::cost::{GroupSize, MapGroup, RunGroups, map_groups};
-use crate::pipeline::graph::run::{
-    FinishedGraph, collect_summary, lock_products, run_ground, write_settings, write_summary,
-};
+use crate::pipeline::graph::finish::{FinishedGraph, collect_summary, write_summary};
+use crate::pipeline::graph::run::{lock_products, run_ground, write_settings};
 use crate::pipeline::graph::summary::GroupRecord;
 use crate::pipeline::graph::{RunScope, RunSummary, downlink_file, space_segment};
 use crate::products::Truth;

@@ -19,6 +19,7 @@ use crate::runtime::{Cancel, Graph, Sink};
 use crate::sky::fits::{WriteOptions, write_map};
 use crate::sky::{Frame, SkyMap};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
+use crate::units::frequency_folder;
 
 /// Maximum number of realisations in one reading of the downlink.
 const PER_READING_MAX: usize = 50;
@@ -44,7 +45,7 @@ impl Config {
 
 /// The map file of a noise realisation in a folder of products. Realisation 1 is the map's own `noise.fits`.
 pub(in crate::pipeline) fn noise_file(out: &Path, frequency_hz: f64, number: usize) -> PathBuf {
-    let folder = out.join(format!("{:.3}MHz", frequency_hz / 1e6));
+    let folder = out.join(frequency_folder(frequency_hz));
     match number {
         1 => folder.join("noise.fits"),
         _ => folder.join("realisations").join(format!("noise-{number:04}.fits")),

@@ -15,8 +15,8 @@ use crate::sky::harmonics::AnalysisOptions;
 use crate::sky::healpix::{pixel_count, pixel_of};
 use crate::sky::spectra::auto_cl;
 use crate::sky::{Frame, SkyMap};
-use crate::units::InvalidValue;
 use crate::units::vector::direction;
+use crate::units::{InvalidValue, frequency_folder};
 
 /// Scatter over the realisations of one case, for one channel.
 #[derive(Clone, Debug, Serialize)]
@@ -158,7 +158,7 @@ fn channel_spread(
     products: SpreadProducts<'_>,
 ) -> Result<RealisationSpread, PipelineError> {
     let (SpreadProducts { folder: out, covariance_at_deg }, (_, first)) = (products, members[0]);
-    let mhz = format!("{:.3}MHz", first.frequency_hz / 1e6);
+    let mhz = frequency_folder(first.frequency_hz);
     let mut noise_k2 = Vec::new();
     let mut pixels: Option<(Frame, SecondMoments)> = None;
     let files = members.iter().flat_map(|(member, _)| {

@@ -16,7 +16,7 @@ use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{Convergence, NamedWatch, SolveError, StoppingRule, System, dot};
 use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::synthesis;
-use crate::units::{StreamKind, random_stream};
+use crate::units::{StreamKind, frequency_folder, random_stream};
 use rand_distr::{Distribution, StandardNormal};
 
 /// Rounds before the last solution: with weights from the measured powers, then from a map.
@@ -57,8 +57,7 @@ impl JointRequest {
         frequencies_hz.extend(&self.at_hz);
         frequencies_hz.sort_by(f64::total_cmp);
         frequencies_hz.dedup();
-        // Folders of maps are named by the frequency in kHz.
-        let is_near = |pair: &&[f64]| (1e-3 * pair[0]).round() == (1e-3 * pair[1]).round();
+        let is_near = |pair: &&[f64]| frequency_folder(pair[0]) == frequency_folder(pair[1]);
         match frequencies_hz.windows(2).find(is_near) {
             Some(pair) => Err(SolveError::NearFrequencies { pair_hz: [pair[0], pair[1]] }),
             None => Ok(()),
