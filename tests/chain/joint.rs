@@ -156,6 +156,13 @@ fn joint_maps_of_a_run_are_those_of_its_state() {
 fn joint_maps_of_a_run_may_leave_out_powers() {
     let place = few_windows("[joint]\non = true\npowers = false");
     assert_eq!(require_maps_of_the_state(&place, &["--no-powers"]), 4);
+    // Joint maps of an earlier run do not stay beside those of the channels.
+    let joint = std::path::PathBuf::from(place.path("run/joint"));
+    let files = || ["5.000MHz/map.fits", "spectra.fits", "joint.json"].map(|name| joint.join(name).exists());
+    assert_eq!(files(), [true; 3]);
+    let off = ["--set", "joint.on=false", "--set", "joint.powers=true"];
+    succeed(&[&["run", &place.pipeline, "--out", &place.path("run")], &off[..]].concat());
+    assert_eq!(files(), [false; 3]);
 }
 
 #[test]
