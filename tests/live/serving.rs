@@ -505,7 +505,8 @@ fn those_who_do_not_read_or_write_are_cut() {
     // More than there are places, and none says anything.
     let silent: Vec<TcpStream> = (0..300).map(|_| served.connect()).collect();
     wait_until("places again", || served.get("/healthz").status == 200);
-    assert!(served.metric("lunarray_http_refused_total") > 0.0);
+    // Not at once: a connection beyond the system's queue arrives when its handshake is repeated, seconds later.
+    wait_until("the excess to be refused", || served.metric("lunarray_http_refused_total") > 0.0);
     drop(silent);
     // All but the one that asks.
     wait_until("the silent to be gone", || served.metric("lunarray_http_connections") <= 1.0);
