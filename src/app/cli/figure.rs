@@ -20,7 +20,7 @@ use crate::units::Pair;
 /// uvw: distribution of baselines on ecliptic axes;
 /// coverage: observing time, visibilities, shortest projected baseline and uv coverage by direction, also as FITS maps;
 /// rows: a row of B at pixel centres and averaged over pixels, drawn without the Moon;
-/// waterfall: visibilities of one pair over time and frequency, of a fine sky and of the sky in the map's pixels;
+/// waterfall: visibilities of one pair over time and within 10 % of the frequency, of the sky and of the sky in the map's pixels;
 /// sub-pixel: effect of the sky's structure within pixels of nside 8 and 16 on visibilities and maps.
 ///
 /// Example: lunarray figure pair-time pipelines/paper-10mhz.toml --out out/figures

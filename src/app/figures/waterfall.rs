@@ -1,5 +1,5 @@
-//! Visibilities of one pair over time and frequency, for the fine sky, and for the sky in pixels of the map with averaged rows
-//! and with rows at pixel centres (the paper, Fig. 8).
+//! Visibilities of one pair over time and frequency, for the sky, and for the sky in pixels of the map with averaged rows and with
+//! rows at pixel centres (the paper, Fig. 8).
 
 use std::fmt::Write;
 
@@ -12,21 +12,19 @@ use super::output::FigureParts;
 use super::request::FigureRequest;
 use super::rows::PairMoment;
 use crate::pipeline::Plan;
+use crate::pipeline::graph::space_segment::sky;
 use crate::products::pictures::{Axis, ColourScale, Raster, draw_rasters};
-use crate::response::pixel::{CHILDREN, Comb, Directions, PairGeometry, PixelMethod, RowMaker, comb_sums};
-use crate::sky::generated::generate;
+use crate::response::pixel::{Comb, Directions, PairGeometry, PixelMethod, RowMaker, comb_sums};
+use crate::sky::SkyMap;
 use crate::sky::healpix::pixel_area_sr;
-use crate::sky::{Frame, SkyMap};
+use crate::units::ChannelId;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
 
 const TIMES: usize = 60;
 const FREQUENCIES: usize = 60;
-/// Lowest and highest frequency relative to the channel.
-const BAND: [f64; 2] = [0.1, 3.0];
-const FINE_NSIDE_MAX: usize = 1024;
-/// Edges of the classes of baseline length, in units of b_p.
-const CLASSES_BP: [f64; 6] = [0.0, 0.5, 1.0, 2.0, 4.0, f64::INFINITY];
+/// Lowest and highest frequency relative to the channel: baselines in units of b_p differ as much.
+const BAND: [f64; 2] = [0.9, 1.1];
 
 #[derive(Serialize)]
 struct WaterfallNumbers {
@@ -37,17 +35,11 @@ struct WaterfallNumbers {
     band_hz: [f64; 2],
     nside: usize,
     nside_fine: usize,
-    classes: Vec<ErrorClass>,
-}
-
-/// Errors of the visibilities in a class of baseline length, relative to the rms of the fine sky's visibilities.
-#[derive(Serialize)]
-struct ErrorClass {
-    from_bp: f64,
-    /// Upper edge; absent for the last class.
-    to_bp: Option<f64>,
-    count: usize,
+    /// Shortest and longest baseline, in units of b_p.
+    length_bp: [f64; 2],
+    /// Error of the visibilities with rows at pixel centres, rms over the rms of the sky's visibilities.
     centre: f64,
+    /// The same with averaged rows.
     average: f64,
 }
 
@@ -63,11 +55,7 @@ struct Cell {
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
     let moment = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
-    let nside_fine = (CHILDREN * nside).min(FINE_NSIDE_MAX).max(nside);
-    let frequency_hz = moment.geometry.frequency_hz;
-    // One sky for all frequencies, so that only the fringes differ.
-    let sky = generate(&plan.config.sky.generated, frequency_hz, nside_fine, plan.config.seed)?;
-    let fine = SkyMap::new(Frame::Ecliptic, sky)?;
+    let fine = sky(plan, ChannelId(0))?.to_ecliptic();
     let window =
         plan.windows.iter().find(|window| window.end.seconds() > moment.t_s).unwrap_or(&plan.windows[0]);
     let [start_s, end_s] = [window.start, window.end].map(|time| time.seconds());
@@ -75,10 +63,14 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     let numbers = WaterfallNumbers {
         pair: moment.pair.to_string(),
         window_s: [start_s, end_s],
-        band_hz: BAND.map(|factor| factor * frequency_hz),
+        band_hz: BAND.map(|factor| factor * moment.geometry.frequency_hz),
         nside,
-        nside_fine,
-        classes: classes(&cells),
+        nside_fine: fine.nside(),
+        length_bp: cells.iter().fold([f64::INFINITY, 0.0], |[least, most], cell| {
+            [cell.length_bp.min(least), cell.length_bp.max(most)]
+        }),
+        centre: error(&cells, 2),
+        average: error(&cells, 1),
     };
     let mut csv =
         "t_s,frequency_hz,length_bp,fine_re,fine_im,average_re,average_im,centre_re,centre_im\n".to_owned();
@@ -146,25 +138,11 @@ fn cells(
     Ok(columns.into_iter().flatten().collect())
 }
 
-fn classes(cells: &[Cell]) -> Vec<ErrorClass> {
-    let class = |edges: &[f64]| {
-        let inside = || cells.iter().filter(|cell| (edges[0]..edges[1]).contains(&cell.length_bp));
-        let power: f64 = inside().map(|cell| cell.values[0].norm_sqr()).sum();
-        let error = |k: usize| {
-            let square: f64 = inside().map(|cell| (cell.values[k] - cell.values[0]).norm_sqr()).sum();
-            (square / power).sqrt()
-        };
-        let count = inside().count();
-        let to_bp = Some(edges[1]).filter(|edge| edge.is_finite());
-        (count > 0).then(|| ErrorClass {
-            from_bp: edges[0],
-            to_bp,
-            count,
-            centre: error(2),
-            average: error(1),
-        })
-    };
-    CLASSES_BP.windows(2).filter_map(class).collect()
+/// Error of the visibilities of a method, rms over the rms of the sky's.
+fn error(cells: &[Cell], method: usize) -> f64 {
+    let power: f64 = cells.iter().map(|cell| cell.values[0].norm_sqr()).sum();
+    let square: f64 = cells.iter().map(|cell| (cell.values[method] - cell.values[0]).norm_sqr()).sum();
+    (square / power).sqrt()
 }
 
 fn draw(

@@ -35,7 +35,7 @@ pub fn skies(plan: &Plan) -> Result<Vec<SkyMap>, PipelineError> {
 ///
 /// # Errors
 /// As [`skies`].
-pub(in crate::pipeline) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineError> {
+pub(crate) fn sky(plan: &Plan, channel: ChannelId) -> Result<SkyMap, PipelineError> {
     let config = &plan.config.sky;
     let channel = usize::from(channel.0);
     let frequency_hz = plan.config.spacecraft.channels_hz[channel];
