@@ -160,14 +160,10 @@ def beam_row(n):
 
 
 def waterfall(n):
-    rows = []
-    for c in n["classes"]:
-        end = "" if c["to_bp"] is None else f"{c['to_bp']:g}"
-        rows.append([f"{c['from_bp']:g} to {end}", f"{c['count']:,}", f"{c['centre']:.3f}", f"{c['average']:.3f}"])
+    (low, high), (short, long) = ((x / 1e6 for x in n["band_hz"]), n["length_bp"])
     return (
-        f"Pair {n['pair']}, a window, {n['band_hz'][0] / 1e6:g} to {n['band_hz'][1] / 1e6:g} MHz, the sky of 10 MHz at nside "
-        f"{n['nside_fine']}, averaged to {n['nside']}.\n\n"
-        + table(["baseline, b_p", "visibilities", "error at centres", "averaged"], rows)
+        f"Pair {n['pair']}, a window, {low:g} to {high:g} MHz, {short:.2f} to {long:.2f} b_p: errors, rms over the rms visibility of "
+        f"the sky at nside {n['nside_fine']}, are {n['centre']:.3f} at centres of nside {n['nside']} and {n['average']:.3f} averaged.\n"
     )
 
 
@@ -206,35 +202,15 @@ def latitudes(name):
     return table(["case", "mean, K", *head], rows)
 
 
-def thinned(name, nside, visibilities_all):
-    """Rows of traces by thinning, Tr Sigma_n scaled to all data. What thinning adds to a trace goes as one over the number of
-    visibilities, so that two thinnings give that of all data; the crossing is on straight lines in logarithms."""
-    found, rows = {}, []
-    for case in load(f"{name}/study.json")["cases"]:
-        channel = case["figures"]["channels"][0]
-        thin = int(case["figures"]["name"].split("thin = ")[1].split(",")[0])
-        t2 = channel["power"]["input_k2"][0] / (4 * math.pi)
-        traces = channel["diagnostics"]["traces"]
-        n, s = traces["sigma_n_k2"]["value"] * channel["visibilities"] / visibilities_all, traces["sigma_s"]["value"]
-        found.setdefault(thin, []).append((channel["diagnostics"]["epsilon"], n, s, t2 * s))
-    named = {thin: "all" if thin == 1 else f"one in {thin}" for thin in found}
-    if 10 in found and 40 in found:
-        named[0] = "all, from 10 and 40"
-        found[0] = [(a[0], *[x - 9 / 30 * (y - x) for x, y in zip(a[1:], b[1:])]) for a, b in zip(found[10], found[40])]
-    for key, points in found.items():
-        crossing = None
-        for (e, n, _, ts), (e2, n2, _, ts2) in zip(points, points[1:]):
-            if n > ts > 0 and 0 < n2 < ts2:
-                above, above2 = math.log(n / ts), math.log(n2 / ts2)
-                crossing = e * (e2 / e) ** (above / (above - above2))
-        for e, n, s, ts in points:
-            rows.append([f"{nside}, {named[key]}", f"{e:.0e}", show(n), f"{s:.4g}", show(ts), show(crossing, "{:.2e}")])
-    return rows
+# Studies at full size, and their cases of the paper's epsilon with post-processing.
+FULL = {10: "fig9-18-10mhz", 3: "fig10-14-3mhz"}
+SMOOTHED = {10: "1e-4 smoothed", 3: "1e-6 smoothed"}
 
 
-def pixel_traces():
-    rows = thinned("fig15-nside8", 8, 566_823) + thinned("fig15-pixels", 16, 2_034_350)
-    return table(["nside, data", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing"], rows)
+def case_of(mhz, name):
+    """Folder of a case at full size."""
+    return OUT / FULL[mhz] / next(
+        case["folder"] for case in load(f"{FULL[mhz]}/study.json")["cases"] if case["figures"]["name"] == name)
 
 
 # Ecliptic longitude and latitude of the paper's patches.
@@ -248,8 +224,7 @@ def patches():
 
     rows, shown = [], ""
     for mhz in (10, 3):
-        case = load(f"patches-{mhz}mhz/study.json")["cases"][0]
-        folder = OUT / f"patches-{mhz}mhz" / case["folder"] / f"{mhz:.3f}MHz"
+        folder = case_of(mhz, SMOOTHED[mhz]) / f"{mhz:.3f}MHz"
         clean, noise = (healpy.read_map(folder / f"{name}-smooth.fits", dtype=float) for name in ("map", "noise"))
         healpy.write_map(folder / "with-noise.fits", clean + noise, dtype=float, coord="E", column_units="K", overwrite=True)
         panels = [folder / name for name in ("input-smooth.fits", "map-smooth.fits", "with-noise.fits")]
@@ -272,17 +247,26 @@ def patches():
 
 
 def maps():
-    rows = []
-    for name, noise in (("paper-10mhz", "10"), ("paper-3mhz", "3")):
-        summary = load(f"{name}/summary.json")
-        channel = summary["channels"][0]
-        rho = channel["rho_noise_subtracted"] or channel["rho"]
-        rows.append(
-            [noise, f"{channel['visibilities']:,}", *[at(rho, l) for l in (8, 16, 32, 64, 96, 128)],
-             f"{channel['noise_rms_k']:.2e}", f"{summary['report']['elapsed_s'] / 60:.1f}"]
-        )
-    head = ["MHz", "visibilities", *[f"rho_{l}" for l in (8, 16, 32, 64, 96, 128)], "noise, K rms", "minutes"]
-    return table(head, rows)
+    """The maps at full size: noise, share of negative pixels, errors by latitude, rho_l without noise, SNR_l by the noise-only map. Errors are
+    mean and rms of map - input over the mean of the input in the band, as ULSA is near zero in the Gum nebula."""
+    import healpy
+    import numpy as np
+
+    edges, text, rows = range(0, 91, 15), "", []
+    for mhz, name in FULL.items():
+        for case in load(f"{name}/study.json")["cases"]:
+            channel, folder = case["figures"]["channels"][0], OUT / name / case["folder"] / f"{mhz:.3f}MHz"
+            ours, truth = (healpy.read_map(folder / f"{which}.fits", dtype=float) for which in ("map", "input"))
+            sine = np.abs(healpy.pix2vec(healpy.get_nside(ours), np.arange(ours.size))[2])
+            bands = [(sine >= math.sin(math.radians(low))) & (sine < math.sin(math.radians(low + 15))) for low in edges[:-1]]
+            errors = [(ours - truth)[inside] / truth[inside].mean() for inside in bands]
+            rows.append([f"{mhz}, {case['figures']['name']}", f"{channel['visibilities']:,}", show(channel["mean_k"], "{:.3e}"),
+                         show(channel["noise_rms_k"]), f"{100 * (ours < 0).mean():.1f}",
+                         *[f"{100 * e.mean():+.1f}, {100 * (e**2).mean() ** 0.5:.1f}" for e in errors]])
+        ls = (2, 4, 8, 12, 16, 20, 32, 64, 96, 128)
+        text += "".join("\n" + correlation(name, ls, f"{mhz} MHz, case", key) for key in ("rho", "snr"))
+    head = ["MHz, case", "visibilities", "mean, K", "noise, K rms", "negative, %", *[f"{low} to {low + 15} deg" for low in edges[:-1]]]
+    return table(head, rows) + text
 
 
 def uniformity():
@@ -310,7 +294,34 @@ def uniformity():
     return table(head, rows)
 
 
-def traces(name="fig15-traces"):
+def crossing(points, scale):
+    """epsilon at which Tr Sigma_n = scale Tr Sigma_s, on a straight line between logarithms of points (epsilon, n, s)."""
+    for (e, n, s), (e2, n2, s2) in zip(points, points[1:]):
+        if n > scale * s > 0 and 0 < n2 < scale * s2:
+            above, above2 = math.log(n / (scale * s)), math.log(n2 / (scale * s2))
+            return e * (e2 / e) ** (above / (above - above2))
+    return None
+
+
+def pixel_traces():
+    """Traces by pixels, Tr Sigma_n scaled from every 4th integration to all data by the number of visibilities."""
+    rows = []
+    for name, nside, whole in (("fig15-nside8", 8, 566_823), ("fig15-pixels", 16, 2_034_350)):
+        groups = {}
+        for case in load(f"{name}/study.json")["cases"]:
+            channel = case["figures"]["channels"][0]
+            mean = math.sqrt(channel["power"]["input_k2"][0] / (4 * math.pi))
+            traces, count = channel["diagnostics"]["traces"], channel["visibilities"]
+            n, s = traces["sigma_n_k2"]["value"] * count / whole, traces["sigma_s"]["value"]
+            groups.setdefault((count, mean), []).append((channel["diagnostics"]["epsilon"], n, s))
+        for (count, mean), points in groups.items():
+            crossings = [show(crossing(points, mean**power)) for power in (2, 1)]
+            rows += [[f"{nside}, {count:,}", f"{e:.0e}", show(n), f"{s:.4g}", show(mean**2 * s), *crossings] for e, n, s in points]
+    head = ["nside, visibilities", "epsilon", "Tr Sigma_n, K²", "Tr Sigma_s", "T² Tr Sigma_s, K²", "crossing with T²", "with T"]
+    return table(head, rows)
+
+
+def traces(name):
     study = load(f"{name}/study.json")
     rows = []
     for case in study["cases"]:
@@ -397,9 +408,8 @@ def five_sigma(folder, removed_deg, thin=1):
             *[f"{jansky * x.std():.0f}" for x in (small, small[np.abs(sine) < 0.5], noise, reached)]]
 
 
-def sensitivity(names, *how):
-    """Fig. 19 of all cases of some studies."""
-    cases = [OUT / name / case["folder"] for name in names for case in load(f"{name}/study.json")["cases"]]
+def sensitivity(cases, *how):
+    """Fig. 19 of some cases."""
     rows = sorted((five_sigma(case, *how) for case in cases), key=lambda row: float(row[0]))
     head = ["MHz", "noise, K rms", "beam, deg", "5 sigma, Jy a beam", "within 30 deg of the ecliptic", "with large scales",
             "at degrees reached"]
@@ -423,9 +433,9 @@ def sky(mhz, nside=256, rest=""):
 
 def sheets(ulsa):
     """Title, what each command makes, and what is printed of it."""
-    def under(mhz):
+    def under(mhz, sources="true", generated=""):
         path = ulsa / f"ulsa_{mhz}mhz.fits"
-        return f" --set sky.file={path} --set 'sky.added={{small_scales=true,sources=true}}'" if path.exists() else ""
+        return f" --set sky.file={path} --set 'sky.added={{small_scales=true,sources={sources}}}'" if path.exists() else generated
 
     short = f"lunarray run {PIPELINE} --set spacecraft.duration_s=30000"
     full_sky_run = {
@@ -433,13 +443,15 @@ def sheets(ulsa):
     priors = full_sky_run | {
         "right-prior.fits": "cp out/full-sky/10.000MHz/input.fits out/right-prior.fits",
         "wrong-prior.fits": "lunarray sky --like out/right-prior.fits --correlation 0.8 --out out/wrong-prior.fits"}
-    patched = {
-        f"patches-{mhz}mhz/study.json": f"lunarray study pipelines/paper/fig13-14-patches.toml{more}{under(mhz)} --out out/patches-{mhz}mhz"
-        for mhz, more in ((10, ""), (3, " --set spacecraft.channels_hz=[3e6] --set map.epsilon=1e-6"))}
+    full = priors | study(FULL[10], under(10)) | study(FULL[3], under(3))
+    # A map of no use, for its input, which is the sky itself with pixels as the engine.
+    diffuse = (f"{short} --set map.engine=pixel --set map.matrix=free --set map.iterations_max=1 --set products.frame=ecliptic "
+               f"--set products.smooth_fwhm_deg=0.25{under(10, 'false', ' --set sky.generated.point_sources=false')} --out out/diffuse")
     return [
         ("Fig. 1: a patch, and N(>S)",
          {f"sources-{mhz}mhz.csv": sky(mhz, 256, f" --out out/sky-{mhz}mhz.fits --sources out/sources-{mhz}mhz.csv") for mhz in (3, 10, 30)}
-         | {"diffuse-10mhz.fits": sky(10, 256, " --set sky.generated.point_sources=false --out out/diffuse-10mhz.fits"),
+         | {"diffuse/summary.json": diffuse,
+            "diffuse-10mhz.fits": "cp out/diffuse/10.000MHz/input-smooth.fits out/diffuse-10mhz.fits",
             "patch.png": "lunarray cutout out/diffuse-10mhz.fits --frame ecliptic --centre 120,0 --out out/patch.png"}, counts),
         ("Fig. 2: the full sky", full_sky_run, full_sky),
         ("Fig. 3: q0 against R and R_2", drawn("spacing"), lambda: figure("spacing", spacing)),
@@ -450,24 +462,15 @@ def sheets(ulsa):
          study("fig6-power") | study("fig6-reflection"),
          lambda: powers() + latitudes("fig6-reflection")),
         ("Fig. 7: a row of B", drawn("rows", " --pair 5-6 --at 4.1736d"), lambda: figure("rows", beam_row)),
-        ("Fig. 8: waterfalls of one pair", drawn("waterfall", " --pair 1-4 --at 6.65d"), lambda: figure("waterfall", waterfall)),
-        ("Fig. 9 and 10: the maps at 10 and 3 MHz, full size",
-         {f"paper-{mhz}mhz/summary.json": f"lunarray run pipelines/paper-{mhz}mhz.toml" for mhz in (10, 3)}, maps),
+        ("Fig. 8: waterfalls of one pair", drawn("waterfall", f" --pair 1-4 --at 6.65d --set sky.nside=1024{under(10)}"), lambda: figure("waterfall", waterfall)),
+        ("Fig. 9, 10, 11, 12 and 18: the maps at 10 and 3 MHz, full size", full, maps),
         ("Fig. 9: by basis and R", study("fig9-basis"), lambda: latitudes("fig9-basis")),
         ("Fig. 9: is the noise uniform?", study("realisations", folder="pipelines/noise"), uniformity),
-        ("Fig. 9, 11 and 12: under the paper's sky at nside 32", priors | study("fig9-12-nside32", under(10)),
-         lambda: correlation("fig9-12-nside32", (2, 4, 8, 12, 16, 20, 32, 64), "case") + "\n" + latitudes("fig9-12-nside32")),
-        ("Fig. 11: a prior of 5 degrees",
-         {"sky-10mhz-512.fits": sky(10, 512, " --out out/sky-10mhz-512.fits")} | study("fig11-prior"),
-         lambda: correlation("fig11-prior", (2, 4, 8, 12, 16, 32, 64, 128), "case")),
-        ("Fig. 12: a wrong prior",
-         {"sky-10mhz-64.fits": sky(10, 64, " --out out/sky-10mhz-64.fits"),
-          "wrong-10mhz-64.fits": "lunarray sky --like out/sky-10mhz-64.fits --correlation 0.8 --out out/wrong-10mhz-64.fits"}
-         | study("fig12-wrong-prior"), lambda: latitudes("fig12-wrong-prior")),
-        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", patched, patches),
+        ("Fig. 13 and 14: patches of 20 x 20 degrees, large scales subtracted", full, patches),
         ("Fig. 15: traces against epsilon",
          study("fig15-nside8") | study("fig15-pixels") | study("fig15-traces"),
-         lambda: pixel_traces() + "\n" + traces()),
+         lambda: pixel_traces() + "\n" + traces("fig15-traces")
+         + picture("fig15-pixels/study.png", "paper-fig15.png", "rho, SNR, power and traces against epsilon")),
         ("Fig. 16: rows at centres and averaged, rho_l without noise", study("fig16-17-rows"), lambda: rows_of_b("rho", "no noise")),
         ("Fig. 16: at nside 32", study("fig16-nside32"),
          lambda: correlation("fig16-nside32", (8, 16, 20, 24, 32, 48, 64), "limit, rows")),
@@ -477,12 +480,10 @@ def sheets(ulsa):
         ("Fig. 16 and 17: by harmonics at nside 64", study("fig16-17-harmonics"),
          lambda: correlation("fig16-17-harmonics", HARMONIC_LS, "limit")
          + "\n" + correlation("fig16-17-harmonics", HARMONIC_LS, "limit", "snr")),
-        ("Fig. 18: rho_l without noise, for epsilon from 1e-9 to 1", study("fig18-epsilon", under(10)),
-         lambda: correlation("fig18-epsilon", (8, 16, 32, 64, 96, 128), "epsilon")),
-        ("Fig. 18: SNR_l", study("fig18-snr", under(10)),
-         lambda: correlation("fig18-snr", (4, 8, 12, 16, 24, 32, 48, 64), "epsilon", "snr")),
-        ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"), lambda: sensitivity(["fig19-sensitivity"], 10, 16)),
-        ("Fig. 19: all data at nside 64", patched, lambda: sensitivity(["patches-10mhz", "patches-3mhz"], 5)),
+        ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"),
+         lambda: sensitivity([OUT / "fig19-sensitivity" / case["folder"] for case in load("fig19-sensitivity/study.json")["cases"]], 10, 16)),
+        ("Fig. 19: all data at nside 64", full,
+         lambda: sensitivity([case_of(10, "1e-3 smoothed"), case_of(3, SMOOTHED[3])], 5)),
         ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
         ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
         ("Fig. 20: N_b and Sigma_b",
