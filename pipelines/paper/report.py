@@ -247,8 +247,8 @@ def patches():
 
 
 def maps():
-    """The maps at full size: noise, share of negative pixels, errors by latitude, rho_l without noise, SNR_l by the noise-only map. Errors are
-    mean and rms of map - input over the mean of the input in the band, as ULSA is near zero in the Gum nebula."""
+    """The maps at full size: noise, share of negative pixels, errors by latitude, rho_l without noise, SNR_l by the noise-only map. Errors
+    are mean and rms of map - input over the mean of the input in the band, as ULSA is near zero in the Gum nebula."""
     import healpy
     import numpy as np
 
@@ -462,7 +462,8 @@ def sheets(ulsa):
          study("fig6-power") | study("fig6-reflection"),
          lambda: powers() + latitudes("fig6-reflection")),
         ("Fig. 7: a row of B", drawn("rows", " --pair 5-6 --at 4.1736d"), lambda: figure("rows", beam_row)),
-        ("Fig. 8: waterfalls of one pair", drawn("waterfall", f" --pair 1-4 --at 6.65d --set sky.nside=1024{under(10)}"), lambda: figure("waterfall", waterfall)),
+        ("Fig. 8: waterfalls of one pair", drawn("waterfall", f" --pair 1-4 --at 6.65d --set sky.nside=1024{under(10)}"),
+         lambda: figure("waterfall", waterfall)),
         ("Fig. 9, 10, 11, 12 and 18: the maps at 10 and 3 MHz, full size", full, maps),
         ("Fig. 9: by basis and R", study("fig9-basis"), lambda: latitudes("fig9-basis")),
         ("Fig. 9: is the noise uniform?", study("realisations", folder="pipelines/noise"), uniformity),
@@ -481,7 +482,8 @@ def sheets(ulsa):
          lambda: correlation("fig16-17-harmonics", HARMONIC_LS, "limit")
          + "\n" + correlation("fig16-17-harmonics", HARMONIC_LS, "limit", "snr")),
         ("Fig. 19: sensitivity against frequency", study("fig19-sensitivity"),
-         lambda: sensitivity([OUT / "fig19-sensitivity" / case["folder"] for case in load("fig19-sensitivity/study.json")["cases"]], 10, 16)),
+         lambda: sensitivity(
+             [OUT / "fig19-sensitivity" / case["folder"] for case in load("fig19-sensitivity/study.json")["cases"]], 10, 16)),
         ("Fig. 19: all data at nside 64", full,
          lambda: sensitivity([case_of(10, "1e-3 smoothed"), case_of(3, SMOOTHED[3])], 5)),
         ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
