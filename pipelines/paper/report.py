@@ -486,6 +486,11 @@ def sheets(ulsa):
              [OUT / "fig19-sensitivity" / case["folder"] for case in load("fig19-sensitivity/study.json")["cases"]], 10, 16)),
         ("Fig. 19: all data at nside 64", full,
          lambda: sensitivity([case_of(10, "1e-3 smoothed"), case_of(3, SMOOTHED[3])], 5)),
+        ("Fig. 19: 30 MHz at nside 64",
+         {"fig19-30mhz/summary.json": f"lunarray run {PIPELINE} --set spacecraft.channels_hz=[30e6] --set map.epsilon=1e-3 "
+          "--set spacecraft.thermal_noise=false --set products.smooth_fwhm_deg=1 --set products.pictures=false --set sky.nside=128 "
+          "--set sky.l_max=256 --set spacecraft.thin=8 --out out/fig19-30mhz"},
+         lambda: sensitivity([OUT / "fig19-30mhz"], 5, 8)),
         ("FWHM after post-processing", study("beams"), lambda: point_beams("beams")),
         ("FWHM at nside 64", study("beams-nside64"), lambda: point_beams("beams-nside64")),
         ("Fig. 20: N_b and Sigma_b",
