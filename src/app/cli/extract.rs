@@ -9,7 +9,7 @@ use super::arguments::{input_path, output_path};
 use super::output::{CommandResult, Completion, print_json_line, print_text};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{DownlinkError, Event, PacketKind};
-use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, read_text};
+use crate::files::{AtomicFile, IfUnfinished, ProtectedInputs, Separator, numbered_lines, read_text};
 
 /// Largest file of ranges that is read, bytes: a million lines.
 const RANGES_BYTES_MAX: u64 = 1 << 24;
@@ -97,12 +97,8 @@ pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
 
 /// Parses ranges, one per line; empty lines and comments (`#`) are skipped.
 fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
-    let lines = text
-        .lines()
-        .zip(1..)
-        .map(|(line, number)| (number, line.split('#').next().unwrap_or_default().trim()));
-    let ranges: Vec<PacketRange> = lines
-        .filter(|(_, line)| !line.is_empty())
+    let ranges: Vec<PacketRange> = numbered_lines(text)
+        .map(|(number, line)| (number, line.split('#').next().unwrap_or_default().trim()))
         .map(|(number, line)| {
             parse_range(line).ok_or_else(|| {
                 format!(
@@ -115,7 +111,7 @@ fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
 }
 
 fn parse_range(line: &str) -> Option<PacketRange> {
-    let mut words = line.split(|c: char| c.is_whitespace() || c == ',').filter(|word| !word.is_empty());
+    let mut words = Separator::CommasOrBlanks.cells(line);
     let apid = words.next()?;
     let apid = match apid.strip_prefix("0x") {
         Some(digits) => u16::from_str_radix(digits, 16).ok()?,

@@ -9,11 +9,12 @@ use super::arguments::{ArrayArgs, MapFileArgs, TimeOfMission, band_text, frequen
 use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::array::Array;
+use crate::files::{Columns, Row, Separator, TableFault};
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
 use crate::sky::fits::{MapFile, ReadOptions, check_frequency, read_notes, read_whole_map_file};
 use crate::sky::healpix::pixel_area_sr;
-use crate::units::{Dimension, Pair, echo};
+use crate::units::{Dimension, MAX_SATELLITES, Pair, echo};
 
 /// Predict visibilities of a sky map by a direct sum over its pixels.
 ///
@@ -21,7 +22,7 @@ use crate::units::{Dimension, Pair, echo};
 /// is evaluated at its centre, and counts if the Moon does not hide its centre. A map in Galactic or equatorial
 /// coordinates is not resampled; its pixel centres are rotated.
 ///
-/// Without --at, reads rows `t_s,i,j,freq_hz` from standard input, as CSV with that header.
+/// Without --at, reads rows from standard input: CSV with the columns t_s, i, j, freq_hz.
 ///
 /// Example: lunarray predict --sky sky.fits --at 2h --pair 1-2 --freq-hz 10e6
 #[derive(Debug, Args)]
@@ -47,6 +48,9 @@ pub(super) struct PredictArgs {
     #[command(flatten)]
     array: ArrayArgs,
 }
+
+/// Columns of standard input.
+const COLUMNS: [&str; 4] = ["t_s", "i", "j", "freq_hz"];
 
 #[derive(Clone, Copy)]
 struct VisibilityQuery {
@@ -106,16 +110,17 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         return Ok(Completion::Done);
     }
     let mut input = std::io::stdin().lock();
-    let header = next_line(&mut input, 1)?.unwrap_or_default();
-    if header.split(',').map(str::trim).ne(["t_s", "i", "j", "freq_hz"]) {
-        let found = echo(header);
-        return Err(format!("standard input, line 1: found `{found}`, expected `t_s,i,j,freq_hz`").into());
-    }
+    let of_input = |fault: TableFault| format!("standard input, {fault}");
+    let names = next_line(&mut input, 1)?.unwrap_or_default();
+    let columns = Columns::new(1, &names, Separator::Sign(',')).map_err(of_input)?;
+    let places = columns.places(COLUMNS, "t_s,i,j,freq_hz").map_err(of_input)?;
     for number in 2.. {
         let Some(line) = next_line(&mut input, number)? else { break };
         if !line.trim().is_empty() {
-            let query = parse(&line).and_then(|query| check(&array, query).map(|()| query));
-            print_prediction(query.map_err(|error| format!("standard input, line {number}: {error}"))?)?;
+            let query = columns.row(number, &line).and_then(|row| query(&row, places));
+            let query = query.map_err(of_input)?;
+            check(&array, query).map_err(|error| format!("standard input, line {number}: {error}"))?;
+            print_prediction(query)?;
         }
     }
     Ok(Completion::Done)
@@ -135,19 +140,12 @@ impl PredictArgs {
     }
 }
 
-fn parse(line: &str) -> Result<VisibilityQuery, String> {
-    let fields: Vec<&str> = line.split(',').map(str::trim).collect();
-    let [t_s, i, j, freq_hz] = fields[..] else {
-        return Err(format!("found {} fields, expected t_s,i,j,freq_hz", fields.len()));
-    };
-    let number = |name: &str, text: &str| {
-        text.parse::<f64>().map_err(|_| format!("{name} = `{}`: expected a number", echo(text)))
-    };
-    let satellite = |name: &str, text: &str| {
-        text.parse::<usize>().map_err(|_| format!("{name} = `{}`: expected a satellite's number", echo(text)))
-    };
-    let pair = Pair::from_one_based(satellite("i", i)?, satellite("j", j)?).map_err(|e| e.to_string())?;
-    Ok(VisibilityQuery { t_s: number("t_s", t_s)?, pair, freq_hz: number("freq_hz", freq_hz)? })
+fn query(row: &Row<'_>, [t_s, i, j, freq_hz]: [usize; 4]) -> Result<VisibilityQuery, TableFault> {
+    let number = |place| row.number(place, |_| true, "a number");
+    let satellite = |place| row.cell(place).parse().map_err(|_| row.fault(place, "a satellite's number"));
+    let pair = Pair::from_one_based(satellite(i)?, satellite(j)?);
+    let pair = pair.map_err(|_| row.fault(j, &format!("1 <= i < j <= {MAX_SATELLITES}")))?;
+    Ok(VisibilityQuery { t_s: number(t_s)?, pair, freq_hz: number(freq_hz)? })
 }
 
 fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {

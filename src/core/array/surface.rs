@@ -6,7 +6,7 @@ use super::bodies::{MoonAxes, Orientation};
 use super::config::ArrayError;
 use super::state::SatelliteState;
 use super::stations::{Station, Stations};
-use crate::files::{read_file, text_of};
+use crate::files::{Columns, Separator, TableFault, numbered_lines, read_file, text_of};
 use crate::units::constants::MOON_RELIEF_M;
 use crate::units::time_scales::Tai;
 use crate::units::vector::{Vec3, cross, direction, norm, scale, unit};
@@ -14,9 +14,6 @@ use crate::units::{Checks, MAX_SATELLITES};
 
 /// Largest file of stations that is read, bytes.
 const FILE_BYTES_MAX: u64 = 1 << 20;
-
-/// Names of the columns of a file of stations.
-const COLUMNS: [&str; 3] = ["longitude_deg", "latitude_deg", "height_m"];
 
 /// The stations' motion from `epoch` on, on a Moon of this radius.
 pub(super) fn motions(
@@ -56,29 +53,23 @@ fn read(path: &Path, satellites: usize) -> Result<Vec<Station>, ArrayError> {
     let bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| error(source.to_string()))?;
     let text =
         text_of(&bytes).map_err(|form| error(format!("{form}; expected a table as plain text (CSV)")))?;
-    let mut lines =
-        text.lines().zip(1..).filter(|(line, _)| !line.trim().is_empty() && !line.starts_with('#'));
-    let cells = |line: &str| -> Vec<String> { line.split(',').map(|cell| cell.trim().to_owned()).collect() };
-    let names = lines.next().map(|(line, _)| cells(line)).unwrap_or_default();
-    let places = COLUMNS.map(|column| names.iter().position(|name| name == column));
-    let [Some(longitude), Some(latitude), height] = places else {
-        let found = names.iter().take(10).cloned().collect::<Vec<_>>().join(", ");
-        return Err(error(format!(
-            "found the columns {found:?}; expected longitude_deg, latitude_deg, and height_m if they are not all 0"
-        )));
-    };
+    let of_table = |fault: TableFault| error(fault.to_string());
+    let mut lines = numbered_lines(&text);
+    let (number, names) = lines.next().unwrap_or((1, ""));
+    let columns = Columns::new(number, names, Separator::Sign(',')).map_err(of_table)?;
+    let expected = "longitude_deg, latitude_deg, and height_m if they are not all 0";
+    let [longitude, latitude] =
+        columns.places(["longitude_deg", "latitude_deg"], expected).map_err(of_table)?;
+    let height = columns.place("height_m").map_err(of_table)?;
     let mut stations = Vec::new();
-    for (line, number) in lines {
-        let cells = cells(line);
-        let value = |place: usize| -> Result<f64, ArrayError> {
-            let cell = cells.get(place).map_or("", String::as_str);
-            let shown: String = cell.chars().take(40).collect();
-            cell.parse().map_err(|_| {
-                error(format!("line {number}: found {shown:?} as {}; expected a number", names[place]))
-            })
+    for (number, line) in lines {
+        let row = columns.row(number, line).map_err(of_table)?;
+        let value = |place| row.number(place, |_| true, "a number").map_err(of_table);
+        let station = Station {
+            longitude_deg: value(longitude)?,
+            latitude_deg: value(latitude)?,
+            height_m: height.map_or(Ok(0.0), value)?,
         };
-        let height_m = height.map_or(Ok(0.0), value)?;
-        let station = Station { longitude_deg: value(longitude)?, latitude_deg: value(latitude)?, height_m };
         let mut checks = Checks::new("");
         station.check("", &mut checks);
         if let Some(problem) = checks.finish().into_iter().next() {
@@ -218,6 +209,10 @@ mod tests {
         for (text, told) in [
             ("lat,lon\n1,2\n", "found the columns \"lat, lon\""),
             ("longitude_deg,latitude_deg\n1,2\n3,x\n", "line 3: found \"x\" as latitude_deg"),
+            (
+                "longitude_deg,latitude_deg,height_km\n1,2,3\n",
+                "\"height_km\"; expected its values as height_m",
+            ),
             ("longitude_deg,latitude_deg\n1,2\n3,95\n", "line 3: latitude_deg = 95"),
             ("longitude_deg,latitude_deg\n1,2\n3,4\n", "2 stations; expected as many as array.satellites, 3"),
             ("longitude_deg,latitude_deg\n1,2\n1,2\n3,4\n", "satellites 1 and 2 are at one place"),

@@ -1,11 +1,12 @@
 //! Atomic files: complete under their name or absent, and written by one process at a time. All code that writes files
-//! uses this module.
+//! uses this module, and all that reads tables its [`Columns`].
 
 mod access;
 mod atomic;
 mod folder_lock;
 mod form;
 mod protected;
+mod table;
 #[cfg(test)]
 mod tests;
 
@@ -18,3 +19,4 @@ pub use atomic::{
 pub use folder_lock::FolderLock;
 pub use form::{form_of, form_with_remedy, text_of};
 pub use protected::{ProtectedInputs, require_replaceable};
+pub use table::{Columns, Row, Separator, TableFault, is_comment, numbered_lines};

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::files::read_text;
+use crate::files::{Separator, numbered_lines, read_text};
 use crate::imaging::circle::degrees;
 use crate::imaging::solver::SolveError;
 
@@ -111,27 +111,21 @@ impl Regulariser {
 /// Parses a table to its first degree and C_l from there on, or says which line is wrong.
 pub(in crate::imaging) fn parse_power(text: &str) -> Result<(usize, Vec<f64>), String> {
     let (mut first, mut power_k2) = (0, Vec::new());
-    for (number, line) in text.lines().enumerate() {
-        let fields: Vec<&str> =
-            line.split([',', ' ', '\t']).map(str::trim).filter(|field| !field.is_empty()).collect();
-        let is_header =
-            power_k2.is_empty() && fields.first().is_some_and(|field| field.parse::<f64>().is_err());
-        if fields.is_empty() || is_header || line.starts_with('#') {
+    for (number, line) in numbered_lines(text) {
+        let mut cells = Separator::CommasOrBlanks.cells(line);
+        let [degree, power] = [cells.next(), cells.next()].map(Option::unwrap_or_default);
+        let is_header = power_k2.is_empty() && degree.parse::<f64>().is_err();
+        if is_header {
             continue;
         }
-        let values = (fields.first().and_then(|l| l.parse::<usize>().ok()), fields.get(1));
-        let power = values.1.and_then(|power| power.parse::<f64>().ok());
-        match (values.0, power) {
+        match (degree.parse::<usize>().ok(), Separator::CommasOrBlanks.number(&power)) {
             (Some(l), Some(power))
-                if (power_k2.is_empty() || l == first + power_k2.len())
-                    && l <= DEGREE_MAX
-                    && power > 0.0
-                    && power.is_finite() =>
+                if (power_k2.is_empty() || l == first + power_k2.len()) && l <= DEGREE_MAX && power > 0.0 =>
             {
                 first = l - power_k2.len();
                 power_k2.push(power);
             }
-            _ => return Err(format!("line {}: {}", number + 1, line.chars().take(60).collect::<String>())),
+            _ => return Err(format!("line {number}: {}", line.chars().take(60).collect::<String>())),
         }
     }
     if power_k2.is_empty() { Err("no degrees".to_owned()) } else { Ok((first, power_k2)) }

@@ -5,15 +5,11 @@ use std::path::Path;
 
 use num_complex::Complex64;
 
-use crate::files::{read_file, text_of};
-use crate::units::{echo, shortened};
+use crate::files::{Columns, Row, Separator, TableFault, numbered_lines, read_file, text_of};
 
 /// Largest table that is read, bytes: three dipoles at 8 frequencies each degree, at 30 each 2 degrees. A line takes 64 bytes in memory, eight
 /// times the shortest.
 const FILE_BYTES_MAX: u64 = 1 << 27;
-
-/// Longest header that a message repeats, characters.
-const HEADER_CHARS_MAX: usize = 200;
 
 /// How much values of one direction may differ, relative to the table's greatest field or gain: as 0 and 360 deg may by rounding.
 const REPEATED_ERROR_MAX: f64 = 1e-3;
@@ -55,65 +51,63 @@ impl Value {
     }
 }
 
-/// Columns of a table, by name.
-struct Columns {
-    places: BTreeMap<String, usize>,
-    count: usize,
-    has_fields: bool,
-    gain: Option<&'static str>,
+/// Places of the columns of a table.
+struct Places {
+    angles: [usize; 3],
+    dipole: Option<usize>,
+    values: ValuePlaces,
+}
+
+#[derive(Clone, Copy)]
+enum ValuePlaces {
+    Fields([usize; 4]),
+    Gain(usize),
+    GainDb(usize),
 }
 
 const FIELDS: [&str; 4] = ["e_theta_re", "e_theta_im", "e_phi_re", "e_phi_im"];
 
-impl Columns {
-    fn of(header: &str) -> Result<Self, String> {
-        let mut places: BTreeMap<String, usize> = BTreeMap::new();
-        for (k, name) in header.split(',').map(str::trim).enumerate() {
-            if places.insert(name.to_owned(), k).is_some() && !name.is_empty() {
-                return Err(format!("several columns {:?}; expected one of each name", echo(name)));
-            }
-        }
-        let has = |name: &str| places.contains_key(name);
-        let has_fields = FIELDS.iter().all(|name| has(name));
-        let gain = ["gain", "gain_db"].into_iter().find(|name| has(name));
-        let angles = ["frequency_hz", "theta_deg", "phi_deg"].iter().all(|name| has(name));
-        if !angles || has_fields == gain.is_some() {
-            return Err(format!(
-                "columns {:?}; expected frequency_hz, theta_deg, phi_deg, and either gain, gain_db or {}; dipole (1 to 3) if \
-                 there are several",
-                shortened(header, HEADER_CHARS_MAX),
-                FIELDS.join(", ")
-            ));
-        }
-        Ok(Self { places, count: header.split(',').count(), has_fields, gain })
+impl Places {
+    fn of(columns: &Columns) -> Result<Self, TableFault> {
+        let expected = format!(
+            "frequency_hz, theta_deg, phi_deg, and either gain, gain_db or {}; dipole (1 to 3) if there are several",
+            FIELDS.join(", ")
+        );
+        let angles = columns.places(["frequency_hz", "theta_deg", "phi_deg"], &expected)?;
+        let fields: Vec<usize> =
+            FIELDS.iter().filter_map(|name| columns.place(name).transpose()).collect::<Result<_, _>>()?;
+        let values = match (fields[..].try_into(), columns.place("gain")?, columns.place("gain_db")?) {
+            (Ok(fields), None, None) => ValuePlaces::Fields(fields),
+            (Err(_), Some(gain), _) => ValuePlaces::Gain(gain),
+            (Err(_), None, Some(gain_db)) => ValuePlaces::GainDb(gain_db),
+            _ => return Err(columns.unlike(&expected)),
+        };
+        Ok(Self { angles, dipole: columns.place("dipole")?, values })
     }
 
     /// A line's frequency and dipole, and its sample.
-    fn sample(&self, line: &str, number: u32) -> Option<((u64, usize), Sample)> {
-        let fields: Vec<&str> = line.split(',').map(str::trim).collect();
-        if fields.iter().skip(self.count).any(|field| !field.is_empty()) {
-            return None;
-        }
-        let value = |name: &str| -> Option<f64> {
-            let value: f64 = fields.get(*self.places.get(name)?)?.parse().ok()?;
-            value.is_finite().then_some(value)
-        };
-        let dipole = if self.places.contains_key("dipole") { value("dipole")? } else { 1.0 };
-        let [hz, theta_deg, phi_deg] = [value("frequency_hz")?, value("theta_deg")?, value("phi_deg")?];
-        if !(hz > 0.0 && (0.0..=180.0).contains(&theta_deg) && [1.0, 2.0, 3.0].contains(&dipole)) {
-            return None;
-        }
-        let value = match self.gain {
-            Some("gain_db") => Value::Gain(10f64.powf(value("gain_db")? / 10.0)),
-            Some(gain) => Value::Gain(value(gain).filter(|gain| *gain >= 0.0)?),
-            None => {
-                let [a, b, c, d] = FIELDS.map(value);
-                Value::Field([Complex64::new(a?, b?), Complex64::new(c?, d?)])
+    fn sample(&self, row: &Row<'_>) -> Result<((u64, usize), Sample), TableFault> {
+        let any = |place| row.number(place, |_| true, "a finite number");
+        let [hz, theta, phi] = self.angles;
+        let hz = row.number(hz, |hz| hz > 0.0, "a frequency above 0")?;
+        let theta_deg = row.number(theta, |theta| (0.0..=180.0).contains(&theta), "0 to 180 deg")?;
+        let phi_deg = any(phi)?;
+        let dipole = self.dipole.map_or(Ok(1.0), |place| {
+            row.number(place, |dipole| [1.0, 2.0, 3.0].contains(&dipole), "a dipole from 1 to 3")
+        })?;
+        let value = match self.values {
+            ValuePlaces::GainDb(gain) => Value::Gain(10f64.powf(any(gain)? / 10.0)),
+            ValuePlaces::Gain(gain) => {
+                Value::Gain(row.number(gain, |gain| gain >= 0.0, "a gain of 0 or more")?)
+            }
+            ValuePlaces::Fields([a, b, c, d]) => {
+                Value::Field([Complex64::new(any(a)?, any(b)?), Complex64::new(any(c)?, any(d)?)])
             }
         };
         // A zero with a sign is the same direction.
         let [theta_deg, phi_deg] = [theta_deg, phi_deg.rem_euclid(360.0)].map(|angle| angle + 0.0);
-        Some(((hz.to_bits(), dipole as usize - 1), Sample { theta_deg, phi_deg, line: number, value }))
+        let sample = Sample { theta_deg, phi_deg, line: row.line as u32, value };
+        Ok(((hz.to_bits(), dipole as usize - 1), sample))
     }
 }
 
@@ -121,25 +115,18 @@ impl Columns {
 pub(super) fn read_table(path: &Path) -> Result<Table, String> {
     let bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| source.to_string())?;
     let text = text_of(&bytes).map_err(|form| format!("{form}; expected CSV as plain text"))?;
-    let mut lines =
-        text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !line.starts_with('#'));
-    let (_, header) = lines.next().ok_or("no lines; expected a line of columns")?;
-    let columns = Columns::of(header)?;
+    let mut lines = numbered_lines(&text);
+    let (line, names) = lines.next().ok_or("no lines; expected a line of columns")?;
+    let told = |fault: TableFault| fault.to_string();
+    let columns = Columns::new(line, names, Separator::Sign(',')).map_err(told)?;
+    let places = Places::of(&columns).map_err(told)?;
     let mut table = Table::new();
-    for (k, line) in lines {
-        let Some((key, sample)) = columns.sample(line, k as u32 + 1) else {
-            return Err(format!(
-                "line {}: found {:?}; expected {} finite numbers: a frequency above 0, theta from 0 to 180 deg, a dipole from 1 to 3, a \
-                 gain of 0 or more",
-                k + 1,
-                echo(line),
-                columns.count
-            ));
-        };
+    for (line, text) in lines {
+        let (key, sample) = columns.row(line, text).and_then(|row| places.sample(&row)).map_err(told)?;
         table.entry(key).or_default().push(sample);
     }
     table.values_mut().try_for_each(leave_repeated_out)?;
-    if columns.has_fields || !table.keys().any(|(_, dipole)| *dipole > 0) {
+    if matches!(places.values, ValuePlaces::Fields(_)) || !table.keys().any(|(_, dipole)| *dipole > 0) {
         return Ok(table);
     }
     // Gains of several dipoles do not say how their phases differ.

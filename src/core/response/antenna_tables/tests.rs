@@ -184,15 +184,15 @@ fn what_is_no_dipole_is_refused() {
             format!("{HEADER}{}", good.split_inclusive('\n').take(30).collect::<String>()),
             "directions; expected 40 or more",
         ),
-        (
-            format!("{HEADER}{good}2e6,1,90,0,1,0,0,0,9\n"),
-            "line 1372: found \"2e6,1,90,0,1,0,0,0,9\"; expected 8 finite",
-        ),
+        (format!("{HEADER}{good}2e6,1,90,0,1,0,0,0,9\n"), "line 1372: found 9 cells; expected 8"),
         (format!("{HEADER}{good}").replace("e_phi_im", "e_phi_im,dipole"), "several columns \"dipole\""),
         ("a\0,\0b\0".to_owned(), "UTF-16; expected CSV"),
         (format!("{HEADER}{lopsided}"), "of the table; expected at most 2.00 %"),
         (format!("{HEADER}{phased}"), "of the table; expected at most 2.00 %"),
-        (format!("{HEADER}{good}2e6,1,190,0,0,0,0,0\n"), "line 1372: found \"2e6,1,190,0,0,0,0,0\""),
+        (
+            format!("{HEADER}{good}2e6,1,190,0,0,0,0,0\n"),
+            "line 1372: found \"190\" as theta_deg; expected 0 to 180",
+        ),
         (format!("{HEADER}{good}").replace("e_phi_im", "e_phi"), "expected frequency_hz, theta_deg, phi_deg"),
         // Two values of one direction; those at 0 and 360 deg differ by rounding.
         (

@@ -1,5 +1,6 @@
 //! Published catalogues of point sources: text tables with a line of column names.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -8,12 +9,12 @@ use thiserror::Error;
 use super::column_units::{
     FLUX_WORDS, POSITION_WORDS, angle_deg, flux_jy, in_comments, is_unit, require_unit,
 };
-use super::columns::{Columns, normalise};
-use crate::files::{read_file, text_of};
+use super::columns::{SourceColumns, normalise};
+use crate::files::{Columns, Row, Separator, TableFault, is_comment, read_file, text_of};
 use crate::sky::Frame;
 use crate::sky::frame::rotate;
-use crate::units::Dimension;
 use crate::units::vector::Vec3;
+use crate::units::{Dimension, echo};
 
 /// Maximum size of a catalogue, bytes; a line has some 50.
 const BYTES_MAX: u64 = 256 << 20;
@@ -136,20 +137,19 @@ struct Units {
     flux_jy: f64,
 }
 
-/// Column names, units and numbered lines of a table.
+/// Columns, units and numbered lines of a table.
 struct Table<'a> {
-    names: Vec<String>,
+    columns: Columns,
     units: Vec<String>,
     /// Names in the comments before the table, and the units that they give.
     comment_units: Vec<(String, String)>,
     rows: Vec<(usize, &'a str)>,
-    separator: char,
 }
 
 impl Table<'_> {
     /// The name of a column, and its units in their row and in comments, there under its name or else one of `others`.
     fn units_of(&self, place: usize, others: &[&str]) -> (&str, Vec<String>) {
-        let name = normalise(&self.names[place]);
+        let name = normalise(&self.columns.names[place]);
         let in_comments = |names: &[&str]| {
             let of_column = self.comment_units.iter().filter(|(found, _)| names.contains(&found.as_str()));
             of_column.map(|(_, unit)| unit.clone()).collect::<Vec<String>>()
@@ -159,7 +159,7 @@ impl Table<'_> {
             found = in_comments(others);
         }
         found.push(self.units[place].clone());
-        (&self.names[place], found)
+        (&self.columns.names[place], found)
     }
 }
 
@@ -178,20 +178,25 @@ impl Reader<'_> {
         CatalogueError::Content { path: self.path.to_owned(), line, found, expected }
     }
 
+    fn table_error(&self, TableFault { line, found, expected }: TableFault) -> CatalogueError {
+        self.content_error(line, found, expected)
+    }
+
     fn read(&self) -> Result<Catalogue, CatalogueError> {
         let text = self.text()?;
         let table = self.table(&text)?;
-        let comments = text.lines().take_while(|line| line.trim().is_empty() || line.starts_with('#'));
+        let comments = text.lines().take_while(|line| line.trim().is_empty() || is_comment(line));
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let is_vlssr =
             comments.clone().chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
-        let columns = Columns::recognise(&table.names, is_vlssr).map_err(|expected| {
-            let names: Vec<String> = table.names.iter().take(40).map(|name| displayed(name)).collect();
+        let columns = SourceColumns::recognise(&table.columns.names, is_vlssr).map_err(|expected| {
+            let names: Vec<String> =
+                table.columns.names.iter().take(40).map(|name| displayed(name)).collect();
             let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
             self.content_error(first, format!("the columns {}", names.join(", ")), expected)
         })?;
         if columns.frame == Frame::Equatorial
-            && !columns.places.iter().flatten().any(|place| table.names[*place].contains("2000"))
+            && !columns.places.iter().flatten().any(|place| table.columns.names[*place].contains("2000"))
             && let Some(line) = old_equinox(comments, &table, &columns)
         {
             let found = "positions of B1950 (FK4)";
@@ -205,17 +210,16 @@ impl Reader<'_> {
         let sources: Vec<Source> = table
             .rows
             .iter()
-            .map(|&(line, text)| self.source(line, &cells(text, table.separator), &columns, &table, units))
-            .collect::<Result<_, _>>()?;
+            .map(|&(line, text)| source(&table.columns.row(line, text)?, &columns, units))
+            .collect::<Result<_, TableFault>>()
+            .map_err(|fault| self.table_error(fault))?;
         if sources.is_empty() {
             return Err(self.content_error(1, "no sources", "one line per source below the names"));
         }
-        let name = |place: usize| table.names[place].clone();
+        let name = |place: usize| table.columns.names[place].clone();
         let is_name = |name: &String| ["name", "source", "id"].contains(&&*normalise(name));
-        let source_names = table.names.iter().position(is_name).map_or_else(Vec::new, |place| {
-            let name = |(_, text): &(usize, &str)| {
-                cells(text, table.separator).get(place).cloned().unwrap_or_default()
-            };
+        let source_names = table.columns.names.iter().position(is_name).map_or_else(Vec::new, |place| {
+            let name = |(_, text): &(usize, &str)| table.columns.cell(text, place);
             table.rows.iter().map(name).collect()
         });
         Ok(Catalogue {
@@ -229,12 +233,12 @@ impl Reader<'_> {
     }
 
     /// The units of the columns that are used, each of which is there once.
-    fn units(&self, table: &Table<'_>, columns: &Columns) -> Result<Units, CatalogueError> {
-        let Columns { places: [lon, lat], flux, unfitted_flux, frequency_place, index, .. } = columns;
+    fn units(&self, table: &Table<'_>, columns: &SourceColumns) -> Result<Units, CatalogueError> {
+        let SourceColumns { places: [lon, lat], flux, unfitted_flux, frequency_place, index, .. } = columns;
         let own = frequency_place.map(|(place, _)| place);
         for &place in lon.iter().chain(lat).chain([flux]).chain(unfitted_flux).chain(&own).chain(index) {
-            let name = &table.names[place];
-            if table.names.iter().filter(|other| *other == name).count() > 1 {
+            let name = &table.columns.names[place];
+            if table.columns.names.iter().filter(|other| *other == name).count() > 1 {
                 let found = format!("several columns `{}`", displayed(name));
                 return Err(self.content_error(1, found, "one of each name"));
             }
@@ -310,107 +314,92 @@ impl Reader<'_> {
     /// Divides the text into names, units and rows. The names are the first line, or the last comment before numbers.
     fn table<'a>(&self, text: &'a str) -> Result<Table<'a>, CatalogueError> {
         let (mut comment, mut comments) = (None, Vec::new());
-        let mut lines = text.lines().zip(1..).map(|(text, line)| (line, text)).filter(|(_, text)| {
-            let is_comment = text.trim_start().starts_with('#');
-            if is_comment {
+        let mut lines = (1..).zip(text.lines()).filter(|(_, text)| {
+            if is_comment(text) {
                 comment = Some(text.trim_start().trim_start_matches('#').trim());
                 comments.extend(comment);
             }
-            !is_comment && !text.trim().is_empty()
+            !is_comment(text) && !text.trim().is_empty()
         });
         let first = lines.next();
         let mut rest: Vec<(usize, &str)> = lines.collect();
         let Some((line, first)) = first else {
             return Err(self.content_error(1, "no columns", "a line of names, then one line per source"));
         };
-        let separator = separator_of(first);
-        let is_data = |text: &str| cells(text, separator).iter().any(|cell| cell.parse::<f64>().is_ok());
-        let names = match (is_data(first), comment) {
+        let separator = Separator::of(first);
+        let cells = |text: &str| separator.cells(text).map(Cow::into_owned).collect::<Vec<String>>();
+        let is_data = |text: &str| separator.cells(text).any(|cell| cell.parse::<f64>().is_ok());
+        let (line, names) = match (is_data(first), comment) {
             (true, Some(comment)) => {
                 rest.insert(0, (line, first));
-                cells(comment, separator)
+                (line, comment)
             }
-            _ => cells(first, separator),
+            _ => (line, first),
         };
+        let columns = Columns::new(line, names, separator).map_err(|fault| self.table_error(fault))?;
         let is_rule = |text: &str| !text.is_empty() && text.chars().all(|c| "-=+| \t;,".contains(c));
-        let mut units = vec![String::new(); names.len()];
-        let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text, separator)));
+        let mut units = vec![String::new(); columns.names.len()];
+        let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text)));
         if has_units {
-            let found = cells(rest.remove(0).1, separator);
+            let found = cells(rest.remove(0).1);
             units.iter_mut().zip(found).for_each(|(unit, found)| *unit = found);
         }
         rest.retain(|(_, text)| !is_rule(text));
-        Ok(Table { names, units, comment_units: in_comments(&comments), rows: rest, separator })
+        Ok(Table { columns, units, comment_units: in_comments(&comments), rows: rest })
     }
+}
 
-    fn source(
-        &self,
-        line: usize,
-        cells: &[String],
-        columns: &Columns,
-        table: &Table<'_>,
-        units: Units,
-    ) -> Result<Source, CatalogueError> {
-        let more = cells.iter().skip(table.names.len()).any(|cell| !cell.is_empty());
-        if more {
-            let found = format!("{} cells", cells.len());
-            return Err(self.content_error(line, found, format!("{}, one a name", table.names.len())));
-        }
-        let cell = |place: usize| cells.get(place).map_or("", String::as_str);
-        let joined = |places: &[usize]| places.iter().map(|&place| cell(place)).collect::<Vec<_>>().join(" ");
-        let angle = |k: usize, expected: &str, limit: f64| {
-            let text = joined(&columns.places[k]);
-            let unit_deg = match is_sexagesimal(&text) {
-                true if k == 0 && (columns.frame == Frame::Equatorial || units.angle_deg[0] == 15.0) => 15.0,
-                true => 1.0,
-                false => units.angle_deg[k],
-            };
-            let degrees = angle_of(&text).map(|value| unit_deg * value);
-            let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= limit);
-            found.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(&text)), expected))
+/// The source of a row.
+fn source(row: &Row<'_>, columns: &SourceColumns, units: Units) -> Result<Source, TableFault> {
+    let fault = |found: String, expected: &str| row.fault_of(found, expected);
+    let joined = |places: &[usize]| places.iter().map(|&place| row.cell(place)).collect::<Vec<_>>().join(" ");
+    let angle = |k: usize, expected: &str, limit: f64| {
+        let text = joined(&columns.places[k]);
+        let unit_deg = match is_sexagesimal(&text) {
+            true if k == 0 && (columns.frame == Frame::Equatorial || units.angle_deg[0] == 15.0) => 15.0,
+            true => 1.0,
+            false => units.angle_deg[k],
         };
-        let lon = angle(0, "a longitude: degrees, or hours, minutes and seconds", 360.0)?.to_radians();
-        let lat = angle(1, "a latitude of -90 to 90 degrees", 90.0)?.to_radians();
-        let number = |place: usize, expected: &str, good: fn(f64) -> bool| {
-            let value = number_of(cell(place), table.separator).filter(|value| good(*value));
-            value.ok_or_else(|| self.content_error(line, format!("`{}`", displayed(cell(place))), expected))
-        };
-        let flux_place =
-            columns.unfitted_flux.filter(|_| is_blank(cell(columns.flux))).unwrap_or(columns.flux);
-        let flux = number(flux_place, "a flux density above 0", |flux| flux > 0.0)?;
-        if units.flux_jy * flux > FLUX_JY_MAX {
-            let found = format!("{flux:e} {}", if units.flux_jy < 1.0 { "mJy" } else { "Jy" });
-            return Err(self.content_error(line, found, format!("at most {FLUX_JY_MAX:e} Jy")));
-        }
-        let at_hz = match columns.frequency_place {
-            None => columns.flux_hz,
-            Some((place, unit)) => unit * number(place, "a frequency above 0", |value| value > 0.0)?,
-        };
-        if !(FREQUENCY_HZ_MIN..=FREQUENCY_HZ_MAX).contains(&at_hz) {
-            let expected = "a radio frequency, 10 kHz to 1000 GHz";
-            return Err(self.content_error(line, format!("a flux at {at_hz:e} Hz"), expected));
-        }
-        let index = match columns.index {
-            // Sources without a fit have no index.
-            Some(place) if !is_blank(cell(place)) => {
-                Some(number(place, "a spectral index of -10 to 10", |index| index.abs() <= 10.0)?)
-            }
-            _ => None,
-        };
-        let own = [lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()];
-        let direction = match columns.frame {
-            Frame::Ecliptic => own,
-            frame => rotate(&frame.to_ecliptic(), own),
-        };
-        Ok(Source { direction, flux_jy: units.flux_jy * flux, at_hz, index })
+        let degrees = angle_of(&text).map(|value| unit_deg * value);
+        let found = degrees.filter(|degrees| degrees.is_finite() && degrees.abs() <= limit);
+        found.ok_or_else(|| fault(format!("{:?}", echo(&text)), expected))
+    };
+    let lon = angle(0, "a longitude: degrees, or hours, minutes and seconds", 360.0)?.to_radians();
+    let lat = angle(1, "a latitude of -90 to 90 degrees", 90.0)?.to_radians();
+    let flux_place =
+        columns.unfitted_flux.filter(|_| is_blank(row.cell(columns.flux))).unwrap_or(columns.flux);
+    let flux = row.number(flux_place, |flux| flux > 0.0, "a flux density above 0")?;
+    if units.flux_jy * flux > FLUX_JY_MAX {
+        let found = format!("{flux:e} {}", if units.flux_jy < 1.0 { "mJy" } else { "Jy" });
+        return Err(fault(found, &format!("at most {FLUX_JY_MAX:e} Jy")));
     }
+    let at_hz = match columns.frequency_place {
+        None => columns.flux_hz,
+        Some((place, unit)) => unit * row.number(place, |value| value > 0.0, "a frequency above 0")?,
+    };
+    if !(FREQUENCY_HZ_MIN..=FREQUENCY_HZ_MAX).contains(&at_hz) {
+        return Err(fault(format!("a flux at {at_hz:e} Hz"), "a radio frequency, 10 kHz to 1000 GHz"));
+    }
+    let index = match columns.index {
+        // Sources without a fit have no index.
+        Some(place) if !is_blank(row.cell(place)) => {
+            Some(row.number(place, |index| index.abs() <= 10.0, "a spectral index of -10 to 10")?)
+        }
+        _ => None,
+    };
+    let own = [lat.cos() * lon.cos(), lat.cos() * lon.sin(), lat.sin()];
+    let direction = match columns.frame {
+        Frame::Ecliptic => own,
+        frame => rotate(&frame.to_ecliptic(), own),
+    };
+    Ok(Source { direction, flux_jy: units.flux_jy * flux, at_hz, index })
 }
 
 /// The line that says that positions are of B1950: a comment, the names, or a row with a column of equinoxes.
 fn old_equinox<'a>(
     comments: impl Iterator<Item = &'a str>,
     table: &Table<'_>,
-    columns: &Columns,
+    columns: &SourceColumns,
 ) -> Option<usize> {
     let is_old_comment = |line: &str| {
         let line = line.to_ascii_lowercase();
@@ -422,13 +411,12 @@ fn old_equinox<'a>(
         cell.contains("FK4") || cell.trim_start_matches('B').parse() == Ok(1950.0)
     };
     let in_rows = || {
-        let place = table.names.iter().position(|name| ["equinox", "epoch"].contains(&&*normalise(name)))?;
-        let old = |(_, text): &&(usize, &str)| {
-            cells(text, table.separator).get(place).is_some_and(|cell| is_old_cell(cell))
-        };
+        let place =
+            table.columns.names.iter().position(|name| ["equinox", "epoch"].contains(&&*normalise(name)))?;
+        let old = |(_, text): &&(usize, &str)| is_old_cell(&table.columns.cell(text, place));
         table.rows.iter().find(old).map(|(line, _)| *line)
     };
-    let in_names = columns.places.iter().flatten().any(|place| table.names[*place].contains("1950"));
+    let in_names = columns.places.iter().flatten().any(|place| table.columns.names[*place].contains("1950"));
     let in_comments = comments.zip(1..).find(|(line, _)| is_old_comment(line)).map(|(_, line)| line);
     in_comments.or(in_names.then_some(1)).or_else(in_rows)
 }
@@ -436,38 +424,6 @@ fn old_equinox<'a>(
 /// Formats a cell for messages: short, and without control characters.
 fn displayed(cell: &str) -> String {
     cell.chars().take(40).collect::<String>().escape_debug().to_string()
-}
-
-/// Detects the separator of a line's cells: the first of these characters that occurs, or blanks.
-fn separator_of(line: &str) -> char {
-    ['\t', ';', '|', ','].into_iter().find(|separator| line.contains(*separator)).unwrap_or(' ')
-}
-
-/// Splits a line into cells. A cell in quotes may contain the separator, and a doubled quote means a quote.
-fn cells(line: &str, separator: char) -> Vec<String> {
-    let is_end = |c: char| c == separator || (separator == ' ' && c.is_whitespace());
-    let (mut cells, mut cell, mut quoted) = (Vec::new(), String::new(), false);
-    let mut was_quoted = false;
-    let mut letters = line.chars().peekable();
-    while let Some(c) = letters.next() {
-        match c {
-            '"' if quoted && letters.peek() == Some(&'"') => {
-                letters.next();
-                cell.push('"');
-            }
-            '"' if quoted => quoted = false,
-            // A quote within a cell, as for arcseconds, is literal.
-            '"' if cell.trim().is_empty() => (quoted, was_quoted) = (true, true),
-            c if is_end(c) && !quoted => {
-                cells.push((std::mem::take(&mut cell), std::mem::take(&mut was_quoted)));
-            }
-            c => cell.push(c),
-        }
-    }
-    cells.push((cell, was_quoted));
-    // Any number of blanks separates.
-    let is_cell = |(cell, was_quoted): &(String, bool)| separator != ' ' || *was_quoted || !cell.is_empty();
-    cells.into_iter().filter(is_cell).map(|(cell, _)| cell.trim().to_owned()).collect()
 }
 
 /// Whether a row contains units: no numbers, and at least one unit that is usual in catalogues.
@@ -478,12 +434,6 @@ fn is_unit_row(cells: &[String]) -> bool {
 fn is_blank(cell: &str) -> bool {
     let cell = cell.to_ascii_lowercase();
     ["", "nan", "--", "-", "null", "none", "n/a"].contains(&cell.as_str())
-}
-
-/// Parses a finite number; with semicolons as separators, a comma may be the decimal point.
-fn number_of(cell: &str, separator: char) -> Option<f64> {
-    let pointed = if separator == ';' { cell.replace(',', ".") } else { cell.to_owned() };
-    pointed.parse().ok().filter(|value: &f64| value.is_finite())
 }
 
 fn is_sexagesimal(text: &str) -> bool {

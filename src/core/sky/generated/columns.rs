@@ -48,7 +48,7 @@ const INDICES: [&str; 8] =
 
 /// Indices of the columns that describe a source.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Columns {
+pub(super) struct SourceColumns {
     /// Frame of positions.
     pub frame: Frame,
     /// Columns of longitude and of latitude; several where hours or degrees, minutes and seconds are separate.
@@ -76,7 +76,7 @@ pub(super) fn normalise(name: &str) -> String {
     kept.trim_matches('.').to_ascii_lowercase()
 }
 
-impl Columns {
+impl SourceColumns {
     /// Recognises the columns of a catalogue by their names; the error is the expected columns. Flux columns of VLSSr do not contain
     /// the frequency in their name.
     pub(super) fn recognise(names: &[String], is_vlssr: bool) -> Result<Self, String> {
@@ -174,8 +174,8 @@ fn flux_hz(name: &str) -> Option<f64> {
 mod tests {
     use super::*;
 
-    fn columns(names: &str) -> Result<Columns, String> {
-        Columns::recognise(&names.split(',').map(str::to_owned).collect::<Vec<_>>(), false)
+    fn columns(names: &str) -> Result<SourceColumns, String> {
+        SourceColumns::recognise(&names.split(',').map(str::to_owned).collect::<Vec<_>>(), false)
     }
 
     #[test]
@@ -225,7 +225,7 @@ mod tests {
             );
         }
         assert_eq!(
-            Columns::recognise(&["ra", "dec", "Si"].map(str::to_owned), true).unwrap().flux_hz,
+            SourceColumns::recognise(&["ra", "dec", "Si"].map(str::to_owned), true).unwrap().flux_hz,
             73.8e6
         );
     }

@@ -160,7 +160,7 @@ fn catalogues_that_are_none_say_where() {
     assert!(said(b"ra,dec,S74 (K)\n1,2,3\n").contains("the unit `k` of `S74 (K)`"));
     // No sources, other line ends, cells beyond the names, and what no source has.
     assert!(said(b"ra,dec,S74\n").contains("no sources"));
-    assert!(said(b"ra,dec,S74\r10,20,5\r11,21,x\r").contains("line 3: found `x`"));
+    assert!(said(b"ra,dec,S74\r10,20,5\r11,21,x\r").contains("line 3: found \"x\" as S74"));
     assert!(said(b"ra,dec,S74\n10,5,20,5,3\n").contains("line 2: found 5 cells, expected 3"));
     assert!(said(b"ra,dec,S74,S74\n10,20,5,7\n").contains("several columns `S74`"));
     assert!(said(b"ra,dec,S74\n1,2,1e300\n").contains("line 2: found 1e300 Jy, expected at most 1e12"));
@@ -183,11 +183,11 @@ fn catalogues_that_are_none_say_where() {
     assert!(said(b"\x28\xb5\x2f\xfd\0").contains("a zstd file"));
     assert!(said(b"r\0a\0,\0").contains("UTF-16"));
     for (row, words) in [
-        ("1,2,x", "found `x`, expected a flux density"),
+        ("1,2,x", "found \"x\" as flux_154mhz_jy, expected a flux density"),
         ("1,2,-3", "above 0"),
         ("1,91,3", "-90 to 90"),
         ("NaN,1,3", "a longitude"),
-        ("1,2", "found ``"),
+        ("1,2", "found \"\" as flux_154mhz_jy"),
         ("10:61:00,2,3", "a longitude"),
     ] {
         let found = said(format!("{head}\n0,0,1\n{row}\n").as_bytes());
