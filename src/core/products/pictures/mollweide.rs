@@ -8,8 +8,8 @@ use super::canvas::{Canvas, Colour, FAINT, INK, Rect, Stroke, WHITE};
 use super::projection::{LatitudeLine, forward};
 use super::scale::{ColourScale, is_seen};
 use super::text::{Align, Style};
-use crate::sky::Frame;
-use crate::sky::healpix::{Ring, pixel_of, ring};
+use crate::sky::healpix::pixel_of;
+use crate::sky::{Bilinear, Frame};
 use crate::units::vector::{Vec3, dot};
 
 /// Number of samples along each side of a pixel of the picture.
@@ -21,7 +21,7 @@ pub enum Sampling {
     /// Each map pixel has a uniform colour.
     #[default]
     Pixels,
-    /// Linear interpolation between pixel centres along and across rings, which is smoother for coarse maps.
+    /// [`Bilinear`] interpolation between pixel centres, which is smoother for coarse maps.
     Interpolated,
 }
 
@@ -74,56 +74,17 @@ pub(super) struct MapField<'a> {
 }
 
 impl MapField<'_> {
-    /// Interpolates linearly between the two rings around a direction and between two pixels on each.
-    fn interpolated(&self, direction: Vec3) -> f64 {
+    /// Interpolates among those of the four pixels around a direction that have values; where the nearest has none there is none.
+    fn interpolated(&self, bilinear: &Bilinear, direction: Vec3) -> f64 {
         let nearest = self.values[pixel_of(self.nside, direction)];
         if !is_seen(nearest) {
             return nearest;
         }
-        let n = self.nside as f64;
-        let z = direction[2].clamp(-1.0, 1.0);
-        let from_north = if z.abs() <= 2.0 / 3.0 {
-            n * (2.0 - 1.5 * z)
-        } else {
-            let from_pole = n * (3.0 * (1.0 - z.abs())).sqrt();
-            if z > 0.0 { from_pole } else { 4.0 * n - from_pole }
-        };
-        let last = 4 * self.nside - 1;
-        let above = from_north.floor() as usize;
-        let weight = from_north - above as f64;
-        let longitude = direction[1].atan2(direction[0]);
-        let (mut sum, mut weights) = (0.0, 0.0);
-        for (k, ring_weight) in [(above, 1.0 - weight), (above + 1, weight)] {
-            if k == 0 || k > last {
-                // Beyond the first and last ring is a pole, whose value is the mean of that ring.
-                let ring = ring(self.nside, k.clamp(1, last));
-                for value in &self.values[ring.first..ring.first + ring.len] {
-                    add(&mut sum, &mut weights, *value, ring_weight / ring.len as f64);
-                }
-                continue;
-            }
-            let ring = ring(self.nside, k);
-            let (pixels, inside) = neighbours(&ring, longitude);
-            add(&mut sum, &mut weights, self.values[pixels[0]], ring_weight * (1.0 - inside));
-            add(&mut sum, &mut weights, self.values[pixels[1]], ring_weight * inside);
-        }
+        let around = bilinear.weights(direction).map(|(pixel, weight)| (self.values[pixel], weight));
+        let seen = around.into_iter().filter(|(value, _)| is_seen(*value));
+        let (sum, weights) = seen.fold((0.0, 0.0), |(sum, all), (value, w)| (sum + w * value, all + w));
         if weights > 1e-9 { sum / weights } else { nearest }
     }
-}
-
-fn add(sum: &mut f64, weights: &mut f64, value: f64, weight: f64) {
-    if is_seen(value) {
-        *sum += weight * value;
-        *weights += weight;
-    }
-}
-
-/// The pixels of a ring west and east of a longitude, and its fractional position between them.
-fn neighbours(ring: &Ring, longitude: f64) -> ([usize; 2], f64) {
-    let position = ((longitude - ring.phi0_rad) / TAU).rem_euclid(1.0) * ring.len as f64;
-    let west = (position.floor() as usize).min(ring.len - 1);
-    let east = if west + 1 == ring.len { 0 } else { west + 1 };
-    ([ring.first + west, ring.first + east], (position - west as f64).clamp(0.0, 1.0))
 }
 
 /// Draws a map into the largest ellipse that fits a rectangle.
@@ -169,28 +130,36 @@ impl Ellipse {
 struct Painter<'a> {
     field: MapField<'a>,
     scale: &'a ColourScale,
-    /// Colour of each map pixel, with [`Sampling::Pixels`].
-    pixels: Option<Vec<Colour>>,
+    sampler: Sampler,
+}
+
+enum Sampler {
+    /// Colour of each map pixel.
+    Pixels(Vec<Colour>),
+    Interpolated(Bilinear),
 }
 
 impl<'a> Painter<'a> {
     fn new(field: MapField<'a>, scale: &'a ColourScale, sampling: Sampling) -> Self {
-        let pixels = match sampling {
-            Sampling::Pixels => Some(field.values.par_iter().map(|v| scale.colour(*v)).collect()),
-            Sampling::Interpolated => None,
+        let sampler = match (sampling, Bilinear::new(field.nside)) {
+            (Sampling::Interpolated, Ok(bilinear)) => Sampler::Interpolated(bilinear),
+            // An nside that a number of pixels has can be interpolated.
+            _ => Sampler::Pixels(field.values.par_iter().map(|v| scale.colour(*v)).collect()),
         };
-        Self { field, scale, pixels }
+        Self { field, scale, sampler }
     }
 
     /// Whether one sample per pixel of the page is enough.
     fn is_smooth(&self) -> bool {
-        self.pixels.is_none()
+        matches!(self.sampler, Sampler::Interpolated(_))
     }
 
     fn colour(&self, direction: Vec3) -> Colour {
-        match &self.pixels {
-            Some(pixels) => pixels[pixel_of(self.field.nside, direction)],
-            None => self.scale.colour(self.field.interpolated(direction)),
+        match &self.sampler {
+            Sampler::Pixels(colours) => colours[pixel_of(self.field.nside, direction)],
+            Sampler::Interpolated(bilinear) => {
+                self.scale.colour(self.field.interpolated(bilinear, direction))
+            }
         }
     }
 }
@@ -298,9 +267,9 @@ mod tests {
         for nside in [1, 2, 8, 16] {
             let directions = pixel_directions(nside);
             let values: Vec<f64> = directions.iter().map(|d| d[2] + 0.3 * d[0]).collect();
-            let field = MapField { values: &values, nside };
+            let (field, bilinear) = (MapField { values: &values, nside }, Bilinear::new(nside).unwrap());
             for (d, v) in directions.iter().zip(&values) {
-                assert!((field.interpolated(*d) - v).abs() < 1e-9, "{nside}");
+                assert!((field.interpolated(&bilinear, *d) - v).abs() < 1e-9, "{nside}");
             }
         }
     }
@@ -310,14 +279,14 @@ mod tests {
         let nside = 4;
         let mut values = vec![2.0; pixel_count(nside)];
         values[50] = f64::NAN;
-        let field = MapField { values: &values, nside };
+        let (field, bilinear) = (MapField { values: &values, nside }, Bilinear::new(nside).unwrap());
         let directions = pixel_directions(nside);
-        assert!(field.interpolated(directions[50]).is_nan());
+        assert!(field.interpolated(&bilinear, directions[50]).is_nan());
         for k in 0..1000_u32 {
             let z = 2.0 * (f64::from(k) + 0.5) / 1000.0 - 1.0;
             let (s, c) = (f64::from(k) * 2.4).sin_cos();
             let across = (1.0 - z * z).sqrt();
-            let value = field.interpolated([across * c, across * s, z]);
+            let value = field.interpolated(&bilinear, [across * c, across * s, z]);
             assert!(value.is_nan() || (value - 2.0).abs() < 1e-12);
         }
     }
