@@ -1,8 +1,8 @@
 //! The tree is the data's path: reads `src/` as text and fails where an import goes against it.
 //!
 //! Two rules, each with its own message on how to mend what offends:
-//! a folder imports only folders before it in [`ORDER`], and the ground nothing of the spacecraft; no files import each other
-//! in a circle.
+//! a folder imports only folders before it in [`ORDER`], and the ground nothing of the spacecraft; neither files nor the parts of a folder
+//! (its files, and folders as wholes) import each other in a circle.
 //!
 //! [`lengths`] has the longest a function may be, [`public`] how many items the library shows, [`book`] what links may lead to.
 //!
@@ -130,28 +130,55 @@ impl Tree {
         found.into_iter().collect()
     }
 
+    /// Circles of files, and of the parts of each folder: its files, and its folders as wholes.
     fn circles(&self) -> Vec<String> {
         let imports = self.imports();
-        let reach: BTreeMap<_, _> = imports.keys().map(|from| (*from, reachable(from, &imports))).collect();
-        let circles: BTreeSet<Vec<&ModulePath>> = reach
+        let file = |file: &ModulePath| Some(file.clone());
+        let mut found: Vec<String> = circles(&among(&imports, file))
             .iter()
-            .map(|(from, to)| to.iter().filter(|to| reach[*to].contains(from)).copied().collect())
-            .filter(|circle: &Vec<_>| circle.len() > 1)
+            .map(|circle| self.describe("files", circle, &imports, file))
             .collect();
-        let describe = |circle: &Vec<&ModulePath>| {
-            let mut text = format!(
-                "{} files import each other in a circle.\n    \
-                 Cut it where one needs least of another: move that item to the other file or to a third below both.",
-                circle.len()
-            );
-            for file in circle {
-                let to = imports[*file].iter().filter(|to| circle.contains(to));
-                let to: Vec<_> = to.map(|to| format!("src/{}", self.files[*to].path)).collect();
-                text += &format!("\n    src/{} imports {}", self.files[*file].path, to.join(", "));
+        let folders: BTreeSet<&[String]> =
+            self.files.keys().flat_map(|module| (0..module.len()).map(|n| &module[..n])).collect();
+        for folder in folders {
+            let part = |file: &ModulePath| {
+                (file.len() > folder.len() && file.starts_with(folder))
+                    .then(|| file[..=folder.len()].to_vec())
+            };
+            // Of files alone is told above.
+            let is_folder = |part: &ModulePath| {
+                self.files.keys().any(|file| file.len() > part.len() && file.starts_with(part))
+            };
+            let circles = circles(&among(&imports, part));
+            let circles = circles.iter().filter(|circle| circle.iter().any(is_folder));
+            found.extend(circles.map(|circle| self.describe("parts of a folder", circle, &imports, part)));
+        }
+        found
+    }
+
+    /// What the members of a circle import of one another, file by file.
+    fn describe(
+        &self,
+        what: &str,
+        circle: &BTreeSet<ModulePath>,
+        imports: &BTreeMap<&ModulePath, BTreeSet<&ModulePath>>,
+        part: impl Fn(&ModulePath) -> Option<ModulePath>,
+    ) -> String {
+        let member = |file: &ModulePath| part(file).filter(|part| circle.contains(part));
+        let mut text = format!(
+            "{} {what} import each other in a circle.\n    \
+             Cut it where one needs least of another: move that item to the other or to a third below both.",
+            circle.len()
+        );
+        for (from, targets) in imports {
+            let Some(own) = member(from) else { continue };
+            let to = targets.iter().filter(|to| member(to).is_some_and(|other| other != own));
+            let to: Vec<_> = to.map(|to| format!("src/{}", self.files[*to].path)).collect();
+            if !to.is_empty() {
+                text += &format!("\n    src/{} imports {}", self.files[*from].path, to.join(", "));
             }
-            text
-        };
-        circles.iter().map(describe).collect()
+        }
+        text
     }
 
     /// Which files each file imports; what it merely re-exports is not among them.
@@ -195,13 +222,37 @@ impl Tree {
     }
 }
 
+/// Imports of files as those of the parts that they belong to.
+fn among(
+    imports: &BTreeMap<&ModulePath, BTreeSet<&ModulePath>>,
+    part: impl Fn(&ModulePath) -> Option<ModulePath>,
+) -> BTreeMap<ModulePath, BTreeSet<ModulePath>> {
+    let mut found = BTreeMap::<ModulePath, BTreeSet<ModulePath>>::new();
+    for (from, targets) in imports {
+        let Some(from) = part(from) else { continue };
+        let targets = targets.iter().filter_map(|to| part(to)).filter(|to| *to != from);
+        found.entry(from.clone()).or_default().extend(targets);
+    }
+    found
+}
+
+/// Groups of which each member reaches every other by imports.
+fn circles(imports: &BTreeMap<ModulePath, BTreeSet<ModulePath>>) -> BTreeSet<BTreeSet<ModulePath>> {
+    let reach: BTreeMap<_, _> = imports.keys().map(|from| (from, reachable(from, imports))).collect();
+    reach
+        .iter()
+        .map(|(from, to)| to.iter().filter(|to| reach[*to].contains(*from)).map(|to| (*to).clone()).collect())
+        .filter(|circle: &BTreeSet<_>| circle.len() > 1)
+        .collect()
+}
+
 fn reachable<'a>(
     from: &'a ModulePath,
-    imports: &BTreeMap<&'a ModulePath, BTreeSet<&'a ModulePath>>,
+    imports: &'a BTreeMap<ModulePath, BTreeSet<ModulePath>>,
 ) -> BTreeSet<&'a ModulePath> {
     let (mut found, mut open) = (BTreeSet::new(), vec![from]);
-    while let Some(file) = open.pop() {
-        open.extend(imports[file].iter().filter(|to| found.insert(**to)));
+    while let Some(part) = open.pop() {
+        open.extend(imports[part].iter().filter(|to| found.insert(*to)));
     }
     found
 }

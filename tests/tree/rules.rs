@@ -98,6 +98,40 @@ fn a_circle_offends_of_three_files_and_of_two() {
 }
 
 #[test]
+fn a_circle_of_a_folder_and_a_file_beside_it_offends() {
+    // No two files import each other; the folder `b`, as a whole, and `a` do, and so do the folders `b` and `c`.
+    let above = ("sky/a.rs", "use super::b::low::Low;");
+    let low = ("sky/b/low.rs", "pub struct Low;");
+    let high = |text| ("sky/b/high.rs", text);
+    assert_one(
+        &[above, low, high("use crate::sky::a::A;")],
+        &[
+            "2 parts of a folder",
+            "src/sky/a.rs imports src/sky/b/low.rs",
+            "src/sky/b/high.rs imports src/sky/a.rs",
+        ],
+    );
+    assert_none(&[above, low, high("use super::low::Low;")]);
+    let other = [("sky/c/one.rs", "use crate::sky::b::low::Low;"), ("sky/c/two.rs", "")];
+    assert_one(
+        &[other[0], other[1], low, high("use crate::sky::c::two::Two;")],
+        &["2 parts of a folder", "src/sky/b/high.rs imports src/sky/c/two.rs"],
+    );
+    // Circles of folders in folders are told once.
+    let deep = |text| ("sky/d/b/high.rs", text);
+    assert_one(
+        &[
+            ("sky/d/a.rs", "use super::b::low::Low;"),
+            ("sky/d/b/low.rs", ""),
+            deep("use crate::sky::d::a::A;"),
+        ],
+        &["2 parts of a folder"],
+    );
+    // A folder's own file is no part of it: it may use its parts and they what it defines, as long as files are in no circle.
+    assert_none(&[("sky/mod.rs", "pub struct Map;"), ("sky/a.rs", "use super::Map;")]);
+}
+
+#[test]
 fn tests_are_free() {
     let products = ("products/mod.rs", "pub struct Plan;");
     for text in [

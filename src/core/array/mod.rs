@@ -35,6 +35,8 @@ pub use bodies::{EarthModel, earth_is_hidden_by_date, jupiter_hat_by_date, sun_h
 pub use config::{ArrayConfig, ArrayError};
 #[doc(hidden)]
 pub use config::{BreathingConfig, NodeMotion, Spacing};
+#[doc(hidden)]
+pub use config::{PropagateConfig, StationKeeping};
 pub use ephemeris::Ephemeris;
 #[doc(hidden)]
 pub use ephemeris::{Insertion, segments_for};
@@ -53,7 +55,7 @@ pub use orbit::{Array, hidden_by_moon};
 #[doc(hidden)]
 pub use placing::PlacingCounts;
 #[doc(hidden)]
-pub use propagate::{PropagateConfig, StationKeeping, report_propagation_to};
+pub use propagate::report_propagation_to;
 pub use state::SatelliteState;
 #[doc(hidden)]
 pub use stations::{Station, Stations};

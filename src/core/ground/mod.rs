@@ -23,6 +23,7 @@ mod placed_files;
 mod power_waterfall;
 mod promises;
 mod reception;
+mod sessions;
 mod sky_hits;
 mod uvw_density;
 
@@ -53,6 +54,8 @@ pub use placed_files::read_placed;
 pub use power_waterfall::PowerWaterfall;
 #[doc(hidden)]
 pub use reception::Reception;
+#[doc(hidden)]
+pub use sessions::{Recalibrated, RefusedPacket, Retracted};
 #[doc(hidden)]
 pub use sky_hits::{HitsMap, SkyHits};
 #[doc(hidden)]

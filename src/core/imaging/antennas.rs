@@ -1,6 +1,6 @@
 //! Configuration of the daughters' antennas that a refined map assumes.
 
-use crate::imaging::anywhere::AssumedAntenna;
+use crate::imaging::assumed_instrument::AssumedAntenna;
 use crate::response::{AntennaFiles, PatternsByFrequency};
 use crate::units::{Checks, keys};
 

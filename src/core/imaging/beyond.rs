@@ -17,8 +17,8 @@ use std::path::Path;
 
 use crate::files::read_text;
 use crate::frames::PlacedVisibilities;
+use crate::imaging::SolveError;
 use crate::imaging::regulariser::{POWER_FILE_BYTES_MAX, parse_power};
-use crate::imaging::solver::SolveError;
 use crate::numerics::bessel::{BesselOrders, LANES};
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::vector::{norm, sub};
@@ -70,7 +70,7 @@ fn power_at(first: usize, power_k2: &[f64], l: usize) -> f64 {
 }
 
 /// Degree from which on `j_l(2 pi u)` is nothing.
-fn reach(u: f64) -> usize {
+fn degree_reached(u: f64) -> usize {
     let x = TAU * u;
     (x + 5.0 * x.cbrt()) as usize + 5
 }
@@ -86,7 +86,7 @@ impl BeyondNoise {
     ) -> Self {
         let wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz;
         let u_max = baseline_m_max / wavelength_m;
-        let power_k2 = (l_max + 1..=reach(u_max)).map(|l| power_at(first, power_k2, l)).collect();
+        let power_k2 = (l_max + 1..=degree_reached(u_max)).map(|l| power_at(first, power_k2, l)).collect();
         Self { power_k2, l_max, wavelength_m, moon_radius_m, u_max, tables: BTreeMap::new() }
     }
 
@@ -126,7 +126,7 @@ impl BeyondNoise {
         let mut table = Vec::with_capacity(count);
         for first in (0..count).step_by(LANES) {
             let x: [f64; LANES] = std::array::from_fn(|lane| TAU * STEP * (first + lane).max(1) as f64);
-            let longest = reach(x[LANES - 1] / TAU);
+            let longest = degree_reached(x[LANES - 1] / TAU);
             let bessel = orders.spherical(&x, longest.max(self.l_max + 1));
             for (lane, x) in x.iter().enumerate().take(count - first) {
                 let term = |(k, power): (usize, &f64)| {

@@ -1,7 +1,7 @@
 //! What a map method is: how it sums the visibilities of a channel, saves the sums, and solves them for a map.
 //!
-//! Each method is a folder with a `method.rs`; [`Method`](super::Method) names them all. Stages, estimates and saved states know only the
-//! traits.
+//! Each method is a folder, and a file in `methods` that implements the traits; [`Method`](super::Method) names them all. Stages, estimates
+//! and saved states know only the traits.
 
 use std::any::Any;
 use std::io::{Read, Write};

@@ -13,6 +13,7 @@
 mod antennas;
 #[doc(hidden)]
 pub mod anywhere;
+mod assumed_instrument;
 mod beyond;
 #[doc(hidden)]
 pub mod circle;
@@ -32,8 +33,10 @@ pub mod rates;
 mod regulariser;
 mod request;
 mod sensitivity;
+mod solve_error;
 mod solver;
 mod stage;
+mod unknowns;
 #[doc(hidden)]
 pub mod zoom;
 
@@ -64,13 +67,14 @@ pub use regulariser::Regulariser;
 pub use request::{KeptSums, SolverSetup};
 #[doc(hidden)]
 pub use sensitivity::{DegreeSensitivity, SensitivitySums};
+pub use solve_error::SolveError;
+pub use solver::Diagnostics;
 #[doc(hidden)]
 pub use solver::{
     Convergence, Estimate, Fit, LargestEigenvalue, NamedWatch, PointBeam, STORED_MAX, SolutionClock,
     SolveWatch, Solving, SolvingPart, StoppingRule, Traces, UnsupportedEpsilon, W_MAX_EXACT,
     largest_eigenvalue, probed_traces, traces,
 };
-pub use solver::{Diagnostics, SolveError};
 #[doc(hidden)]
 pub use stage::{Accumulator, AccumulatorState, Snapshot, Solution, Solver};
 

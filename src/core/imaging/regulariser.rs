@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use crate::files::{Separator, numbered_lines, read_text};
-use crate::imaging::circle::degrees;
-use crate::imaging::solver::SolveError;
+use crate::imaging::solve_error::SolveError;
+use crate::imaging::unknowns::degrees;
 
 /// Maximum size of a table, bytes; a table up to the maximum degree is smaller.
 pub(in crate::imaging) const POWER_FILE_BYTES_MAX: u64 = 1 << 20;

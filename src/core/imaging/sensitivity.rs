@@ -5,8 +5,8 @@ use faer::prelude::Solve;
 use faer::{Accum, Mat, MatRef, Side, get_global_parallelism};
 use serde::Serialize;
 
+use super::SolveError;
 use super::circle::{coefficients, degrees};
-use super::solver::SolveError;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::response::pixel::{PairGeometry, PixelMethod, RowMaker};
 use crate::sky::harmonics::Transform;

@@ -197,7 +197,13 @@ impl MeasuredAntennas {
     /// The antenna of a satellite, whose axes along the track, along the orbit's normal and away from the Moon are given; tilted from
     /// its attitude, and with a factor `1 + q P_2` of its voltage where there are no tables.
     #[must_use]
-    pub fn antenna(&self, of: AntennaOf, track: [Vec3; 3], tilt_deg: [f64; 2], q: f64) -> SatelliteAntenna {
+    pub fn antenna(
+        &self,
+        of: AntennaOf,
+        track: [Vec3; 3],
+        tilt_deg: [f64; 2],
+        q: f64,
+    ) -> SatelliteAntenna {
         let AntennaOf { satellite, tai_s, frequency_hz, elements } = of;
         let body = self.attitudes.as_ref().and_then(|attitudes| attitudes.body_axes(satellite, tai_s));
         let upright = body.map_or(track, |[x, y, z]| [x, z, scale(-1.0, y)]);

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::frame::Frame;
-use super::generated::GeneratedSky;
+use super::generated::{AddedSky, GeneratedSky};
 use super::healpix::is_valid_nside;
 use super::moving::MovingSource;
 use crate::units::{Checks, InvalidValue, PerChannel, keys};
@@ -64,20 +64,6 @@ keys! {
         #[serde(skip_serializing_if = "Vec::is_empty")]
         expert moving: Vec<MovingSource> = Vec::new();
     }
-}
-
-/// Components added to a map file (`sky.added`), with the parameters of `[sky.generated]`, at `sky.nside` or at the nside of the map
-/// if that is finer.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct AddedSky {
-    /// Fluctuations on small scales.
-    pub small_scales: bool,
-    /// Point sources drawn from the published counts.
-    pub sources: bool,
-    /// Point sources from a table (CSV).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub catalogue: Option<PathBuf>,
 }
 
 /// Maximum nside of a generated sky.

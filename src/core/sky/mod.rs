@@ -29,7 +29,7 @@ pub use compare::{Comparison, compare};
 #[doc(hidden)]
 pub use compare::{ErrorSummary, InputSky, compare_with};
 #[doc(hidden)]
-pub use config::{AddedSky, GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
+pub use config::{GENERATED_NSIDE_MAX, MapFrequency, SkyConfig};
 #[doc(hidden)]
 pub use cutout::{Cutout, PlaneProjection};
 pub use error::MapError;

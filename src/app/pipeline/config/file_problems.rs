@@ -8,11 +8,12 @@ use super::plan::Plan;
 use super::problems::Problems;
 use super::sections::Config;
 use crate::imaging::{Regulariser, read_power};
+use crate::sky::SkyConfig;
 use crate::sky::fits::{
     FitsError, FitsProblem, MapOutline, ReadOptions, check_frequency, read_prior, read_sky, sky_options,
 };
+use crate::sky::generated::AddedSky;
 use crate::sky::generated::describe_catalogue;
-use crate::sky::{AddedSky, SkyConfig};
 use crate::units::InvalidValue;
 
 impl Plan {

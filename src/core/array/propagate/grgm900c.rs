@@ -6,9 +6,6 @@ pub(super) const GM_M3_S2: f64 = 4.902_799_967_088_64e12;
 /// Radius to which its coefficients belong, m.
 pub(super) const RADIUS_M: f64 = 1.738e6;
 
-/// Greatest degree and order of the table.
-pub(super) const DEGREE_MAX: usize = 16;
-
 /// Coefficients C and S of full normalisation (4 pi), tide free, on the principal axes of DE421: degrees from 2 on, each by order
 /// from 0.
 ///

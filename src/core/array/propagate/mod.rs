@@ -11,7 +11,6 @@
 //! instantaneously, for the arcs of that time, when the Earth is high above satellite 1: no observing window has a
 //! jump.
 
-mod config;
 mod dop853;
 mod field;
 mod grgm900c;
@@ -21,9 +20,7 @@ use std::sync::{Mutex, OnceLock};
 
 use rayon::prelude::*;
 
-pub use config::{PropagateConfig, StationKeeping};
-
-use super::config::{ArrayConfig, ArrayError};
+use super::config::{ArrayConfig, ArrayError, PropagateConfig, StationKeeping};
 use super::formation::Formation;
 use super::kepler::{KeplerElements, KeplerOrbit};
 use super::oem::{OrbitArc, TableOrbit};

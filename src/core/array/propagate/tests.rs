@@ -1,4 +1,4 @@
-use super::grgm900c::{COEFFICIENTS, DEGREE_MAX, RADIUS_M};
+use super::grgm900c::{COEFFICIENTS, RADIUS_M};
 use super::*;
 use crate::array::{Array, Ephemeris, ObservingWindows, segments_for};
 use crate::units::MissionTime;
@@ -52,7 +52,7 @@ fn the_acceleration_is_the_gradient_of_the_potential() {
         let angle = 0.7 * lane as f64;
         [1.8e6 * angle.cos(), 1.7e6 * angle.sin(), 1.1e6 * (1.3 * angle).cos() - 0.3e6]
     };
-    for degree in [0, 2, 3, 8, DEGREE_MAX] {
+    for degree in [0, 2, 3, 8, PropagateConfig::DEGREE_MAX] {
         let mut states = all_lanes(SatelliteState { position_m: [0.0; 3], velocity_m_s: [1.0, 2.0, 3.0] });
         for lane in 0..LANES {
             put(&mut states, lane, SatelliteState { position_m: place(lane), velocity_m_s: [1.0, 2.0, 3.0] });
@@ -101,10 +101,10 @@ fn the_table_agrees_with_another_field_of_the_moon() {
     // Unnormalised: J2 = 2.033e-4 and C22 = 2.24e-5, as by the IAU and in most textbooks.
     assert!((-5_f64.sqrt() * of(2, 0)[0] - 2.033e-4).abs() < 2e-7);
     assert!(((5.0 / 12.0_f64).sqrt() * of(2, 2)[0] - 2.24e-5).abs() < 3e-8);
-    assert_eq!(COEFFICIENTS.len(), (2..=DEGREE_MAX).map(|n| n + 1).sum::<usize>());
+    assert_eq!(COEFFICIENTS.len(), (2..=PropagateConfig::DEGREE_MAX).map(|n| n + 1).sum::<usize>());
     // Zonal terms have no sine; the power decreases with the degree roughly by Kaula's rule for the Moon, 2.5e-4 /
     // n^2 (Lemoine et al., Fig. 2).
-    for n in 2..=DEGREE_MAX {
+    for n in 2..=PropagateConfig::DEGREE_MAX {
         assert_eq!(of(n, 0)[1], 0.0);
         let power: f64 = (0..=n).flat_map(|m| of(n, m)).map(|value| value * value).sum();
         let rms = (power / (2 * n + 1) as f64).sqrt();

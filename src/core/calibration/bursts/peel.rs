@@ -16,9 +16,8 @@ use bincode::{Decode, Encode};
 use num_complex::Complex64;
 
 use crate::array::hidden_by_moon;
-use crate::calibration::solver::DenseFactor;
 use crate::frames::PlacedVisibilities;
-use crate::numerics::median;
+use crate::numerics::{DenseFactor, median};
 use crate::response::beacon::plane_wave;
 use crate::units::Pair;
 use crate::units::vector::{Vec3, norm, sub};

@@ -6,13 +6,13 @@
 use serde::Serialize;
 
 use super::config::SolverConfig;
-use super::dense::DenseFactor;
 use super::layout::ParameterLayout;
 use super::model::{KnownSignal, Offsets};
 use super::positions::modelled;
 use super::robust_fit::sums_of;
 use crate::calibration::CalibrationError;
 use crate::frames::{Instrument, PlacedVisibilities};
+use crate::numerics::DenseFactor;
 use crate::sky::SkyMap;
 use crate::units::vector::Vec3;
 

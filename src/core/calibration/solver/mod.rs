@@ -36,7 +36,6 @@ mod circle;
 mod config;
 #[cfg(test)]
 mod cramer_rao;
-mod dense;
 mod detect;
 mod diagnosis;
 mod estimates;
@@ -72,7 +71,6 @@ mod verdict;
 pub use bound::{DaughterBound, GainBound, bounds};
 pub use circle::wavelengths_max as known_wavelengths_max;
 pub use config::{AmplitudeScale, CalibrationMode, SkyModel, SolverConfig};
-pub(super) use dense::DenseFactor;
 pub use diagnosis::ModelFault;
 pub use estimates::{DaughterEstimate, GainEstimate, GainState, OutlierFractions};
 pub use events::InstrumentEvent;

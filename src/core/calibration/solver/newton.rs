@@ -8,9 +8,9 @@
 use num_complex::Complex64;
 
 use super::config::AmplitudeScale;
-use super::dense::DenseFactor;
 use super::layout::{ParameterLayout, ParameterValues};
 use super::sums::{MODEL_TERMS, PairSums};
+use crate::numerics::DenseFactor;
 
 /// Standard deviation of the mean log amplitude where it is fixed to zero.
 const MEAN_SIGMA: f64 = 1e-6;

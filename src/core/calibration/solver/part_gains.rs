@@ -5,7 +5,7 @@
 
 use num_complex::Complex64;
 
-use super::dense::DenseFactor;
+use crate::numerics::DenseFactor;
 
 /// Number of Gauss-Newton steps: changes of half a turn settle within ten.
 const STEPS: usize = 10;

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-use super::config::LinkConfig;
+use crate::downlink::config::LinkConfig;
 
 /// Gilbert-Elliott channel: two states, each with a bit error rate and a geometrically distributed length. Without bursts,
 /// there is one state.

@@ -3,10 +3,10 @@
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-use super::config::LinkConfig;
 use super::simulator::LinkSimulator;
 use super::truth::LinkTruth;
 use crate::downlink::config::DownlinkConfig;
+use crate::downlink::config::LinkConfig;
 use crate::downlink::error::{DownlinkError, io_error};
 use crate::downlink::receive::{DownlinkFile, EventReader};
 use crate::downlink::wire::cadu::ReedSolomon;

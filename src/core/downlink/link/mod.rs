@@ -8,13 +8,12 @@
 
 mod bit_errors;
 mod bit_writer;
-mod config;
 mod file;
 mod simulator;
 mod splitter;
 mod truth;
 
-pub use config::LinkConfig;
+pub use super::config::LinkConfig;
 pub use file::corrupt;
 #[doc(hidden)]
 pub use file::{LinkStage, truth_path};

@@ -5,9 +5,9 @@ use rand_chacha::ChaCha8Rng;
 
 use super::bit_errors::BitErrors;
 use super::bit_writer::BitWriter;
-use super::config::LinkConfig;
 use super::splitter::{SentPass, Splitter};
 use super::truth::{FrameFate, LinkTruth, list_packet};
+use crate::downlink::config::LinkConfig;
 use crate::downlink::error::DownlinkError;
 use crate::downlink::wire::Format;
 use crate::downlink::wire::cadu::{ERRORS_MAX, MARKER_ERRORS_MAX, ReedSolomon, SYNC_MARKER_BYTES};

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
-use super::config::LinkConfig;
+use crate::downlink::config::LinkConfig;
 use crate::downlink::wire::Format;
 
 /// Why a frame cannot be recovered on the ground. Of several copies, the greatest fate counts: that of the copy that got

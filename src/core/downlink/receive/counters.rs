@@ -3,8 +3,8 @@
 use serde::Serialize;
 
 use super::cadu::FrameCounters;
+use crate::downlink::error::PayloadFault;
 use crate::downlink::wire::PacketKind;
-use crate::downlink::wire::payload::PayloadFault;
 
 /// Counters of the packets of one kind.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, bincode::Encode, bincode::Decode)]

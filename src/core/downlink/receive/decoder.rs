@@ -1,9 +1,9 @@
 //! Decodes packets into ground frames.
 
 use super::{Event, Packet, PacketOutcome, PayloadOutcome, ReceptionCounters};
+use crate::downlink::error::PayloadFault;
 use crate::downlink::wire::payload::{
-    PayloadFault, count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument,
-    decode_visibilities,
+    count_visibilities, decode_ephemeris, decode_housekeeping, decode_instrument, decode_visibilities,
 };
 use crate::downlink::wire::{CucTime, FORMAT_VERSION, PacketHeader, PacketKind, PacketSegment};
 use crate::frames::{GroundFrame, Instrument};

@@ -13,9 +13,6 @@ pub const HEADER_BYTES: usize = 22;
 /// Bytes after the payload: CRC-32C.
 pub const TRAILER_BYTES: usize = 4;
 
-/// Longest packet that the 16-bit length field allows.
-pub const PACKET_BYTES_MAX: usize = 65_542;
-
 const PRIMARY_BYTES: usize = 6;
 const MAGIC: u8 = 0x4C;
 /// Bits above the APID: version 000, telemetry, secondary header present.
@@ -130,6 +127,7 @@ pub(crate) fn has_valid_checksum(bytes: &[u8]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::downlink::PACKET_BYTES_MAX;
 
     fn header() -> PacketHeader {
         PacketHeader {

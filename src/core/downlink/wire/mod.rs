@@ -12,20 +12,18 @@
 
 pub mod cadu;
 mod cuc;
-mod format;
 mod header;
 mod kind;
 mod packetizer;
 pub(crate) mod payload;
 mod transmission;
 
+pub use super::config::{Format, PACKET_BYTES_MAX};
+pub use super::error::PayloadFault;
 pub use cuc::CucTime;
-pub use format::Format;
 pub(crate) use header::{COUNT_MAX, has_valid_checksum, packet_checksum};
-pub use header::{
-    FORMAT_VERSION, HEADER_BYTES, PACKET_BYTES_MAX, PacketHeader, PacketSegment, TRAILER_BYTES,
-};
+pub use header::{FORMAT_VERSION, HEADER_BYTES, PacketHeader, PacketSegment, TRAILER_BYTES};
 pub use kind::{APID_BASE, PacketKind};
 pub use packetizer::Packetizer;
-pub use payload::{NODES_MIN, PayloadFault, VisibilitiesOutline};
+pub use payload::{NODES_MIN, VisibilitiesOutline};
 pub use transmission::Transmission;

@@ -1,8 +1,8 @@
 //! Encodes ground frames as packets, on the spacecraft.
 
 use super::payload::{
-    check_visibilities, encode_ephemeris, encode_housekeeping, encode_instrument, encode_visibilities,
-    visibilities_in,
+    VISIBILITY_BYTES, check_visibilities, encode_ephemeris, encode_housekeeping, encode_instrument,
+    encode_visibilities, visibilities_in,
 };
 use super::{
     COUNT_MAX, CucTime, FORMAT_VERSION, HEADER_BYTES, PacketHeader, PacketKind, PacketSegment, TRAILER_BYTES,
@@ -15,6 +15,18 @@ use crate::units::MissionTime;
 
 /// Maximum number of ephemeris segments that are repeated: a window's, split at the formation's turnarounds.
 const REPEATED_SEGMENTS_MAX: usize = 8;
+
+impl DownlinkConfig {
+    /// Rate available to visibilities, without headers and coding, bytes per second; `None` for no limit.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn payload_bytes_per_s(&self) -> Option<f64> {
+        let payload = self.packet_bytes_max.saturating_sub(HEADER_BYTES + TRAILER_BYTES);
+        let visibilities = VISIBILITY_BYTES * visibilities_in(payload).max(1);
+        let overhead = self.expansion() * self.packet_bytes_max as f64 / visibilities as f64;
+        (self.rate_bits_per_s_max > 0.0).then(|| self.rate_bits_per_s_max / 8.0 / overhead)
+    }
+}
 
 /// Encodes ground frames as packets.
 ///

@@ -9,12 +9,12 @@ use crate::calibration::FoundBurst;
 use crate::ground::PassGateState;
 
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct CalibrationState {
+pub(in crate::ground) struct CalibrationState {
     /// Number of the calibration that the sums were made with, from 1.
-    pub(super) version: u32,
-    pub(super) passes: PassGateState,
+    pub(in crate::ground) version: u32,
+    pub(in crate::ground) passes: PassGateState,
     /// The bursts found. A checkpoint holds them last, and ends before them if there are none.
-    pub(super) bursts: Vec<FoundBurst>,
+    pub(in crate::ground) bursts: Vec<FoundBurst>,
 }
 
 impl Default for CalibrationState {
@@ -24,7 +24,7 @@ impl Default for CalibrationState {
 }
 
 impl CalibrationState {
-    pub(super) fn is_solved(&self) -> bool {
+    pub(in crate::ground) fn is_solved(&self) -> bool {
         self.passes != PassGateState::default()
     }
 }

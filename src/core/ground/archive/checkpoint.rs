@@ -31,30 +31,30 @@ const MEMORY_PER_BYTE: usize = 16;
 
 /// The head of a checkpoint: data and the journal, without the sums.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct ArchiveHead {
+pub(in crate::ground) struct ArchiveHead {
     /// Keys and values of the settings on which the sums depend.
-    pub(super) settings: Vec<(String, String)>,
-    pub(super) collector: CollectorState,
-    pub(super) ephemeris: Vec<EphemerisSegment>,
-    pub(super) autos: AutoTable,
-    pub(super) accumulator: AccumulatorState,
-    pub(super) journal: Journal,
+    pub(in crate::ground) settings: Vec<(String, String)>,
+    pub(in crate::ground) collector: CollectorState,
+    pub(in crate::ground) ephemeris: Vec<EphemerisSegment>,
+    pub(in crate::ground) autos: AutoTable,
+    pub(in crate::ground) accumulator: AccumulatorState,
+    pub(in crate::ground) journal: Journal,
     /// Default if the head ends before it.
-    pub(super) calibration: CalibrationState,
+    pub(in crate::ground) calibration: CalibrationState,
     /// Checksum of the encoded head. Heads with equal bytes are equal even if they contain NaN.
-    pub(super) checksum: u64,
+    pub(in crate::ground) checksum: u64,
 }
 
 /// A borrowed [`ArchiveHead`] for writing without copies of large fields.
 #[derive(Encode)]
-pub(super) struct ArchiveHeadView<'a> {
-    pub(super) settings: &'a Vec<(String, String)>,
-    pub(super) collector: CollectorView<'a>,
-    pub(super) ephemeris: Vec<&'a EphemerisSegment>,
-    pub(super) autos: &'a AutoTable,
-    pub(super) accumulator: AccumulatorState,
-    pub(super) journal: &'a Journal,
-    pub(super) calibration: CalibrationState,
+pub(in crate::ground) struct ArchiveHeadView<'a> {
+    pub(in crate::ground) settings: &'a Vec<(String, String)>,
+    pub(in crate::ground) collector: CollectorView<'a>,
+    pub(in crate::ground) ephemeris: Vec<&'a EphemerisSegment>,
+    pub(in crate::ground) autos: &'a AutoTable,
+    pub(in crate::ground) accumulator: AccumulatorState,
+    pub(in crate::ground) journal: &'a Journal,
+    pub(in crate::ground) calibration: CalibrationState,
 }
 
 struct ChecksumWriter<'a, W> {
@@ -75,7 +75,7 @@ impl<W: Write> Write for ChecksumWriter<'_, W> {
 }
 
 /// Writes a checkpoint; `engines` writes the sums.
-pub(super) fn write(
+pub(in crate::ground) fn write(
     out: &mut impl Write,
     path: &Path,
     head: &ArchiveHeadView<'_>,
@@ -108,7 +108,7 @@ pub(super) fn write(
 }
 
 /// Whether a checkpoint is intact and has this head.
-pub(super) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
+pub(in crate::ground) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
     let found = read(path, |head, engines| {
         std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
         Ok(head.checksum)
@@ -125,7 +125,7 @@ pub(super) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool
 }
 
 /// Whether a file starts like a checkpoint of any version.
-pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
+pub(in crate::ground) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
     let mut magic = Vec::new();
     let file = File::open(path).map_err(GroundError::io(path, "open the file"))?;
     file.take(MAGIC.len() as u64).read_to_end(&mut magic).map_err(GroundError::io(path, "read"))?;
@@ -133,14 +133,14 @@ pub(super) fn is_checkpoint(path: &Path) -> Result<bool, GroundError> {
 }
 
 /// Reads a checkpoint; `rest` takes the head and the reader of the sums.
-pub(super) fn read<T>(
+pub(in crate::ground) fn read<T>(
     path: &Path,
     rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,
 ) -> Result<T, GroundError> {
     read_from(&mut open(path)?, path, rest)
 }
 
-pub(super) fn verify(path: &Path) -> Result<(), GroundError> {
+pub(in crate::ground) fn verify(path: &Path) -> Result<(), GroundError> {
     verified_length(&mut open(path)?, path).map(|_| ())
 }
 
@@ -149,7 +149,7 @@ fn open(path: &Path) -> Result<File, GroundError> {
 }
 
 /// Reads a checkpoint from any reader, after verifying its checksum. Messages call it `path`.
-pub(super) fn read_from<T>(
+pub(in crate::ground) fn read_from<T>(
     from: &mut (impl Read + Seek),
     path: &Path,
     rest: impl FnOnce(ArchiveHead, &mut dyn Read) -> Result<T, GroundError>,

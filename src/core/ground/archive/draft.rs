@@ -9,14 +9,14 @@ use crate::units::{ChannelId, MissionTime};
 #[derive(Debug, Default)]
 pub(in crate::ground) struct RecordDraft {
     /// Summary of the packet, without its count and time.
-    pub(super) entry: JournalEntry,
-    pub(super) window: MissionTime,
-    pub(super) segment: Option<EphemerisSegment>,
-    pub(super) report: Option<Housekeeping>,
+    pub(in crate::ground) entry: JournalEntry,
+    pub(in crate::ground) window: MissionTime,
+    pub(in crate::ground) segment: Option<EphemerisSegment>,
+    pub(in crate::ground) report: Option<Housekeeping>,
     /// Channel of the sums, which sub-bands share.
-    pub(super) channel: ChannelId,
-    pub(super) digest: u32,
-    pub(super) offered: u32,
+    pub(in crate::ground) channel: ChannelId,
+    pub(in crate::ground) digest: u32,
+    pub(in crate::ground) offered: u32,
     /// First and last mission time, s, of the data offered to an engine.
     pub(in crate::ground) used_s: Option<[f64; 2]>,
 }
@@ -43,7 +43,7 @@ impl RecordDraft {
 }
 
 /// Checksum of the data that enter the sums.
-pub(super) fn digest(placed: &PlacedVisibilities) -> u32 {
+pub(in crate::ground) fn digest(placed: &PlacedVisibilities) -> u32 {
     let mut crc = crc_fast::Digest::new(crc_fast::CrcAlgorithm::Crc32Iscsi);
     let mut bytes = Vec::with_capacity(80 * placed.len());
     for k in 0..placed.len() {

@@ -20,7 +20,7 @@ const KEPT: usize = 2;
 
 /// A folder that one process, or one job of ranks, uses at a time.
 #[derive(Debug)]
-pub(super) struct StateFolder {
+pub(in crate::ground) struct StateFolder {
     path: PathBuf,
     /// The checkpoints in the folder, oldest first.
     checkpoints: Vec<CheckpointSet>,
@@ -33,12 +33,12 @@ pub(super) struct StateFolder {
 
 impl StateFolder {
     /// Creates the folder if needed, and locks it.
-    pub(super) fn open(path: &Path) -> Result<Self, GroundError> {
+    pub(in crate::ground) fn open(path: &Path) -> Result<Self, GroundError> {
         Self::open_with_ranks(path, &Ranks::single())
     }
 
     /// Like [`StateFolder::open`], together with the other ranks.
-    pub(super) fn open_with_ranks(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
+    pub(in crate::ground) fn open_with_ranks(path: &Path, ranks: &Ranks) -> Result<Self, GroundError> {
         let lock = ranks.is_first().then(|| FolderLock::acquire(path, LOCK, false)).transpose();
         let lock = lock.map_err(|error| match error.kind() {
             ErrorKind::ResourceBusy => GroundError::Locked { path: path.to_owned() },
@@ -48,7 +48,7 @@ impl StateFolder {
     }
 
     /// Opens a folder to read it. A folder on a read-only file system cannot change and needs no lock.
-    pub(super) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
+    pub(in crate::ground) fn open_to_read(path: &Path) -> Result<Self, GroundError> {
         match Self::open(path) {
             Err(GroundError::Io { source, .. }) if source.kind() == ErrorKind::ReadOnlyFilesystem => {
                 Self::new(path, &Ranks::single(), None)
@@ -74,19 +74,19 @@ impl StateFolder {
         Ok(Self { path: path.to_owned(), checkpoints, segments: BTreeMap::new(), lock, ranks: ranks.clone() })
     }
 
-    pub(super) fn path(&self) -> &Path {
+    pub(in crate::ground) fn path(&self) -> &Path {
         &self.path
     }
 
-    pub(super) fn newest(&self) -> Option<u64> {
+    pub(in crate::ground) fn newest(&self) -> Option<u64> {
         self.checkpoints.last().map(|newest| newest.number)
     }
 
-    pub(super) fn numbers(&self) -> Vec<u64> {
+    pub(in crate::ground) fn numbers(&self) -> Vec<u64> {
         self.checkpoints.iter().map(|checkpoint| checkpoint.number).collect()
     }
 
-    pub(super) fn ranks(&self) -> &Ranks {
+    pub(in crate::ground) fn ranks(&self) -> &Ranks {
         &self.ranks
     }
 
@@ -94,7 +94,7 @@ impl StateFolder {
     ///
     /// Also returns notes on newer checkpoints that are damaged; these are renamed if `renames_damaged`. A checkpoint
     /// that the system cannot read may be intact, so that this is an error and changes nothing.
-    pub(super) fn load<T>(
+    pub(in crate::ground) fn load<T>(
         &mut self,
         renames_damaged: bool,
         read: impl Fn(&Path) -> Result<T, GroundError>,
@@ -146,12 +146,12 @@ impl StateFolder {
         Ok(())
     }
 
-    pub(super) fn next(&self) -> (PathBuf, u64) {
+    pub(in crate::ground) fn next(&self) -> (PathBuf, u64) {
         (self.path.clone(), self.checkpoints.last().map_or(1, |newest| newest.number + 1))
     }
 
     /// Notes the segment files of the newest checkpoint.
-    pub(super) fn set_segments<'a>(&mut self, segments: impl Iterator<Item = &'a ArchiveSegment>) {
+    pub(in crate::ground) fn set_segments<'a>(&mut self, segments: impl Iterator<Item = &'a ArchiveSegment>) {
         if let Some(newest) = self.checkpoints.last() {
             self.segments.insert(newest.number, segments.copied().collect());
         }
@@ -159,7 +159,7 @@ impl StateFolder {
 
     /// Removes segment files that no checkpoint names, once the segments of all checkpoints are known. A file that cannot be removed
     /// only takes space. Ranks have no segments.
-    pub(super) fn remove_unnamed(&mut self) {
+    pub(in crate::ground) fn remove_unnamed(&mut self) {
         self.segments
             .retain(|number, _| self.checkpoints.iter().any(|checkpoint| checkpoint.number == *number));
         if self.segments.len() < self.checkpoints.len()
@@ -181,7 +181,7 @@ impl StateFolder {
     /// Writes a checkpoint, or this rank's part of one, atomically, and removes all but the newest two.
     ///
     /// A single process that has no disk space for a third deletes the older one first, after verifying the newer one.
-    pub(super) fn save(
+    pub(in crate::ground) fn save(
         &mut self,
         mut write: impl FnMut(&mut AtomicFile, &Path) -> Result<(), GroundError>,
     ) -> Result<(), GroundError> {
@@ -232,7 +232,7 @@ impl StateFolder {
     }
 
     /// Removes all checkpoints except the newest. If the newest is damaged, this is an error and nothing is removed.
-    pub(super) fn drop_older(&mut self) -> Result<(), GroundError> {
+    pub(in crate::ground) fn drop_older(&mut self) -> Result<(), GroundError> {
         if let Some(newest) = self.checkpoints.last().copied() {
             newest.paths(&self.path).iter().try_for_each(|path| checkpoint::verify(path))?;
             for segment in self.segments.get(&newest.number).into_iter().flatten() {
@@ -286,12 +286,12 @@ impl StateFolder {
 const LOCK: &str = "lock";
 
 /// The note on a damaged checkpoint in place of which an older one is used.
-pub(super) fn note(error: &GroundError, used: &Path) -> String {
+pub(in crate::ground) fn note(error: &GroundError, used: &Path) -> String {
     format!("{error}; resuming from the previous checkpoint, {}", used.display())
 }
 
 /// The first file of each checkpoint in a folder, oldest first.
-pub(super) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
+pub(in crate::ground) fn checkpoints(folder: &Path) -> Result<Vec<PathBuf>, GroundError> {
     let [whole, _] = numbered(folder)?;
     Ok(whole.into_iter().map(|checkpoint| checkpoint.path(folder, 0)).collect())
 }

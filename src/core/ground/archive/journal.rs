@@ -14,72 +14,72 @@ use crate::downlink::wire::{COUNT_MAX, PACKET_BYTES_MAX};
 use crate::downlink::{PacketHeader, PacketKind};
 use crate::frames::{Housekeeping, VisibilityReason};
 use crate::ground::DeliveredPacket;
-pub(super) use crate::ground::hold_buffer::SendingKey;
+pub(in crate::ground) use crate::ground::hold_buffer::SendingKey;
 use crate::runtime::LedgerReport;
 use crate::units::{ChannelId, MissionTime};
 
 #[derive(Clone, Debug, PartialEq, Encode, Decode)]
-pub(super) struct JournalRecord {
-    pub(super) entry: JournalEntry,
+pub(in crate::ground) struct JournalRecord {
+    pub(in crate::ground) entry: JournalEntry,
     /// Start of the window of the visibilities.
-    pub(super) window: MissionTime,
-    pub(super) checksum: u32,
-    pub(super) bytes: u32,
-    pub(super) counts: PacketOutcome,
+    pub(in crate::ground) window: MissionTime,
+    pub(in crate::ground) checksum: u32,
+    pub(in crate::ground) bytes: u32,
+    pub(in crate::ground) counts: PacketOutcome,
     /// Whether its block had been received already, in another packet.
-    pub(super) is_duplicate: bool,
+    pub(in crate::ground) is_duplicate: bool,
     /// Digest of the positions, values and weights offered to the sums.
-    pub(super) digest: u32,
+    pub(in crate::ground) digest: u32,
     /// Number of visibilities with positions, which were offered to the sums.
-    pub(super) offered: u32,
-    pub(super) accumulated: u32,
+    pub(in crate::ground) offered: u32,
+    pub(in crate::ground) accumulated: u32,
     /// Number of visibilities flagged or lost, by reason.
-    pub(super) left_out: Vec<(VisibilityReason, u32)>,
+    pub(in crate::ground) left_out: Vec<(VisibilityReason, u32)>,
     /// Channel and span of the visibilities offered to an engine.
-    pub(super) used: Option<SumsSpan>,
+    pub(in crate::ground) used: Option<SumsSpan>,
 }
 
 /// Channel of the sums, which sub-bands share, and first and last mission time, s, of the data offered to its engine.
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct SumsSpan {
-    pub(super) channel: ChannelId,
-    pub(super) span_s: [f64; 2],
+pub(in crate::ground) struct SumsSpan {
+    pub(in crate::ground) channel: ChannelId,
+    pub(in crate::ground) span_s: [f64; 2],
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Encode, Decode)]
-pub(super) struct OtherRecord {
-    pub(super) checksum: u32,
-    pub(super) bytes: u32,
-    pub(super) counts: PacketOutcome,
+pub(in crate::ground) struct OtherRecord {
+    pub(in crate::ground) checksum: u32,
+    pub(in crate::ground) bytes: u32,
+    pub(in crate::ground) counts: PacketOutcome,
     /// First and last count of the packets of its payload.
-    pub(super) payload: [u64; 2],
+    pub(in crate::ground) payload: [u64; 2],
     /// Start of the ephemeris segment in it; `None` if another segment with that start is used.
-    pub(super) ephemeris_start: Option<MissionTime>,
+    pub(in crate::ground) ephemeris_start: Option<MissionTime>,
     /// Housekeeping report of the spacecraft in it.
-    pub(super) report: Option<Housekeeping>,
+    pub(in crate::ground) report: Option<Housekeeping>,
 }
 
 /// Records of all applied packets, in the order of sending.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Journal {
-    pub(super) visibilities: BTreeMap<SendingKey, JournalRecord>,
-    pub(super) others: BTreeMap<(PacketKind, SendingKey), OtherRecord>,
+pub(in crate::ground) struct Journal {
+    pub(in crate::ground) visibilities: BTreeMap<SendingKey, JournalRecord>,
+    pub(in crate::ground) others: BTreeMap<(PacketKind, SendingKey), OtherRecord>,
 }
 
 impl Journal {
-    pub(super) fn is_empty(&self) -> bool {
+    pub(in crate::ground) fn is_empty(&self) -> bool {
         self.visibilities.is_empty() && self.others.is_empty()
     }
 
     /// Whether all records are of valid packets. Checkpoints are untrusted.
-    pub(super) fn is_sound(&self) -> bool {
+    pub(in crate::ground) fn is_sound(&self) -> bool {
         let is_valid =
             |(_, count): &SendingKey, bytes: u32| *count <= COUNT_MAX && bytes <= PACKET_BYTES_MAX as u32;
         self.visibilities.iter().all(|(key, record)| is_valid(key, record.bytes))
             && self.others.iter().all(|((_, key), record)| is_valid(key, record.bytes))
     }
 
-    pub(super) fn contains(&self, header: &PacketHeader) -> bool {
+    pub(in crate::ground) fn contains(&self, header: &PacketHeader) -> bool {
         let sent = (header.time, header.count);
         match header.kind {
             PacketKind::Visibilities => self.visibilities.contains_key(&sent),
@@ -88,7 +88,7 @@ impl Journal {
     }
 
     /// Records a packet of visibilities whose outcome is in the ledger entries `posts`.
-    pub(super) fn record_visibilities(
+    pub(in crate::ground) fn record_visibilities(
         &mut self,
         packet: &DeliveredPacket,
         draft: RecordDraft,
@@ -115,7 +115,7 @@ impl Journal {
     }
 
     /// Adds the records of another journal. A packet of visibilities in both is an error, which is its count.
-    pub(super) fn merge(&mut self, other: Self) -> Result<(), u64> {
+    pub(in crate::ground) fn merge(&mut self, other: Self) -> Result<(), u64> {
         let Self { visibilities, others } = other;
         if let Some((_, count)) = visibilities.keys().find(|sent| self.visibilities.contains_key(sent)) {
             return Err(*count);

@@ -66,23 +66,19 @@
 //! ends instead, as a set that lacks a part is not used. Disk space for two checkpoints is enough: if there is none for a
 //! third, the older one is deleted first.
 
-mod calibration_state;
-mod checkpoint;
-mod draft;
+pub(super) mod calibration_state;
+pub(super) mod checkpoint;
+pub(super) mod draft;
 mod entry;
-mod folder;
+pub(super) mod folder;
 mod gap_report;
 mod gaps;
-mod journal;
-mod names;
-mod open_archive;
+pub(super) mod journal;
+pub(super) mod names;
 mod packet_order;
-mod recalibrate;
-mod recovery;
-mod retract;
-mod sessions;
-mod settings;
-mod store;
+pub(super) mod raw_archive;
+pub(super) mod settings;
+pub(super) mod store;
 mod survey;
 mod views;
 
@@ -90,9 +86,7 @@ pub(super) use draft::RecordDraft;
 pub use entry::JournalEntry;
 pub use gap_report::{GapReport, LostStream, VisibilityPacket};
 pub use gaps::{ChannelCoverage, EphemerisPacket, Gaps, ReceivedPackets, RestartReport, find_gaps};
-pub use recalibrate::Recalibrated;
-pub use recovery::{ARCHIVE_BYTES_MAX, packets_folder};
-pub use retract::{RefusedPacket, Retracted};
+pub use raw_archive::{ARCHIVE_BYTES_MAX, packets_folder};
 pub use settings::REMEMBERED;
 pub(super) use store::Archive;
 pub use survey::CoverageSurvey;

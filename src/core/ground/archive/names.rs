@@ -14,18 +14,18 @@ use crate::ranks::RankShare;
 
 const PREFIX: &str = "checkpoint-";
 const SUFFIX: &str = ".lunarray";
-pub(super) const NUMBER_MAX: u64 = u64::MAX / 2;
+pub(in crate::ground) const NUMBER_MAX: u64 = u64::MAX / 2;
 const PARTS_MAX: usize = 1 << 20;
 
 /// A checkpoint, which consists of one or more files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct CheckpointSet {
-    pub(super) number: u64,
-    pub(super) parts: usize,
+pub(in crate::ground) struct CheckpointSet {
+    pub(in crate::ground) number: u64,
+    pub(in crate::ground) parts: usize,
 }
 
 impl CheckpointSet {
-    pub(super) fn file_name(self, part: usize) -> String {
+    pub(in crate::ground) fn file_name(self, part: usize) -> String {
         let Self { number, parts } = self;
         match parts {
             1 => format!("{PREFIX}{number:08}{SUFFIX}"),
@@ -33,16 +33,16 @@ impl CheckpointSet {
         }
     }
 
-    pub(super) fn path(self, folder: &Path, part: usize) -> PathBuf {
+    pub(in crate::ground) fn path(self, folder: &Path, part: usize) -> PathBuf {
         folder.join(self.file_name(part))
     }
 
-    pub(super) fn paths(self, folder: &Path) -> Vec<PathBuf> {
+    pub(in crate::ground) fn paths(self, folder: &Path) -> Vec<PathBuf> {
         (0..self.parts).map(|part| self.path(folder, part)).collect()
     }
 
     /// Removes all files, and returns whether none is left.
-    pub(super) fn remove(self, folder: &Path) -> bool {
+    pub(in crate::ground) fn remove(self, folder: &Path) -> bool {
         let stays =
             |path: &PathBuf| fs::remove_file(path).is_err_and(|error| error.kind() != ErrorKind::NotFound);
         // `count` visits all files, even after a failure.
@@ -63,7 +63,7 @@ impl CheckpointSet {
     }
 }
 
-pub(super) fn number_of(path: &Path) -> Option<u64> {
+pub(in crate::ground) fn number_of(path: &Path) -> Option<u64> {
     let name = path.file_name()?.to_string_lossy().into_owned();
     CheckpointSet::parse(&name).map(|(found, _)| found.number)
 }
@@ -74,7 +74,7 @@ fn inner(text: &str) -> Option<&str> {
 }
 
 /// All files of the checkpoint to which a file belongs, each with its share. A file with another name is a checkpoint by itself.
-pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
+pub(in crate::ground) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
     let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     match (CheckpointSet::parse(&name), path.parent()) {
         (Some((found, _)), Some(folder)) if found.parts > 1 => {
@@ -87,7 +87,7 @@ pub(super) fn parts_with(path: &Path) -> Vec<(PathBuf, RankShare)> {
 
 /// The complete and the incomplete checkpoints in a folder, oldest first. An invalid checkpoint name is an error, as the file may be
 /// a checkpoint.
-pub(super) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundError> {
+pub(in crate::ground) fn numbered(folder: &Path) -> Result<[Vec<CheckpointSet>; 2], GroundError> {
     let mut found: BTreeMap<CheckpointSet, BTreeSet<usize>> = BTreeMap::new();
     for entry in read_folder(folder).map_err(GroundError::io(folder, "read the folder"))? {
         let name = entry.map_err(GroundError::io(folder, "read the folder"))?.file_name();

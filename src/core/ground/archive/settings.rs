@@ -7,7 +7,7 @@ use crate::ground::{GroundConfig, GroundError};
 use crate::imaging::RegulariserChoice;
 
 /// The settings on which the sums depend, including checksums of input files, and those that are [`REMEMBERED`].
-pub(super) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>, GroundError> {
+pub(in crate::ground) fn settings_of(config: &GroundConfig) -> Result<Vec<(String, String)>, GroundError> {
     let mut settings: Vec<(String, String)> =
         config.map.sum_settings().into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
     settings.push(("calibration.hook".to_owned(), format!("{:?}", config.calibration.hook)));
@@ -62,7 +62,7 @@ fn checksum(path: &Path) -> Result<String, GroundError> {
 }
 
 /// Returns an error if a checkpoint was made with other settings.
-pub(super) fn require_equal(
+pub(in crate::ground) fn require_equal(
     path: &Path,
     found: &[(String, String)],
     expected: &[(String, String)],

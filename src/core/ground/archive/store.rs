@@ -23,22 +23,22 @@ const RETRY_DIVISOR: u64 = 8;
 
 /// Keeps a journal of the packets applied by a ground stage, and writes its checkpoints into a folder.
 pub(in crate::ground) struct Archive {
-    pub(super) folder: StateFolder,
-    pub(super) settings: Vec<(String, String)>,
+    pub(in crate::ground) folder: StateFolder,
+    pub(in crate::ground) settings: Vec<(String, String)>,
     /// Number of the calibration that the sums were made with, from 1.
-    pub(super) version: u32,
-    pub(super) journal: Journal,
+    pub(in crate::ground) version: u32,
+    pub(in crate::ground) journal: Journal,
     /// Notes on checkpoints that could not be used.
-    pub(super) notes: Vec<String>,
+    pub(in crate::ground) notes: Vec<String>,
     /// Ledger entries of the current packet.
-    pub(super) posts: Ledger<VisibilityReason>,
-    pub(super) interval: u64,
+    pub(in crate::ground) posts: Ledger<VisibilityReason>,
+    pub(in crate::ground) interval: u64,
     /// Number of visibilities between the last attempt and the next. After a failure it is shorter than the interval, and grows.
-    pub(super) wait: u64,
-    pub(super) since_attempt: u64,
-    pub(super) saving: SharedSaving,
+    pub(in crate::ground) wait: u64,
+    pub(in crate::ground) since_attempt: u64,
+    pub(in crate::ground) saving: SharedSaving,
     /// The raw archive beside the checkpoints; `None` if the stage does not write to one.
-    pub(super) packets: Option<PacketArchive>,
+    pub(in crate::ground) packets: Option<PacketArchive>,
 }
 
 impl Archive {
@@ -85,16 +85,16 @@ impl Archive {
     }
 
     /// The ledger for the packet that is being applied.
-    pub(super) fn posts(&self) -> Ledger<VisibilityReason> {
+    pub(in crate::ground) fn posts(&self) -> Ledger<VisibilityReason> {
         self.posts.clone()
     }
 
-    pub(super) fn set_settings(&mut self, settings: Vec<(String, String)>) {
+    pub(in crate::ground) fn set_settings(&mut self, settings: Vec<(String, String)>) {
         self.settings = settings;
     }
 
     /// Notes on checkpoints that could not be used.
-    pub(super) fn notes(&self) -> impl Iterator<Item = &str> {
+    pub(in crate::ground) fn notes(&self) -> impl Iterator<Item = &str> {
         self.notes.iter().map(String::as_str)
     }
 

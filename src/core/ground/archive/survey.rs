@@ -10,7 +10,7 @@ use super::folder::{checkpoints, note};
 use super::gap_report::VisibilityPacket;
 use super::gaps::{EphemerisPacket, Gaps, ReceivedPackets, find_gaps};
 use super::names::number_of;
-use super::recovery::unsaved_note;
+use super::raw_archive::unsaved_note;
 use crate::array::Ephemeris;
 use crate::downlink::ReceptionCounters;
 use crate::frames::GroundFrame;

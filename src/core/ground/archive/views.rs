@@ -15,12 +15,14 @@ impl Journal {
         self.visibilities.values().filter(|record| record.entry.visibilities > 0)
     }
 
-    pub(super) fn packets(&self) -> usize {
+    pub(in crate::ground) fn packets(&self) -> usize {
         self.with_visibilities().count()
     }
 
     /// Packets with visibilities, each with the fraction of its offered visibilities that was accumulated.
-    pub(super) fn accumulated_fractions(&self) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
+    pub(in crate::ground) fn accumulated_fractions(
+        &self,
+    ) -> impl Iterator<Item = (&JournalEntry, Option<f64>)> {
         self.with_visibilities().map(|record| {
             let offered = (record.offered > 0).then_some(record.offered);
             let share = offered.map(|offered| f64::from(record.accumulated) / f64::from(offered));
@@ -28,12 +30,12 @@ impl Journal {
         })
     }
 
-    pub(super) fn delivered(&self) -> impl Iterator<Item = (PacketKind, SendingKey)> {
+    pub(in crate::ground) fn delivered(&self) -> impl Iterator<Item = (PacketKind, SendingKey)> {
         let visibilities = self.visibilities.keys().map(|sent| (PacketKind::Visibilities, *sent));
         visibilities.chain(self.others.keys().copied())
     }
 
-    pub(super) fn reception(&self) -> ReceptionCounters {
+    pub(in crate::ground) fn reception(&self) -> ReceptionCounters {
         let mut counters = ReceptionCounters::default();
         for record in self.visibilities.values() {
             counters.add_packet(PacketKind::Visibilities, record.bytes, &record.counts);
@@ -45,7 +47,7 @@ impl Journal {
     }
 
     /// The received blocks and the spacecraft's reports.
-    pub(super) fn blocks(&self) -> ReceivedBlocks {
+    pub(in crate::ground) fn blocks(&self) -> ReceivedBlocks {
         let mut blocks = ReceivedBlocks::default();
         for record in self.with_visibilities() {
             let JournalEntry { channel, pair, start, visibilities, .. } = record.entry;
@@ -61,7 +63,7 @@ impl Journal {
         blocks
     }
 
-    pub(super) fn ledger(&self) -> LedgerReport<VisibilityReason> {
+    pub(in crate::ground) fn ledger(&self) -> LedgerReport<VisibilityReason> {
         let mut ledger = LedgerReport::default();
         for record in self.visibilities.values() {
             ledger.accumulated = ledger.accumulated.saturating_add(u64::from(record.accumulated));
@@ -77,7 +79,7 @@ impl Journal {
     }
 
     /// First and last mission time, s, of the data offered to the engine of each channel of the sums.
-    pub(super) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
+    pub(in crate::ground) fn spans_s(&self) -> BTreeMap<ChannelId, [f64; 2]> {
         let mut spans: BTreeMap<ChannelId, [f64; 2]> = BTreeMap::new();
         for record in self.visibilities.values() {
             let Some(SumsSpan { channel, span_s: [first, last] }) = record.used else { continue };
@@ -88,12 +90,12 @@ impl Journal {
     }
 
     /// Mission time of the latest visibilities in the sums, s.
-    pub(super) fn latest_s(&self) -> Option<f64> {
+    pub(in crate::ground) fn latest_s(&self) -> Option<f64> {
         self.spans_s().values().map(|[_, last]| *last).reduce(f64::max)
     }
 
     /// Whether the sums hold cross-correlations that overlap a time span.
-    pub(super) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
+    pub(in crate::ground) fn uses(&self, [from, to]: [MissionTime; 2]) -> bool {
         self.visibilities.values().any(|JournalRecord { entry, accumulated, .. }| {
             *accumulated > 0 && entry.pair.i != entry.pair.j && entry.start <= to && entry.end >= from
         })

@@ -10,13 +10,13 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::archived::{ArchivedVisibility, RefinedSetup, VisibilitiesHead};
-use super::assumed_instrument::AssumedInstrument;
 use super::segments::{ArchiveSegment, SEGMENTS_MAX, SegmentFolder};
 use super::sums::{
     BLOCK, Departures, RefinedData, RefinedSums, VisibilityColumns, circle_engine, nearest_circle,
     refined_sums,
 };
 use crate::frames::PlacedVisibilities;
+use crate::imaging::assumed_instrument::AssumedInstrument;
 use crate::imaging::circle::{HarmonicEngine, HarmonicSums, OrderBlocks};
 use crate::imaging::exact::checkpoint::{BasisKind, FrameReader, FrameWriter, refused};
 use crate::imaging::exact::fixed_point::{Direction, Totals, WeightScale};

@@ -17,7 +17,7 @@ use crate::units::constants::SPEED_OF_LIGHT_M_S;
 const SUMMED_VISIBILITY_BYTES: f64 = 120.0;
 
 /// The circle's sums, solved once per iteration; visibilities in memory; and tables of the true rows.
-pub(super) fn refined_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
+pub(in crate::imaging) fn refined_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
     let ChannelData { frequency_hz, visibilities, limb_range_rad, .. } = data;
     let circle = harmonic_cost(map, data);
     // Intermediate maps are solved on the nearest circle.

@@ -3,10 +3,8 @@
 
 mod archive;
 mod archived;
-mod assumed_instrument;
 mod cost;
 mod iterations;
-mod method;
 mod refinement;
 mod segments;
 mod solve;
@@ -14,11 +12,12 @@ mod subspace;
 mod sums;
 mod with_power;
 
+pub use super::assumed_instrument::{AssumedAntenna, AssumedInstrument};
 pub use archive::{REFINED_VISIBILITY_BYTES, VisibilityArchive};
 pub use archived::RefinedSetup;
-pub use assumed_instrument::{AssumedAntenna, AssumedInstrument};
-pub(super) use method::{ArchiveUse, ArchivedSums, RefinedMaps};
+pub(super) use cost::refined_cost;
+pub(super) use iterations::IterationFile;
 pub use refinement::{ChiSquares, Refinement};
-pub use segments::{ArchiveSegment, HELD_BYTES, SegmentFolder};
+pub use segments::{HELD_BYTES, ArchiveSegment, SegmentFolder};
 pub use solve::{RefineRule, RefineSteps, solve_refined};
 pub use sums::{Departures, RefinedData, RefinedSums, orbit_phase_deg};

@@ -8,8 +8,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::archived::{ArchivedVisibility, RefinedSetup};
-use super::assumed_instrument::{AssumedInstrument, PairAntennas, is_same_pass};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
+use crate::imaging::assumed_instrument::{AssumedInstrument, PairAntennas, is_same_pass};
 use crate::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums};
 use crate::imaging::circle::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 use crate::imaging::exact::noise::companion_noise;

@@ -5,8 +5,9 @@
 use super::solve::HarmonicRequest;
 use super::{HarmonicSums, coefficients, unknowns};
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 use crate::imaging::regulariser::Regulariser;
-use crate::imaging::solver::{NamedWatch, PointBeam, SolveError, System};
+use crate::imaging::solver::{NamedWatch, PointBeam, System};
 use crate::sky::harmonics::Transform;
 use crate::sky::healpix::pixel_count;
 

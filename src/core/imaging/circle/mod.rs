@@ -27,7 +27,6 @@ mod coverage;
 mod exact;
 mod grid;
 mod lines;
-mod method;
 mod noise_maps;
 mod noises;
 mod operator;
@@ -48,26 +47,26 @@ mod workspace;
 use std::io::Read;
 use std::sync::{Arc, OnceLock};
 
+pub use super::unknowns::{coefficients, degrees, unknowns, unknowns_of_gradient};
 pub use beams::harmonic_beams;
 pub use blocks::{OrderBlocks, OrderFactors};
 pub(super) use cost::harmonic_cost;
 pub use coverage::{GeometryCoverage, GeometrySurvey};
 pub use grid::SPREAD_MULTIPLY_ADDS;
-pub(super) use method::CircleMaps;
 pub use noise_maps::solve_noises;
 pub use noises::NoiseSums;
 pub use parts::SumPart;
 pub use posterior::NOISES_TOGETHER;
 pub(super) use posterior::Posterior;
 pub use setup::{
-    ApplicationSize, HarmonicMemory, HarmonicSetup, L_MAX, SharedSize, application_size, memory,
-    nominal_orbit, shared_size,
+    ApplicationSize, HarmonicMemory, HarmonicSetup, SharedSize, application_size, memory, nominal_orbit,
+    shared_size,
 };
 pub(super) use setup::{INCLINATION_STEP_DEG, RADIUS_STEP_M};
 pub(super) use sigma::{moments, moments_k, resolution_deg, sample, view_sigma_k};
 pub use solve::{HarmonicRequest, HarmonicSolution, solve_regularised};
 pub(super) use solve::{largest_of_circle, prior_unknowns};
-pub use sums::{HarmonicSums, coefficients, degrees, unknowns, unknowns_of_gradient};
+pub use sums::HarmonicSums;
 
 use self::checkpoint::HarmonicHead;
 use self::exact::{ExactTori, SCALES_MAX};

@@ -4,8 +4,9 @@ use super::posterior::NOISES_TOGETHER;
 use super::solve::{HarmonicRequest, largest_of_circle, power_of_data};
 use super::{HarmonicSums, coefficients};
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 use crate::imaging::regulariser::Regulariser;
-use crate::imaging::solver::{NamedWatch, SolveError, System, check_request};
+use crate::imaging::solver::{NamedWatch, System, check_request};
 use crate::sky::harmonics::synthesis;
 
 /// Solves for the noise-only maps, K, of the additional realisations of the sums ([`HarmonicSums::noise_realisations`]). Each equals the

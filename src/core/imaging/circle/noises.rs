@@ -11,13 +11,14 @@ use super::grid::{Grids, NODES};
 use super::operator::{RightHandSide, SharedTori};
 use super::quanta::Quanta;
 use super::spread::{GriddedNoise, TorusPoint, add_noise_pair};
-use super::sums::{HarmonicSums, unknowns_of_gradient};
+use super::sums::HarmonicSums;
 use super::tori::{NodeSums, Tori};
 use super::{HarmonicBasis, HarmonicEngine};
 use crate::frames::PlacedVisibilities;
 use crate::imaging::exact::engine::SkyBasis;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::exact::noise::{NoiseKey, unit_noise};
+use crate::imaging::unknowns::unknowns_of_gradient;
 
 /// A visibility whose noise realisations wait to be summed.
 #[derive(Clone, Copy, Debug)]

@@ -3,12 +3,13 @@
 use super::coefficients;
 use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 use crate::imaging::power::{
     Block, Factors, FoundPower, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE,
 };
 use crate::imaging::power::{Sample, Samples, Uncertainty};
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{NamedWatch, SolveError, StoppingRule, System, add, dot};
+use crate::imaging::solver::{NamedWatch, StoppingRule, System, add, dot};
 use crate::sky::harmonics::synthesis;
 
 /// Realisations or samples that are solved for together: a thread has a workspace for each.

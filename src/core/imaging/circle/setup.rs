@@ -5,6 +5,7 @@ use super::grid::Grids;
 use super::operator::Operator;
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::AccumulationError;
+use crate::imaging::config::L_MAX;
 use crate::response::harmonic::{
     GeometryLimits, NominalOrbit, PairOrientation, PatternGeometry, degree_count,
 };
@@ -31,8 +32,6 @@ pub struct HarmonicSetup {
     pub weight_max: f64,
 }
 
-/// Maximum degree that is accepted. Its sums take 0.5 GB per wavelength, so that all but short baselines need many ranks.
-pub const L_MAX: usize = 1024;
 /// Maximum baseline that is accepted, wavelengths.
 const U_MAX: f64 = 10_000.0;
 

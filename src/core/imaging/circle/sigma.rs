@@ -7,8 +7,8 @@ use faer::Mat;
 use rayon::prelude::*;
 
 use super::blocks::orders_of;
-use super::sums::degrees;
 use crate::imaging::power::{Block, Factors, Sample};
+use crate::imaging::unknowns::degrees;
 use crate::sky::healpix::pixel_directions;
 
 /// Standard deviations, K, of the pixels of a map, HEALPix RING; `ratio` is that of traces, by degree.

@@ -1,13 +1,14 @@
 //! Solves the regularised normal equations over harmonic coefficients.
 
 use super::posterior::Posterior;
-use super::sums::degrees;
 use super::{HarmonicSums, OrderBlocks, coefficients, unknowns};
+use crate::imaging::SolveError;
 use crate::imaging::power::{MapsWithPower, PowerProblem, Samples, Uncertainty};
 use crate::imaging::regulariser::Regulariser;
-use crate::imaging::solver::{Convergence, Diagnostics, FitInputs, NamedWatch, SolveError, StoppingRule};
+use crate::imaging::solver::{Convergence, Diagnostics, FitInputs, NamedWatch, StoppingRule};
 use crate::imaging::solver::{LargestEigenvalue, System, largest_eigenvalue_from, normalised, random_vector};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, traces};
+use crate::imaging::unknowns::degrees;
 use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis, synthesis};
 use crate::sky::healpix::{nside_of, pixel_area_sr};

@@ -9,6 +9,7 @@ use super::grid::Grids;
 use super::operator::{Operator, RightHandSide, SharedTori};
 use super::stored::TorusPart;
 use super::tori::Tori;
+use crate::imaging::unknowns::{coefficients, unknowns_of_gradient};
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::ranks::Ranks;
 use crate::sky::harmonics::Alm;
@@ -124,46 +125,4 @@ impl NormalSums for HarmonicSums {
     fn failure(&self) -> Option<&str> {
         self.tori.stored.as_ref()?.failure()
     }
-}
-
-/// The degree of each unknown, in order.
-pub fn degrees(l_max: usize) -> impl Iterator<Item = usize> {
-    let of_order =
-        move |m: usize| (m..=l_max).flat_map(move |l| std::iter::repeat_n(l, if m == 0 { 1 } else { 2 }));
-    (0..=l_max).flat_map(of_order)
-}
-
-/// Converts a vector of unknowns to coefficients; missing ones are zero.
-#[must_use]
-pub fn coefficients(unknowns: &[f64], l_max: usize) -> Alm {
-    let half = std::f64::consts::FRAC_1_SQRT_2;
-    let mut alm = Alm::zeros(l_max);
-    let (zonal, rest) = unknowns.split_at(unknowns.len().min(l_max + 1));
-    let values = alm.values_mut();
-    for (value, x) in values.iter_mut().zip(zonal) {
-        value.re = *x;
-    }
-    for (value, x) in values[l_max + 1..].iter_mut().zip(rest.as_chunks::<2>().0) {
-        value.re = half * x[0];
-        value.im = half * x[1];
-    }
-    alm
-}
-
-/// Converts coefficients to a vector of unknowns.
-#[must_use]
-pub fn unknowns(alm: &Alm) -> Vec<f64> {
-    scaled(alm, std::f64::consts::SQRT_2)
-}
-
-/// Converts a gradient with respect to `Re T_lm` and `Im T_lm` to one with respect to the unknowns.
-#[must_use]
-pub fn unknowns_of_gradient(gradient: &Alm) -> Vec<f64> {
-    scaled(gradient, std::f64::consts::FRAC_1_SQRT_2)
-}
-
-fn scaled(alm: &Alm, factor: f64) -> Vec<f64> {
-    let (zonal, rest) = alm.values().split_at(alm.l_max() + 1);
-    let rest = rest.iter().flat_map(|value| [factor * value.re, factor * value.im]);
-    zonal.iter().map(|value| value.re).chain(rest).collect()
 }

@@ -1,7 +1,6 @@
 //! Which settings of maps are valid, alone and with an instrument.
 
-use super::{EngineKind, MapConfig, Method, PIXEL_ENGINE_NSIDE_MAX, RefineConfig, RegulariserChoice};
-use crate::imaging::circle::L_MAX;
+use super::{EngineKind, L_MAX, MapConfig, Method, PIXEL_ENGINE_NSIDE_MAX, RefineConfig, RegulariserChoice};
 use crate::sky::TEMPERATURE_K_MAX;
 use crate::sky::healpix::is_valid_nside;
 use crate::units::{Checks, InvalidValue};

@@ -8,9 +8,9 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::frames::Instrument;
+use crate::imaging::AccumulationError;
 use crate::imaging::antennas::AntennasConfig;
-use crate::imaging::anywhere::AssumedInstrument;
-use crate::imaging::{AccumulationError, PixelEngine};
+use crate::imaging::assumed_instrument::AssumedInstrument;
 use crate::response::harmonic::GeometryLimits;
 use crate::response::pixel::PixelMethod;
 use crate::response::{MeasuredAntennas, MeasuredAntennasError};
@@ -19,6 +19,9 @@ use crate::sky::fits::{ReadOptions, check_frequency};
 use crate::sky::healpix::pixel_area_sr;
 use crate::units::constants::SPEED_OF_LIGHT_M_S;
 use crate::units::{ChannelId, PerChannel, keys};
+
+/// Maximum degree of harmonic sums. They take 0.5 GB per wavelength, so that all but short baselines need many ranks.
+pub(in crate::imaging) const L_MAX: usize = 1024;
 
 /// Maximum nside of the pixel engine: 49152 pixels, 9.7 GB of sums per channel (half of a symmetric matrix, f64).
 pub const PIXEL_ENGINE_NSIDE_MAX: usize = 64;
@@ -380,35 +383,6 @@ impl MapConfig {
     #[doc(hidden)]
     pub fn is_mapped(&self, channel: ChannelId) -> bool {
         self.channels.is_empty() || self.channels.contains(&channel.0)
-    }
-
-    /// Requires that the sums of the mapped channels of a group take at most `limit_bytes`; the instrument has `channels` channels. Harmonic sums
-    /// grow with the data and are not counted.
-    ///
-    /// # Errors
-    /// [`AccumulationError::Memory`].
-    #[doc(hidden)]
-    pub fn require_memory(
-        &self,
-        channels: usize,
-        limit_bytes: Option<u64>,
-        group: Option<&ChannelGroup>,
-    ) -> Result<(), AccumulationError> {
-        let each = match self.method() {
-            Method::Pixel => PixelEngine::memory_bytes(self.nside),
-            Method::MatrixFree | Method::Harmonic | Method::Refined => 0,
-        };
-        let is_summed = |channel: &ChannelId| {
-            self.is_mapped(*channel) && group.is_none_or(|group| group.contains(channel))
-        };
-        let channels = (0..channels as u16).map(ChannelId).filter(is_summed).count();
-        let needed_bytes = each.saturating_mul(channels as u64);
-        match limit_bytes {
-            Some(limit_bytes) if needed_bytes > limit_bytes => {
-                Err(AccumulationError::Memory { channels, needed_bytes, limit_bytes })
-            }
-            _ => Ok(()),
-        }
     }
 
     /// Requires that prior maps which state a frequency have that of their channel.

@@ -8,12 +8,13 @@ use super::powers::{PowerAgreement, PowerPriors, PowerRows, WeightedRows};
 use super::prior::{FREE, Prior, View};
 use super::spectrum::{SpectralMaps, SpectrumFit};
 use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
+use crate::imaging::SolveError;
 use crate::imaging::circle::{NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
 use crate::imaging::power::{
     Block, Factors, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE, SkyPower,
 };
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{Convergence, NamedWatch, SolveError, StoppingRule, System, dot};
+use crate::imaging::solver::{Convergence, NamedWatch, StoppingRule, System, dot};
 use crate::imaging::{NormalSums, SumCounts};
 use crate::sky::harmonics::synthesis;
 use crate::units::{StreamKind, frequency_folder, random_stream};

@@ -14,7 +14,7 @@ use faer::linalg::triangular_solve::solve_upper_triangular_in_place;
 use faer::{Mat, Par, Side};
 use serde::Serialize;
 
-use crate::imaging::solver::SolveError;
+use crate::imaging::SolveError;
 
 /// Degrees whose prior is free: mean and dipole.
 pub(super) const FREE: usize = 2;

@@ -8,9 +8,10 @@ use super::powers::{PowerRows, PowerSample};
 use super::prior::{Correlation, FREE, Prior, View};
 use super::spectrum::SpectralMaps;
 use super::sums::{ScaledBlocks, joint_blocks, scaled_blocks};
+use crate::imaging::SolveError;
 use crate::imaging::circle::{HarmonicSums, OrderBlocks, degrees};
 use crate::imaging::power::{Block, FoundPower, PowerProblem, SkyPower, value};
-use crate::imaging::solver::{Convergence, NamedWatch, SolveError, SolveWatch, StoppingRule};
+use crate::imaging::solver::{Convergence, NamedWatch, SolveWatch, StoppingRule};
 use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 
 /// Correlation lengths of the initial grid.

@@ -42,7 +42,7 @@ fn element_s(map: &MapConfig) -> f64 {
 }
 
 /// The cost of sums over pixels whose matrix is stored and factorised.
-pub(super) fn stored(map: &MapConfig, solutions: u64) -> EngineCost {
+pub(in crate::imaging) fn pixel_cost(map: &MapConfig, solutions: u64) -> EngineCost {
     let nside = map.nside;
     let pixels = pixel_count(nside) as f64;
     // Two real rows of B per visibility, and half of a symmetric matrix.
@@ -75,7 +75,7 @@ fn data_products(data: ChannelData, iterations_max: f64) -> f64 {
 }
 
 /// Stored visibilities and matrix products, each of which computes a row per visibility for the map and its noise map together.
-pub(super) fn matrix_free(map: &MapConfig, data: ChannelData) -> EngineCost {
+pub(in crate::imaging) fn matrix_free_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
     let pixels = pixel_count(map.nside) as f64;
     let visibilities = data.visibilities.min(map.refine.visibilities_max as f64);
     let from_data = map.regulariser() == RegulariserChoice::Data;
@@ -273,7 +273,7 @@ mod tests {
                 solutions: 1,
                 limb_range_rad: 0.0,
             };
-            let estimated = matrix_free(&map, data).products;
+            let estimated = matrix_free_cost(&map, data).products;
             let counted = sums.products.into_inner();
             let ratio = estimated / counted as f64;
             // Whole missions from 1 to 30 MHz have 0.7 to 1.7; without the rounds it would be 0.05 to 0.3.
@@ -299,7 +299,7 @@ mod tests {
             let diagonal: Vec<f64> = blocks.blocks().iter().map(|block| block.matrix[(0, 0)]).collect();
             let (windows, frequency_hz) = (windows as f64, 3e6);
             let data = ChannelData { frequency_hz, visibilities, windows, solutions: 1, limb_range_rad: 0.0 };
-            (diagonal, matrix_free(&map, data).other_bytes)
+            (diagonal, matrix_free_cost(&map, data).other_bytes)
         });
         assert!(!near.0.is_empty() && near.0.len() == far.0.len());
         let largest = near.0.iter().copied().fold(0.0, f64::max);

@@ -7,9 +7,9 @@ use faer::{Accum, Mat, Par};
 use rayon::prelude::*;
 
 use super::PixelSums;
+use crate::imaging::SolveError;
 use crate::imaging::circle::{coefficients, unknowns};
 use crate::imaging::power::Block;
-use crate::imaging::solver::SolveError;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::numerics::legendre::Legendre;
 use crate::sky::harmonics::Transform;
@@ -19,7 +19,7 @@ use crate::sky::healpix::{pixel_area_sr, pixel_directions};
 const DEGREES_PER_NSIDE: f64 = 2.5;
 
 /// Maximum degree of pixel maps whose R depends on the degree: pixels represent no higher ones of a sky whose power falls with the degree.
-pub(super) fn degree_max(nside: usize) -> usize {
+pub(in crate::imaging) fn degree_max(nside: usize) -> usize {
     (DEGREES_PER_NSIDE * nside as f64) as usize
 }
 
@@ -97,7 +97,7 @@ impl NormalSums for Projected<'_> {
 }
 
 /// The blocks of `Y'AY` that keep order and parity, averaged over turns about the pole, as those of sums on a circle.
-pub(super) fn averaged_blocks(sums: &PixelSums) -> Vec<Block<'static>> {
+pub(in crate::imaging) fn averaged_blocks(sums: &PixelSums) -> Vec<Block<'static>> {
     let l_max = degree_max(sums.nside);
     let rings = Rings::new(sums.nside);
     let points = rings.cos_sin.iter().copied();

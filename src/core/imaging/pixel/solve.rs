@@ -1,7 +1,8 @@
 //! The regularised solution over pixels.
 
 use super::cholesky::{Cholesky, NotPositive};
-use crate::imaging::solver::{Diagnostics, FitInputs, NamedWatch, PointBeam, SolveError, SolveWatch};
+use crate::imaging::SolveError;
+use crate::imaging::solver::{Diagnostics, FitInputs, NamedWatch, PointBeam, SolveWatch};
 use crate::imaging::solver::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};
 use crate::imaging::solver::{add, check_request, right_hand_side, subtract, traces};
 use crate::imaging::{NormalSums, PixelSums};

@@ -6,10 +6,11 @@
 use super::projected::{Harmonics, Projected};
 use super::solve::{PixelSolution, point_response};
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 use crate::imaging::circle::{HarmonicRequest, Posterior, unknowns};
 use crate::imaging::power::{Block, Factors, MapsWithPower, PowerProblem, Uncertainty};
 use crate::imaging::regulariser::{Diagonal, Regulariser};
-use crate::imaging::solver::{Convergence, Diagnostics, NamedWatch, PointBeam, SolveError, System};
+use crate::imaging::solver::{Convergence, Diagnostics, NamedWatch, PointBeam, System};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, random_vector};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, subtract};
 use crate::sky::harmonics::{AnalysisOptions, analysis};
@@ -19,18 +20,18 @@ use crate::sky::healpix::pixel_area_sr;
 const W_MAX_TOLERANCE: f64 = 1e-3;
 
 /// The equations of a map over pixels, and blocks near theirs over harmonics.
-pub(super) struct PixelEquations<'a> {
-    pub(super) sums: &'a (dyn NormalSums + Sync),
-    pub(super) blocks: &'a [Block<'a>],
+pub(in crate::imaging) struct PixelEquations<'a> {
+    pub(in crate::imaging) sums: &'a (dyn NormalSums + Sync),
+    pub(in crate::imaging) blocks: &'a [Block<'a>],
 }
 
 /// A pixel map whose R depends on the degree.
-pub(super) struct SolvedByDegree {
-    pub(super) solution: PixelSolution,
+pub(in crate::imaging) struct SolvedByDegree {
+    pub(in crate::imaging) solution: PixelSolution,
     /// Unknowns of the map, without its prior, and of the noise map: a start for more data.
-    pub(super) unknowns: [Vec<f64>; 2],
+    pub(in crate::imaging) unknowns: [Vec<f64>; 2],
     /// Errors, with R from the data.
-    pub(super) uncertainty: Option<Uncertainty>,
+    pub(in crate::imaging) uncertainty: Option<Uncertainty>,
 }
 
 /// The unknowns of map and noise map, and the R that they have.
@@ -57,7 +58,7 @@ impl PixelEquations<'_> {
     /// # Errors
     /// There is no data, the prior has another size, a table of power ends before the map's degrees, or numbers are not finite;
     /// [`SolveError::Interrupted`].
-    pub(super) fn solve(
+    pub(in crate::imaging) fn solve(
         &self,
         request: HarmonicRequest,
         regulariser: &Regulariser,

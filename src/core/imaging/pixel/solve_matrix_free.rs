@@ -1,8 +1,9 @@
 //! Solves for pixel maps without a stored matrix, by conjugate gradients.
 
 use super::solve::PixelSolution;
+use crate::imaging::SolveError;
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{Diagnostics, NamedWatch, SolveError, add, check_request, right_hand_side};
+use crate::imaging::solver::{Diagnostics, NamedWatch, add, check_request, right_hand_side};
 use crate::imaging::solver::{LargestEigenvalue, largest_eigenvalue_from, random_vector};
 use crate::imaging::solver::{StoppingRule, System};
 use crate::imaging::{MatrixFreeSums, NormalSums};

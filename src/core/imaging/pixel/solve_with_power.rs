@@ -7,9 +7,10 @@ use faer::{Accum, Mat, get_global_parallelism};
 
 use super::projected::Harmonics;
 use super::solve::{PixelSolution, point_response};
+use crate::imaging::SolveError;
 use crate::imaging::circle::{degrees, moments, moments_k, resolution_deg, sample, unknowns};
 use crate::imaging::power::{Block, Factors, FoundPower, PowerProblem, Sample, Samples, Uncertainty};
-use crate::imaging::solver::{Diagnostics, NamedWatch, PointBeam, SolveError};
+use crate::imaging::solver::{Diagnostics, NamedWatch, PointBeam};
 use crate::imaging::solver::{add, check_request, dot, right_hand_side, subtract};
 use crate::imaging::{NormalSums, PixelSums, SumCounts};
 use crate::sky::harmonics::{AnalysisOptions, analysis};
@@ -17,7 +18,7 @@ use crate::units::{StreamKind, random_stream};
 use rand_distr::{Distribution, StandardNormal};
 
 /// Maximum nside: 6561 harmonics, and matrices of 1.6 GB in addition to the sums.
-pub(super) const POWER_NSIDE_MAX: usize = 32;
+pub(in crate::imaging) const POWER_NSIDE_MAX: usize = 32;
 /// First number of the draws of Gibbs sampling: those of plain samples are below.
 const GIBBS: u64 = 1 << 40;
 /// Rows of the matrix that are multiplied at once.

@@ -35,7 +35,7 @@ pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 
 use self::blocks::{evidence, largest_diagonal};
 use self::knots::{FREE, Knots};
-use crate::imaging::solver::SolveError;
+use crate::imaging::SolveError;
 use crate::sky::healpix::pixel_count;
 
 /// Decades of amplitude that are searched, in units of the smallest noise variance.

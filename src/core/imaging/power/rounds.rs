@@ -7,8 +7,9 @@ use super::knots::FREE;
 use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 use crate::imaging::regulariser::Diagonal;
-use crate::imaging::solver::{Convergence, NamedWatch, SolveError, StoppingRule, System, dot};
+use crate::imaging::solver::{Convergence, NamedWatch, StoppingRule, System, dot};
 
 /// Maximum number of rounds.
 const ROUNDS_MAX: usize = 6;

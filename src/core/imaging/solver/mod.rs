@@ -1,7 +1,6 @@
 //! Solvers that all map methods share: conjugate gradients, eigenvalues, traces of covariances, and progress reports.
 
 mod conjugate_gradients;
-mod error;
 mod fit;
 mod lanczos;
 mod prologue;
@@ -11,7 +10,6 @@ mod watch;
 
 pub use conjugate_gradients::{Convergence, StoppingRule};
 pub(super) use conjugate_gradients::{System, solve_one};
-pub use error::SolveError;
 pub use fit::Fit;
 pub(super) use fit::FitInputs;
 pub use lanczos::{LargestEigenvalue, W_MAX_EXACT, largest_eigenvalue};

@@ -3,11 +3,11 @@
 use serde::Serialize;
 
 use super::conjugate_gradients::Convergence;
-use super::error::SolveError;
 use super::fit::Fit;
 use super::traces::{Traces, UnsupportedEpsilon};
 use super::vectors::subtract;
 use crate::imaging::NormalSums;
+use crate::imaging::SolveError;
 
 /// Diagnostics of a solution. Eigenvalues and traces are in pixel units, for harmonic maps too.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, bincode::Encode, bincode::Decode)]

@@ -7,11 +7,11 @@ use std::sync::Arc;
 
 use super::snapshot::Snapshot;
 use crate::frames::{Instrument, PlacedFrame, PlacedVisibilities, VisibilityReason};
+use crate::imaging::SolveError;
 use crate::imaging::anywhere::{ArchiveSegment, SegmentFolder};
 use crate::imaging::beyond::{BeyondNoise, read_power};
 use crate::imaging::circle::SumPart;
 use crate::imaging::method::{MapSums, NewOrRefused, SumShare};
-use crate::imaging::solver::SolveError;
 use crate::imaging::{AccumulationError, Added, ChannelGroup, MapConfig};
 use crate::ranks::{RankShare, Ranks};
 use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};

@@ -5,9 +5,10 @@ use std::sync::Arc;
 
 use super::snapshot::Snapshot;
 use crate::frames::Instrument;
+use crate::imaging::SolveError;
 use crate::imaging::anywhere::Refinement;
 use crate::imaging::request::{LastSolution, MapRequest, SolvedMap, SolverSetup};
-use crate::imaging::solver::{Diagnostics, PointBeam, SolveError};
+use crate::imaging::solver::{Diagnostics, PointBeam};
 use crate::imaging::{SumCounts, Uncertainty};
 use crate::runtime::{Outlet, Stage, Units};
 use crate::sky::healpix::pixel_count;

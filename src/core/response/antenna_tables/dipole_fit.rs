@@ -33,7 +33,7 @@ pub(super) struct FittedSet {
 }
 
 /// A direction of a table on the axes of the body, with the unit vectors across it.
-struct Directed {
+struct TableDirection {
     n_hat: Vec3,
     across: [Vec3; 2],
     /// Share of the sphere.
@@ -41,7 +41,7 @@ struct Directed {
     value: Value,
 }
 
-impl Directed {
+impl TableDirection {
     fn new(sample: &Sample) -> Self {
         let angles = [sample.theta_deg, sample.phi_deg];
         let [(sin_t, cos_t), (sin_p, cos_p)] = angles.map(|angle| angle.to_radians().sin_cos());
@@ -73,7 +73,7 @@ pub(super) fn fit_table(table: &Table, left_max: f64) -> Result<Vec<FittedSet>, 
         let mut samples = Vec::new();
         for dipole in 0..dipoles {
             let found = table.get(&(bits, dipole)).map_or(&[][..], Vec::as_slice);
-            let found: Vec<Directed> = found.iter().map(Directed::new).collect();
+            let found: Vec<TableDirection> = found.iter().map(TableDirection::new).collect();
             require_sphere(&found).map_err(|what| format!("{}: {what}", at(dipole)))?;
             samples.push(found);
         }
@@ -104,9 +104,10 @@ pub(super) fn fit_table(table: &Table, left_max: f64) -> Result<Vec<FittedSet>, 
 }
 
 /// Requires directions all over the sphere.
-fn require_sphere(samples: &[Directed]) -> Result<(), String> {
+fn require_sphere(samples: &[TableDirection]) -> Result<(), String> {
     let weight: f64 = samples.iter().map(|sample| sample.weight).sum();
-    let mean = |of: &dyn Fn(&Directed) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>() / weight;
+    let mean =
+        |of: &dyn Fn(&TableDirection) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>() / weight;
     let uneven = (0..3).map(|k| {
         let first = mean(&|s| s.n_hat[k]).abs();
         first.max((3.0 * mean(&|s| s.n_hat[k] * s.n_hat[k]) - 1.0).abs())
@@ -126,7 +127,7 @@ fn require_sphere(samples: &[Directed]) -> Result<(), String> {
 }
 
 /// The factor of length 1 that makes fields as real as they can be, with the first dipole along its nominal axis.
-fn common_phase(dipoles: &[Vec<Directed>]) -> Complex64 {
+fn common_phase(dipoles: &[Vec<TableDirection>]) -> Complex64 {
     let mut square = Complex64::ZERO;
     for sample in dipoles.iter().flatten() {
         if let Value::Field([a, b]) = sample.value {
@@ -166,7 +167,7 @@ fn form_of(x: &Numbers) -> [Vec3; 3] {
 }
 
 /// The model in a direction: its field across, and the derivatives.
-fn modelled(x: &Numbers, sample: &Directed) -> ([f64; 2], [[f64; 8]; 2]) {
+fn modelled(x: &Numbers, sample: &TableDirection) -> ([f64; 2], [[f64; 8]; 2]) {
     let n = sample.n_hat;
     let form = form_of(x);
     let factor = dot(n, [0, 1, 2].map(|k| dot(form[k], n)));
@@ -193,7 +194,7 @@ fn modelled(x: &Numbers, sample: &Directed) -> ([f64; 2], [[f64; 8]; 2]) {
 }
 
 /// Differences of a sample from the model, and the model's derivatives: of fields two, of a gain one.
-fn differences(x: &Numbers, sample: &Directed, phase: Complex64) -> [(f64, [f64; 8]); 2] {
+fn differences(x: &Numbers, sample: &TableDirection, phase: Complex64) -> [(f64, [f64; 8]); 2] {
     let (field, slopes) = modelled(x, sample);
     match sample.value {
         Value::Field(given) => [0, 1].map(|k| ((given[k] * phase).re - field[k], slopes[k])),
@@ -206,8 +207,8 @@ fn differences(x: &Numbers, sample: &Directed, phase: Complex64) -> [(f64, [f64;
 }
 
 /// Least squares by damped Newton steps from the nominal axis; gives the part that is left, too.
-fn fit(samples: &[Directed], phase: Complex64, dipole: usize) -> (FittedDipole, f64) {
-    let whole = |of: &dyn Fn(&Directed) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>();
+fn fit(samples: &[TableDirection], phase: Complex64, dipole: usize) -> (FittedDipole, f64) {
+    let whole = |of: &dyn Fn(&TableDirection) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>();
     let size = whole(&|s| match s.value {
         Value::Field([a, b]) => a.norm_sqr() + b.norm_sqr(),
         Value::Gain(gain) => gain * gain,
@@ -254,7 +255,7 @@ fn fit(samples: &[Directed], phase: Complex64, dipole: usize) -> (FittedDipole, 
 }
 
 /// The nominal axis with the size of the table, and no form; of fields the axis that fits best.
-fn start(samples: &[Directed], phase: Complex64, dipole: usize) -> Numbers {
+fn start(samples: &[TableDirection], phase: Complex64, dipole: usize) -> Numbers {
     let weight: f64 = samples.iter().map(|s| s.weight).sum();
     let mut axis = [0.0; 3];
     let mut power = 0.0;

@@ -43,7 +43,7 @@ impl Value {
         }
     }
 
-    fn apart(self, other: Self) -> f64 {
+    fn distance(self, other: Self) -> f64 {
         match (self, other) {
             (Self::Field([a, b]), Self::Field([c, d])) => Self::Field([a - c, b - d]).size(),
             _ => (self.size() - other.size()).abs(),
@@ -140,7 +140,7 @@ fn leave_repeated_out(samples: &mut Vec<Sample>) -> Result<(), String> {
     samples.sort_by_key(|sample| (direction(sample), sample.line));
     let differ = |pair: &&[Sample]| {
         let is_repeated = direction(&pair[0]) == direction(&pair[1]);
-        is_repeated && pair[0].value.apart(pair[1].value) > REPEATED_ERROR_MAX * greatest
+        is_repeated && pair[0].value.distance(pair[1].value) > REPEATED_ERROR_MAX * greatest
     };
     if let Some([first, second]) = samples.windows(2).find(differ) {
         return Err(format!(

@@ -1,5 +1,8 @@
 //! Small scales and point sources added to a map file: the paper's input is a smooth map (ULSA) with both.
 
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::catalogue::{Catalogue, CatalogueError, Source};
@@ -7,7 +10,21 @@ use super::fluctuations::{RandomField, gaussian_field, small_scale_fraction, sma
 use super::sources::{COUNTS_HZ, draw, kelvin_sr_per_jansky};
 use super::{FLUCTUATION_FLOOR, GeneratedSky, HASLAM_HZ};
 use crate::sky::healpix::{pixel_area_sr, pixel_of};
-use crate::sky::{AddedSky, MapError, SkyMap};
+use crate::sky::{MapError, SkyMap};
+
+/// Components added to a map file (`sky.added`), with the parameters of `[sky.generated]`, at `sky.nside` or at the nside of the map
+/// if that is finer.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AddedSky {
+    /// Fluctuations on small scales.
+    pub small_scales: bool,
+    /// Point sources drawn from the published counts.
+    pub sources: bool,
+    /// Point sources from a table (CSV).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub catalogue: Option<PathBuf>,
+}
 
 /// Temperature index for scaling a map's emission to 408 MHz, where the amplitude of small scales is known.
 const INDEX_TO_HASLAM: f64 = 2.5;

@@ -27,7 +27,7 @@ mod points;
 mod sources;
 
 #[doc(hidden)]
-pub use added::AddedSkyError;
+pub use added::{AddedSky, AddedSkyError};
 #[doc(hidden)]
 pub use catalogue::CatalogueError;
 pub use config::{GeneratedSky, GeneratedSkyError};

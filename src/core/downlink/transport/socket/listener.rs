@@ -12,11 +12,11 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::Instant;
 
 use super::answers::HeldAnswers;
-use super::config::ListenConfig;
 use super::instrument_filter::SharedReception;
 use super::report::{BUSY, ListenEvent, ListenNote, Listening};
 use super::slots::ConnectionSlots;
 use super::stations::Stations;
+use crate::downlink::config::ListenConfig;
 use crate::downlink::transport::packet_archive::{PacketArchive, Ticket};
 
 /// Maximum number of notes in a burst; the mean rate is one per second.

@@ -36,12 +36,10 @@
 #[cfg(not(target_family = "wasm"))]
 mod accept;
 mod answers;
-mod config;
 #[cfg(not(target_family = "wasm"))]
 mod connection;
 #[cfg(not(target_family = "wasm"))]
 mod datagrams;
-mod error;
 mod instrument_filter;
 #[cfg(not(target_family = "wasm"))]
 mod listener;
@@ -56,9 +54,9 @@ mod stations;
 mod stream_receiver;
 mod url;
 
+pub use crate::downlink::config::ListenConfig;
+pub use crate::downlink::error::SocketError;
 pub use answers::HeldAnswers;
-pub use config::ListenConfig;
-pub use error::SocketError;
 pub use instrument_filter::InstrumentCheck;
 #[cfg(not(target_family = "wasm"))]
 pub use listener::{ListenLimits, NoteHandler};

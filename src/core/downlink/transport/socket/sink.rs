@@ -7,11 +7,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::answers::HELD_REQUEST;
-use super::error::SocketError;
 use super::preamble::TOKEN;
 use super::report::{BUSY, CLOSED};
 use super::url::TcpUrl;
-use crate::downlink::error::DownlinkError;
+use crate::downlink::error::{DownlinkError, SocketError};
 use crate::runtime::{Cancel, Sink, Units};
 use crate::units::printable;
 

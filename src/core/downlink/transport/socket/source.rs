@@ -11,15 +11,14 @@ use tokio::sync::{Semaphore, watch};
 
 use super::accept::listen;
 use super::answers::HeldAnswers;
-use super::config::ListenConfig;
-use super::error::SocketError;
 use super::instrument_filter::{InstrumentCheck, SharedReception};
 use super::listener::{ListenContext, ListenLimits, NoteHandler, Notes, PacketBatch};
 use super::report::{DatagramReport, Listening};
 use super::slots::ConnectionSlots;
 use super::stations::Stations;
 use super::url::{TcpUrl, udp_url};
-use crate::downlink::error::DownlinkError;
+use crate::downlink::config::ListenConfig;
+use crate::downlink::error::{DownlinkError, SocketError};
 use crate::downlink::transport::packet_archive::PacketArchive;
 use crate::frames::Instrument;
 use crate::runtime::{Flow, Outlet, Source, Units};

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-use super::error::SocketError;
+use crate::downlink::error::SocketError;
 
 /// Minimum length of a token, so that it cannot be guessed if it is random.
 const TOKEN_BYTES_MIN: usize = 16;

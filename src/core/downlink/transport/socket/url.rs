@@ -4,7 +4,7 @@ use std::fmt;
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::str::FromStr;
 
-use super::error::SocketError;
+use crate::downlink::error::SocketError;
 
 /// Address at which a ground listens: for connections (`tcp://`) or for datagrams (`udp://`).
 #[derive(Clone, Debug, PartialEq, Eq)]

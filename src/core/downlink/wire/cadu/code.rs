@@ -8,8 +8,6 @@ pub const PARITY_BYTES: usize = 32;
 pub const DATA_BYTES: usize = CODEWORD_BYTES - PARITY_BYTES;
 /// Maximum number of correctable octets in a codeword.
 pub const ERRORS_MAX: usize = PARITY_BYTES / 2;
-/// Permitted depths of interleaving.
-pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
 
 /// The generator's roots are the powers 11 j of the primitive element, j = 112 to 143.
 pub(super) const ROOT_STEP: usize = 11;

@@ -3,7 +3,24 @@
 use super::framer::{Framer, PACKET_HEADER_BYTES};
 use super::reed_solomon::ReedSolomon;
 use super::{HOUSEKEEPING, IDLE, SCIENCE, SYNC_MARKER, randomize};
+use crate::downlink::config::{DownlinkConfig, Format};
 use crate::downlink::wire::PacketKind;
+
+impl DownlinkConfig {
+    /// The Reed-Solomon code of the frames; `None` for plain packets.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn code(&self) -> Option<ReedSolomon> {
+        ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)
+    }
+
+    /// The frame encoder of the configured format; `None` for plain packets.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn encoder(&self) -> Option<CaduEncoder> {
+        self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
+    }
+}
 
 /// Fills transfer frames with packets and encodes the frames as CADUs.
 #[derive(Debug)]

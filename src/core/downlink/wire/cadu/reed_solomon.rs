@@ -12,10 +12,11 @@ use std::sync::LazyLock;
 
 use multiversion::multiversion;
 
-pub use super::code::{CODEWORD_BYTES, DATA_BYTES, ERRORS_MAX, INTERLEAVES, PARITY_BYTES};
+pub use super::code::{CODEWORD_BYTES, DATA_BYTES, ERRORS_MAX, PARITY_BYTES};
 use super::code::{ROOT_FIRST, ROOT_STEP};
 use super::field::{FIELD, ORDER};
 use super::locator::{Errors, locate};
+pub use crate::downlink::config::INTERLEAVES;
 
 /// Octets processed per table lookup.
 const SLICE: usize = 4;

@@ -3,19 +3,17 @@
 use std::io::{Read, Write};
 use std::path::Path;
 
-use super::cost;
-use super::matrix_free::MatrixFreeVisibilities;
-use super::projected::{averaged_blocks, degree_max};
-use super::solve::{PixelExtras, PixelSolution, solve_pixels_with};
-use super::solve_by_degree::{PixelEquations, SolvedByDegree};
-use super::solve_matrix_free::solve_matrix_free;
-use super::solve_with_power::{POWER_NSIDE_MAX, solve_pixels_with_power};
-use super::{PixelEngine, PixelSetup, PixelSums};
+use super::anywhere::{ArchiveUse, ArchivedSums};
 use crate::frames::PlacedVisibilities;
-use crate::imaging::anywhere::{ArchiveUse, ArchivedSums, SegmentFolder, VisibilityArchive};
+use crate::imaging::anywhere::{SegmentFolder, VisibilityArchive};
 use crate::imaging::circle::{HarmonicRequest, HarmonicSums};
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
+use crate::imaging::pixel::{
+    MatrixFreeVisibilities, POWER_NSIDE_MAX, PixelEngine, PixelEquations, PixelExtras, PixelSetup,
+    PixelSolution, PixelSums, SolvedByDegree, averaged_blocks, degree_max, matrix_free_cost, pixel_cost,
+    solve_matrix_free, solve_pixels_with, solve_pixels_with_power,
+};
 use crate::imaging::request::{MapRequest, SolvedMap};
 use crate::imaging::{AccumulationError, Added, MapConfig, NormalEngine, Regulariser};
 use crate::imaging::{SolveError, SumCounts, Uncertainty};
@@ -51,7 +49,7 @@ impl MapMethod for PixelMaps {
     }
 
     fn cost(&self, map: &MapConfig, data: ChannelData) -> EngineCost {
-        cost::stored(map, data.solutions)
+        pixel_cost(map, data.solutions)
     }
 }
 
@@ -191,7 +189,7 @@ impl MapMethod for MatrixFreeMaps {
     }
 
     fn cost(&self, map: &MapConfig, data: ChannelData) -> EngineCost {
-        cost::matrix_free(map, data)
+        matrix_free_cost(map, data)
     }
 }
 

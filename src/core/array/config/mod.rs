@@ -1,16 +1,19 @@
 //! Configuration of the array.
 
+mod propagate;
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::kepler::KeplerElements;
-use super::propagate::PropagateConfig;
 use super::stations::Stations;
 use crate::units::constants::{DAY_S, MOON_RADIUS_M, YEAR_S};
 use crate::units::time_scales::{Tai, TimeScale, utc_text};
 use crate::units::{Checks, InvalidValue, MAX_SATELLITES, keys};
+
+pub use propagate::{PropagateConfig, StationKeeping};
 
 /// Sense of the precession of the ascending node.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

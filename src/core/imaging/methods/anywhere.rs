@@ -3,14 +3,12 @@
 use std::io::{Read, Write};
 use std::path::Path;
 
-use super::archive::VisibilityArchive;
-use super::archived::RefinedSetup;
-use super::assumed_instrument::AssumedInstrument;
-use super::cost::refined_cost;
-use super::iterations::IterationFile;
-use super::segments::{ArchiveSegment, SegmentFolder};
-use super::solve::{RefineSteps, solve_refined};
 use crate::frames::PlacedVisibilities;
+use crate::imaging::anywhere::{
+    ArchiveSegment, IterationFile, RefineSteps, RefinedSetup, SegmentFolder, VisibilityArchive, refined_cost,
+    solve_refined,
+};
+use crate::imaging::assumed_instrument::AssumedInstrument;
 use crate::imaging::circle::{HarmonicRequest, HarmonicSolution, HarmonicSums};
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
@@ -66,14 +64,14 @@ impl ArchiveUse for TrueRows {
 /// The visibilities of a channel, for a method that needs them one by one.
 pub(in crate::imaging) struct ArchivedSums<U> {
     archive: VisibilityArchive,
-    used: U,
+    solver: U,
 }
 
 impl<U: ArchiveUse> ArchivedSums<U> {
     pub(in crate::imaging) fn new(
         channel: &NewChannel<'_>,
         l_max: usize,
-        used: U,
+        solver: U,
     ) -> Result<Self, AccumulationError> {
         let NewChannel { config, instrument, placed, frequency_hz, weight_max, .. } = *channel;
         let archive = VisibilityArchive::new(RefinedSetup {
@@ -88,17 +86,17 @@ impl<U: ArchiveUse> ArchivedSums<U> {
             limits: config.limits,
             visibilities_max: config.refine.visibilities_max,
         })?;
-        Ok(Self { archive, used })
+        Ok(Self { archive, solver })
     }
 
     pub(in crate::imaging) fn load(
         config: &MapConfig,
         from: &mut dyn Read,
         folder: Option<&Path>,
-        used: U,
+        solver: U,
     ) -> Result<Self, AccumulationError> {
         let visibilities_max = config.refine.visibilities_max;
-        Ok(Self { archive: VisibilityArchive::restore(from, folder, visibilities_max)?, used })
+        Ok(Self { archive: VisibilityArchive::restore(from, folder, visibilities_max)?, solver })
     }
 }
 
@@ -132,12 +130,12 @@ impl<U: ArchiveUse> MapSums for ArchivedSums<U> {
     }
 
     fn snapshot(&mut self) -> Result<Box<dyn MapEquations>, AccumulationError> {
-        self.used.snapshot(&mut self.archive)
+        self.solver.snapshot(&mut self.archive)
     }
 
     fn finish(self: Box<Self>) -> Result<Option<Box<dyn MapEquations>>, AccumulationError> {
-        let Self { archive, used } = *self;
-        Ok(Some(used.finish(archive)))
+        let Self { archive, solver } = *self;
+        Ok(Some(solver.finish(archive)))
     }
 }
 

@@ -1,11 +1,15 @@
 //! Errors of a downlink as a whole. Bad data in a stream is counted instead.
 
+mod payload;
+mod socket;
+
 use std::io;
 use std::path::PathBuf;
 
+pub use payload::PayloadFault;
+pub use socket::SocketError;
 use thiserror::Error;
 
-use super::wire::payload::PayloadFault;
 use crate::units::InvalidValue;
 
 /// Why a downlink cannot be written or read.
@@ -70,7 +74,7 @@ pub enum DownlinkError {
     },
     /// An error of a socket.
     #[error(transparent)]
-    Socket(#[from] crate::downlink::transport::socket::SocketError),
+    Socket(#[from] SocketError),
     /// The input of the link simulator is damaged already.
     #[error(
         "at byte {offset}: no valid frame or packet; expected an undamaged downlink, as `lunarray simulate` writes it"

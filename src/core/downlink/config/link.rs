@@ -1,6 +1,6 @@
 //! Configuration of a simulated link.
 
-use crate::downlink::wire::Format;
+use super::Format;
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum delay of a reordered frame, and maximum number of frames that a second station repeats.

@@ -3,12 +3,12 @@
 use std::io::{Read, Write};
 use std::path::Path;
 
-use super::cost::harmonic_cost;
-use super::noises::NoiseSums;
-use super::solve::{HarmonicRequest, HarmonicSolution, solve_regularised};
-use super::{HarmonicEngine, HarmonicSetup, HarmonicSums, SumPart, harmonic_beams, nominal_orbit};
 use crate::frames::{PlacedVisibilities, VisibilityReason};
 use crate::imaging::anywhere::SegmentFolder;
+use crate::imaging::circle::{
+    HarmonicEngine, HarmonicRequest, HarmonicSetup, HarmonicSolution, HarmonicSums, NoiseSums, SumPart,
+    harmonic_beams, harmonic_cost, nominal_orbit, solve_regularised,
+};
 use crate::imaging::cost::{ChannelData, EngineCost};
 use crate::imaging::method::{MapEquations, MapMethod, MapSums, NewChannel, NewOrRefused, same_method};
 use crate::imaging::request::{MapRequest, SolvedMap};

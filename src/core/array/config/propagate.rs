@@ -2,7 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::grgm900c::DEGREE_MAX;
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum number of satellite-days: 1.6 GB of states.
@@ -42,6 +41,9 @@ keys! {
 }
 
 impl PropagateConfig {
+    /// Greatest degree and order of the table of the Moon's field.
+    pub(in crate::array) const DEGREE_MAX: usize = 16;
+
     /// Whether orbits are propagated.
     #[must_use]
     pub fn is_on(&self) -> bool {
@@ -55,6 +57,7 @@ impl PropagateConfig {
 
     /// All invalid values; empty if there are none.
     pub(in crate::array) fn problems(&self, satellites: usize, from_elements: bool) -> Vec<InvalidValue> {
+        const DEGREE_MAX: usize = PropagateConfig::DEGREE_MAX;
         let mut checks = Checks::new("array.propagate");
         let days_max = DAYS_MAX / satellites.max(1) as f64;
         let expected =

@@ -1,14 +1,21 @@
-//! Opens archives and merges them.
+//! Sessions of a ground with an archive: opened, merged, resumed; packets retracted, recalibrated, or read again from the raw archive.
+
+mod open_archive;
+mod recalibrate;
+mod recovery;
+mod retract;
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use super::checkpoint::{self, ArchiveHead};
-use super::folder::{StateFolder, checkpoints};
-use super::open_archive::OpenArchive;
-use super::recovery::{SETTINGS, kept_settings, packets_folder, require_saved};
-use super::store::Archive;
+use self::open_archive::OpenArchive;
+pub use self::recalibrate::Recalibrated;
+pub use self::retract::{RefusedPacket, Retracted};
 use crate::frames::{AutoPower, Instrument};
+use crate::ground::archive::checkpoint::{self, ArchiveHead};
+use crate::ground::archive::folder::{StateFolder, checkpoints};
+use crate::ground::archive::raw_archive::{SETTINGS, kept_settings, packets_folder, require_saved};
+use crate::ground::archive::store::Archive;
 use crate::ground::{Ground, GroundConfig, GroundError};
 use crate::imaging::Snapshot;
 use crate::ranks::Ranks;
@@ -52,7 +59,7 @@ impl Ground {
     }
 
     /// Opens a new archive in `folder` without applying its raw archive.
-    pub(super) fn open_anew(folder: &Path, config: &GroundConfig) -> Result<Self, GroundError> {
+    fn open_anew(folder: &Path, config: &GroundConfig) -> Result<Self, GroundError> {
         OpenArchive::new(folder, config, true)?.resume(config, u64::MAX)
     }
 

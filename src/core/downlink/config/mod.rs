@@ -1,12 +1,30 @@
 //! Configuration of the downlink.
 
-use super::link::LinkConfig;
-use super::transport::socket::ListenConfig;
-use super::wire::Format;
-use super::wire::cadu::{CaduEncoder, INTERLEAVES, ReedSolomon};
-use super::wire::payload::{VISIBILITY_BYTES, visibilities_in};
-use super::wire::{HEADER_BYTES, PACKET_BYTES_MAX, TRAILER_BYTES};
+mod link;
+mod listen;
+
+pub use link::LinkConfig;
+pub use listen::ListenConfig;
+use serde::{Deserialize, Serialize};
+
 use crate::units::{Checks, InvalidValue, keys};
+
+/// The format of a downlink.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// Space packets, one after the other.
+    #[default]
+    Packets,
+    /// Packets in coded transfer frames (CADU).
+    Cadu,
+}
+
+/// Longest packet that the 16-bit length field allows.
+pub const PACKET_BYTES_MAX: usize = 65_542;
+
+/// Permitted depths of interleaving.
+pub const INTERLEAVES: [usize; 6] = [1, 2, 3, 4, 5, 8];
 
 /// Smallest packet that holds headers and more than one record of any kind.
 const PACKET_BYTES_MIN: usize = 256;
@@ -64,13 +82,6 @@ impl DownlinkConfig {
         problems
     }
 
-    /// The Reed-Solomon code of the frames; `None` for plain packets.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn code(&self) -> Option<ReedSolomon> {
-        ReedSolomon::new(self.interleave).filter(|_| self.format == Format::Cadu)
-    }
-
     /// Bytes sent for each byte of packets: 1279 for 1107 with five codewords a frame.
     #[must_use]
     #[doc(hidden)]
@@ -79,22 +90,5 @@ impl DownlinkConfig {
             Format::Packets => 1.0,
             Format::Cadu => (4 + 255 * self.interleave) as f64 / (223 * self.interleave - 8) as f64,
         }
-    }
-
-    /// Rate available to visibilities, without headers and coding, bytes per second; `None` for no limit.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn payload_bytes_per_s(&self) -> Option<f64> {
-        let payload = self.packet_bytes_max.saturating_sub(HEADER_BYTES + TRAILER_BYTES);
-        let visibilities = VISIBILITY_BYTES * visibilities_in(payload).max(1);
-        let overhead = self.expansion() * self.packet_bytes_max as f64 / visibilities as f64;
-        (self.rate_bits_per_s_max > 0.0).then(|| self.rate_bits_per_s_max / 8.0 / overhead)
-    }
-
-    /// The frame encoder of the configured format; `None` for plain packets.
-    #[must_use]
-    #[doc(hidden)]
-    pub fn encoder(&self) -> Option<CaduEncoder> {
-        self.code().map(|code| CaduEncoder::new(code, self.spacecraft_id, self.idle_frames))
     }
 }

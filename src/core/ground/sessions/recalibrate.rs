@@ -5,14 +5,14 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::draft::{RecordDraft, digest};
-use super::folder::checkpoints;
-use super::journal::{Journal, JournalRecord, SendingKey};
-use super::settings::settings_of;
 use crate::calibration::{AntennaGains, AutoTable, CalibrationHook, Calibrator, ReceivedBlocks};
 use crate::downlink::receive::EventReader;
 use crate::downlink::{Event, PacketKind};
 use crate::frames::GroundFrame;
+use crate::ground::archive::draft::{RecordDraft, digest};
+use crate::ground::archive::folder::checkpoints;
+use crate::ground::archive::journal::{Journal, JournalRecord, SendingKey};
+use crate::ground::archive::settings::settings_of;
 use crate::ground::{DeliveredPacket, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::runtime::Outlet;
 use crate::units::ChannelId;

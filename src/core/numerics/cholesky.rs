@@ -1,14 +1,14 @@
 //! Cholesky factors of small dense symmetric matrices.
 
 /// Lower triangle of a Cholesky factor.
-pub(in crate::calibration) struct DenseFactor {
+pub(crate) struct DenseFactor {
     order: usize,
     rows: Vec<f64>,
 }
 
 impl DenseFactor {
     /// Factorises a symmetric matrix, given row by row; `None` if it is not positive definite.
-    pub(in crate::calibration) fn new(matrix: &[f64], order: usize) -> Option<Self> {
+    pub(crate) fn new(matrix: &[f64], order: usize) -> Option<Self> {
         let mut rows = matrix.to_vec();
         for j in 0..order {
             for i in j..order {
@@ -28,7 +28,7 @@ impl DenseFactor {
     }
 
     /// Solves in place for one right-hand side.
-    pub(in crate::calibration) fn solve(&self, x: &mut [f64]) {
+    pub(crate) fn solve(&self, x: &mut [f64]) {
         let Self { order, rows } = self;
         for i in 0..*order {
             let sum: f64 = (0..i).map(|k| rows[i * order + k] * x[k]).sum();
@@ -41,7 +41,7 @@ impl DenseFactor {
     }
 
     /// The inverse matrix, row by row.
-    pub(in crate::calibration) fn inverse(&self) -> Vec<f64> {
+    pub(crate) fn inverse(&self) -> Vec<f64> {
         let order = self.order;
         let mut inverse = vec![0.0; order * order];
         for (index, column) in inverse.chunks_exact_mut(order).enumerate() {

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::draft::digest;
-use super::folder::checkpoints;
-use super::journal::{Journal, OtherRecord, SendingKey};
-use super::recovery::record_retraction;
 use crate::downlink::receive::{Decoder, EventReader};
 use crate::downlink::transport::packet_archive::PacketName;
 use crate::downlink::{Event, PacketHeader, PacketKind};
+use crate::ground::archive::draft::digest;
+use crate::ground::archive::folder::checkpoints;
+use crate::ground::archive::journal::{Journal, OtherRecord, SendingKey};
+use crate::ground::archive::raw_archive::record_retraction;
 use crate::ground::{Collector, Ground, GroundConfig, GroundError, HeldPacket};
 use crate::units::MissionTime;
 
