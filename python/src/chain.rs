@@ -18,7 +18,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::error::{Failure, exception, refused};
-use crate::maps::{Collected, MapData, MapTaker, dicts};
+use crate::maps::{Collected, MapCallback, MapData, dicts};
 use crate::wait::{require_process, require_threads, wait, wait_for};
 
 /// How often an iterator looks for Ctrl-C while it waits for a map.
@@ -114,7 +114,7 @@ pub(crate) fn run<'py>(
                     found.push(map)
                 }
             };
-            watched.maps.add_viewer(Box::new(MapTaker(take)));
+            watched.maps.add_viewer(Box::new(MapCallback(take)));
         })?;
         Ok(serde_json::to_string(&summary)?)
     };
@@ -210,7 +210,7 @@ impl NativeReplay {
             let summary = pipeline::replay(source, &config, ground, &out, &ended, &mut |watched| {
                 begun.begin(&watched, 0);
                 let (sender, ended) = (sender.clone(), ended.clone());
-                watched.maps.add_viewer(Box::new(MapTaker(move |map| {
+                watched.maps.add_viewer(Box::new(MapCallback(move |map| {
                     if sender.send(map).is_err() {
                         ended.cancel();
                     }

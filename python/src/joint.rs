@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use lunarray::imaging::SolveWatch;
 use lunarray::imaging::joint::{JointRequest, PowerPriors};
-use lunarray::pipeline::{self, MemoryLimit, SumsPlace, use_threads};
+use lunarray::pipeline::{self, MemoryLimit, SumsStorage, use_threads};
 use lunarray::runtime::Cancel;
 use numpy::PyArray1;
 use pyo3::prelude::*;
@@ -51,7 +51,7 @@ pub(crate) fn joint<'py>(
             constant_k_sr,
         });
         let request = |rule| JointRequest { rule, samples, at_hz: at_hz.clone(), powers: powers.clone() };
-        let place = SumsPlace { limit: MemoryLimit::of_machine(), folder: &scratch };
+        let place = SumsStorage { limit: MemoryLimit::of_machine(), folder: &scratch };
         Ok(pipeline::solve_states_jointly(&states, &request, place, &watch)?)
     })?;
     let maps: Vec<_> = found

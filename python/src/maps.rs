@@ -112,9 +112,9 @@ pub(crate) fn dicts(py: Python<'_>, maps: Vec<MapData>) -> PyResult<Vec<Bound<'_
 }
 
 /// Gives every map that is published to a function.
-pub(crate) struct MapTaker<F>(pub(crate) F);
+pub(crate) struct MapCallback<F>(pub(crate) F);
 
-impl<F: Fn(MapData) + Send + Sync> MapViewer for MapTaker<F> {
+impl<F: Fn(MapData) + Send + Sync> MapViewer for MapCallback<F> {
     fn view(&self, map: PublishedMap<'_>) {
         let rho = map.comparison.map(|comparison| comparison.rho.clone());
         self.0(MapData { rho, ..MapData::new(map.solution) });

@@ -14,7 +14,7 @@ use crate::error::{Failure, exception, refused};
 const POLL: Duration = Duration::from_millis(50);
 
 /// What a caller does from time to time while it waits; an error ends the work.
-pub(crate) type Tick<'a> = &'a mut dyn FnMut(Python<'_>) -> PyResult<()>;
+pub(crate) type WhileWaiting<'a> = &'a mut dyn FnMut(Python<'_>) -> PyResult<()>;
 
 /// The process whose threads work; 0 before any does.
 static WORKER: AtomicU32 = AtomicU32::new(0);
@@ -42,23 +42,23 @@ fn forked(worker: u32) -> PyErr {
     ))
 }
 
-/// Does `work` on a thread without the interpreter's lock. An exception while it waits (Ctrl-C, or what `tick` raises)
+/// Does `work` on a thread without the interpreter's lock. An exception while it waits (Ctrl-C, or what `while_waiting` raises)
 /// cancels the work and is raised once the work has ended; a second one is raised at once and leaves the work behind.
 pub(crate) fn wait_for<T: Send + 'static>(
     py: Python<'_>,
     cancel: &Cancel,
-    tick: Tick<'_>,
+    while_waiting: WhileWaiting<'_>,
     work: impl FnOnce() -> Result<T, Failure> + Send + 'static,
 ) -> PyResult<T> {
     require_threads()?;
-    wait_alone(py, cancel, tick, work)
+    wait_alone(py, cancel, while_waiting, work)
 }
 
 /// As [`wait_for`], for work that needs no thread but its own, which a fork can begin.
 fn wait_alone<T: Send + 'static>(
     py: Python<'_>,
     cancel: &Cancel,
-    tick: Tick<'_>,
+    while_waiting: WhileWaiting<'_>,
     work: impl FnOnce() -> Result<T, Failure> + Send + 'static,
 ) -> PyResult<T> {
     let (sender, mut receiver) = sync_channel(1);
@@ -85,7 +85,8 @@ fn wait_alone<T: Send + 'static>(
             }
             Err(RecvTimeoutError::Timeout) => {}
         }
-        if let Err(error) = py.check_signals().and_then(|()| if raised.is_none() { tick(py) } else { Ok(()) })
+        if let Err(error) =
+            py.check_signals().and_then(|()| if raised.is_none() { while_waiting(py) } else { Ok(()) })
         {
             if raised.is_some() {
                 return Err(error);

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use lunarray::imaging::joint::{JointMap, JointRequest, PowerPriors, PowerSample, solve_jointly};
 use lunarray::imaging::{SolveWatch, StoppingRule};
-use lunarray::pipeline::{ConfigSource, SumsPlace, joint_channels};
+use lunarray::pipeline::{ConfigSource, SumsStorage, joint_channels};
 use lunarray::sky::fits::{WriteOptions, write_map};
 use lunarray::sky::{Frame, SkyMap};
 use serde_json::Value;
@@ -222,7 +222,7 @@ fn map_with(state: &str, change: &dyn Fn(&mut [PowerSample])) -> JointMap {
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: vec![0.0] };
     let rule = StoppingRule { residual_max: 1e-4, iterations_max: 300 };
     let request = JointRequest { rule, samples: 8, at_hz: Vec::new(), powers: Some(priors) };
-    let place = SumsPlace { limit: None, folder };
+    let place = SumsStorage { limit: None, folder };
     let watch = SolveWatch::default();
     let mut channels = joint_channels(&[(folder, config)], &request, place, &watch).unwrap();
     change(&mut channels[0].powers);

@@ -9,7 +9,7 @@ use super::output::{CommandResult, Completion, print_json_line, print_text};
 use super::progress::while_solving;
 use crate::imaging::SolveWatch;
 use crate::imaging::joint::{JointRequest, PRIOR_PERCENT_MAX, PowerPriors, SAMPLES_MAX};
-use crate::pipeline::{MemoryLimit, SumsPlace, solve_states_jointly, use_threads};
+use crate::pipeline::{MemoryLimit, SumsStorage, solve_states_jointly, use_threads};
 use crate::products::write_joint;
 use crate::sky::Frame;
 
@@ -98,7 +98,7 @@ pub(super) fn execute(args: &JointArgs) -> CommandResult {
     };
     let watch = SolveWatch::default();
     let limit = args.memory_max.map(MemoryLimit::of_user).or_else(MemoryLimit::of_machine);
-    let place = SumsPlace { limit, folder: &args.out };
+    let place = SumsStorage { limit, folder: &args.out };
     let solved = while_solving(&watch, || solve_states_jointly(&states, &request, place, &watch))?;
     let report = write_joint(&args.out, &solved, args.priors(), Some(Frame::Galactic))?;
     if args.json {

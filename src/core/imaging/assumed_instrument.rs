@@ -3,7 +3,7 @@
 use crate::array::{orbit_normal_hat, track_axes};
 use crate::frames::AntennaResponse;
 use crate::response::general::{PairResponse, TimedPair};
-use crate::response::{AntennaOf, MeasuredAntennas, MeasuredAntennasError, PatternsByFrequency};
+use crate::response::{AntennaQuery, MeasuredAntennas, MeasuredAntennasError, PatternsByFrequency};
 use crate::units::vector::{Vec3, cross, dot, sub, unit};
 
 /// Maximum time between positions that define a satellite's orbital plane, s: a quarter of a low orbit.
@@ -109,7 +109,7 @@ impl PairAntennas {
             let satellite = usize::from(daughter);
             let known = assumed.antennas.get(satellite).copied().unwrap_or_default();
             let q = known.distortion + assumed.patterns.q(satellite, frequency_hz);
-            let of = AntennaOf { satellite, tai_s, frequency_hz, elements };
+            let of = AntennaQuery { satellite, tai_s, frequency_hz, elements };
             assumed.measured.antenna(of, track_axes(r_m, normal_hat), known.tilt_deg, q)
         };
         let a = antenna(pair.pair.i, pair.r_i_m, normal_i);

@@ -55,7 +55,7 @@ pub struct ChannelFigures {
     pub latitudes: Option<Vec<LatitudeError>>,
     /// Power relative to an ideal instrument, in a study of errors.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub power_kept: Option<PowerKept>,
+    pub power_kept: Option<RelativePower>,
 }
 
 /// Measured modes by degree from l = 0: the parts of Tr A (A + R)^-1.
@@ -67,14 +67,14 @@ pub struct MeasuredModes {
 
 /// Power of a map relative to the map of an ideal instrument, by degree from l = 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PowerKept {
+pub struct RelativePower {
     /// C_l over C_l of the ideal map, including power added by errors.
     pub cl_ratio: Vec<Option<f64>>,
     /// Square of the cross power with the input over that of the ideal map, the fraction that is coherent with the sky.
     pub coherent: Vec<Option<f64>>,
 }
 
-impl PowerKept {
+impl RelativePower {
     /// The power of `map` relative to `ideal`; `None` if either has no spectra.
     fn new(map: &ChannelFigures, ideal: &ChannelFigures) -> Option<Self> {
         let (map, ideal) = (map.power.as_ref()?, ideal.power.as_ref()?);
@@ -195,7 +195,7 @@ impl RunFigures {
     pub fn set_power_kept(&mut self, ideal: &Self) {
         for channel in &mut self.channels {
             let same = ideal.channels.iter().find(|ideal| ideal.frequency_hz == channel.frequency_hz);
-            channel.power_kept = same.and_then(|ideal| PowerKept::new(channel, ideal));
+            channel.power_kept = same.and_then(|ideal| RelativePower::new(channel, ideal));
         }
     }
 }

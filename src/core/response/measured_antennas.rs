@@ -97,7 +97,7 @@ pub struct MeasuredAntennas {
 
 /// What an antenna is asked for.
 #[derive(Clone, Copy, Debug)]
-pub struct AntennaOf {
+pub struct AntennaQuery {
     /// Its satellite, from 0.
     pub satellite: usize,
     /// TAI seconds since 1958.
@@ -199,12 +199,12 @@ impl MeasuredAntennas {
     #[must_use]
     pub fn antenna(
         &self,
-        of: AntennaOf,
+        of: AntennaQuery,
         track: [Vec3; 3],
         tilt_deg: [f64; 2],
         q: f64,
     ) -> SatelliteAntenna {
-        let AntennaOf { satellite, tai_s, frequency_hz, elements } = of;
+        let AntennaQuery { satellite, tai_s, frequency_hz, elements } = of;
         let body = self.attitudes.as_ref().and_then(|attitudes| attitudes.body_axes(satellite, tai_s));
         let upright = body.map_or(track, |[x, y, z]| [x, z, scale(-1.0, y)]);
         let [axis, across] = tilted_axes(upright, tilt_deg);

@@ -31,6 +31,6 @@ pub mod pixel;
 #[doc(hidden)]
 pub use antenna_tables::{AntennaTables, FittedDipole, TableError};
 #[doc(hidden)]
-pub use measured_antennas::{AntennaFiles, AntennaOf, MeasuredAntennas, MeasuredAntennasError};
+pub use measured_antennas::{AntennaFiles, AntennaQuery, MeasuredAntennas, MeasuredAntennasError};
 #[doc(hidden)]
 pub use patterns_by_frequency::PatternsByFrequency;

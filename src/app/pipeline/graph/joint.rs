@@ -17,7 +17,7 @@ const SUMS_SHARE: f64 = 0.6;
 
 /// Where the sums of a joint solution are kept.
 #[derive(Clone, Copy, Debug)]
-pub struct SumsPlace<'a> {
+pub struct SumsStorage<'a> {
     /// Limit of the memory; `None` if it is not known, and all sums stay in memory.
     pub limit: Option<MemoryLimit>,
     /// Folder of the sums that memory does not hold.
@@ -38,8 +38,8 @@ pub(in crate::pipeline) struct KeptChannels<'a> {
 }
 
 impl<'a> KeptChannels<'a> {
-    pub(in crate::pipeline) fn new(place: SumsPlace<'a>, reading: u64) -> Self {
-        let SumsPlace { limit, folder } = place;
+    pub(in crate::pipeline) fn new(place: SumsStorage<'a>, reading: u64) -> Self {
+        let SumsStorage { limit, folder } = place;
         let bytes_max = limit.map(|limit| (SUMS_SHARE * limit.bytes as f64) as u64);
         Self { channels: Vec::new(), held_bytes: 0, largest_bytes: 0, bytes_max, reading, folder }
     }
@@ -129,7 +129,7 @@ impl JointData {
         let held: u64 = sums.iter().map(|(.., sums)| sums.weight_bytes()).sum();
         // What the sums take is not available any more, but theirs.
         let limit = MemoryLimit::of_machine().map(|limit| MemoryLimit { bytes: limit.bytes + held, ..limit });
-        let mut kept = KeptChannels::new(SumsPlace { limit, folder: &folder }, 0);
+        let mut kept = KeptChannels::new(SumsStorage { limit, folder: &folder }, 0);
         for (channel, nside, sums) in sums {
             if cancel.is_cancelled() {
                 return Ok(None);

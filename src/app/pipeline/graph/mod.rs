@@ -16,7 +16,7 @@ pub(super) mod summary;
 mod view;
 
 pub use found_solutions::{CalibrateRound, CalibrateSummary};
-pub use joint::SumsPlace;
+pub use joint::SumsStorage;
 pub(crate) use run::SHUTDOWN;
 pub use run::{
     Destination, GroundSource, OnStart, READ, downlink_file, main_products, replay, run, run_with_ranks,

@@ -7,7 +7,7 @@ use crate::ground::{Ground, GroundConfig, WAIT_BYTES};
 use crate::imaging::joint::{JointChannel, JointRequest, JointSolution, solve_jointly};
 use crate::imaging::{ChannelGroup, Snapshot, SolveError, SolveWatch, StoppingRule};
 use crate::pipeline::config::{Config, PipelineError};
-use crate::pipeline::graph::SumsPlace;
+use crate::pipeline::graph::SumsStorage;
 use crate::pipeline::graph::joint::{KeptChannels, powers_of};
 use crate::units::ChannelId;
 
@@ -22,7 +22,7 @@ const READING: u64 = 2;
 pub fn solve_states_jointly(
     states: &[(&Path, Config)],
     request: &dyn Fn(StoppingRule) -> JointRequest,
-    place: SumsPlace<'_>,
+    place: SumsStorage<'_>,
     watch: &SolveWatch,
 ) -> Result<JointSolution, PipelineError> {
     let (_, first) = states.first().ok_or(SolveError::NoData)?;
@@ -40,7 +40,7 @@ pub fn solve_states_jointly(
 pub fn joint_channels(
     states: &[(&Path, Config)],
     request: &JointRequest,
-    place: SumsPlace<'_>,
+    place: SumsStorage<'_>,
     watch: &SolveWatch,
 ) -> Result<Vec<JointChannel>, PipelineError> {
     let mut of_states = Vec::new();

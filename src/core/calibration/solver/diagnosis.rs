@@ -103,10 +103,10 @@ impl Datum {
 }
 
 /// Model of a channel with its frequency times a factor, at some positions, K sr; `None` if there is none.
-pub(super) type AtRatio<'a> = &'a dyn Fn(f64, &[PairPosition]) -> Option<Vec<Complex64>>;
+pub(super) type ModelAtRatio<'a> = &'a dyn Fn(f64, &[PairPosition]) -> Option<Vec<Complex64>>;
 
 /// Finds what is wrong with the model of a channel; `pairs` has the visibilities of each.
-pub(super) fn diagnose(pairs: &[Vec<Datum>], at_ratio: AtRatio<'_>) -> Option<ModelFault> {
+pub(super) fn diagnose(pairs: &[Vec<Datum>], at_ratio: ModelAtRatio<'_>) -> Option<ModelFault> {
     source(&within(pairs, SOURCE_WAVELENGTHS))
         .or_else(|| frequency(&within(pairs, REACH_WAVELENGTHS), at_ratio))
 }
@@ -157,7 +157,7 @@ fn thinned(pair: &[Datum], count: usize) -> Vec<Datum> {
 }
 
 /// The frequency that the short baselines ask for.
-fn frequency(pairs: &[Vec<Datum>], at_ratio: AtRatio<'_>) -> Option<ModelFault> {
+fn frequency(pairs: &[Vec<Datum>], at_ratio: ModelAtRatio<'_>) -> Option<ModelFault> {
     let longest = pairs.last()?.iter().map(Datum::wavelengths).fold(0.0, f64::max);
     let of_pair = (VISIBILITIES / pairs.len()).max(OF_PAIR);
     let near: Vec<Vec<Datum>> = pairs.iter().map(|pair| thinned(pair, of_pair)).collect();

@@ -28,7 +28,7 @@ pub(super) struct PairPart {
 
 /// What a fit of gains leaves of a pair.
 #[derive(Clone, Copy)]
-pub(super) struct PairLeft {
+pub(super) struct PairRemainder {
     /// Factor by which the product of both gains changes.
     pub(super) change: Complex64,
     /// Chi-square of the rest.
@@ -41,7 +41,7 @@ pub(super) struct PairLeft {
 const SIGNS: [[f64; 2]; 2] = [[1.0, 1.0], [1.0, -1.0]];
 
 /// Fits changes of the gains of the `free` daughters; the others stay.
-pub(super) fn fit_part(pairs: &[PairPart], satellites: usize, free: &[usize]) -> Vec<PairLeft> {
+pub(super) fn fit_part(pairs: &[PairPart], satellites: usize, free: &[usize]) -> Vec<PairRemainder> {
     let order = free.len();
     let mut place = vec![None; satellites];
     free.iter().enumerate().for_each(|(at, daughter)| place[*daughter] = Some(at));
@@ -78,7 +78,7 @@ pub(super) fn fit_part(pairs: &[PairPart], satellites: usize, free: &[usize]) ->
             (0..2).map(|axis| information * variance(axis, pair, &inverses[axis], &place)).sum();
         let chi_square = if pair.information > 0.0 { rest.norm_sqr() / pair.information } else { 0.0 };
         let degrees_of_freedom = if pair.information > 0.0 { (2.0 - leverage).max(0.0) } else { 0.0 };
-        PairLeft { change, chi_square, degrees_of_freedom }
+        PairRemainder { change, chi_square, degrees_of_freedom }
     };
     pairs.iter().map(left).collect()
 }

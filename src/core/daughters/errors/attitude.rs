@@ -8,7 +8,7 @@ use crate::array::{Array, tilted_axes, track_axes};
 use crate::frames::{AntennaResponse, ObservingWindow};
 use crate::response::model::AntennaPatterns;
 use crate::response::pixel::SatelliteAntenna;
-use crate::response::{AntennaOf, MeasuredAntennas, PatternsByFrequency};
+use crate::response::{AntennaQuery, MeasuredAntennas, PatternsByFrequency};
 
 /// Antennas along the normal and the track of each daughter's own orbit.
 pub struct OrbitAntennas {
@@ -115,7 +115,7 @@ impl AntennaPatterns for ChannelAntennas {
         let (r_m, normal_hat) = (array.position_m(number, t_s), array.normal_hat(number, t_s));
         let distortion = patterns.q(number, self.frequency_hz) + distortion;
         let (satellite, tai_s, frequency_hz) = (number, epoch_tai_s + t_s, self.frequency_hz);
-        let of = AntennaOf { satellite, tai_s, frequency_hz, elements: *elements };
+        let of = AntennaQuery { satellite, tai_s, frequency_hz, elements: *elements };
         measured.antenna(of, track_axes(r_m, normal_hat), [along_deg, radial_deg], distortion)
     }
 

@@ -18,6 +18,6 @@ pub use archived::RefinedSetup;
 pub(super) use cost::refined_cost;
 pub(super) use iterations::IterationFile;
 pub use refinement::{ChiSquares, Refinement};
-pub use segments::{HELD_BYTES, ArchiveSegment, SegmentFolder};
+pub use segments::{ARCHIVED_BYTES, ArchiveSegment, SegmentFolder};
 pub use solve::{RefineRule, RefineSteps, solve_refined};
 pub use sums::{Departures, RefinedData, RefinedSums, orbit_phase_deg};

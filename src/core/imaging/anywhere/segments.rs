@@ -27,7 +27,7 @@ use crate::response::general::TimedPair;
 use crate::units::{ChannelId, Pair};
 
 /// Bytes of a visibility on disk.
-pub const HELD_BYTES: u64 = 88;
+pub const ARCHIVED_BYTES: u64 = 88;
 
 const MAGIC: &[u8; 8] = b"LNRHELD2";
 const MAGIC_OF_VERSION_1: &[u8; 8] = b"LNRHELD1";
@@ -177,10 +177,10 @@ impl ArchiveSegment {
         let mut left = self.visibilities;
         while left > 0 {
             let count = left.min(CHUNK as u64);
-            let mut piece = vec![0; (count * HELD_BYTES) as usize];
+            let mut piece = vec![0; (count * ARCHIVED_BYTES) as usize];
             file.read_exact(&mut piece)?;
             crc.update(&piece);
-            take(&mut piece.as_chunks::<{ HELD_BYTES as usize }>().0.iter().map(decode));
+            take(&mut piece.as_chunks::<{ ARCHIVED_BYTES as usize }>().0.iter().map(decode));
             left -= count;
         }
         let mut stored = [0; 8];
@@ -208,7 +208,7 @@ impl ArchiveSegment {
 
     /// Length of the file; `None` for an impossible count.
     fn bytes(&self) -> Option<u64> {
-        self.visibilities.checked_mul(HELD_BYTES)?.checked_add(FIXED_BYTES)
+        self.visibilities.checked_mul(ARCHIVED_BYTES)?.checked_add(FIXED_BYTES)
     }
 }
 
@@ -219,10 +219,10 @@ fn restore(from: &Path, to: &Path) -> std::io::Result<()> {
     file.finish().map(drop)
 }
 
-fn encode(held: &ArchivedVisibility) -> [u8; HELD_BYTES as usize] {
+fn encode(held: &ArchivedVisibility) -> [u8; ARCHIVED_BYTES as usize] {
     let ArchivedVisibility { at, band, value_k_sr: value, weight, duration_s } = held;
     let ([a, b, c], [d, e, f]) = (at.r_i_m, at.r_j_m);
-    let mut bytes = [0; HELD_BYTES as usize];
+    let mut bytes = [0; ARCHIVED_BYTES as usize];
     (bytes[0], bytes[1]) = (at.pair.i, at.pair.j);
     bytes[2..4].copy_from_slice(&band.to_le_bytes());
     let numbers = [at.time_s, a, b, c, d, e, f, value.re, value.im, *weight];
@@ -233,7 +233,7 @@ fn encode(held: &ArchivedVisibility) -> [u8; HELD_BYTES as usize] {
     bytes
 }
 
-fn decode(bytes: &[u8; HELD_BYTES as usize]) -> ArchivedVisibility {
+fn decode(bytes: &[u8; ARCHIVED_BYTES as usize]) -> ArchivedVisibility {
     let mut numbers = [0.0; 10];
     for (number, bytes) in numbers.iter_mut().zip(bytes[4..].as_chunks::<8>().0) {
         *number = f64::from_le_bytes(*bytes);
@@ -307,7 +307,7 @@ mod tests {
         // Without the copy all damage is found.
         std::fs::remove_file(&copy).unwrap();
         let good = std::fs::read(&path).unwrap();
-        assert_eq!(good.len() as u64, 3 * HELD_BYTES + FIXED_BYTES);
+        assert_eq!(good.len() as u64, 3 * ARCHIVED_BYTES + FIXED_BYTES);
         let assert_damaged = || {
             let error = segment.verify(folder.path()).unwrap_err();
             assert!(matches!(error, AccumulationError::Segment { .. }), "{error}");
@@ -333,7 +333,7 @@ mod tests {
         assert_damaged();
         // A forged count costs nothing.
         ArchiveSegment::write(segment_folder, ChannelId(2), &visibilities(3)).unwrap();
-        for visibilities in [0, u64::MAX, u64::MAX / HELD_BYTES] {
+        for visibilities in [0, u64::MAX, u64::MAX / ARCHIVED_BYTES] {
             assert!(ArchiveSegment { visibilities, ..segment }.verify(folder.path()).is_err());
         }
     }

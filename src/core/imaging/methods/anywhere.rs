@@ -40,7 +40,7 @@ impl MapMethod for RefinedMaps {
 }
 
 /// What an archive of visibilities is solved with.
-pub(in crate::imaging) trait ArchiveUse: Send + 'static {
+pub(in crate::imaging) trait ArchiveSolver: Send + 'static {
     /// As [`MapSums::snapshot`].
     fn snapshot(&self, archive: &mut VisibilityArchive) -> Result<Box<dyn MapEquations>, AccumulationError>;
 
@@ -51,7 +51,7 @@ pub(in crate::imaging) trait ArchiveUse: Send + 'static {
 /// Rows at the true positions; intermediate maps are those of the nearest circle.
 struct TrueRows;
 
-impl ArchiveUse for TrueRows {
+impl ArchiveSolver for TrueRows {
     fn snapshot(&self, archive: &mut VisibilityArchive) -> Result<Box<dyn MapEquations>, AccumulationError> {
         Ok(Box::new(archive.circle_sums()?))
     }
@@ -67,7 +67,7 @@ pub(in crate::imaging) struct ArchivedSums<U> {
     solver: U,
 }
 
-impl<U: ArchiveUse> ArchivedSums<U> {
+impl<U: ArchiveSolver> ArchivedSums<U> {
     pub(in crate::imaging) fn new(
         channel: &NewChannel<'_>,
         l_max: usize,
@@ -100,7 +100,7 @@ impl<U: ArchiveUse> ArchivedSums<U> {
     }
 }
 
-impl<U: ArchiveUse> MapSums for ArchivedSums<U> {
+impl<U: ArchiveSolver> MapSums for ArchivedSums<U> {
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
         self.archive.add(placed)
     }

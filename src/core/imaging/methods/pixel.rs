@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::path::Path;
 
-use super::anywhere::{ArchiveUse, ArchivedSums};
+use super::anywhere::{ArchiveSolver, ArchivedSums};
 use crate::frames::PlacedVisibilities;
 use crate::imaging::anywhere::{SegmentFolder, VisibilityArchive};
 use crate::imaging::circle::{HarmonicRequest, HarmonicSums};
@@ -162,7 +162,7 @@ impl PixelRows {
     }
 }
 
-impl ArchiveUse for PixelRows {
+impl ArchiveSolver for PixelRows {
     fn snapshot(&self, archive: &mut VisibilityArchive) -> Result<Box<dyn MapEquations>, AccumulationError> {
         Ok(self.finish(archive.copy()))
     }
