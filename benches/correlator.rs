@@ -140,25 +140,38 @@ fn seconds(work: impl FnOnce()) -> f64 {
     since.elapsed().as_secs_f64()
 }
 
+/// The data of a channel for the library: a matrix of daughters by samples.
+fn matrix(blocks: &[Samples], lane: usize) -> Vec<Complex32> {
+    let level = |code: i8| (f32::from(code) + 0.5) * 0.1;
+    let mut matrix = vec![Complex32::ZERO; DAUGHTERS * SAMPLES];
+    for daughter in 0..DAUGHTERS {
+        let Samples::Codes { re, im, .. } = &blocks[lane * DAUGHTERS + daughter] else { continue };
+        for k in 0..SAMPLES {
+            matrix[k * DAUGHTERS + daughter] = Complex32::new(level(re[k]), level(im[k]));
+        }
+    }
+    matrix
+}
+
+/// The library's products of `depth` samples each.
+fn products(matrices: &[Vec<Complex32>], depth: usize) {
+    let mut product = vec![Complex32::ZERO; DAUGHTERS * DAUGHTERS];
+    for samples in matrices.iter().flat_map(|m| m.chunks_exact(DAUGHTERS * depth)) {
+        let a = MatRef::from_column_major_slice(samples, DAUGHTERS, depth);
+        let target = MatMut::from_column_major_slice_mut(&mut product, DAUGHTERS, DAUGHTERS);
+        let one = Complex32::ONE;
+        faer::linalg::matmul::matmul(target, Accum::Replace, a, a.adjoint(), one, Par::Seq);
+    }
+    black_box(&product);
+}
+
 fn main() {
     let arch = Arch::new();
     let codes = |seed: usize| (0..SAMPLES).map(|k| ((k * 31 + seed * 7919) % 251) as u8 as i8).collect();
     let blocks: Vec<Samples> = (0..DAUGHTERS * LANES)
         .map(|n| Samples::Codes { bits: 8, step: 0.1, re: codes(n), im: codes(n + 1000) })
         .collect();
-    // The same data for the library: a matrix of daughters by samples for each channel.
-    let level = |code: i8| (f32::from(code) + 0.5) * 0.1;
-    let matrix = |lane: usize| -> Vec<Complex32> {
-        let mut matrix = vec![Complex32::ZERO; DAUGHTERS * SAMPLES];
-        for daughter in 0..DAUGHTERS {
-            let Samples::Codes { re, im, .. } = &blocks[lane * DAUGHTERS + daughter] else { continue };
-            for k in 0..SAMPLES {
-                matrix[k * DAUGHTERS + daughter] = Complex32::new(level(re[k]), level(im[k]));
-            }
-        }
-        matrix
-    };
-    let matrices: Vec<Vec<Complex32>> = (0..LANES).map(matrix).collect();
+    let matrices: Vec<Vec<Complex32>> = (0..LANES).map(|lane| matrix(&blocks, lane)).collect();
     let slices = SAMPLES / SLICE;
     let mut packed = Packed::new(DAUGHTERS);
     for daughter in 0..DAUGHTERS {
@@ -193,16 +206,7 @@ fn main() {
         });
         packing = packing.max(operations / spent);
         for (library, depth) in library.iter_mut().zip(depths) {
-            let mut product = vec![Complex32::ZERO; DAUGHTERS * DAUGHTERS];
-            let spent = seconds(|| {
-                for samples in matrices.iter().flat_map(|m| m.chunks_exact(DAUGHTERS * depth)) {
-                    let a = MatRef::from_column_major_slice(samples, DAUGHTERS, depth);
-                    let target = MatMut::from_column_major_slice_mut(&mut product, DAUGHTERS, DAUGHTERS);
-                    let one = Complex32::ONE;
-                    faer::linalg::matmul::matmul(target, Accum::Replace, a, a.adjoint(), one, Par::Seq);
-                }
-            });
-            black_box(&product);
+            let spent = seconds(|| products(&matrices, depth));
             *library = library.max(operations / spent);
         }
     }

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use lunarray::array::{Array, ArrayConfig, ObservingWindows};
 use lunarray::frames::{AntennaResponse, ObservingWindow, PlacedVisibilities};
-use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, memory};
+use lunarray::imaging::circle::{HarmonicEngine, HarmonicSetup, HarmonicSums, memory};
 use lunarray::imaging::{NormalEngine, NormalSums};
 use lunarray::response::harmonic::{
     GeometryLimits, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
@@ -215,10 +215,26 @@ fn engine(array: &Array, l_max: usize) {
                 .collect()
         })
         .collect();
+    accumulate(&mut engine, &chunks);
+    let clock = Clock::start();
+    let sums = engine.into_sums();
+    println!("  fold {:.2} s", clock.read().0);
+    let clock = Clock::start();
+    let right = sums.right_hand_side().to_vec();
+    println!("  tables and right-hand side {:.2} s", clock.read().0);
+    let y = products(&sums, &right);
+    let clock = Clock::start();
+    let factors = sums.order_blocks().factors(1e-3 * y[0].abs());
+    println!("  preconditioner {:.2} s", clock.read().0);
+    drop(factors);
+}
+
+/// Adds all blocks twice, and prints the rate of the second time.
+fn accumulate(engine: &mut HarmonicEngine, chunks: &[Vec<PlacedVisibilities>]) {
     let (mut rates, mut count, mut processor) = (Vec::new(), 0, 0.0);
     // The first pass touches the memory for the first time; a mission is like the second.
     for pass in 0..2 {
-        for blocks in &chunks {
+        for blocks in chunks {
             let of_chunk: usize = blocks.iter().map(PlacedVisibilities::len).sum();
             let clock = Clock::start();
             for block in blocks {
@@ -240,17 +256,15 @@ fn engine(array: &Array, l_max: usize) {
         rates.len(),
         count as f64 / processor
     );
-    let clock = Clock::start();
-    let sums = engine.into_sums();
-    println!("  fold {:.2} s", clock.read().0);
-    let clock = Clock::start();
-    let right = sums.right_hand_side().to_vec();
-    println!("  tables and right-hand side {:.2} s", clock.read().0);
+}
+
+/// Measures products with the matrix; the last of them.
+fn products(sums: &HarmonicSums, right: &[f64]) -> Vec<f64> {
     let mut y = vec![0.0; right.len()];
     let (mut times, mut processor) = (Vec::new(), 0.0);
     for _ in 0..5 {
         let clock = Clock::start();
-        sums.apply(&right, &mut y);
+        sums.apply(right, &mut y);
         let run = clock.read();
         times.push(run.0);
         processor += run.1 / 5.0;
@@ -266,10 +280,10 @@ fn engine(array: &Array, l_max: usize) {
     let mut ratios: Vec<f64> = (0..5)
         .map(|_| {
             let clock = Clock::start();
-            sums.apply(&right, &mut y);
+            sums.apply(right, &mut y);
             let one = clock.read().0;
             let clock = Clock::start();
-            sums.apply_all(&[&right, &y]);
+            sums.apply_all(&[right, &y]);
             clock.read().0 / one
         })
         .collect();
@@ -286,10 +300,7 @@ fn engine(array: &Array, l_max: usize) {
         1e-9 * products,
         100.0 * flops / products / times[2]
     );
-    let clock = Clock::start();
-    let factors = sums.order_blocks().factors(1e-3 * y[0].abs());
-    println!("  preconditioner {:.2} s", clock.read().0);
-    drop(factors);
+    y
 }
 
 fn main() {

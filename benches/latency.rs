@@ -73,6 +73,13 @@ struct Stream {
     visibilities_per_packet: f64,
 }
 
+impl Stream {
+    /// Number of packets of visibilities.
+    fn count(&self) -> usize {
+        self.packets.iter().filter(|(_, kind)| *kind == PacketKind::Visibilities).count()
+    }
+}
+
 /// A percentile of sorted times.
 fn at(sorted: &[f64], quantile: f64) -> f64 {
     let rank = (quantile * sorted.len() as f64).ceil().max(1.0) as usize;
@@ -237,6 +244,72 @@ fn numbers<T: FromStr<Err: Error + Send + Sync + 'static> + Clone>(
     Ok(text.split(',').map(|part| part.trim().parse()).collect::<Result<_, _>>()?)
 }
 
+/// A piece of the mission that is long enough, of all `total` visibilities.
+fn simulated_stream(folder: &Path, total: f64) -> Result<Stream, Failure> {
+    let thinned = [
+        format!("spacecraft.every_nth_window={EVERY_NTH_WINDOW}"),
+        format!("spacecraft.every_nth_integration={EVERY_NTH_INTEGRATION}"),
+    ];
+    let file = folder.join("stream.ccsds");
+    let mut simulate = Command::new(env!("CARGO_BIN_EXE_lunarray"));
+    simulate.args(["simulate", "--out"]).arg(&file);
+    for setting in settings().iter().chain(&thinned) {
+        simulate.args(["--set", setting]);
+    }
+    let simulated = simulate.output()?;
+    if !simulated.status.success() {
+        return Err(String::from_utf8_lossy(&simulated.stderr).into());
+    }
+    let packets = split(&std::fs::read(&file)?)?;
+    let count = packets.iter().filter(|(_, kind)| *kind == PacketKind::Visibilities).count();
+    let sent = total / (EVERY_NTH_WINDOW * EVERY_NTH_INTEGRATION);
+    Ok(Stream { packets, visibilities_per_packet: sent / count as f64 })
+}
+
+/// Delays, ms: the number of them and their quantiles.
+struct Delays {
+    to_sums: (u64, [f64; 3]),
+    to_disk: (u64, [f64; 3]),
+    to_page: [f64; 3],
+}
+
+/// Sends the stream to a ground that browsers watch.
+fn measure(
+    stream: &Stream,
+    out: &Path,
+    snapshots: &str,
+    (packets_per_s, length_s): (f64, f64),
+    browsers: usize,
+) -> Result<Delays, Failure> {
+    let kept = ["map.nside=8", "map.epsilon=1e-4", "products.pictures=false", snapshots];
+    let ground = GroundProcess::start(&kept.map(str::to_owned), out)?;
+    let (seen, over) = (Seen::default(), AtomicBool::new(false));
+    let (address, to) = (ground.page.clone(), ground.packets.clone());
+    let (sent, summary) = thread::scope(|scope| {
+        for browser in 0..browsers {
+            let (address, seen, over) = (&address, (browser == 0).then_some(&seen), &over);
+            // It ends with the server, however that ends.
+            scope.spawn(move || drop(browse(address, seen, over)));
+        }
+        let sent = send(stream, &to, packets_per_s, length_s);
+        over.store(true, Ordering::Relaxed);
+        (sent, ground.summary())
+    });
+    let ((began, sent), summary) = (sent?, summary?);
+    let seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut to_page: Vec<f64> = seen
+        .iter()
+        .filter_map(|(&(_, number), instant)| {
+            let since = began.get(usize::try_from(number).ok()?.checked_sub(1)?)?;
+            Some(1e3 * instant.duration_since(*since).as_secs_f64())
+        })
+        .collect();
+    to_page.sort_by(f64::total_cmp);
+    let to_page = [0.5, 0.99, 0.999].map(|quantile| at(&to_page, quantile));
+    debug_assert!(sent > 0);
+    Ok(Delays { to_sums: latencies(&summary, "ground"), to_disk: latencies(&summary, "publish"), to_page })
+}
+
 fn main() -> Result<(), Failure> {
     let length_s: f64 = std::env::var("LUNARRAY_LATENCY_S").map_or(Ok(60.0), |text| text.parse())?;
     let multiples = numbers("LUNARRAY_LATENCY_MULTIPLES", &MULTIPLES)?;
@@ -256,26 +329,10 @@ fn main() -> Result<(), Failure> {
     // A piece of it that is long enough.
     let folder = std::env::temp_dir().join(format!("lunarray-latency-{}", std::process::id()));
     std::fs::create_dir_all(&folder)?;
-    let thinned = [
-        format!("spacecraft.every_nth_window={EVERY_NTH_WINDOW}"),
-        format!("spacecraft.every_nth_integration={EVERY_NTH_INTEGRATION}"),
-    ];
-    let file = folder.join("stream.ccsds");
-    let mut simulate = Command::new(env!("CARGO_BIN_EXE_lunarray"));
-    simulate.args(["simulate", "--out"]).arg(&file);
-    for setting in settings().iter().chain(&thinned) {
-        simulate.args(["--set", setting]);
-    }
-    let simulated = simulate.output()?;
-    if !simulated.status.success() {
-        return Err(String::from_utf8_lossy(&simulated.stderr).into());
-    }
-    let packets = split(&std::fs::read(&file)?)?;
-    let count = packets.iter().filter(|(_, kind)| *kind == PacketKind::Visibilities).count();
-    let sent = total / (EVERY_NTH_WINDOW * EVERY_NTH_INTEGRATION);
-    let stream = Stream { packets, visibilities_per_packet: sent / count as f64 };
+    let stream = simulated_stream(&folder, total)?;
     println!(
-        "the stream: {count} packets of {:.1} visibilities; {length_s} s a run; load {}",
+        "the stream: {} packets of {:.1} visibilities; {length_s} s a run; load {}",
+        stream.count(),
         stream.visibilities_per_packet,
         std::fs::read_to_string("/proc/loadavg").unwrap_or_default().trim()
     );
@@ -299,34 +356,9 @@ fn main() -> Result<(), Failure> {
     for multiple in multiples {
         for &browsers in &crowds {
             let out = folder.join(format!("out-{multiple}-{browsers}"));
-            let kept = ["map.nside=8", "map.epsilon=1e-4", "products.pictures=false", &snapshots];
-            let ground = GroundProcess::start(&kept.map(str::to_owned), &out)?;
-            let (seen, over) = (Seen::default(), AtomicBool::new(false));
             let packets_per_s = multiple * per_s / stream.visibilities_per_packet;
-            let (address, to) = (ground.page.clone(), ground.packets.clone());
-            let (sent, summary) = thread::scope(|scope| {
-                for browser in 0..browsers {
-                    let (address, seen, over) = (&address, (browser == 0).then_some(&seen), &over);
-                    // It ends with the server, however that ends.
-                    scope.spawn(move || drop(browse(address, seen, over)));
-                }
-                let sent = send(&stream, &to, packets_per_s, length_s);
-                over.store(true, Ordering::Relaxed);
-                (sent, ground.summary())
-            });
-            let ((began, sent), summary) = (sent?, summary?);
-            let (pieces, to_sums) = latencies(&summary, "ground");
-            let (maps, to_disk) = latencies(&summary, "publish");
-            let seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
-            let mut to_page: Vec<f64> = seen
-                .iter()
-                .filter_map(|(&(_, number), instant)| {
-                    let since = began.get(usize::try_from(number).ok()?.checked_sub(1)?)?;
-                    Some(1e3 * instant.duration_since(*since).as_secs_f64())
-                })
-                .collect();
-            to_page.sort_by(f64::total_cmp);
-            let to_page = [0.5, 0.99, 0.999].map(|quantile| at(&to_page, quantile));
+            let measured = measure(&stream, &out, &snapshots, (packets_per_s, length_s), browsers)?;
+            let Delays { to_sums: (pieces, to_sums), to_disk: (maps, to_disk), to_page } = measured;
             let ratio = |aim_s: f64, [_, p99, _]: [f64; 3]| match p99.is_finite() {
                 true => format!("{:>7.1}", 1e3 * aim_s / p99),
                 false => format!("{:>7}", "-"),
@@ -340,7 +372,6 @@ fn main() -> Result<(), Failure> {
                 three(to_page),
                 ratio(TO_PAGE_S, to_page),
             );
-            debug_assert!(sent > 0);
         }
     }
     std::fs::remove_dir_all(&folder)?;

@@ -8,6 +8,7 @@ use std::path::Path;
 use common::workplace::{Workplace, json, succeed};
 use lunarray::downlink::DownlinkReader;
 use lunarray::frames::{Flags, GroundFrame, VisibilityBlock};
+use lunarray::units::vector::{cross, dot, unit};
 use num_complex::Complex64;
 
 const SMALL: &str = r#"
@@ -156,6 +157,18 @@ fn column(table: &str, name: &str, line: &str) -> f64 {
     line.split(',').nth(place).unwrap().parse().unwrap()
 }
 
+/// Tilts towards the track and away from the Moon, rad, and the distortion, as the truth has them for the pass of a time.
+fn true_antenna(table: &str, n: u8, t_s: f64) -> [f64; 3] {
+    let of = |line: &&str| {
+        let daughter = column(table, "daughter", line) as u8 == n + 1;
+        let near_s = (column(table, "time_s", line) - t_s).abs();
+        if daughter { (near_s * 1e3) as u64 } else { u64::MAX }
+    };
+    let line = table.lines().skip(1).min_by_key(of).unwrap();
+    let [along, radial] = ["tilt_along_deg", "tilt_radial_deg"].map(|name| column(table, name, line));
+    [along.to_radians(), radial.to_radians(), column(table, "pattern", line)]
+}
+
 #[test]
 fn tilted_dipoles_see_one_source_by_their_projections() {
     let place = Workplace::new(SMALL);
@@ -190,19 +203,6 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
         ..lunarray::array::ArrayConfig::default()
     })
     .unwrap();
-    type Vec3 = [f64; 3];
-    let dot = |a: Vec3, b: Vec3| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    // Radians towards the track and away from the Moon, and the distortion, as the truth has them for the pass of a time.
-    let truth = |n: u8, t_s: f64| -> [f64; 3] {
-        let of = |line: &&str| {
-            let daughter = column(&table, "daughter", line) as u8 == n + 1;
-            let near_s = (column(&table, "time_s", line) - t_s).abs();
-            if daughter { (near_s * 1e3) as u64 } else { u64::MAX }
-        };
-        let line = table.lines().skip(1).min_by_key(of).unwrap();
-        let [along, radial] = ["tilt_along_deg", "tilt_radial_deg"].map(|name| column(&table, name, line));
-        [along.to_radians(), radial.to_radians(), column(&table, "pattern", line)]
-    };
     let (mut compared, mut far) = (0, 0.0_f64);
     for ((key, ideal), tilted) in ideal.iter().zip(tilted.values()) {
         let of = |block: &VisibilityBlock| {
@@ -215,19 +215,16 @@ fn tilted_dipoles_see_one_source_by_their_projections() {
         }
         let t_s = ideal.middle_s(0);
         // Across the wave's direction, dipoles lie along two axes p and q; each has its own part on them.
-        let (normal, p) = (array.orbit_normal_hat(t_s), {
-            let helper = if n_hat[2].abs() < 0.9 { [0.0, 0.0, 1.0] } else { [1.0, 0.0, 0.0] };
-            lunarray::units::vector::unit(lunarray::units::vector::cross(n_hat, helper))
-        });
-        let q = lunarray::units::vector::cross(n_hat, p);
+        let normal = array.orbit_normal_hat(t_s);
+        let helper = if n_hat[2].abs() < 0.9 { [0.0, 0.0, 1.0] } else { [1.0, 0.0, 0.0] };
+        let p = unit(cross(n_hat, helper));
+        let q = cross(n_hat, p);
         let voltages = |n: u8| {
-            let [along, radial, distortion] = truth(n, t_s);
-            let r_m = array.position_m(n.into(), t_s);
-            let up = lunarray::units::vector::unit(r_m);
-            let track = lunarray::units::vector::cross(normal, up);
-            let axis: Vec3 =
-                std::array::from_fn(|k| normal[k] + along.tan() * track[k] + radial.tan() * up[k]);
-            let axis = lunarray::units::vector::unit(axis);
+            let [along, radial, distortion] = true_antenna(&table, n, t_s);
+            let up = unit(array.position_m(n.into(), t_s));
+            let track = cross(normal, up);
+            let axis =
+                unit(std::array::from_fn(|k| normal[k] + along.tan() * track[k] + radial.tan() * up[k]));
             let factor = 1.0 + distortion * (3.0 * dot(axis, n_hat).powi(2) - 1.0) / 2.0;
             [factor * dot(axis, p), factor * dot(axis, q)]
         };

@@ -64,20 +64,20 @@ fn worth(file: &str) -> BTreeMap<u64, Worth> {
     found
 }
 
-#[test]
-fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
-    // Half a day from pass to pass: the formation breathes in fourteen.
-    let pipeline = SMALL
+/// A pipeline in which the formation, which breathes in fourteen days, changes little from pass to pass.
+fn half_a_day_from_pass_to_pass() -> String {
+    SMALL
         .replace("every_nth_window = 300", "every_nth_window = 5\nduration_s = 1.2e6")
         .replace("packet_bytes_max = 2048", "packet_bytes_max = 1024")
         .replace("every_nth_integration = 2", "")
         .replace("baseline_wavelengths_max = 16.0", "")
         .replace("[3.0e6, 10.0e6]", "[1.0e6, 3.0e6]")
-        .replace(
-            "[spacecraft]",
-            "[array]\nsatellites = 4\n[array.breathing]\nspan_m_max = 5e3\n[spacecraft]",
-        );
-    let place = Ground(Workplace::new(&pipeline));
+        .replace("[spacecraft]", "[array]\nsatellites = 4\n[array.breathing]\nspan_m_max = 5e3\n[spacecraft]")
+}
+
+#[test]
+fn gaps_stand_in_the_order_of_what_their_recovery_adds() {
+    let place = Ground(Workplace::new(&half_a_day_from_pass_to_pass()));
     let file = place.downlink();
     let (worth, all) = (worth(&file), packets(&file));
     // Each pass ends with the spacecraft's own counts.

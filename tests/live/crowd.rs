@@ -61,6 +61,32 @@ fn memory(served: &Served) -> [u64; 2] {
     })
 }
 
+/// Sends one request of each kind at a time, and reads the answers.
+fn send_all_kinds(address: &str, kinds: &[Vec<u8>]) {
+    let send = |kind: &Vec<u8>| {
+        let mut guest = TcpStream::connect(address).unwrap();
+        let _ = guest.write_all(kind);
+        let _ = guest.shutdown(Shutdown::Write);
+        guest
+    };
+    let guests: Vec<TcpStream> = kinds.iter().map(send).collect();
+    for mut guest in guests {
+        let _ = guest.read_to_end(&mut Vec::new());
+    }
+}
+
+/// Whether the server has closed a connection that does not block.
+fn is_closed(guest: &mut TcpStream) -> bool {
+    let mut bytes = [0; 4096];
+    loop {
+        match guest.read(&mut bytes) {
+            Ok(0) => return true,
+            Ok(_) => {}
+            Err(error) => return error.kind() != std::io::ErrorKind::WouldBlock,
+        }
+    }
+}
+
 #[test]
 fn ten_thousand_bad_guests_cost_no_memory_and_no_bit() {
     let place = Place::new();
@@ -108,19 +134,7 @@ fn ten_thousand_bad_guests_cost_no_memory_and_no_bit() {
 
     // Those who take the port for packets for a page; as many at a time as there are places.
     for _ in 0..LOST_BROWSERS / kinds.len() {
-        let lost: Vec<TcpStream> = kinds
-            .iter()
-            .map(|kind| {
-                let mut guest = TcpStream::connect(&packets).unwrap();
-                let _ = guest.write_all(kind);
-                let _ = guest.shutdown(Shutdown::Write);
-                guest
-            })
-            .collect();
-        for mut guest in lost {
-            let mut answer = Vec::new();
-            let _ = guest.read_to_end(&mut answer);
-        }
+        send_all_kinds(&packets, &kinds);
     }
     // With all ten thousand still there, a station sends a mission.
     let answer = finish(TcpStream::connect(&packets).unwrap(), &good);
@@ -131,17 +145,7 @@ fn ten_thousand_bad_guests_cost_no_memory_and_no_bit() {
 
     // Nobody of the crowd is still connected: the server has closed every one.
     for guest in &mut crowd {
-        let mut closed = || {
-            let mut bytes = [0; 4096];
-            loop {
-                match guest.read(&mut bytes) {
-                    Ok(0) => return true,
-                    Ok(_) => {}
-                    Err(error) => return error.kind() != std::io::ErrorKind::WouldBlock,
-                }
-            }
-        };
-        wait_until("the server to close a connection", &mut closed);
+        wait_until("the server to close a connection", || is_closed(guest));
     }
     wait_until("places", || served.metric("lunarray_http_connections") <= 2.0);
     let refused = served.metric("lunarray_http_refused_total");

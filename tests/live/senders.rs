@@ -17,6 +17,45 @@ fn claims(count: u64) -> Vec<u8> {
     (0..count).flat_map(|count| header(count).to_bytes()).collect()
 }
 
+/// Sends a piece again and again until the ground closes; its answer may then be lost with the connection.
+fn flood(ground: &Ground, piece: &[u8]) {
+    let mut stream = ground.connect();
+    let mut bytes = 0_u64;
+    while bytes < 1 << 30 && stream.write_all(piece).is_ok() {
+        bytes += piece.len() as u64;
+    }
+    assert!(bytes < 1 << 30, "the ground goes on taking garbage");
+}
+
+/// Sends sound packets a byte at a time.
+fn trickle(ground: &Ground, packet: &[u8]) {
+    let mut stream = ground.connect();
+    for octet in packet.iter().cycle() {
+        if stream.write_all(&[*octet]).is_err() {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+}
+
+/// Sends all packets, then the first again and again while others are connected.
+fn send_until(over: &AtomicBool, ground: &Ground, packets: &[Vec<u8>]) {
+    let (mut stream, mut sent) = (ground.connect(), 0);
+    for packets in packets.chunks(packets.len() / 20 + 1) {
+        for packet in packets {
+            stream.write_all(packet).unwrap();
+            sent += packet.len();
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    while !over.load(Ordering::Relaxed) {
+        stream.write_all(&packets[0]).unwrap();
+        sent += packets[0].len();
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    assert_eq!(finish(stream, &[]), format!("taken {sent} bytes\n"));
+}
+
 #[test]
 fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let place = Place::new();
@@ -28,15 +67,6 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let set: Vec<&str> = set.iter().flat_map(|limit| ["--set", limit.as_str()]).collect();
     // Three deliver sound packets: the good one, the one that falls silent, the one of another mission.
     let ground = place.ground("heard", &[&set[..], &["--connections", "3"]].concat());
-    // Until the ground closes; its answer may then be lost with the connection.
-    let flood = |piece: &[u8]| {
-        let mut stream = ground.connect();
-        let mut bytes = 0_u64;
-        while bytes < 1 << 30 && stream.write_all(piece).is_ok() {
-            bytes += piece.len() as u64;
-        }
-        assert!(bytes < 1 << 30, "the ground goes on taking garbage");
-    };
     let noise: Vec<u8> =
         (0..1_u64 << 16).map(|k| (k.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 41) as u8).collect();
     let marker = [0x1A, 0xCF, 0xFC, 0x1D];
@@ -48,23 +78,7 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let (ground, packets, foreign, over) = (&ground, &packets, &foreign, &over);
-        // Sends continuously: repeats some packets while the others are connected.
-        let good = scope.spawn(move || {
-            let (mut stream, mut sent) = (ground.connect(), 0);
-            for packets in packets.chunks(packets.len() / 20 + 1) {
-                for packet in packets {
-                    stream.write_all(packet).unwrap();
-                    sent += packet.len();
-                }
-                std::thread::sleep(Duration::from_millis(100));
-            }
-            while !over.load(Ordering::Relaxed) {
-                stream.write_all(&packets[0]).unwrap();
-                sent += packets[0].len();
-                std::thread::sleep(Duration::from_millis(100));
-            }
-            assert_eq!(finish(stream, &[]), format!("taken {sent} bytes\n"));
-        });
+        let good = scope.spawn(move || send_until(over, ground, packets));
         let answer_to = |bytes: &[u8]| {
             let mut stream = ground.connect();
             stream.write_all(bytes).unwrap();
@@ -73,20 +87,11 @@ fn bad_senders_are_closed_and_counted_and_a_good_one_loses_nothing() {
             answer
         };
         let mut others = vec![
-            scope.spawn(|| flood(&noise)),
-            scope.spawn(|| flood(&markers)),
-            scope.spawn(|| flood(&only_markers)),
-            scope.spawn(|| flood(&claims(3000))),
-            // A byte at a time, of sound packets.
-            scope.spawn(|| {
-                let mut stream = ground.connect();
-                for octet in packets[0].iter().cycle() {
-                    if stream.write_all(&[*octet]).is_err() {
-                        break;
-                    }
-                    std::thread::sleep(Duration::from_millis(200));
-                }
-            }),
+            scope.spawn(|| flood(ground, &noise)),
+            scope.spawn(|| flood(ground, &markers)),
+            scope.spawn(|| flood(ground, &only_markers)),
+            scope.spawn(|| flood(ground, &claims(3000))),
+            scope.spawn(|| trickle(ground, &packets[0])),
             scope.spawn(move || assert!(answer_to(&[]).contains("first_packet_s_max"))),
             scope.spawn(move || assert!(answer_to(&packets[0]).contains("idle_s_max"))),
             scope.spawn(|| assert_eq!(ground.send(&[]), "taken 0 bytes\n")),

@@ -224,6 +224,37 @@ fn what_is_served_is_what_is_on_disk() {
     assert!(served.end().success());
 }
 
+fn only_its_own_names_are_answered(served: &Served) {
+    // A name that somebody else's name server points here.
+    let port = served.address.rsplit(':').next().unwrap();
+    for host in
+        ["evil.example", &format!("evil.example:{port}"), "127.0.0.1:1", "localhost.evil.example", "[::2]"]
+    {
+        assert_eq!(served.request("GET", "/api/status", host).status, 421, "{host}");
+    }
+    for host in ["localhost", &format!("localhost:{port}"), "127.0.0.1", &format!("[::1]:{port}")] {
+        assert_eq!(served.request("GET", "/api/status", host).status, 200, "{host}");
+    }
+    let own = &served.address;
+    for (request, status) in [
+        ("GET /api/status HTTP/1.1\r\nConnection: close\r\n\r\n".to_owned(), 400),
+        (format!("GET / HTTP/1.1\r\nHost: {own}\r\nHost: evil.example\r\nConnection: close\r\n\r\n"), 400),
+        (format!("GET http://evil.example/ HTTP/1.1\r\nHost: {own}\r\nConnection: close\r\n\r\n"), 421),
+        ("nonsense\r\n\r\n".to_owned(), 400),
+        (format!("GET / HTTP/1.1\r\nHost: {own}\r\nX: {}\r\n\r\n", "x".repeat(1 << 20)), 431),
+        (format!("GET /{} HTTP/1.1\r\nHost: {own}\r\n\r\n", "x".repeat(1 << 20)), 0),
+        (format!("GET / HTTP/1.1\r\nHost: {own}\r\n{}\r\n", "X: y\r\n".repeat(100)), 431),
+    ] {
+        let reply = served.raw(request.as_bytes());
+        let shown = request.get(..80).unwrap_or(&request);
+        if status == 0 {
+            assert!((400..500).contains(&reply.status) || reply.status == 0, "{shown}: {}", reply.status);
+        } else {
+            assert_eq!(reply.status, status, "{shown}");
+        }
+    }
+}
+
 #[test]
 fn every_route_answers_and_nothing_else_does() {
     let place = Place::new();
@@ -285,34 +316,7 @@ fn every_route_answers_and_nothing_else_does() {
         let reply = served.request(method, "/api/status", &served.address);
         assert_eq!((reply.status, reply.header("allow")), (405, "GET, HEAD"), "{method}");
     }
-    // A name that somebody else's name server points here.
-    let port = served.address.rsplit(':').next().unwrap();
-    for host in
-        ["evil.example", &format!("evil.example:{port}"), "127.0.0.1:1", "localhost.evil.example", "[::2]"]
-    {
-        assert_eq!(served.request("GET", "/api/status", host).status, 421, "{host}");
-    }
-    for host in ["localhost", &format!("localhost:{port}"), "127.0.0.1", &format!("[::1]:{port}")] {
-        assert_eq!(served.request("GET", "/api/status", host).status, 200, "{host}");
-    }
-    let own = &served.address;
-    for (request, status) in [
-        ("GET /api/status HTTP/1.1\r\nConnection: close\r\n\r\n".to_owned(), 400),
-        (format!("GET / HTTP/1.1\r\nHost: {own}\r\nHost: evil.example\r\nConnection: close\r\n\r\n"), 400),
-        (format!("GET http://evil.example/ HTTP/1.1\r\nHost: {own}\r\nConnection: close\r\n\r\n"), 421),
-        ("nonsense\r\n\r\n".to_owned(), 400),
-        (format!("GET / HTTP/1.1\r\nHost: {own}\r\nX: {}\r\n\r\n", "x".repeat(1 << 20)), 431),
-        (format!("GET /{} HTTP/1.1\r\nHost: {own}\r\n\r\n", "x".repeat(1 << 20)), 0),
-        (format!("GET / HTTP/1.1\r\nHost: {own}\r\n{}\r\n", "X: y\r\n".repeat(100)), 431),
-    ] {
-        let reply = served.raw(request.as_bytes());
-        let shown = request.get(..80).unwrap_or(&request);
-        if status == 0 {
-            assert!((400..500).contains(&reply.status) || reply.status == 0, "{shown}: {}", reply.status);
-        } else {
-            assert_eq!(reply.status, status, "{shown}");
-        }
-    }
+    only_its_own_names_are_answered(&served);
     assert_eq!(served.get("/healthz").status, 200);
     wait_until("what was cut to be counted", || served.metric("lunarray_http_cut_total") >= 1.0);
 }

@@ -1,9 +1,11 @@
 //! Refined maps: against a dense solution by other code, on a circle, and whatever the order of arrival.
 
+mod power;
+
 use crate::common;
 use crate::engines::solve_harmonics;
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::TAU;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -12,16 +14,13 @@ use std::time::Duration;
 use faer::linalg::solvers::{DenseSolveCore, Solve};
 use faer::{Mat, Side};
 use lunarray::frames::{AntennaResponse, PlacedVisibilities};
-use lunarray::imaging::Refusal;
-use lunarray::imaging::Samples;
-use lunarray::imaging::anywhere::RefineRule;
-use lunarray::imaging::anywhere::RefineSteps;
-use lunarray::imaging::anywhere::Refinement;
-use lunarray::imaging::anywhere::solve_refined;
-use lunarray::imaging::anywhere::{AssumedInstrument, RefinedSetup, RefinedSums, VisibilityArchive};
+use lunarray::imaging::anywhere::{
+    AssumedInstrument, RefineRule, RefineSteps, RefinedSetup, RefinedSums, Refinement, VisibilityArchive,
+    solve_refined,
+};
 use lunarray::imaging::circle::{coefficients, degrees};
 use lunarray::imaging::{
-    HarmonicRequest, HarmonicSolution, Regulariser, SolveError, SolveWatch, StoppingRule,
+    HarmonicRequest, HarmonicSolution, Refusal, Regulariser, Samples, SolveError, SolveWatch, StoppingRule,
 };
 use lunarray::response::general::{GeneralRows, RowsSetup, TimedPair};
 use lunarray::response::harmonic::{GeometryLimits, GeometryRefusal};
@@ -32,9 +31,6 @@ use lunarray::units::constants::{MOON_RADIUS_M, SPEED_OF_LIGHT_M_S};
 use lunarray::units::vector::Vec3;
 use lunarray::units::{ChannelId, Pair};
 use num_complex::Complex64;
-use rand_chacha::ChaCha8Rng;
-use rand_chacha::rand_core::SeedableRng;
-use rand_distr::{Distribution, StandardNormal};
 
 const RADIUS_M: f64 = MOON_RADIUS_M + 300e3;
 const WAVELENGTH_M: f64 = 30.0;
@@ -183,7 +179,7 @@ fn difference(found: &[f64], expected: &[f64]) -> f64 {
 /// Relative difference of one degree.
 fn degree_change(found: &[f64], expected: &[f64], l: usize) -> f64 {
     let of = |x: &[f64]| {
-        let alm = lunarray::imaging::circle::coefficients(x, L_MAX);
+        let alm = coefficients(x, L_MAX);
         (0..=l).flat_map(|m| [alm.get(l, m).re, alm.get(l, m).im]).collect::<Vec<f64>>()
     };
     difference(&of(found), &of(expected))
@@ -202,19 +198,24 @@ fn rows(wavelength_m: f64, l_max: usize) -> GeneralRows {
 /// A month of orbits: the plane turns by 23 deg.
 const MONTH_RAD: f64 = 0.4;
 
-/// Data of a sky with degrees beyond the map's, which no map fits.
-fn seen_sky(wavelength_m: f64, at: &[TimedPair], l_max: usize) -> Vec<Complex64> {
-    let l_max = l_max + 8;
+/// Coefficients of these sizes by degree.
+fn sky(l_max: usize, size: impl Fn(f64) -> f64) -> Alm {
     let mut sky = Alm::zeros(l_max);
     for l in 0..=l_max {
         for m in 0..=l {
             let angle = (l * l + 3 * m) as f64;
             let im = if m == 0 { 0.0 } else { angle.sin() };
-            *sky.get_mut(l, m) = Complex64::new(angle.cos(), im) * (1e6 / (l as f64 + 1.0).powf(1.35));
+            *sky.get_mut(l, m) = Complex64::new(angle.cos(), im) * size(l as f64);
         }
     }
+    sky
+}
+
+/// Data of a sky with degrees beyond the map's, which no map fits.
+fn seen_sky(wavelength_m: f64, at: &[TimedPair], l_max: usize) -> Vec<Complex64> {
+    let l_max = l_max + 8;
     let rows = rows(wavelength_m, l_max);
-    rows.forward(&rows.plan(at).unwrap(), &[sky]).remove(0)
+    rows.forward(&rows.plan(at).unwrap(), &[sky(l_max, |l| 1e6 / (l + 1.0).powf(1.35))]).remove(0)
 }
 
 /// The solution of `(Bt N^-1 B + R) x = Bt N^-1 V` with the matrix in memory: of the same rows, which other tests hold against other code.
@@ -222,7 +223,7 @@ fn dense_solution(sums: &RefinedSums, l_max: usize, r: &dyn Fn(usize) -> f64) ->
     let unknowns = (l_max + 1) * (l_max + 1);
     let unit = |k: usize| {
         let x: Vec<f64> = (0..unknowns).map(|n| f64::from(u8::from(n == k))).collect();
-        lunarray::imaging::circle::coefficients(&x, l_max)
+        coefficients(&x, l_max)
     };
     let mut columns: Vec<Vec<Complex64>> = Vec::new();
     for first in (0..unknowns).step_by(32) {
@@ -270,108 +271,6 @@ fn a_month_of_any_orbit_is_refined_to_the_dense_solution() {
     }
 }
 
-/// Coefficients of a sky of a known power, and their data with noise.
-fn noisy_sky(at: &[TimedPair]) -> (Vec<f64>, RefinedSums) {
-    let mut stream = ChaCha8Rng::seed_from_u64(11);
-    let mut normal = || -> f64 { StandardNormal.sample(&mut stream) };
-    let x: Vec<f64> = degrees(L_MAX).map(|l| sky_power(l).sqrt() * normal()).collect();
-    let truth = coefficients(&x, L_MAX);
-    let rows = rows(WAVELENGTH_M, L_MAX);
-    let mut values = rows.forward(&rows.plan(at).unwrap(), &[truth]).remove(0);
-    for (value, at) in values.iter_mut().zip(at) {
-        *value += Complex64::new(normal(), normal()) / weight(at).sqrt();
-    }
-    (x, sums(L_MAX, &blocks(at, &values, 1000)))
-}
-
-fn sky_power(l: usize) -> f64 {
-    1e12 * (l as f64 + 1.0).powf(-2.7)
-}
-
-fn solve_with_power(sums: &RefinedSums, passes_max: usize) -> (HarmonicSolution, Refinement) {
-    let rule = RefineRule { passes_max, residual_max: 1e-5 };
-    let steps = RefineSteps { start: None, save: &mut |_| {} };
-    let watch = SolveWatch::default();
-    let samples = Samples { count: if passes_max < 30 { 0 } else { 40 }, gibbs: false };
-    let request = HarmonicRequest { samples, ..request(NSIDE) };
-    solve_refined(sums, request, (rule, &Regulariser::Data), None, steps, watch.named("test")).unwrap()
-}
-
-/// The first R is that of the circle. A map that says it has converged has another, however few passes it may take.
-#[test]
-fn few_passes_leave_no_r_of_the_circle() {
-    let at = geometry_over(60e3, 0.2, 150.0, 9, &BASELINES_M, MONTH_RAD);
-    let (_, sums) = noisy_sky(&at);
-    let (few, refinement) = solve_with_power(&sums, 3);
-    eprintln!("{refinement}");
-    // Equations of so few unknowns are solved directly in each of two rounds, which counts as a pass: after two of the three, and after the last.
-    assert!(refinement.direct && refinement.convergence.iterations == 5, "{refinement}");
-    if refinement.convergence.converged {
-        let [few, many] =
-            [few, solve_with_power(&sums, 29).0].map(|found| found.uncertainty.unwrap().power.power_k2);
-        let off = (2..=L_MAX).map(|l| (few[l] / many[l]).ln().abs()).fold(0.0, f64::max);
-        // Rounds end where ln C_l changes by less than a tenth: each of the two by as much.
-        assert!(off < 0.2, "{off}");
-    }
-}
-
-/// R from the data: the map is the dense solution with the R that was found, and its C_l that of the sky. Its errors hold where the node turns all
-/// round; in a month of orbits far off the circle they do not.
-#[test]
-fn r_from_the_data_is_found_with_true_rows() {
-    for (altitude_m, cross, turn_rad) in [(1e3, 0.02, TAU), (60e3, 0.2, TAU), (60e3, 0.2, MONTH_RAD)] {
-        let at = geometry_over(altitude_m, cross, 75.0, 9, &BASELINES_M, turn_rad);
-        let (x, sums) = noisy_sky(&at);
-        let (found, refinement) = solve_with_power(&sums, 30);
-        let errors = found.uncertainty.unwrap();
-        let factor = errors.power.noise_factor;
-        let r = |l: usize| factor * factor / errors.power.power_k2[l];
-        let (dense, inverse) = dense_solution(&sums, L_MAX, &r);
-        let off = difference(&found.unknowns[0][1..], &dense[1..]);
-        let ln: Vec<f64> = (2..=L_MAX)
-            .map(|l| (errors.power.power_k2[l] / sky_power(l)).ln() / errors.power.sigma_ln[l].max(0.2))
-            .collect();
-        let count = found.map_k.len() as f64;
-        let traced: f64 =
-            (0..dense.len()).map(|k| inverse[(k, k)]).sum::<f64>() * factor * factor / (4.0 * PI);
-        let stated = errors.sigma_k.iter().map(|s| s * s).sum::<f64>() / count;
-        let drawn = errors.samples.iter().flat_map(|sample| sample.map_k.iter().zip(&found.map_k));
-        let drawn = drawn.map(|(a, b)| (a - b).powi(2)).sum::<f64>() / (40.0 * count);
-        let error: f64 =
-            found.unknowns[0].iter().zip(&x).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / (4.0 * PI);
-        let mean_sigma_k = factor * (inverse[(0, 0)] / (4.0 * PI)).sqrt();
-        eprintln!(
-            "+-{} km, {cross}, {turn_rad:.1}: off {off:.1e}, noise {factor:.3}, ln C_l {ln:.1?}, variance {traced:.2e}: stated {:.2}, drawn \
-             {:.2}, error {:.2}; mean {:.2}; {refinement}",
-            altitude_m / 1e3,
-            stated / traced,
-            drawn / traced,
-            error / traced,
-            errors.mean_sigma_k / mean_sigma_k,
-        );
-        assert!(refinement.convergence.converged, "{refinement}");
-        // A residual of 1e-5 in the norm of the inverse, which modes that R alone decides multiply.
-        assert!(off < 2e-3, "{off}");
-        // The power that the sky was drawn from: within four of its errors, or within 0.8 where they are below 0.2, as those of C_l between knots are of
-        // a straight line, which this one is not quite, in ln (l + 1).
-        assert!(ln.iter().all(|off| off.abs() < 4.0), "{ln:?}");
-        if turn_rad == TAU {
-            // Of the circle's matrix where it measures what the true one does: a fifth. Samples are of the true matrix: 40 of 169 coefficients.
-            assert!(
-                (stated / traced - 1.0).abs() < 0.25 && (drawn / traced - 1.0).abs() < 0.1,
-                "{stated} {drawn} {traced}"
-            );
-            assert!((errors.mean_sigma_k / mean_sigma_k - 1.0).abs() < 0.25);
-            // Of one sky, which scatters by its few modes that are measured worst.
-            assert!((0.5..2.0).contains(&(error / traced)), "{error} {traced}");
-        } else {
-            // The circle's matrix measures other modes: sigma is three times too small. Samples are solved to a tolerance that its blocks set.
-            assert!((0.1..0.2).contains(&(stated / traced)), "{stated} {traced}");
-            assert!((0.5..0.75).contains(&(drawn / traced)), "{drawn} {traced}");
-        }
-    }
-}
-
 #[test]
 fn a_map_that_has_not_converged_says_so() {
     let at = geometry_over(60e3, 0.2, 150.0, 6, &BASELINES_M, MONTH_RAD);
@@ -400,7 +299,7 @@ fn a_refined_map_takes_an_r_of_the_degree() {
     let power: Vec<f64> = (0..=10).map(|l| EPSILON / level * if l > 4 { 1e-12 } else { 1.0 }).collect();
     let stopped = solved(&Regulariser::Wiener(power));
     let size = |x: &[f64], l: usize| {
-        let alm = lunarray::imaging::circle::coefficients(x, 10);
+        let alm = coefficients(x, 10);
         (0..=l).map(|m| alm.get(l, m).norm_sqr()).sum::<f64>().sqrt()
     };
     for l in 0..=10 {
@@ -497,14 +396,8 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
             .collect();
 
         // Rows: the visibilities of that sky.
-        let rows = GeneralRows::new(RowsSetup {
-            l_max: L_MAX,
-            wavelength_m: WAVELENGTH_M,
-            moon_radius_m: MOON_RADIUS_M,
-            response: AntennaResponse::Isotropic,
-            polynomial_degree: 0,
-        });
-        let alm: Alm = lunarray::imaging::circle::coefficients(&sky, L_MAX);
+        let rows = rows(WAVELENGTH_M, L_MAX);
+        let alm: Alm = coefficients(&sky, L_MAX);
         let seen = rows.forward(&rows.plan_direct(&at).unwrap(), &[alm]).remove(0);
         let parts = |v: &[Complex64]| v.iter().flat_map(|v| [v.re, v.im]).collect::<Vec<f64>>();
         let error = difference(&parts(&seen), &parts(&values));
@@ -536,21 +429,8 @@ fn refined_maps_are_the_dense_solution_of_other_code() {
 #[test]
 fn refinement_leaves_a_map_of_a_circle_as_it_is() {
     let at = geometry(0.0, 0.0, 60.0, 48, &BASELINES_M);
-    let rows = GeneralRows::new(RowsSetup {
-        l_max: L_MAX,
-        wavelength_m: WAVELENGTH_M,
-        moon_radius_m: MOON_RADIUS_M,
-        response: AntennaResponse::Isotropic,
-        polynomial_degree: 0,
-    });
-    let mut alm = Alm::zeros(L_MAX);
-    for l in 0..=L_MAX {
-        for m in 0..=l {
-            let angle = (l * l + 3 * m) as f64;
-            let im = if m == 0 { 0.0 } else { angle.sin() };
-            *alm.get_mut(l, m) = Complex64::new(angle.cos(), im) * (1e5 / (l as f64 + 1.0));
-        }
-    }
+    let rows = rows(WAVELENGTH_M, L_MAX);
+    let alm = sky(L_MAX, |l| 1e5 / (l + 1.0));
     let values = rows.forward(&rows.plan(&at).unwrap(), &[alm]).remove(0);
     let sums = sums(L_MAX, &blocks(&at, &values, 1000));
     assert_eq!(sums.departures.by_refinement, 0);
