@@ -76,7 +76,7 @@ def run_page(page):
 def test_the_page_of_the_package_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     python = [(block, line) for kind, block, line in blocks("python.md") if kind == "python"]
-    assert len(python) > 7
+    assert len(python) > 6
     names = {}
     for block, line in python:
         run_python("python.md", block, line, names)
@@ -91,8 +91,8 @@ def test_the_tutorial_for_cosmologists_runs(tmp_path, monkeypatch, capsys):
     said = run_page("tutorials/cosmologist.md")
     assert "mine.toml: no problems" in said and "rho_l (noise power subtracted)" in said
     printed = capsys.readouterr().out
-    assert "l = 12: rho " in printed and "epsilon 0.01: noise" in printed and "visibilities" in printed
-    for name in ("made.png", "spectra.csv", "alm.fits", "hips/properties", "mine.uvh5"):
+    assert "l = 12: rho " in printed and "epsilon 0.01: noise" in printed
+    for name in ("made.png", "spectra.csv", "alm.fits", "hips/properties"):
         assert (tmp_path / name).stat().st_size > 100
 
 
