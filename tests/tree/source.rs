@@ -246,7 +246,7 @@ fn text_literal(text: &str) -> Option<usize> {
         let behind = text.strip_prefix(p).unwrap_or_default();
         behind.trim_start_matches('#').starts_with('"') && (p.ends_with('r') || behind.starts_with('"'))
     });
-    let start = prefix.map_or(0, str::len);
+    let start = prefix.map_or(usize::from(text.starts_with("b'")), str::len);
     if prefix.is_some_and(|p| p.ends_with('r')) {
         let signs = text[start..].find('"')?;
         let end = format!("\"{}", "#".repeat(signs));
