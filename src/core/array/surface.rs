@@ -49,7 +49,7 @@ pub(super) fn motions(
 
 /// Reads a file of stations.
 fn read(path: &Path, satellites: usize) -> Result<Vec<Station>, ArrayError> {
-    let error = |what: String| ArrayError::Oem { path: path.to_owned(), what };
+    let error = |what: String| ArrayError::File { path: path.to_owned(), what };
     let bytes = read_file(path, FILE_BYTES_MAX).map_err(|source| error(source.to_string()))?;
     let text =
         text_of(&bytes).map_err(|form| error(format!("{form}; expected a table as plain text (CSV)")))?;

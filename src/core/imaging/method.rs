@@ -23,7 +23,8 @@ pub(in crate::imaging) trait MapMethod: Sync {
     /// The settings do not fit the instrument.
     fn create(&self, channel: &NewChannel<'_>) -> Result<NewOrRefused<Box<dyn MapSums>>, AccumulationError>;
 
-    /// Reads what [`MapSums::save`] wrote on the rank with share `part`, with archive files in `folder`. Only the share of `ranks` is kept.
+    /// Reads what [`MapSums::save`] wrote on the rank of the first of `shares`, with archive files in `folder`. Of it that of the second, the
+    /// reading rank, is kept.
     ///
     /// # Errors
     /// The data are damaged, or of another method.

@@ -144,9 +144,9 @@ pub enum ArrayError {
     /// A value of the configuration is not accepted.
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
-    /// A file of orbits or attitudes cannot be used.
+    /// A file of orbits, attitudes or stations cannot be used.
     #[error("{}: {what}", path.display())]
-    Oem {
+    File {
         /// The file.
         path: PathBuf,
         /// Problem in the file, and what was expected.

@@ -14,7 +14,7 @@ use crate::files::{form_of, read_file};
 const FILE_BYTES_MAX: u64 = 1 << 30;
 
 pub(in crate::array) fn error(path: &Path, what: String) -> ArrayError {
-    ArrayError::Oem { path: path.to_owned(), what }
+    ArrayError::File { path: path.to_owned(), what }
 }
 
 /// The fault of a file.
