@@ -291,4 +291,10 @@ fn what_cannot_be_drawn_is_refused() {
     let arcs = "array.arcs_m=[600.0,1200.0,2e3,4e3,8e3,16e3,32e3]";
     let said = fail(&["figure", "spacing", &place.pipeline, "--set", arcs, "--out", &out]);
     assert!(said.contains("expected no array.arcs_m"), "{said}");
+    // A sky in pixels of the map's own would have no error at their centres.
+    for (nside, name) in [("4", "expected a sky of nside 16"), ("8", "increase sky.nside")] {
+        let set = format!("sky.nside={nside}");
+        let said = fail(&["figure", "waterfall", &place.pipeline, "--set", &set, "--out", &out]);
+        assert!(said.contains(&format!("nside {nside}, map.nside is 4")) && said.contains(name), "{said}");
+    }
 }

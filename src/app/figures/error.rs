@@ -49,6 +49,28 @@ pub enum FigureError {
         /// Limit on the baseline, m.
         limit_m: f64,
     },
+    /// A sky hardly finer than the map, which hides what pixels do to visibilities.
+    #[error(
+        "figure waterfall: the sky has nside {sky}, map.nside is {map}: errors of pixels would seem too small; expected a sky of \
+         nside {expected} at least: increase sky.nside, take a finer sky.file, or decrease map.nside"
+    )]
+    CoarseSky {
+        /// nside of the sky.
+        sky: usize,
+        /// nside of the map.
+        map: usize,
+        /// Least nside of the sky.
+        expected: usize,
+    },
+    /// A sky without visibilities, to which errors could be relative.
+    #[error(
+        "figure waterfall: the sky's visibilities of pair {pair} are 0, so that errors relative to them are undefined; expected a \
+         sky with pixels above 0 in sight of both satellites: mend sky.file or take another --at"
+    )]
+    DarkSky {
+        /// Pair of the waterfall.
+        pair: Pair,
+    },
     /// An error of the array.
     #[error(transparent)]
     Array(#[from] ArrayError),

@@ -25,6 +25,10 @@ const TIMES: usize = 60;
 const FREQUENCIES: usize = 60;
 /// Lowest and highest frequency relative to the channel: baselines in units of b_p differ as much.
 const BAND: [f64; 2] = [0.9, 1.1];
+/// Least nside of the sky over that of the map: 16 of its pixels in one of the map.
+const FINENESS_MIN: usize = 4;
+/// A finer `sky.file` is averaged to this, for memory.
+const NSIDE_MAX: usize = 1024;
 
 #[derive(Serialize)]
 struct WaterfallNumbers {
@@ -55,11 +59,12 @@ struct Cell {
 pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, FigureError> {
     let moment = PairMoment::new(plan, request)?;
     let nside = plan.config.map.nside;
-    let fine = sky(plan, ChannelId(0))?.to_ecliptic();
+    let fine = fine_sky(plan)?;
     let window =
         plan.windows.iter().find(|window| window.end.seconds() > moment.t_s).unwrap_or(&plan.windows[0]);
     let [start_s, end_s] = [window.start, window.end].map(|time| time.seconds());
     let cells = cells(plan, &moment, &fine, [start_s, end_s])?;
+    let error_of = |method| error(&cells, method).ok_or(FigureError::DarkSky { pair: moment.pair });
     let numbers = WaterfallNumbers {
         pair: moment.pair.to_string(),
         window_s: [start_s, end_s],
@@ -69,8 +74,8 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
         length_bp: cells.iter().fold([f64::INFINITY, 0.0], |[least, most], cell| {
             [cell.length_bp.min(least), cell.length_bp.max(most)]
         }),
-        centre: error(&cells, 2),
-        average: error(&cells, 1),
+        centre: error_of(2)?,
+        average: error_of(1)?,
     };
     let mut csv =
         "t_s,frequency_hz,length_bp,fine_re,fine_im,average_re,average_im,centre_re,centre_im\n".to_owned();
@@ -83,6 +88,21 @@ pub(super) fn make(plan: &Plan, request: &FigureRequest) -> Result<FigureParts, 
     }
     let picture = draw(&numbers, &cells)?;
     Ok(FigureParts::new(&numbers, csv, picture))
+}
+
+/// The sky of the first channel, finer than the map: pixels of the map's own size would have no error at their centres.
+fn fine_sky(plan: &Plan) -> Result<SkyMap, FigureError> {
+    let map = plan.config.map.nside;
+    let expected = FINENESS_MIN * map;
+    let mut fine = sky(plan, ChannelId(0))?;
+    let most = NSIDE_MAX.max(expected);
+    if plan.config.sky.file.is_some() && fine.nside() > most {
+        fine = fine.degrade(most)?;
+    }
+    if fine.nside() < expected {
+        return Err(FigureError::CoarseSky { sky: fine.nside(), map, expected });
+    }
+    Ok(fine.to_ecliptic())
 }
 
 /// The cells of the waterfall, by time and then by frequency.
@@ -138,11 +158,11 @@ fn cells(
     Ok(columns.into_iter().flatten().collect())
 }
 
-/// Error of the visibilities of a method, rms over the rms of the sky's.
-fn error(cells: &[Cell], method: usize) -> f64 {
+/// Error of the visibilities of a method, rms over the rms of the sky's; `None` if these are all 0.
+fn error(cells: &[Cell], method: usize) -> Option<f64> {
     let power: f64 = cells.iter().map(|cell| cell.values[0].norm_sqr()).sum();
     let square: f64 = cells.iter().map(|cell| (cell.values[method] - cell.values[0]).norm_sqr()).sum();
-    (square / power).sqrt()
+    (power > 0.0).then(|| (square / power).sqrt())
 }
 
 fn draw(
@@ -179,4 +199,23 @@ fn draw(
         })
         .collect();
     Ok(draw_rasters(&format!("Visibilities of pair {}, real part", numbers.pair), &rasters, 3)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cell(values: [f64; 3]) -> Cell {
+        let values = values.map(|value| Complex64::new(0.0, value));
+        Cell { t_s: 0.0, frequency_hz: 10e6, length_bp: 1.0, values }
+    }
+
+    #[test]
+    fn a_dark_sky_has_no_relative_error() {
+        assert_eq!(error(&[cell([0.0; 3])], 1), None);
+        // By hand: the root of (1 + 9) / (9 + 16).
+        let bright = [cell([3.0, 4.0, 3.0]), cell([-4.0, -1.0, -4.0])];
+        assert!((error(&bright, 1).unwrap() - 0.4_f64.sqrt()).abs() < 1e-15);
+        assert_eq!(error(&bright, 2), Some(0.0));
+    }
 }
