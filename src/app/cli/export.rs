@@ -85,8 +85,8 @@ struct AlmArgs {
 /// A map as HiPS, a folder of tiles, which Aladin and Aladin Lite show.
 ///
 /// Tiles are FITS (K, single precision) and PNG, of orders 0 to 3, or higher for maps beyond nside 4096, with `properties` and
-/// Norder3/Allsky. Pixels of tiles take the value of the map's pixel at their centre, without interpolation. They are at least
-/// as fine as those of the map, and no coarser than nside 512.
+/// Norder3/Allsky. Pixels of the highest order take the value of the map's pixel at their centre, without interpolation; those
+/// of lower orders are means of the next one. The highest order is at least as fine as the map, and no coarser than nside 512.
 ///
 /// Aladin opens the folder as a file; Aladin Lite reads it from a web server.
 ///

@@ -95,7 +95,7 @@ pub(super) fn execute(args: &ExtractArgs) -> CommandResult {
     Ok(Completion::Done)
 }
 
-/// Parses ranges, one per line; empty lines and comments (`#`) are skipped.
+/// Parses ranges, one per line; lines without cells and comments (`#`) are skipped.
 fn parse(text: &str) -> Result<Vec<PacketRange>, String> {
     let ranges: Vec<PacketRange> = numbered_lines(text)
         .map(|(number, line)| (number, line.split('#').next().unwrap_or_default().trim()))
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn ranges_are_lines_of_apid_and_counts() {
-        let found = parse("0x103 61 62\n\n258, 14 # positions\n").unwrap();
+        let found = parse("\u{feff}0x103 61 62\n\n,\n258, 14 # positions\n").unwrap();
         let range = |kind, from, to| PacketRange { kind, from, to };
         assert_eq!(found, [range(PacketKind::Visibilities, 61, 62), range(PacketKind::Ephemeris, 14, 14)]);
         for text in

@@ -1,5 +1,6 @@
 //! `lunarray predict`: predict single visibilities.
 
+use std::io::BufRead;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -9,7 +10,7 @@ use super::arguments::{ArrayArgs, MapFileArgs, TimeOfMission, band_text, frequen
 use super::lines::next_line;
 use super::output::{CommandError, CommandResult, Completion, print_json_line, print_notes, print_text};
 use crate::array::Array;
-use crate::files::{Columns, Row, Separator, TableFault};
+use crate::files::{Columns, Row, Separator, TableFault, without_cells, without_mark};
 use crate::mother::BAND_HZ;
 use crate::response::pixel::{PairGeometry, exact};
 use crate::sky::fits::{MapFile, ReadOptions, check_frequency, read_notes, read_whole_map_file};
@@ -109,21 +110,42 @@ pub(super) fn execute(args: &PredictArgs) -> CommandResult {
         print_prediction(VisibilityQuery { t_s, pair, freq_hz })?;
         return Ok(Completion::Done);
     }
-    let mut input = std::io::stdin().lock();
-    let of_input = |fault: TableFault| format!("standard input, {fault}");
-    let names = next_line(&mut input, 1)?.unwrap_or_default();
-    let columns = Columns::new(1, &names, Separator::Sign(',')).map_err(of_input)?;
-    let places = columns.places(COLUMNS, "t_s,i,j,freq_hz").map_err(of_input)?;
-    for number in 2.. {
-        let Some(line) = next_line(&mut input, number)? else { break };
-        if !line.trim().is_empty() {
-            let query = columns.row(number, &line).and_then(|row| query(&row, places));
-            let query = query.map_err(of_input)?;
-            check(&array, query).map_err(|error| format!("standard input, line {number}: {error}"))?;
-            print_prediction(query)?;
-        }
-    }
+    each_row(&mut std::io::stdin().lock(), |number, query| {
+        check(&array, query).map_err(|error| format!("standard input, line {number}: {error}"))?;
+        print_prediction(query)
+    })?;
     Ok(Completion::Done)
+}
+
+/// Hands on the number and the visibility of each row of a table, as it comes.
+fn each_row(
+    input: &mut impl BufRead,
+    mut answer: impl FnMut(usize, VisibilityQuery) -> Result<(), CommandError>,
+) -> Result<(), CommandError> {
+    let of_input = |fault: TableFault| format!("standard input, {fault}");
+    let header = |number, names: &str| {
+        let columns = Columns::new(number, names, Separator::Sign(','))?;
+        let places = columns.places(COLUMNS, "t_s,i,j,freq_hz")?;
+        Ok((columns, places))
+    };
+    let mut table = None;
+    for number in 1.. {
+        let Some(line) = next_line(input, number)? else { break };
+        let line = if number == 1 { without_mark(&line) } else { &line };
+        if without_cells(line) {
+            continue;
+        }
+        let Some((columns, places)) = &table else {
+            table = Some(header(number, line).map_err(of_input)?);
+            continue;
+        };
+        let query = columns.row(number, line).and_then(|row| query(&row, *places));
+        answer(number, query.map_err(of_input)?)?;
+    }
+    if table.is_none() {
+        header(1, "").map_err(of_input)?;
+    }
+    Ok(())
 }
 
 impl PredictArgs {
@@ -143,8 +165,10 @@ impl PredictArgs {
 fn query(row: &Row<'_>, [t_s, i, j, freq_hz]: [usize; 4]) -> Result<VisibilityQuery, TableFault> {
     let number = |place| row.number(place, |_| true, "a number");
     let satellite = |place| row.cell(place).parse().map_err(|_| row.fault(place, "a satellite's number"));
-    let pair = Pair::from_one_based(satellite(i)?, satellite(j)?);
-    let pair = pair.map_err(|_| row.fault(j, &format!("1 <= i < j <= {MAX_SATELLITES}")))?;
+    let [one, other] = [satellite(i)?, satellite(j)?];
+    let expected = || format!("1 <= i < j <= {MAX_SATELLITES}");
+    let pair = Pair::from_one_based(one, other)
+        .map_err(|_| row.fault_of(format!("i = {one}, j = {other}"), &expected()))?;
     Ok(VisibilityQuery { t_s: number(t_s)?, pair, freq_hz: number(freq_hz)? })
 }
 
@@ -162,4 +186,47 @@ fn check(array: &Array, query: VisibilityQuery) -> Result<(), String> {
         return Err(format!("freq_hz = {found}: expected {}", band_text(BAND_HZ)));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rows(text: &str) -> Result<Vec<(usize, f64, String, f64)>, String> {
+        let mut found = Vec::new();
+        let read = each_row(&mut text.as_bytes(), |number, query| {
+            found.push((number, query.t_s, query.pair.to_string(), query.freq_hz));
+            Ok(())
+        });
+        read.map(|()| found).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn rows_are_of_columns_by_name_and_faults_are_told() {
+        let text = "\u{feff}# pairs\r\n\r\nfreq_hz,j,note,i,t_s\r\n3e6,2,\"a, b\",1,5\r\n# later\r\n,,,,\r\n1e7,3,,2,-6\r\n";
+        assert_eq!(rows(text), Ok(vec![(4, 5.0, "1-2".into(), 3e6), (7, -6.0, "2-3".into(), 1e7)]));
+        assert_eq!(rows("\u{feff}t_s,i,j,freq_hz\n"), Ok(vec![]));
+        for (text, told) in [
+            ("", "standard input, line 1: found the columns \"\"; expected t_s,i,j,freq_hz"),
+            (
+                "t_s,i,j,freq_hz\n0,0,2,3e6\n",
+                "standard input, line 2: found i = 0, j = 2; expected 1 <= i < j <= 64",
+            ),
+            (
+                "t_s,i,j,freq_hz\n\n0,3,3,3e6\n",
+                "standard input, line 3: found i = 3, j = 3; expected 1 <= i < j <= 64",
+            ),
+            (
+                "t_s,i,j,freq_hz\n0,x,2,3e6\n",
+                "standard input, line 2: found \"x\" as i; expected a satellite's number",
+            ),
+            (
+                "t_s,i,j,freq_mhz\n0,1,2,3\n",
+                "standard input, line 1: found the column \"freq_mhz\"; \
+                 expected its values as freq_hz, or another name if they mean something else",
+            ),
+        ] {
+            assert_eq!(rows(text), Err(told.to_owned()), "{text}");
+        }
+    }
 }

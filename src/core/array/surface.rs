@@ -206,7 +206,17 @@ mod tests {
         };
         let text = "# South of Ingenii\nlatitude_deg, longitude_deg, height_m\n-30,170,0\n-30,170.004,12\n-29.994,170,-4\n";
         assert_eq!(of_file(text).unwrap(), Array::new(&far_side("2030-01-01T00:00:00")).unwrap());
+        // As spreadsheets leave it: a mark, quotes, other line ends, empty cells.
+        let text = "\u{feff}\"longitude_deg\",latitude_deg,height_m,name,\r\n170,-30,0,\"A, B\",\r\n170.004,\"-30\",12,,,,\r\n\
+                    170,-29.994,-4\r\n,,,,\r\n";
+        assert_eq!(of_file(text).unwrap(), Array::new(&far_side("2030-01-01T00:00:00")).unwrap());
         for (text, told) in [
+            ("longitude_deg,latitude_deg\n1,2\n3,4,5\n", "line 3: found 3 cells; expected 2"),
+            ("longitude_deg,latitude_deg\n1,\"2\n3,4\n5,6\n", "line 2: found a quote that is not closed"),
+            (
+                "longitude_deg,latitude_deg,Height (m)\n1,2,3\n",
+                "\"Height (m)\"; expected its values as height_m",
+            ),
             ("lat,lon\n1,2\n", "found the columns \"lat, lon\""),
             ("longitude_deg,latitude_deg\n1,2\n3,x\n", "line 3: found \"x\" as latitude_deg"),
             (

@@ -19,4 +19,6 @@ pub use atomic::{
 pub use folder_lock::FolderLock;
 pub use form::{form_of, form_with_remedy, text_of};
 pub use protected::{ProtectedInputs, require_replaceable};
-pub use table::{Columns, Row, Separator, TableFault, is_comment, numbered_lines};
+pub use table::{
+    Columns, Row, Separator, TableFault, is_comment, numbered_lines, without_cells, without_mark,
+};

@@ -12,12 +12,6 @@ const COLUMNS_MAX: usize = 10_000;
 /// Longest list of names that a message repeats, characters.
 const NAMES_CHARS_MAX: usize = 200;
 
-/// Units that end the names of columns.
-const UNITS: [&str; 19] = [
-    "deg", "rad", "arcmin", "arcsec", "hours", "m", "km", "cm", "mm", "hz", "khz", "mhz", "ghz", "s", "ms",
-    "us", "ns", "min", "d",
-];
-
 /// What is wrong in a table, and where.
 #[derive(Clone, Debug, Error, PartialEq, Eq)]
 #[error("line {line}: found {found}; expected {expected}")]
@@ -62,21 +56,21 @@ impl Separator {
         let mut rest = Some(line);
         std::iter::from_fn(move || {
             loop {
-                let (cell, was_quoted, after) = self.first_cell(rest?);
+                let (cell, quotes, after) = self.first_cell(rest?);
                 rest = after;
-                if was_quoted || !cell.is_empty() || matches!(self, Self::Sign(_)) {
+                if quotes != Quotes::None || !cell.is_empty() || matches!(self, Self::Sign(_)) {
                     return Some(cell);
                 }
             }
         })
     }
 
-    /// The first cell, whether it has quotes, and what is behind its separator.
-    fn first_cell(self, text: &str) -> (Cow<'_, str>, bool, Option<&str>) {
+    /// The first cell, its quotes, and what is behind its separator.
+    fn first_cell(self, text: &str) -> (Cow<'_, str>, Quotes, Option<&str>) {
         let text = text.trim_start_matches(|c: char| c.is_whitespace() && !self.is(c));
         let Some(quoted) = text.strip_prefix('"') else {
             let (cell, rest) = text.split_at(text.find(|c| self.is(c)).unwrap_or(text.len()));
-            return (Cow::Borrowed(cell.trim_end()), false, behind_first(rest));
+            return (Cow::Borrowed(cell.trim_end()), Quotes::None, behind_first(rest));
         };
         let (mut cell, mut is_within, mut letters) = (String::new(), true, quoted.char_indices().peekable());
         while let Some((at, c)) = letters.next() {
@@ -87,12 +81,29 @@ impl Separator {
                 }
                 '"' if is_within => is_within = false,
                 c if !is_within && self.is(c) => {
-                    return (Cow::Owned(cell.trim().to_owned()), true, behind_first(&quoted[at..]));
+                    return (Cow::Owned(cell.trim().to_owned()), Quotes::Closed, behind_first(&quoted[at..]));
                 }
                 c => cell.push(c),
             }
         }
-        (Cow::Owned(cell.trim().to_owned()), true, None)
+        (Cow::Owned(cell.trim().to_owned()), if is_within { Quotes::Open } else { Quotes::Closed }, None)
+    }
+
+    /// That every quote of a line of this number is closed.
+    ///
+    /// # Errors
+    /// A quote that is not.
+    pub fn require_closed(self, line: usize, text: &str) -> Result<(), TableFault> {
+        let mut rest = text.contains('"').then_some(text);
+        while let Some(text) = rest {
+            let (_, quotes, after) = self.first_cell(text);
+            if quotes == Quotes::Open {
+                let (found, expected) = ("a quote that is not closed", "its end on the same line");
+                return Err(TableFault { line, found: found.to_owned(), expected: expected.to_owned() });
+            }
+            rest = after;
+        }
+        Ok(())
     }
 
     /// A finite number; with semicolons between cells, a comma may be the decimal point.
@@ -106,15 +117,36 @@ impl Separator {
     }
 }
 
+/// Quotes around a cell.
+#[derive(Clone, Copy, PartialEq)]
+enum Quotes {
+    None,
+    Closed,
+    /// Up to the end of the line.
+    Open,
+}
+
 /// What is behind the first character.
 fn behind_first(text: &str) -> Option<&str> {
     let mut letters = text.chars();
     letters.next().map(|_| letters.as_str())
 }
 
-/// Lines with their numbers, from 1, without blank ones and comments (`#`).
+/// Lines with their numbers, from 1, without a byte order mark and those [`without_cells`].
 pub fn numbered_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty() && !is_comment(line))
+    (1..).zip(without_mark(text).lines()).filter(|(_, line)| !without_cells(line))
+}
+
+/// A text without the byte order mark at its beginning.
+#[must_use]
+pub fn without_mark(text: &str) -> &str {
+    text.strip_prefix('\u{feff}').unwrap_or(text)
+}
+
+/// Whether a line is a comment (`#`), or its cells, between commas or blanks, are all empty.
+#[must_use]
+pub fn without_cells(line: &str) -> bool {
+    is_comment(line) || Separator::CommasOrBlanks.cells(line).all(|cell| cell.is_empty())
 }
 
 /// Whether a line is a comment (`#`).
@@ -130,15 +162,17 @@ pub struct Columns {
     pub names: Vec<String>,
     /// What separates cells.
     pub separator: Separator,
-    line: usize,
+    /// Number of the line of names.
+    pub line: usize,
 }
 
 impl Columns {
     /// Reads the line of names, of this number.
     ///
     /// # Errors
-    /// A line of too many names.
+    /// A line of too many names, or with a quote that is not closed.
     pub fn new(line: usize, names: &str, separator: Separator) -> Result<Self, TableFault> {
+        separator.require_closed(line, names)?;
         let names: Vec<String> = separator.cells(names).take(COLUMNS_MAX + 1).map(Cow::into_owned).collect();
         if names.len() > COLUMNS_MAX {
             let found = format!("more than {COLUMNS_MAX} columns");
@@ -147,31 +181,37 @@ impl Columns {
         Ok(Self { names, separator, line })
     }
 
-    /// The place of a column, if there is one of this name.
+    /// The place of the column of this very name, if there is one.
     ///
     /// # Errors
-    /// Several of this name, or one with the name but for its unit.
-    pub fn place(&self, name: &str) -> Result<Option<usize>, TableFault> {
-        let fault = |found: String, expected: &str| TableFault {
-            line: self.line,
-            found,
-            expected: expected.to_owned(),
-        };
+    /// Several of this name.
+    pub fn place_of_name(&self, name: &str) -> Result<Option<usize>, TableFault> {
         let mut places = (0..self.names.len()).filter(|place| self.names[*place] == name);
         let place = places.next();
-        if places.next().is_some() {
-            return Err(fault(format!("several columns {:?}", echo(name)), "one of each name"));
+        match places.next() {
+            Some(_) => Err(self.fault(format!("several columns {:?}", echo(name)), "one of each name")),
+            None => Ok(place),
         }
-        let split = |name: &'_ str| {
-            name.rsplit_once('_').filter(|(_, unit)| UNITS.contains(unit)).map(|(stem, _)| stem.to_owned())
-        };
-        let is_same = |other: &&String| split(other).is_some_and(|stem| split(name) == Some(stem));
-        match (place, self.names.iter().find(is_same)) {
-            (None, Some(other)) => {
-                Err(fault(format!("the column {:?}", echo(other)), &format!("its values as {name}")))
-            }
-            _ => Ok(place),
+    }
+
+    /// The place of a column, if there is one of this name or of one that may mean the same.
+    ///
+    /// # Errors
+    /// Several of this name; or none, but one whose first word is the same in capitals or small letters, as in another unit.
+    pub fn place(&self, name: &str) -> Result<Option<usize>, TableFault> {
+        let word = |name: &str| name.split(|c: char| !c.is_alphanumeric()).next().map(str::to_lowercase);
+        let place = self.place_of_name(name)?;
+        match self.names.iter().find(|other| place.is_none() && word(other) == word(name)) {
+            Some(other) => Err(self.fault(
+                format!("the column {:?}", echo(other)),
+                &format!("its values as {name}, or another name if they mean something else"),
+            )),
+            None => Ok(place),
         }
+    }
+
+    fn fault(&self, found: String, expected: &str) -> TableFault {
+        TableFault { line: self.line, found, expected: expected.to_owned() }
     }
 
     /// The places of columns that a table has to have.
@@ -190,14 +230,15 @@ impl Columns {
     #[must_use]
     pub fn unlike(&self, expected: &str) -> TableFault {
         let names = shortened(&self.names.join(", "), NAMES_CHARS_MAX);
-        TableFault { line: self.line, found: format!("the columns {names:?}"), expected: expected.to_owned() }
+        self.fault(format!("the columns {names:?}"), expected)
     }
 
     /// The cells of a line of this number.
     ///
     /// # Errors
-    /// More cells than columns; empty ones do not count.
+    /// More cells than columns (empty ones do not count), or a quote that is not closed.
     pub fn row<'a>(&'a self, line: usize, text: &'a str) -> Result<Row<'a>, TableFault> {
+        self.separator.require_closed(line, text)?;
         let mut rest = self.separator.cells(text);
         let cells: Vec<_> = rest.by_ref().take(self.names.len()).collect();
         let beyond = rest.enumerate().filter(|(_, cell)| !cell.is_empty()).last();
@@ -295,7 +336,7 @@ mod tests {
             ),
             (
                 found.place("c_deg").unwrap_err(),
-                "line 3: found the column \"c_rad\"; expected its values as c_deg",
+                "line 3: found the column \"c_rad\"; expected its values as c_deg, or another name if they mean something else",
             ),
             (
                 columns("a,a").place("a").unwrap_err(),
@@ -328,7 +369,37 @@ mod tests {
 
     #[test]
     fn blank_lines_and_comments_are_no_rows() {
-        let lines: Vec<_> = numbered_lines("# a\n\nb\n  # c\r\n d\n").collect();
-        assert_eq!(lines, [(3, "b"), (5, " d")]);
+        let lines: Vec<_> =
+            numbered_lines("\u{feff}# a\n\nb\n  # c\r\n d\n,, ,\r\n\"\", \n,\"\u{feff}\"\n").collect();
+        assert_eq!(lines, [(3, "b"), (5, " d"), (8, ",\"\u{feff}\"")]);
+        assert_eq!(numbered_lines("\u{feff}a,b").collect::<Vec<_>>(), [(1, "a,b")]);
+    }
+
+    #[test]
+    fn columns_that_may_mean_the_wanted_one_are_refused() {
+        let columns = |names: &str| Columns::new(2, names, Separator::Sign(',')).unwrap();
+        for other in ["height", "Height_m", "height_KM", "height_ft", "height (m)", "HEIGHT[m]", "height-m"] {
+            let told = columns(&format!("a,{other}")).place("height_m").unwrap_err().to_string();
+            assert!(told.starts_with(&format!(
+                "line 2: found the column {other:?}; expected its values as height_m"
+            )));
+        }
+        assert_eq!(columns("heights,above_height_m,,(m)").place("height_m"), Ok(None));
+        assert_eq!(columns("height_km,height_m").place("height_m"), Ok(Some(1)));
+        assert_eq!(columns("gain_db").place_of_name("gain"), Ok(None));
+    }
+
+    #[test]
+    fn quotes_are_closed_on_their_line() {
+        let comma = Separator::Sign(',');
+        let columns = Columns::new(1, "\"a\",b", comma).unwrap();
+        let told = "line 7: found a quote that is not closed; expected its end on the same line";
+        for text in ["1,\"2", "\"1,2", "\"1\"\",2", "\""] {
+            assert_eq!(columns.row(7, text).unwrap_err().to_string(), told, "{text}");
+            assert_eq!(Columns::new(7, text, comma).unwrap_err().to_string(), told, "{text}");
+        }
+        for text in ["\"1\",2", "12'3\",\"2\"", "\"\"\"\",\"\""] {
+            assert_eq!(columns.row(7, text).err(), None, "{text}");
+        }
     }
 }

@@ -112,6 +112,7 @@ impl Regulariser {
 pub(in crate::imaging) fn parse_power(text: &str) -> Result<(usize, Vec<f64>), String> {
     let (mut first, mut power_k2) = (0, Vec::new());
     for (number, line) in numbered_lines(text) {
+        Separator::CommasOrBlanks.require_closed(number, line).map_err(|fault| fault.to_string())?;
         let mut cells = Separator::CommasOrBlanks.cells(line);
         let [degree, power] = [cells.next(), cells.next()].map(Option::unwrap_or_default);
         let is_header = power_k2.is_empty() && degree.parse::<f64>().is_err();
@@ -149,6 +150,9 @@ mod tests {
     #[test]
     fn tables_are_parsed_or_the_bad_line_is_named() {
         assert_eq!(parse_power("l,power_k2\n0,3e9\n1, 2.5\n\n2\t1\n"), Ok((0, vec![3e9, 2.5, 1.0])));
+        // As spreadsheets leave it.
+        assert_eq!(parse_power("\u{feff}0,1\r\n1,2\r\n,\r\n , ,\r\n"), Ok((0, vec![1.0, 2.0])));
+        assert_eq!(parse_power("\u{feff}l,power_k2\n\"0\",1\n"), Ok((0, vec![1.0])));
         assert_eq!(parse_power("# from elsewhere\n0 1\n"), Ok((0, vec![1.0])));
         // As a map leaves it.
         assert_eq!(parse_power("# C_l\nl,power_k2,low_k2\n2,4,3\n3,2,1\n"), Ok((2, vec![4.0, 2.0])));
@@ -159,6 +163,7 @@ mod tests {
             ("0,1\n1,-1", "line 2: 1,-1"),
             ("0,inf", "line 1: 0,inf"),
             ("0,1\n1", "line 2: 1"),
+            ("\"0,1\n1,2", "line 1: found a quote that is not closed; expected its end on the same line"),
             ("0,1\none,1", "line 2: one,1"),
             ("2,1\n4,1", "line 2: 4,1"),
             // A degree after which there is no other number.

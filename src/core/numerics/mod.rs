@@ -1,4 +1,5 @@
-//! General mathematics: quadrature, interpolation, special functions, statistics, small dense matrices. Contains no physics and uses no other module of the crate.
+//! General mathematics: quadrature, interpolation, special functions, statistics, small dense matrices. Contains no physics and
+//! uses no other module of the crate.
 
 pub(crate) mod bessel;
 pub(crate) mod chebyshev;

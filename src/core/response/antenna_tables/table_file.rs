@@ -74,12 +74,15 @@ impl Places {
             FIELDS.join(", ")
         );
         let angles = columns.places(["frequency_hz", "theta_deg", "phi_deg"], &expected)?;
-        let fields: Vec<usize> =
-            FIELDS.iter().filter_map(|name| columns.place(name).transpose()).collect::<Result<_, _>>()?;
-        let values = match (fields[..].try_into(), columns.place("gain")?, columns.place("gain_db")?) {
-            (Ok(fields), None, None) => ValuePlaces::Fields(fields),
-            (Err(_), Some(gain), _) => ValuePlaces::Gain(gain),
-            (Err(_), None, Some(gain_db)) => ValuePlaces::GainDb(gain_db),
+        let fields: Vec<usize> = FIELDS
+            .iter()
+            .filter_map(|name| columns.place_of_name(name).transpose())
+            .collect::<Result<_, _>>()?;
+        let gains = [columns.place_of_name("gain")?, columns.place_of_name("gain_db")?];
+        let values = match (&fields[..], gains) {
+            (&[a, b, c, d], [None, None]) => ValuePlaces::Fields([a, b, c, d]),
+            ([], [Some(gain), None]) => ValuePlaces::Gain(gain),
+            ([], [None, Some(gain_db)]) => ValuePlaces::GainDb(gain_db),
             _ => return Err(columns.unlike(&expected)),
         };
         Ok(Self { angles, dipole: columns.place("dipole")?, values })

@@ -203,6 +203,9 @@ fn what_is_no_dipole_is_refused() {
         (format!("{HEADER}{poles}"), "40 directions that are uneven"),
         (format!("{HEADER}{}\n", "9".repeat(10_000)), "... (10000 bytes)"),
         (format!("{}\n", "x".repeat(10_000)), "xxx... (10000 bytes)"),
+        ("frequency_hz,theta_deg,phi_deg,gain,gain_db\n".to_owned(), "and either gain, gain_db or"),
+        ("frequency_hz,theta_deg,phi_deg,gain,e_phi_re\n".to_owned(), "and either gain, gain_db or"),
+        (HEADER.replace("dipole", "Dipole"), "found the column \"Dipole\"; expected its values as dipole"),
         (HEADER.to_owned(), "no directions"),
         (String::new(), "no lines"),
         (

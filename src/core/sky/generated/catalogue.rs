@@ -10,7 +10,7 @@ use super::column_units::{
     FLUX_WORDS, POSITION_WORDS, angle_deg, flux_jy, in_comments, is_unit, require_unit,
 };
 use super::columns::{SourceColumns, normalise};
-use crate::files::{Columns, Row, Separator, TableFault, is_comment, read_file, text_of};
+use crate::files::{Columns, Row, Separator, TableFault, is_comment, read_file, text_of, without_cells};
 use crate::sky::Frame;
 use crate::sky::frame::rotate;
 use crate::units::vector::Vec3;
@@ -185,15 +185,14 @@ impl Reader<'_> {
     fn read(&self) -> Result<Catalogue, CatalogueError> {
         let text = self.text()?;
         let table = self.table(&text)?;
-        let comments = text.lines().take_while(|line| line.trim().is_empty() || is_comment(line));
+        let comments = text.lines().take_while(|line| without_cells(line));
         let name = self.path.file_name().unwrap_or_default().to_string_lossy();
         let is_vlssr =
             comments.clone().chain([&*name]).any(|text| text.to_ascii_lowercase().contains("vlss"));
         let columns = SourceColumns::recognise(&table.columns.names, is_vlssr).map_err(|expected| {
             let names: Vec<String> =
                 table.columns.names.iter().take(40).map(|name| displayed(name)).collect();
-            let first = table.rows.first().map_or(1, |(line, _)| line.saturating_sub(1).max(1));
-            self.content_error(first, format!("the columns {}", names.join(", ")), expected)
+            self.content_error(table.columns.line, format!("the columns {}", names.join(", ")), expected)
         })?;
         if columns.frame == Frame::Equatorial
             && !columns.places.iter().flatten().any(|place| table.columns.names[*place].contains("2000"))
@@ -240,13 +239,17 @@ impl Reader<'_> {
             let name = &table.columns.names[place];
             if table.columns.names.iter().filter(|other| *other == name).count() > 1 {
                 let found = format!("several columns `{}`", displayed(name));
-                return Err(self.content_error(1, found, "one of each name"));
+                return Err(self.content_error(table.columns.line, found, "one of each name"));
             }
         }
         let refuse = |(name, _): &(&str, Vec<String>), expected| {
             let name = displayed(name);
             move |unit: String| {
-                self.content_error(1, format!("the unit `{}` of `{name}`", displayed(&unit)), expected)
+                self.content_error(
+                    table.columns.line,
+                    format!("the unit `{}` of `{name}`", displayed(&unit)),
+                    expected,
+                )
             }
         };
         let angle = |places: &[usize], hours: Option<f64>, expected| match *places {
@@ -279,7 +282,7 @@ impl Reader<'_> {
                 let expected =
                     format!("the unit of `{}`, in place of which it is used", displayed(of_flux.0));
                 return Err(self.content_error(
-                    1,
+                    table.columns.line,
                     format!("another unit of `{}`", displayed(column.0)),
                     expected,
                 ));
@@ -313,13 +316,16 @@ impl Reader<'_> {
 
     /// Divides the text into names, units and rows. The names are the first line, or the last comment before numbers.
     fn table<'a>(&self, text: &'a str) -> Result<Table<'a>, CatalogueError> {
-        let (mut comment, mut comments) = (None, Vec::new());
-        let mut lines = (1..).zip(text.lines()).filter(|(_, text)| {
+        let (mut comment, mut comments, mut is_before) = (None, Vec::new(), true);
+        let mut lines = (1..).zip(text.lines()).filter(|(line, text)| {
             if is_comment(text) {
-                comment = Some(text.trim_start().trim_start_matches('#').trim());
-                comments.extend(comment);
+                let words = text.trim_start().trim_start_matches('#').trim();
+                comment = if is_before { Some((*line, words)) } else { comment };
+                comments.push(words);
             }
-            !is_comment(text) && !text.trim().is_empty()
+            let has_cells = !without_cells(text);
+            is_before &= !has_cells;
+            has_cells
         });
         let first = lines.next();
         let mut rest: Vec<(usize, &str)> = lines.collect();
@@ -330,9 +336,9 @@ impl Reader<'_> {
         let cells = |text: &str| separator.cells(text).map(Cow::into_owned).collect::<Vec<String>>();
         let is_data = |text: &str| separator.cells(text).any(|cell| cell.parse::<f64>().is_ok());
         let (line, names) = match (is_data(first), comment) {
-            (true, Some(comment)) => {
+            (true, Some(names)) => {
                 rest.insert(0, (line, first));
-                (line, comment)
+                names
             }
             _ => (line, first),
         };
@@ -341,7 +347,9 @@ impl Reader<'_> {
         let mut units = vec![String::new(); columns.names.len()];
         let has_units = rest.first().is_some_and(|(_, text)| is_unit_row(&cells(text)));
         if has_units {
-            let found = cells(rest.remove(0).1);
+            let (line, text) = rest.remove(0);
+            separator.require_closed(line, text).map_err(|fault| self.table_error(fault))?;
+            let found = cells(text);
             units.iter_mut().zip(found).for_each(|(unit, found)| *unit = found);
         }
         rest.retain(|(_, text)| !is_rule(text));
@@ -418,7 +426,7 @@ fn old_equinox<'a>(
     };
     let in_names = columns.places.iter().flatten().any(|place| table.columns.names[*place].contains("1950"));
     let in_comments = comments.zip(1..).find(|(line, _)| is_old_comment(line)).map(|(_, line)| line);
-    in_comments.or(in_names.then_some(1)).or_else(in_rows)
+    in_comments.or(in_names.then_some(table.columns.line)).or_else(in_rows)
 }
 
 /// Formats a cell for messages: short, and without control characters.

@@ -158,6 +158,17 @@ fn catalogues_that_are_none_say_where() {
     assert!(said(b"\x1f\x8b\x08").contains("gzip"));
     assert!(said(b"<?xml version='1.0'?><VOTABLE/>").contains("VOTable"));
     assert!(said(b"ra,dec,S74 (K)\n1,2,3\n").contains("the unit `k` of `S74 (K)`"));
+    // The names may be a comment.
+    assert!(said(b"# J2000\n# a,b\n1,2\n").contains("line 2: found the columns a, b"));
+    assert!(
+        said(b"# of 2020\n\n# ra,dec,S74,S74\n1,2,3,4\n# end\n").contains("line 3: found several columns")
+    );
+    assert!(said(b"# ra,dec,\"S74\n1,2,3\n").contains("line 1: found a quote that is not closed"));
+    assert!(
+        said(b"name,ra,dec,S74\n\"A\",1,2,3\n\"B,1,2,3\n")
+            .contains("line 3: found a quote that is not closed")
+    );
+    assert!(said(b"ra,dec,S74\n\"deg,deg,mJy\n1,2,3\n").contains("line 2: found a quote that is not closed"));
     // No sources, other line ends, cells beyond the names, and what no source has.
     assert!(said(b"ra,dec,S74\n").contains("no sources"));
     assert!(said(b"ra,dec,S74\r10,20,5\r11,21,x\r").contains("line 3: found \"x\" as S74"));
