@@ -27,6 +27,7 @@ impl RefinedProblem<'_> {
         let on_circle = PowerProblem {
             sums: circle,
             blocks,
+            coupling: None,
             degrees: &degrees,
             right: right.of_circle,
             // Of data that the circle does not fit and a prior that is not taken off: where rounds begin, the noise is too large.

@@ -23,6 +23,7 @@ mod beams;
 mod blocks;
 mod checkpoint;
 mod cost;
+mod coupling;
 mod coverage;
 mod exact;
 mod grid;

@@ -131,7 +131,8 @@ pub(super) fn power_of_data(
     let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let problem = PowerProblem { sums, blocks: &blocks, degrees: &degrees, right, power, numbers };
+    let problem =
+        PowerProblem { sums, blocks: &blocks, coupling: None, degrees: &degrees, right, power, numbers };
     Ok(Regulariser::Wiener(problem.solve(None, rule, watch)?.power.over_noise_k2()))
 }
 
@@ -159,6 +160,7 @@ fn solve_with_power(
     let problem = PowerProblem {
         sums,
         blocks: &blocks,
+        coupling: None,
         degrees: &degrees,
         right: &right,
         power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),

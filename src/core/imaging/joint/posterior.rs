@@ -7,11 +7,11 @@ use serde::Serialize;
 use super::powers::{PowerAgreement, PowerPriors, PowerRows, WeightedRows};
 use super::prior::{FREE, Prior, View};
 use super::spectrum::{SpectralMaps, SpectrumFit};
-use super::sums::{JointSums, ScaledBlocks, joint_blocks, scaled_blocks};
+use super::sums::{JointSums, ScaledBlocks, joint_blocks, joint_coupling, scaled_blocks};
 use crate::imaging::SolveError;
 use crate::imaging::circle::{NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
 use crate::imaging::power::{
-    Block, Factors, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE, SkyPower,
+    Block, Coupling, Factors, PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE, SkyPower,
 };
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{Convergence, NamedWatch, StoppingRule, System, dot};
@@ -107,25 +107,37 @@ pub struct Agreement {
     pub strain: f64,
 }
 
-/// Sums and scaled blocks of all channels with the weights of their powers, and a solution from which to begin.
-type WeightedEquations<'a> = (JointSums<'a>, Vec<ScaledBlocks>, Option<Vec<f64>>);
+/// Sums of all channels with the weights of their powers, what preconditions them, and a solution from which to begin.
+type WeightedEquations<'a> = (JointSums<'a>, Approximation, Option<Vec<f64>>);
+
+/// The scaled blocks, and what couples them in the unknowns of the prior.
+pub(super) struct Approximation {
+    pub(super) scaled: Vec<ScaledBlocks>,
+    pub(super) coupling: Coupling,
+}
 
 /// The sums of all channels with their blocks.
 pub(super) struct Equations<'a> {
     pub(super) prior: &'a Prior,
     pub(super) sums: &'a [&'a (dyn NormalSums + Sync)],
     pub(super) blocks: &'a [Vec<Block<'a>>],
+    /// What couples the blocks of each channel.
+    pub(super) couplings: Vec<Option<&'a Coupling>>,
     pub(super) noise_factors: &'a [f64],
 }
 
 impl<'a> Equations<'a> {
-    fn joint(&self, powers: Vec<Option<WeightedRows<'a>>>) -> (JointSums<'a>, Vec<ScaledBlocks>) {
+    pub(super) fn joint(&self, powers: Vec<Option<WeightedRows<'a>>>) -> (JointSums<'a>, Approximation) {
         let power_blocks: Vec<_> =
             powers.iter().map(|powers| powers.as_ref().map(WeightedRows::blocks)).collect();
         let scaled = scaled_blocks(self.prior, self.blocks, self.noise_factors, &power_blocks);
+        let of_powers = powers.iter().zip(&power_blocks);
+        let of_powers: Vec<Option<Coupling>> =
+            of_powers.map(|(powers, blocks)| Some(powers.as_ref()?.coupling(blocks.as_ref()?))).collect();
+        let coupling = joint_coupling(self.prior, &self.couplings, self.noise_factors, &of_powers);
         (
             JointSums::new(self.prior, self.sums.to_vec(), self.noise_factors.to_vec()).with_powers(powers),
-            scaled,
+            Approximation { scaled, coupling },
         )
     }
 
@@ -138,12 +150,12 @@ impl<'a> Equations<'a> {
     ) -> Result<WeightedEquations<'a>, SolveError> {
         let weighted =
             |rows: &'a Option<PowerRows>| rows.as_ref().map(|rows| rows.weighted(&rows.measured(), 1.0));
-        let (mut joint, mut scaled) = self.joint(rows.iter().map(weighted).collect());
+        let (mut joint, mut approximation) = self.joint(rows.iter().map(weighted).collect());
         let mut start = None;
         let rounds = if rows.iter().any(Option::is_some) { ROUNDS } else { 0 };
         let request = JointRequest { samples: 0, ..request.clone() };
         for _ in 0..rounds {
-            let posterior = Posterior::new(&joint, &scaled, &request, start.as_deref(), watch)?;
+            let posterior = Posterior::new(&joint, &approximation, &request, start.as_deref(), watch)?;
             let weighted = |(channel, rows): (usize, &'a Option<PowerRows>)| {
                 let (rows, before) = (rows.as_ref()?, joint.powers(channel)?);
                 let x = posterior.coefficients(&self.prior.view_of(channel), &posterior.solution);
@@ -153,9 +165,9 @@ impl<'a> Equations<'a> {
             };
             let next = self.joint(rows.iter().enumerate().map(weighted).collect());
             start = Some(posterior.solution);
-            (joint, scaled) = next;
+            (joint, approximation) = next;
         }
-        Ok((joint, scaled, start))
+        Ok((joint, approximation, start))
     }
 }
 
@@ -173,15 +185,15 @@ pub(super) struct Posterior<'a> {
 impl<'a> Posterior<'a> {
     pub(super) fn new(
         sums: &'a JointSums<'a>,
-        scaled: &[ScaledBlocks],
+        approximation: &Approximation,
         request: &JointRequest,
         start: Option<&[f64]>,
         watch: NamedWatch<'_>,
     ) -> Result<Self, SolveError> {
-        let blocks = joint_blocks(sums.prior, scaled);
+        let blocks = joint_blocks(sums.prior, &approximation.scaled);
         let (offsets, count) = sums.prior.offsets();
         let unit = unit_regularisation(sums.prior);
-        let factors = Factors::new(&blocks, &unit);
+        let factors = Factors::coupled(&blocks, &approximation.coupling, &unit);
         let regularisation = Diagonal::Uniform(1.0);
         let precondition = |v: &mut [f64]| factors.solve(v);
         let system = System { sums, regularisation: regularisation.clone(), precondition: &precondition };

@@ -242,7 +242,7 @@ fn conditional(factor: &Mat<f64>, likeness: Correlation, channels_hz: &[f64], fr
 }
 
 /// Calls `take` with degree, order and part of each unknown of a map, in order.
-fn for_each_unknown(l_max: usize, take: &mut dyn FnMut(usize, usize, usize)) {
+pub(super) fn for_each_unknown(l_max: usize, take: &mut dyn FnMut(usize, usize, usize)) {
     for m in 0..=l_max {
         for l in m..=l_max {
             for part in 0..if m == 0 { 1 } else { 2 } {

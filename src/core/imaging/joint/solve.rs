@@ -10,7 +10,7 @@ use super::spectrum::SpectralMaps;
 use super::sums::{ScaledBlocks, joint_blocks, scaled_blocks};
 use crate::imaging::SolveError;
 use crate::imaging::circle::{HarmonicSums, OrderBlocks, degrees};
-use crate::imaging::power::{Block, FoundPower, PowerProblem, SkyPower, value};
+use crate::imaging::power::{Block, Coupling, FoundPower, PowerProblem, SkyPower, value};
 use crate::imaging::solver::{Convergence, NamedWatch, SolveWatch, StoppingRule};
 use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 
@@ -36,6 +36,7 @@ pub struct JointChannel {
     pub powers: Vec<PowerSample>,
     sums: HarmonicSums,
     blocks: OrderBlocks,
+    coupling: Option<Coupling>,
     alone: SingleChannel,
 }
 
@@ -52,10 +53,16 @@ impl JointChannel {
         watch: &SolveWatch,
     ) -> Result<Self, SolveError> {
         let blocks = sums.order_blocks();
+        let coupling = sums.coupling();
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
-        let alone =
-            SingleChannel::solve(&sums, &blocks.blocks(), rule, watch.named(&name).with_priority(true))?;
-        Ok(Self { frequency_hz, nside, powers, sums, blocks, alone })
+        let alone = SingleChannel::solve(
+            &sums,
+            &blocks.blocks(),
+            coupling.as_ref(),
+            rule,
+            watch.named(&name).with_priority(true),
+        )?;
+        Ok(Self { frequency_hz, nside, powers, sums, blocks, coupling, alone })
     }
 
     /// Bytes of its sums, which are in memory unless they were moved to disk.
@@ -110,8 +117,9 @@ pub fn solve_jointly(
     request: &JointRequest,
     watch: &SolveWatch,
 ) -> Result<JointSolution, SolveError> {
-    // `Prior` needs decreasing l_max.
-    channels.sort_by(|a, b| b.l_max().cmp(&a.l_max()).then(a.frequency_hz.total_cmp(&b.frequency_hz)));
+    // `Prior` needs decreasing l_max. The unknowns of a channel are coupled up to the degree of those that follow, which is the smaller the
+    // lower the frequency.
+    channels.sort_by(|a, b| b.l_max().cmp(&a.l_max()).then(b.frequency_hz.total_cmp(&a.frequency_hz)));
     let all_hz: Vec<f64> = channels.iter().map(|channel| channel.frequency_hz).collect();
     let has_powers = channels.iter().any(|channel| !channel.powers.is_empty());
     request.check(&all_hz, has_powers)?;
@@ -132,9 +140,11 @@ pub fn solve_jointly(
     let rows = power_rows(&channels, request)?;
     let sums: Vec<&(dyn NormalSums + Sync)> =
         channels.iter().map(|channel| &channel.sums as &(dyn NormalSums + Sync)).collect();
-    let equations = Equations { prior: &prior, sums: &sums, blocks: &blocks, noise_factors: &noise_factors };
-    let (joint, scaled, start) = equations.with_powers(&rows, request, watch)?;
-    let posterior = Posterior::new(&joint, &scaled, request, start.as_deref(), watch)?;
+    let couplings = channels.iter().map(|channel| channel.coupling.as_ref()).collect();
+    let equations =
+        Equations { prior: &prior, sums: &sums, blocks: &blocks, couplings, noise_factors: &noise_factors };
+    let (joint, approximation, start) = equations.with_powers(&rows, request, watch)?;
+    let posterior = Posterior::new(&joint, &approximation, request, start.as_deref(), watch)?;
     let mut views = (0..prior.channels()).map(|channel| prior.view_of(channel)).collect::<Vec<View>>();
     for &at_hz in &request.at_hz {
         views.push(prior.view_at(at_hz)?);
@@ -184,6 +194,7 @@ impl SingleChannel {
     fn solve(
         sums: &HarmonicSums,
         blocks: &[Block<'_>],
+        coupling: Option<&Coupling>,
         rule: StoppingRule,
         watch: NamedWatch<'_>,
     ) -> Result<Self, SolveError> {
@@ -193,7 +204,7 @@ impl SingleChannel {
             return Err(SolveError::NoData);
         }
         let (right, numbers) = (sums.right_hand_side(), 2.0 * visibilities as f64);
-        let equations = PowerProblem { sums, blocks, degrees: &degrees, right, power, numbers };
+        let equations = PowerProblem { sums, blocks, coupling, degrees: &degrees, right, power, numbers };
         let FoundPower { solution, power, regularisation, .. } = equations.solve(None, rule, watch)?;
         let mut right = crate::imaging::power::multiply(blocks, &solution);
         for ((b, x), l) in right.iter_mut().zip(&solution).zip(&degrees) {

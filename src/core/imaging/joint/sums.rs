@@ -6,8 +6,8 @@ use faer::Mat;
 use rayon::prelude::*;
 
 use super::powers::WeightedRows;
-use super::prior::{Prior, index_of};
-use crate::imaging::power::Block;
+use super::prior::{Prior, for_each_unknown, index_of};
+use crate::imaging::power::{Block, Coupling};
 use crate::imaging::solver::add;
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
@@ -212,6 +212,69 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
     }
 }
 
+/// Maximum number of coupled unknowns, whose matrix takes 128 MB.
+const COUPLED_MAX: usize = 4000;
+
+/// What couples the blocks of [`joint_blocks`], from that of each channel's visibilities and powers: `sum_c T_c' E_c T_c`.
+pub(super) fn joint_coupling(
+    prior: &Prior,
+    visibilities: &[Option<&Coupling>],
+    noise_factors: &[f64],
+    powers: &[Option<Coupling>],
+) -> Coupling {
+    // Channel c depends on the unknowns of channels up to c.
+    let of_channel = |channel: usize| {
+        let both = visibilities[channel].into_iter().chain(&powers[channel]);
+        both.map(|coupling| coupling.degree_max).max().unwrap_or(0)
+    };
+    let of_unknowns = |channel: usize| (channel..prior.channels()).map(of_channel).max().unwrap_or(0);
+    let all: Vec<usize> = (0..prior.channels()).map(of_unknowns).collect();
+    let capped = |cap: usize| all.iter().map(|degree| *degree.min(&cap)).collect::<Vec<usize>>();
+    let highest = all.iter().copied().max().unwrap_or(0);
+    let degree_max = (0..=highest).rev().find(|cap| count_up_to(&capped(*cap)) <= COUPLED_MAX).unwrap_or(0);
+    // By channel the highest degree of its coupled unknowns, and the first of them.
+    let degrees = capped(degree_max);
+    let first: Vec<usize> = (0..degrees.len()).map(|a| count_up_to(&degrees[..a])).collect();
+    let (offsets, _) = prior.offsets();
+    let mut places = Vec::new();
+    for ((degree, l_max), offset) in degrees.iter().zip(&prior.l_max).zip(offsets) {
+        for_each_unknown(*degree, &mut |l, m, part| places.push(offset + index_of(*l_max, l, m, part)));
+    }
+    let mut matrix = Mat::<f64>::zeros(places.len(), places.len());
+    for channel in 0..prior.channels() {
+        let weighted = [(visibilities[channel], noise_factors[channel]), (powers[channel].as_ref(), 1.0)];
+        for (coupling, factor) in weighted {
+            let Some(coupling) = coupling else { continue };
+            let mut unknowns = Vec::new();
+            let highest = coupling.degree_max.min(degree_max);
+            for_each_unknown(highest, &mut |l, m, part| unknowns.push((l, m, part)));
+            let at = |degree: usize| {
+                unknowns.iter().map(move |(l, m, part)| index_of(degree, *l, *m, *part)).collect::<Vec<_>>()
+            };
+            let scale: Vec<f64> = unknowns.iter().map(|(l, ..)| prior.scale[channel][*l] / factor).collect();
+            let own = at(coupling.degree_max);
+            for a in 0..=channel {
+                for b in 0..=channel {
+                    let share = prior.share(channel, a) * prior.share(channel, b);
+                    let (rows, columns) = (at(degrees[a]), at(degrees[b]));
+                    for (j, column) in columns.iter().enumerate() {
+                        for (i, row) in rows.iter().enumerate() {
+                            matrix[(first[a] + row, first[b] + column)] +=
+                                share * scale[i] * coupling.matrix[(own[i], own[j])] * scale[j];
+                        }
+                    }
+                }
+            }
+        }
+    }
+    Coupling { degree_max, places, matrix }
+}
+
+/// The number of unknowns up to a degree for each channel, summed.
+fn count_up_to(degrees: &[usize]) -> usize {
+    degrees.iter().map(|degree| (degree + 1).pow(2)).sum()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -256,5 +319,47 @@ mod tests {
         for (a, b) in found.iter().zip(&expected) {
             assert!((a - b).abs() < 1e-12 * (1.0 + b.abs()), "{a} {b}");
         }
+    }
+
+    /// The form with the coupling is that of the channels' couplings with the skies of the unknowns, also where the number of unknowns is
+    /// limited.
+    #[test]
+    fn coupling_is_the_channels_couplings_between_t_and_its_transpose() {
+        let scale = vec![vec![1.0, 0.5, 0.3, 0.2], vec![2.0, 1.5, 0.7], vec![1.2, 0.9, 0.4]];
+        let likeness = Correlation { length: 2.0, own_share: 0.05 };
+        let prior = Prior::new(vec![10e6, 3e6, 5e6], scale, likeness).unwrap();
+        let factors = [1.0, 1.5, 1.2];
+        let of = |channel: usize, degree_max: usize| {
+            let count = (degree_max + 1).pow(2);
+            let element = |i: usize, j: usize| ((channel + 2) as f64 * (i + j) as f64).cos();
+            let mut places = Vec::new();
+            for_each_unknown(degree_max, &mut |l, m, part| {
+                places.push(index_of(prior.l_max[channel], l, m, part));
+            });
+            Coupling { degree_max, places, matrix: Mat::from_fn(count, count, element) }
+        };
+        let visibilities = [of(0, 2), of(1, 1)];
+        let of_visibilities = [Some(&visibilities[0]), Some(&visibilities[1]), None];
+        let powers = [None, None, Some(of(2, 1))];
+        let found = joint_coupling(&prior, &of_visibilities, &factors, &powers);
+        let (_, count) = prior.offsets();
+        let mut u = vec![0.0; count];
+        found.places.iter().for_each(|place| u[*place] = (0.9 * *place as f64).sin());
+        let form = |coupling: &Coupling, x: &[f64]| -> f64 {
+            let at = |k: usize| x[coupling.places[k]];
+            let row =
+                |i: usize| (0..coupling.places.len()).map(move |j| at(i) * coupling.matrix[(i, j)] * at(j));
+            (0..coupling.places.len()).flat_map(row).sum()
+        };
+        let skies = prior.skies(&u);
+        let expected = form(&visibilities[0], &skies[0])
+            + form(&visibilities[1], &skies[1]) / 1.5_f64.powi(2)
+            + form(powers[2].as_ref().unwrap(), &skies[2]);
+        assert!(
+            (form(&found, &u) - expected).abs() < 1e-11 * expected.abs(),
+            "{} {expected}",
+            form(&found, &u)
+        );
+        assert_eq!(found.places.len(), 9 + 4 + 4);
     }
 }

@@ -8,7 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::posterior::{Equations, JointRequest, Posterior};
 use super::powers::{PowerPriors, PowerRows, PowerSample};
-use super::prior::{Correlation, Prior, View, index_of};
+use super::prior::{Correlation, Prior, View, for_each_unknown, index_of};
 use super::solve::most_likely;
 use super::sums::{JointSums, scaled_blocks};
 use crate::imaging::SkyPower;
@@ -160,14 +160,19 @@ fn compare(
     let sums: Vec<&(dyn NormalSums + Sync)> =
         channels.iter().map(|dense| dense as &(dyn NormalSums + Sync)).collect();
     let weighted = powers.map(|rows| rows.weighted(&rows.measured(), 1.0));
-    let power_blocks = [weighted.as_ref().map(|powers| powers.blocks()), None];
-    let scaled = scaled_blocks(&prior, &blocks, &factors, &power_blocks);
-    let joint = JointSums::new(&prior, sums, factors).with_powers(vec![weighted, None]);
+    let equations = Equations {
+        prior: &prior,
+        sums: &sums,
+        blocks: &blocks,
+        couplings: vec![None, None],
+        noise_factors: &factors,
+    };
+    let (joint, approximation) = equations.joint(vec![weighted, None]);
     let rule = StoppingRule { residual_max: 1e-11, iterations_max: 500 };
     let samples = if powers.is_some() { 0 } else { 400 };
     let request = JointRequest { rule, samples, at_hz: Vec::new(), powers: None };
     let watch = SolveWatch::default();
-    let found = Posterior::new(&joint, &scaled, &request, None, watch.named("test")).unwrap();
+    let found = Posterior::new(&joint, &approximation, &request, None, watch.named("test")).unwrap();
     assert!(found.convergence.converged);
 
     let at_seven = prior.view_at(7e6).unwrap();
@@ -295,6 +300,38 @@ fn powers_with_free_gains_count_as_those_of_the_dense_matrices() {
     compare(&channels, Some(&rows), &[both, dense(3, 2)], 0.25);
 }
 
+/// Blocks and coupling of the powers make up their normal matrix.
+#[test]
+fn blocks_and_coupling_are_the_matrix_of_the_powers() {
+    let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.02, constant_k_sr: Vec::new() };
+    let sky = SkyPower { power_k2: vec![1.0; 5], sigma_ln: vec![], decided: vec![], noise_factor: 1.0 };
+    // All at one altitude, that of the blocks.
+    let at_one_altitude = |sample: PowerSample| PowerSample { r_m: scale(2.0e6, unit(sample.r_m)), ..sample };
+    let samples: Vec<PowerSample> = passes().into_iter().map(at_one_altitude).collect();
+    let rows = PowerRows::new(&samples, 1.7e6, &sky, &priors, 190.0).unwrap();
+    let weighted = rows.weighted(&rows.measured(), 1.0);
+    let blocks = weighted.blocks();
+    let coupling = weighted.coupling(&blocks);
+    let mut names = Vec::new();
+    for_each_unknown(4, &mut |l, m, part| names.push((l, m, part)));
+    assert_eq!((coupling.degree_max, coupling.places.len()), (4, names.len()));
+    for (j, (other, m_other, part_other)) in names.iter().enumerate() {
+        let expected =
+            weighted.product(&unit_vector(names.len(), index_of(4, *other, *m_other, *part_other)));
+        let largest = expected.iter().fold(0.0_f64, |a, b| a.max(b.abs()));
+        for (i, (l, m, part)) in names.iter().enumerate() {
+            let is_of_block = (m, part) == (m_other, part_other) && (l + other) % 2 == 0;
+            let of_block = match is_of_block {
+                true => blocks[2 * m + (l - m) % 2][((l - m) / 2, (other - m) / 2)],
+                false => 0.0,
+            };
+            let found = of_block + coupling.matrix[(i, j)];
+            // The products interpolate on a grid, which errs by 1e-4 at the highest degree.
+            assert!((found - expected[coupling.places[i]]).abs() < 1e-4 * largest, "{i} {j}: {found}");
+        }
+    }
+}
+
 /// The agreement is that of the dense covariance, and powers are averaged while the Moon turns little.
 #[test]
 fn powers_are_averaged_and_split_into_passes() {
@@ -371,13 +408,21 @@ fn errors_of_the_mean_hold_with_unknown_gains() {
             let rows = [PowerRows::new(&samples, 1.7e6, &sky, &priors, 0.0)];
             let blocks = [order_blocks(&dense, 4)];
             let sums: [&(dyn NormalSums + Sync); 1] = [&dense];
-            let equations = Equations { prior: &prior, sums: &sums, blocks: &blocks, noise_factors: &[1.0] };
+            let equations = Equations {
+                prior: &prior,
+                sums: &sums,
+                blocks: &blocks,
+                couplings: vec![None],
+                noise_factors: &[1.0],
+            };
             let rule = StoppingRule { residual_max: 1e-8, iterations_max: 500 };
             let request = JointRequest { rule, samples: 0, at_hz: Vec::new(), powers: None };
             let watch = SolveWatch::default();
-            let (joint, scaled, start) = equations.with_powers(&rows, &request, watch.named("test")).unwrap();
+            let (joint, approximation, start) =
+                equations.with_powers(&rows, &request, watch.named("test")).unwrap();
             let found =
-                Posterior::new(&joint, &scaled, &request, start.as_deref(), watch.named("test")).unwrap();
+                Posterior::new(&joint, &approximation, &request, start.as_deref(), watch.named("test"))
+                    .unwrap();
             let variance = dense_precision(&joint).llt(Side::Lower).unwrap().inverse()[(0, 0)];
             (found.coefficients(&prior.view_of(0), &found.solution)[0] - x[0]) / (scale[0] * variance.sqrt())
         })

@@ -118,6 +118,7 @@ impl Problem<'_> {
         let problem = PowerProblem {
             sums: projected,
             blocks: self.blocks,
+            coupling: None,
             degrees: &degrees,
             right: &projected.right,
             power: counts.power - self.predicted_power()?,

@@ -62,6 +62,7 @@ pub fn solve_pixels_with_power(
     let problem = PowerProblem {
         sums,
         blocks: &blocks,
+        coupling: None,
         degrees: &degrees,
         right: &right,
         power: power - predicted,

@@ -1,6 +1,7 @@
 //! A block-diagonal normal matrix, or the block-diagonal approximation of one that it preconditions.
 
 use std::borrow::Cow;
+use std::collections::HashMap;
 
 use faer::linalg::solvers::{DenseSolveCore, Llt, Solve};
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
@@ -30,10 +31,37 @@ pub(super) struct Evidence {
     pub(super) fisher: Mat<f64>,
 }
 
+/// Elements of the matrix that couple unknowns of different blocks.
+#[derive(Clone, Debug)]
+pub(in crate::imaging) struct Coupling {
+    /// Highest degree of the coupled unknowns.
+    pub(in crate::imaging) degree_max: usize,
+    /// Indices of the unknowns, with all parts of a row of a block or none.
+    pub(in crate::imaging) places: Vec<usize>,
+    /// What the blocks lack, in this order.
+    pub(in crate::imaging) matrix: Mat<f64>,
+}
+
 /// Cholesky factors of the blocks plus R; `None` for a block that is not positive definite.
 pub(in crate::imaging) struct Factors<'a> {
     blocks: &'a [Block<'a>],
+    /// The order in which the rows of each block are eliminated.
+    orders: Vec<Vec<usize>>,
     factors: Vec<Option<Llt<f64>>>,
+    coupled: Option<Coupled>,
+}
+
+/// The factor of the coupling: with L of the blocks the whole is `L Q L'`, where Q is the identity but for the coupled unknowns.
+struct Coupled {
+    places: Vec<usize>,
+    factor: Llt<f64>,
+}
+
+impl Coupling {
+    /// The index of each coupled unknown in the matrix.
+    fn index_of(&self) -> HashMap<usize, usize> {
+        self.places.iter().enumerate().map(|(index, place)| (*place, index)).collect()
+    }
 }
 
 impl Block<'_> {
@@ -47,6 +75,13 @@ impl Block<'_> {
             matrix[(k, k)] += r[*l];
         }
         matrix.llt(Side::Lower).ok()
+    }
+
+    /// The block with its rows in another order, without its places.
+    fn in_order(&self, order: &[usize]) -> Block<'static> {
+        let matrix = Mat::from_fn(order.len(), order.len(), |i, j| self.matrix[(order[i], order[j])]);
+        let degrees = order.iter().map(|k| self.degrees[*k]).collect();
+        Block { matrix: Cow::Owned(matrix), degrees, places: Vec::new() }
     }
 
     fn gather(&self, unknowns: &[f64]) -> Mat<f64> {
@@ -151,41 +186,103 @@ fn block_evidence(block: &Block<'_>, knots: &Knots, r: &[f64], right: &[f64]) ->
 impl<'a> Factors<'a> {
     /// Factorises the blocks plus R by degree. A block that is not positive definite leaves its unknowns unchanged in solutions.
     pub(in crate::imaging) fn new(blocks: &'a [Block<'a>], r: &[f64]) -> Self {
-        Self { blocks, factors: blocks.par_iter().map(|block| block.factor(r)).collect() }
+        let orders = blocks.iter().map(|block| (0..block.order()).collect()).collect();
+        let factors = blocks.par_iter().map(|block| block.factor(r)).collect();
+        Self { blocks, orders, factors, coupled: None }
+    }
+
+    /// Factorises the blocks, what couples them, and R. If both together are not positive definite, the coupling is left out.
+    pub(in crate::imaging) fn coupled(blocks: &'a [Block<'a>], coupling: &Coupling, r: &[f64]) -> Self {
+        // What is coupled comes last, so that it is coupled by its own part of the factors alone.
+        let index_of = coupling.index_of();
+        let order = |block: &Block<'a>| {
+            let mut order: Vec<usize> = (0..block.order()).collect();
+            order.sort_by_key(|k| index_of.contains_key(&block.places[0][*k]));
+            order
+        };
+        let orders: Vec<Vec<usize>> = blocks.iter().map(order).collect();
+        let factor = |(block, order): (&Block<'a>, &Vec<usize>)| block.in_order(order).factor(r);
+        let factors = blocks.par_iter().zip(&orders).map(factor).collect();
+        let mut factors = Self { blocks, orders, factors, coupled: None };
+        factors.coupled = factors.couple(coupling);
+        factors
+    }
+
+    /// `Q = 1 + L^-1 E L^-t` of the coupled unknowns.
+    fn couple(&self, coupling: &Coupling) -> Option<Coupled> {
+        let index_of = coupling.index_of();
+        let mut matrix = coupling.matrix.clone();
+        for _ in 0..2 {
+            for ((block, order), factor) in self.blocks.iter().zip(&self.orders).zip(&self.factors) {
+                let lower = factor.as_ref()?.L();
+                let first = order.iter().position(|k| index_of.contains_key(&block.places[0][*k]));
+                let Some(first) = first else { continue };
+                let corner = lower.submatrix(first, first, order.len() - first, order.len() - first);
+                for places in &block.places {
+                    let rows: Vec<usize> = order[first..].iter().map(|k| index_of[&places[*k]]).collect();
+                    let mut values = Mat::from_fn(rows.len(), matrix.ncols(), |i, j| matrix[(rows[i], j)]);
+                    solve_lower_triangular_in_place(corner, values.as_mut(), Par::Seq);
+                    for j in 0..matrix.ncols() {
+                        rows.iter().enumerate().for_each(|(i, row)| matrix[(*row, j)] = values[(i, j)]);
+                    }
+                }
+            }
+            matrix = matrix.transpose().to_owned();
+        }
+        for k in 0..matrix.nrows() {
+            matrix[(k, k)] += 1.0;
+        }
+        Some(Coupled { places: coupling.places.clone(), factor: matrix.llt(Side::Lower).ok()? })
     }
 
     /// Applies `operation` to the unknowns of each block, in place.
     fn apply(&self, unknowns: &mut [f64], operation: &dyn Fn(&Llt<f64>, &mut Mat<f64>)) {
-        for (block, factor) in self.blocks.iter().zip(&self.factors) {
+        for ((block, order), factor) in self.blocks.iter().zip(&self.orders).zip(&self.factors) {
             let Some(factor) = factor else { continue };
-            let mut values = block.gather(unknowns);
+            let at = |k: usize, part: usize| block.places[part][order[k]];
+            let mut values = Mat::from_fn(order.len(), block.places.len(), |k, part| unknowns[at(k, part)]);
             operation(factor, &mut values);
-            for (part, places) in block.places.iter().enumerate() {
-                places.iter().enumerate().for_each(|(k, place)| unknowns[*place] = values[(k, part)]);
+            for part in 0..block.places.len() {
+                (0..order.len()).for_each(|k| unknowns[at(k, part)] = values[(k, part)]);
             }
         }
     }
 
+    /// Applies `operation` to the coupled unknowns, in place.
+    fn apply_coupled(&self, unknowns: &mut [f64], operation: &dyn Fn(&Llt<f64>, &mut Mat<f64>)) {
+        let Some(Coupled { places, factor }) = &self.coupled else { return };
+        let mut values = Mat::from_fn(places.len(), 1, |k, _| unknowns[places[k]]);
+        operation(factor, &mut values);
+        places.iter().enumerate().for_each(|(k, place)| unknowns[*place] = values[(k, 0)]);
+    }
+
     /// Solves for a vector of unknowns, in place.
     pub(in crate::imaging) fn solve(&self, unknowns: &mut [f64]) {
-        self.apply(unknowns, &|factor, values| factor.solve_in_place(values));
+        if self.coupled.is_none() {
+            return self.apply(unknowns, &|factor, values| factor.solve_in_place(values));
+        }
+        self.solve_lower(unknowns);
+        self.solve_upper(unknowns);
     }
 
     /// Solves with the lower factors, `L^-1 x`.
     pub(in crate::imaging) fn solve_lower(&self, unknowns: &mut [f64]) {
-        self.apply(unknowns, &|factor, values| {
-            solve_lower_triangular_in_place(factor.L(), values.as_mut(), Par::Seq);
-        });
+        self.apply(unknowns, &solve_lower);
+        self.apply_coupled(unknowns, &solve_lower);
     }
 
-    /// Solves with the upper factors, `L^-t x`. For standard normal x the result is a sample with the inverse of the blocks plus R as covariance.
+    /// Solves with the upper factors, `L^-t x`. For standard normal x the result is a sample whose covariance is the inverse of what was factorised.
     pub(in crate::imaging) fn solve_upper(&self, unknowns: &mut [f64]) {
-        self.apply(unknowns, &|factor, values| {
-            solve_upper_triangular_in_place(factor.L().transpose(), values.as_mut(), Par::Seq);
-        });
+        self.apply_coupled(unknowns, &solve_upper);
+        self.solve_upper_of_blocks(unknowns);
     }
 
-    /// The trace of the inverse of the blocks plus R, by degree.
+    /// Solves with the upper factors of the blocks alone.
+    pub(in crate::imaging) fn solve_upper_of_blocks(&self, unknowns: &mut [f64]) {
+        self.apply(unknowns, &solve_upper);
+    }
+
+    /// The trace of the inverse of the blocks plus R, by degree, without what couples them.
     pub(in crate::imaging) fn traces(&self, l_max: usize) -> Vec<f64> {
         let diagonal = |factor: &Option<Llt<f64>>| {
             factor.as_ref().map(|factor| {
@@ -195,20 +292,30 @@ impl<'a> Factors<'a> {
         };
         let diagonals: Vec<Option<Vec<f64>>> = self.factors.par_iter().map(diagonal).collect();
         let mut traces = vec![0.0; l_max + 1];
-        for (block, diagonal) in self.blocks.iter().zip(diagonals) {
-            for (l, term) in block.degrees.iter().zip(diagonal.unwrap_or_default()) {
-                traces[*l] += block.places.len() as f64 * term;
+        for ((block, order), diagonal) in self.blocks.iter().zip(&self.orders).zip(diagonals) {
+            for (k, term) in order.iter().zip(diagonal.unwrap_or_default()) {
+                traces[block.degrees[*k]] += block.places.len() as f64 * term;
             }
         }
         traces
     }
 
-    /// The values `v.(A + R)^-1 v` in one block for each column of `v`; zeros if the block has no factor.
+    /// The values `v.(A + R)^-1 v` in one block, without what couples it, for each column of `v`; zeros if the block has no factor.
     pub(in crate::imaging) fn quadratic_forms(&self, block: usize, mut v: Mat<f64>) -> Vec<f64> {
         let Some(Some(factor)) = self.factors.get(block) else { return vec![0.0; v.ncols()] };
+        let order = &self.orders[block];
+        v = Mat::from_fn(v.nrows(), v.ncols(), |k, column| v[(order[k], column)]);
         solve_lower_triangular_in_place(factor.L(), v.as_mut(), Par::Seq);
         (0..v.ncols()).map(|column| (0..v.nrows()).map(|k| v[(k, column)].powi(2)).sum()).collect()
     }
+}
+
+fn solve_lower(factor: &Llt<f64>, values: &mut Mat<f64>) {
+    solve_lower_triangular_in_place(factor.L(), values.as_mut(), Par::Seq);
+}
+
+fn solve_upper(factor: &Llt<f64>, values: &mut Mat<f64>) {
+    solve_upper_triangular_in_place(factor.L().transpose(), values.as_mut(), Par::Seq);
 }
 
 /// Multiplies a vector of unknowns by the blocks.

@@ -29,7 +29,7 @@ use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, Side};
 use serde::Serialize;
 
-pub(super) use blocks::{Block, Factors, multiply, value};
+pub(super) use blocks::{Block, Coupling, Factors, multiply, value};
 pub(super) use rounds::{FoundPower, MapsWithPower, PowerProblem};
 pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 

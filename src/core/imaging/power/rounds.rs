@@ -2,7 +2,7 @@
 
 use faer::Mat;
 
-use super::blocks::{Block, Factors};
+use super::blocks::{Block, Coupling, Factors};
 use super::knots::FREE;
 use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
 use super::{BlockData, PowerFit, SkyPower};
@@ -33,6 +33,8 @@ pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) sums: &'a dyn NormalSums,
     /// Blocks of the normal matrix, or of an approximation that preconditions it.
     pub(in crate::imaging) blocks: &'a [Block<'a>],
+    /// What couples the blocks, for preconditioning.
+    pub(in crate::imaging) coupling: Option<&'a Coupling>,
     pub(in crate::imaging) degrees: &'a [usize],
     pub(in crate::imaging) right: &'a [f64],
     /// `V'N^-1V` of the data.
@@ -75,6 +77,13 @@ impl FoundPower {
 impl PowerProblem<'_> {
     fn l_max(&self) -> usize {
         self.degrees.iter().copied().max().unwrap_or(0)
+    }
+
+    fn preconditioner(&self, r: &[f64]) -> Factors<'_> {
+        match self.coupling {
+            Some(coupling) => Factors::coupled(self.blocks, coupling, r),
+            None => Factors::new(self.blocks, r),
+        }
     }
 
     /// Estimates the power if the blocks are the whole normal matrix.
@@ -147,7 +156,7 @@ impl PowerProblem<'_> {
         loop {
             round += 1;
             let r = fit.regularisation();
-            let factors = Factors::new(self.blocks, &r);
+            let factors = self.preconditioner(&r);
             let regularisation = Diagonal::ByDegree(r.clone());
             let mut rule = rule;
             if is_early {
@@ -186,7 +195,7 @@ impl PowerProblem<'_> {
         watch: NamedWatch<'_>,
     ) -> Result<MapsWithPower, SolveError> {
         let found = self.solve(start.map(|[map, _]| map.as_slice()), rule, watch)?;
-        let factors = Factors::new(self.blocks, &found.regularisation);
+        let factors = self.preconditioner(&found.regularisation);
         let regularisation = Diagonal::ByDegree(found.regularisation.clone());
         let system = System { sums: self.sums, regularisation, precondition: &|v| factors.solve(v) };
         let noise = match start {

@@ -173,15 +173,13 @@ impl PosteriorPrecision<'_> {
             let products = self.products(&vectors);
             running.iter_mut().zip(products).for_each(|(sampler, product)| sampler.step(product));
         }
-        let upper = |mut vector: Vec<f64>| {
-            self.factors.solve_upper(&mut vector);
-            vector
-        };
         let finished = samplers.iter().zip(starts);
         finished
-            .map(|(sampler, start)| PosteriorSample {
-                exact: upper(sampler.sample()),
-                preconditioner: upper(start),
+            .map(|(sampler, mut start)| {
+                let mut exact = sampler.sample();
+                self.factors.solve_upper(&mut exact);
+                self.factors.solve_upper_of_blocks(&mut start);
+                PosteriorSample { exact, preconditioner: start }
             })
             .collect()
     }

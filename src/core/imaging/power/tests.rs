@@ -177,6 +177,67 @@ fn pairs(a: &Mat<f64>) -> Vec<Block<'static>> {
     (0..ORDER).step_by(2).map(of).collect()
 }
 
+/// The elements of `a` between the first `count` unknowns that its blocks of pairs lack.
+fn between_pairs(a: &Mat<f64>, count: usize) -> Coupling {
+    let element = |i: usize, j: usize| if i / 2 == j / 2 { 0.0 } else { a[(i, j)] };
+    Coupling { degree_max: 1, places: (0..count).collect(), matrix: Mat::from_fn(count, count, element) }
+}
+
+#[test]
+fn coupled_factors_are_those_of_the_whole_matrix() {
+    let a = random_normal(5, 2 * ORDER);
+    let r = vec![0.5; L_MAX + 1];
+    // Blocks of three pairs of unknowns that are not neighbours, of which some are coupled.
+    let mut blocks = pairs(&a);
+    blocks[0].places = vec![vec![3, 10]];
+    blocks[1].places = vec![vec![11, 0]];
+    blocks[5].places = vec![vec![1, 2]];
+    let coupled = [3, 11, 2];
+    let matrix = Mat::from_fn(3, 3, |i, j| if i == j { 0.3 } else { 0.2 * (1.0 + (i + j) as f64) });
+    let coupling = Coupling { degree_max: 1, places: coupled.to_vec(), matrix };
+    let mut whole = Mat::<f64>::zeros(ORDER, ORDER);
+    for block in &blocks {
+        for (i, row) in block.places[0].iter().enumerate() {
+            whole[(*row, *row)] += r[0];
+            block.places[0]
+                .iter()
+                .enumerate()
+                .for_each(|(j, column)| whole[(*row, *column)] += block.matrix[(i, j)]);
+        }
+    }
+    for (i, row) in coupled.iter().enumerate() {
+        coupled.iter().enumerate().for_each(|(j, column)| whole[(*row, *column)] += coupling.matrix[(i, j)]);
+    }
+    let inverse = whole.llt(Side::Lower).unwrap().inverse();
+    let factors = Factors::coupled(&blocks, &coupling, &r);
+    for k in 0..ORDER {
+        let unit: Vec<f64> = (0..ORDER).map(|j| f64::from(u8::from(j == k))).collect();
+        let [mut solved, mut halves] = [unit.clone(), unit];
+        factors.solve(&mut solved);
+        factors.solve_lower(&mut halves);
+        factors.solve_upper(&mut halves);
+        for j in 0..ORDER {
+            let tolerance = 1e-12 * (inverse[(j, j)] * inverse[(k, k)]).sqrt();
+            assert!((solved[j] - inverse[(j, k)]).abs() < tolerance, "{j} {k}: {}", solved[j]);
+            assert!((halves[j] - inverse[(j, k)]).abs() < tolerance, "{j} {k}: {}", halves[j]);
+        }
+    }
+}
+
+/// Without a factor, the blocks precondition alone.
+#[test]
+fn a_coupling_that_is_not_positive_definite_is_left_out() {
+    let a = random_normal(5, 2 * ORDER);
+    let (blocks, r) = (pairs(&a), vec![0.5; L_MAX + 1]);
+    let mut coupling = between_pairs(&a, 6);
+    coupling.matrix *= -1e6;
+    let right: Vec<f64> = (0..ORDER).map(|k| (0.7 * k as f64).sin()).collect();
+    let [mut found, mut expected] = [right.clone(), right];
+    Factors::coupled(&blocks, &coupling, &r).solve(&mut found);
+    Factors::new(&blocks, &r).solve(&mut expected);
+    assert!(found.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-12 * b.abs()));
+}
+
 #[test]
 fn samples_have_the_covariance_of_the_posterior() {
     const DRAWS: usize = 4000;
@@ -186,7 +247,7 @@ fn samples_have_the_covariance_of_the_posterior() {
     degrees().iter().enumerate().for_each(|(k, l)| whole[(k, k)] += r[*l]);
     let expected = whole.llt(Side::Lower).unwrap().inverse();
     let blocks = pairs(&a);
-    let factors = Factors::new(&blocks, &r);
+    let factors = Factors::coupled(&blocks, &between_pairs(&a, 20), &r);
     let sums = Dense::new(a, vec![0.0; ORDER]);
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
     let products = |x: &[&[f64]]| sums.apply_all(x);
@@ -225,6 +286,7 @@ fn intervals_have_the_stated_coverage() {
         let problem = PowerProblem {
             sums: &sums,
             blocks: &blocks,
+            coupling: None,
             degrees: &degrees,
             right: &right,
             power: 0.0,
@@ -266,6 +328,7 @@ fn without_data_the_power_is_the_prior_and_never_rises() {
     let problem = PowerProblem {
         sums: &sums,
         blocks: &blocks,
+        coupling: None,
         degrees: &degrees,
         right: &right,
         power: 0.0,
@@ -283,6 +346,7 @@ fn without_data_the_power_is_the_prior_and_never_rises() {
     let rounds = PowerProblem {
         sums: &sums,
         blocks: &blocks,
+        coupling: None,
         degrees: &degrees,
         right: &right,
         power: 0.0,
@@ -302,6 +366,7 @@ fn rounds_converge_to_the_result_of_the_exact_matrix() {
     let problem = |blocks| PowerProblem {
         sums: &sums,
         blocks,
+        coupling: None,
         degrees: &degrees,
         right: &right,
         power: 0.0,
@@ -336,8 +401,15 @@ fn an_intermediate_noise_map_is_as_exact_as_its_map() {
     let (degrees, blocks) = (degrees(), pairs(&a));
     let sums = Dense { noise: noise.clone(), ..Dense::new(a.clone(), right.clone()) };
     let (power, numbers) = (0.0, 1.0);
-    let problem =
-        PowerProblem { sums: &sums, blocks: &blocks, degrees: &degrees, right: &right, power, numbers };
+    let problem = PowerProblem {
+        sums: &sums,
+        blocks: &blocks,
+        coupling: None,
+        degrees: &degrees,
+        right: &right,
+        power,
+        numbers,
+    };
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 400 };
     let watch = SolveWatch::default();
     let maps = |is_final| {
@@ -409,7 +481,7 @@ fn the_power_is_at_most_what_the_data_may_come_from() {
     let sums = Dense::new(a.clone(), right.clone());
     let found = |right: &[f64], power: f64| {
         let (blocks, degrees, numbers) = (&blocks[..], &degrees[..], f64::INFINITY);
-        let problem = PowerProblem { sums: &sums, blocks, degrees, right, power, numbers };
+        let problem = PowerProblem { sums: &sums, blocks, coupling: None, degrees, right, power, numbers };
         problem.solve_blocks().unwrap().power.power_k2
     };
     let expected = |power: &[f64]| -> f64 {

@@ -161,6 +161,7 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
         let sought = PowerProblem {
             sums: &sums,
             blocks: &blocks,
+            coupling: None,
             degrees: &map_degrees,
             right: &right,
             power,

@@ -247,6 +247,35 @@ fn the_operator_is_symmetric() {
 ///
 /// The bound is the engine's error of interpolation between nodes (8e-5 in the mean over 600 rows) and of data kernels (1e-4); the forward
 /// operator has an error of 1e-5.
+/// Blocks and coupling make up the operator, from few times, so that what they average is uneven.
+#[test]
+fn blocks_and_coupling_are_the_operator() {
+    const LOW: usize = 6;
+    let sums = engine(&blocks(0, 3)).into_sums();
+    let coupling = sums.coupling_within(LOW, f64::INFINITY).unwrap();
+    let order_blocks = sums.order_blocks();
+    let unknowns = degrees(L_MAX).collect::<Vec<usize>>();
+    let low: Vec<usize> = (0..unknowns.len()).filter(|k| unknowns[*k] <= LOW).collect();
+    assert_eq!(low.len(), coupling.nrows());
+    let largest = order_blocks.diagonal(0);
+    let mut coupled: f64 = 0.0;
+    for (j, place) in low.iter().enumerate() {
+        let mut x = vec![0.0; unknowns.len()];
+        x[*place] = 1.0;
+        let mut expected: Vec<f64> = vec![0.0; unknowns.len()];
+        sums.apply(&x, &mut expected);
+        order_blocks.multiply(&mut x);
+        for (i, at) in low.iter().enumerate() {
+            let found: f64 = x[*at] + coupling[(i, j)];
+            coupled = coupled.max(coupling[(i, j)].abs() / largest);
+            // The accuracy of single-precision sums of some thousand weights.
+            assert!((found - expected[*at]).abs() < 1e-5 * largest, "{i} {j}: {found} {}", expected[*at]);
+        }
+    }
+    // Far more than the tolerance.
+    assert!(coupled > 0.1, "{coupled}");
+}
+
 #[test]
 fn data_is_projected_by_the_adjoint() {
     let blocks = blocks(0, 60);
