@@ -7,7 +7,9 @@
 //! A(l m, l' m') = sum_{mu mu'} d^l_{m mu} d^l'_{m' mu'} sum_{kk'} f_{l mu}^k f_{l' mu'}^k' w_kk'(m - m', mu - mu').
 //! ```
 //!
-//! Nodes far beyond those that see the degrees are left out: their part of the matrix stays averaged, so that both together remain positive.
+//! Nodes far beyond those that see the degrees are left out: there all but the averages is small.
+
+use std::ops::Range;
 
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 use num_complex::{Complex32, Complex64};
@@ -26,14 +28,14 @@ use crate::sky::harmonics::WignerTable;
 
 /// Degrees up to this multiple of `2 pi u` of the shortest baseline u are coupled: 25 for 100 m at 10 MHz.
 const SEEN: f64 = 1.2;
-/// Highest such degree; the time grows with its fifth power.
+/// Highest such degree; the time grows with its sixth power.
 const COUPLED_DEGREES: usize = 48;
 /// The same in units of l_max, so that it takes no longer than a few products.
 const COUPLED_SHARE: f64 = 0.3;
 /// Baselines that see a degree l have about l / (2 pi) wavelengths; those beyond this multiple are left out.
 const REACH: f64 = 2.0;
 
-/// Harmonics of the weights of the first nodes.
+/// Harmonics of the weights of some nodes.
 struct WeightHarmonics {
     /// Highest p and q.
     highest: usize,
@@ -45,16 +47,20 @@ struct WeightHarmonics {
 /// The patterns and rows of d of one order mu, from `-l_max` to `l_max`.
 struct OrderPattern {
     mu: i64,
-    /// f_{l mu} at the nodes, for l = |mu|, |mu| + 2, ..
+    /// f_{l mu} at these nodes, for l = |mu|, |mu| + 2, ..
     pattern: Mat<f32>,
     /// d^l_{m mu}, m = -l ..= l.
     rows: Vec<Vec<f64>>,
 }
 
 impl HarmonicSums {
-    /// What [`Self::order_blocks`] lack of BtN^-1B at the degrees that the shortest baselines see, where coverage is least even. `None` if the
-    /// sums could not be read.
+    /// What [`Self::order_blocks`] lack of BtN^-1B at the degrees that the shortest baselines see, where coverage is least even. `None` of a rank's share, if the sums could not be read, or
+    /// if no baseline is short enough for these degrees.
     pub(in crate::imaging) fn coupling(&self) -> Option<Coupling> {
+        // Of several ranks each has a part of the weights.
+        if self.grids.share.count > 1 {
+            return None;
+        }
         let shortest = self.grids.nodes.u(self.shared().reached.start + NODES / 2).max(0.0);
         let seen = (SEEN * std::f64::consts::TAU * shortest) as usize;
         let l_max = self.setup.l_max;
@@ -67,14 +73,14 @@ impl HarmonicSums {
 
     /// The coupling of all unknowns up to a degree, from nodes up to a baseline, wavelengths.
     pub(super) fn coupling_within(&self, l_max: usize, wavelengths: f64) -> Option<Mat<f64>> {
-        let nodes = &self.grids.nodes;
-        let first = self.shared().reached.start;
-        // At least the first few with data.
-        let reach = (0..nodes.count).take_while(|k| nodes.u(*k) <= wavelengths).count();
-        let count = reach.max(first + 2 * NODES).min(nodes.count);
-        let harmonics = WeightHarmonics::new(&self.grids, &self.tori, count, 2 * l_max)?;
+        let reached = self.shared().reached;
+        let nodes = reached.start..reached.end.min(self.grids.nodes_up_to(wavelengths));
+        if nodes.is_empty() {
+            return None;
+        }
         let wigner = WignerTable::new(l_max, self.setup.orbit.inclination_rad);
-        let orders = order_patterns(&self.operator().patterns, &wigner, l_max, count);
+        let orders = order_patterns(&self.operator().patterns, &wigner, l_max, &nodes);
+        let harmonics = WeightHarmonics::new(&self.grids, &self.tori, nodes, 2 * l_max)?;
         let of_difference = |p: usize| (p, difference_matrices(&orders, &harmonics, l_max, p));
         let all: Vec<_> = (0..=2 * l_max).into_par_iter().map(of_difference).collect();
         Some(real_matrix(l_max, &all))
@@ -82,10 +88,10 @@ impl HarmonicSums {
 }
 
 impl WeightHarmonics {
-    fn new(grids: &Grids, tori: &Tori, nodes: usize, highest: usize) -> Option<Self> {
+    fn new(grids: &Grids, tori: &Tori, nodes: Range<usize>, highest: usize) -> Option<Self> {
         let (points, count) = (grids.points, highest + 1);
         let node_len = NODES * 4 * count * count;
-        let mut sums = vec![0.0_f32; nodes * node_len];
+        let mut sums = vec![0.0_f32; nodes.len() * node_len];
         let transform = FftPlanner::<f32>::new().plan_fft_inverse(points);
         for block in (0..points.div_ceil(ALPHAS)).filter(|block| grids.share.holds(*block)) {
             let rows = tori.block(grids, TorusPart::Weights, block)?;
@@ -96,7 +102,7 @@ impl WeightHarmonics {
                     std::f64::consts::TAU * ((row % count * alphas[k]) % points) as f64 / points as f64;
                 if row < count { angle.cos() as f32 } else { angle.sin() as f32 }
             });
-            sums.par_chunks_exact_mut(node_len).enumerate().for_each(|(node, sums)| {
+            sums.par_chunks_exact_mut(node_len).zip(nodes.clone()).for_each(|(sums, node)| {
                 // `[diagonal][re, im][q]` by alpha.
                 let mut spectra = Mat::<f32>::zeros(NODES * 2 * count, alphas.len());
                 let mut line = vec![Complex32::ZERO; points];
@@ -125,7 +131,7 @@ impl WeightHarmonics {
                 }
             });
         }
-        Some(Self { highest, nodes, sums })
+        Some(Self { highest, nodes: nodes.len(), sums })
     }
 
     /// w(p, q) of a node and a diagonal, for p >= 0; zero for p = q = 0, which the blocks have.
@@ -151,14 +157,16 @@ fn order_patterns(
     patterns: &FilteredPatterns,
     wigner: &WignerTable,
     l_max: usize,
-    nodes: usize,
+    nodes: &Range<usize>,
 ) -> Vec<OrderPattern> {
     let stride = 2 * patterns.grid.count;
     let of_order = |mu: i64| {
         let order = mu.unsigned_abs() as usize;
         let all = patterns.order(order);
         let sign = usize::from(mu < 0);
-        let pattern = Mat::from_fn(nodes, degree_count(l_max, order), |k, i| all[i * stride + 2 * k + sign]);
+        let pattern = Mat::from_fn(nodes.len(), degree_count(l_max, order), |k, i| {
+            all[i * stride + 2 * (nodes.start + k) + sign]
+        });
         let mut rows = Vec::new();
         let mut every = wigner.rows(order);
         while let Some((l, row)) = every.next_row() {

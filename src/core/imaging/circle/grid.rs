@@ -76,6 +76,11 @@ impl Grids {
         self.share.holds(alpha / ALPHAS)
     }
 
+    /// The number of nodes up to a baseline, wavelengths.
+    pub(super) fn nodes_up_to(&self, wavelengths: f64) -> usize {
+        (0..self.nodes.count).take_while(|k| self.nodes.u(*k) <= wavelengths).count()
+    }
+
     /// The row number of an alpha that this process holds.
     #[inline(always)]
     pub(super) fn row(&self, alpha: usize) -> usize {

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::powers::{PowerAgreement, PowerPriors, PowerRows, WeightedRows};
 use super::prior::{FREE, Prior, View};
 use super::spectrum::{SpectralMaps, SpectrumFit};
-use super::sums::{JointSums, ScaledBlocks, joint_blocks, joint_coupling, scaled_blocks};
+use super::sums::{COUPLED_MAX, JointSums, ScaledBlocks, joint_blocks, joint_coupling, scaled_blocks};
 use crate::imaging::SolveError;
 use crate::imaging::circle::{NOISES_TOGETHER, coefficients, degrees, view_sigma_k};
 use crate::imaging::power::{
@@ -134,7 +134,8 @@ impl<'a> Equations<'a> {
         let of_powers = powers.iter().zip(&power_blocks);
         let of_powers: Vec<Option<Coupling>> =
             of_powers.map(|(powers, blocks)| Some(powers.as_ref()?.coupling(blocks.as_ref()?))).collect();
-        let coupling = joint_coupling(self.prior, &self.couplings, self.noise_factors, &of_powers);
+        let coupling =
+            joint_coupling(self.prior, &self.couplings, self.noise_factors, &of_powers, COUPLED_MAX);
         (
             JointSums::new(self.prior, self.sums.to_vec(), self.noise_factors.to_vec()).with_powers(powers),
             Approximation { scaled, coupling },
@@ -163,9 +164,9 @@ impl<'a> Equations<'a> {
                 let noise = before.agreement(&x).chi_square.max(1.0);
                 Some(rows.weighted(&rows.model(&x), noise))
             };
-            let next = self.joint(rows.iter().enumerate().map(weighted).collect());
+            let weighted = rows.iter().enumerate().map(weighted).collect();
             start = Some(posterior.solution);
-            (joint, approximation) = next;
+            (joint, approximation) = self.joint(weighted);
         }
         Ok((joint, approximation, start))
     }
@@ -177,7 +178,7 @@ pub(super) struct Posterior<'a> {
     blocks: Vec<Block<'static>>,
     offsets: Vec<usize>,
     pub(super) solution: Vec<f64>,
-    /// Posterior samples without the mean, with the samples of the preconditioner from the same random numbers.
+    /// Posterior samples without the mean, with those of the blocks from the same random numbers.
     samples: Vec<PosteriorSample>,
     pub(super) convergence: Convergence,
 }
@@ -232,12 +233,11 @@ impl<'a> Posterior<'a> {
         view.coefficients(self.prior(), &self.offsets, unknowns)
     }
 
-    /// Ratio of the variances of posterior samples and preconditioner samples by degree, averaged over neighbouring degrees for accuracy.
+    /// Ratio of the variances of posterior samples and those of the blocks by degree, averaged over neighbouring degrees for accuracy.
     fn variance_ratio(&self, view: &View) -> Vec<f64> {
         let mut sums = vec![[0.0; 2]; view.l_max + 1];
-        for PosteriorSample { exact, preconditioner } in &self.samples {
-            let both =
-                self.coefficients(view, exact).into_iter().zip(self.coefficients(view, preconditioner));
+        for PosteriorSample { exact, of_blocks } in &self.samples {
+            let both = self.coefficients(view, exact).into_iter().zip(self.coefficients(view, of_blocks));
             for (l, (x, y)) in degrees(view.l_max).zip(both) {
                 sums[l] = [sums[l][0] + x * x, sums[l][1] + y * y];
             }

@@ -38,9 +38,9 @@ const BLOCK_DEGREES: usize = 48;
 /// Highest degree up to which the normal matrix is found whole to precondition. With 12 its eigenvalues are within 0.68 to 1.5 of the
 /// preconditioner's, with the blocks alone down to 0.07 (nside 32, 13,216 passes).
 const COUPLED_DEGREES: usize = 12;
-/// Parts and passes at a time in which it is summed.
+/// Parts, and rows at a time, in which it is summed.
 const COUPLING_PARTS: usize = 16;
-const COUPLING_PASSES: usize = 64;
+const COUPLING_ROWS: usize = 4096;
 /// Free numbers of a pass.
 const NUISANCES: usize = 3;
 
@@ -338,7 +338,12 @@ impl WeightedRows<'_> {
     fn normal_matrix(&self, degree_max: usize, passes: &[Range<usize>]) -> Mat<f64> {
         let count = (degree_max + 1).pow(2);
         let mut matrix = Mat::<f64>::zeros(count, count);
-        for passes in passes.chunks(COUPLING_PASSES) {
+        let mut rest = passes;
+        while !rest.is_empty() {
+            let rows_to = |end: usize| rest[..end].iter().map(ExactSizeIterator::len).sum::<usize>();
+            let end = (1..=rest.len()).take_while(|end| *end == 1 || rows_to(*end) <= COUPLING_ROWS).count();
+            let (passes, others) = rest.split_at(end);
+            rest = others;
             let rows: Vec<usize> = passes.iter().cloned().flatten().collect();
             let mut harmonics = self.rows.harmonics(degree_max, &rows);
             let mut free = Mat::<f64>::zeros(NUISANCES * passes.len(), count);

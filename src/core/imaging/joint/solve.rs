@@ -52,6 +52,9 @@ impl JointChannel {
         rule: StoppingRule,
         watch: &SolveWatch,
     ) -> Result<Self, SolveError> {
+        if sums.counts().visibilities == 0 {
+            return Err(SolveError::NoData);
+        }
         let blocks = sums.order_blocks();
         let coupling = sums.coupling();
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
@@ -152,8 +155,8 @@ pub fn solve_jointly(
     let nside_of = |view: &View| {
         let own = channels.iter().find(|channel| channel.frequency_hz == view.frequency_hz);
         // Between channels the coarser neighbour has the same l_max.
-        let similar = own.or_else(|| channels.iter().find(|channel| channel.l_max() == view.l_max));
-        similar.map_or(1, |channel| channel.nside)
+        let of_l_max = channels.iter().filter(|channel| channel.l_max() == view.l_max);
+        own.or_else(|| of_l_max.min_by_key(|channel| channel.nside)).map_or(1, |channel| channel.nside)
     };
     let mut maps = Vec::new();
     for (index, view) in views.iter().enumerate() {
@@ -200,9 +203,6 @@ impl SingleChannel {
     ) -> Result<Self, SolveError> {
         let degrees: Vec<usize> = degrees(sums.setup().l_max).collect();
         let SumCounts { visibilities, power, .. } = sums.counts();
-        if visibilities == 0 {
-            return Err(SolveError::NoData);
-        }
         let (right, numbers) = (sums.right_hand_side(), 2.0 * visibilities as f64);
         let equations = PowerProblem { sums, blocks, coupling, degrees: &degrees, right, power, numbers };
         let FoundPower { solution, power, regularisation, .. } = equations.solve(None, rule, watch)?;

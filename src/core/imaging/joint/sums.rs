@@ -212,8 +212,8 @@ fn joint_block(prior: &Prior, scaled: &ScaledBlocks, offsets: &[usize]) -> Block
     }
 }
 
-/// Maximum number of coupled unknowns, whose matrix takes 128 MB.
-const COUPLED_MAX: usize = 4000;
+/// Maximum number of coupled unknowns, whose matrix takes 128 MB, some four times while it is factorised.
+pub(super) const COUPLED_MAX: usize = 4000;
 
 /// What couples the blocks of [`joint_blocks`], from that of each channel's visibilities and powers: `sum_c T_c' E_c T_c`.
 pub(super) fn joint_coupling(
@@ -221,6 +221,7 @@ pub(super) fn joint_coupling(
     visibilities: &[Option<&Coupling>],
     noise_factors: &[f64],
     powers: &[Option<Coupling>],
+    unknowns_max: usize,
 ) -> Coupling {
     // Channel c depends on the unknowns of channels up to c.
     let of_channel = |channel: usize| {
@@ -231,7 +232,7 @@ pub(super) fn joint_coupling(
     let all: Vec<usize> = (0..prior.channels()).map(of_unknowns).collect();
     let capped = |cap: usize| all.iter().map(|degree| *degree.min(&cap)).collect::<Vec<usize>>();
     let highest = all.iter().copied().max().unwrap_or(0);
-    let degree_max = (0..=highest).rev().find(|cap| count_up_to(&capped(*cap)) <= COUPLED_MAX).unwrap_or(0);
+    let degree_max = (0..=highest).rev().find(|cap| count_up_to(&capped(*cap)) <= unknowns_max).unwrap_or(0);
     // By channel the highest degree of its coupled unknowns, and the first of them.
     let degrees = capped(degree_max);
     let first: Vec<usize> = (0..degrees.len()).map(|a| count_up_to(&degrees[..a])).collect();
@@ -341,25 +342,28 @@ mod tests {
         let visibilities = [of(0, 2), of(1, 1)];
         let of_visibilities = [Some(&visibilities[0]), Some(&visibilities[1]), None];
         let powers = [None, None, Some(of(2, 1))];
-        let found = joint_coupling(&prior, &of_visibilities, &factors, &powers);
-        let (_, count) = prior.offsets();
-        let mut u = vec![0.0; count];
-        found.places.iter().for_each(|place| u[*place] = (0.9 * *place as f64).sin());
-        let form = |coupling: &Coupling, x: &[f64]| -> f64 {
-            let at = |k: usize| x[coupling.places[k]];
-            let row =
-                |i: usize| (0..coupling.places.len()).map(move |j| at(i) * coupling.matrix[(i, j)] * at(j));
-            (0..coupling.places.len()).flat_map(row).sum()
-        };
-        let skies = prior.skies(&u);
-        let expected = form(&visibilities[0], &skies[0])
-            + form(&visibilities[1], &skies[1]) / 1.5_f64.powi(2)
-            + form(powers[2].as_ref().unwrap(), &skies[2]);
-        assert!(
-            (form(&found, &u) - expected).abs() < 1e-11 * expected.abs(),
-            "{} {expected}",
-            form(&found, &u)
-        );
-        assert_eq!(found.places.len(), 9 + 4 + 4);
+        for (unknowns_max, count_of) in [(100, 9 + 4 + 4), (14, 4 + 4 + 4), (11, 3)] {
+            let found = joint_coupling(&prior, &of_visibilities, &factors, &powers, unknowns_max);
+            assert_eq!(found.places.len(), count_of);
+            let (_, count) = prior.offsets();
+            let mut u = vec![0.0; count];
+            found.places.iter().for_each(|place| u[*place] = (0.9 * *place as f64).sin());
+            let form = |coupling: &Coupling, x: &[f64]| -> f64 {
+                let at = |k: usize| x[coupling.places[k]];
+                let row = |i: usize| {
+                    (0..coupling.places.len()).map(move |j| at(i) * coupling.matrix[(i, j)] * at(j))
+                };
+                (0..coupling.places.len()).flat_map(row).sum()
+            };
+            let skies = prior.skies(&u);
+            let expected = form(&visibilities[0], &skies[0])
+                + form(&visibilities[1], &skies[1]) / 1.5_f64.powi(2)
+                + form(powers[2].as_ref().unwrap(), &skies[2]);
+            assert!(
+                (form(&found, &u) - expected).abs() < 1e-11 * expected.abs(),
+                "{} {expected}",
+                form(&found, &u)
+            );
+        }
     }
 }

@@ -51,6 +51,9 @@ pub(in crate::imaging) struct Factors<'a> {
     coupled: Option<Coupled>,
 }
 
+/// Least pivot of the coupling's factor, below which rounding may be all of it; of blocks it is 1.
+const LEAST_PIVOT: f64 = 1e-4;
+
 /// The factor of the coupling: with L of the blocks the whole is `L Q L'`, where Q is the identity but for the coupled unknowns.
 struct Coupled {
     places: Vec<usize>,
@@ -58,9 +61,18 @@ struct Coupled {
 }
 
 impl Coupling {
-    /// The index of each coupled unknown in the matrix.
-    fn index_of(&self) -> HashMap<usize, usize> {
-        self.places.iter().enumerate().map(|(index, place)| (*place, index)).collect()
+    /// The same with other unknowns first: in order of decreasing degree, so that samples of the lowest degrees resemble those of the blocks.
+    fn by_degree(&self, blocks: &[Block<'_>]) -> Self {
+        let of_block = |block: &Block<'_>| {
+            let degrees = block.degrees.clone();
+            let pairs = |places: &Vec<usize>| places.iter().copied().zip(degrees.clone()).collect::<Vec<_>>();
+            block.places.iter().flat_map(pairs).collect::<Vec<_>>()
+        };
+        let degree_of: HashMap<usize, usize> = blocks.iter().flat_map(of_block).collect();
+        let mut order: Vec<usize> = (0..self.places.len()).collect();
+        order.sort_by_key(|k| std::cmp::Reverse(degree_of.get(&self.places[*k])));
+        let matrix = Mat::from_fn(order.len(), order.len(), |i, j| self.matrix[(order[i], order[j])]);
+        Self { degree_max: self.degree_max, places: order.iter().map(|k| self.places[*k]).collect(), matrix }
     }
 }
 
@@ -194,7 +206,7 @@ impl<'a> Factors<'a> {
     /// Factorises the blocks, what couples them, and R. If both together are not positive definite, the coupling is left out.
     pub(in crate::imaging) fn coupled(blocks: &'a [Block<'a>], coupling: &Coupling, r: &[f64]) -> Self {
         // What is coupled comes last, so that it is coupled by its own part of the factors alone.
-        let index_of = coupling.index_of();
+        let index_of = coupling_index(&coupling.places);
         let order = |block: &Block<'a>| {
             let mut order: Vec<usize> = (0..block.order()).collect();
             order.sort_by_key(|k| index_of.contains_key(&block.places[0][*k]));
@@ -210,13 +222,13 @@ impl<'a> Factors<'a> {
 
     /// `Q = 1 + L^-1 E L^-t` of the coupled unknowns.
     fn couple(&self, coupling: &Coupling) -> Option<Coupled> {
-        let index_of = coupling.index_of();
-        let mut matrix = coupling.matrix.clone();
+        let Coupling { places, mut matrix, .. } = coupling.by_degree(self.blocks);
+        let index_of = coupling_index(&places);
         for _ in 0..2 {
             for ((block, order), factor) in self.blocks.iter().zip(&self.orders).zip(&self.factors) {
-                let lower = factor.as_ref()?.L();
                 let first = order.iter().position(|k| index_of.contains_key(&block.places[0][*k]));
                 let Some(first) = first else { continue };
+                let lower = factor.as_ref()?.L();
                 let corner = lower.submatrix(first, first, order.len() - first, order.len() - first);
                 for places in &block.places {
                     let rows: Vec<usize> = order[first..].iter().map(|k| index_of[&places[*k]]).collect();
@@ -232,7 +244,9 @@ impl<'a> Factors<'a> {
         for k in 0..matrix.nrows() {
             matrix[(k, k)] += 1.0;
         }
-        Some(Coupled { places: coupling.places.clone(), factor: matrix.llt(Side::Lower).ok()? })
+        let factor = matrix.llt(Side::Lower).ok()?;
+        let least = (0..matrix.nrows()).map(|k| factor.L()[(k, k)].powi(2)).fold(f64::INFINITY, f64::min);
+        (least > LEAST_PIVOT).then_some(Coupled { places, factor })
     }
 
     /// Applies `operation` to the unknowns of each block, in place.
@@ -265,13 +279,13 @@ impl<'a> Factors<'a> {
         self.solve_upper(unknowns);
     }
 
-    /// Solves with the lower factors, `L^-1 x`.
+    /// Solves with the lower factor of all.
     pub(in crate::imaging) fn solve_lower(&self, unknowns: &mut [f64]) {
         self.apply(unknowns, &solve_lower);
         self.apply_coupled(unknowns, &solve_lower);
     }
 
-    /// Solves with the upper factors, `L^-t x`. For standard normal x the result is a sample whose covariance is the inverse of what was factorised.
+    /// Solves with its transpose. For standard normal x the result is a sample whose covariance is the inverse of what was factorised.
     pub(in crate::imaging) fn solve_upper(&self, unknowns: &mut [f64]) {
         self.apply_coupled(unknowns, &solve_upper);
         self.solve_upper_of_blocks(unknowns);
@@ -308,6 +322,11 @@ impl<'a> Factors<'a> {
         solve_lower_triangular_in_place(factor.L(), v.as_mut(), Par::Seq);
         (0..v.ncols()).map(|column| (0..v.nrows()).map(|k| v[(k, column)].powi(2)).sum()).collect()
     }
+}
+
+/// The index of each coupled unknown.
+fn coupling_index(places: &[usize]) -> HashMap<usize, usize> {
+    places.iter().enumerate().map(|(index, place)| (*place, index)).collect()
 }
 
 fn solve_lower(factor: &Llt<f64>, values: &mut Mat<f64>) {

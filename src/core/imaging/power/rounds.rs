@@ -306,8 +306,8 @@ impl PowerProblem<'_> {
     /// The ratio of the traces of the true covariance and of the preconditioner, averaged over neighbouring degrees for accuracy.
     fn ratio(&self, samples: &[PosteriorSample], traces: &[f64]) -> Vec<f64> {
         let mut excess = vec![0.0; traces.len()];
-        for PosteriorSample { exact, preconditioner } in samples {
-            for ((l, x), y) in self.degrees.iter().zip(exact).zip(preconditioner) {
+        for PosteriorSample { exact, of_blocks } in samples {
+            for ((l, x), y) in self.degrees.iter().zip(exact).zip(of_blocks) {
                 excess[*l] += (x * x - y * y) / samples.len() as f64;
             }
         }

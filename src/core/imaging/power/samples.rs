@@ -1,9 +1,9 @@
 //! Samples from the posterior, a Gaussian with covariance `(A + R)^-1`, for map errors and for stochastic trace estimates.
 //!
-//! A is the normal matrix and L the Cholesky factor of its block approximation plus R (the preconditioner). `K = L^-1 (A + R) L^-t` is near the
-//! identity, so that a few Lanczos steps from a standard normal vector w give `K^(-1/2) w`, and `d = L^-t K^(-1/2) w` has the covariance
-//! `(A + R)^-1`. `L^-t w` is the matching sample of the preconditioner: as both come from the same w, the difference of their squared norms
-//! has little variance, so it serves as a control variate for the trace.
+//! A is the normal matrix and L the Cholesky factor of the preconditioner. `K = L^-1 (A + R) L^-t` is near the identity, so that a few Lanczos
+//! steps from a standard normal vector w give `K^(-1/2) w`, and `d = L^-t K^(-1/2) w` has the covariance `(A + R)^-1`. With the factor of the
+//! blocks alone, `L^-t w` is the matching sample of the blocks plus R: as both come from the same w, the difference of their squared norms has
+//! little variance, so it serves as a control variate for the trace.
 
 use faer::{Mat, Side};
 use rand_distr::{Distribution, StandardNormal};
@@ -23,10 +23,10 @@ const STEPS_MAX: usize = 100;
 /// Seed of the random vectors; streams of probes have smaller ones.
 const SAMPLE_SEED: u64 = 3;
 
-/// A sample of the posterior without its mean, and the sample of the preconditioner from the same random vector.
+/// A sample of the posterior without its mean, and one of the blocks plus R from the same random vector.
 pub(in crate::imaging) struct PosteriorSample {
     pub(in crate::imaging) exact: Vec<f64>,
-    pub(in crate::imaging) preconditioner: Vec<f64>,
+    pub(in crate::imaging) of_blocks: Vec<f64>,
 }
 
 /// Products of the normal matrix with several vectors.
@@ -179,7 +179,7 @@ impl PosteriorPrecision<'_> {
                 let mut exact = sampler.sample();
                 self.factors.solve_upper(&mut exact);
                 self.factors.solve_upper_of_blocks(&mut start);
-                PosteriorSample { exact, preconditioner: start }
+                PosteriorSample { exact, of_blocks: start }
             })
             .collect()
     }

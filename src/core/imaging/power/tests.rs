@@ -247,7 +247,8 @@ fn samples_have_the_covariance_of_the_posterior() {
     degrees().iter().enumerate().for_each(|(k, l)| whole[(k, k)] += r[*l]);
     let expected = whole.llt(Side::Lower).unwrap().inverse();
     let blocks = pairs(&a);
-    let factors = Factors::coupled(&blocks, &between_pairs(&a, 20), &r);
+    let (factors, block_inverse) =
+        (Factors::coupled(&blocks, &between_pairs(&a, 20), &r), Factors::new(&blocks, &r));
     let sums = Dense::new(a, vec![0.0; ORDER]);
     let (regularisation, watch) = (Diagonal::ByDegree(r), SolveWatch::default());
     let products = |x: &[&[f64]]| sums.apply_all(x);
@@ -259,6 +260,18 @@ fn samples_have_the_covariance_of_the_posterior() {
     };
     let sample_ids: Vec<u64> = (0..DRAWS as u64).collect();
     let drawn = precision.draw(&sample_ids, SAMPLE_TOLERANCE, &watch.named("test").start("draws", 0.0));
+    let of_blocks = block_inverse.traces(L_MAX);
+    for (l, expected) in of_blocks.iter().enumerate() {
+        let square = |d: &PosteriorSample| -> f64 {
+            degrees().iter().zip(&d.of_blocks).filter(|(degree, _)| **degree == l).map(|(_, x)| x * x).sum()
+        };
+        let found = drawn.iter().map(square).sum::<f64>() / DRAWS as f64;
+        // At least that of one number: five standard errors.
+        assert!(
+            (found / expected - 1.0).abs() < 5.0 * (2.0 / DRAWS as f64).sqrt(),
+            "{l}: {found} {expected}"
+        );
+    }
     for i in 0..ORDER {
         let variance: f64 = drawn.iter().map(|d| d.exact[i].powi(2)).sum::<f64>() / DRAWS as f64;
         // Five standard errors of a variance.

@@ -243,10 +243,6 @@ fn the_operator_is_symmetric() {
     assert!((dot(&z, &ax) - dot(&x, &az)).abs() < 1e-6 * scale);
 }
 
-/// Tests `<B x, N^-1 V> = <x, Bt N^-1 V>` with B from the forward operator and Bt from the engine, which share no kernel.
-///
-/// The bound is the engine's error of interpolation between nodes (8e-5 in the mean over 600 rows) and of data kernels (1e-4); the forward
-/// operator has an error of 1e-5.
 /// Blocks and coupling make up the operator, from few times, so that what they average is uneven.
 #[test]
 fn blocks_and_coupling_are_the_operator() {
@@ -276,6 +272,10 @@ fn blocks_and_coupling_are_the_operator() {
     assert!(coupled > 0.1, "{coupled}");
 }
 
+/// Tests `<B x, N^-1 V> = <x, Bt N^-1 V>` with B from the forward operator and Bt from the engine, which share no kernel.
+///
+/// The bound is the engine's error of interpolation between nodes (8e-5 in the mean over 600 rows) and of data kernels (1e-4); the forward
+/// operator has an error of 1e-5.
 #[test]
 fn data_is_projected_by_the_adjoint() {
     let blocks = blocks(0, 60);
