@@ -21,7 +21,7 @@ use super::stored::TorusPart;
 use super::sums::HarmonicSums;
 use super::tori::Tori;
 use crate::imaging::power::Coupling;
-use crate::imaging::unknowns::degrees;
+use crate::imaging::unknowns::{degrees, degrees_orders_parts};
 use crate::response::harmonic::degree_count;
 use crate::response::harmonic::filter::FilteredPatterns;
 use crate::sky::harmonics::WignerTable;
@@ -54,8 +54,8 @@ struct OrderPattern {
 }
 
 impl HarmonicSums {
-    /// What [`Self::order_blocks`] lack of BtN^-1B at the degrees that the shortest baselines see, where coverage is least even. `None` of a rank's share, if the sums could not be read, or
-    /// if no baseline is short enough for these degrees.
+    /// What [`Self::order_blocks`] lack of BtN^-1B at the degrees that the shortest baselines see, where coverage is least even. `None` of a
+    /// rank's share, if the sums could not be read, or if no baseline is short enough for these degrees.
     pub(in crate::imaging) fn coupling(&self) -> Option<Coupling> {
         // Of several ranks each has a part of the weights.
         if self.grids.share.count > 1 {
@@ -270,11 +270,7 @@ fn real_matrix(l_max: usize, differences: &[(usize, Vec<Mat<Complex64>>)]) -> Ma
         let matrix = &differences[p.unsigned_abs() as usize].1[first as usize];
         if p >= 0 { matrix[(l, other)] } else { matrix[(other, l)].conj() }
     };
-    let unknowns: Vec<(usize, usize, usize)> = (0..=l_max)
-        .flat_map(|m| {
-            (m..=l_max).flat_map(move |l| (0..if m == 0 { 1 } else { 2 }).map(move |part| (l, m, part)))
-        })
-        .collect();
+    let unknowns: Vec<(usize, usize, usize)> = degrees_orders_parts(l_max).collect();
     // Coefficients of T_lm and T_l-m = (-1)^m conj(T_lm).
     let terms = |(_, m, part): (usize, usize, usize)| -> Vec<(i64, Complex64)> {
         let half = std::f64::consts::FRAC_1_SQRT_2;

@@ -17,7 +17,7 @@ use num_complex::Complex64;
 use rayon::prelude::*;
 use rustfft::{Fft, FftPlanner};
 
-use super::prior::index_of;
+use crate::imaging::unknowns::index_of;
 use crate::numerics::lagrange_weights;
 use crate::numerics::legendre::Legendre;
 use crate::units::vector::Vec3;

@@ -19,9 +19,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::disc::{Disc, Discs, visible_sr};
-use super::prior::{for_each_unknown, index_of};
 use crate::imaging::SkyPower;
 use crate::imaging::power::Coupling;
+use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 use crate::numerics::legendre::Legendre;
 use crate::units::vector::{Vec3, add, dot, norm, scale, unit};
 
@@ -213,8 +213,8 @@ impl PowerRows {
     }
 
     /// Real harmonics up to a degree, in the order of unknowns, at the discs of some rows.
-    fn harmonics(&self, degree_max: usize, rows: &[usize]) -> Mat<f64> {
-        let directions = || rows.iter().map(|row| self.discs[*row].direction);
+    fn harmonics(&self, degree_max: usize, rows: Range<usize>) -> Mat<f64> {
+        let directions = || self.discs[rows.clone()].iter().map(|disc| disc.direction);
         let legendre = Legendre::new(degree_max, directions().map(cos_sin));
         let turns: Vec<f64> = directions().map(|[x, y, _]| y.atan2(x)).collect();
         let ones = vec![1.0; rows.len()];
@@ -316,8 +316,7 @@ impl WeightedRows<'_> {
         let per_part = passes.len().div_ceil(COUPLING_PARTS).max(1);
         let parts: Vec<Mat<f64>> =
             passes.par_chunks(per_part).map(|passes| self.normal_matrix(degree_max, passes)).collect();
-        let mut unknowns = Vec::new();
-        for_each_unknown(degree_max, &mut |l, m, part| unknowns.push((l, m, part)));
+        let unknowns: Vec<(usize, usize, usize)> = degrees_orders_parts(degree_max).collect();
         let middle = self.rows.discs.len() / 2;
         let visible = visible_sr(degree_max, self.rows.discs[middle].cos_radius);
         let matrix = Mat::from_fn(unknowns.len(), unknowns.len(), |i, j| {
@@ -339,27 +338,26 @@ impl WeightedRows<'_> {
         let count = (degree_max + 1).pow(2);
         let mut matrix = Mat::<f64>::zeros(count, count);
         let mut rest = passes;
-        while !rest.is_empty() {
-            let rows_to = |end: usize| rest[..end].iter().map(ExactSizeIterator::len).sum::<usize>();
-            let end = (1..=rest.len()).take_while(|end| *end == 1 || rows_to(*end) <= COUPLING_ROWS).count();
-            let (passes, others) = rest.split_at(end);
+        while let [first, ..] = rest {
+            let count_max = rest.partition_point(|pass| pass.end - first.start <= COUPLING_ROWS).max(1);
+            let (passes, others) = rest.split_at(count_max);
             rest = others;
-            let rows: Vec<usize> = passes.iter().cloned().flatten().collect();
-            let mut harmonics = self.rows.harmonics(degree_max, &rows);
+            let rows = first.start..passes[passes.len() - 1].end;
+            let mut harmonics = self.rows.harmonics(degree_max, rows.clone());
             let mut free = Mat::<f64>::zeros(NUISANCES * passes.len(), count);
-            let mut number = 0;
-            for (pass, range) in passes.iter().enumerate() {
-                for row in range.clone() {
+            for (number, pass) in passes.iter().enumerate() {
+                for row in pass.clone() {
                     for (which, g) in self.columns[row].iter().enumerate() {
                         for k in 0..count {
-                            free[(NUISANCES * pass + which, k)] += g * harmonics[(number, k)];
+                            free[(NUISANCES * number + which, k)] += g * harmonics[(row - rows.start, k)];
                         }
                     }
-                    number += 1;
                 }
             }
             for k in 0..count {
-                rows.iter().enumerate().for_each(|(at, row)| harmonics[(at, k)] *= self.weights[*row].sqrt());
+                for row in rows.clone() {
+                    harmonics[(row - rows.start, k)] *= self.weights[row].sqrt();
+                }
             }
             for (factor, columns) in [(1.0, &harmonics), (-1.0, &free)] {
                 matmul(&mut matrix, Accum::Add, columns.transpose(), columns, factor, Par::Seq);

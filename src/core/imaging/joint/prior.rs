@@ -15,6 +15,7 @@ use faer::{Mat, Par, Side};
 use serde::Serialize;
 
 use crate::imaging::SolveError;
+use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 
 /// Degrees whose prior is free: mean and dipole.
 pub(super) const FREE: usize = 2;
@@ -131,15 +132,13 @@ impl Prior {
         let (offsets, count) = self.offsets();
         let mut u = vec![0.0; count];
         for (channel, sky) in skies.iter().enumerate() {
-            let mut index = 0;
-            for_each_unknown(self.l_max[channel], &mut |l, m, part| {
-                let scaled = self.scale[channel][l] * sky[index];
-                index += 1;
+            for ((l, m, part), value) in degrees_orders_parts(self.l_max[channel]).zip(sky) {
+                let scaled = self.scale[channel][l] * value;
                 for source in 0..=channel {
                     u[offsets[source] + index_of(self.l_max[source], l, m, part)] +=
                         self.share(channel, source) * scaled;
                 }
-            });
+            }
         }
         u
     }
@@ -209,17 +208,16 @@ impl Prior {
 impl View {
     /// The coefficients of the map for these unknowns.
     pub(super) fn coefficients(&self, prior: &Prior, offsets: &[usize], u: &[f64]) -> Vec<f64> {
-        let mut sky = Vec::with_capacity((self.l_max + 1).pow(2));
-        for_each_unknown(self.l_max, &mut |l, m, part| {
+        let of_unknown = |(l, m, part): (usize, usize, usize)| {
             let of_channel = |(channel, q): (usize, &f64)| {
                 q * u[offsets[channel] + index_of(prior.l_max[channel], l, m, part)]
             };
             let shares = if l < FREE { &self.shares_of_free } else { &self.shares };
             let sum: f64 =
                 shares.iter().enumerate().take(prior.channels_with_degree(l)).map(of_channel).sum();
-            sky.push(self.scale[l] * sum);
-        });
-        sky
+            self.scale[l] * sum
+        };
+        degrees_orders_parts(self.l_max).map(of_unknown).collect()
     }
 
     /// The view truncated to a lower maximum degree.
@@ -241,23 +239,6 @@ fn conditional(factor: &Mat<f64>, likeness: Correlation, channels_hz: &[f64], fr
     shares
 }
 
-/// Calls `take` with degree, order and part of each unknown of a map, in order.
-pub(super) fn for_each_unknown(l_max: usize, take: &mut dyn FnMut(usize, usize, usize)) {
-    for m in 0..=l_max {
-        for l in m..=l_max {
-            for part in 0..if m == 0 { 1 } else { 2 } {
-                take(l, m, part);
-            }
-        }
-    }
-}
-
-/// The index of an unknown among those of a map.
-pub(super) fn index_of(l_max: usize, l: usize, m: usize, part: usize) -> usize {
-    // Before order m are l_max + 1 unknowns of order 0, and 2 (l_max + 1 - k) of each order k below m.
-    if m == 0 { l } else { (l_max + 1) * (2 * m - 1) - m * (m - 1) + 2 * (l - m) + part }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -265,18 +246,6 @@ mod tests {
     fn prior() -> Prior {
         let scale = vec![vec![3.0, 2.0, 1.0, 0.5], vec![6.0, 4.0, 2.5], vec![1.0, 1.0, 1.0]];
         Prior::new(vec![10e6, 5e6, 20e6], scale, Correlation { length: 1.5, own_share: 0.01 }).unwrap()
-    }
-
-    #[test]
-    fn indices_follow_the_order_of_unknowns() {
-        for l_max in [0, 1, 5] {
-            let mut next = 0;
-            for_each_unknown(l_max, &mut |l, m, part| {
-                assert_eq!(index_of(l_max, l, m, part), next);
-                next += 1;
-            });
-            assert_eq!(next, (l_max + 1).pow(2));
-        }
     }
 
     /// Compares T T' with the covariance of the prior, element by element.

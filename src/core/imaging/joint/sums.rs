@@ -6,9 +6,10 @@ use faer::Mat;
 use rayon::prelude::*;
 
 use super::powers::WeightedRows;
-use super::prior::{Prior, for_each_unknown, index_of};
+use super::prior::Prior;
 use crate::imaging::power::{Block, Coupling};
 use crate::imaging::solver::add;
+use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 
 /// The sums of all channels. Residuals of a channel in excess of its noise count as noise.
@@ -237,22 +238,21 @@ pub(super) fn joint_coupling(
     let degrees = capped(degree_max);
     let first: Vec<usize> = (0..degrees.len()).map(|a| count_up_to(&degrees[..a])).collect();
     let (offsets, _) = prior.offsets();
-    let mut places = Vec::new();
-    for ((degree, l_max), offset) in degrees.iter().zip(&prior.l_max).zip(offsets) {
-        for_each_unknown(*degree, &mut |l, m, part| places.push(offset + index_of(*l_max, l, m, part)));
-    }
+    let of_one = |((degree, l_max), offset): ((&usize, &usize), usize)| {
+        let l_max = *l_max;
+        degrees_orders_parts(*degree).map(move |(l, m, part)| offset + index_of(l_max, l, m, part))
+    };
+    let places: Vec<usize> = degrees.iter().zip(&prior.l_max).zip(offsets).flat_map(of_one).collect();
     let mut matrix = Mat::<f64>::zeros(places.len(), places.len());
     for channel in 0..prior.channels() {
         let weighted = [(visibilities[channel], noise_factors[channel]), (powers[channel].as_ref(), 1.0)];
         for (coupling, factor) in weighted {
             let Some(coupling) = coupling else { continue };
-            let mut unknowns = Vec::new();
-            let highest = coupling.degree_max.min(degree_max);
-            for_each_unknown(highest, &mut |l, m, part| unknowns.push((l, m, part)));
-            let at = |degree: usize| {
-                unknowns.iter().map(move |(l, m, part)| index_of(degree, *l, *m, *part)).collect::<Vec<_>>()
+            let unknowns = || degrees_orders_parts(coupling.degree_max.min(degree_max));
+            let at = |degree: usize| -> Vec<usize> {
+                unknowns().map(|(l, m, part)| index_of(degree, l, m, part)).collect()
             };
-            let scale: Vec<f64> = unknowns.iter().map(|(l, ..)| prior.scale[channel][*l] / factor).collect();
+            let scale: Vec<f64> = unknowns().map(|(l, ..)| prior.scale[channel][l] / factor).collect();
             let own = at(coupling.degree_max);
             for a in 0..=channel {
                 for b in 0..=channel {
@@ -333,10 +333,9 @@ mod tests {
         let of = |channel: usize, degree_max: usize| {
             let count = (degree_max + 1).pow(2);
             let element = |i: usize, j: usize| ((channel + 2) as f64 * (i + j) as f64).cos();
-            let mut places = Vec::new();
-            for_each_unknown(degree_max, &mut |l, m, part| {
-                places.push(index_of(prior.l_max[channel], l, m, part));
-            });
+            let places = degrees_orders_parts(degree_max)
+                .map(|(l, m, part)| index_of(prior.l_max[channel], l, m, part))
+                .collect();
             Coupling { degree_max, places, matrix: Mat::from_fn(count, count, element) }
         };
         let visibilities = [of(0, 2), of(1, 1)];

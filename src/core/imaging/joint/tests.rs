@@ -8,13 +8,14 @@ use rand_distr::{Distribution, StandardNormal};
 
 use super::posterior::{Equations, JointRequest, Posterior};
 use super::powers::{PowerPriors, PowerRows, PowerSample};
-use super::prior::{Correlation, Prior, View, for_each_unknown, index_of};
+use super::prior::{Correlation, Prior, View};
 use super::solve::most_likely;
 use super::sums::{JointSums, scaled_blocks};
 use crate::imaging::SkyPower;
 use crate::imaging::circle::{coefficients, degrees};
 use crate::imaging::power::Block;
 use crate::imaging::solver::{SolveWatch, StoppingRule};
+use crate::imaging::unknowns::{degrees_orders_parts, index_of};
 use crate::imaging::{Accuracy, NormalSums, SumCounts};
 use crate::sky::harmonics::synthesis;
 use crate::sky::healpix::{pixel_area_sr, pixel_directions};
@@ -312,8 +313,7 @@ fn blocks_and_coupling_are_the_matrix_of_the_powers() {
     let weighted = rows.weighted(&rows.measured(), 1.0);
     let blocks = weighted.blocks();
     let coupling = weighted.coupling(&blocks);
-    let mut names = Vec::new();
-    for_each_unknown(4, &mut |l, m, part| names.push((l, m, part)));
+    let names: Vec<(usize, usize, usize)> = degrees_orders_parts(4).collect();
     assert_eq!((coupling.degree_max, coupling.places.len()), (4, names.len()));
     for (j, (other, m_other, part_other)) in names.iter().enumerate() {
         let expected =

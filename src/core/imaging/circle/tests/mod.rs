@@ -10,7 +10,9 @@ use super::*;
 use crate::array::{Array, ArrayConfig};
 use crate::frames::{AntennaResponse, PlacedVisibilities};
 use crate::imaging::exact::noise::companion_noise;
-use crate::imaging::regulariser::Regulariser;
+use crate::imaging::power::Factors;
+use crate::imaging::regulariser::{Diagonal, Regulariser};
+use crate::imaging::solver::System;
 use crate::imaging::{NormalEngine, NormalSums, Samples, SolveWatch, StoppingRule, Uncertainty};
 use crate::response::harmonic::{
     GeometryLimits, GeometryRefusal, HarmonicModel, ModelSettings, NominalOrbit, PairState, PatternGeometry,
@@ -270,6 +272,33 @@ fn blocks_and_coupling_are_the_operator() {
     }
     // Far more than the tolerance.
     assert!(coupled > 0.1, "{coupled}");
+}
+
+/// With what couples the blocks a solution takes fewer products.
+#[test]
+fn coupling_preconditions() {
+    let sums = engine(&blocks(0, 60)).into_sums();
+    let order_blocks = sums.order_blocks();
+    let blocks = order_blocks.blocks();
+    let coupling = sums.coupling().unwrap();
+    // 100 m at 3 MHz see l = 6.3, of which 1.2 times; at most 0.3 l_max.
+    assert_eq!((coupling.degree_max, coupling.places.len()), (6, 49));
+    let r = vec![1e-4 * order_blocks.diagonal(0); L_MAX + 1];
+    let iterations = |factors: &Factors<'_>| {
+        let precondition = |v: &mut [f64]| factors.solve(v);
+        let regularisation = Diagonal::ByDegree(r.clone());
+        let system = System { sums: &sums, regularisation, precondition: &precondition };
+        let watch = SolveWatch::default();
+        let rule = StoppingRule { residual_max: 1e-6, iterations_max: 500 };
+        let mut solution = [vec![0.0; sums.unknowns()]];
+        let task = watch.named("test").start("map", rule.residual_max);
+        let converged = system.solve(&[sums.right_hand_side()], &mut solution, &[rule], &task);
+        assert!(converged[0].converged);
+        converged[0].iterations
+    };
+    let [alone, coupled] = [Factors::new(&blocks, &r), Factors::coupled(&blocks, &coupling, &r)]
+        .map(|factors| iterations(&factors));
+    assert!(coupled < alone, "{coupled} {alone}");
 }
 
 /// Tests `<B x, N^-1 V> = <x, Bt N^-1 V>` with B from the forward operator and Bt from the engine, which share no kernel.
