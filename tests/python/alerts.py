@@ -2,17 +2,20 @@
 
 alerts.py PROMETHEUS LUNARRAY PIPELINE DOWNLINK ALERTS FOLDER
 
-The rules are those of ALERTS, with other times: a day is seconds here. A full disk is a limit on the size of files of the running
-process, which fails every write of it and can be lifted again. What needs a machine without memory or hours of load is tested by
-promtool.
+The rules are those of ALERTS, with other times and shares: a day is seconds here. A full disk is a limit on the size of files of the
+running process, which fails every write of it and can be lifted again; little memory is a limit on its address space; a disk that fills
+is a large file; load is a ground that is stopped nine tenths of the time.
 """
 
 import json
+import os
 import re
 import resource
+import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -29,20 +32,30 @@ def free_port():
         return free.getsockname()[1]
 
 
-def hurried(rules):
-    """The rules, with times of seconds."""
+def space(folder):
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
+
+
+def hurried(rules, disk_share):
+    """The rules, with times of seconds, that share of a disk, and half of the memory."""
     rules = re.sub(r"\bfor: \w+", "for: 1s", rules)
-    rules = re.sub(r"\[(10m|5m|1h)\]", f"[{WINDOW_S}s]", rules)
+    rules = re.sub(r"\[(10m|1h)\]", f"[{WINDOW_S}s]", rules)
+    # A slow packet may take longer than that on a busy machine.
+    rules = rules.replace("[5m]", f"[{5 * WINDOW_S}s]")
     rules, silences = re.subn(r"> (86400|691200)\b", f"> {SILENCE_S}", rules)
     rules, ages = re.subn(r"(unsaved_age_seconds) > 600", r"\1 > 3", rules)
-    assert (silences, ages) == (3, 1), "the rules have other times than this test knows"
+    rules, disks = re.subn(r"(disk_size_bytes) < 0.1\b", rf"\1 < {disk_share}", rules)
+    rules, memories = re.subn(r"(memory_resident_bytes\)) < 0.1\b", r"\1 < 0.5", rules)
+    assert (silences, ages, disks, memories) == (3, 1, 1, 1), "the rules have other limits than this test knows"
     return rules
 
 
 class Prometheus:
-    def __init__(self, program, folder, targets, rules):
+    def __init__(self, program, folder, targets, rules, disk_share):
         self.port = free_port()
-        (folder / "alerts.yml").write_text(hurried(rules))
+        folder.mkdir()
+        (folder / "alerts.yml").write_text(hurried(rules, disk_share))
         named = ", ".join(f"'127.0.0.1:{port}'" for port in targets)
         (folder / "prometheus.yml").write_text(
             "global: {scrape_interval: 1s, scrape_timeout: 1s, evaluation_interval: 1s}\n"
@@ -89,22 +102,64 @@ def start(words, folder, name):
     return subprocess.Popen(words, stdout=log, stderr=log, restore_signals=False)
 
 
-def send(port, data, token=TOKEN):
+def connect(port):
     deadline = time.monotonic() + PATIENCE_S
     while True:
         try:
-            connection = socket.create_connection(("127.0.0.1", port), timeout=30)
-            break
+            return socket.create_connection(("127.0.0.1", port), timeout=30)
         except OSError:
-            assert time.monotonic() < deadline
+            assert time.monotonic() < deadline, "the ground does not listen"
             time.sleep(0.1)
-    with connection:
+
+
+def send(port, data, token=TOKEN):
+    with connect(port) as connection:
         try:
             connection.sendall(f"token {token}\n".encode() + data)
             connection.shutdown(socket.SHUT_WR)
             return connection.recv(1000).decode()
         except OSError:
             return ""  # The ground may close before all is sent.
+
+
+def processor_s(process):
+    times = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    return sum(map(int, times)) / os.sysconf("SC_CLK_TCK")
+
+
+def slowed(process, over):
+    """Stops a process for a moment after every 30 ms of processor time."""
+    begun = processor_s(process)
+    while not over.wait(0.01):
+        if processor_s(process) - begun >= 0.03:
+            process.send_signal(signal.SIGSTOP)
+            over.wait(0.27)
+            process.send_signal(signal.SIGCONT)
+            begun = processor_s(process)
+
+
+def trickle(port, packets):
+    """Sends packets one by one; returns the connection, still open, when all are on their way."""
+    connection = connect(port)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for packet in packets:
+        connection.sendall(packet)
+        time.sleep(0.1)
+    return connection
+
+
+def keep_sending(connection, packets, stop):
+    """Sends packets slowly, over and over, until told to stop."""
+    while not stop.is_set():
+        for _, data in packets:
+            if stop.wait(0.1):
+                return
+            connection.sendall(data)
+
+
+def used_address_space(process):
+    status = Path(f"/proc/{process}/status").read_text()
+    return int(re.search(r"VmSize:\s+(\d+) kB", status)[1]) * 1024
 
 
 def packets_of(data):
@@ -115,9 +170,17 @@ def packets_of(data):
         at = end
 
 
-def main(prometheus, lunarray, pipeline, downlink, rules, folder):
-    folder = Path(folder)
-    folder.mkdir(exist_ok=True)
+def whole(packets):
+    return b"".join(data for _, data in packets)
+
+
+def parts_of(packets):
+    third = len(packets) // 3
+    return packets[:third], packets[third : 2 * third], packets[2 * third :]
+
+
+def faults_of_operation(prometheus, lunarray, pipeline, packets, rules, folder):
+    """Silence, losses, intruders, a full disk, a failure; returns the alerts that were seen."""
     stations = folder / "stations"
     stations.write_text(f"malargue {TOKEN}\n")
     stations.chmod(0o600)
@@ -125,13 +188,10 @@ def main(prometheus, lunarray, pipeline, downlink, rules, folder):
     words = [lunarray, "replay", "--map", pipeline, "--state", str(folder / "state"), "--out", str(folder / "out")]
     words += ["--listen", f"tcp://127.0.0.1:{port}", "--serve", str(page), "--stations", str(stations), "--snapshot-every", "1h"]
     ground = start(words, folder, "ground.log")
-    alerts = Prometheus(prometheus, folder, [page, follows], Path(rules).read_text())
+    alerts = Prometheus(prometheus, folder / "rules", [page, follows], rules, 0.0)
     running = [ground, alerts.process]
     try:
-        packets = list(packets_of(Path(downlink).read_bytes()))
-        third = len(packets) // 3
-        first, second, last = packets[:third], packets[third : 2 * third], packets[2 * third :]
-        whole = lambda part: b"".join(data for _, data in part)
+        first, second, last = parts_of(packets)
         # The second target has not begun.
         alerts.fire("GroundDown")
         follow = folder / "followed.ccsds"
@@ -171,13 +231,89 @@ def main(prometheus, lunarray, pipeline, downlink, rules, folder):
         alerts.fire("RunFailed")
         follower.wait(PATIENCE_S)
         alerts.clear("RunFailed")
-
-        print(f"seen: {' '.join(sorted(alerts.seen))}; {time.monotonic() - BEGUN:.0f} s")
     finally:
         for process in running:
             if process.poll() is None:
                 process.kill()
                 process.wait()
+    return alerts.seen
+
+
+def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folder):
+    """Too little processor time, places, archive, memory and disk; returns the alerts that were seen."""
+    page, port = free_port(), free_port()
+    words = [lunarray, "replay", "--map", pipeline, "--state", str(folder / "loaded"), "--out", str(folder / "loaded.out")]
+    words += ["--listen", f"tcp://127.0.0.1:{port}", "--serve", str(page), "--archive-max", "1kB"]
+    for setting in ["map.engine=pixel", "map.nside=16", "runtime.queue_capacity=1", "downlink.listen.connections_max=1"]:
+        words += ["--set", setting]
+    free, size = space(folder)
+    large = min(2 << 30, free // 2)
+    ground = start(words, folder, "loaded.log")
+    alerts = Prometheus(prometheus, folder / "loaded.rules", [page], rules, (free - large // 2) / size)
+    running = [ground, alerts.process]
+    try:
+        first, second, last = parts_of(packets)
+        # Packets come one by one, and wait.
+        over = threading.Event()
+        busy = threading.Thread(target=slowed, args=(ground, over), daemon=True)
+        busy.start()
+        arrived = []
+        sender = threading.Thread(target=lambda: arrived.append(trickle(port, [data for _, data in first])), daemon=True)
+        sender.start()
+        alerts.fire("QueueFull SlowToSums")
+        over.set()
+        busy.join(PATIENCE_S)
+        sender.join(PATIENCE_S)
+        alerts.clear("QueueFull SlowToSums")
+        # It has one place, which the first of these takes.
+        with trickle(port, []) as holder:
+            stop = threading.Event()
+            keep = threading.Thread(target=keep_sending, args=(holder, second, stop), daemon=True)
+            keep.start()
+            while "busy" not in send(port, whole(last)):
+                time.sleep(0.2)
+            alerts.fire("SendersRefused")
+            stop.set()
+            keep.join(PATIENCE_S)
+        alerts.clear("SendersRefused")
+        # Its archive holds nothing: after a restart a checkpoint comes, and what was there goes.
+        ground.terminate()
+        ground.wait(PATIENCE_S)
+        ground = start(words, folder, "loaded.log")
+        running.append(ground)
+        print(send(port, whole(second)).strip())
+        alerts.fire("ArchiveCut")
+        # Memory of its own, and then as before.
+        limits = resource.prlimit(ground.pid, resource.RLIMIT_AS)
+        resource.prlimit(ground.pid, resource.RLIMIT_AS, (used_address_space(ground.pid) + (64 << 20), limits[1]))
+        alerts.fire("MemoryLow")
+        resource.prlimit(ground.pid, resource.RLIMIT_AS, limits)
+        alerts.clear("MemoryLow")
+        # Something else fills the disk.
+        filler = folder / "filler"
+        with filler.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, large)
+        alerts.fire("DiskLow")
+        filler.unlink()
+        alerts.clear("DiskLow")
+    finally:
+        for process in running:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    return alerts.seen
+
+
+def main(prometheus, lunarray, pipeline, downlink, rules, folder):
+    folder = Path(folder)
+    folder.mkdir(exist_ok=True)
+    packets = list(packets_of(Path(downlink).read_bytes()))
+    rules = Path(rules).read_text()
+    given = (prometheus, lunarray, pipeline, packets, rules, folder)
+    seen = faults_of_operation(*given) | ground_with_too_little(*given)
+    names = set(re.findall(r"- alert: (\w+)", rules))
+    assert seen == names, f"not seen: {names - seen}; without a rule: {seen - names}"
+    print(f"seen: {' '.join(sorted(seen))}; {time.monotonic() - BEGUN:.0f} s")
 
 
 BEGUN = time.monotonic()

@@ -297,7 +297,7 @@ fn interference_from_the_earth_is_at_the_limb_and_at_its_frequency() {
     };
     let frames = craft.sample(24).0;
     let leak =
-        |n: u8, t_s: f64| power * (-craft.array.earth_depth_of_m(n.into(), t_s).max(0.0) / depth_m).exp();
+        |n: u8, t_s: f64| power * (-craft.array.earth_depth_for_m(n.into(), t_s).max(0.0) / depth_m).exp();
     let start_s = craft.window.start.seconds();
     // It fades for the first daughter; the last one, 100 km behind, still sees the Earth at the end.
     for n in [0, 1, 7] {

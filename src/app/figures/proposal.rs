@@ -209,7 +209,7 @@ fn degree_values(
     let of = |curve: Option<&Vec<Option<f64>>>| Some((curve?.get(l).copied()??, Measured));
     let rho = figures.and_then(|figures| of(figures.rho.as_ref()));
     let snr = figures.and_then(|figures| of(figures.snr.as_ref()));
-    let modes = figures.and_then(|figures| figures.sky_power.as_ref()?.decided.get(l).copied());
+    let modes = figures.and_then(|figures| figures.sky_power.as_ref()?.constrained.get(l).copied());
     let snr = snr.or_else(|| Some((estimate?.relative_noise().recip(), Estimated)));
     let rho = rho.or_else(|| Some((estimate?.rho(), Estimated)));
     let modes = modes.map(|modes| (modes, Measured)).or_else(|| Some((estimate?.measured, Estimated)));

@@ -43,7 +43,7 @@ pub fn segments_for(
 
 /// Tick of the first turnaround of a formation after `from`, which may itself be one.
 fn turnaround_after(array: &Array, from: MissionTime) -> Option<MissionTime> {
-    let formation = array.breathing()?;
+    let formation = array.formation_of_any_shape()?;
     let next_after =
         |time: MissionTime| MissionTime::from_seconds(formation.next_turnaround_s(time.seconds()));
     let next_tick = from.plus_ticks(1);

@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::axes::to_equatorial;
-use super::oem::OrbitArc;
+use super::oem::TableSpan;
 use super::orbit::Array;
 use super::state::SatelliteState;
 use crate::units::time_scales::{Tai, TimeScale};
@@ -60,7 +60,7 @@ impl OemExport {
     /// if the Earth of the mission is idealised.
     #[must_use]
     pub fn text(&self, array: &Array, satellite: usize) -> (String, usize) {
-        let stretches = array.stretches(satellite).unwrap_or_else(|| self.sampled(array, satellite));
+        let stretches = array.table_spans(satellite).unwrap_or_else(|| self.sampled(array, satellite));
         let epoch = self.date(0.0);
         let idealised = match array.epoch_tai_s() {
             Some(_) => "",
@@ -99,14 +99,15 @@ impl OemExport {
     }
 
     /// States at equal steps between turnarounds of the formation.
-    fn sampled(&self, array: &Array, satellite: usize) -> Vec<OrbitArc> {
+    fn sampled(&self, array: &Array, satellite: usize) -> Vec<TableSpan> {
         let mut stretches = Vec::new();
         let mut from_s = 0.0;
         while from_s < self.until_s {
-            let turnaround_s = array.breathing().map(|formation| formation.next_turnaround_s(from_s));
+            let turnaround_s =
+                array.formation_of_any_shape().map(|formation| formation.next_turnaround_s(from_s));
             let to_s = turnaround_s.map_or(self.until_s, |turn_s| turn_s.min(self.until_s));
             let steps = ((to_s - from_s) / self.step_s).ceil().max(STATES_MIN - 1.0);
-            let mut stretch = OrbitArc::default();
+            let mut stretch = TableSpan::default();
             for k in 0..=steps as usize {
                 let time_s =
                     if k as f64 == steps { to_s } else { from_s + (to_s - from_s) * k as f64 / steps };

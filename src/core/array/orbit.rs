@@ -7,7 +7,7 @@ use super::bodies::{DatedEarth, Earth};
 use super::config::{ArrayConfig, ArrayError, NodeMotion};
 use super::formation::Formation;
 use super::kepler::{KeplerOrbit, eccentric_anomaly};
-use super::oem::{self, OrbitArc, TableOrbit};
+use super::oem::{self, TableOrbit, TableSpan};
 use super::propagate;
 use super::state::SatelliteState;
 use super::surface::{self, StationMotion};
@@ -80,8 +80,9 @@ impl OwnOrbit {
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Shape {
     eccentricity: f64,
-    /// Argument of the periapsis at the epoch, rad, and its rate, rad/s.
-    periapsis: [f64; 2],
+    /// Argument of the periapsis at the epoch.
+    periapsis_rad: f64,
+    periapsis_rate_rad_s: f64,
     /// Ratio of the maximum distance across the track to that along it.
     cross_track_ratio: f64,
 }
@@ -90,10 +91,8 @@ impl Shape {
     fn new(config: &ArrayConfig) -> Option<Self> {
         let shape = Self {
             eccentricity: config.eccentricity,
-            periapsis: [
-                config.periapsis_deg.to_radians(),
-                config.periapsis_rate_deg_per_day.to_radians() / DAY_S,
-            ],
+            periapsis_rad: config.periapsis_deg.to_radians(),
+            periapsis_rate_rad_s: config.periapsis_rate_deg_per_day.to_radians() / DAY_S,
             cross_track_ratio: config.cross_track_ratio,
         };
         (!config.is_circle()).then_some(shape)
@@ -159,7 +158,7 @@ impl Array {
                 require_distinct(
                     &stations.iter().map(|station| station.state(0.0).position_m).collect::<Vec<_>>(),
                 )?;
-                // The ground, which leaves every station the half of the sky above its own horizon.
+                // The Moon's surface is below every station, so that each sees the half of the sky above its own horizon.
                 moon_radius_m = stations.iter().map(StationMotion::radius_m).fold(0.0, f64::max);
                 stations.into_iter().map(OwnOrbit::Station).collect()
             } else if config.propagate.is_on() {
@@ -172,7 +171,7 @@ impl Array {
                 found.orbits.into_iter().map(OwnOrbit::Table).collect()
             };
         let earth = match epoch {
-            // Without a span there is no table.
+            // Orbits that are always known have no span, and the Earth then no table.
             Some(epoch) => Earth::Dated(Arc::new(DatedEarth::new(epoch, known_s(&own).unwrap_or_default()))),
             None => Earth::Circle(config.earth_longitude_deg.to_radians()),
         };
@@ -245,9 +244,9 @@ impl Array {
     }
 
     /// Tabulated states of the orbit of satellite `n` (from 0), if there are any.
-    pub(super) fn stretches(&self, n: usize) -> Option<Vec<OrbitArc>> {
+    pub(super) fn table_spans(&self, n: usize) -> Option<Vec<TableSpan>> {
         match self.own.get(n) {
-            Some(OwnOrbit::Table(orbit)) => Some(orbit.stretches()),
+            Some(OwnOrbit::Table(orbit)) => Some(orbit.table_spans()),
             _ => None,
         }
     }
@@ -307,9 +306,9 @@ impl Array {
         self.formation.as_ref().filter(|_| self.shape.is_none())
     }
 
-    /// The formation whose breathing changes the speeds, on a circle or not.
+    /// The daughters' arcs on a common orbit, a circle or not.
     #[must_use]
-    pub(crate) fn breathing(&self) -> Option<&Formation> {
+    pub(crate) fn formation_of_any_shape(&self) -> Option<&Formation> {
         self.formation.as_ref()
     }
 
@@ -327,8 +326,9 @@ impl Array {
         if angle > FRAC_PI_2 {
             return 0.0;
         }
-        // Directions at angles of t and u from the common node, in planes that are tilted by d, differ by at least t - u times
-        // cos(d / 2): 1 - cos = 1 - cos(t - u) + sin t sin u (1 - cos d), and sin t sin u >= -sin^2((t - u) / 2).
+        // Directions at angles of t and u from the common node, in planes tilted by d, are an angle s apart with
+        // 1 - cos s = 1 - cos(t - u) + sin t sin u (1 - cos d), and sin t sin u >= -sin^2((t - u) / 2): so sin(s / 2) is at least
+        // sin((t - u) / 2) cos(d / 2).
         2.0 * axis_m * (1.0 - e) * (0.5 * along).sin() * (0.5 * cross_track_ratio * angle).cos()
     }
 
@@ -344,19 +344,19 @@ impl Array {
         }
         let radius = self.orbit_radius_m;
         let (arc_m, arc_rate_m_s) = formation.arc_m(n, t_s);
-        // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track.
+        // As in the paper; after 1.3 years the last bit of the phase is worth 7 um along the track, equal for all daughters.
         let phase = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / radius;
         let phase_rate = TAU / self.orbital_period_s - arc_rate_m_s / radius;
         let (sin_f, cos_f) = phase.sin_cos();
         let (sin_o, cos_o) = (self.node_rad + self.node_rate_rad_s * t_s).sin_cos();
         let (sin_i, cos_i) = self.inclination_rad.sin_cos();
         // The point in the orbital plane, then its rotation with fused operations: fewer roundings than with the radius
-        // outside. Half a nanometre is 1e-10 of a turn at 30 MHz, the accuracy required of rows.
-        let (along_node, across) = (radius * cos_f, radius * sin_f);
+        // outside. Half a nanometre at each end of a baseline is 1e-10 of a turn at 30 MHz, the accuracy required of rows.
+        let (along_node, beyond_node) = (radius * cos_f, radius * sin_f);
         let position_m = [
-            (-sin_o * cos_i).mul_add(across, cos_o * along_node),
-            (cos_o * cos_i).mul_add(across, sin_o * along_node),
-            sin_i * across,
+            (-sin_o * cos_i).mul_add(beyond_node, cos_o * along_node),
+            (cos_o * cos_i).mul_add(beyond_node, sin_o * along_node),
+            sin_i * beyond_node,
         ];
         let along =
             [-cos_o * sin_f - sin_o * cos_f * cos_i, -sin_o * sin_f + cos_o * cos_f * cos_i, cos_f * sin_i];
@@ -373,7 +373,8 @@ impl Array {
     /// inclination differs by `cross_track_ratio` times that angle.
     fn shaped_state(&self, shape: &Shape, (arc_m, arc_rate_m_s): (f64, f64), t_s: f64) -> SatelliteState {
         let (axis_m, e) = (self.orbit_radius_m, shape.eccentricity);
-        let [periapsis, periapsis_rate] = [shape.periapsis[0] + shape.periapsis[1] * t_s, shape.periapsis[1]];
+        let periapsis_rate = shape.periapsis_rate_rad_s;
+        let periapsis = shape.periapsis_rad + periapsis_rate * t_s;
         let mean = self.phase_rad + TAU * t_s / self.orbital_period_s - arc_m / axis_m - periapsis;
         let mean_rate = TAU / self.orbital_period_s - arc_rate_m_s / axis_m - periapsis_rate;
         let anomaly = eccentric_anomaly(mean, e);
@@ -387,10 +388,10 @@ impl Array {
         let (sin_i, cos_i) = (self.inclination_rad + shape.cross_track_ratio * arc_m / axis_m).sin_cos();
         let inclination_rate = shape.cross_track_ratio * arc_rate_m_s / axis_m;
         let node_hat = [cos_o, sin_o, 0.0];
-        let across_hat = [-sin_o * cos_i, cos_o * cos_i, sin_i];
+        let quadrature_hat = [-sin_o * cos_i, cos_o * cos_i, sin_i];
         let normal_hat = [sin_i * sin_o, -sin_i * cos_o, cos_i];
         let in_space = |[x, y]: [f64; 2]| {
-            add(scale(x * cos_w - y * sin_w, node_hat), scale(x * sin_w + y * cos_w, across_hat))
+            add(scale(x * cos_w - y * sin_w, node_hat), scale(x * sin_w + y * cos_w, quadrature_hat))
         };
         let position_m = in_space(plane_m);
         // The line of apsides rotates about the orbit's normal, the plane about its node, the node about the pole.
@@ -404,10 +405,10 @@ impl Array {
     /// Position of a satellite that trails daughter 1 by an arc `arc_m` on its osculating circle, m.
     #[must_use]
     #[doc(hidden)]
-    pub fn trailing_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
+    pub fn trailing_position_m(&self, arc_m: f64, t_s: f64) -> Vec3 {
         let ahead_m = self.position_m(0, t_s);
-        let own_m = self.formation.as_ref().map_or(0.0, |formation| formation.arc_m(0, t_s).0);
-        let (sin, cos) = ((own_m - arc_m) / self.orbit_radius_m()).sin_cos();
+        let first_arc_m = self.formation.as_ref().map_or(0.0, |formation| formation.arc_m(0, t_s).0);
+        let (sin, cos) = ((first_arc_m - arc_m) / self.orbit_radius_m()).sin_cos();
         let along_m = cross(self.orbit_normal_hat(t_s), ahead_m);
         add(scale(cos, ahead_m), scale(sin, along_m))
     }
@@ -477,13 +478,13 @@ impl Array {
 
     /// Depth of the Earth behind the limb for daughter 1, m: positive when hidden.
     pub(super) fn earth_depth_m(&self, t_s: f64) -> f64 {
-        self.earth_depth_of_m(0, t_s)
+        self.earth_depth_for_m(0, t_s)
     }
 
     /// Depth of the Earth behind the limb for daughter `n` (from 0), m: positive when hidden.
     #[must_use]
     #[doc(hidden)]
-    pub fn earth_depth_of_m(&self, n: usize, t_s: f64) -> f64 {
+    pub fn earth_depth_for_m(&self, n: usize, t_s: f64) -> f64 {
         let position = self.position_m(n, t_s);
         hiding_depth_m(position, self.earth_hat(t_s), self.moon_radius_m)
     }
@@ -522,19 +523,20 @@ fn require_distinct(positions: &[Vec3]) -> Result<(), ArrayError> {
     Ok(())
 }
 
-/// Whether a position is below the Moon's surface by more than its relief. Stations lie on the surface, below the highest of them.
+/// Whether a position is below the Moon's surface by more than its relief. With stations that is the highest one's, and the others lie below.
 #[must_use]
 pub fn is_underground(r_m: Vec3, moon_radius_m: f64) -> bool {
     norm(r_m) <= moon_radius_m - MOON_RELIEF_M
 }
 
-/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Sect. 3.2): from one on the ground, what is below its
-/// horizon.
+/// Whether the Moon hides direction `n_hat` from a satellite at `r_m` (the paper, Sect. 3.2). From a station that is what lies below
+/// its horizon.
 #[must_use]
 pub fn hidden_by_moon(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> bool {
     hiding_depth_m(r_m, n_hat, moon_radius_m) > 0.0
 }
 
+/// How far the tangent point of the line of sight lies beyond the limb, along that line, m: positive when hidden.
 fn hiding_depth_m(r_m: Vec3, n_hat: Vec3, moon_radius_m: f64) -> f64 {
     let to_limb_m = (dot(r_m, r_m) - moon_radius_m * moon_radius_m).max(0.0).sqrt();
     -dot(n_hat, r_m) - to_limb_m

@@ -73,7 +73,7 @@ impl EarthOccultation {
             if n == 0 {
                 return [window.start, window.end];
             }
-            let is_hidden = |t_s: f64| array.earth_depth_of_m(n, t_s) > 0.0;
+            let is_hidden = |t_s: f64| array.earth_depth_for_m(n, t_s) > 0.0;
             let inside = [start_s, end_s, 0.5 * (start_s + end_s)].into_iter().find(|t_s| is_hidden(*t_s));
             let Some(inside_s) = inside else { return [window.end, window.start] };
             // Whole ticks within the occultation.

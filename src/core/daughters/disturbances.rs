@@ -77,7 +77,7 @@ impl BlockTones<'_> {
             self.add(gain_at(offset_hz) * start, [offset_hz, 0.0], re, im);
         }
         if d.interference_k_sr > 0.0 {
-            let depth_m = self.array.earth_depth_of_m(self.daughter, t_s).max(0.0);
+            let depth_m = self.array.earth_depth_for_m(self.daughter, t_s).max(0.0);
             let power = d.interference_k_sr * (-depth_m / d.interference_depth_m).exp();
             // One phase per window, common to all daughters.
             let identity = [self.channel.frequency_hz.to_bits(), self.window_s.to_bits()];

@@ -1,4 +1,4 @@
-//! Source of the space segment in sample fidelity: samples of all daughters and channels, window by window.
+//! Source of the space segment that simulates voltages, not visibilities: samples of all daughters and channels, window by window.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -19,7 +19,7 @@ use crate::runtime::{Flow, Outlet, Source, Units};
 use crate::units::{ChannelId, MissionTime, TICKS_PER_SECOND};
 
 /// Number of samples made from one prediction: 2 s at 8 kHz. Longer chunks need fewer predictions of slow fringes,
-/// shorter ones a shorter sum over instants at each epoch.
+/// shorter ones a shorter sum over instants at each epoch (every 64 samples).
 const CHUNK_SAMPLES: usize = 1 << 14;
 
 /// Array and sky that determine the samples.
@@ -41,7 +41,7 @@ pub struct Scene {
 pub struct SamplerCounts {
     /// Complex samples made for all daughters and channels.
     pub samples: u64,
-    /// Real and imaginary parts out of a quantiser's range.
+    /// Number of real or imaginary parts out of a quantiser's range.
     pub saturated: u64,
     /// Repairs of covariances.
     pub repairs: Repairs,
@@ -62,7 +62,7 @@ pub struct Sampler {
     spare: Mutex<Vec<ChannelWorkspace>>,
     counts: Arc<Mutex<SamplerCounts>>,
     errors: Option<Arc<InstrumentErrors>>,
-    /// Errors in the current window.
+    /// Errors in the current window, a pass of the satellites.
     pass: Option<PassErrors>,
 }
 
@@ -120,22 +120,23 @@ impl Sampler {
     }
 
     fn begin(&self, mut window: ObservingWindow) -> WindowProgress {
-        let width_hz = self.width_hz();
+        let sample_rate_hz = self.sample_rate_hz();
         let length_s = (window.end.0 - window.start.0) as f64 / TICKS_PER_SECOND as f64;
-        let samples = (length_s * width_hz) as usize / HOP * HOP;
+        let samples = (length_s * sample_rate_hz) as usize / HOP * HOP;
         window.end = self.time(window.start, samples);
-        let block_s = self.config.block_samples as f64 / width_hz;
+        let block_s = self.config.block_samples as f64 / sample_rate_hz;
         let quantiser = Quantiser::new(self.config.bits, block_s, self.config.level_time_constant_s);
         let quantisers = vec![vec![quantiser; self.scene.array.satellites()]; self.scene.channels.len()];
         WindowProgress { window, samples, done: 0, ready: None, quantisers }
     }
 
-    fn width_hz(&self) -> f64 {
+    fn sample_rate_hz(&self) -> f64 {
+        // Channels are sampled critically.
         self.scene.channels.first().map_or(1.0, |channel| channel.width_hz)
     }
 
     fn time(&self, start: MissionTime, samples: usize) -> MissionTime {
-        start.plus_ticks(sample_ticks(samples as u64, self.width_hz()))
+        start.plus_ticks(sample_ticks(samples as u64, self.sample_rate_hz()))
     }
 
     /// Makes the next chunk of the current window and sends the one before.
@@ -171,7 +172,7 @@ impl Sampler {
         let (window, first) = (progress.window, progress.done);
         let epochs = Epochs {
             start_s: self.time(window.start, first).seconds(),
-            step_s: HOP as f64 / self.width_hz(),
+            step_s: HOP as f64 / self.sample_rate_hz(),
             count: samples / HOP + 1,
         };
         let asked = models.par_iter_mut().zip(progress.quantisers.par_iter_mut()).enumerate();
@@ -260,7 +261,7 @@ impl ChannelWork<'_> {
         covariances.predict(model, &request)?;
         let daughters = quantisers.len();
         let block_samples = sampler.config.block_samples;
-        // The epoch before the first sample contributes its second half only.
+        // Epochs overlap by half. This fills the overlap; the samples that it writes are before the chunk, and overwritten next.
         let mut repairs = self.draw(covariances, 0, draft, SampleSlot { planes, first: 0 });
         let mut blocks = Vec::with_capacity(self.samples.div_ceil(block_samples) * daughters);
         for hop in 0..self.samples / HOP {
@@ -289,9 +290,9 @@ impl ChannelWork<'_> {
         let time = self.sampler.time(self.window.start, self.first + epoch * HOP);
         let key = DrawKey { seed: scene.seed, channel: self.id.0, ticks: time.0 };
         let channel = scene.channels[usize::from(self.id.0)];
-        let number = usize::from(self.id.0);
+        let channel_index = usize::from(self.id.0);
         let responses: Vec<Response> = pass.as_ref().map_or_else(Vec::new, |pass| {
-            let response = |n| Response::with_errors(pass, (n, number), channel, time.seconds());
+            let response = |n| Response::with_errors(pass, (n, channel_index), channel, time.seconds());
             (0..covariances.daughters()).map(response).collect()
         });
         synthesis.draw(covariances, epoch, key, &responses, draft, out)

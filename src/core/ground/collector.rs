@@ -438,7 +438,7 @@ impl Collector {
             && visibilities_outline(packet.payload).as_ref().is_none_or(is_due)
         {
             let (frame, counts) = self.decoder.decode(packet, false);
-            let packets = vec![DeliveredPacket { header, checksum: packet.check, counts }];
+            let packets = vec![DeliveredPacket { header, checksum: packet.checksum, counts }];
             return Ok(EventOutcome::Delivery(Delivery { packets, frame }));
         }
         self.held.insert(HeldPacket::new(&packet));

@@ -43,14 +43,14 @@ impl HeldPacket {
     /// A copy of a packet.
     #[must_use]
     pub fn new(packet: &Packet<'_>) -> Self {
-        Self { header: packet.header, payload: packet.payload.to_vec(), checksum: packet.check }
+        Self { header: packet.header, payload: packet.payload.to_vec(), checksum: packet.checksum }
     }
 
     /// The packet as the receiver returned it.
     #[must_use]
     pub fn packet(&self) -> Packet<'_> {
         let Self { header, payload, checksum } = self;
-        Packet { offset: 0, header: *header, payload, check: *checksum, late: false }
+        Packet { offset: 0, header: *header, payload, checksum: *checksum, late: false }
     }
 
     /// First and last instant of the visibilities in the packet; `None` if unknown.

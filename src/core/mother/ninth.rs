@@ -228,7 +228,7 @@ impl Ninth {
         let position = |(offset, duration): (&u32, &u32)| {
             let middle = f64::from(*offset) + 0.5 * f64::from(*duration);
             let t_s = window.start.seconds() + middle / TICKS_PER_SECOND as f64;
-            let r_m = self.setup.array.trailing_m(config.arc_m, t_s);
+            let r_m = self.setup.array.trailing_position_m(config.arc_m, t_s);
             DaughterPosition {
                 r_m,
                 normal_hat: self.setup.array.orbit_normal_hat(t_s),

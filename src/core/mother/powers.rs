@@ -47,7 +47,7 @@ impl SkyPowers {
         });
         let spans: Vec<(f64, usize)> = spans.collect();
         let position = |n: usize, t_s: f64| DaughterPosition {
-            r_m: if shared { array.trailing_m(0.0, t_s) } else { array.position_m(n, t_s) },
+            r_m: if shared { array.trailing_position_m(0.0, t_s) } else { array.position_m(n, t_s) },
             normal_hat: array.normal_hat(n, t_s),
             daughter_time: Some((n as u8, t_s)),
         };

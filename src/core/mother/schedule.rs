@@ -88,7 +88,7 @@ impl Schedule {
 /// window or at a turnaround.
 fn shortest_m(array: &Array, window: ObservingWindow, pair: Pair) -> f64 {
     // Orbits of one's own give no bound.
-    let Some(formation) = array.breathing() else { return 0.0 };
+    let Some(formation) = array.formation_of_any_shape() else { return 0.0 };
     let (start_s, end_s) = (window.start.seconds(), window.end.seconds());
     // There is no bound for a formation with more turnarounds.
     if (end_s - start_s) * 2.0 > TURNAROUNDS_MAX as f64 * formation.period_s() {

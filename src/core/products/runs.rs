@@ -62,7 +62,7 @@ pub struct ChannelFigures {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct MeasuredModes {
     /// Of each degree, at most 2 l + 1.
-    pub decided: Vec<f64>,
+    pub constrained: Vec<f64>,
 }
 
 /// Power of a map relative to the map of an ideal instrument, by degree from l = 0.

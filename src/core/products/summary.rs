@@ -139,10 +139,10 @@ impl ChannelSummary {
                 None => String::new(),
             };
         };
-        let decided: f64 = power.decided.iter().sum();
-        let all = power.decided.len().pow(2);
+        let constrained: f64 = power.constrained.iter().sum();
+        let all = power.constrained.len().pow(2);
         format!(
-            "regulariser from the data: {decided:.0} of {all} harmonics measured, residuals {:.2} times the noise; errors of pixels in \
+            "regulariser from the data: {constrained:.0} of {all} harmonics measured, residuals {:.2} times the noise; errors of pixels in \
             sigma.fits ({})",
             power.noise_factor,
             limits(&self.diagnostics, self.refinement.as_ref())

@@ -21,6 +21,8 @@ pub enum MemorySource {
     System,
     /// The limit of a control group, as set by containers and job schedulers.
     ControlGroup,
+    /// A limit of the process, as set by `ulimit -v` or `ulimit -d`.
+    Process,
     /// A limit given by the user.
     User,
 }
@@ -30,6 +32,7 @@ impl fmt::Display for MemorySource {
         f.write_str(match self {
             Self::System => "MemAvailable of /proc/meminfo",
             Self::ControlGroup => "the limit of this process's control group",
+            Self::Process => "the limit of this process (`ulimit -v` or `-d`)",
             Self::User => "the limit that was given",
         })
     }
@@ -53,14 +56,32 @@ impl MemoryLimit {
         let system = available_bytes(&fs::read_to_string(root.join("proc/meminfo")).ok()?);
         let system = system.map(|bytes| Self { bytes, source: MemorySource::System });
         let groups = group_bytes(root).map(|bytes| Self { bytes, source: MemorySource::ControlGroup });
-        system.into_iter().chain(groups).min_by_key(|limit| limit.bytes)
+        let process = process_bytes(root).map(|bytes| Self { bytes, source: MemorySource::Process });
+        system.into_iter().chain(groups).chain(process).min_by_key(|limit| limit.bytes)
     }
 }
 
 fn available_bytes(meminfo: &str) -> Option<u64> {
-    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    line_bytes(meminfo, "MemAvailable:")
+}
+
+/// The number of bytes in the line `NAME: 12 kB` of a file of the system.
+fn line_bytes(file: &str, name: &str) -> Option<u64> {
+    let line = file.lines().find_map(|line| line.strip_prefix(name))?;
     let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
     kibibytes.checked_mul(1024)
+}
+
+/// Memory left below the limits of this process, bytes: an allocation beyond them fails, whatever the machine has.
+fn process_bytes(root: &Path) -> Option<u64> {
+    let limits = fs::read_to_string(root.join("proc/self/limits")).ok()?;
+    let used = fs::read_to_string(root.join("proc/self/status")).ok()?;
+    let left = |(limit, name)| {
+        let line = limits.lines().find_map(|line| line.strip_prefix(limit))?;
+        let soft: u64 = line.split_whitespace().next()?.parse().ok()?;
+        Some(soft.saturating_sub(line_bytes(&used, name)?))
+    };
+    [("Max address space", "VmSize:"), ("Max data size", "VmData:")].into_iter().filter_map(left).min()
 }
 
 /// Memory left in the tightest of this process's control groups and their ancestors, bytes.
@@ -130,6 +151,27 @@ mod tests {
         assert_eq!(limit(&[]), None);
         assert_eq!(limit(&[("proc/meminfo", "MemTotal: 5 kB\n")]), None);
         assert_eq!(limit(&[("proc/meminfo", "MemAvailable: many\n")]), None);
+    }
+
+    #[test]
+    fn a_limit_of_the_process_is_less_what_it_uses() {
+        let status = ("proc/self/status", "Name:\tx\nVmSize:\t 1000000 kB\nVmData:\t  400000 kB\n");
+        let table = |address: &str, data: &str| {
+            format!(
+                "Limit                     Soft Limit           Hard Limit           Units     \n\
+                 Max data size             {data:<20} unlimited            bytes     \n\
+                 Max address space         {address:<20} unlimited            bytes     \n"
+            )
+        };
+        for (address, data, expected) in [
+            ("unlimited", "unlimited", (20_480_000_000, MemorySource::System)),
+            ("4096000000", "unlimited", (3_072_000_000, MemorySource::Process)),
+            ("4096000000", "1024000000", (614_400_000, MemorySource::Process)),
+            ("1000", "unlimited", (0, MemorySource::Process)),
+        ] {
+            let limits = table(address, data);
+            assert_eq!(limit(&[MEMINFO, status, ("proc/self/limits", &limits)]), Some(expected));
+        }
     }
 
     #[test]

@@ -488,7 +488,7 @@ fn checked(maps: [&ChannelFigures; 2], l: usize) -> Option<CheckedDegree> {
         l,
         noise_ratio,
         rho: maps.map(|map| of(&map.rho)),
-        modes: maps.map(|map| map.sky_power.as_ref()?.decided.get(l).copied()),
+        modes: maps.map(|map| map.sky_power.as_ref()?.constrained.get(l).copied()),
     })
 }
 

@@ -13,4 +13,4 @@ mod xml;
 pub(super) use file::{at_line, error, read_message};
 pub(super) use form::{Fault, Message, short};
 pub(super) use message::{Metadata, SegmentTimes, read_epoch};
-pub(super) use orbit::{OrbitArc, TableOrbit, read};
+pub(super) use orbit::{TableOrbit, TableSpan, read};

@@ -28,13 +28,13 @@ pub(in crate::array) struct TableOrbit {
 
 /// States of one orbit, at rising times, without a jump.
 #[derive(Clone, Debug, Default)]
-pub(in crate::array) struct OrbitArc {
+pub(in crate::array) struct TableSpan {
     time_s: Vec<f64>,
     position_m: Vec<Vec3>,
     velocity_m_s: Vec<Vec3>,
 }
 
-impl OrbitArc {
+impl TableSpan {
     pub(in crate::array) fn times_s(&self) -> &[f64] {
         &self.time_s
     }
@@ -222,8 +222,8 @@ impl OemMessage {
 impl TableOrbit {
     /// An orbit through states at times after the mission's epoch; each stretch, of four states or more, begins when the one
     /// before ends.
-    pub(in crate::array) fn of_stretches(stretches: Vec<OrbitArc>) -> Self {
-        let segment = |OrbitArc { time_s, position_m, velocity_m_s }| OemSegment {
+    pub(in crate::array) fn of_stretches(stretches: Vec<TableSpan>) -> Self {
+        let segment = |TableSpan { time_s, position_m, velocity_m_s }| OemSegment {
             method: TableMethod::Hermite,
             degree: 7,
             useable_s: [time_s.first(), time_s.last()].map(|s| s.copied().unwrap_or_default()),
@@ -239,7 +239,7 @@ impl TableOrbit {
 
     /// The states of the table that are to be used, at times since the mission's epoch; where useable times lie between states, also
     /// those then.
-    pub(in crate::array) fn stretches(&self) -> Vec<OrbitArc> {
+    pub(in crate::array) fn table_spans(&self) -> Vec<TableSpan> {
         let stretch = |segment: &OemSegment| {
             let [from_s, until_s] = segment.useable_s;
             let first = segment.time_s.partition_point(|t_s| *t_s < from_s);
@@ -248,7 +248,7 @@ impl TableOrbit {
             let own = |t_s: f64, k: usize| {
                 segment.time_s.get(k).is_none_or(|known_s| *known_s != t_s).then_some(t_s)
             };
-            let mut out = OrbitArc::default();
+            let mut out = TableSpan::default();
             let mut add = |t_s: f64| out.push(t_s - self.epoch_s, segment.state(t_s));
             own(from_s, first).into_iter().for_each(&mut add);
             segment.time_s[first..end].iter().copied().for_each(&mut add);

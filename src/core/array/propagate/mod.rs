@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use super::config::{ArrayConfig, ArrayError, PropagateConfig, StationKeeping};
 use super::formation::Formation;
 use super::kepler::{KeplerElements, KeplerOrbit};
-use super::oem::{OrbitArc, TableOrbit};
+use super::oem::{TableOrbit, TableSpan};
 use super::state::SatelliteState;
 use crate::units::constants::{DAY_S, SIDEREAL_MONTH_S};
 use crate::units::vector::{Vec3, add, cross, dot, norm, scale, unit};
@@ -84,7 +84,7 @@ fn propagated(config: &ArrayConfig) -> Result<Vec<TableOrbit>, ArrayError> {
             all.chunks(LANES).map(<[usize]>::to_vec).collect()
         }
     };
-    let found: Result<Vec<Vec<Vec<OrbitArc>>>, ArrayError> = groups
+    let found: Result<Vec<Vec<Vec<TableSpan>>>, ArrayError> = groups
         .par_iter()
         .enumerate()
         .map(|(index, group)| propagation.propagate_group(group, index == 0))
@@ -127,9 +127,9 @@ impl<'a> Propagation<'a> {
         &self,
         group: &[usize],
         reports_progress: bool,
-    ) -> Result<Vec<Vec<OrbitArc>>, ArrayError> {
+    ) -> Result<Vec<Vec<TableSpan>>, ArrayError> {
         let mut states = self.at_epoch(group);
-        let mut out: Vec<Vec<OrbitArc>> = vec![vec![OrbitArc::default()]; group.len()];
+        let mut out: Vec<Vec<TableSpan>> = vec![vec![TableSpan::default()]; group.len()];
         let every_s = self.config.propagate.keep_every_days * DAY_S;
         let mut due_s = if every_s > 0.0 { every_s } else { f64::INFINITY };
         // Height of the Earth above satellite 1 at the last two states.
@@ -143,7 +143,7 @@ impl<'a> Propagation<'a> {
             heights = [heights[1], height];
             if time_s >= due_s && culminates && node + NODES_MIN <= self.nodes {
                 states = self.after_station_keeping(time_s, &states, group);
-                out.iter_mut().for_each(|stretches| stretches.push(OrbitArc::default()));
+                out.iter_mut().for_each(|stretches| stretches.push(TableSpan::default()));
                 append(&mut out, time_s, &states);
                 due_s = every_s * ((time_s / every_s).floor() + 1.0);
             }
@@ -275,7 +275,7 @@ impl<'a> Propagation<'a> {
     }
 }
 
-fn append(out: &mut [Vec<OrbitArc>], time_s: f64, states: &States) {
+fn append(out: &mut [Vec<TableSpan>], time_s: f64, states: &States) {
     for (lane, stretches) in out.iter_mut().enumerate() {
         if let Some(stretch) = stretches.last_mut() {
             stretch.push(time_s, of_lane(states, lane));

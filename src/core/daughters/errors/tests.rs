@@ -216,7 +216,7 @@ fn a_leak_falls_with_the_angle_below_the_limb() {
         let expected = if earth_deg < disc_deg { (-(disc_deg - earth_deg) / 2.0).exp() } else { 1.0 };
         let found = errors.leak_k_sr(&array, 2, t_s) / 1e6;
         assert!((found / expected - 1.0).abs() < 1e-9, "{t_s}: {found} {expected}");
-        assert_eq!(earth_deg < disc_deg, array.earth_depth_of_m(2, t_s) > 0.0);
+        assert_eq!(earth_deg < disc_deg, array.earth_depth_for_m(2, t_s) > 0.0);
         (hidden, seen) = if earth_deg < disc_deg { (hidden + 1, seen) } else { (hidden, seen + 1) };
     }
     assert!(hidden > 100 && seen > 100);

@@ -46,7 +46,7 @@ impl DownlinkReceiver {
         if self.format != Some(Format::Cadu) {
             self.packets.push(bytes);
         }
-        if self.format.is_none() && self.packets.has_header() {
+        if self.format.is_none() && self.packets.has_any_packet() {
             self.format = Some(Format::Packets);
             self.frames = CaduReceiver::new();
         }

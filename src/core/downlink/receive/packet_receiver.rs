@@ -25,7 +25,7 @@ pub struct Packet<'a> {
     /// The payload, without headers and checksum.
     pub payload: &'a [u8],
     /// The packet checksum, over headers and payload.
-    pub check: u32,
+    pub checksum: u32,
     /// Whether the packet fills a gap that was reported earlier.
     pub late: bool,
 }
@@ -66,22 +66,22 @@ pub enum Event<'a> {
         /// Number of bytes skipped: the packet, or only its headers if no other packet follows it.
         bytes: u64,
     },
-    /// Packets of a kind are missing, with counts from `expected` to just below the count of the next packet.
+    /// Packets of a kind are missing, with sequence counts from `expected` to just below that of the next packet.
     Gap {
         /// Offset of the next packet, bytes.
         offset: u64,
         /// Headers of the next packet.
         header: PacketHeader,
-        /// Count of the first missing packet.
+        /// Sequence count of the first missing packet.
         expected: u64,
     },
-    /// The spacecraft restarted its packet count.
+    /// The spacecraft restarted its sequence count.
     Restart {
         /// Offset of the next packet, bytes.
         offset: u64,
         /// Headers of the next packet.
         header: PacketHeader,
-        /// The count expected without a restart.
+        /// The sequence count expected without a restart.
         expected: u64,
     },
     /// An idle packet (APID 0x7FF), which fills a stream without data.
@@ -158,7 +158,7 @@ pub struct PacketReceiver {
     is_finished: bool,
     pending: VecDeque<PendingEvent>,
     sequences: [Sequence; PacketKind::ALL.len()],
-    /// Whether packet counts are left to the caller.
+    /// Whether sequence counts are left to the caller.
     unfiltered: bool,
 }
 
@@ -208,8 +208,8 @@ impl PacketReceiver {
         self.is_finished
     }
 
-    /// Whether the next events contain a packet, valid or damaged.
-    pub(super) fn has_header(&mut self) -> bool {
+    /// Whether the next events contain a packet, valid, damaged or idle.
+    pub(super) fn has_any_packet(&mut self) -> bool {
         if self.pending.is_empty() {
             self.queue_next();
         }
@@ -224,7 +224,7 @@ impl PacketReceiver {
         })
     }
 
-    /// Number of restarts of the packet count of a kind, in any order of arrival.
+    /// Number of restarts of the sequence count of a kind, whatever the order of arrival.
     pub(super) fn restarts(&self, kind: PacketKind) -> u64 {
         self.sequences[kind.index()].restarts()
     }
@@ -253,8 +253,8 @@ impl PacketReceiver {
                 let packet = &self.buffer[self.begin..self.begin + header.bytes];
                 self.begin += header.bytes;
                 let payload = &packet[HEADER_BYTES..packet.len() - TRAILER_BYTES];
-                let check = packet.last_chunk().map_or(0, |check| u32::from_be_bytes(*check));
-                Event::Packet(Packet { offset, header, payload, check, late })
+                let checksum = packet.last_chunk().map_or(0, |bytes| u32::from_be_bytes(*bytes));
+                Event::Packet(Packet { offset, header, payload, checksum, late })
             }
             PendingEvent::Duplicate(header) => {
                 self.begin += header.bytes;
@@ -303,6 +303,7 @@ impl PacketReceiver {
                 PacketMatch::Idle(bytes) => return self.pending.push_back(PendingEvent::Idle(bytes)),
                 PacketMatch::Undecided => return,
                 PacketMatch::Truncated => {
+                    // Its headers may be chance: packets are sought inside it, and if there are none `queue_end` reports it.
                     self.truncated_from.get_or_insert(self.offset + self.begin as u64);
                     self.skip_garbage();
                 }
@@ -342,12 +343,12 @@ impl PacketReceiver {
         if after.len() < HEADER_BYTES && !self.is_finished {
             return PacketMatch::Undecided;
         }
-        let another_follows = match after.first() {
+        let ends_cleanly = match after.first() {
             None => true,
             Some(first) if after.len() < HEADER_BYTES => *first == PacketHeader::FIRST_BYTE,
             Some(_) => PacketHeader::parse(after).is_some(),
         };
-        PacketMatch::Damaged(header, if another_follows { header.bytes } else { HEADER_BYTES })
+        PacketMatch::Damaged(header, if ends_cleanly { header.bytes } else { HEADER_BYTES })
     }
 
     /// Examines an idle packet at the beginning of `rest`. It is accepted if another packet, or the end, follows it.
@@ -365,8 +366,8 @@ impl PacketReceiver {
         if after.len() < HEADER_BYTES && !self.is_finished {
             return Some(PacketMatch::Undecided);
         }
-        let another_follows = after.is_empty() || is_idle(after) || PacketHeader::parse(after).is_some();
-        another_follows.then_some(PacketMatch::Idle(bytes))
+        let ends_cleanly = after.is_empty() || is_idle(after) || PacketHeader::parse(after).is_some();
+        ends_cleanly.then_some(PacketMatch::Idle(bytes))
     }
 
     /// Skips bytes up to the next one that could begin a packet, at least one.

@@ -31,8 +31,8 @@ impl RefinedProblem<'_> {
             degrees: &degrees,
             right: right.of_circle,
             // Of data that the circle does not fit and a prior that is not taken off: where rounds begin, the noise is too large.
-            power: counts.power,
-            numbers: 2.0 * counts.visibilities as f64,
+            data_chi2: counts.power,
+            data_count: 2.0 * counts.visibilities as f64,
         };
         let mut found = on_circle.solve(None, self.inner, self.watch)?;
         let passes_max = self.rule.passes_max;

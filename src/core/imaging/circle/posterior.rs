@@ -65,7 +65,7 @@ impl Posterior<'_> {
         let [_, dipole_k @ ..] = moments_k(self.whole, self.l_max());
         Ok(Uncertainty {
             sigma_k,
-            resolution_deg: pixel_resolution_deg(self.blocks, &factors, (r, &power.decided), nside),
+            resolution_deg: pixel_resolution_deg(self.blocks, &factors, (r, &power.constrained), nside),
             mean_sigma_k,
             dipole_k,
             dipole_sigma_k,

@@ -23,30 +23,30 @@ pub(super) fn pixel_sigma_k(
 
 /// Root of the solid angle, degrees, for each coefficient that the data decide at the pixels of a map. Their density is
 /// `y.(1 - R^1/2 (A + R)^-1 R^1/2) y` of the harmonics y at a pixel, whose integral is the number of those that the data decide: with the
-/// blocks for A each degree counts by how many of it are decided in truth.
+/// blocks for A each degree counts by how many of it are constrained in truth.
 pub(super) fn pixel_resolution_deg(
     blocks: &[Block<'_>],
     factors: &Factors<'_>,
-    (r, decided): (&[f64], &[f64]),
+    (r, constrained): (&[f64], &[f64]),
     nside: usize,
 ) -> Vec<f64> {
-    let share = |((l, trace), decided): ((usize, f64), &f64)| {
+    let share = |((l, trace), constrained): ((usize, f64), &f64)| {
         let by_blocks = (2 * l + 1) as f64 - r[l] * trace;
-        if by_blocks > 0.0 { (decided / by_blocks).min(1.0) } else { 1.0 }
+        if by_blocks > 0.0 { (constrained / by_blocks).min(1.0) } else { 1.0 }
     };
     let traces = factors.traces(r.len() - 1).into_iter().enumerate();
-    let shares: Vec<f64> = traces.zip(decided).map(share).collect();
+    let shares: Vec<f64> = traces.zip(constrained).map(share).collect();
     let open = view_sigma_k(blocks, factors, &|_, l| (shares[l] * r[l]).sqrt(), &[], nside);
     let most: f64 = shares.iter().enumerate().map(|(l, share)| (2 * l + 1) as f64 * share).sum();
     open.iter().map(|open| resolution_deg(most, open * open)).collect()
 }
 
-/// Of a pixel at which `open` of the density of coefficients is not decided, where `most` over the whole sphere would be.
+/// Of a pixel at which `open` of the density of coefficients is not constrained, where `most` over the whole sphere would be.
 pub(in crate::imaging) fn resolution_deg(most: f64, open: f64) -> f64 {
     let sphere_sr = 4.0 * std::f64::consts::PI;
     // One at least, the mean.
-    let decided = (most / sphere_sr - open).max(sphere_sr.recip());
-    decided.sqrt().recip().to_degrees()
+    let constrained = (most / sphere_sr - open).max(sphere_sr.recip());
+    constrained.sqrt().recip().to_degrees()
 }
 
 /// Where the unknowns of the mean and of the dipole along x, y and z are, and what each is multiplied by for kelvins.

@@ -131,8 +131,15 @@ pub(super) fn power_of_data(
     let (blocks, right) = (order_blocks.blocks(), sums.right_hand_side());
     let SumCounts { visibilities, power, .. } = sums.counts();
     let numbers = 2.0 * visibilities as f64;
-    let problem =
-        PowerProblem { sums, blocks: &blocks, coupling: None, degrees: &degrees, right, power, numbers };
+    let problem = PowerProblem {
+        sums,
+        blocks: &blocks,
+        coupling: None,
+        degrees: &degrees,
+        right,
+        data_chi2: power,
+        data_count: numbers,
+    };
     Ok(Regulariser::Wiener(problem.solve(None, rule, watch)?.power.over_noise_k2()))
 }
 
@@ -163,8 +170,8 @@ fn solve_with_power(
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
-        numbers: 2.0 * visibilities as f64,
+        data_chi2: power - prior.as_ref().map_or(0.0, |prior| predicted_power(sums, prior, &right)),
+        data_count: 2.0 * visibilities as f64,
     };
     let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
     let [solved, noise] = columns;
@@ -185,7 +192,7 @@ fn solve_with_power(
         watch,
     };
     let errors = || posterior.uncertainty(samples, &|x| sums.apply_all(x));
-    let uncertainty = watch.has_priority().then(errors).transpose()?;
+    let uncertainty = watch.is_of_final_map().then(errors).transpose()?;
     let diagnostics = Diagnostics::of_power(l_max, &convergence);
     Ok(HarmonicSolution {
         map_k: map(&whole)?,

@@ -328,12 +328,12 @@ impl<'a> Posterior<'a> {
             |x: &[f64], product: &[f64]| power - 2.0 * dot(x, sums.right_hand_side()) + dot(x, product);
         let [before, after] = [chi_square(alone, &products[0]), chi_square(&joint, &products[1])];
         let numbers = 2.0 * visibilities as f64;
-        let decided: f64 = power_alone.decided.iter().sum();
+        let constrained: f64 = power_alone.constrained.iter().sum();
         let factor = power_alone.noise_factor.powi(2);
         Agreement {
             chi_square_alone: before / numbers,
             chi_square: after / numbers,
-            strain: (after - before) / (factor * decided.max(1.0)),
+            strain: (after - before) / (factor * constrained.max(1.0)),
         }
     }
 

@@ -1,7 +1,7 @@
 //! Total powers of the daughters as rows beside the visibilities of a channel.
 //!
 //! ```text
-//! P(t) = (1 + g) (Int T (1 - M) dn + constant) + (o + s t) <P> + n,   t from -1/2 to 1/2 over the pass.
+//! P(t) = (1 + g) (Int T (1 - M) dOmega + constant) + (o + s t) <P> + noise,   t from -1/2 to 1/2 over the pass, M = 1 behind the Moon.
 //! ```
 //!
 //! Gain g, offset o and slope s are free in every pass of every daughter, with Gaussian priors, and are marginalised: with the columns C of
@@ -29,9 +29,10 @@ use crate::units::vector::{Vec3, add, dot, norm, scale, unit};
 const GAP_S: f64 = 600.0;
 /// The longest pass, about an orbit, s.
 const PASS_S: f64 = 8000.0;
-/// Motion of the Moon over which powers are averaged, in units of 1 / l_max: the highest degree loses `0.7^2 / 24`, 2 %.
+/// Change of the Moon's direction, seen from a daughter, over which powers are averaged, in units of 1 / l_max: the highest degree loses
+/// `0.7^2 / 24`, 2 %.
 const AVERAGED_RAD_L: f64 = 0.7;
-/// The longest such motion.
+/// The largest such change.
 const AVERAGED_DEG_MAX: f64 = 2.0;
 /// Highest degree of the blocks that precondition; powers have little of higher ones.
 const BLOCK_DEGREES: usize = 48;
@@ -41,7 +42,7 @@ const COUPLED_DEGREES: usize = 12;
 /// Parts, and rows at a time, in which it is summed.
 const COUPLING_PARTS: usize = 16;
 const COUPLING_ROWS: usize = 4096;
-/// Free numbers of a pass.
+/// Free parameters of a pass: gain, offset, slope.
 const NUISANCES: usize = 3;
 
 /// A total power of a daughter.
@@ -88,7 +89,7 @@ pub struct PowerAgreement {
     pub rows: usize,
     /// Passes of the daughters, each with a gain, an offset and a slope of its own.
     pub passes: usize,
-    /// Reduced chi-square of the powers with the map; what exceeds 1 counts as noise.
+    /// Reduced chi-square of the powers with the map; above 1 it multiplies the variances.
     pub chi_square: f64,
 }
 
@@ -99,45 +100,48 @@ pub(super) struct PowerRows {
     operator: Discs,
     power_k_sr: Vec<f64>,
     /// Number of independent samples in each row.
-    samples: Vec<f64>,
+    independent: Vec<f64>,
     /// Time from -1/2 to 1/2 over the pass.
     time: Vec<f64>,
     passes: Vec<Range<usize>>,
     priors: [f64; NUISANCES],
     constant_k_sr: f64,
-    /// Variance of what the sky has beyond l_max, (K sr)^2, times the number of rows that share it.
+    /// Variance of what the sky has beyond l_max, (K sr)^2, times the number of rows that see the same structure: their errors are equal, and
+    /// do not average.
     beyond: Vec<f64>,
 }
 
 /// The rows with their marginalised weights.
 pub(super) struct WeightedRows<'a> {
     rows: &'a PowerRows,
-    /// Factor of the variances beyond noise and priors.
-    noise: f64,
+    /// Multiplies the variance of every row.
+    noise_factor: f64,
     weights: Vec<f64>,
     /// G of `N^-1 - G G'` in each pass.
-    columns: Vec<[f64; NUISANCES]>,
+    g: Vec<[f64; NUISANCES]>,
 }
 
-/// An average of consecutive powers: sums weighted by the numbers of samples.
+/// Sums over consecutive powers, weighted by their numbers of independent samples.
 #[derive(Clone, Copy, Default)]
-struct Average {
-    samples: f64,
-    power: f64,
-    time: f64,
-    radius: f64,
-    position: Vec3,
-    start: Vec3,
+struct WeightedSums {
+    independent: f64,
+    power_k_sr: f64,
+    time_s: f64,
+    radius_m: f64,
+    position_m: Vec3,
+    /// Direction of the first, not weighted.
+    start_hat: Vec3,
 }
 
-impl Average {
+impl WeightedSums {
     fn add(&mut self, sample: &PowerSample) {
+        // The radiometer equation.
         let count = (sample.power_k_sr / sample.sigma_k_sr).powi(2);
-        self.samples += count;
-        self.power += count * sample.power_k_sr;
-        self.time += count * sample.time_s;
-        self.radius += count * norm(sample.r_m);
-        self.position = add(self.position, scale(count, sample.r_m));
+        self.independent += count;
+        self.power_k_sr += count * sample.power_k_sr;
+        self.time_s += count * sample.time_s;
+        self.radius_m += count * norm(sample.r_m);
+        self.position_m = add(self.position_m, scale(count, sample.r_m));
     }
 }
 
@@ -151,16 +155,19 @@ impl PowerRows {
         constant_k_sr: f64,
     ) -> Option<Self> {
         let l_max = sky.power_k2.len() - 1;
-        let turn_rad = (AVERAGED_RAD_L / l_max.max(1) as f64).min(AVERAGED_DEG_MAX.to_radians());
-        let (averages, passes) = averaged(samples, turn_rad.cos());
-        let disc = |average: &Average| Disc {
-            direction: unit(scale(-1.0, average.position)),
-            cos_radius: (1.0 - (moon_radius_m * average.samples / average.radius).powi(2)).max(0.0).sqrt(),
+        let change_rad = (AVERAGED_RAD_L / l_max.max(1) as f64).min(AVERAGED_DEG_MAX.to_radians());
+        let (averages, passes) = averaged(samples, change_rad.cos());
+        let disc = |average: &WeightedSums| Disc {
+            direction: unit(scale(-1.0, average.position_m)),
+            cos_radius: (1.0 - (moon_radius_m * average.independent / average.radius_m).powi(2))
+                .max(0.0)
+                .sqrt(),
         };
         let discs: Vec<Disc> = averages.iter().map(disc).collect();
+        // Orbits are nearly circles: one radius of the Moon serves for all.
         let middle = discs.get(discs.len() / 2)?;
         let variance = variance_beyond(sky, middle.cos_radius);
-        let times: Vec<f64> = averages.iter().map(|average| average.time / average.samples).collect();
+        let times: Vec<f64> = averages.iter().map(|average| average.time_s / average.independent).collect();
         let time = passes.iter().flat_map(|pass| {
             let [first, last] = [times[pass.start], times[pass.end - 1]];
             let length = if last > first { last - first } else { 1.0 };
@@ -172,8 +179,8 @@ impl PowerRows {
             time: time.collect(),
             beyond: sharing(&discs, l_max).into_iter().map(|rows| rows * variance).collect(),
             discs,
-            power_k_sr: averages.iter().map(|average| average.power / average.samples).collect(),
-            samples: averages.iter().map(|average| average.samples).collect(),
+            power_k_sr: averages.iter().map(|average| average.power_k_sr / average.independent).collect(),
+            independent: averages.iter().map(|average| average.independent).collect(),
             passes,
             priors: [priors.gain, priors.offset, priors.slope],
             constant_k_sr,
@@ -189,38 +196,40 @@ impl PowerRows {
         self.operator.powers(x).into_iter().map(|power| power + self.constant_k_sr).collect()
     }
 
-    /// Marginalises gains, offsets and slopes for powers near `model`. `noise` multiplies the variance of what is left.
-    pub(super) fn weighted(&self, model: &[f64], noise: f64) -> WeightedRows<'_> {
-        let variance = |((power, samples), beyond): ((&f64, &f64), &f64)| power * power / samples + beyond;
+    /// Marginalises gains, offsets and slopes for powers near `model`. `noise_factor` multiplies the variance of every row.
+    pub(super) fn weighted(&self, model: &[f64], noise_factor: f64) -> WeightedRows<'_> {
+        let variance =
+            |((power, independent), beyond): ((&f64, &f64), &f64)| power * power / independent + beyond;
         let weights: Vec<f64> = model
             .iter()
-            .zip(&self.samples)
+            .zip(&self.independent)
             .zip(&self.beyond)
-            .map(|row| (noise * variance(row)).recip())
+            .map(|row| (noise_factor * variance(row)).recip())
             .collect();
-        let columns = self.passes.par_iter().flat_map_iter(|pass| {
+        let g = self.passes.par_iter().flat_map_iter(|pass| {
             let mean = self.power_k_sr[pass.clone()].iter().sum::<f64>() / pass.len() as f64;
-            let free: Vec<[f64; NUISANCES]> = pass
+            let c: Vec<[f64; NUISANCES]> = pass
                 .clone()
                 .map(|row| {
                     let [gain, offset, slope] = self.priors;
                     [gain * model[row], offset * mean, slope * mean * self.time[row]]
                 })
                 .collect();
-            projection(&free, &weights[pass.clone()])
+            marginalised(&c, &weights[pass.clone()])
         });
-        WeightedRows { rows: self, noise, columns: columns.collect(), weights }
+        WeightedRows { rows: self, noise_factor, g: g.collect(), weights }
     }
 
     /// Real harmonics up to a degree, in the order of unknowns, at the discs of some rows.
     fn harmonics(&self, degree_max: usize, rows: Range<usize>) -> Mat<f64> {
         let directions = || self.discs[rows.clone()].iter().map(|disc| disc.direction);
         let legendre = Legendre::new(degree_max, directions().map(cos_sin));
-        let turns: Vec<f64> = directions().map(|[x, y, _]| y.atan2(x)).collect();
+        let azimuths_rad: Vec<f64> = directions().map(|[x, y, _]| y.atan2(x)).collect();
         let ones = vec![1.0; rows.len()];
         let mut harmonics = Mat::<f64>::zeros(rows.len(), (degree_max + 1).pow(2));
         for m in 0..=degree_max {
-            let waves: Vec<(f64, f64)> = turns.iter().map(|turn| (m as f64 * turn).sin_cos()).collect();
+            let waves: Vec<(f64, f64)> =
+                azimuths_rad.iter().map(|azimuth| (m as f64 * azimuth).sin_cos()).collect();
             let lambda = legendre.rows::<f64>(m, &ones);
             for (l, lambda) in (m..).zip(lambda.chunks_exact(rows.len())) {
                 let at = index_of(degree_max, l, m, 0);
@@ -244,11 +253,11 @@ impl WeightedRows<'_> {
         let of_pass = |pass: &Range<usize>| {
             let mut sums = [0.0; NUISANCES];
             for row in pass.clone() {
-                sums.iter_mut().zip(self.columns[row]).for_each(|(sum, g)| *sum += g * rows[row]);
+                sums.iter_mut().zip(self.g[row]).for_each(|(sum, g)| *sum += g * rows[row]);
             }
-            let free =
-                move |row: usize| self.columns[row].iter().zip(sums).map(|(g, sum)| g * sum).sum::<f64>();
-            pass.clone().map(move |row| self.weights[row] * rows[row] - free(row))
+            let correction =
+                move |row: usize| self.g[row].iter().zip(sums).map(|(g, sum)| g * sum).sum::<f64>();
+            pass.clone().map(move |row| self.weights[row] * rows[row] - correction(row))
         };
         self.rows.passes.iter().flat_map(of_pass).collect()
     }
@@ -272,20 +281,24 @@ impl WeightedRows<'_> {
         let residuals: Vec<f64> = self.sky_k_sr().iter().zip(sky).map(|(a, b)| a - b).collect();
         let square: f64 = residuals.iter().zip(self.weigh(&residuals)).map(|(a, b)| a * b).sum();
         let rows = residuals.len();
-        PowerAgreement { rows, passes: self.rows.passes.len(), chi_square: self.noise * square / rows as f64 }
+        PowerAgreement {
+            rows,
+            passes: self.rows.passes.len(),
+            chi_square: self.noise_factor * square / rows as f64,
+        }
     }
 
-    /// The blocks of the normal matrix, averaged over turns about the pole, by order and parity as those of the visibilities.
+    /// The blocks of the normal matrix, averaged over rotations about the pole, by order and parity as those of the visibilities.
     pub(super) fn blocks(&self) -> Vec<Mat<f64>> {
         let l_max = self.rows.l_max;
         let highest = l_max.min(BLOCK_DEGREES);
         let points: Vec<(f64, f64)> = self.rows.discs.iter().map(|disc| cos_sin(disc.direction)).collect();
-        let turns: Vec<f64> =
+        let azimuths_rad: Vec<f64> =
             self.rows.discs.iter().map(|disc| disc.direction[1].atan2(disc.direction[0])).collect();
         let middle = self.rows.discs.len() / 2;
         let visible = visible_sr(highest, self.rows.discs[middle].cos_radius);
         let legendre = Legendre::new(highest, points.into_iter());
-        let ones = vec![1.0; turns.len()];
+        let ones = vec![1.0; azimuths_rad.len()];
         let of_order = |m: usize| -> [Mat<f64>; 2] {
             let lambda = if m <= highest { legendre.rows::<f64>(m, &ones) } else { Vec::new() };
             let of_parity = |parity: usize| {
@@ -293,8 +306,8 @@ impl WeightedRows<'_> {
                 let mut block = Mat::<f64>::zeros(size, size);
                 if m <= highest {
                     let degrees: Vec<usize> = (m + parity..=highest).step_by(2).collect();
-                    let rows = |l: &usize| &lambda[(l - m) * turns.len()..][..turns.len()];
-                    let found = self.block(&degrees.iter().map(rows).collect::<Vec<_>>(), m, &turns);
+                    let rows = |l: &usize| &lambda[(l - m) * azimuths_rad.len()..][..azimuths_rad.len()];
+                    let found = self.block(&degrees.iter().map(rows).collect::<Vec<_>>(), m, &azimuths_rad);
                     for (j, l) in degrees.iter().enumerate() {
                         for (i, k) in degrees.iter().enumerate() {
                             block[(i, j)] = visible[*k] * found[(i, j)] * visible[*l];
@@ -344,12 +357,13 @@ impl WeightedRows<'_> {
             rest = others;
             let rows = first.start..passes[passes.len() - 1].end;
             let mut harmonics = self.rows.harmonics(degree_max, rows.clone());
-            let mut free = Mat::<f64>::zeros(NUISANCES * passes.len(), count);
+            let mut g_times_y = Mat::<f64>::zeros(NUISANCES * passes.len(), count);
             for (number, pass) in passes.iter().enumerate() {
                 for row in pass.clone() {
-                    for (which, g) in self.columns[row].iter().enumerate() {
+                    for (which, g) in self.g[row].iter().enumerate() {
                         for k in 0..count {
-                            free[(NUISANCES * number + which, k)] += g * harmonics[(row - rows.start, k)];
+                            g_times_y[(NUISANCES * number + which, k)] +=
+                                g * harmonics[(row - rows.start, k)];
                         }
                     }
                 }
@@ -359,32 +373,33 @@ impl WeightedRows<'_> {
                     harmonics[(row - rows.start, k)] *= self.weights[row].sqrt();
                 }
             }
-            for (factor, columns) in [(1.0, &harmonics), (-1.0, &free)] {
+            for (factor, columns) in [(1.0, &harmonics), (-1.0, &g_times_y)] {
                 matmul(&mut matrix, Accum::Add, columns.transpose(), columns, factor, Par::Seq);
             }
         }
         matrix
     }
 
-    /// `Y (N^-1 - G G') Y'` of harmonics at the discs, averaged over turns.
-    fn block(&self, lambda: &[&[f64]], m: usize, turns: &[f64]) -> Mat<f64> {
+    /// `Y' (N^-1 - G G') Y` of harmonics of one order at the discs, averaged over rotations about the pole.
+    fn block(&self, lambda: &[&[f64]], m: usize, azimuths_rad: &[f64]) -> Mat<f64> {
         let count = lambda.len();
-        let weighted = Mat::from_fn(turns.len(), count, |row, k| self.weights[row].sqrt() * lambda[k][row]);
+        let weighted =
+            Mat::from_fn(azimuths_rad.len(), count, |row, k| self.weights[row].sqrt() * lambda[k][row]);
         let mut block = weighted.transpose() * &weighted;
-        let mut free = Mat::<f64>::zeros(2 * NUISANCES * self.rows.passes.len(), count);
+        let mut g_times_y = Mat::<f64>::zeros(2 * NUISANCES * self.rows.passes.len(), count);
         for (number, pass) in self.rows.passes.iter().enumerate() {
             for row in pass.clone() {
-                let (sin, cos) = (m as f64 * turns[row]).sin_cos();
-                for (which, g) in self.columns[row].iter().enumerate() {
+                let (sin, cos) = (m as f64 * azimuths_rad[row]).sin_cos();
+                for (which, g) in self.g[row].iter().enumerate() {
                     let at = 2 * (NUISANCES * number + which);
                     for (k, lambda) in lambda.iter().enumerate() {
-                        free[(at, k)] += g * cos * lambda[row];
-                        free[(at + 1, k)] += g * sin * lambda[row];
+                        g_times_y[(at, k)] += g * cos * lambda[row];
+                        g_times_y[(at + 1, k)] += g * sin * lambda[row];
                     }
                 }
             }
         }
-        block -= free.transpose() * &free;
+        block -= g_times_y.transpose() * &g_times_y;
         block
     }
 }
@@ -394,28 +409,28 @@ fn cos_sin([x, y, z]: Vec3) -> (f64, f64) {
     (z, x.hypot(y).max(1e-12))
 }
 
-/// Averages powers while the Moon turns by less than an angle. Returns the averages, and those of each pass of each daughter.
-fn averaged(samples: &[PowerSample], cos_turn: f64) -> (Vec<Average>, Vec<Range<usize>>) {
+/// Averages powers while the Moon's direction changes by less than an angle. Returns the averages, and those of each pass of each daughter.
+fn averaged(samples: &[PowerSample], cos_change: f64) -> (Vec<WeightedSums>, Vec<Range<usize>>) {
     let is_good = |sample: &&PowerSample| {
         let positive = sample.power_k_sr > 0.0 && sample.sigma_k_sr > 0.0;
         positive && sample.power_k_sr.is_finite() && sample.sigma_k_sr.is_finite() && norm(sample.r_m) > 0.0
     };
-    let (mut averages, mut passes) = (Vec::<Average>::new(), Vec::<Range<usize>>::new());
+    let (mut averages, mut passes) = (Vec::<WeightedSums>::new(), Vec::<Range<usize>>::new());
     let mut before: Option<&PowerSample> = None;
     let mut start_s = 0.0;
     for sample in samples.iter().filter(is_good) {
         let direction = unit(sample.r_m);
         let is_of_pass = |before: &PowerSample| {
-            let is_near = sample.time_s - before.time_s < GAP_S && sample.time_s - start_s < PASS_S;
-            before.daughter == sample.daughter && is_near
+            let is_soon = sample.time_s - before.time_s < GAP_S && sample.time_s - start_s < PASS_S;
+            before.daughter == sample.daughter && is_soon
         };
         let goes_on = before.is_some_and(is_of_pass);
         if !goes_on {
             start_s = sample.time_s;
         }
-        let is_near = averages.last().is_some_and(|average| dot(average.start, direction) > cos_turn);
+        let is_near = averages.last().is_some_and(|average| dot(average.start_hat, direction) > cos_change);
         if !(goes_on && is_near) {
-            averages.push(Average { start: direction, ..Average::default() });
+            averages.push(WeightedSums { start_hat: direction, ..WeightedSums::default() });
             match passes.last_mut() {
                 Some(pass) if goes_on => pass.end = averages.len(),
                 _ => passes.push(averages.len() - 1..averages.len()),
@@ -429,18 +444,18 @@ fn averaged(samples: &[PowerSample], cos_turn: f64) -> (Vec<Average>, Vec<Range<
     (averages, passes)
 }
 
-/// The columns G of `N^-1 - G G' = N^-1 - N^-1 C (C'N^-1 C + I)^-1 C'N^-1`, row by row.
-fn projection(free: &[[f64; NUISANCES]], weights: &[f64]) -> Vec<[f64; NUISANCES]> {
+/// G of `N^-1 - G G' = N^-1 - N^-1 C (C'N^-1 C + I)^-1 C'N^-1`, row by row.
+fn marginalised(columns: &[[f64; NUISANCES]], weights: &[f64]) -> Vec<[f64; NUISANCES]> {
     let mut matrix = Mat::<f64>::identity(NUISANCES, NUISANCES);
-    for (c, w) in free.iter().zip(weights) {
+    for (c, w) in columns.iter().zip(weights) {
         for i in 0..NUISANCES {
             for j in 0..NUISANCES {
                 matrix[(i, j)] += c[i] * w * c[j];
             }
         }
     }
-    // Its eigenvalues are at least 1, so that only numbers that are not finite have no factor.
-    let Ok(factor) = matrix.llt(Side::Lower) else { return vec![[0.0; NUISANCES]; free.len()] };
+    // Its eigenvalues are at least 1: only input that is not finite has no factor.
+    let Ok(factor) = matrix.llt(Side::Lower) else { return vec![[0.0; NUISANCES]; columns.len()] };
     let lower = factor.L();
     let of_row = |(c, w): (&[f64; NUISANCES], &f64)| {
         let mut g = [0.0; NUISANCES];
@@ -450,7 +465,7 @@ fn projection(free: &[[f64; NUISANCES]], weights: &[f64]) -> Vec<[f64; NUISANCES
         }
         g
     };
-    free.iter().zip(weights).map(of_row).collect()
+    columns.iter().zip(weights).map(of_row).collect()
 }
 
 /// Variance of a power from what the sky has beyond l_max, with C_l continued as it ends.

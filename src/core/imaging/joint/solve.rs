@@ -10,7 +10,7 @@ use super::spectrum::SpectralMaps;
 use super::sums::{ScaledBlocks, joint_blocks, scaled_blocks};
 use crate::imaging::SolveError;
 use crate::imaging::circle::{HarmonicSums, OrderBlocks, degrees};
-use crate::imaging::power::{Block, Coupling, FoundPower, PowerProblem, SkyPower, value};
+use crate::imaging::power::{Block, Coupling, FoundPower, PowerProblem, SkyPower, log_evidence};
 use crate::imaging::solver::{Convergence, NamedWatch, SolveWatch, StoppingRule};
 use crate::imaging::{AccumulationError, NormalSums, SumCounts};
 
@@ -63,7 +63,7 @@ impl JointChannel {
             &blocks.blocks(),
             coupling.as_ref(),
             rule,
-            watch.named(&name).with_priority(true),
+            watch.named(&name).of_final_map(true),
         )?;
         Ok(Self { frequency_hz, nside, powers, sums, blocks, coupling, alone })
     }
@@ -131,7 +131,7 @@ pub fn solve_jointly(
     let noise_factors: Vec<f64> = singles().map(|single| single.power.noise_factor).collect();
     let scale = singles().map(SingleChannel::scale).collect();
     let initial = Prior::new(all_hz, scale, Correlation { length: LENGTHS[2], own_share: OWN_SHARES[1] })?;
-    let watch = watch.named("all channels").with_priority(true);
+    let watch = watch.named("all channels").of_final_map(true);
     let likeness = if channels.len() > 1 {
         let scaled = scaled_blocks(&initial, &blocks, &noise_factors, &[]);
         let rights: Vec<Vec<f64>> = singles().map(|single| single.right.clone()).collect();
@@ -204,7 +204,15 @@ impl SingleChannel {
         let degrees: Vec<usize> = degrees(sums.setup().l_max).collect();
         let SumCounts { visibilities, power, .. } = sums.counts();
         let (right, numbers) = (sums.right_hand_side(), 2.0 * visibilities as f64);
-        let equations = PowerProblem { sums, blocks, coupling, degrees: &degrees, right, power, numbers };
+        let equations = PowerProblem {
+            sums,
+            blocks,
+            coupling,
+            degrees: &degrees,
+            right,
+            data_chi2: power,
+            data_count: numbers,
+        };
         let FoundPower { solution, power, regularisation, .. } = equations.solve(None, rule, watch)?;
         let mut right = crate::imaging::power::multiply(blocks, &solution);
         for ((b, x), l) in right.iter_mut().zip(&solution).zip(&degrees) {
@@ -240,7 +248,7 @@ pub(super) fn most_likely(
         let prior = initial.with_correlation(likeness).ok()?;
         let blocks = joint_blocks(&prior, scaled);
         let unit = vec![1.0; initial.l_max.first().map_or(1, |l_max| l_max + 1)];
-        let found = value(&blocks, &unit, &prior.transposed(rights))?;
+        let found = log_evidence(&blocks, &unit, &prior.transposed(rights))?;
         known.insert(key, found);
         Some(found)
     };

@@ -294,7 +294,7 @@ fn powers_with_free_gains_count_as_those_of_the_dense_matrices() {
     };
     // A sky with nothing beyond l_max.
     let power_k2 = vec![1.0, 1.0, 1.0, 1.0, 1e-30];
-    let sky = SkyPower { power_k2, sigma_ln: vec![], decided: vec![], noise_factor: 1.0 };
+    let sky = SkyPower { power_k2, sigma_ln: vec![], constrained: vec![], noise_factor: 1.0 };
     let rows = PowerRows::new(&samples, moon_m, &sky, &priors, 190.0).unwrap();
     // Rows of pixels have errors of some 1e-3 sr at the limb, of a sky of some kelvins and data of 13 K sr: a hundredth of a standard deviation
     // for each of 90 powers, and some tenth together.
@@ -305,7 +305,7 @@ fn powers_with_free_gains_count_as_those_of_the_dense_matrices() {
 #[test]
 fn blocks_and_coupling_are_the_matrix_of_the_powers() {
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.02, constant_k_sr: Vec::new() };
-    let sky = SkyPower { power_k2: vec![1.0; 5], sigma_ln: vec![], decided: vec![], noise_factor: 1.0 };
+    let sky = SkyPower { power_k2: vec![1.0; 5], sigma_ln: vec![], constrained: vec![], noise_factor: 1.0 };
     // All at one altitude, that of the blocks.
     let at_one_altitude = |sample: PowerSample| PowerSample { r_m: scale(2.0e6, unit(sample.r_m)), ..sample };
     let samples: Vec<PowerSample> = passes().into_iter().map(at_one_altitude).collect();
@@ -336,7 +336,7 @@ fn blocks_and_coupling_are_the_matrix_of_the_powers() {
 #[test]
 fn powers_are_averaged_and_split_into_passes() {
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: Vec::new() };
-    let sky = SkyPower { power_k2: vec![1.0; 5], sigma_ln: vec![], decided: vec![], noise_factor: 1.0 };
+    let sky = SkyPower { power_k2: vec![1.0; 5], sigma_ln: vec![], constrained: vec![], noise_factor: 1.0 };
     let mut samples = passes();
     // Each power again half a degree farther on, with half the noise and so four times the weight.
     let again = samples.clone().into_iter().map(|sample| {
@@ -366,7 +366,7 @@ fn errors_of_the_mean_hold_with_unknown_gains() {
     let sky = SkyPower {
         power_k2: vec![1.0, 1.0, 1.0, 1.0, 1e-30],
         sigma_ln: vec![],
-        decided: vec![],
+        constrained: vec![],
         noise_factor: 1.0,
     };
     let prior =

@@ -121,8 +121,8 @@ impl Problem<'_> {
             coupling: None,
             degrees: &degrees,
             right: &projected.right,
-            power: counts.power - self.predicted_power()?,
-            numbers: 2.0 * counts.visibilities as f64,
+            data_chi2: counts.power - self.predicted_power()?,
+            data_count: 2.0 * counts.visibilities as f64,
         };
         let MapsWithPower { found, columns, convergence } = problem.solve_maps(start, rule, watch)?;
         let errors = || -> Result<Uncertainty, SolveError> {
@@ -149,7 +149,7 @@ impl Problem<'_> {
             errors.sigma_k.iter_mut().for_each(|sigma_k| *sigma_k = sigma_k.hypot(beyond_k2.sqrt()));
             Ok(errors)
         };
-        let uncertainty = watch.has_priority().then(errors).transpose()?;
+        let uncertainty = watch.is_of_final_map().then(errors).transpose()?;
         Ok(Columns {
             columns,
             convergence,

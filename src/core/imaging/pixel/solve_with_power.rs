@@ -65,8 +65,8 @@ pub fn solve_pixels_with_power(
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power: power - predicted,
-        numbers,
+        data_chi2: power - predicted,
+        data_count: numbers,
     };
     let found = problem.solve_blocks()?;
     let factors = Factors::new(&blocks, &found.regularisation);

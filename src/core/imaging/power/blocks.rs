@@ -119,7 +119,7 @@ fn regularisation(power: &[f64]) -> Vec<f64> {
 }
 
 /// The log evidence; `None` if a block is not positive definite.
-pub(in crate::imaging) fn value(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
+pub(in crate::imaging) fn log_evidence(blocks: &[Block<'_>], power: &[f64], right: &[f64]) -> Option<f64> {
     let r = regularisation(power);
     let block_value = |block: &Block<'_>| {
         let factor = block.factor(&r)?;

@@ -8,7 +8,7 @@ use faer::{Mat, Side};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::knots::{FREE, Knots};
+use super::knots::{FREE_DEGREES, Knots};
 use super::{ExpectedLimit, FoundPower};
 use crate::units::{StreamKind, random_stream};
 
@@ -61,8 +61,8 @@ fn moved(theta: &[f64], covariance: &Mat<f64>, scale: f64, stream: &mut impl Rng
 /// Logarithm of the density of parameters given the sums of squares of coefficients by degree.
 fn log_density((knots, limit): (&Knots, &ExpectedLimit), theta: &[f64], squares: &[f64]) -> f64 {
     let term = |(l, ln): (usize, f64)| -0.5 * ((2 * l + 1) as f64 * ln + squares[l] * (-ln).exp());
-    let of_sky: f64 = knots.log_power(theta).into_iter().enumerate().skip(FREE).map(term).sum();
-    of_sky + knots.hyperprior(theta).value + limit.value(&knots.power(theta))
+    let of_sky: f64 = knots.log_power(theta).into_iter().enumerate().skip(FREE_DEGREES).map(term).sum();
+    of_sky + knots.hyperprior(theta).value + limit.log_prior(&knots.power(theta))
 }
 
 /// Parameters drawn given the sky, by Metropolis' walk from `theta`.
@@ -75,7 +75,7 @@ fn given_sky(
     let (knots, _) = prior;
     // Fisher's information of coefficients that are known: half of each.
     let mut precision = knots.hyperprior(&theta).precision;
-    for l in FREE..squares.len() {
+    for l in FREE_DEGREES..squares.len() {
         for (k, a) in knots.weights(l) {
             for (j, b) in knots.weights(l) {
                 precision[(k, j)] += 0.5 * (2 * l + 1) as f64 * a * b;

@@ -5,9 +5,9 @@ use faer::Mat;
 /// Degree of the first knot; lower degrees are free.
 pub(super) const FIRST: usize = 2;
 /// Number of degrees with a free prior: mean and dipole do not follow the power of structure.
-pub(super) const FREE: usize = FIRST;
+pub(super) const FREE_DEGREES: usize = FIRST;
 /// Prior power of monopole and dipole in units of the power at [`FIRST`]: far more than of any sky.
-const FREE_FACTORS: [f64; FREE] = [1e6, 1e4];
+const FREE_FACTORS: [f64; FREE_DEGREES] = [1e6, 1e4];
 /// Prior mean of the fall of ln C_l from knot to knot: the sky between 1 and 100 MHz falls as `l^-2` to `l^-3.5` at all scales.
 const FALL: f64 = 2.7 * std::f64::consts::LN_2;
 /// Prior standard deviation of the fall.
@@ -55,7 +55,7 @@ impl Knots {
 
     /// The knots on both sides of a degree with their weights, which are 0 for a free degree.
     pub(super) fn weights(&self, l: usize) -> [(usize, f64); 2] {
-        if l < FREE {
+        if l < FREE_DEGREES {
             return [(0, 0.0), (0, 0.0)];
         }
         let position = ((l + 1) as f64 / (FIRST + 1) as f64).log2();

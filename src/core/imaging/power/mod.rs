@@ -8,11 +8,11 @@
 //! ```
 //!
 //! x is the solution, and gamma_l the number of coefficients that the data determine (MacKay 1992). All of this is cheap if A is block
-//! diagonal, exactly or as an approximation that preconditions it. With the true A, each round solves for x. Then the blocks replace A, with
-//! the data for which x is their solution, and with true traces estimated from posterior samples. Both problems have the same gradient at
+//! diagonal, exactly or as an approximation that preconditions it. With the true A, each round solves for x. Then the blocks
+//! replace A, and b is replaced by the right-hand side for which the blocks have the solution x; true traces are estimated from posterior samples. Both problems have the same gradient at
 //! theta, so that rounds converge to the maximum for the true A.
 //!
-//! A map is limited in degree and the sky is not. If the residual `|V - B x|^2`, which follows from the sums, exceeds the noise by a factor
+//! A map is band-limited and the sky is not. If the residual `|V - B x|^2`, which follows from the sums, exceeds the noise by a factor
 //! s^2, it counts as noise: everything is done for data divided by s.
 
 mod blocks;
@@ -29,12 +29,12 @@ use faer::linalg::solvers::DenseSolveCore;
 use faer::{Mat, Side};
 use serde::Serialize;
 
-pub(super) use blocks::{Block, Coupling, Factors, multiply, value};
+pub(super) use blocks::{Block, Coupling, Factors, log_evidence, multiply};
 pub(super) use rounds::{FoundPower, MapsWithPower, PowerProblem};
 pub(super) use samples::{PosteriorPrecision, PosteriorSample, SAMPLE_TOLERANCE};
 
 use self::blocks::{evidence, largest_diagonal};
-use self::knots::{FREE, Knots};
+use self::knots::{FREE_DEGREES, Knots};
 use crate::imaging::SolveError;
 use crate::sky::healpix::pixel_count;
 
@@ -49,13 +49,13 @@ const STEP_MAX: f64 = 2.0;
 /// Maximum number of halvings of a step without gain.
 const HALVINGS: usize = 8;
 
-/// `V'N^-1V` up to which structure may be expected, in units of what the data have. Rounds of data that leave most of the sky open could
-/// otherwise run away: a larger sky makes a larger map, which makes a larger sky. Beyond it a narrow Gaussian prior in the logarithm sets in.
+/// Limit of the `V'N^-1V` that C_l predicts for degrees from 2 on, in units of that of the data. Rounds of data that leave most of the sky open
+/// could otherwise run away: a larger C_l makes a larger map, which makes a larger C_l. Beyond it a narrow Gaussian prior in the logarithm sets in.
 const EXPECTED_MAX: f64 = 30.0;
 /// Standard deviation of that prior: a wall that is smooth enough for Newton's steps.
 const EXPECTED_SIGMA: f64 = 1e-3;
 
-/// The angular power of the sky (minus the prior map), estimated from the data, with its uncertainty. R is 1 / C_l.
+/// The angular power of the sky's difference from the prior map, estimated from the data, with its uncertainty. R is s^2 / C_l, s the noise factor.
 #[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
 pub struct SkyPower {
     /// C_l of the ensemble, K^2, from l = 0, as a smooth curve. Values at l = 0 and 1 are no estimates, but so large that mean and dipole are
@@ -63,8 +63,8 @@ pub struct SkyPower {
     pub power_k2: Vec<f64>,
     /// Standard deviation of ln C_l, from the curvature of the evidence; 0 for l = 0 and 1.
     pub sigma_ln: Vec<f64>,
-    /// Number of the 2 l + 1 coefficients that the data determine.
-    pub decided: Vec<f64>,
+    /// gamma_l: how many of the 2 l + 1 coefficients the data constrain.
+    pub constrained: Vec<f64>,
     /// Scatter of the residuals in units of the noise, at least 1. The excess, from the sky beyond the map's degrees or from instrument errors,
     /// counts as noise.
     pub noise_factor: f64,
@@ -78,7 +78,7 @@ impl SkyPower {
         Some([power * (-sigma).exp(), power * sigma.exp()])
     }
 
-    /// The inverse of R by degree: C_l divided by the square of the noise factor.
+    /// C_l / s^2, the inverse of R by degree.
     #[must_use]
     pub fn over_noise_k2(&self) -> Vec<f64> {
         self.power_k2.iter().map(|power| power / self.noise_factor.powi(2)).collect()
@@ -117,15 +117,15 @@ impl SkyPower {
     #[must_use]
     pub fn csv(&self) -> String {
         let mut table = String::from(
-            "# Angular power of the sky from the data, with the interval that holds it with 68 % probability; decided: how many of the 2 l + 1\n\
-             # coefficients the data decide. R = 1 / C_l. The interval is that of a smooth curve; of the last tenth of the degrees it leaves out\n\
-             # what the sky beyond the map's adds, some 10 %.\n\
-             l,power_k2,low_k2,high_k2,decided\n",
+            "# Angular power of the sky from the data, with the interval that holds it with 68 % probability; constrained: how many of the\n\
+             # 2 l + 1 coefficients the data constrain. R = s^2 / C_l, s the noise factor. The interval is that of a smooth curve; in the last tenth of the degrees\n\
+             # the sky beyond the map adds some 10 %, which it does not include.\n\
+             l,power_k2,low_k2,high_k2,constrained\n",
         );
-        for l in FREE..self.power_k2.len() {
+        for l in FREE_DEGREES..self.power_k2.len() {
             let [low, high] = self.interval_k2(l).unwrap_or_default();
-            let decided = self.decided.get(l).copied().unwrap_or_default();
-            table.push_str(&format!("{l},{:e},{low:e},{high:e},{decided:.3}\n", self.power_k2[l]));
+            let constrained = self.constrained.get(l).copied().unwrap_or_default();
+            table.push_str(&format!("{l},{:e},{low:e},{high:e},{constrained:.3}\n", self.power_k2[l]));
         }
         table
     }
@@ -137,12 +137,12 @@ pub struct Uncertainty {
     /// Posterior standard deviation of every pixel, K. Harmonic maps include errors up to their maximum degree, pixel maps also the sky's
     /// higher degrees.
     pub sigma_k: Vec<f64>,
-    /// Root of the solid angle for each coefficient that the data decide, by pixel, degrees: `sqrt(4 pi) / (l_max + 1)` rad of a map that
+    /// Root of the sky's solid angle over the number of coefficients that the data constrain, by pixel, degrees: `sqrt(4 pi) / (l_max + 1)` rad of a map that
     /// keeps all degrees up to l_max.
     pub resolution_deg: Vec<f64>,
     /// Standard deviation of the mean, K.
     pub mean_sigma_k: f64,
-    /// Dipole along the ecliptic's x, y and z, K: the map has `mean + dipole . n` of degrees 0 and 1.
+    /// Dipole along the ecliptic's x, y and z, K: the map's degrees 0 and 1 are `mean + dipole . n`.
     pub dipole_k: [f64; 3],
     /// Standard deviations of the dipole, K.
     pub dipole_sigma_k: [f64; 3],
@@ -152,7 +152,7 @@ pub struct Uncertainty {
     pub samples: Vec<Sample>,
 }
 
-/// Draws from the posterior that are wanted beside a map.
+/// How many draws from the posterior are wanted beside a map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Samples {
     /// Their number.
@@ -186,12 +186,12 @@ impl Uncertainty {
         self
     }
 
-    /// 1 for the pixels that the data measure, 0 for the others: those where they leave open more than half of the variance that R expects of
-    /// the sky's structure (l >= 2), so that the map shows the expectation more than the sky.
+    /// 1 for the pixels that the data measure: those whose posterior variance is less than half of the prior variance of the sky's structure
+    /// (l >= 2); 0 for the others.
     #[must_use]
     pub fn mask(&self) -> Vec<f64> {
         let of_degree = |(l, power): (usize, &f64)| (2 * l + 1) as f64 / (4.0 * PI) * power;
-        let expected: f64 = self.power.power_k2.iter().enumerate().skip(FREE).map(of_degree).sum();
+        let expected: f64 = self.power.power_k2.iter().enumerate().skip(FREE_DEGREES).map(of_degree).sum();
         self.sigma_k.iter().map(|sigma| f64::from(u8::from(sigma * sigma < 0.5 * expected))).collect()
     }
 }
@@ -207,8 +207,7 @@ pub(in crate::imaging) struct PowerFit {
     limit: ExpectedLimit,
 }
 
-/// A soft limit of the power: the `V'N^-1V` that structure of the sky makes the data expect is the sum of C_l times the traces of the normal
-/// matrix by degree. Mean and dipole are free.
+/// A soft limit of C_l: it predicts a `V'N^-1V` of the sum of C_l times the traces of the normal matrix by degree. Mean and dipole are free.
 #[derive(Clone, Debug)]
 struct ExpectedLimit {
     traces: Vec<f64>,
@@ -216,15 +215,15 @@ struct ExpectedLimit {
 }
 
 impl ExpectedLimit {
-    fn new(blocks: &[Block<'_>], l_max: usize, data_power: f64) -> Self {
+    fn new(blocks: &[Block<'_>], l_max: usize, data_chi2: f64) -> Self {
         let mut traces = vec![0.0; l_max + 1];
         for block in blocks {
             for (k, l) in block.degrees.iter().enumerate() {
                 traces[*l] += block.places.len() as f64 * block.matrix[(k, k)];
             }
         }
-        traces.iter_mut().take(FREE).for_each(|trace| *trace = 0.0);
-        Self { traces, max: EXPECTED_MAX * data_power }
+        traces.iter_mut().take(FREE_DEGREES).for_each(|trace| *trace = 0.0);
+        Self { traces, max: EXPECTED_MAX * data_chi2 }
     }
 
     /// How far the logarithm of the expectation is above the limit, in standard deviations; 0 if it is not.
@@ -234,7 +233,7 @@ impl ExpectedLimit {
     }
 
     /// The logarithm of the prior.
-    fn value(&self, power: &[f64]) -> f64 {
+    fn log_prior(&self, power: &[f64]) -> f64 {
         -0.5 * self.excess(power).powi(2)
     }
 
@@ -246,9 +245,9 @@ impl ExpectedLimit {
     }
 }
 
-/// `V'N^-1V` of data divided by a factor, at least what as many coefficients as unknowns would make of noise alone.
-fn expected_power(data_power: f64, factor: f64, unknowns: usize) -> f64 {
-    (data_power / factor.powi(2)).max(unknowns as f64)
+/// `V'N^-1V` of the data divided by a factor, at least its mean for pure noise in as many coefficients as unknowns.
+fn chi2_in_found_noise(data_chi2: f64, factor: f64, unknowns: usize) -> f64 {
+    (data_chi2 / factor.powi(2)).max(unknowns as f64)
 }
 
 /// The data and matrix of a fit.
@@ -267,9 +266,9 @@ impl PowerFit {
         Self { knots, theta, power, limit }
     }
 
-    /// The same for data whose noise is larger by `factor`, and which are divided by it; `data_power` is their `V'N^-1V` before.
-    pub(super) fn with_noise_factor(mut self, data_power: f64, factor: f64, unknowns: usize) -> Self {
-        self.limit.max = EXPECTED_MAX * expected_power(data_power, factor, unknowns);
+    /// The same for data whose noise is larger by `factor`, and which are divided by it; `data_chi2` is their `V'N^-1V` before the division.
+    pub(super) fn with_noise_factor(mut self, data_chi2: f64, factor: f64, unknowns: usize) -> Self {
+        self.limit.max = EXPECTED_MAX * chi2_in_found_noise(data_chi2, factor, unknowns);
         self
     }
 
@@ -278,14 +277,14 @@ impl PowerFit {
         blocks: &[Block<'_>],
         l_max: usize,
         right: &[f64],
-        data_power: f64,
+        data_chi2: f64,
     ) -> Result<Self, SolveError> {
         let unit = largest_diagonal(blocks).recip();
-        let limit = ExpectedLimit::new(blocks, l_max, expected_power(data_power, 1.0, right.len()));
+        let limit = ExpectedLimit::new(blocks, l_max, chi2_in_found_noise(data_chi2, 1.0, right.len()));
         let of = |decade: i32| {
             let knots = Knots::new(l_max, (unit * 10.0_f64.powi(decade)).ln());
             let fit = Self::new(knots.clone(), knots.start(), limit.clone());
-            Some((value(blocks, &fit.power, right)? + limit.value(&fit.power), fit))
+            Some((log_evidence(blocks, &fit.power, right)? + limit.log_prior(&fit.power), fit))
         };
         let best = DECADES.filter_map(of).max_by(|(a, _), (b, _)| a.total_cmp(b));
         best.map(|(_, fit)| fit).ok_or(SolveError::NoPower)
@@ -315,9 +314,9 @@ impl PowerFit {
         let log_power = self.knots.log_power(theta);
         let power: Vec<f64> = log_power.iter().map(|ln| ln.exp()).collect();
         let correction: f64 =
-            data.gradient_correction.iter().zip(&log_power).skip(FREE).map(|(t, ln)| t * ln).sum();
-        let prior = self.knots.hyperprior(theta).value + self.limit.value(&power);
-        Some(value(data.blocks, &power, data.right)? + correction + prior)
+            data.gradient_correction.iter().zip(&log_power).skip(FREE_DEGREES).map(|(t, ln)| t * ln).sum();
+        let prior = self.knots.hyperprior(theta).value + self.limit.log_prior(&power);
+        Some(log_evidence(data.blocks, &power, data.right)? + correction + prior)
     }
 
     /// Gradient and Fisher information of the objective. The information leaves out the limit, which is no knowledge of the sky.
@@ -325,7 +324,7 @@ impl PowerFit {
         let found = evidence(data.blocks, &self.knots, &self.power, data.right)?;
         let prior = self.knots.hyperprior(&self.theta);
         let mut gradient = prior.gradient;
-        for (l, of_degree) in found.gradient.iter().enumerate().skip(FREE) {
+        for (l, of_degree) in found.gradient.iter().enumerate().skip(FREE_DEGREES) {
             let of_degree = of_degree + data.gradient_correction.get(l).copied().unwrap_or(0.0);
             for (knot, share) in self.knots.weights(l) {
                 gradient[knot] += share * of_degree;
@@ -341,7 +340,7 @@ impl PowerFit {
     fn limit_slopes(&self) -> Vec<f64> {
         let mut slopes = vec![0.0; self.theta.len()];
         if self.limit.excess(&self.power) > 0.0 {
-            for (l, slope) in self.limit.slopes(&self.power).iter().enumerate().skip(FREE) {
+            for (l, slope) in self.limit.slopes(&self.power).iter().enumerate().skip(FREE_DEGREES) {
                 self.knots.weights(l).iter().for_each(|(knot, share)| slopes[*knot] += share * slope);
             }
         }
@@ -410,12 +409,12 @@ impl PowerFit {
         for block in data.blocks {
             block.degrees.iter().for_each(|l| counts[*l] += block.places.len() as f64);
         }
-        let decided =
+        let constrained =
             (counts.iter().zip(traces)).zip(&self.power).map(|((n, trace), c)| (n - trace / c).max(0.0));
         let power = SkyPower {
             power_k2: self.power.clone(),
             sigma_ln: (0..self.power.len()).map(sigma).collect(),
-            decided: decided.collect(),
+            constrained: constrained.collect(),
             noise_factor: 1.0,
         };
         Ok((power, covariance))

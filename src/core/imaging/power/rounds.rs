@@ -3,7 +3,7 @@
 use faer::Mat;
 
 use super::blocks::{Block, Coupling, Factors};
-use super::knots::FREE;
+use super::knots::FREE_DEGREES;
 use super::samples::{PosteriorPrecision, PosteriorSample, TRACE_TOLERANCE};
 use super::{BlockData, PowerFit, SkyPower};
 use crate::imaging::NormalSums;
@@ -15,15 +15,15 @@ use crate::imaging::solver::{Convergence, NamedWatch, StoppingRule, System, dot}
 const ROUNDS_MAX: usize = 6;
 /// Change of ln C_l at which rounds have converged: a tenth in C_l changes a map by far less than its error.
 const TOLERANCE: f64 = 0.1;
-/// That of early rounds, and of intermediate maps.
+/// The same for early rounds, and for intermediate maps.
 const EARLY_TOLERANCE: f64 = 0.5;
 /// Error of a solution of early rounds in units of its posterior error.
 const EARLY_ERROR: f64 = 0.1;
-/// Ids of the posterior samples for trace estimates, different from those of maps. The first alone suffices if the preconditioner is accurate.
+/// Ids of the posterior samples for trace estimates, different from those of maps. The first alone suffices if the blocks are accurate.
 const TRACE_SAMPLES: [u64; 4] = [1 << 32, (1 << 32) + 1, (1 << 32) + 2, (1 << 32) + 3];
-/// Maximum difference of ln(trace) between the true matrix and the preconditioner for which one sample suffices.
+/// Maximum difference of ln(trace) between the true matrix and the blocks for which one sample suffices.
 const LN_RATIO_ACCURATE: f64 = 0.2;
-/// Maximum ratio of true traces to those of the preconditioner.
+/// Maximum ratio of true traces to those of the blocks.
 const RATIO_MAX: f64 = 30.0;
 /// Change of the logarithm of the noise factor at which it has converged.
 const FACTOR_TOLERANCE: f64 = 0.03;
@@ -38,9 +38,9 @@ pub(in crate::imaging) struct PowerProblem<'a> {
     pub(in crate::imaging) degrees: &'a [usize],
     pub(in crate::imaging) right: &'a [f64],
     /// `V'N^-1V` of the data.
-    pub(in crate::imaging) power: f64,
-    /// Number of real data.
-    pub(in crate::imaging) numbers: f64,
+    pub(in crate::imaging) data_chi2: f64,
+    /// Number of real numbers in the data: two for each visibility.
+    pub(in crate::imaging) data_count: f64,
 }
 
 /// The estimated power and the solution.
@@ -49,9 +49,9 @@ pub(in crate::imaging) struct FoundPower {
     /// The last solution, for nearly this R.
     pub(in crate::imaging) solution: Vec<f64>,
     pub(in crate::imaging) power: SkyPower,
-    /// Ratio of the traces of `(A + R)^-1` to those of the preconditioner, by degree.
+    /// Ratio of the traces of `(A + R)^-1` to those of the blocks alone, by degree.
     pub(in crate::imaging) ratio: Vec<f64>,
-    /// The curve, with which further rounds begin.
+    /// The fitted curve, from which further rounds start.
     pub(in crate::imaging) fit: PowerFit,
     /// Covariance of its parameters.
     pub(super) covariance: Mat<f64>,
@@ -90,19 +90,19 @@ impl PowerProblem<'_> {
     pub(in crate::imaging) fn solve_blocks(&self) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
         let gradient_correction = vec![0.0; l_max + 1];
-        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.power)?;
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.data_chi2)?;
         let mut factor = 1.0;
         for round in 1.. {
             let right = self.right_divided_by(factor);
             let data =
                 BlockData { blocks: self.blocks, right: &right, gradient_correction: &gradient_correction };
-            fit = fit.with_noise_factor(self.power, factor, self.right.len()).maximised(data)?;
+            fit = fit.with_noise_factor(self.data_chi2, factor, self.right.len()).maximised(data)?;
             let regularisation = fit.regularisation();
             let factors = Factors::new(self.blocks, &regularisation);
             let mut solution = self.right.to_vec();
             factors.solve(&mut solution);
-            let next = self.noise_factor(&solution, &regularisation);
-            if round >= ROUNDS_MAX || (next / factor).ln().abs() < FACTOR_TOLERANCE {
+            let next_factor = self.noise_factor(&solution, &regularisation);
+            if round >= ROUNDS_MAX || (next_factor / factor).ln().abs() < FACTOR_TOLERANCE {
                 let (power, covariance) = fit.estimate(data, &factors.traces(l_max))?;
                 return Ok(FoundPower {
                     regularisation,
@@ -114,7 +114,7 @@ impl PowerProblem<'_> {
                     degrees: self.degrees.to_vec(),
                 });
             }
-            factor = next;
+            factor = next_factor;
         }
         Err(SolveError::NoPower)
     }
@@ -126,18 +126,18 @@ impl PowerProblem<'_> {
 
     /// Scatter of the residuals of a solution in units of the noise, at least 1.
     fn noise_factor(&self, x: &[f64], r: &[f64]) -> f64 {
-        // |V - B x|^2 = V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
+        // |V - B x|^2 in units of the noise is V'N^-1V - 2 x.b + x.A x, and A x = b - R x.
         let regularised: f64 = x.iter().zip(self.degrees).map(|(x, l)| r[*l] * x * x).sum();
-        let residual = self.power - dot(x, self.right) - regularised;
-        // The few degrees of freedom that the solution takes are neglected. The exact solution fits no worse than an empty sky; one that is
-        // far from it may, and counts as that.
-        (residual.min(self.power) / self.numbers).max(1.0).sqrt()
+        let residual = self.data_chi2 - dot(x, self.right) - regularised;
+        // The few degrees of freedom that the solution takes are neglected. An unconverged solution may fit worse than an empty sky: then
+        // the residual is that of the empty sky.
+        (residual.min(self.data_chi2) / self.data_count).max(1.0).sqrt()
     }
 
     /// Estimates the power in rounds, from the initial solution `start`.
     ///
-    /// The first rounds stop their solutions early and do without samples, and those of an intermediate map are all so. For data of a short time
-    /// the power of the blocks, with which they begin, is far too large: a solution to the end would follow the rounding of the matrix.
+    /// Early rounds stop their solutions early and draw no samples; an intermediate map has no others. While data are few, the C_l of the blocks,
+    /// from which rounds start, is far too large, and a converged solution would fit rounding errors of the matrix.
     pub(in crate::imaging) fn solve(
         &self,
         start: Option<&[f64]>,
@@ -145,7 +145,7 @@ impl PowerProblem<'_> {
         watch: NamedWatch<'_>,
     ) -> Result<FoundPower, SolveError> {
         let l_max = self.l_max();
-        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.power)?;
+        let mut fit = PowerFit::begin(self.blocks, l_max, self.right, self.data_chi2)?;
         let mut x = [match start {
             Some(start) if start.len() == self.right.len() => start.to_vec(),
             _ => vec![0.0; self.right.len()],
@@ -171,18 +171,18 @@ impl PowerProblem<'_> {
             }
             let before = factor;
             factor = self.noise_factor(&x[0], &r);
-            let next = self.next(&fit, &x[0], (factor, &ratio))?;
-            // That of the noise is one of the power, too.
-            let change = next.fit.change(&fit).max((factor / before).ln().abs());
+            let found = self.next(&fit, &x[0], (factor, &ratio))?;
+            // A change of the noise factor changes C_l, too.
+            let change = found.fit.change(&fit).max((factor / before).ln().abs());
             let tolerance = if is_early { EARLY_TOLERANCE } else { TOLERANCE };
             let task = watch.start("the sky's power", tolerance);
             if !task.report_step(change > tolerance && round < ROUNDS_MAX, round, change) {
-                if !is_early || !watch.has_priority() {
-                    return Ok(next);
+                if !is_early || !watch.is_of_final_map() {
+                    return Ok(found);
                 }
                 (is_early, round) = (false, 0);
             }
-            fit = next.fit;
+            fit = found.fit;
         }
     }
 
@@ -205,13 +205,13 @@ impl PowerProblem<'_> {
         let mut columns = [found.solution.clone(), noise];
         let task = watch.start("map and noise map", rule.residual_max);
         let right = [self.right, self.sums.noise_right_hand_side()];
-        let rules = [rule, if watch.has_priority() { rule } else { noise_rule(right, &factors, rule) }];
+        let rules = [rule, if watch.is_of_final_map() { rule } else { noise_rule(right, &factors, rule) }];
         let convergence = system.solve(&right, &mut columns, &rules, &task);
         drop(task);
         Ok(MapsWithPower { found, columns, convergence })
     }
 
-    /// The power of `fit`, of which `x` is the solution, with its uncertainty.
+    /// The C_l of `fit` with its uncertainty, given the solution `x` for its R.
     ///
     /// # Errors
     /// Numbers that are not finite.
@@ -221,7 +221,7 @@ impl PowerProblem<'_> {
         x: &[f64],
         (factor, ratio): (f64, &[f64]),
     ) -> Result<FoundPower, SolveError> {
-        self.of_round(fit, x, (factor, ratio), &|_| Ok(fit.clone()))
+        self.found_power(fit, x, (factor, ratio), &|_| Ok(fit.clone()))
     }
 
     /// The power that the solution `x` of `fit` makes most likely, of data whose noise is larger by a factor and with these ratios of traces.
@@ -234,12 +234,13 @@ impl PowerProblem<'_> {
         x: &[f64],
         (factor, ratio): (f64, &[f64]),
     ) -> Result<FoundPower, SolveError> {
-        self.of_round(fit, x, (factor, ratio), &|data| {
-            fit.clone().with_noise_factor(self.power, factor, self.right.len()).maximised(data)
+        self.found_power(fit, x, (factor, ratio), &|data| {
+            fit.clone().with_noise_factor(self.data_chi2, factor, self.right.len()).maximised(data)
         })
     }
 
-    fn of_round(
+    /// The C_l after a step from `fit`, with the data for which `x` solves the equations of the blocks.
+    fn found_power(
         &self,
         fit: &PowerFit,
         x: &[f64],
@@ -281,11 +282,11 @@ impl PowerProblem<'_> {
         factors.solve(&mut solved);
         // In the norm of A + R, in which residuals are measured, posterior variances sum to one per unknown.
         let posterior_error = factor * (self.right.len() as f64 / dot(self.right, &solved)).sqrt();
-        // At least a tenth of the map, for any noise.
+        // Never less accurate than a tenth of the map.
         StoppingRule { residual_max: rule.residual_max.max(EARLY_ERROR * posterior_error.min(1.0)), ..rule }
     }
 
-    /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the preconditioner is accurate.
+    /// Estimates the ratio of traces from posterior samples, from one if the last estimate says that the blocks are accurate.
     pub(in crate::imaging) fn sampled_ratio(
         &self,
         regularisation: &Diagonal,
@@ -303,7 +304,7 @@ impl PowerProblem<'_> {
         self.ratio(&samples, &factors.traces(self.l_max()))
     }
 
-    /// The ratio of the traces of the true covariance and of the preconditioner, averaged over neighbouring degrees for accuracy.
+    /// The ratio of the traces of the true covariance and of the blocks', averaged over neighbouring degrees for accuracy.
     fn ratio(&self, samples: &[PosteriorSample], traces: &[f64]) -> Vec<f64> {
         let mut excess = vec![0.0; traces.len()];
         for PosteriorSample { exact, of_blocks } in samples {
@@ -312,9 +313,9 @@ impl PowerProblem<'_> {
             }
         }
         let of_degree = |l: usize| {
-            let l = l.max(FREE);
+            let l = l.max(FREE_DEGREES);
             let width = (l / 4).max(2);
-            let neighbours = l.saturating_sub(width).max(FREE)..(l + width + 1).min(traces.len());
+            let neighbours = l.saturating_sub(width).max(FREE_DEGREES)..(l + width + 1).min(traces.len());
             let sums = neighbours.fold([0.0, 0.0], |[a, b], l| [a + excess[l], b + traces[l]]);
             if sums[1] > 0.0 { (1.0 + sums[0] / sums[1]).clamp(RATIO_MAX.recip(), RATIO_MAX) } else { 1.0 }
         };
@@ -325,8 +326,8 @@ impl PowerProblem<'_> {
 /// Largest relative residual of an intermediate noise map.
 const NOISE_RESIDUAL_MAX: f64 = 0.1;
 
-/// The stopping rule of an intermediate noise map, the second of two right-hand sides: a residual as large as that of the map, which is relative
-/// to a much larger right-hand side.
+/// The stopping rule of an intermediate noise map, the second of two right-hand sides: the map's absolute residual, which is larger relative to the
+/// noise's much smaller right-hand side.
 fn noise_rule([map, noise]: [&[f64]; 2], factors: &Factors<'_>, rule: StoppingRule) -> StoppingRule {
     let square = |right: &[f64]| {
         let mut solved = right.to_vec();

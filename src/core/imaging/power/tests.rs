@@ -82,7 +82,7 @@ fn evidence_is_the_density_of_the_data() {
     let expected = log_density(&a, &one, &right) - log_density(&a, &other, &right);
     // Logarithms of eigenvalues over twelve decades in f64.
     assert!((found - expected).abs() < 1e-6 * expected.abs().max(1.0), "{found} {expected}");
-    assert_eq!(super::blocks::value(&block(&a), &one, &right), Some(of(&one).value));
+    assert_eq!(super::blocks::log_evidence(&block(&a), &one, &right), Some(of(&one).value));
     // Compared with central differences of the density, whose error is of second order: 1e-6 of it.
     for l in 0..=L_MAX {
         let moved = |by: f64| {
@@ -302,8 +302,8 @@ fn intervals_have_the_stated_coverage() {
             coupling: None,
             degrees: &degrees,
             right: &right,
-            power: 0.0,
-            numbers: 1.0,
+            data_chi2: 0.0,
+            data_count: 1.0,
         };
         let found = problem.solve_blocks().unwrap();
         let mut whole = a.clone();
@@ -344,15 +344,15 @@ fn without_data_the_power_is_the_prior_and_never_rises() {
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power: 0.0,
-        numbers: 1.0,
+        data_chi2: 0.0,
+        data_count: 1.0,
     };
     let power = problem.solve_blocks().unwrap().power;
     assert!(power.power_k2.iter().all(|power| power.is_finite() && *power > 0.0), "{power:?}");
     assert!(power.power_k2[2..].windows(2).all(|pair| pair[1] < pair[0]), "{power:?}");
     // Mean and dipole are free, so any data determine them.
-    let decided: f64 = power.decided[FREE..].iter().sum();
-    assert!(decided < 1.0, "{decided}");
+    let constrained: f64 = power.constrained[FREE_DEGREES..].iter().sum();
+    assert!(constrained < 1.0, "{constrained}");
     // The same in rounds with products of the true matrix.
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 200 };
     let watch = SolveWatch::default();
@@ -362,8 +362,8 @@ fn without_data_the_power_is_the_prior_and_never_rises() {
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power: 0.0,
-        numbers: 1.0,
+        data_chi2: 0.0,
+        data_count: 1.0,
     };
     assert!(rounds.solve(None, rule, watch.named("test")).is_ok());
 }
@@ -382,15 +382,15 @@ fn rounds_converge_to_the_result_of_the_exact_matrix() {
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power: 0.0,
-        numbers: 1.0,
+        data_chi2: 0.0,
+        data_count: 1.0,
     };
     let expected = problem(&exact).solve_blocks().unwrap();
     let approximation = pairs(&a);
     let rule = StoppingRule { residual_max: 1e-8, iterations_max: 400 };
     let watch = SolveWatch::default();
     let found = problem(&approximation).solve(None, rule, watch.named("test")).unwrap();
-    for l in FREE..=L_MAX {
+    for l in FREE_DEGREES..=L_MAX {
         let off = (found.power.power_k2[l] / expected.power.power_k2[l]).ln();
         eprintln!("{l}: {off:.3} of sigma {:.3}", expected.power.sigma_ln[l]);
         // Rounds end within a tenth; traces are from four samples of 81 numbers, and these blocks are wrong by a factor of three.
@@ -420,13 +420,13 @@ fn an_intermediate_noise_map_is_as_exact_as_its_map() {
         coupling: None,
         degrees: &degrees,
         right: &right,
-        power,
-        numbers,
+        data_chi2: power,
+        data_count: numbers,
     };
     let rule = StoppingRule { residual_max: 1e-6, iterations_max: 400 };
     let watch = SolveWatch::default();
     let maps = |is_final| {
-        let watch = watch.named("test").with_priority(is_final);
+        let watch = watch.named("test").of_final_map(is_final);
         let MapsWithPower { found, columns, convergence } = problem.solve_maps(None, rule, watch).unwrap();
         let r = |i: usize| found.regularisation[degrees[i]];
         let whole = Mat::from_fn(ORDER, ORDER, |i, j| a[(i, j)] + if i == j { r(i) } else { 0.0 });
@@ -458,7 +458,7 @@ fn an_intermediate_noise_map_is_as_exact_as_its_map() {
 fn the_variance_beyond_is_that_of_pixels_of_a_falling_sky() {
     const NSIDE: usize = 4;
     let power_k2: Vec<f64> = (0..=10).map(|l| ((l + 1) as f64).powi(-3)).collect();
-    let power = SkyPower { sigma_ln: vec![0.1; 11], decided: vec![1.0; 11], power_k2, noise_factor: 1.0 };
+    let power = SkyPower { sigma_ln: vec![0.1; 11], constrained: vec![1.0; 11], power_k2, noise_factor: 1.0 };
     // Means of 16 small pixels in each pixel, for skies of the higher degrees.
     let mut normal = normal(21);
     let (mut sum, mut count) = (0.0, 0);
@@ -494,11 +494,24 @@ fn the_power_is_at_most_what_the_data_may_come_from() {
     let sums = Dense::new(a.clone(), right.clone());
     let found = |right: &[f64], power: f64| {
         let (blocks, degrees, numbers) = (&blocks[..], &degrees[..], f64::INFINITY);
-        let problem = PowerProblem { sums: &sums, blocks, coupling: None, degrees, right, power, numbers };
+        let problem = PowerProblem {
+            sums: &sums,
+            blocks,
+            coupling: None,
+            degrees,
+            right,
+            data_chi2: power,
+            data_count: numbers,
+        };
         problem.solve_blocks().unwrap().power.power_k2
     };
     let expected = |power: &[f64]| -> f64 {
-        degrees.iter().enumerate().filter(|(_, l)| **l >= FREE).map(|(k, l)| a[(k, k)] * power[*l]).sum()
+        degrees
+            .iter()
+            .enumerate()
+            .filter(|(_, l)| **l >= FREE_DEGREES)
+            .map(|(k, l)| a[(k, k)] * power[*l])
+            .sum()
     };
     let true_power: f64 = (0..ORDER).map(|k| sky[k] * right[k]).sum();
     let ordinary = found(&right, true_power);

@@ -81,7 +81,7 @@ pub struct NamedWatch<'a> {
     watch: &'a SolveWatch,
     name: &'a str,
     /// Whether it is of a final map, which may still begin after the run was cancelled, for few iterations and within the time limit.
-    has_priority: bool,
+    is_of_final_map: bool,
 }
 
 /// Maximum number of iterations of a solution that starts after cancellation: enough for the well-measured modes of a map.
@@ -128,10 +128,10 @@ impl SolveWatch {
         self.state().current.clone()
     }
 
-    /// The watch with a solution's name; see [`NamedWatch::with_priority`] for its priority.
+    /// The watch with a solution's name; see [`NamedWatch::of_final_map`] for its priority.
     #[must_use]
     pub fn named<'a>(&'a self, name: &'a str) -> NamedWatch<'a> {
-        NamedWatch { watch: self, name, has_priority: true }
+        NamedWatch { watch: self, name, is_of_final_map: true }
     }
 
     fn state(&self) -> MutexGuard<'_, WatchState> {
@@ -141,14 +141,14 @@ impl SolveWatch {
 
 impl<'a> NamedWatch<'a> {
     /// Whether the solution is of a final map.
-    pub(in crate::imaging) fn has_priority(self) -> bool {
-        self.has_priority
+    pub(in crate::imaging) fn is_of_final_map(self) -> bool {
+        self.is_of_final_map
     }
 
     /// Sets whether the solution is of a final map (the default), which may still begin after cancellation, or of an intermediate one.
     #[must_use]
-    pub fn with_priority(self, has_priority: bool) -> Self {
-        Self { has_priority, ..self }
+    pub fn of_final_map(self, is_of_final_map: bool) -> Self {
+        Self { is_of_final_map, ..self }
     }
 
     /// Whether `holds` is true on all ranks.
@@ -162,7 +162,7 @@ impl<'a> NamedWatch<'a> {
     }
 
     fn may_continue_here(self) -> bool {
-        if self.has_priority { !self.watch.is_expired() } else { !self.watch.cancel.is_cancelled() }
+        if self.is_of_final_map { !self.watch.is_expired() } else { !self.watch.cancel.is_cancelled() }
     }
 
     /// Starts a task with the residual `target`.

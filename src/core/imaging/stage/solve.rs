@@ -119,7 +119,7 @@ impl Stage for Solver {
         let name = format!("{:.3} MHz", frequency_hz / 1e6);
         let setup = &self.setup;
         // An intermediate map must not take time from a final one.
-        let watch = setup.watch.named(&name).with_priority(is_final);
+        let watch = setup.watch.named(&name).of_final_map(is_final);
         if !watch.may_continue() {
             return Ok(());
         }

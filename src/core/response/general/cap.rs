@@ -5,20 +5,20 @@
 //! of the class and that of the pair (see `limb_zone.rs`):
 //!
 //! ```text
-//! q_{l m} = sum_rings w lambda_{l m}(theta) 2 pi (-1)^m J_m(2 pi u cos(p) sin theta) exp(2 pi i u sin(p) cos theta)
+//! q_{l m} = sum_rings v lambda_{l m}(theta) 2 pi (-1)^m J_m(2 pi u cos(p) sin theta) exp(2 pi i u sin(p) cos theta)
 //!         + (-i)^m sum_j a_{j l m} c_{j m},
 //! ```
 //!
-//! with p the pitch of the baseline, w the quadrature weight of a ring, lambda the normalised Legendre functions, a their series in the
+//! with u the baseline in wavelengths, p its pitch, l m about the nadir, v the quadrature weight of a ring, lambda the normalised Legendre functions, a their series in the
 //! limb zone, and c the Fourier coefficients of the zone's moments. The pattern is mirror-symmetric in the plane of the pair, so that
-//! `q_{l,-m} = q_{l m}`, and a quarter turn takes the pole to the normal of the plane (see `turns.rs`):
+//! `q_{l,-m} = q_{l m}`, and a quarter turn F takes the pole to the normal of the plane, l mu (see `turns.rs`):
 //!
 //! ```text
 //! h_{l mu} = exp(-i mu p) sum_m F_{m mu} q_{l m},    (-1)^mu h_{l,-mu} = exp(i mu p) sum_m (-1)^m F_{m mu} q_{l m}.
 //! ```
 //!
 //! Without the Moon the coefficients are `w_{l mu} = 4 pi (-1)^((l + mu) / 2) lambda_{l mu}(pi / 2) j_l(2 pi u)` (Rayleigh). The
-//! pattern is `f = w - h`.
+//! pattern is `f = w - h`. A node is a pair at an instant whose row is computed, not interpolated; it takes a lane.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -71,10 +71,16 @@ fn order_max(l_max: usize, sin: f64) -> usize {
     l_max.min((turning + 8.0 * turning.cbrt()) as usize + 8)
 }
 
-/// Memory of a task's work buffers without patterns, bytes.
+/// The column of the real (0) or imaginary (1) part of a pair: groups of [`LANES`] real parts, then as many imaginary ones.
+fn column_of(pair: usize, part: usize) -> usize {
+    pair / LANES * COMPLEX_LANES + part * LANES + pair % LANES
+}
+
+/// Memory of a task's work buffers for `batch` pairs, without patterns, bytes.
 pub(super) fn batch_bytes(l_max: usize, u_max: f64, batch: usize) -> f64 {
     let orders = (l_max + 1) as f64;
     let rings = (rings_for(l_max, FRAC_PI_2, u_max) + 16) as f64;
+    // Real and imaginary parts of four bytes.
     8.0 * batch as f64 * orders * (rings + orders)
 }
 
@@ -89,7 +95,7 @@ impl CapClass {
             rings.push(Ring { sin, cos, order_max: order_max(l_max, sin) });
             weights.push(TAU * limb_rad * w * sin);
         }
-        let limb_zone = LimbZone::new(setup, limb_rad, class.width_rad, class.u_max);
+        let limb_zone = LimbZone::new(setup, limb_rad, class.half_width_rad, class.u_max);
         let functions = Legendre::new(l_max, rings.iter().map(|ring| (ring.cos, ring.sin)));
         let angles = limb_zone.angles_rad();
         let limb_zone_legendre = Legendre::new(l_max, angles.iter().map(|theta| (theta.cos(), theta.sin())));
@@ -114,23 +120,23 @@ impl CapClass {
     }
 
     /// Computes the coefficients `q_{l m}` of the occulted caps, `[l][m][group][real or imaginary part][lane]`.
-    fn hidden<'a>(&self, nodes: &[RowNode], wavelength_m: f64, buffers: &'a mut CapBuffers) -> &'a [Value] {
+    fn occulted<'a>(&self, nodes: &[RowNode], wavelength_m: f64, buffers: &'a mut CapBuffers) -> &'a [Value] {
         let groups = nodes.len().div_ceil(LANES);
         let columns = groups * COMPLEX_LANES;
         let (l_max, terms) = (self.l_max, self.limb_zone.terms);
         let height = terms + self.rings.len();
         // Only written elements are read: the orders up to each ring's maximum.
-        buffers.rings.resize((l_max + 1) * height * columns, 0.0);
+        buffers.coefficients.resize((l_max + 1) * height * columns, 0.0);
         for (group, nodes) in nodes.chunks(LANES).enumerate() {
             self.ring_coefficients(nodes, wavelength_m, group, columns, buffers);
         }
         self.limb_zone_coefficients(nodes, columns, buffers);
-        buffers.hidden.resize((l_max + 1) * (l_max + 1) * columns, 0.0);
+        buffers.occulted.resize((l_max + 1) * (l_max + 1) * columns, 0.0);
         for m in 0..=l_max {
             let inner = terms + self.rings_by_order[m];
-            let rings = &buffers.rings[m * height * columns..][..inner * columns];
+            let rings = &buffers.coefficients[m * height * columns..][..inner * columns];
             let rows = l_max + 1 - m;
-            let out = &mut buffers.hidden[(m * (l_max + 1) + m) * columns..];
+            let out = &mut buffers.occulted[(m * (l_max + 1) + m) * columns..];
             let out = &mut out[..(rows - 1) * (l_max + 1) * columns + columns];
             faer::linalg::matmul::matmul(
                 strided_rows_mut(out, rows, columns, (l_max + 1) * columns),
@@ -141,7 +147,7 @@ impl CapClass {
                 Par::Seq,
             );
         }
-        &buffers.hidden
+        &buffers.occulted
     }
 
     /// Computes the rings' coefficients of up to [`LANES`] pairs, `[m][row][column]`; the last pair is repeated to fill the remaining
@@ -173,7 +179,7 @@ impl CapClass {
             let orders = buffers.bessel.cylindrical(&x, ring.order_max + extra_orders);
             let first = (terms + k) * columns + group * COMPLEX_LANES;
             let phases = phases(&vertical, ring.cos);
-            let out = &mut buffers.rings[first..];
+            let out = &mut buffers.coefficients[first..];
             write_ring(orders, &phases, ring, extra_orders > 0, out, height * columns);
         }
     }
@@ -182,7 +188,7 @@ impl CapClass {
     fn limb_zone_coefficients(&self, nodes: &[RowNode], columns: usize, buffers: &mut CapBuffers) {
         let (terms, points) = (self.limb_zone.terms, self.limb_zone.points());
         let height = terms + self.rings.len();
-        // `[term][column][psi]`.
+        // `[term][column][psi]`, with a column for each part of each pair, as `column_of` says.
         let width = terms * columns;
         buffers.limb_zone.resize(points * width, 0.0);
         for pair in 0..columns / 2 {
@@ -190,10 +196,9 @@ impl CapClass {
             if pair < nodes.len() {
                 self.limb_zone.integrate(&node.view, &mut buffers.pair);
             }
-            let column = pair / LANES * COMPLEX_LANES + pair % LANES;
             for (part, sums) in buffers.pair.sums.iter().enumerate() {
                 for (term, sums) in sums.chunks_exact(points).enumerate() {
-                    let place = (term * columns + column + part * LANES) * points;
+                    let place = (term * columns + column_of(pair, part)) * points;
                     let to = &mut buffers.limb_zone[place..place + points];
                     to.iter_mut().zip(sums).for_each(|(to, from)| *to = *from as Value);
                 }
@@ -210,7 +215,7 @@ impl CapClass {
             Par::Seq,
         );
         for (m, fourier) in buffers.fourier.chunks_exact(width).enumerate() {
-            let out = &mut buffers.rings[m * height * columns..][..width];
+            let out = &mut buffers.coefficients[m * height * columns..][..width];
             for (to, from) in out.chunks_exact_mut(COMPLEX_LANES).zip(fourier.chunks_exact(COMPLEX_LANES)) {
                 let ((to_re, to_im), (re, im)) = (to.split_at_mut(LANES), from.split_at(LANES));
                 // Times (-i)^m.
@@ -270,10 +275,11 @@ fn write_ring(
 pub(super) struct CapBuffers {
     bessel: BesselOrders,
     pair: LimbZoneBuffers,
-    rings: Vec<Value>,
+    /// `[m][limb-zone term, then ring][column]`.
+    coefficients: Vec<Value>,
     limb_zone: Vec<Value>,
     fourier: Vec<Value>,
-    hidden: Vec<Value>,
+    occulted: Vec<Value>,
     /// Contributions of even and of odd m after the quarter turn.
     rotated: [Vec<Value>; 2],
 }
@@ -303,14 +309,14 @@ impl Patterns {
         let l_max = self.setup.l_max;
         let groups = nodes.len().div_ceil(LANES);
         let columns = groups * COMPLEX_LANES;
-        class.hidden(nodes, self.setup.wavelength_m, buffers);
+        class.occulted(nodes, self.setup.wavelength_m, buffers);
         out.resize_with(l_max + 1, NodePatterns::default);
         // All elements are overwritten.
         out.iter_mut().enumerate().for_each(|(mu, out)| out.resize(degree_count(l_max, mu), groups));
         let spherical_bessel = self.spherical_bessel(nodes, buffers);
         let pitches = pitch_phases(nodes, l_max);
         for l in 0..=l_max {
-            let hidden = &buffers.hidden[l * (l_max + 1) * columns..][..(l + 1) * columns];
+            let hidden = &buffers.occulted[l * (l_max + 1) * columns..][..(l + 1) * columns];
             turns.rotate_symmetric(l, hidden, columns, &mut buffers.rotated);
             let rotated = buffers.rotated.each_ref().map(Vec::as_slice);
             assemble(rotated, &pitches, &spherical_bessel, &self.whole_sky, [l, l_max, groups], out);
@@ -411,13 +417,13 @@ fn whole_sky_factors(setup: &RowsSetup) -> Vec<Vec<[f64; 3]>> {
                     match setup.response {
                         AntennaResponse::Isotropic | AntennaResponse::ThreeDipoles => [value(row), 0.0, 0.0],
                         AntennaResponse::DipoleNormal => {
-                            let to_l = 1.0 - coupling(l + 1).powi(2) - coupling(l).powi(2);
-                            let to_l_plus_2 = -coupling(l + 1) * coupling(l + 2) * value(row + 1);
-                            let to_l_minus_2 = match row {
+                            let from_l = (1.0 - coupling(l + 1).powi(2) - coupling(l).powi(2)) * value(row);
+                            let from_l_plus_2 = -coupling(l + 1) * coupling(l + 2) * value(row + 1);
+                            let from_l_minus_2 = match row {
                                 0 => 0.0,
                                 _ => -coupling(l) * coupling(l - 1) * value(row - 1),
                             };
-                            [to_l * value(row), to_l_plus_2, to_l_minus_2]
+                            [from_l, from_l_plus_2, from_l_minus_2]
                         }
                     }
                 })
@@ -544,7 +550,7 @@ mod tests {
                 |view: &PairView| (view.cap_rad() - middle_rad).abs() + view.limb_spread_rad();
             let class = NodeClass {
                 limb_rad: middle_rad,
-                width_rad: views.iter().map(half_width_rad).fold(0.0, f64::max),
+                half_width_rad: views.iter().map(half_width_rad).fold(0.0, f64::max),
                 u_max: 40.0,
             };
             let class = CapClass::new(&setup, &class);

@@ -21,7 +21,7 @@ pub(super) struct NodeClass {
     /// Angle between nadir and limb in the middle of the class, rad.
     pub(super) limb_rad: f64,
     /// Maximum distance of a pair's limb from the middle, rad.
-    pub(super) width_rad: f64,
+    pub(super) half_width_rad: f64,
     /// Longest baseline, wavelengths.
     pub(super) u_max: f64,
 }
@@ -54,7 +54,7 @@ pub(super) struct Classes {
     first_rad: f64,
     step_rad: f64,
     count: usize,
-    width_rad: f64,
+    half_width_rad: f64,
     u_max: f64,
 }
 
@@ -73,7 +73,7 @@ impl Classes {
             step_rad,
             count,
             // Nodes lie between visibilities.
-            width_rad: 0.5 * step_rad + 1.05 * spread_rad,
+            half_width_rad: 0.5 * step_rad + 1.05 * spread_rad,
             u_max,
         }
     }
@@ -91,7 +91,7 @@ impl Classes {
         let class = |length: f64| {
             (0..self.count).map(move |k| NodeClass {
                 limb_rad: self.first_rad + self.step_rad * k as f64,
-                width_rad: self.width_rad,
+                half_width_rad: self.half_width_rad,
                 u_max: length * self.u_max,
             })
         };

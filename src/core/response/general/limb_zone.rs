@@ -33,7 +33,7 @@ const POINTS_MARGIN: f64 = 24.0;
 #[derive(Clone, Debug)]
 pub(super) struct LimbZone {
     limb_rad: f64,
-    width_rad: f64,
+    half_width_rad: f64,
     /// Number of terms of the series.
     pub(super) terms: usize,
     /// Matrix `[term][point]` from values at the Chebyshev points to the series' coefficients.
@@ -58,10 +58,10 @@ pub(super) struct LimbZoneBuffers {
 }
 
 impl LimbZone {
-    /// Prepares the zone for pairs of up to `u_max` wavelengths whose limbs lie within `width_rad` of `limb_rad`.
-    pub(super) fn new(setup: &RowsSetup, limb_rad: f64, width_rad: f64, u_max: f64) -> Self {
+    /// Prepares the zone for pairs of up to `u_max` wavelengths whose limbs lie within `half_width_rad` of `limb_rad`.
+    pub(super) fn new(setup: &RowsSetup, limb_rad: f64, half_width_rad: f64, u_max: f64) -> Self {
         let fringe = TAU * u_max;
-        let orders = fringe * (limb_rad + width_rad).sin().min(1.0);
+        let orders = fringe * (limb_rad + half_width_rad).sin().min(1.0);
         let count =
             (0.5 * (orders + setup.l_max as f64) + 4.0 * orders.cbrt() + POINTS_MARGIN).ceil() as usize;
         let psi: Vec<f64> = (0..=count).map(|k| PI * k as f64 / count as f64).collect();
@@ -72,15 +72,15 @@ impl LimbZone {
             .flat_map(|m| (0..=count).map(move |k| (m * k, k)))
             .map(|(mk, k)| (weight(k) * circle[mk % (2 * count)]) as Value)
             .collect();
-        let terms = series_terms(setup.l_max as f64 * width_rad);
+        let terms = series_terms(setup.l_max as f64 * half_width_rad);
         Self {
             limb_rad,
-            width_rad,
+            half_width_rad,
             terms,
             to_series: (0..terms).flat_map(|j| (0..terms).map(move |k| series_weight(terms, j, k))).collect(),
             cos_psi: psi.iter().map(|psi| psi.cos()).collect(),
             sin_psi: psi.iter().map(|psi| psi.sin()).collect(),
-            rule: GaussLegendre::new(gauss_points(0.5 * width_rad * (setup.l_max as f64 + fringe))),
+            rule: GaussLegendre::new(gauss_points(0.5 * half_width_rad * (setup.l_max as f64 + fringe))),
             cos_weights,
             response: setup.response,
             wavelength_m: setup.wavelength_m,
@@ -94,7 +94,7 @@ impl LimbZone {
     /// Chebyshev points of the series, as angles from the nadir, rad.
     pub(super) fn angles_rad(&self) -> Vec<f64> {
         (0..self.terms)
-            .map(|k| self.limb_rad + self.width_rad * chebyshev_angle(self.terms, k).cos())
+            .map(|k| self.limb_rad + self.half_width_rad * chebyshev_angle(self.terms, k).cos())
             .collect()
     }
 
@@ -135,7 +135,7 @@ impl LimbZone {
         for (t, weight) in self.rule.abscissae.iter().zip(&self.rule.weights) {
             let at = InnerPoint {
                 limb_rad: self.limb_rad,
-                inverse_width: 1.0 / self.width_rad,
+                inverse_width: 1.0 / self.half_width_rad,
                 t: *t,
                 weight: *weight,
                 along: wave * cos_pitch,

@@ -164,9 +164,9 @@ fn coverage(skies: usize, l_max: usize, sky_l_max: usize) -> Vec<[f64; 2]> {
             coupling: None,
             degrees: &map_degrees,
             right: &right,
-            power,
+            data_chi2: power,
             // So many that residuals are noise.
-            numbers: f64::INFINITY,
+            data_count: f64::INFINITY,
         };
         let found = sought.solve_blocks().unwrap();
         let factors = Factors::new(&blocks, &found.regularisation);
