@@ -500,6 +500,22 @@ fn forged_packets_of_one_time_are_refused_beyond_a_number() {
     }
 }
 
+/// Packets that were dropped for want of space may come again: they are not counted as received.
+#[test]
+fn packets_that_were_dropped_before_the_instrument_are_not_received() {
+    // More than the 64 MiB that are held before an instrument's description, at some 200 bytes of memory each.
+    const PACKETS: u64 = 600_000;
+    let mut collector = Collector::new(1 << 20);
+    for first in (0..PACKETS).step_by(1000) {
+        let some: Vec<u8> = (first..first + 1000).flat_map(|k| forged(k, 5)).collect();
+        collector.push(&some);
+        while collector.next_delivery(&|_| true).unwrap().is_some() {}
+    }
+    let received = collector.received().map(|(_, set)| set.len()).sum::<u64>();
+    assert!(0 < received && received < PACKETS, "none were dropped, or all");
+    assert_eq!(collector.packets(), received);
+}
+
 #[test]
 fn forged_packet_times_fill_a_bounded_set_and_are_then_refused() {
     const ROOM: usize = 100;

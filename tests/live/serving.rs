@@ -289,7 +289,7 @@ fn every_route_answers_and_nothing_else_does() {
         ("/api/maps/00/latest.f32", 404, "text/plain; charset=utf-8", "no such map"),
         ("/api/maps/-1/latest.f32", 404, "text/plain; charset=utf-8", "no such map"),
         ("/api/maps/0/noise.fits", 404, "text/plain; charset=utf-8", ".f32"),
-        ("/api/figures/99999", 404, "text/plain; charset=utf-8", "no such map"),
+        ("/api/figures/99999", 404, "text/plain; charset=utf-8", "no such channel"),
         ("/api/maps/../../etc/passwd", 404, "text/plain; charset=utf-8", "no such"),
         ("/api/maps/0/..%2f..%2fetc%2fpasswd", 404, "text/plain; charset=utf-8", "no such"),
         ("/../../../../etc/passwd", 404, "text/plain; charset=utf-8", "no such"),

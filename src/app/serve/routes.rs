@@ -41,6 +41,7 @@ const PALETTE_STEPS: u32 = 256;
 /// State that all request handlers share.
 #[derive(Clone)]
 pub(super) struct PageState {
+    /// What the run shows: maps, log, phase, clients.
     pub(super) console: Arc<Console>,
     /// The newest status in JSON; empty before the first.
     pub(super) newest_status: watch::Receiver<Arc<str>>,
@@ -56,7 +57,7 @@ pub(super) struct PageState {
 
 pub(super) const READERS_MAX: usize = 96;
 
-/// The routes that answer also when all places are taken.
+/// The routes that answer also when all connections are taken.
 fn vital_routes() -> Router<PageState> {
     Router::new()
         .route("/api/status", get(status))
@@ -65,7 +66,7 @@ fn vital_routes() -> Router<PageState> {
         .route("/readyz", get(readyz))
 }
 
-/// Answers beyond the limit of connections: of the vital routes, and to others that there are too many.
+/// Beyond the limit of connections: answers the vital routes, and refuses all others.
 pub(super) fn vital_router(page: PageState) -> Router {
     vital_routes()
         .fallback(|State(page): State<PageState>| async move {
@@ -238,11 +239,11 @@ fn no_channel() -> Response {
 }
 
 async fn figures(State(page): State<PageState>, Path(channel): Path<String>) -> Response {
-    let Some(channel) = parse_channel(&channel) else { return no_map() };
+    let Some(channel) = parse_channel(&channel) else { return no_channel() };
     let maps = Arc::clone(&page.console.maps);
     match run_slow(&page, move || maps.figures(channel)).await {
         Ok(Some(figures)) => json(&figures),
-        Ok(None) => no_map(),
+        Ok(None) => no_channel(),
         Err(refusal) => refusal,
     }
 }
@@ -309,7 +310,7 @@ async fn gaps(State(page): State<PageState>) -> Response {
     };
     match run_slow(&page, move || CoverageSurvey::read(&folder).map(|survey| survey.gaps())).await {
         Ok(Ok(gaps)) => json(&gaps),
-        // There is no checkpoint yet.
+        // There may be no checkpoint yet; the error says so, or what is wrong.
         Ok(Err(error)) => refusal(StatusCode::SERVICE_UNAVAILABLE, &error.to_string()),
         Err(refusal) => refusal,
     }
@@ -363,7 +364,7 @@ async fn events(State(page): State<PageState>) -> Response {
         Ok(permit) => event_stream(page, permit).into_response(),
         Err(_) => {
             let text = "too many readers of events; /api/status has the same";
-            // It gives its place back.
+            // So that it takes no connection from others.
             ([(CONNECTION, "close")], refusal(StatusCode::SERVICE_UNAVAILABLE, text)).into_response()
         }
     }

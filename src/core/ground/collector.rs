@@ -25,8 +25,8 @@ pub struct DeliveredPacket {
     pub counts: PacketOutcome,
 }
 
-/// Maximum number of intervals in the received set of a kind, some 100 MB. An interval is a run of consecutive counts with the
-/// same creation time. A mission of 30 channels over 1.3 years has some tens of thousands, and 300,000 if a tenth of
+/// Maximum number of intervals in the received set of a kind, some 100 MB. An interval is a run of consecutive sequence counts with
+/// the same creation time. A mission of 30 channels over 1.3 years has some tens of thousands, and 300,000 if a tenth of
 /// its packets are lost.
 const INTERVALS_MAX: usize = 1 << 20;
 
@@ -68,9 +68,10 @@ pub struct Collector {
     decoder: Decoder,
     /// Counts duplicates, damaged bytes and bytes outside packets in this session.
     session_counts: Decoder,
+    /// Held packets that may be released now.
     candidates: VecDeque<PacketHeader>,
-    /// Whether an ephemeris has arrived since all held visibilities were last checked.
-    has_new_ephemeris: bool,
+    /// Whether held visibilities have to be checked again, as after a new ephemeris.
+    must_recheck: bool,
     /// Whether visibilities are held although their positions are known, while there is room.
     holds_for_next_session: bool,
     intervals_max: usize,
@@ -97,7 +98,7 @@ impl Collector {
             decoder: Decoder::new(),
             session_counts: Decoder::new(),
             candidates: VecDeque::new(),
-            has_new_ephemeris: false,
+            must_recheck: false,
             holds_for_next_session: false,
             intervals_max: INTERVALS_MAX,
             packets: 0,
@@ -213,7 +214,7 @@ impl Collector {
 
     /// Checks all held packets for release again.
     pub fn recheck_held(&mut self) {
-        self.has_new_ephemeris = true;
+        self.must_recheck = true;
         self.make_candidates();
     }
 
@@ -362,9 +363,9 @@ impl Collector {
         Some(self.deliver(&[packet]))
     }
 
-    /// Makes all held packets candidates if an ephemeris has arrived. Returns whether it did.
+    /// Makes all held packets candidates if they have to be checked again. Returns whether they had.
     fn make_candidates(&mut self) -> bool {
-        let is_needed = std::mem::take(&mut self.has_new_ephemeris) && self.knows_instrument();
+        let is_needed = std::mem::take(&mut self.must_recheck) && self.knows_instrument();
         if is_needed {
             self.candidates = headers(&self.held);
         }
@@ -376,6 +377,8 @@ impl Collector {
         while let Some(packet) = self.held.pop_before_instrument() {
             let header = packet.header;
             self.received[header.kind.index()].remove(header.count, header.time);
+            self.packets = self.packets.saturating_sub(1);
+            // Only to count it.
             self.decoder.decode(packet.packet(), true);
         }
     }
@@ -397,7 +400,7 @@ impl Collector {
             delivery.packets.push(DeliveredPacket { header, checksum, counts });
             delivery.frame = frame.or(delivery.frame);
         }
-        self.has_new_ephemeris |= matches!(delivery.frame, Some(GroundFrame::Ephemeris(_)));
+        self.must_recheck |= matches!(delivery.frame, Some(GroundFrame::Ephemeris(_)));
         delivery
     }
 

@@ -337,7 +337,7 @@ impl Ground {
                 removed += self.accumulator.remove(&as_received)?.visibilities;
                 removed = removed.saturating_sub(self.accumulator.put_back(&peeled)?.visibilities);
             }
-            self.outcome.ledger.reflag(VisibilityReason::Burst, removed);
+            self.outcome.ledger.move_to_left_out(VisibilityReason::Burst, removed);
             if let Some((archive, sent)) = self.archive.as_mut().zip(sent) {
                 archive.reflag(sent, &used, removed);
             }

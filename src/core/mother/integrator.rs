@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::moving::MovingSky;
 use super::noise::NoiseModel;
 use super::pair_errors::PairErrors;
-use super::powers::SkyPowers;
+use super::powers::{NOISE_STEP_S, SENT_STEP_S, SkyPowers};
 use super::schedule::{Integration, Schedule};
 use crate::array::{Array, EarthOccultation, segments_for};
 use crate::daughters::{InstrumentErrors, PassErrors};
@@ -193,7 +193,8 @@ impl Integrator {
         let mut powers: Vec<(ChannelId, Vec<SkyPowers>)> = Vec::new();
         for channel in 0..self.schedules.len() {
             let Some(model) = &mut self.models[channel].model else { continue };
-            let sky = SkyPowers::predict(model.as_mut(), &self.array, &windows)?;
+            let step_s = if self.options.auto_integration_s > 0.0 { SENT_STEP_S } else { NOISE_STEP_S };
+            let sky = SkyPowers::predict(model.as_mut(), &self.array, &windows, step_s)?;
             blocks.push(
                 self.channel_blocks(&queued, channel, &sky, (&earth_occultations, &passes))?.into_iter(),
             );
@@ -319,18 +320,22 @@ impl Integrator {
             let dt_s = f64::from(integration.duration_ticks) / TICKS_PER_SECOND as f64;
             let from = window.start.plus_ticks(i64::from(integration.offset_ticks));
             let middle_s = from.seconds() + 0.5 * dt_s;
-            let mut sky_powers_k_sr = [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
+            let mut antenna_powers_k_sr =
+                [pair.i, pair.j].map(|n| powers.at(&self.array, n.into(), middle_s));
             let mut value = *prediction;
             if let Some(moving) = &self.moving {
-                let signal = moving.signal(pair, of_channel, [middle_s, dt_s]);
+                let signal = moving.signal(pair, of_channel, middle_s, dt_s);
                 value += signal.visibility_k_sr;
-                sky_powers_k_sr.iter_mut().zip(signal.powers_k_sr).for_each(|(total, power)| *total += power);
+                antenna_powers_k_sr
+                    .iter_mut()
+                    .zip(signal.powers_k_sr)
+                    .for_each(|(total, power)| *total += power);
             }
             let mut gain = Complex64::ONE;
             if let Some(pair_errors) = &pair_errors {
                 let interference = pair_errors.artificial_signals(middle_s);
                 value += interference.visibility_k_sr;
-                sky_powers_k_sr
+                antenna_powers_k_sr
                     .iter_mut()
                     .zip(interference.powers_k_sr)
                     .for_each(|(total, power)| *total += power);
@@ -338,7 +343,7 @@ impl Integrator {
                 // A dead receiver delivers noise of the same power.
                 value = if pair_errors.is_dead() { Complex64::ZERO } else { value * gain };
             }
-            let sigma = noise_model.sigma_k_sr(channel, sky_powers_k_sr, width_hz, dt_s) * gain.norm();
+            let sigma = noise_model.sigma_k_sr(channel, antenna_powers_k_sr, width_hz, dt_s) * gain.norm();
             if let Some(stream) = &mut noise {
                 let draw: [f64; 2] = std::array::from_fn(|_| StandardNormal.sample(stream));
                 value.re += sigma * draw[0];
@@ -401,7 +406,7 @@ impl Integrator {
                 let mut expected_k_sr =
                     noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
                 if let Some(moving) = &self.moving {
-                    expected_k_sr += moving.signal(pair, of_channel, [middle_s, dt_s]).powers_k_sr[0];
+                    expected_k_sr += moving.signal(pair, of_channel, middle_s, dt_s).powers_k_sr[0];
                 }
                 let mut flags = context.flags(pair, from, duration);
                 if let Some(pair_errors) = &pair_errors {
@@ -496,8 +501,8 @@ impl Stage for Integrator {
     type Error = ModelError;
 
     fn step(&mut self, window: ObservingWindow, out: &mut Outlet<GroundFrame>) -> Result<(), ModelError> {
-        let scheduled = self.schedule(window);
-        self.queued.push(scheduled);
+        let window = self.schedule(window);
+        self.queued.push(window);
         if self.batch_is_full() { self.simulate_queue(out) } else { Ok(()) }
     }
 

@@ -66,7 +66,7 @@ impl MovingSky {
 
     /// The signal in an integration of a pair about a time, of a length, s. Powers of auto-correlations are those of a pair of one daughter
     /// with itself.
-    pub(super) fn signal(&self, pair: Pair, channel: &Channel, [middle_s, dt_s]: [f64; 2]) -> MovingSignal {
+    pub(super) fn signal(&self, pair: Pair, channel: &Channel, middle_s: f64, dt_s: f64) -> MovingSignal {
         let mut total = MovingSignal::default();
         let ends_s = [middle_s - 0.5 * dt_s, middle_s + 0.5 * dt_s];
         let instants = if self.smear_integrations { INSTANTS } else { 1 };
@@ -229,10 +229,10 @@ mod tests {
         };
         let channel = Channel { frequency_hz: 1e7, width_hz: 8e3 };
         let pair = Pair { i: 0, j: 7 };
-        assert_eq!(sky.signal(pair, &channel, [900.0, 1.0]), MovingSignal::default());
+        assert_eq!(sky.signal(pair, &channel, 900.0, 1.0), MovingSignal::default());
         // Over an orbit the Moon hides a source for a part that its disc, seen from 300 km, covers: less than a third of the circle.
         let times = (0..100).map(|k| 1010.0 + 82.0 * f64::from(k));
-        let signals: Vec<MovingSignal> = times.map(|t_s| sky.signal(pair, &channel, [t_s, 1.0])).collect();
+        let signals: Vec<MovingSignal> = times.map(|t_s| sky.signal(pair, &channel, t_s, 1.0)).collect();
         let seen = signals.iter().filter(|signal| signal.visibility_k_sr != Complex64::ZERO);
         assert!((55..100).contains(&seen.clone().count()), "{}", seen.count());
         for signal in seen {
@@ -268,12 +268,12 @@ mod tests {
                 if is_seen(*n_hat) { *k_sr * Complex64::cis(-2.0 * PI * turns) } else { Complex64::ZERO }
             };
             let expected: Complex64 = sources.iter().map(wave).sum();
-            let found = sky.signal(Pair { i: 0, j: 7 }, &channel, [t_s, 1.0]).visibility_k_sr;
+            let found = sky.signal(Pair { i: 0, j: 7 }, &channel, t_s, 1.0).visibility_k_sr;
             // 3e3 turns of 16 digits.
             assert!((found - expected).norm() < 1e-9, "{found} {expected}");
         }
         assert!((10..60).contains(&hidden), "{hidden}");
         let other = Channel { frequency_hz: 2e7, width_hz: 8e3 };
-        assert_eq!(sky.signal(Pair { i: 0, j: 7 }, &other, [1e6, 1.0]).visibility_k_sr, Complex64::ZERO);
+        assert_eq!(sky.signal(Pair { i: 0, j: 7 }, &other, 1e6, 1.0).visibility_k_sr, Complex64::ZERO);
     }
 }

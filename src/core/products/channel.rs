@@ -32,7 +32,7 @@ const FREE_DIVISOR: u64 = 20;
 const LATEST_MAP: &str = "latest.fits";
 const LATEST_PICTURE: &str = "latest.png";
 
-/// The output folder of a channel, and the summary of its maps so far.
+/// The output folder of a channel, and what the summary says of its maps so far.
 pub(super) struct ChannelFolder {
     config: ProductsConfig,
     root: PathBuf,
@@ -43,7 +43,7 @@ pub(super) struct ChannelFolder {
     snapshots: Vec<SnapshotSummary>,
     files: Vec<String>,
     summary: Option<ChannelSummary>,
-    beams: Vec<PointBeamSummary>,
+    point_beams: Vec<PointBeamSummary>,
     needs_free_disk: bool,
 }
 
@@ -69,7 +69,7 @@ impl ChannelFolder {
             snapshots: Vec::new(),
             files: Vec::new(),
             summary: None,
-            beams: Vec::new(),
+            point_beams: Vec::new(),
             needs_free_disk: false,
         })
     }
@@ -101,15 +101,16 @@ impl ChannelFolder {
         provenance: &Provenance,
         viewers: &MapWatch,
     ) -> Result<(), ProductsError> {
-        let (snapshots, beams) = (self.snapshots.len(), self.beams.len());
+        let (snapshots, beams, files) = (self.snapshots.len(), self.point_beams.len(), self.files.len());
         let published = self.write_products(solution, provenance, viewers);
         if published.is_err() {
-            // There is a new summary entry if the map itself is valid and only its files could not be written.
+            // There is a new entry of `snapshots` if the map itself is valid and only its files could not be written.
             if self.snapshots.len() > snapshots {
                 self.show(None, Origin { provenance, solution }, viewers);
             }
             self.snapshots.truncate(snapshots);
-            self.beams.truncate(beams);
+            self.point_beams.truncate(beams);
+            self.files.truncate(files);
         }
         published
     }
@@ -140,11 +141,12 @@ impl ChannelFolder {
             self.sheet_maps.offer(shown.map.values(), &caption(solution));
             self.draw_snapshot(solution, shown)?;
         }
-        self.write_named(LATEST_MAP, &map_name(solution), &solved.map, None, origin)?;
+        self.write_described_map(LATEST_MAP, &map_name(solution), &solved.map, None, origin)?;
         if solution.is_final {
             for maps in [Some(&solved), processed.as_ref()].into_iter().flatten() {
                 self.write_final(maps, origin)?;
             }
+            self.write_errors(origin)?;
             self.write_beams(origin)?;
             if self.config.pictures {
                 self.draw_final(shown, comparison.as_ref(), origin)?;
@@ -206,7 +208,7 @@ impl ChannelFolder {
         shown: &ShownMaps,
         comparison: Option<Comparison>,
     ) -> ChannelSummary {
-        let (pixels, errors) = (solution.map_k.len() as f64, solution.uncertainty.as_ref());
+        let (pixels, uncertainty) = (solution.map_k.len() as f64, solution.uncertainty.as_ref());
         let beam = comparison.as_ref().map(|comparison| {
             let l_max = comparison.cl_map.len().saturating_sub(1);
             let smoothing = shown.processing.map_or(0.0, PostProcessing::fwhm_rad);
@@ -230,10 +232,10 @@ impl ChannelFolder {
             span_s: solution.span_s,
             visibilities: solution.visibilities,
             mean_k: solution.map_k.iter().sum::<f64>() / pixels,
-            mean_sigma_k: errors.map(|errors| errors.mean_sigma_k),
-            dipole_k: errors.map(|errors| errors.dipole_k),
-            dipole_sigma_k: errors.map(|errors| errors.dipole_sigma_k),
-            sky_power: errors.map(|errors| errors.power.clone()),
+            mean_sigma_k: uncertainty.map(|found| found.mean_sigma_k),
+            dipole_k: uncertainty.map(|found| found.dipole_k),
+            dipole_sigma_k: uncertainty.map(|found| found.dipole_sigma_k),
+            sky_power: uncertainty.map(|found| found.power.clone()),
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),
@@ -245,14 +247,14 @@ impl ChannelFolder {
             snr,
             power,
             beam,
-            point_beams: self.beams.clone(),
+            point_beams: self.point_beams.clone(),
             latitudes,
             files: Vec::new(),
         }
     }
 
-    /// The path of a file in the channel's folder. Adds the file to the list in the summary.
-    fn file(&mut self, name: &str) -> PathBuf {
+    /// Adds a file of the channel's folder to the list in the summary; returns its path.
+    fn register_file(&mut self, name: &str) -> PathBuf {
         let relative = format!("{}/{name}", self.name);
         let path = self.root.join(&relative);
         if !self.files.contains(&relative) {
@@ -268,11 +270,11 @@ impl ChannelFolder {
         processing: Option<PostProcessing>,
         origin: Origin<'_>,
     ) -> Result<(), ProductsError> {
-        self.write_named(name, name.trim_end_matches(".fits"), map, processing, origin)
+        self.write_described_map(name, name.trim_end_matches(".fits"), map, processing, origin)
     }
 
     /// Writes a map; `what` is its description in the header.
-    fn write_named(
+    fn write_described_map(
         &mut self,
         name: &str,
         what: &str,
@@ -282,7 +284,7 @@ impl ChannelFolder {
     ) -> Result<(), ProductsError> {
         let cards = provenance.cards(solution, what, processing);
         let options = WriteOptions { cards, ..WriteOptions::default() };
-        let path = self.file(name);
+        let path = self.register_file(name);
         Ok(write_map(&path, map, &options)?)
     }
 
@@ -295,6 +297,11 @@ impl ChannelFolder {
         if let Some(input) = self.input(processing).map(|input| input.map.clone()) {
             self.write_map(&format!("input{ending}.fits"), &input, processing, origin)?;
         }
+        Ok(())
+    }
+
+    /// Writes what belongs to the solution, not to its post-processing: errors by pixel, the sky's power, residuals.
+    fn write_errors(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         if let Some(errors) = &origin.solution.uncertainty {
             for map in ErrorMap::all(errors) {
                 let what = map.file.trim_end_matches(".fits");
@@ -303,18 +310,18 @@ impl ChannelFolder {
                     let Solution { diagnostics, refinement, .. } = origin.solution;
                     cards.push(Card::text("ERRORS", limits(diagnostics, refinement.as_ref()), ""));
                 }
-                self.file(map.file);
+                self.register_file(map.file);
                 map.write(&self.root.join(&self.name), &WriteOptions { cards, ..WriteOptions::default() })?;
             }
-            write_product(&self.file("sky-power.csv"), errors.power.csv().as_bytes())?;
+            write_product(&self.register_file("sky-power.csv"), errors.power.csv().as_bytes())?;
         }
         if let Some(refinement) = &origin.solution.refinement {
-            write_product(&self.file("residuals.csv"), refinement.chi_square.csv().as_bytes())?;
+            write_product(&self.register_file("residuals.csv"), refinement.chi_square.csv().as_bytes())?;
         }
         Ok(())
     }
 
-    /// Writes maps of the effective beams, as solved and post-processed, and a table of their widths.
+    /// Writes maps of the point beams, as solved and post-processed, and a table of their widths.
     fn write_beams(&mut self, origin: Origin<'_>) -> Result<(), ProductsError> {
         let Origin { solution, .. } = origin;
         for (number, beam) in solution.beams.iter().enumerate() {
@@ -326,10 +333,10 @@ impl ChannelFolder {
                 self.write_map(&format!("beam-{}-smooth.fits", number + 1), processed, processing, origin)?;
             }
             let l_max = solution.diagnostics.l_max;
-            self.beams.push(PointBeamSummary::new(beam.pixel, &map, l_max, processed.as_ref())?);
+            self.point_beams.push(PointBeamSummary::new(beam.pixel, &map, l_max, processed.as_ref())?);
         }
-        if !self.beams.is_empty() {
-            write_product(&self.file("beams.csv"), beams_csv(&self.beams))?;
+        if !self.point_beams.is_empty() {
+            write_product(&self.register_file("beams.csv"), beams_csv(&self.point_beams))?;
         }
         Ok(())
     }
@@ -350,7 +357,7 @@ impl ChannelFolder {
         let title = format!("{} MHz, {}", self.frequency_hz / 1e6, caption(solution));
         let subtitle = format!("{} visibilities", solution.visibilities);
         let panel = self.panel(map, "", self.scale(shown));
-        let path = self.file(&format!("snapshot-{:03}.png", solution.number));
+        let path = self.register_file(&format!("snapshot-{:03}.png", solution.number));
         // Half the size of the final picture, because there are many.
         let sheet =
             Sheet { title, subtitle, width_px: 800, view: view(self.config.frame), ..Sheet::default() };
@@ -358,7 +365,7 @@ impl ChannelFolder {
         picture.write(&path)?;
         // The final map has its own picture.
         if !solution.is_final {
-            picture.write(&self.file(LATEST_PICTURE))?;
+            picture.write(&self.register_file(LATEST_PICTURE))?;
         }
         Ok(())
     }
@@ -377,7 +384,7 @@ impl ChannelFolder {
         let panel = self.panel(map, &format!("Map at {mhz} MHz"), scale);
         let picture = draw_map(&panel, &subtitle, &view(self.config.frame))?;
         self.write_picture("map", &picture)?;
-        picture.write(&self.file(LATEST_PICTURE))?;
+        picture.write(&self.register_file(LATEST_PICTURE))?;
         if let Some(input) = self.input(shown.processing).cloned() {
             let panel = self.panel(input.map.values(), &format!("Input at {mhz} MHz"), scale);
             let picture = draw_map(&panel, &shown.resolution_text(), &view(self.config.frame))?;
@@ -391,10 +398,10 @@ impl ChannelFolder {
             let title = format!("{mhz} MHz, {}, {noise} thermal noise", shown.resolution_text());
             self.write_picture("spectra", &draw_comparison(&title, comparison)?)?;
         }
-        self.draw_sheet(shown, &caption(solution), scale)
+        self.draw_sharpening(shown, &caption(solution), scale)
     }
 
-    fn draw_sheet(
+    fn draw_sharpening(
         &mut self,
         last: &ShownMaps,
         caption: &str,
@@ -416,10 +423,10 @@ impl ChannelFolder {
 
     /// Writes a final picture as PNG, and as SVG if configured.
     fn write_picture(&mut self, name: &str, picture: &Picture) -> Result<(), ProductsError> {
-        let path = self.file(&format!("{name}.png"));
+        let path = self.register_file(&format!("{name}.png"));
         picture.write(&path)?;
         if self.config.svg {
-            let path = self.file(&format!("{name}.svg"));
+            let path = self.register_file(&format!("{name}.svg"));
             picture.write(&path)?;
         }
         Ok(())

@@ -19,7 +19,7 @@ pub use job::RankJob;
 #[cfg(test)]
 pub(crate) use threads::on_threads;
 
-/// Exchanges numbers between ranks. All ranks call the same functions in the same order, with the same number of values.
+/// Exchanges numbers between ranks (all-reduce). All ranks call the same functions in the same order, with the same number of values.
 pub trait RankExchange: fmt::Debug + Send + Sync {
     /// Replaces each value by its sum over all ranks, which must fit 64 bits.
     fn sum(&self, values: &mut [i64]);
@@ -28,7 +28,7 @@ pub trait RankExchange: fmt::Debug + Send + Sync {
     fn max(&self, values: &mut [i64]);
 }
 
-/// The rank of this process among those that share the sums of a map.
+/// This process as one of several ranks, which share the sums of a map.
 #[derive(Clone, Debug)]
 pub struct Ranks {
     share: RankShare,
@@ -36,7 +36,7 @@ pub struct Ranks {
     exchange: Option<Arc<dyn RankExchange>>,
 }
 
-/// The blocks that a rank holds: every `count`-th from number `rank` on, so that data of any time span are shared evenly.
+/// The blocks of the sums that a rank holds: every `count`-th from number `rank` on, so that data of any time span are shared evenly.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RankShare {
     /// Number of this rank, from 0.
@@ -94,7 +94,7 @@ impl Ranks {
         self.share.rank == 0
     }
 
-    /// Whether there are several ranks.
+    /// Whether the sums are divided: among several ranks, or held one share at a time.
     #[must_use]
     pub fn is_distributed(&self) -> bool {
         self.share.count > 1
@@ -114,10 +114,10 @@ impl Ranks {
         }
     }
 
-    /// Whether `holds` is true on all ranks.
+    /// Whether `condition` is true on all ranks.
     #[must_use]
-    pub fn all(&self, holds: bool) -> bool {
-        let mut fails = [i64::from(!holds)];
+    pub fn all(&self, condition: bool) -> bool {
+        let mut fails = [i64::from(!condition)];
         self.max(&mut fails);
         fails == [0]
     }

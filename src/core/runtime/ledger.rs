@@ -1,4 +1,4 @@
-//! Accounting of samples, which must balance at the end of a run: sampled = accumulated + flagged + lost.
+//! Accounting of samples (in space of voltages, on the ground of visibilities), which must balance at the end of a run: sampled = accumulated + flagged + lost.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -33,7 +33,7 @@ impl<R: Reason> Ledger<R> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Adds `count` new samples.
+    /// Adds `count` samples that were taken.
     pub fn add_sampled(&self, count: u64) {
         add(&mut self.counts().sampled, count);
     }
@@ -50,7 +50,7 @@ impl<R: Reason> Ledger<R> {
 
     /// Counts samples that had reached the result, and were removed from it, as flagged.
     #[doc(hidden)]
-    pub fn reflag(&self, reason: R, count: u64) {
+    pub fn move_to_left_out(&self, reason: R, count: u64) {
         let mut counts = self.counts();
         counts.accumulated = counts.accumulated.saturating_sub(count);
         counts.leave_out(reason, count);
@@ -98,7 +98,7 @@ fn add(entry: &mut u64, count: u64) {
 /// The counts of a ledger, displayed as a table.
 #[derive(Clone, Debug, PartialEq, Eq, bincode::Encode, bincode::Decode)]
 pub struct LedgerReport<R: Reason> {
-    /// Number of new samples.
+    /// Number of samples that were taken.
     pub sampled: u64,
     /// Number of samples that reached the result.
     pub accumulated: u64,
@@ -121,13 +121,13 @@ struct Loss {
 
 impl<R: Reason> LedgerReport<R> {
     fn leave_out(&mut self, reason: R, count: u64) {
-        // Without entries of zero.
+        // No entries of zero, so that equal counts compare equal.
         if count > 0 {
             add(self.left_out.entry(reason).or_default(), count);
         }
     }
 
-    /// Merges the ledgers of two readings of the same samples, each of which accumulated some of them.
+    /// Merges the ledgers of two readings of the same samples, each of which accumulated some of them, such as those of other channels.
     ///
     /// Counts of reasons for which `is_of_reading` holds are of one reading only and added. Other counts are common and taken
     /// once. Samples that neither reading accumulated count under `elsewhere`.

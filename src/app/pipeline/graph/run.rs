@@ -47,6 +47,10 @@ impl<S: GroundSource> GroundSource for PacedSource<S> {
     fn listening(&self) -> Option<Listening> {
         self.source().listening()
     }
+
+    fn is_service(&self) -> bool {
+        self.source().is_service()
+    }
 }
 
 #[cfg(not(target_family = "wasm"))]
@@ -182,7 +186,7 @@ pub fn run_with_ranks(
         products: None,
     };
     on_start(handles);
-    let report = start(graph, ranks, &plan.config.runtime, cancel)?;
+    let report = run_graph(graph, ranks, &plan.config.runtime, cancel)?;
     let samples = sample_summary(&counts, plan, &report)?;
     let finished = FinishedGraph::new(report, outcome, None, cancel).with_samples(samples);
     if let Some(sums) = joint_sums {
@@ -250,7 +254,8 @@ pub(in crate::pipeline) fn simulate_skies(
         (None, None) => drop(bytes),
     }
     on_start(RunView::without_ground(&graph));
-    let report = start_single_process(graph, &plan.config.runtime, cancel)?;
+    let report = run_graph_alone(graph, &plan.config.runtime, cancel)?;
+    // An error if the counts do not balance.
     sample_summary(&counts, plan, &report)?;
     Ok(report)
 }
@@ -321,7 +326,7 @@ pub(in crate::pipeline) fn run_ground<S: GroundSource + 'static>(
         products,
     };
     on_start(handles);
-    let report = start(graph, &ranks, &config.runtime, cancel)?;
+    let report = run_graph(graph, &ranks, &config.runtime, cancel)?;
     Ok(FinishedGraph::new(report, outcome, listening, cancel))
 }
 
@@ -351,7 +356,7 @@ fn sample_summary(
     if report.cut.is_empty() { counts.close(plan) } else { Ok(None) }
 }
 
-/// Adds the link's faults, if any are configured; their truth file goes beside the downlink file.
+/// Adds the faults of the radio link, if any are configured; the file that lists them goes beside the downlink file.
 pub(in crate::pipeline) fn add_link(
     graph: &mut Graph,
     bytes: Link<Vec<u8>>,
@@ -364,7 +369,7 @@ pub(in crate::pipeline) fn add_link(
     })
 }
 
-/// Writes the true errors of the instrument and the true bursts beside a downlink file, if there are any.
+/// Writes the true errors of the instrument and the true bursts of moving sources beside a downlink file, if there are any.
 pub(in crate::pipeline) fn write_truth(plan: &Plan, file: &Path) -> Result<(), PipelineError> {
     let tables = [(".instrument.csv", plan.instrument_truth()), (".moving.csv", plan.moving_truth())];
     for (ending, text) in tables {
@@ -403,7 +408,7 @@ pub(in crate::pipeline) fn write_pipeline(
     Ok(write_product(path, text)?)
 }
 
-/// Locks a folder for maps; an error if an input file of the configuration lies where a product would be written.
+/// Locks a folder for maps; an error if an input file of the configuration lies in a channel's folder of it.
 pub(in crate::pipeline) fn lock_products(config: &Config, out: &Path) -> Result<FolderLock, PipelineError> {
     for input in config.input_files() {
         if is_in_channel_folder(&input, out) {
@@ -451,15 +456,15 @@ pub(crate) const SHUTDOWN: Duration = Duration::from_secs(10);
 const RANK_SHUTDOWN: Duration = Duration::from_secs(3);
 
 /// Runs a graph that is not shared with other ranks.
-pub(in crate::pipeline) fn start_single_process(
+pub(in crate::pipeline) fn run_graph_alone(
     graph: Graph,
     config: &RuntimeConfig,
     cancel: &Cancel,
 ) -> Result<Report, PipelineError> {
-    start(graph, &Ranks::single(), config, cancel)
+    run_graph(graph, &Ranks::single(), config, cancel)
 }
 
-fn start(
+fn run_graph(
     mut graph: Graph,
     ranks: &Ranks,
     config: &RuntimeConfig,
@@ -468,7 +473,7 @@ fn start(
     if config.stall_s > 0.0 {
         graph.fail_after_stall(Duration::from_secs_f64(config.stall_s));
     }
-    // The named stages save data: they may finish without a time limit.
+    // The named stages save data: they are not abandoned.
     graph.cut_after(Duration::from_secs_f64(config.grace_s), &[RECORD, ground_segment::GROUND]);
     Ok(graph.run(cancel, if ranks.is_distributed() { RANK_SHUTDOWN } else { SHUTDOWN })?)
 }
@@ -484,5 +489,23 @@ pub fn use_threads(config: &RuntimeConfig) -> Result<(), PipelineError> {
             Err(PipelineError::Threads { threads, reason: error.to_string() })
         }
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::downlink::Pace;
+
+    #[test]
+    fn a_followed_file_is_a_service_at_any_pace() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("packets.ccsds");
+        // An idle packet of one byte.
+        std::fs::write(&path, [0x07, 0xff, 0xc0, 0, 0, 0, 0]).unwrap();
+        let files = std::slice::from_ref(&path);
+        let paced = |source: FileSource| PacedSource::new(source, Pace::Speed(10.0)).is_service();
+        assert!(paced(FileSource::follow(files, 1.0).unwrap()));
+        assert!(!paced(FileSource::open(files).unwrap()));
     }
 }

@@ -12,7 +12,7 @@ use crate::imaging::{HarmonicRequest, NOISES_TOGETHER, SolveError, SolveWatch, S
 use crate::imaging::{Method, Snapshot};
 use crate::pipeline::config::{Config, MemoryLimit, PipelineError};
 use crate::pipeline::graph::ground_segment::GROUND;
-use crate::pipeline::graph::run::start_single_process;
+use crate::pipeline::graph::run::run_graph_alone;
 use crate::pipeline::graph::{OnStart, READ, RunView};
 use crate::products::create_folder;
 use crate::runtime::{Cancel, Graph, Sink};
@@ -103,7 +103,7 @@ impl NoiseMaps<'_> {
         let setup = config.solver(solving.clone())?;
         graph.sink("noise maps", sums, NoiseMapSolver { setup, out: self.out.to_owned(), first });
         watch(RunView { solving, ..RunView::without_ground(&graph) });
-        Ok(Outcome::of(start_single_process(graph, &config.runtime, cancel)?.cancelled))
+        Ok(Outcome::of(run_graph_alone(graph, &config.runtime, cancel)?.cancelled))
     }
 }
 

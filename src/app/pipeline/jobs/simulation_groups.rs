@@ -74,7 +74,7 @@ pub fn simulate_in_groups(
             drop(skies);
             graph.sink(SPOOL, frames, writer);
             watch(JobEvent::Simulate(number), Some(RunView::without_ground(&graph)));
-            let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
+            let report = run::run_graph_alone(graph, &plan.config.runtime, cancel)?;
             let outcome = Outcome::of(report.cancelled);
             reports.push(report);
             Ok(outcome)
@@ -102,7 +102,7 @@ pub fn simulate_in_groups(
     let bytes = run::add_link(&mut graph, bytes, &plan.config, file)?;
     graph.sink(run::RECORD, bytes, recorder);
     watch(JobEvent::Merge, Some(RunView::without_ground(&graph)));
-    let report = run::start_single_process(graph, &plan.config.runtime, cancel)?;
+    let report = run::run_graph_alone(graph, &plan.config.runtime, cancel)?;
     if !report.cancelled {
         remove_spools(groups, file)?;
     }

@@ -57,7 +57,8 @@ impl Circle {
         let pairs: Vec<&PairOrientation> = pairs.iter().flatten().filter(within).collect();
         let longest_m = pairs.iter().map(|pair| pair.baseline_m).fold(0.0, f64::max);
         let long = || pairs.iter().filter(|pair| pair.baseline_m >= 0.5 * longest_m);
-        let inclination_deg = median(long().map(|pair| pair.prograde_rad().to_degrees()).collect())?;
+        let inclination_deg =
+            median(long().map(|pair| pair.prograde_inclination_rad().to_degrees()).collect())?;
         Some(Self {
             inclination_deg: (inclination_deg / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG,
             radius_m: (median(long().map(|pair| pair.radius_m).collect())? / RADIUS_STEP_M).round()
@@ -67,7 +68,7 @@ impl Circle {
 
     /// Whether a pair is on the circle, to within a negligible phase.
     fn contains(&self, pair: &PairOrientation, wavelength_m: f64) -> bool {
-        let tilt_rad = (pair.prograde_rad() - self.inclination_rad()).abs();
+        let tilt_rad = (pair.prograde_inclination_rad() - self.inclination_rad()).abs();
         let off_rad = tilt_rad + pair.radius_difference_m.abs() / pair.baseline_m;
         (pair.radius_m - self.radius_m).abs() <= RADIUS_STEP_M
             && off_rad * TAU * (pair.baseline_m / wavelength_m + 1.0) <= PHASE_RAD_MAX

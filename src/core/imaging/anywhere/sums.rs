@@ -151,7 +151,8 @@ pub(in crate::imaging) fn nearest_circle(
     let mean = |value: &dyn Fn(&PairOrientation) -> f64| {
         found.iter().map(value).sum::<f64>() / found.len().max(1) as f64
     };
-    let orbit_rad = orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&PairOrientation::prograde_rad));
+    let orbit_rad =
+        orbit_inclination_rad(at, count).unwrap_or_else(|| mean(&PairOrientation::prograde_inclination_rad));
     let inclination_deg = (orbit_rad.to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     let mean_m = (mean(&|pair| pair.radius_m) / RADIUS_STEP_M).round() * RADIUS_STEP_M;
     // Positions are untrusted: the circle must lie above the surface and be larger than the longest baseline.

@@ -46,7 +46,7 @@ pub fn nominal_orbit(placed: &PlacedVisibilities, limits: GeometryLimits) -> Opt
     let mut pairs = placed.r_i_m.iter().zip(&placed.r_j_m);
     let found = pairs.find_map(|(&r_i_m, &r_j_m)| PairOrientation::of_pair(r_i_m, r_j_m).ok())?;
     let inclination_deg =
-        (found.prograde_rad().to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
+        (found.prograde_inclination_rad().to_degrees() / INCLINATION_STEP_DEG).round() * INCLINATION_STEP_DEG;
     Some(NominalOrbit {
         inclination_rad: inclination_deg.to_radians(),
         radius_m: (found.radius_m / RADIUS_STEP_M).round() * RADIUS_STEP_M,

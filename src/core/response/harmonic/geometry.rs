@@ -137,7 +137,7 @@ const BASELINE_M_MIN: f64 = 1e-3;
 
 impl PairOrientation {
     /// Inclination of the pair's plane, rad, of a prograde orbit: where satellite j leads, the plane's normal is reversed.
-    pub(crate) fn prograde_rad(&self) -> f64 {
+    pub(crate) fn prograde_inclination_rad(&self) -> f64 {
         self.inclination_rad.min(std::f64::consts::PI - self.inclination_rad)
     }
 
@@ -157,12 +157,12 @@ impl PairOrientation {
         }
         let y = scale(1.0 / baseline_m, difference);
         // Orthogonal to the baseline even if the distances differ.
-        let across = sub(sum, scale(dot(sum, y), y));
-        let across_m = norm(across);
-        if !(baseline_m > BASELINE_M_MIN && across_m > BASELINE_M_MIN) {
+        let outward = sub(sum, scale(dot(sum, y), y));
+        let outward_m = norm(outward);
+        if !(baseline_m > BASELINE_M_MIN && outward_m > BASELINE_M_MIN) {
             return Err(GeometryRefusal::Degenerate);
         }
-        let x = scale(1.0 / across_m, across);
+        let x = scale(1.0 / outward_m, outward);
         Ok(Self {
             baseline_m,
             radius_m: 0.5 * (radius_i_m + radius_j_m),
@@ -301,7 +301,7 @@ mod tests {
                 (single.inclination_rad, about.inclination_rad),
                 (single.phase_rad, about.phase_rad),
             ] {
-                // The node moves by 1.5e-7 rad in these 2 s, 2e-4 of the motion along the orbit.
+                // The node moves by 3e-7 rad in these 2 s, 2e-4 of the motion along the orbit.
                 assert!(wrap(found - expected).abs() < 3e-4, "{t_s}: {found} {expected}");
             }
             // The daughters are in their plane; rounding of 2e6 m.

@@ -93,7 +93,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         let preamble = state.receiver.preamble();
         sent = bytes - preamble.bytes();
         // `taken` would let the sender delete what the ground does not have.
-        if ended == ConnectionEnd::Whole && !state.receiver.is_downlink() {
+        if ended == ConnectionEnd::Whole && !state.receiver.is_empty_or_downlink() {
             ended = ConnectionEnd::NotADownlink;
             foreign_format = state.receiver.foreign_format();
         }
@@ -105,7 +105,7 @@ pub(super) async fn serve(mut stream: TcpStream, peer: SocketAddr, shared: Arc<L
         if let Some(station) = &station {
             shared.listening.write().record_bytes(station, 0, counters.faults() - state.faults, false);
         }
-        let is_downlink = state.receiver.has_valid() && ended != ConnectionEnd::NotADownlink;
+        let is_downlink = state.receiver.has_had_valid() && ended != ConnectionEnd::NotADownlink;
         status.done.fetch_add(u64::from(is_downlink), Ordering::Relaxed);
     }
     let synced = sync(ticket, &shared).await;
@@ -215,7 +215,7 @@ async fn read(
     silence: &mut Duration,
 ) -> Result<usize, ConnectionEnd> {
     let shared = slot.shared;
-    let (limit_s, ended) = match state.receiver.has_valid() {
+    let (limit_s, ended) = match state.receiver.has_had_valid() {
         true => (shared.config.idle_s_max, ConnectionEnd::Idle),
         false => (shared.config.first_packet_s_max, ConnectionEnd::FirstPacket),
     };

@@ -83,8 +83,8 @@ impl DatagramSenders {
         let sender = self.sender(peer);
         let before = sender.packets();
         let activity = match bytes.starts_with(&SYNC_MARKER.to_be_bytes()) {
-            true => sender.frames.receive_next(bytes, out),
-            false => sender.packets.receive_alone(bytes, out),
+            true => sender.frames.receive_continued(bytes, out),
+            false => sender.packets.receive_datagram(bytes, out),
         };
         sender.last_received = Instant::now();
         report.received += 1;

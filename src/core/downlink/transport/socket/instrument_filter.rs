@@ -82,7 +82,7 @@ impl InstrumentFilter {
     }
 
     /// Updates the verdict; returns whether all packets so far may be forwarded.
-    pub(super) fn update_verdict(&mut self) -> bool {
+    pub(super) fn is_confirmed_after_update(&mut self) -> bool {
         if self.verdict == InstrumentVerdict::Undecided {
             let instrument = self.reception.instrument.lock().unwrap_or_else(PoisonError::into_inner);
             match (&*instrument, self.decoder.instrument()) {
@@ -119,7 +119,7 @@ impl InstrumentFilter {
         }
         match frame {
             Some(GroundFrame::Instrument(found)) => {
-                self.update_verdict();
+                self.is_confirmed_after_update();
                 if self.verdict == InstrumentVerdict::Undecided && !(self.reception.is_supported)(&found) {
                     self.verdict = InstrumentVerdict::Refused(ConnectionEnd::UnfitInstrument);
                 }

@@ -10,7 +10,7 @@ use crate::downlink::wire::{Format, PacketSegment};
 const PAYLOAD_BYTES_MAX: usize = 1 << 20;
 
 /// Maximum number of bytes of packets that are kept until visibilities with positions confirm their instrument: four times
-/// the interval at which a spacecraft repeats description and ephemeris (1 MiB by default).
+/// the bytes after which a spacecraft repeats description and ephemeris (1 MiB by default).
 const UNCONFIRMED_BYTES_MAX: usize = 1 << 22;
 
 /// The packets and frames found in a piece of a stream.
@@ -22,7 +22,8 @@ pub(super) struct Activity {
     pub(super) has_new: bool,
 }
 
-/// The receiver of one sender's stream. It counts everything except valid packets, which the ground counts.
+/// The receiver of one sender's stream. Its reception counters leave out valid packets, which the ground counts; here these are only
+/// forwarded or refused.
 pub(super) struct StreamReceiver {
     preamble: Preamble,
     receiver: DownlinkReceiver,
@@ -80,7 +81,7 @@ impl StreamReceiver {
     ///
     /// # Errors
     /// The instrument is refused, or was not confirmed in time.
-    pub(super) fn receive_alone(
+    pub(super) fn receive_datagram(
         &mut self,
         bytes: &[u8],
         out: &mut Vec<u8>,
@@ -95,7 +96,7 @@ impl StreamReceiver {
     ///
     /// # Errors
     /// The instrument is refused, or was not confirmed in time.
-    pub(super) fn receive_next(
+    pub(super) fn receive_continued(
         &mut self,
         bytes: &[u8],
         out: &mut Vec<u8>,
@@ -135,7 +136,7 @@ impl StreamReceiver {
     }
 
     /// Whether the stream has had a valid packet or frame.
-    pub(super) fn has_valid(&self) -> bool {
+    pub(super) fn has_had_valid(&self) -> bool {
         self.valid_items > 0
     }
 
@@ -145,7 +146,7 @@ impl StreamReceiver {
     }
 
     /// Whether the stream so far is empty, or a downlink that had packets for the ground.
-    pub(super) fn is_downlink(&self) -> bool {
+    pub(super) fn is_empty_or_downlink(&self) -> bool {
         self.receiver.bytes() == 0 || (self.packets > 0 && self.receiver.unsupported_frames().is_none())
     }
 
@@ -228,7 +229,7 @@ impl StreamReceiver {
 
     /// Forwards the packets of complete payloads, if the verdict allows it.
     fn forward_confirmed(&mut self, out: &mut Vec<u8>) {
-        if self.filter.update_verdict() {
+        if self.filter.is_confirmed_after_update() {
             out.append(&mut self.unconfirmed);
             self.packets += std::mem::take(&mut self.unconfirmed_packets);
         }
