@@ -403,8 +403,12 @@ impl Integrator {
                 let dt_s = f64::from(duration) / TICKS_PER_SECOND as f64;
                 let from = window.start.plus_ticks(offset.into());
                 let middle_s = from.seconds() + 0.5 * dt_s;
-                let mut expected_k_sr =
-                    noise_model.receiver_k_sr(channel) + powers.at(&self.array, n.into(), middle_s);
+                // The mean over the integration, in which the Moon's direction changes: Gauss's quadrature with two points.
+                let offset_s = 0.5 * dt_s / 3.0_f64.sqrt();
+                let sky_k_sr = |t_s: f64| 0.5 * powers.at(&self.array, n.into(), t_s);
+                let mut expected_k_sr = noise_model.receiver_k_sr(channel)
+                    + sky_k_sr(middle_s - offset_s)
+                    + sky_k_sr(middle_s + offset_s);
                 if let Some(moving) = &self.moving {
                     expected_k_sr += moving.signal(pair, of_channel, middle_s, dt_s).powers_k_sr[0];
                 }

@@ -81,8 +81,12 @@ pub(in crate::pipeline) fn powers_of(
     let of_daughters = all
         .iter()
         .filter(|(power, _)| power.frequency_hz == frequency_hz && power.daughter < instrument.satellites);
-    let sample = |&(AutoPower { daughter, time_s, power_k_sr, sigma_k_sr, .. }, r_m): &(AutoPower, Vec3)| {
-        PowerSample { daughter, time_s, r_m, power_k_sr, sigma_k_sr }
+    let receivers = f64::from(instrument.response.receivers());
+    let sample = |&(power, r_m): &(AutoPower, Vec3)| {
+        let AutoPower { daughter, width_hz, time_s, power_k_sr, sigma_k_sr, .. } = power;
+        // The radiometer equation.
+        let duration_s = (power_k_sr / sigma_k_sr).powi(2) / (receivers * width_hz);
+        PowerSample { daughter, time_s, duration_s, r_m, power_k_sr, sigma_k_sr }
     };
     let powers: Vec<PowerSample> = of_daughters.map(sample).collect();
     let has_pattern = instrument.response == AntennaResponse::DipoleNormal;

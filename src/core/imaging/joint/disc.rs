@@ -44,7 +44,8 @@ pub(super) struct Discs {
     points: usize,
     /// v_l at each of the radii.
     visible: Vec<Vec<f64>>,
-    places: Vec<Place>,
+    /// The places over which each power is averaged.
+    places: Vec<[Place; 2]>,
     /// Interpolation weights of the radii, for each disc.
     radius_weights: Vec<f64>,
     legendre: Legendre,
@@ -74,14 +75,14 @@ pub(super) fn visible_sr(l_max: usize, cos_radius: f64) -> Vec<f64> {
 }
 
 impl Discs {
-    pub(super) fn new(l_max: usize, discs: &[Disc]) -> Self {
+    /// The operator for powers outside these discs, each averaged over two directions of its disc (those of an arc, in Gauss's quadrature).
+    pub(super) fn new(l_max: usize, discs: &[(Disc, [Vec3; 2])]) -> Self {
         let points = OVERSAMPLING * (l_max + 1);
         let step = PI / points as f64;
-        let radii: Vec<f64> = discs.iter().map(|disc| disc.cos_radius.acos()).collect();
+        let radii: Vec<f64> = discs.iter().map(|(disc, _)| disc.cos_radius.acos()).collect();
         let ends = radii.iter().fold([PI, 0.0_f64], |[low, high], a| [low.min(*a), high.max(*a)]);
         let nodes = radius_nodes(ends, l_max);
-        let place = |disc: &Disc| {
-            let [x, y, z] = disc.direction;
+        let place = |[x, y, z]: Vec3| {
             let colatitude = z.clamp(-1.0, 1.0).acos();
             // Colatitudes are in the middle of their steps, so that none is a pole.
             let angles = [colatitude / step - 0.5, y.atan2(x) / step];
@@ -99,7 +100,7 @@ impl Discs {
             l_max,
             points,
             visible: nodes.iter().map(|a| visible_sr(l_max, a.cos())).collect(),
-            places: discs.par_iter().map(place).collect(),
+            places: discs.par_iter().map(|(_, ends)| ends.map(place)).collect(),
             radius_weights: radii.iter().flat_map(|a| lagrange_weights(&nodes, *a)).collect(),
             legendre: Legendre::new(l_max, (0..points).map(|k| colatitude_cos_sin(k, step))),
             inverse: planner.plan_fft_inverse(2 * points),
@@ -130,13 +131,15 @@ impl Discs {
             circle.iter().map(|value| value.re).collect()
         };
         let circles: Vec<Vec<f64>> = (0..radii * self.points).into_par_iter().map(circle).collect();
-        let of_disc = |(place, radius_weights): (&Place, &[f64])| {
+        let of_disc = |(places, radius_weights): (&[Place; 2], &[f64])| {
             let mut power = 0.0;
-            self.for_each_node(place, &mut |circle, k, weight| {
-                for (radius, share) in radius_weights.iter().enumerate() {
-                    power += share * weight * circles[radius * self.points + circle][k];
-                }
-            });
+            for place in places {
+                self.for_each_node(place, &mut |circle, k, weight| {
+                    for (radius, share) in radius_weights.iter().enumerate() {
+                        power += 0.5 * share * weight * circles[radius * self.points + circle][k];
+                    }
+                });
+            }
             power
         };
         self.places.par_iter().zip(self.radius_weights.par_chunks_exact(radii)).map(of_disc).collect()
@@ -146,14 +149,17 @@ impl Discs {
     pub(super) fn transposed(&self, rows: &[f64]) -> Vec<f64> {
         let (radii, around) = (self.visible.len(), 2 * self.points);
         let mut circles = vec![Complex64::default(); radii * self.points * around];
-        for ((place, radius_weights), row) in
+        for ((places, radius_weights), row) in
             self.places.iter().zip(self.radius_weights.chunks_exact(radii)).zip(rows)
         {
-            self.for_each_node(place, &mut |circle, k, weight| {
-                for (radius, share) in radius_weights.iter().enumerate() {
-                    circles[(radius * self.points + circle) * around + k].re += share * weight * row;
-                }
-            });
+            for place in places {
+                self.for_each_node(place, &mut |circle, k, weight| {
+                    for (radius, share) in radius_weights.iter().enumerate() {
+                        circles[(radius * self.points + circle) * around + k].re +=
+                            0.5 * share * weight * row;
+                    }
+                });
+            }
         }
         circles.par_chunks_exact_mut(around).for_each(|circle| self.forward.process(circle));
         let of_order = |m: usize| -> Vec<Complex64> {
@@ -242,6 +248,10 @@ mod tests {
         discs
     }
 
+    fn at_rest(discs: &[Disc]) -> Vec<(Disc, [Vec3; 2])> {
+        discs.iter().map(|disc| (*disc, [disc.direction; 2])).collect()
+    }
+
     fn wave(count: usize, f: f64) -> Vec<f64> {
         (0..count).map(|k| (f * k as f64 + 0.1).sin()).collect()
     }
@@ -272,7 +282,7 @@ mod tests {
         let sky = synthesis(&coefficients(&x, l_max), NSIDE).unwrap();
         let directions = pixel_directions(NSIDE);
         let discs = discs();
-        let found = Discs::new(l_max, &discs).powers(&x);
+        let found = Discs::new(l_max, &at_rest(&discs)).powers(&x);
         for (disc, found) in discs.iter().zip(found) {
             let seen =
                 directions.iter().zip(&sky).filter(|(n, _)| dot(**n, disc.direction) < disc.cos_radius);
@@ -286,7 +296,9 @@ mod tests {
     fn transposed_is_the_transpose() {
         let discs = discs();
         for l_max in [1, 13] {
-            let operator = Discs::new(l_max, &discs);
+            // Averages of each disc's direction and the next one's.
+            let ends = (0..discs.len()).map(|k| [discs[k].direction, discs[(k + 1) % discs.len()].direction]);
+            let operator = Discs::new(l_max, &discs.iter().copied().zip(ends).collect::<Vec<_>>());
             let (x, y) = (wave((l_max + 1).pow(2), 0.9), wave(discs.len(), 0.31));
             let left: f64 = operator.powers(&x).iter().zip(&y).map(|(a, b)| a * b).sum();
             let right: f64 = operator.transposed(&y).iter().zip(&x).map(|(a, b)| a * b).sum();
