@@ -23,7 +23,8 @@ use crate::units::vector::Vec3;
 /// Pauses between attempts to write the last checkpoint of a session, as a shortage may pass.
 const LAST_CHECKPOINT_PAUSES: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(1)];
 
-/// Steps between updates of the shown counters while data arrive without pause. Counting gaps takes a while.
+/// Steps between updates of the shown counters while data arrive without pause, and at powers of two, so that a short run shows something.
+/// Counting gaps takes a while.
 const STEPS_PER_UPDATE: u64 = 32;
 
 /// The ground stage: takes the bytes of a downlink and emits sums.
@@ -102,8 +103,8 @@ impl Ground {
         Self { accumulator: self.accumulator.with_noise_realisations(seeds), ..self }
     }
 
-    /// Reports through `answers` which data the checkpoints hold, for senders that wait for it. It needs an archive and, from its
-    /// beginning, the stream of the source that shares `answers`.
+    /// Reports through `answers` which data the checkpoints hold, for senders that wait for it. It needs an archive, and has to read the
+    /// source that shares `answers` from its first byte.
     #[must_use]
     #[doc(hidden)]
     pub fn with_answers(self, answers: &HeldAnswers) -> Self {
@@ -176,39 +177,42 @@ impl Ground {
                 }
                 _ => {}
             }
-            self.note_all_held();
+            self.register_all_held();
             if self.collector.held().is_full() {
-                self.close_passes();
+                self.solve_open_passes();
             }
             let Self { collector, calibrator, gate, .. } = self;
-            let delivery = match collector.next_step(&|outline| is_due(calibrator, gate.as_ref(), outline))? {
+            let delivery = match collector
+                .next_step(&|outline| is_ready(calibrator, gate.as_ref(), outline))?
+            {
                 CollectorStep::Released(delivery) => delivery,
                 CollectorStep::Direct(delivery) => {
+                    // They need not wait: the gains of their pass were solved before they came.
                     if let (Some(gate), Some(GroundFrame::Visibilities(block))) = (gate, &delivery.frame) {
                         gate.count_late(block);
                     }
                     delivery
                 }
                 CollectorStep::Held(header) => {
-                    self.note(&header, true);
+                    self.register(&header, true);
                     continue;
                 }
                 CollectorStep::NeedsBytes => return Ok(()),
             };
             self.apply(delivery, out)?;
             if self.archive.as_ref().is_some_and(Archive::is_due) {
+                // A failure loses no data: the outcome reports it, and the next attempt follows.
                 let written = self.checkpoint();
                 if self.ranks().is_distributed() {
                     // Without it the parts of the other ranks are useless.
                     written?;
                 }
-                // A failure loses no data: the outcome reports it, and the next attempt follows.
             }
         }
     }
 
     /// Registers a packet that waits for its gains, and closes the pass that it ends.
-    fn note(&mut self, header: &PacketHeader, is_new: bool) {
+    fn register(&mut self, header: &PacketHeader, is_new: bool) {
         let Self { collector, gate: Some(gate), archive, cancel, .. } = self else { return };
         if archive.is_some() && cancel.is_cancelled() {
             // The next session registers them, in the order of sending.
@@ -219,7 +223,7 @@ impl Ground {
         };
         let ended = gate.ended_by(&block);
         if let Some(which) = ended {
-            self.close_pass(which);
+            self.solve_gains_of_pass(which);
         }
         if let Some(gate) = &mut self.gate
             && !gate.register(&block)
@@ -230,7 +234,7 @@ impl Ground {
     }
 
     /// Registers packets that were held before the instrument was known, or in an earlier session.
-    fn note_all_held(&mut self) {
+    fn register_all_held(&mut self) {
         let Self { collector, gate: Some(gate), .. } = self else { return };
         if !gate.must_register_held || collector.instrument().is_none() {
             return;
@@ -239,17 +243,17 @@ impl Ground {
         let held: Vec<PacketHeader> = collector.held().packets().map(|packet| packet.header).collect();
         held.iter()
             .filter(|header| header.kind == PacketKind::Visibilities)
-            .for_each(|header| self.note(header, false));
+            .for_each(|header| self.register(header, false));
         self.collector.recheck_held();
     }
 
-    fn close_passes(&mut self) {
+    fn solve_open_passes(&mut self) {
         let open = self.gate.as_ref().map(PassGate::open_passes).unwrap_or_default();
-        open.into_iter().for_each(|which| self.close_pass(which));
+        open.into_iter().for_each(|which| self.solve_gains_of_pass(which));
     }
 
     /// Solves for the gains of a pass with the packets held, in the order of sending.
-    fn close_pass(&mut self, which: usize) {
+    fn solve_gains_of_pass(&mut self, which: usize) {
         let Self { collector, calibrator, gate: Some(gate), .. } = self else { return };
         let waiting =
             collector.held().packets().filter(|packet| packet.header.kind == PacketKind::Visibilities);
@@ -269,9 +273,9 @@ impl Ground {
             let bad = packets.iter().map(|packet| u64::from(packet.counts.visibilities_bad_value)).sum();
             self.calibrator.count_bad(block.start, bad);
         }
-        let autos = self.live_view_writer.auto_span(frame.as_ref());
+        let span = self.live_view_writer.auto_span(frame.as_ref());
         let used = self.use_frame(&packets, frame, out);
-        if let Some((span, autos)) = autos.zip(self.calibrator.autos()) {
+        if let Some((span, autos)) = span.zip(self.calibrator.autos()) {
             self.live_view_writer.add_powers(span, autos);
         }
         used
@@ -284,12 +288,12 @@ impl Ground {
         out: &mut Outlet<Snapshot>,
     ) -> Result<(), GroundError> {
         let mut draft = RecordDraft::new(frame.as_ref());
-        let placed = placed(&mut self.calibrator, frame)?;
+        let placed = calibrate(&mut self.calibrator, frame)?;
         if let Some(mut placed) = placed {
             if self.burst_watch.is_ended_by(&placed) {
                 let known = self.outcome.bursts.len();
-                self.end_pass()?;
-                // Of the same pass, if there was no room for it.
+                self.take_out_bursts()?;
+                // If the pass ended only because the watch was full, this block belongs to it, too.
                 if let PlacedFrame::Visibilities(placed) = &mut placed {
                     self.calibrator.take_bursts_out(placed, known);
                 }
@@ -305,9 +309,9 @@ impl Ground {
                 }
                 _ => None,
             };
-            draft.used_s = self.accumulator.accept(placed, out)?;
+            draft.used_span_s = self.accumulator.accept(placed, out)?;
             if let Some(watched) = watched {
-                self.burst_watch.keep(watched, packets, draft.used_s.is_some());
+                self.burst_watch.keep(watched, packets, draft.used_span_s.is_some());
             }
         }
         if let Some(archive) = &mut self.archive {
@@ -318,7 +322,7 @@ impl Ground {
     }
 
     /// Judges the visibilities of the open pass, and takes those in bursts out of the sums.
-    fn end_pass(&mut self) -> Result<(), GroundError> {
+    fn take_out_bursts(&mut self) -> Result<(), GroundError> {
         let Some(instrument) = self.collector.instrument() else { return Ok(()) };
         let search = BurstSearch {
             moon_radius_m: instrument.moon_radius_m,
@@ -331,6 +335,7 @@ impl Ground {
         for WatchedBlock { placed, sent, is_used } in self.burst_watch.end(search, &bursts) {
             let divided = bursts.divided(&placed, known);
             let Some(DividedBlock { used, left_out, as_received, peeled }) = divided else { continue };
+            // Those in a burst leave the sums; where its flux is known they come back without it.
             let mut removed = 0;
             if is_used {
                 removed += self.accumulator.remove(&left_out)?.visibilities;
@@ -348,11 +353,12 @@ impl Ground {
     /// Closes open passes, and applies held packets although their positions are unknown.
     pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         if !(self.archive.is_some() && self.cancel.is_cancelled()) {
-            self.note_all_held();
-            self.close_passes();
+            self.register_all_held();
+            self.solve_open_passes();
             loop {
                 let Self { collector, calibrator, gate, .. } = self;
-                let released = collector.next_released(&|outline| is_due(calibrator, gate.as_ref(), outline));
+                let released =
+                    collector.next_released(&|outline| is_ready(calibrator, gate.as_ref(), outline));
                 let Some(delivery) = released else { break };
                 self.apply(delivery, out)?;
             }
@@ -409,8 +415,8 @@ impl Ground {
         }
     }
 
-    /// Whether a checkpoint is due by the age of unsaved data. Ranks write at the same place of the stream, so never for them.
-    fn is_old(&self) -> bool {
+    /// Whether a checkpoint is due by the age of unsaved data. Ranks have to write at the same place of the stream, not by the clock.
+    fn has_old_unsaved_data(&self) -> bool {
         let saves = self.archive.as_ref().is_some_and(Archive::saves_during_session);
         saves && !self.ranks().is_distributed() && self.outcome.saving.is_old()
     }
@@ -455,11 +461,11 @@ pub(super) fn missing_packets(collector: &Collector, calibrator: &Calibrator) ->
 }
 
 /// Whether visibilities can be applied: their positions and gains are known.
-fn is_due(calibrator: &Calibrator, gate: Option<&PassGate>, outline: &VisibilitiesOutline) -> bool {
+fn is_ready(calibrator: &Calibrator, gate: Option<&PassGate>, outline: &VisibilitiesOutline) -> bool {
     calibrator.ephemeris().covers(outline.span) && gate.is_none_or(|gate| gate.is_due(outline))
 }
 
-fn placed(
+fn calibrate(
     calibrator: &mut Calibrator,
     frame: Option<GroundFrame>,
 ) -> Result<Option<PlacedFrame>, GroundError> {
@@ -479,7 +485,7 @@ impl Stage for Ground {
         self.advance(out)?;
         self.promises.note_bytes(self.collector.bytes());
         self.note_unsaved();
-        if self.promises.are_due(self.collector.packets()) || self.is_old() {
+        if self.promises.are_due(self.collector.packets()) || self.has_old_unsaved_data() {
             // After a failure the next attempt follows while a sender waits.
             let _ = self.checkpoint();
         }
@@ -497,11 +503,11 @@ impl Stage for Ground {
     fn finish(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         self.collector.finish();
         self.advance(out)?;
-        self.end_pass()?;
+        self.take_out_bursts()?;
         // The checkpoint keeps held packets held; the final maps use them although their positions are unknown.
         self.last_checkpoint()?;
         self.flush(out)?;
-        self.end_pass()?;
+        self.take_out_bursts()?;
         store(
             &self.outcome.completeness,
             self.calibrator.post_losses(missing_packets(&self.collector, &self.calibrator)),

@@ -18,7 +18,7 @@ pub(in crate::ground) struct RecordDraft {
     pub(in crate::ground) digest: u32,
     pub(in crate::ground) offered: u32,
     /// First and last mission time, s, of the data offered to an engine.
-    pub(in crate::ground) used_s: Option<[f64; 2]>,
+    pub(in crate::ground) used_span_s: Option<[f64; 2]>,
 }
 
 impl RecordDraft {

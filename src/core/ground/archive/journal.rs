@@ -109,7 +109,7 @@ impl Journal {
             offered: draft.offered,
             accumulated: posts.accumulated as u32,
             left_out,
-            used: draft.used_s.map(|span_s| SumsSpan { channel: draft.channel, span_s }),
+            used: draft.used_span_s.map(|span_s| SumsSpan { channel: draft.channel, span_s }),
         };
         self.visibilities.insert((header.time, header.count), record);
     }

@@ -172,7 +172,7 @@ impl Archive {
                 AccumulationError::Io(source) => GroundError::io(path, "write")(source),
                 other => other.into(),
             };
-            checkpoint::write(out, path, &head, |out| accumulator.write_engines(out, place).map_err(add_path))
+            checkpoint::write(out, path, &head, |out| accumulator.write_sums(out, place).map_err(add_path))
         })?;
         self.folder.set_segments(accumulator.segments());
         self.folder.remove_unnamed();

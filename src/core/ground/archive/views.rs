@@ -273,7 +273,7 @@ mod tests {
             draft.entry.channel = ChannelId(5);
             let channel = ChannelId(2);
             draft.offer(&PlacedFrame::Visibilities(PlacedVisibilities { channel, ..Default::default() }));
-            draft.used_s = Some(times_s);
+            draft.used_span_s = Some(times_s);
             let packet = DeliveredPacket { header, checksum: 1, counts: PacketOutcome::default() };
             journal.record_visibilities(&packet, draft, &LedgerReport::default());
         }

@@ -77,7 +77,7 @@ fn read_parts(
     let read_part = |path: &Path, part: RankShare, empty: Accumulator| {
         checkpoint::read(path, |head, engines| {
             check(&head)?;
-            let sums = empty.resume_part(head.accumulator.clone(), engines, path.parent(), part);
+            let sums = empty.resume_share(head.accumulator.clone(), engines, path.parent(), part);
             Ok((head, sums.map_err(|error| unreadable(path, error))?))
         })
     };
@@ -90,7 +90,7 @@ fn read_parts(
                 let found = "a different state from that of the first part".to_owned();
                 return Err(GroundError::Damaged { path, found, expected: "parts of one checkpoint" });
             }
-            Some((_, joined)) => joined.join(sums)?,
+            Some((_, joined)) => joined.add_rank_share(sums)?,
         }
     }
     whole.ok_or_else(|| GroundError::without_checkpoint(path))
@@ -182,7 +182,7 @@ impl OpenArchive {
         let mut outcome = GroundOutcome::default();
         outcome.saving.begin();
         outcome.ledger.post_report(&journal.ledger());
-        accumulator.retain_spans(&journal.spans_s());
+        accumulator.restore_spans(&journal.spans_s());
         let instrument = collector.instrument().cloned();
         let mut gate = config.gate()?;
         if let Some(instrument) = instrument.as_ref().filter(|_| !config.map.prior_files.is_empty()) {

@@ -204,7 +204,7 @@ impl Recalibration {
         let Ground { collector, calibrator: old, accumulator, archive: Some(archive), .. } = ground else {
             return Ok(());
         };
-        accumulator.retain_spans(&journal.spans_s());
+        accumulator.restore_spans(&journal.spans_s());
         archive.take_posts();
         let segments: Vec<_> = old.ephemeris().segments().cloned().collect();
         let resume = |calibrator: Calibrator, autos: AutoTable, blocks: ReceivedBlocks| {
@@ -227,7 +227,7 @@ impl Recalibration {
             let mut draft = RecordDraft::new(Some(&frame));
             if let Some(placed) = calibrator.accept(frame)? {
                 draft.offer(&placed);
-                draft.used_s = accumulator.accept(placed, &mut Outlet::collect())?;
+                draft.used_span_s = accumulator.accept(placed, &mut Outlet::collect())?;
             }
             let posted = archive.take_posts();
             report.accumulated += posted.accumulated;
@@ -265,7 +265,7 @@ impl Recalibration {
     /// Writes the archive twice, so that falling back to the older checkpoint does not bring the old gains back.
     fn write(self, new: &GroundConfig) -> Result<Recalibrated, GroundError> {
         let Self { mut ground, journal, mut report, .. } = self;
-        ground.accumulator.retain_spans(&journal.spans_s());
+        ground.accumulator.restore_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             let settings = settings_of(new)?;
             let gains = settings.iter().find(|(key, _)| key == "calibration.gains_file");

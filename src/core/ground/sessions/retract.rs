@@ -265,7 +265,7 @@ impl Retraction {
     fn write(self, config: &GroundConfig) -> Result<(), GroundError> {
         let Self { mut ground, journal, removed, .. } = self;
         let is_empty = journal.is_empty() && ground.collector.held().packets().next().is_none();
-        ground.accumulator.retain_spans(&journal.spans_s());
+        ground.accumulator.restore_spans(&journal.spans_s());
         if let Some(archive) = &mut ground.archive {
             archive.journal = journal;
             // Before the checkpoints: if the command is interrupted in between, running it again completes it.

@@ -1,7 +1,8 @@
 //! Applies BtN^-1B to harmonic coefficients, and projects data onto them.
 //!
-//! For each block of alphas the sky is rotated into the orbital plane (products with d), multiplied by the patterns at all nodes, and
-//! transformed from mu to gamma, where the weights multiply pointwise. Then the transposed steps follow in reverse order.
+//! For each block of alphas (the longitude of the orbit's node less 90 degrees) the sky is rotated into the orbital plane by Wigner's d,
+//! multiplied by the fringe patterns at all nodes (grid points of the baseline u), and transformed from order mu to gamma (the orbital phase plus
+//! 90 degrees), where the weights multiply pointwise. Then the transposed steps follow in reverse order.
 
 use std::ops::Range;
 
@@ -29,7 +30,7 @@ pub(super) struct Operator {
     grids: Grids,
     rotation: RotationTable<f32>,
     pub(super) patterns: FilteredPatterns,
-    /// Inverse transform of the data kernel at the orders 0 ..= l_max.
+    /// Reciprocal of the transform of the data's spreading kernel, at the orders 0 ..= l_max.
     correction: Vec<f64>,
 }
 
@@ -63,13 +64,13 @@ struct Blocks<'a> {
     is_reversed: bool,
 }
 
-/// The points of a grid on a circle.
+/// The points of a grid of an angle.
 #[derive(Clone, Copy)]
-struct Circle {
+struct AngleGrid {
     points: usize,
 }
 
-impl Circle {
+impl AngleGrid {
     /// Sine and cosine of the angle of a point.
     fn sin_cos(self, index: usize) -> (f64, f64) {
         (std::f64::consts::TAU * (index % self.points) as f64 / self.points as f64).sin_cos()
@@ -127,7 +128,8 @@ impl Operator {
         NodeRange { first, count: (reached.end - first).next_multiple_of(NODE_GROUP) }
     }
 
-    /// Multiplies the coefficients of each sky by BtN^-1B. The results are gradients with respect to real and imaginary parts for m >= 0.
+    /// Multiplies the coefficients of each sky by BtN^-1B. The results are gradients of x'Ax / 2 with
+    /// respect to real and imaginary parts for m >= 0.
     /// Weights and patterns are read once for all skies, but each product has the bits that it would have alone.
     pub(super) fn apply(&self, shared: &SharedTori<'_>, skies: &[Alm]) -> Vec<Alm> {
         if skies.is_empty() {
@@ -135,7 +137,7 @@ impl Operator {
         }
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
-        let circle = Circle { points: self.grids.points };
+        let circle = AngleGrid { points: self.grids.points };
         let blocks = Blocks {
             ranks: shared.ranks,
             used: shared.used,
@@ -163,7 +165,7 @@ impl Operator {
     pub(super) fn project(&self, shared: &SharedTori<'_>, side: RightHandSide) -> Alm {
         let tori = shared.tori;
         let reach = self.reach(shared.reached.clone());
-        let circle = Circle { points: self.grids.data_points() };
+        let circle = AngleGrid { points: self.grids.data_points() };
         let used = tori.alphas(&self.grids, TorusPart::Right);
         let blocks = Blocks { ranks: shared.ranks, used: &used, reach, skies: 1, is_reversed: false };
         let mut projected = self.sum_over_blocks(blocks, |work, alphas| {
@@ -214,16 +216,16 @@ impl Operator {
                 |work, alphas| block(work, alphas).unwrap_or_else(|| vec![vec![f64::NAN]; skies]),
             )
             .collect();
-        let sum = |sky: usize| {
-            let mut sum = Alm::zeros(self.l_max);
+        let of_sky = |sky: usize| {
+            let mut total = Alm::zeros(self.l_max);
             let parts: Vec<&[f64]> = parts.iter().map(|part| part[sky].as_slice()).collect();
-            let sums = sum_of_parts(ranks, &parts, 2 * sum.values().len(), points.div_ceil(ALPHAS));
-            for (value, sums) in sum.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
+            let sums = sum_of_parts(ranks, &parts, 2 * total.values().len(), points.div_ceil(ALPHAS));
+            for (value, sums) in total.values_mut().iter_mut().zip(sums.as_chunks::<2>().0) {
                 *value = Complex64::new(sums[0], sums[1]);
             }
-            sum
+            total
         };
-        (0..skies).map(sum).collect()
+        (0..skies).map(of_sky).collect()
     }
 
     /// The offset of each order mu in `columns` columns of rotated skies.
@@ -234,7 +236,7 @@ impl Operator {
 
     /// Rotates a sky into the orbital plane at each alpha, in the columns from `first` on: `t_{l mu} = sum_m d+ Re z + i d- Im z` with
     /// `z = conj(T_lm) exp(-i m alpha)`.
-    fn rotate(&self, sky: &Alm, circle: Circle, alphas: &[usize], first: usize, work: &mut Workspace) {
+    fn rotate(&self, sky: &Alm, circle: AngleGrid, alphas: &[usize], first: usize, work: &mut Workspace) {
         let Workspace { columns, rotated, .. } = work;
         let starts = self.rotated_starts(*columns);
         let count = alphas.len();
@@ -247,8 +249,8 @@ impl Operator {
             self.rotation.rotate_degree(l, |m| sky.get(l, m).conj(), &phases, [re, im], out);
             for (part, out) in out.chunks_exact(order_count(l) * count).enumerate() {
                 for (k, column) in out.chunks_exact(order_count(l)).enumerate() {
-                    for (order, value) in column.iter().enumerate() {
-                        let mu = l % 2 + 2 * order;
+                    for (index, value) in column.iter().enumerate() {
+                        let mu = l % 2 + 2 * index;
                         let rows = degree_count(self.l_max, mu);
                         rotated[starts[mu] + (part * *columns + first + k) * rows + (l - mu) / 2] = *value;
                     }
@@ -258,7 +260,7 @@ impl Operator {
     }
 
     /// The sines and cosines of m alpha: `[m][alpha]`.
-    fn phases(&self, circle: Circle, alphas: &[usize]) -> Vec<(f64, f64)> {
+    fn phases(&self, circle: AngleGrid, alphas: &[usize]) -> Vec<(f64, f64)> {
         (0..=self.l_max).flat_map(|m| alphas.iter().map(move |alpha| circle.sin_cos(m * alpha))).collect()
     }
 
@@ -291,17 +293,18 @@ impl Operator {
         }
     }
 
-    /// Multiplies one column by the weights of neighbouring nodes: transforms it from mu to gamma and back. `alpha` is its number in the block.
+    /// Multiplies one column by the weights of neighbouring nodes, between the transforms from mu to gamma (in `gather`) and back. `place` is its
+    /// alpha's number in the block.
     fn multiply_weights(
         &self,
         block: &BlockRows<'_>,
-        alpha: usize,
+        place: usize,
         column: usize,
         work: &mut Workspace,
         reach: NodeRange,
     ) {
         const BEHIND: usize = NODES - 1;
-        let rows = |node: usize| block.row(node, alpha);
+        let rows = |node: usize| block.row(node, place);
         work.ring.iter_mut().for_each(|line| line.fill(Complex32::ZERO));
         // Results lag behind the input by the number of nodes that weights couple.
         for group in (0..reach.count + NODE_GROUP).step_by(NODE_GROUP) {
@@ -344,7 +347,7 @@ impl Operator {
         &self,
         work: &mut Workspace,
         reach: NodeRange,
-        circle: Circle,
+        circle: AngleGrid,
         alphas: &[usize],
         factor: Option<&[f64]>,
     ) -> Vec<Vec<f64>> {
@@ -369,7 +372,7 @@ impl Operator {
     fn rotate_back(
         &self,
         work: &Workspace,
-        circle: Circle,
+        circle: AngleGrid,
         alphas: &[usize],
         first: usize,
         factor: Option<&[f64]>,
@@ -385,8 +388,8 @@ impl Operator {
             for (part, d) in [plus, minus].into_iter().enumerate() {
                 let column = &mut column[..order_count(l) * count];
                 for (k, column) in column.chunks_exact_mut(order_count(l)).enumerate() {
-                    for (order, value) in column.iter_mut().enumerate() {
-                        let mu = l % 2 + 2 * order;
+                    for (index, value) in column.iter_mut().enumerate() {
+                        let mu = l % 2 + 2 * index;
                         let rows = degree_count(self.l_max, mu);
                         *value = work.rotated
                             [starts[mu] + (part * work.columns + first + k) * rows + (l - mu) / 2];

@@ -1,4 +1,4 @@
-//! The ground stage that accumulates the normal equations, with one engine per channel.
+//! Accumulates the normal equations, with sums for each channel. The stage `ground` calls it by [`Accumulator::accept`].
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
@@ -18,13 +18,13 @@ use crate::runtime::{Cancel, Ledger, Outlet, Stage, Units};
 use crate::units::ChannelId;
 use crate::units::vector::{norm, sub};
 
-/// Checkpoint state of an accumulator, except its engines, time spans and ledger, which are saved separately.
+/// Checkpoint state of an accumulator, except its sums, time spans and ledger, which are saved separately.
 ///
 /// Snapshot numbers are not saved: they start from 1 again, because snapshot times depend on how the data arrived.
 #[derive(Clone, Debug, Default, PartialEq, bincode::Encode, bincode::Decode)]
 pub struct AccumulatorState {
     instrument: Option<Instrument>,
-    /// Whether each channel has an engine.
+    /// Whether each channel has sums.
     channels: Vec<bool>,
 }
 
@@ -98,8 +98,8 @@ impl Accumulator {
         Self { share: SumShare { ranks: ranks.clone(), ..self.share }, ..self }
     }
 
-    /// Accumulates only this part of the harmonic sums; `None` for all of them. The complete sums are emitted after the last part, and no
-    /// snapshots before.
+    /// Accumulates only this part of the harmonic sums; `None` for all of them. The data are read once for each part. The complete sums are
+    /// emitted after the last part, and no snapshots before.
     #[must_use]
     pub fn with_part(self, part: Option<SumPart>) -> Self {
         Self { share: SumShare { part, ..self.share }, ..self }
@@ -147,7 +147,7 @@ impl Accumulator {
         Self { cancel: cancel.clone(), ..self }
     }
 
-    /// The checkpoint state, except engines and spans.
+    /// The checkpoint state, except sums and spans.
     #[must_use]
     pub fn state(&self) -> AccumulatorState {
         AccumulatorState {
@@ -156,11 +156,11 @@ impl Accumulator {
         }
     }
 
-    /// Writes its engines one after another; archives of visibilities go into files of their own in `segments`.
+    /// Writes its sums one after another; stored visibilities go into files of their own in `segments`.
     ///
     /// # Errors
     /// The writer's.
-    pub fn write_engines(
+    pub fn write_sums(
         &mut self,
         out: &mut dyn Write,
         segments: SegmentFolder<'_>,
@@ -171,61 +171,62 @@ impl Accumulator {
         Ok(())
     }
 
-    /// The archive files that belong to the checkpoint.
+    /// The files of stored visibilities that belong to the checkpoint.
     pub fn segments(&self) -> impl Iterator<Item = &ArchiveSegment> {
         self.channels.iter().flatten().flat_map(|state| state.sums.segments())
     }
 
-    /// Forgets the archive files, so that the next checkpoint can go into another folder.
+    /// Forgets the files of stored visibilities, so that the next checkpoint can go into another folder.
     pub fn forget_segments(&mut self) {
         for state in self.channels.iter_mut().flatten() {
             state.sums.forget_segments();
         }
     }
 
-    /// Resumes from a state and the engines that [`Accumulator::write_engines`] wrote, with archive files in `folder`. The channels' spans
-    /// are restored by [`Accumulator::retain_spans`].
+    /// Resumes from a state and the sums that [`Accumulator::write_sums`] wrote, with stored visibilities in `folder`. The channels' spans
+    /// are restored by [`Accumulator::restore_spans`].
     ///
     /// # Errors
-    /// The engines are damaged, or of another kind than configured.
+    /// The sums are damaged, or of another kind than configured.
     pub fn resume(
         self,
         state: AccumulatorState,
         from: &mut dyn Read,
         folder: Option<&Path>,
     ) -> Result<Self, AccumulationError> {
-        self.resume_part(state, from, folder, RankShare::WHOLE)
+        self.resume_share(state, from, folder, RankShare::WHOLE)
     }
 
-    /// Resumes from engines that the rank with share `part` wrote, as [`Accumulator::resume`]. Only the share of this rank is kept; call
-    /// [`Accumulator::join`] for what other ranks wrote.
+    /// Resumes from sums that the rank with share `written_by` wrote, as [`Accumulator::resume`]. Only the share of this rank is kept; call
+    /// [`Accumulator::add_rank_share`] for what other ranks wrote.
     ///
     /// # Errors
     /// As [`Accumulator::resume`].
-    pub fn resume_part(
+    pub fn resume_share(
         self,
         state: AccumulatorState,
         from: &mut dyn Read,
         folder: Option<&Path>,
-        part: RankShare,
+        written_by: RankShare,
     ) -> Result<Self, AccumulationError> {
         let mut channels = Vec::new();
-        for (channel, has_engine) in (0..).map(ChannelId).zip(state.channels) {
-            let sums =
-                has_engine.then(|| self.config.load_sums(from, folder, (part, &self.share))).transpose()?;
-            // Sums of other groups are read, because they have no length of their own, and dropped.
+        for (channel, has_sums) in (0..).map(ChannelId).zip(state.channels) {
+            let sums = has_sums
+                .then(|| self.config.load_sums(from, folder, (written_by, &self.share)))
+                .transpose()?;
+            // Sums of other groups are read and dropped: without a length before them they cannot be skipped.
             let is_kept = self.group.as_ref().is_none_or(|group| group.contains(&channel));
             channels.push(sums.filter(|_| is_kept).map(ChannelState::new));
         }
         Ok(Self { instrument: state.instrument.map(Arc::new), channels, ..self })
     }
 
-    /// Adds the share of the sums that another rank wrote, channel by channel. Both must hold the same visibilities, at different alphas
-    /// (see [`crate::imaging::circle`]).
+    /// Adds the share of the sums that another rank wrote, channel by channel. Both must hold the same visibilities, in different blocks
+    /// of the sums (see [`crate::imaging::circle`]).
     ///
     /// # Errors
-    /// The shares are of different sums, or of an engine that does not divide its sums.
-    pub fn join(&mut self, other: Self) -> Result<(), AccumulationError> {
+    /// The shares are of different sums, or of a method that does not divide its sums.
+    pub fn add_rank_share(&mut self, other: Self) -> Result<(), AccumulationError> {
         if self.channels.len() != other.channels.len() {
             return Err(AccumulationError::Mismatch { what: "numbers of channels" });
         }
@@ -242,7 +243,7 @@ impl Accumulator {
     /// Adds the sums of another accumulator, channel by channel.
     ///
     /// # Errors
-    /// The engines have different setups.
+    /// The sums have different setups.
     pub fn merge(&mut self, other: Self) -> Result<(), AccumulationError> {
         if self.instrument.is_none() {
             self.instrument = other.instrument;
@@ -275,15 +276,15 @@ impl Accumulator {
     /// Visibilities beyond the map's longest baseline were never added: they are neither removed nor refused.
     ///
     /// # Errors
-    /// The channel holds nothing, or as [`NormalEngine::remove`].
+    /// The channel holds nothing, or as [`MapSums::remove`].
     pub fn remove(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let short = self.usable(placed)?;
-        if short.is_empty() {
+        let usable = self.usable(placed)?;
+        if usable.is_empty() {
             return Ok(Added::default());
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        let removed = state.sums.remove(&short)?;
+        let removed = state.sums.remove(&usable)?;
         self.accumulated = self.accumulated.saturating_sub(removed.visibilities);
         Ok(removed)
     }
@@ -293,19 +294,19 @@ impl Accumulator {
     /// # Errors
     /// As [`Self::remove`].
     pub fn put_back(&mut self, placed: &PlacedVisibilities) -> Result<Added, AccumulationError> {
-        let short = self.usable(placed)?;
-        if short.is_empty() {
+        let usable = self.usable(placed)?;
+        if usable.is_empty() {
             return Ok(Added::default());
         }
         let slot = self.channels.get_mut(usize::from(placed.channel.0)).and_then(Option::as_mut);
         let state = slot.ok_or(AccumulationError::NothingHeld(placed.channel))?;
-        let added = state.sums.add(&short)?;
+        let added = state.sums.add(&usable)?;
         self.accumulated += added.visibilities;
         Ok(added)
     }
 
     /// Sets the first and last mission time, s, of the data in each channel, and drops channels without a span.
-    pub fn retain_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
+    pub fn restore_spans(&mut self, spans_s: &BTreeMap<ChannelId, [f64; 2]>) {
         for (slot, channel) in self.channels.iter_mut().zip(0..) {
             match (slot.as_mut(), spans_s.get(&ChannelId(channel))) {
                 (Some(state), Some(&span_s)) => state.span_s = span_s,
@@ -315,10 +316,10 @@ impl Accumulator {
     }
 
     /// Accepts the next frame and emits the snapshots that are due. Returns the first and last mission time, s, of the visibilities that
-    /// were passed to an engine.
+    /// were passed to the sums.
     ///
     /// # Errors
-    /// As [`NormalEngine::add`]; or the map's settings do not fit the instrument.
+    /// As [`MapSums::add`]; or the map's settings do not fit the instrument.
     pub fn accept(
         &mut self,
         frame: PlacedFrame,
@@ -379,9 +380,10 @@ impl Accumulator {
     fn usable(&mut self, placed: &PlacedVisibilities) -> Result<PlacedVisibilities, AccumulationError> {
         let (config, channel) = (&self.config, placed.channel);
         let baseline_m_max = config.baseline_m_max(placed.frequency_hz);
-        let mut short = within_baseline(placed, baseline_m_max);
-        let Some(path) = config.beyond_files.get(usize::from(channel.0)).filter(|_| !short.is_empty()) else {
-            return Ok(short);
+        let mut usable = within_baseline(placed, baseline_m_max);
+        let Some(path) = config.beyond_files.get(usize::from(channel.0)).filter(|_| !usable.is_empty())
+        else {
+            return Ok(usable);
         };
         if !self.beyond.contains_key(&channel) {
             let instrument = self.instrument.as_ref().ok_or(AccumulationError::UnknownChannel(channel))?;
@@ -392,9 +394,9 @@ impl Accumulator {
             self.beyond.insert(channel, beyond);
         }
         if let Some(beyond) = self.beyond.get_mut(&channel) {
-            beyond.lower_weights(&mut short);
+            beyond.lower_weights(&mut usable);
         }
-        Ok(short)
+        Ok(usable)
     }
 
     fn add(&mut self, placed: &PlacedVisibilities) -> Result<Option<[f64; 2]>, AccumulationError> {
@@ -402,21 +404,21 @@ impl Accumulator {
             self.ledger.add_left_out(VisibilityReason::ChannelNotMapped, placed.len() as u64);
             return Ok(None);
         }
-        let short = self.usable(placed)?;
-        self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - short.len()) as u64);
-        if short.is_empty() {
+        let usable = self.usable(placed)?;
+        self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - usable.len()) as u64);
+        if usable.is_empty() {
             // A channel without usable data gets no engine and no map.
             return Ok(None);
         }
-        let state = match self.channel_or_new(&short)? {
+        let state = match self.channel_or_new(&usable)? {
             Ok(state) => state,
             Err(reason) => {
-                self.ledger.add_left_out(reason, short.len() as u64);
+                self.ledger.add_left_out(reason, usable.len() as u64);
                 return Ok(None);
             }
         };
-        let Added { visibilities, refused } = state.sums.add(&short)?;
-        let offered_s = short.time_s.first().zip(short.time_s.last()).map(|(&first, &last)| [first, last]);
+        let Added { visibilities, refused } = state.sums.add(&usable)?;
+        let offered_s = usable.time_s.first().zip(usable.time_s.last()).map(|(&first, &last)| [first, last]);
         if let Some([first, last]) = offered_s {
             state.span_s = [state.span_s[0].min(first), state.span_s[1].max(last)];
         }
@@ -431,7 +433,7 @@ impl Accumulator {
     /// Emits snapshots of the data of earlier sessions, if snapshots are wanted.
     ///
     /// # Errors
-    /// As [`NormalEngine::add`], for the harmonic sums of stored visibilities.
+    /// As [`MapSums::add`], for the harmonic sums of stored visibilities.
     pub fn emit_resumed(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), AccumulationError> {
         if self.config.snapshot_every_s > 0.0 { self.emit(out) } else { Ok(()) }
     }
