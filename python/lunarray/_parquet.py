@@ -53,7 +53,7 @@ def to_table(downlink, channel):
 def write_parquet(downlink, path, channel):
     """Writes a file; see ``Downlink.write_parquet``."""
     parquet = needed("pyarrow.parquet", "parquet")
-    table = to_table(downlink, channel)
     with writing(path, downlink.path, b"PAR1", "Parquet") as unfinished:
+        table = to_table(downlink, channel)
         parquet.write_table(table, unfinished)
     return len(table)

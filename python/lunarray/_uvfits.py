@@ -15,9 +15,9 @@ BESIDE = "LUNARRAY"
 
 def write_uvfits(downlink, path, channel, phase_centre):
     """Writes a file; see ``Downlink.write_uvfits``."""
-    made, rows = to_uvdata(downlink, channel, phase_centre)
     fits = needed("astropy.io.fits", "uvh5")
     with writing(path, downlink.path, b"SIMPLE  =", "UVFITS") as unfinished:
+        made, rows = to_uvdata(downlink, channel, phase_centre)
         with offline():
             made.write_uvfits(unfinished, run_check=False)
         columns, attributes = truth_of(rows, downlink.instrument)

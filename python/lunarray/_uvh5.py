@@ -150,8 +150,8 @@ def to_uvdata(downlink, channel, phase_centre, polarisations=("pI",)):
 def write_uvh5(downlink, path, channel, phase_centre):
     """Writes a file; see ``Downlink.write_uvh5``."""
     h5py = needed("h5py", "uvh5")
-    made, rows = to_uvdata(downlink, channel, phase_centre)
     with writing(path, downlink.path, b"\x89HDF", "UVH5") as unfinished:
+        made, rows = to_uvdata(downlink, channel, phase_centre)
         made.write_uvh5(unfinished, run_check=False)
         add_truth(h5py, unfinished, rows, downlink.instrument)
     return len(rows)

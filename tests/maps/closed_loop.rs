@@ -22,7 +22,7 @@ use lunarray::units::{Pair, all_pairs};
 use num_complex::Complex64;
 
 const NSIDE: usize = 16;
-const VISIBILITIES: usize = 40_000;
+const VISIBILITIES: usize = 28_000;
 const CHANNEL_WIDTH_HZ: f64 = 8_000.0;
 /// Every 10th orbit of 1.3 years: the node moves by 0.7 degrees and the formation breathes by 7 % from one
 /// window to the next.

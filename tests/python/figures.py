@@ -27,16 +27,13 @@ def fringes(n, r_i, r_j, frequency):
     return (sees(r_i) & sees(r_j)) * np.exp(-2j * np.pi * frequency / LIGHT * (n @ (r_i - r_j)))
 
 
-def centres(nside):
-    return np.array(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)))).T
+def centres(nside, nest=False):
+    return np.array(hp.pix2vec(nside, np.arange(hp.nside2npix(nside)), nest=nest)).T
 
 
-def averaged(nside, *geometry):
-    """Means over children, pixel by pixel in RING order."""
-    fine = fringes(centres(CHILDREN * nside), *geometry)
-    nested = hp.reorder(fine.real, r2n=True) + 1j * hp.reorder(fine.imag, r2n=True)
-    mean = nested.reshape(-1, CHILDREN**2).mean(axis=1)
-    return hp.reorder(mean.real, n2r=True) + 1j * hp.reorder(mean.imag, n2r=True)
+def averaged(fine):
+    """Means over the children of each pixel, both in NESTED order, in which children follow each other."""
+    return fine.reshape(-1, CHILDREN**2).mean(axis=1)
 
 
 def report(name, found, expected):
@@ -50,20 +47,25 @@ if sys.argv[1] == "rows":
     nside = numbers["nside"]
     geometry = np.array(numbers["r_i_m"]), np.array(numbers["r_j_m"]), numbers["frequency_hz"]
     report("centre", table[:, 1] + 1j * table[:, 2], fringes(centres(nside), *geometry))
-    report("average", table[:, 3] + 1j * table[:, 4], averaged(nside, *geometry))
+    mean = averaged(fringes(centres(CHILDREN * nside, nest=True), *geometry))
+    report("average", table[:, 3] + 1j * table[:, 4], mean[hp.ring2nest(nside, np.arange(len(mean)))])
 else:
     sky = hp.read_map(sys.argv[2], dtype=np.float64)
     nside, fine = int(sys.argv[4]), hp.get_nside(sky)
+    assert fine == CHILDREN * nside
     coarse = hp.ud_grade(sky, nside)
+    sky, coarse_nested = (hp.reorder(pixels, r2n=True) for pixels in (sky, coarse))
+    directions, coarse_directions = centres(fine, nest=True), centres(nside)
     found, expected = [], []
     for row in csv.reader(open(sys.argv[3])):
         values = np.array(row, float)
         geometry = values[1:4], values[4:7], values[0]
         found.append(values[7::2] + 1j * values[8::2])
+        seen = fringes(directions, *geometry)
         expected.append([
-            hp.nside2pixarea(fine) * fringes(centres(fine), *geometry) @ sky,
-            hp.nside2pixarea(nside) * averaged(nside, *geometry) @ coarse,
-            hp.nside2pixarea(nside) * fringes(centres(nside), *geometry) @ coarse,
+            hp.nside2pixarea(fine) * seen @ sky,
+            hp.nside2pixarea(nside) * averaged(seen) @ coarse_nested,
+            hp.nside2pixarea(nside) * fringes(coarse_directions, *geometry) @ coarse,
         ])
     for name, f, e in zip(("fine", "average", "centre"), np.array(found).T, np.array(expected).T):
         report(name, f, e)

@@ -48,6 +48,43 @@ pub(crate) fn cos_sin_turns<const FMA: bool>(turns: f32) -> (f32, f32) {
     (fused::<FMA>(-twice, sin, 1.0), twice * cos)
 }
 
+/// e^x - 1 and e^x for x <= 700, each to a few 1e-16 of it; below -700 those of -700.
+///
+/// x = k ln 2 + r, |r| <= ln 2 / 2, and the series of e^r - 1, whose first omitted term is below 1e-17 of it.
+#[inline(always)]
+pub(crate) fn exponentials<const FMA: bool>(x: f64) -> (f64, f64) {
+    /// Adding 1.5 2^52 rounds to a whole number, which is then in the low bits.
+    const MAGIC: f64 = 6_755_399_441_055_744.0;
+    /// 13!, 12!, .. 2!
+    const FACTORIALS: [f64; 12] = [
+        6_227_020_800.0,
+        479_001_600.0,
+        39_916_800.0,
+        3_628_800.0,
+        362_880.0,
+        40_320.0,
+        5_040.0,
+        720.0,
+        120.0,
+        24.0,
+        6.0,
+        2.0,
+    ];
+    let x = x.max(-700.0);
+    let shifted = fused64::<FMA>(x, std::f64::consts::LOG2_E, MAGIC);
+    let k = shifted - MAGIC;
+    // ln 2 in two parts, the first of so few bits that its product with k is exact (fdlibm).
+    let r = fused64::<FMA>(k, -6.931_471_803_691_238e-1, x);
+    let r = fused64::<FMA>(k, -1.908_214_929_270_587_7e-10, r);
+    let mut sum = 0.0;
+    for factorial in FACTORIALS {
+        sum = fused64::<FMA>(sum, r, 1.0 / factorial);
+    }
+    let less_one = fused64::<FMA>(r * r, sum, r);
+    let power = f64::from_bits(shifted.to_bits().wrapping_add(1023) << 52);
+    (fused64::<FMA>(power, less_one, power - 1.0), fused64::<FMA>(power, less_one, power))
+}
+
 /// The function sin(x) / x, 1 at x = 0.
 #[inline]
 pub(crate) fn sinc(x: f64) -> f64 {
@@ -78,5 +115,22 @@ mod tests {
             let expected = turns - f64::round(turns);
             assert!((f64::from(fraction_of_turn(turns)) - expected).abs() < 1e-7, "{turns}");
         }
+    }
+
+    #[test]
+    fn exponentials_agree_with_the_library() {
+        let sizes = (0..1800).map(|k| 1e-12 * 1.02_f64.powi(k)).take_while(|&x| x < 700.0);
+        for x in sizes.flat_map(|x| [-x, x]).chain([0.0, 0.5 * std::f64::consts::LN_2]) {
+            for (less_one, whole) in [exponentials::<false>(x), exponentials::<true>(x)] {
+                // A few roundings of 1.1e-16 of terms that are at most twice the result.
+                let close = |found: f64, expected: f64| (found - expected).abs() <= 8e-16 * expected;
+                assert!(
+                    close(less_one.abs(), x.exp_m1().abs()) && close(whole, x.exp()),
+                    "{x:e}: {less_one:e} {whole:e}"
+                );
+                assert_eq!(less_one.signum() * x.signum(), 1.0);
+            }
+        }
+        assert_eq!(exponentials::<false>(-1e9).0, -1.0);
     }
 }

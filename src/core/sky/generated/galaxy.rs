@@ -6,8 +6,10 @@
 
 use std::f64::consts::PI;
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
+use crate::units::arithmetic::exponentials;
 use crate::units::vector::Vec3;
 
 /// Frequency at which emission and opacity are stated, Hz.
@@ -66,29 +68,32 @@ const LATITUDE_SOFT_RAD: f64 = 1.5 * PI / 180.0;
 /// Number of nodes in the cloudiness of the absorber, one standard deviation apart.
 const CLOUDS: usize = 11;
 const CLOUD_MIDDLE: f64 = 5.0;
+/// Cloudinesses of a ray: whole vectors of the processor, of which [`CLOUDS`] count.
+const LANES: usize = 16;
 
 /// Returns the emissivity, K/kpc, and the opacity, 1/kpc, at distance `s_kpc`, both at [`REFERENCE_HZ`].
-fn medium(direction: Vec3, s_kpc: f64) -> (f64, f64) {
+#[inline(always)]
+fn medium<const FMA: bool>(direction: Vec3, s_kpc: f64) -> (f64, f64) {
+    let exp = |x: f64| exponentials::<FMA>(x).1;
+    let sech2 = |x: f64| {
+        let e = exp(-2.0 * x.abs());
+        4.0 * e / ((1.0 + e) * (1.0 + e))
+    };
     let x = SUN_RADIUS_KPC - s_kpc * direction[0];
     let y = s_kpc * direction[1];
     let z = SUN_HEIGHT_KPC + s_kpc * direction[2];
     let radius = (x * x + y * y).sqrt();
     let outward = radius - SUN_RADIUS_KPC;
     let outward_spherical = (radius * radius + z * z).sqrt() - SUN_RADIUS_KPC;
-    let emission = DISK_K_KPC * (-outward / DISK_LENGTH_KPC).exp() * sech2(z / DISK_HEIGHT_KPC)
-        + HALO_K_KPC * (-outward_spherical / HALO_LENGTH_KPC).exp() * sech2(z / HALO_HEIGHT_KPC);
+    let emission = DISK_K_KPC * exp(-outward / DISK_LENGTH_KPC) * sech2(z / DISK_HEIGHT_KPC)
+        + HALO_K_KPC * exp(-outward_spherical / HALO_LENGTH_KPC) * sech2(z / HALO_HEIGHT_KPC);
     let from_ring = (radius - RING_RADIUS_KPC) / RING_WIDTH_KPC;
-    let gas = GAS_PER_KPC * (-outward / GAS_LENGTH_KPC).exp() * sech2(z / GAS_HEIGHT_KPC)
-        + RING_PER_KPC * (-from_ring * from_ring).exp() * sech2(z / RING_HEIGHT_KPC);
+    let gas = GAS_PER_KPC * exp(-outward / GAS_LENGTH_KPC) * sech2(z / GAS_HEIGHT_KPC)
+        + RING_PER_KPC * exp(-from_ring * from_ring) * sech2(z / RING_HEIGHT_KPC);
     let northward = direction[2].max(0.0);
     let edge = s_kpc / (CAVITY_KPC * (1.0 + CAVITY_NORTH * northward * northward));
-    let inside = 1.0 / (1.0 + edge.powi(4));
+    let inside = 1.0 / (1.0 + (edge * edge) * (edge * edge));
     (emission, gas * (1.0 - inside) + CAVITY_PER_KPC * inside)
-}
-
-fn sech2(x: f64) -> f64 {
-    let e = (-2.0 * x.abs()).exp();
-    4.0 * e / ((1.0 + e) * (1.0 + e))
 }
 
 fn step_edges() -> [f64; STEPS + 1] {
@@ -103,31 +108,35 @@ struct Ray {
     /// Optical depth at [`REFERENCE_HZ`].
     depth: f64,
     /// Absorbed synchrotron temperature for each cloudiness, K with the emissivity at [`REFERENCE_HZ`].
-    absorbed_k: [f64; CLOUDS],
+    absorbed_k: [f64; LANES],
 }
 
-/// Solves the radiative transfer from the last of `edges` to the Sun; each step is homogeneous.
-fn transfer(direction: Vec3, edges: &[f64], opacity_scales: &[f64; CLOUDS]) -> Ray {
-    let mut ray = Ray { unabsorbed_k: 0.0, depth: 0.0, absorbed_k: [0.0; CLOUDS] };
-    let mut transmitted = [1.0; CLOUDS];
-    for edge in edges.windows(2) {
-        let step = edge[1] - edge[0];
-        let (emission, opacity) = medium(direction, 0.5 * (edge[0] + edge[1]));
-        let (emitted, depth) = (emission * step, opacity * step);
-        ray.unabsorbed_k += emitted;
-        ray.depth += depth;
-        for ((absorbed, transmitted), scale) in
-            ray.absorbed_k.iter_mut().zip(&mut transmitted).zip(opacity_scales)
-        {
-            let depth = depth * scale;
-            let stopped = -(-depth).exp_m1();
+/// Solves the radiative transfer from the last of `edges`, at most `STEPS + 1`, to the Sun; each step is homogeneous.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn transfer(direction: Vec3, edges: &[f64], opacity_scales: &[f64; LANES]) -> Ray {
+    const FMA: bool =
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_feature = "neon"));
+    let (mut middles, mut steps) = ([0.0; STEPS], [0.0; STEPS]);
+    for ((middle, step), edge) in middles.iter_mut().zip(&mut steps).zip(edges.windows(2)) {
+        (*middle, *step) = (0.5 * (edge[0] + edge[1]), edge[1] - edge[0]);
+    }
+    let (mut emitted, mut depths) = ([0.0; STEPS], [0.0; STEPS]);
+    for k in 0..STEPS {
+        let (emission, opacity) = medium::<FMA>(direction, middles[k]);
+        (emitted[k], depths[k]) = (emission * steps[k], opacity * steps[k]);
+    }
+    let (mut absorbed_k, mut transmitted) = ([0.0; LANES], [1.0; LANES]);
+    for (emitted, depth) in emitted.iter().zip(&depths) {
+        for k in 0..LANES {
+            let depth = depth * opacity_scales[k];
+            let stopped = -exponentials::<FMA>(-depth).0;
             // (1 - exp(-x)) / x, by its series where that is accurate to 1e-12.
             let escaping = if depth > 1e-6 { stopped / depth } else { 1.0 - 0.5 * depth };
-            *absorbed += emitted * escaping * *transmitted;
-            *transmitted *= 1.0 - stopped;
+            absorbed_k[k] += emitted * escaping * transmitted[k];
+            transmitted[k] *= 1.0 - stopped;
         }
     }
-    ray
+    Ray { unabsorbed_k: emitted.iter().sum(), depth: depths.iter().sum(), absorbed_k }
 }
 
 /// Smooth Galaxy at one frequency, tabulated over the sky and the cloudiness of its gas.
@@ -162,7 +171,9 @@ impl Galaxy {
     pub fn new(frequency_hz: f64, cloud_rms: f64) -> Self {
         let ratio = frequency_hz / REFERENCE_HZ;
         let opacity_scale = ratio.powf(-OPACITY_INDEX);
-        let scales = std::array::from_fn(|k| opacity_scale * cloudiness(cloud_rms, k as f64 - CLOUD_MIDDLE));
+        let scales = std::array::from_fn(|k| {
+            opacity_scale * cloudiness(cloud_rms, k.min(CLOUDS - 1) as f64 - CLOUD_MIDDLE)
+        });
         let edges = step_edges();
         let rays: Vec<Ray> = (0..LATITUDES * LONGITUDES)
             .into_par_iter()
@@ -178,7 +189,7 @@ impl Galaxy {
             cloud_rms,
             depth: rays.iter().map(|ray| ray.depth.ln()).collect(),
             unabsorbed: rays.iter().map(|ray| ray.unabsorbed_k.ln()).collect(),
-            absorbed: rays.iter().flat_map(|ray| ray.absorbed_k.map(f64::ln)).collect(),
+            absorbed: rays.iter().flat_map(|ray| ray.absorbed_k[..CLOUDS].iter().map(|k| k.ln())).collect(),
         }
     }
 
@@ -222,7 +233,7 @@ impl Galaxy {
     pub fn foreground_k(&self, direction: Vec3, distance_kpc: f64) -> f64 {
         let mut edges: Vec<f64> = step_edges().into_iter().take_while(|&s| s < distance_kpc).collect();
         edges.push(distance_kpc);
-        let scales = [self.opacity_scale; CLOUDS];
+        let scales = [self.opacity_scale; LANES];
         self.emission_scale * transfer(direction, &edges, &scales).absorbed_k[0]
     }
 }
@@ -289,7 +300,7 @@ mod tests {
             let latitude = (2.0 * (f64::from(k) + 0.5) / 400.0 - 1.0).asin();
             let direction = direction_of(longitude, latitude);
             let cloud = 1.7 * f64::from(k).sin();
-            let scales = [galaxy.opacity_scale * galaxy.opacity_factor(cloud); CLOUDS];
+            let scales = [galaxy.opacity_scale * galaxy.opacity_factor(cloud); LANES];
             let ray = transfer(direction, &edges, &scales);
             let seen = galaxy.sight(direction, cloud);
             // The error of interpolation between nodes about a degree apart is far below the added fluctuations.
