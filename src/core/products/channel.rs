@@ -234,6 +234,7 @@ impl ChannelFolder {
             dipole_k: errors.map(|errors| errors.dipole_k),
             dipole_sigma_k: errors.map(|errors| errors.dipole_sigma_k),
             sky_power: errors.map(|errors| errors.power.clone()),
+            gain_errors: errors.and_then(|errors| errors.gains.clone()),
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),

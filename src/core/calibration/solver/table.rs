@@ -2,9 +2,12 @@
 
 use std::fmt::Write;
 
-use super::estimates::GainState;
+use super::estimates::{GainEstimate, GainState};
 use super::solution::PassSolution;
-use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+use crate::calibration::gains_file::SIGMA_MAX;
+use crate::calibration::{
+    ChannelGains, GainErrors, GainSolution, GainsFile, Interpolation, PositionSolution,
+};
 use crate::frames::Channel;
 
 /// Duration of a jump in a gains file, s.
@@ -57,6 +60,26 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
+/// Errors of the gains of a solution in a channel, as independent ones of every daughter. Only differences of phases count, and the stated ones
+/// are relative to the reference, whose own error is in all of them: its share is half of the smallest variance, as if the best were as good.
+fn errors_of(solution: &PassSolution, c: usize, is_used: impl Fn(&GainEstimate) -> bool) -> GainErrors {
+    let reference = solution.reference;
+    let gains = || solution.daughters.iter().map(|one| (one.daughter == reference, &one.gains[c]));
+    let variance = |gain: &GainEstimate| gain.phase_sigma_deg.to_radians().powi(2);
+    let others = gains().filter(|(is_reference, gain)| !is_reference && is_used(gain));
+    let least = others.map(|(_, gain)| variance(gain)).fold(f64::INFINITY, f64::min);
+    let own = if least.is_finite() { 0.5 * least } else { 0.0 };
+    let sigma = |(is_reference, gain): (bool, &GainEstimate)| {
+        if !is_used(gain) {
+            return [0.0; 2];
+        }
+        let phase = if is_reference { own } else { variance(gain) - own }.sqrt();
+        // `min` takes the bound for what is not a number.
+        [gain.amplitude_sigma, phase].map(|sigma| sigma.min(SIGMA_MAX))
+    };
+    GainErrors { solution_s: 0.5 * (solution.from_s + solution.until_s), sigma: gains().map(sigma).collect() }
+}
+
 /// Gains file for `antenna-gains`: gains that are not good are zero, which removes their visibilities. With
 /// `without_held_out`, held-out passes have no gains either.
 ///
@@ -64,10 +87,13 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
 /// their middles.
 #[must_use]
 pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held_out: bool) -> GainsFile {
+    let is_used = |solution: &PassSolution, gain: &GainEstimate| {
+        gain.state == GainState::Good && !(without_held_out && solution.is_held_out)
+    };
     let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
         let gain_of = |daughter: &super::DaughterEstimate| {
             let gain = &daughter.gains[c];
-            if gain.state != GainState::Good || (without_held_out && solution.is_held_out) {
+            if !is_used(solution, gain) {
                 return [0.0, 0.0];
             }
             let (sin, cos) = gain.phase_deg.to_radians().sin_cos();
@@ -80,7 +106,8 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         let mut push = |time_s: f64, solution: &PassSolution| {
             // Times must increase: of two equal ones the first is used.
             if found.last().is_none_or(|last| last.time_s < time_s) {
-                found.push(GainSolution { time_s, gains: gains(c, solution) });
+                let errors = Some(errors_of(solution, c, |gain| is_used(solution, gain)));
+                found.push(GainSolution { time_s, gains: gains(c, solution), errors });
             }
         };
         for (k, solution) in solutions.iter().enumerate() {

@@ -1,0 +1,272 @@
+//! Tests of the errors by gains: against dense algebra with rows from the forward model, and against the truth of simulated errors.
+
+use faer::linalg::solvers::Solve;
+use faer::{Mat, Side};
+use rand_distr::{Distribution, StandardNormal};
+
+use super::*;
+use crate::calibration::{AntennaGains, Calibration, ChannelGains};
+use crate::calibration::{GainErrors, GainSolution, GainsFile, Interpolation};
+use crate::units::{StreamKind, random_stream};
+
+const SATELLITES: usize = 8;
+/// Baselines up to 1.1 wavelengths, which see up to l = 7.
+const LOW_HZ: f64 = 0.25e6;
+const DEGREE: usize = 8;
+const PASSES: usize = 30;
+const TIMES: usize = 40;
+const NSIDE: usize = 8;
+/// Far below the errors of 8 % that gains make: V is some 1e6 K sr.
+const NOISE_K_SR: f64 = 3e3;
+/// Standard deviations of ln amplitude and phase, rad. The second order is below a tenth of the first.
+const SIGMA: [f64; 2] = [0.04, 0.07];
+
+fn low_setup() -> HarmonicSetup {
+    HarmonicSetup { l_max: DEGREE, frequency_hz: LOW_HZ, baseline_m_max: 1_300.0, weight_max: 1.0, ..setup() }
+}
+
+fn start_s(pass: usize) -> f64 {
+    409_193.7 * pass as f64
+}
+
+/// Positions of all pairs with short baselines in all passes; no data yet.
+fn geometry() -> Vec<PlacedVisibilities> {
+    let array = Array::new(&ArrayConfig::default()).unwrap();
+    let mut blocks = Vec::new();
+    for pass in 0..PASSES {
+        for pair in all_pairs(SATELLITES) {
+            let mut placed =
+                PlacedVisibilities { frequency_hz: LOW_HZ, pair, ..PlacedVisibilities::default() };
+            for n in 0..TIMES {
+                let time_s = start_s(pass) + 90.0 * n as f64;
+                let [r_i_m, r_j_m] = [pair.i, pair.j].map(|n| array.position_m(usize::from(n), time_s));
+                if norm(sub(r_i_m, r_j_m)) < 1_300.0 {
+                    placed.time_s.push(time_s);
+                    placed.r_i_m.push(r_i_m);
+                    placed.r_j_m.push(r_j_m);
+                    placed.value_k_sr.push(Complex64::ZERO);
+                    placed.weight.push(NOISE_K_SR.powi(-2));
+                }
+            }
+            if !placed.is_empty() {
+                blocks.push(placed);
+            }
+        }
+    }
+    blocks
+}
+
+/// Visibilities of a sky by the forward model, which has rows of its own.
+fn observed(unknowns: &[f64], blocks: &[PlacedVisibilities]) -> Vec<Complex64> {
+    let setup = low_setup();
+    let wavelength_m = setup.wavelength_m();
+    let geometry = PatternGeometry {
+        orbit_radius_m: setup.orbit.radius_m,
+        moon_radius_m: setup.moon_radius_m,
+        wavelength_m,
+        response: setup.response,
+    };
+    let settings = ModelSettings::new(geometry, setup.orbit.inclination_rad, 1.2);
+    let mut model = HarmonicModel::new(coefficients(unknowns, DEGREE), settings).unwrap();
+    let states: Vec<PairState> = blocks
+        .iter()
+        .flat_map(|block| block.r_i_m.iter().zip(&block.r_j_m))
+        .map(|(&r_i, &r_j)| {
+            setup.orbit.pair(&PairOrientation::of_pair(r_i, r_j).unwrap(), wavelength_m).unwrap().state
+        })
+        .collect();
+    let mut values = vec![Complex64::ZERO; states.len()];
+    model.visibilities(&states, &mut values).unwrap();
+    values
+}
+
+fn normals(seed: u64, which: u64, count: usize) -> Vec<f64> {
+    let mut stream = random_stream(seed, StreamKind::Instrument, [which, 43]);
+    (0..count).map(|_| StandardNormal.sample(&mut stream)).collect()
+}
+
+/// A sky of 3e5 K with structure that falls with the degree.
+fn sky(seed: u64) -> Vec<f64> {
+    let mut sky = normals(seed, 0, (DEGREE + 1).pow(2));
+    sky.iter_mut().zip(degrees(DEGREE)).for_each(|(x, l)| *x *= 1e5 * ((l + 1) as f64).powf(-1.3));
+    sky[0] = 1e6;
+    sky
+}
+
+/// Gains of one in every pass, with stated errors.
+fn gains(draws: usize, seed: u64) -> AntennaGains {
+    let entry = |pass: usize, time_s: f64| GainSolution {
+        time_s,
+        gains: vec![[1.0, 0.0]; SATELLITES],
+        errors: Some(GainErrors { solution_s: start_s(pass), sigma: vec![SIGMA; SATELLITES] }),
+    };
+    let solutions =
+        (0..PASSES).flat_map(|pass| [0.0, 1e4].map(|after_s| entry(pass, start_s(pass) + after_s)));
+    let file = GainsFile {
+        interpolation: Interpolation::LogLinear,
+        frequency_tolerance_hz: 1.0,
+        channels: vec![ChannelGains { frequency_hz: LOW_HZ, solutions: solutions.collect() }],
+        positions: Vec::new(),
+    };
+    AntennaGains::new(&file).unwrap().with_error_draws(draws, seed)
+}
+
+/// The blocks with these values, calibrated.
+fn calibrated(
+    blocks: &[PlacedVisibilities],
+    values: &[Complex64],
+    gains: &AntennaGains,
+) -> Vec<PlacedVisibilities> {
+    let (mut blocks, mut values, mut gains) = (blocks.to_vec(), values.iter(), gains.clone());
+    for block in &mut blocks {
+        block.value_k_sr.iter_mut().zip(&mut values).for_each(|(to, from)| *to = *from);
+        assert_eq!(gains.apply(block).unwrap().unusable_gain, 0);
+    }
+    blocks
+}
+
+fn low_engine(blocks: &[PlacedVisibilities]) -> HarmonicEngine {
+    let mut engine = HarmonicEngine::new(low_setup()).unwrap();
+    for block in blocks {
+        assert_eq!(engine.add(block).unwrap().visibilities, block.len() as u64);
+    }
+    engine
+}
+
+fn solved(sums: &HarmonicSums, samples: usize) -> HarmonicSolution {
+    let rule = StoppingRule { residual_max: 1e-4, iterations_max: 300 };
+    let samples = Samples { count: samples, gibbs: false };
+    let request = HarmonicRequest { epsilon: 1.0, nside: NSIDE, rule, samples, probes: 0 };
+    solve_regularised(sums, request, &Regulariser::Data, None, None, SolveWatch::default().named("test"))
+        .unwrap()
+}
+
+/// Values with errors of gains, another for each pass and satellite, and noise.
+fn with_errors(seed: u64, blocks: &[PlacedVisibilities], values: &[Complex64]) -> Vec<Complex64> {
+    let errors = normals(seed, 1, 2 * SATELLITES * PASSES);
+    let gain = |pass: usize, n: u8| {
+        let at = 2 * (SATELLITES * pass + usize::from(n));
+        Complex64::new(SIGMA[0] * errors[at], SIGMA[1] * errors[at + 1]).exp()
+    };
+    let noise = normals(seed, 2, 2 * values.len());
+    let mut places = blocks.iter().flat_map(|block| block.time_s.iter().map(|time_s| (block.pair, *time_s)));
+    let of = |(k, value): (usize, &Complex64)| {
+        let (pair, time_s) = places.next().unwrap();
+        let pass = (time_s / start_s(1)) as usize;
+        gain(pass, pair.i) * gain(pass, pair.j).conj() * value
+            + NOISE_K_SR * Complex64::new(noise[2 * k], noise[2 * k + 1])
+    };
+    values.iter().enumerate().map(of).collect()
+}
+
+/// Rows of B by the forward model, real and imaginary part of each visibility after another, times the square root of the weight.
+fn dense_rows(blocks: &[PlacedVisibilities]) -> Mat<f64> {
+    let count = (DEGREE + 1).pow(2);
+    let columns: Vec<Vec<Complex64>> = (0..count)
+        .map(|k| {
+            let mut unit = vec![0.0; count];
+            unit[k] = 1.0;
+            observed(&unit, blocks)
+        })
+        .collect();
+    Mat::from_fn(2 * columns[0].len(), count, |row, column| {
+        let value = columns[column][row / 2];
+        (if row % 2 == 0 { value.re } else { value.im }) / NOISE_K_SR
+    })
+}
+
+/// Errors of the data by one standard deviation of each gain of each pass: amplitude and phase of each satellite, in units of the noise.
+fn rank_one_terms(blocks: &[PlacedVisibilities], values: &[Complex64]) -> Mat<f64> {
+    let mut terms = Mat::zeros(2 * values.len(), 2 * SATELLITES * PASSES);
+    let places = blocks.iter().flat_map(|block| block.time_s.iter().map(|time_s| (block.pair, *time_s)));
+    for (k, ((pair, time_s), value)) in places.zip(values).enumerate() {
+        let pass = (time_s / start_s(1)) as usize;
+        for (n, sign) in [(pair.i, 1.0), (pair.j, -1.0)] {
+            let column = 2 * (SATELLITES * pass + usize::from(n));
+            let amplitude = SIGMA[0] / NOISE_K_SR * value;
+            let phase = Complex64::new(0.0, sign * SIGMA[1] / NOISE_K_SR) * value;
+            for (column, term) in [(column, amplitude), (column + 1, phase)] {
+                (terms[(2 * k, column)], terms[(2 * k + 1, column)]) = (term.re, term.im);
+            }
+        }
+    }
+    terms
+}
+
+/// The variances that draws state are those of dense algebra: the sum over passes and satellites of rank-one terms, which have no draws.
+#[test]
+fn draws_have_the_covariance_of_all_gains() {
+    const DRAWS: usize = 64;
+    let blocks = geometry();
+    let values = observed(&sky(5), &blocks);
+    let sums = low_engine(&calibrated(&blocks, &values, &gains(DRAWS, 1))).into_sums();
+    let errors = solved(&sums, 0).uncertainty.unwrap();
+    let stated = errors.gains.unwrap();
+    let rows = dense_rows(&blocks);
+    let power_k2 = errors.power.over_noise_k2();
+    let mut matrix = rows.transpose() * &rows;
+    degrees(DEGREE).enumerate().for_each(|(k, l)| matrix[(k, k)] += power_k2[l].recip());
+    let right = rows.transpose() * rank_one_terms(&blocks, &values);
+    let maps = matrix.llt(Side::Lower).unwrap().solve(&right);
+    let covariance = &maps * maps.transpose();
+    // Sums of squares of Gaussian numbers of this covariance scatter by twice the sum of its squares.
+    let compare = |name: &str, found: f64, places: &[usize]| {
+        let expected: f64 = places.iter().map(|&k| covariance[(k, k)]).sum();
+        let squares: f64 =
+            places.iter().flat_map(|&j| places.iter().map(move |&k| covariance[(j, k)].powi(2))).sum();
+        let scatter = (2.0 * squares / DRAWS as f64).sqrt() / expected;
+        println!("{name}: {:.3} of the dense variance, scatter {scatter:.3}", found / expected);
+        // Two thousandths for the gridded rows.
+        assert!(
+            (found / expected - 1.0).abs() < 4.0 * scatter + 2e-3,
+            "{name}: {found} {expected} {scatter}"
+        );
+        assert!(scatter < 0.2, "{name} tells little: {scatter}");
+    };
+    let of_degree = |l: usize| degrees(DEGREE).enumerate().filter(|(_, of)| *of == l).map(|(k, _)| k);
+    for l in 0..=DEGREE {
+        let places: Vec<usize> = of_degree(l).collect();
+        compare(&format!("l = {l}"), stated.power_k2[l] * (2 * l + 1) as f64, &places);
+    }
+    let all: Vec<usize> = (0..(DEGREE + 1).pow(2)).collect();
+    compare("all", stated.sigma_rms_k.powi(2) * 4.0 * std::f64::consts::PI, &all);
+    compare("mean", stated.mean_sigma_k.powi(2) * 4.0 * std::f64::consts::PI, &[0]);
+}
+
+/// Deviations of a map from the truth in units of its stated errors: shares of pixels within 1 and 1.96, and squares of the mean and of ln C_l.
+fn deviations(seed: u64, blocks: &[PlacedVisibilities], draws: usize) -> [f64; 3] {
+    let truth = sky(seed);
+    let truth_k = crate::sky::harmonics::synthesis(&coefficients(&truth, DEGREE), NSIDE).unwrap();
+    let data = with_errors(seed, blocks, &observed(&truth, blocks));
+    let sums = low_engine(&calibrated(blocks, &data, &gains(draws, seed))).into_sums();
+    let found = solved(&sums, 0);
+    let errors = found.uncertainty.unwrap();
+    let pixels = found.map_k.len() as f64;
+    let away = || found.map_k.iter().zip(&truth_k).map(|(map, truth)| map - truth);
+    let within = |limit: f64| {
+        away().zip(&errors.sigma_k).filter(|(a, s)| a.abs() < limit * **s).count() as f64 / pixels
+    };
+    let mean = away().sum::<f64>() / pixels / errors.mean_sigma_k;
+    [within(1.0), within(1.96), mean * mean]
+}
+
+/// Mean and its standard error of each.
+fn means(values: &[[f64; 3]]) -> [[f64; 2]; 3] {
+    let count = values.len() as f64;
+    [0, 1, 2].map(|k| {
+        let mean = values.iter().map(|v| v[k]).sum::<f64>() / count;
+        let variance = values.iter().map(|v| (v[k] - mean).powi(2)).sum::<f64>() / (count - 1.0);
+        [mean, (variance / count).sqrt()]
+    })
+}
+
+/// Where gains err by far more than the noise, the truth is within the stated errors as often as of Gaussian ones, and without draws it is not.
+#[test]
+fn stated_errors_hold_the_truth() {
+    let blocks = geometry();
+    let begin = std::time::Instant::now();
+    let known = means(&(0..100).map(|seed| deviations(seed, &blocks, 16)).collect::<Vec<_>>());
+    println!("{known:?} {:?}", begin.elapsed());
+    let unknown = means(&(0..20).map(|seed| deviations(seed, &blocks, 0)).collect::<Vec<_>>());
+    println!("{unknown:?}");
+}
