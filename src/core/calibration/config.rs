@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    AntennaGains, BurstChoice, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck,
+    AntennaGains, BurstChoice, Calibration, CalibrationError, GainSolution, GainsFile, Identity, SolvedGains,
+    SubBands, VanVleck,
 };
 use crate::frames::ERROR_DRAWS_MAX;
 use crate::units::{Checks, InvalidValue, keys};
@@ -81,6 +82,23 @@ impl CalibrationConfig {
         let expected = "the path of a file, for hook = \"antenna-gains\"";
         checks.require("gains_file", "(missing)", has_file, expected);
         checks.finish()
+    }
+
+    /// Number of draws of the errors of the gains that are applied; 0 if no errors are known.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn known_error_draws(&self) -> usize {
+        let states_errors = |path: &PathBuf| {
+            let states = |solution: &GainSolution| solution.errors.is_some();
+            GainsFile::read(path)
+                .is_ok_and(|file| file.channels.iter().flat_map(|c| &c.solutions).any(states))
+        };
+        let is_known = match self.hook {
+            CalibrationHook::Identity => false,
+            CalibrationHook::AntennaGains => self.gains_file.as_ref().is_some_and(states_errors),
+            CalibrationHook::Solve => true,
+        };
+        if is_known { self.error_draws } else { 0 }
     }
 
     /// The van Vleck correction, if any.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use num_complex::Complex64;
 
-use super::gain_errors::{ErrorTable, PairErrors};
+use super::gain_errors::ErrorTable;
 use super::{Calibration, CalibrationError, CalibrationReport, GainsFile, Interpolation, PositionSolution};
 use crate::array::track_offset_m;
 use crate::frames::{Instrument, PlacedVisibilities};
@@ -148,7 +148,7 @@ impl AntennaGains {
         let (Ok(own), Ok(others)) = tables else { return false };
         self.interpolation == other.interpolation
             && own.rows(self.satellites, pair, span_s).eq(others.rows(other.satellites, pair, span_s))
-            && own.errors_of_rows(pair, span_s).eq(others.errors_of_rows(pair, span_s))
+            && own.has_errors_of(others, span_s)
             && self.positions_within(span_s).eq(other.positions_within(span_s))
     }
 
@@ -187,9 +187,12 @@ impl ChannelTable {
         count_until(from_s).saturating_sub(1)..(count_until(until_s) + 1).min(self.time_s.len())
     }
 
-    /// Errors of the gains of a pair, with the solution that they are of, in these solutions.
-    fn errors_of_rows(&self, pair: Pair, span_s: [f64; 2]) -> impl Iterator<Item = PairErrors> {
-        self.rows_within(span_s).map(move |row| self.errors.of_pair(row, pair))
+    /// Whether the errors that hold between two times are those of another table.
+    fn has_errors_of(&self, other: &Self, span_s: [f64; 2]) -> bool {
+        let entries = |table: &Self| {
+            table.rows_within(span_s).map(|row| table.errors.entry(row).cloned()).collect::<Vec<_>>()
+        };
+        entries(self) == entries(other)
     }
 
     /// The solutions between which a time lies, and how far it is towards the second; one alone before the first and after the last.

@@ -36,6 +36,7 @@ impl ClosedPass {
                 && solution.outlier_fractions.has_channels(channels)
                 && solution.model_error.len() == channels
                 && solution.models.len() == channels
+                && solution.correlations.len() == channels
                 && (1..=satellites).contains(&(solution.reference as usize))
         };
         self.span_s.iter().all(|time_s| time_s.is_finite())

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use super::estimates::{GainEstimate, GainState};
+use super::estimates::{DaughterEstimate, GainEstimate, GainState};
 use super::solution::PassSolution;
 use crate::calibration::gains_file::SIGMA_MAX;
 use crate::calibration::{
@@ -60,24 +60,19 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
-/// Errors of the gains of a solution in a channel, as independent ones of every daughter. Only differences of phases count, and the stated ones
-/// are relative to the reference, whose own error is in all of them: its share is half of the smallest variance, as if the best were as good.
+/// Errors of the gains of a solution in a channel.
 fn errors_of(solution: &PassSolution, c: usize, is_used: impl Fn(&GainEstimate) -> bool) -> GainErrors {
-    let reference = solution.reference;
-    let gains = || solution.daughters.iter().map(|one| (one.daughter == reference, &one.gains[c]));
-    let variance = |gain: &GainEstimate| gain.phase_sigma_deg.to_radians().powi(2);
-    let others = gains().filter(|(is_reference, gain)| !is_reference && is_used(gain));
-    let least = others.map(|(_, gain)| variance(gain)).fold(f64::INFINITY, f64::min);
-    let own = if least.is_finite() { 0.5 * least } else { 0.0 };
-    let sigma = |(is_reference, gain): (bool, &GainEstimate)| {
-        if !is_used(gain) {
-            return [0.0; 2];
-        }
-        let phase = if is_reference { own } else { variance(gain) - own }.sqrt();
+    let sigma = |daughter: &DaughterEstimate| {
+        let gain = &daughter.gains[c];
+        let stated = [gain.amplitude_sigma, gain.phase_sigma_deg.to_radians()];
         // `min` takes the bound for what is not a number.
-        [gain.amplitude_sigma, phase].map(|sigma| sigma.min(SIGMA_MAX))
+        if is_used(gain) { stated.map(|sigma| sigma.min(SIGMA_MAX)) } else { [0.0; 2] }
     };
-    GainErrors { solution_s: 0.5 * (solution.from_s + solution.until_s), sigma: gains().map(sigma).collect() }
+    GainErrors {
+        solution_s: 0.5 * (solution.from_s + solution.until_s),
+        sigma: solution.daughters.iter().map(sigma).collect(),
+        correlations: solution.correlations.get(c).cloned().unwrap_or_default(),
+    }
 }
 
 /// Gains file for `antenna-gains`: gains that are not good are zero, which removes their visibilities. With
@@ -91,7 +86,7 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         gain.state == GainState::Good && !(without_held_out && solution.is_held_out)
     };
     let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
-        let gain_of = |daughter: &super::DaughterEstimate| {
+        let gain_of = |daughter: &DaughterEstimate| {
             let gain = &daughter.gains[c];
             if !is_used(solution, gain) {
                 return [0.0, 0.0];
