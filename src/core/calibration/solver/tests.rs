@@ -398,3 +398,40 @@ fn interference_and_bursts_are_distinguished() {
     let [InstrumentEvent::Burst { pass: 4, from_s, until_s }] = events[..] else { panic!("{events:?}") };
     assert!((from_s - 900.0).abs() < 60.0 && (until_s - 1080.0).abs() < 60.0, "{events:?}");
 }
+
+/// Of two satellites the sum of ln amplitudes is known and their difference is not: the errors of pairs follow from deviations and correlations.
+#[test]
+fn errors_of_pairs_follow_from_correlations() {
+    const SEEDS: u64 = 60;
+    let scene = Scene { satellites: 3, count: 200, ..scene(&[10e6]) };
+    let truth = scene.errors(3, [0.1, 60.0, 0.0]);
+    let kept = |block: &ModelledBlock| block.pair.j - block.pair.i == 1;
+    let (mut squares, mut stated) = ([[0.0; 2]; 2], [[0.0; 2]; 2]);
+    for seed in 0..SEEDS {
+        let mut blocks = scene.blocks(&truth, seed);
+        blocks.retain(kept);
+        let found = scene.solve(&SolverConfig::default(), &mut blocks);
+        let file =
+            gains_file(&[found], &[crate::frames::Channel { frequency_hz: 10e6, width_hz: 8e3 }], false);
+        let solution = &file.channels[0].solutions[0];
+        let errors = solution.errors.as_ref().unwrap();
+        for (k, (i, j)) in [(0, 1), (1, 2)].into_iter().enumerate() {
+            let gain = |n: usize| Complex64::new(solution.gains[n][0], solution.gains[n][1]);
+            let away = (gain(i) * gain(j).conj() / (truth.gains[0][i] * truth.gains[0][j].conj())).ln();
+            // Correlations of satellite 2 with 1, 3 with 1, 3 with 2.
+            let with = errors.correlations[[0, 2][k]];
+            for (axis, (away, sign)) in [(away.re, 1.0), (away.im, -1.0)].into_iter().enumerate() {
+                let [a, b] = [errors.sigma[i][axis], errors.sigma[j][axis]];
+                squares[k][axis] += away * away / SEEDS as f64;
+                stated[k][axis] += (a * a + b * b + sign * 2.0 * with[axis] * a * b) / SEEDS as f64;
+            }
+        }
+        assert!(errors.sigma[0][0] > 0.1, "{:?}", errors.sigma);
+    }
+    for (found, stated) in squares.as_flattened().iter().zip(stated.as_flattened()) {
+        eprintln!("pair: variance {found:.3e}, stated {stated:.3e}");
+        // Stated deviations are 1.1 times the bound; 60 squares scatter by 0.18 of it: four times that.
+        let ratio = found / stated * 1.21;
+        assert!((0.28..1.72).contains(&ratio), "{ratio}");
+    }
+}

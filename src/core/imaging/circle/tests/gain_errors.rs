@@ -277,3 +277,89 @@ fn stated_errors_hold_the_truth() {
     println!("{:?} {:?}", means(&of(20, 16)), begin.elapsed());
     println!("{:?} {:?}", means(&of(100, 16)), begin.elapsed());
 }
+
+/// The bits of all right-hand sides of draws, and of their power.
+fn error_bits(sums: &HarmonicSums) -> Vec<u64> {
+    let right = sums.gain_error_right_hand_sides().iter().flatten();
+    right.chain([&sums.gain_error_power()]).map(|x| x.to_bits()).collect()
+}
+
+/// Sums of draws are exact: they depend on which visibilities are in them alone, and data without draws leave no trace of them.
+#[test]
+fn sums_of_draws_are_added_removed_merged_and_kept() {
+    let all = geometry();
+    let values = observed(&sky(2), &all);
+    let drawn = calibrated(&all, &values, &gains(4, 1));
+    let bare = calibrated(&all, &values, &gains(0, 1));
+    let (first, rest) = drawn.split_at(drawn.len() / 3);
+    let bytes = |engine: &mut HarmonicEngine| {
+        let mut bytes = Vec::new();
+        engine.checkpoint(&mut bytes).unwrap();
+        bytes
+    };
+    let mut whole = low_engine(&drawn);
+    let expected = bytes(&mut whole);
+    let mut merged = low_engine(rest);
+    merged.merge(low_engine(first)).unwrap();
+    assert!(bytes(&mut merged) == expected);
+    for block in first {
+        assert_eq!(merged.remove(block).unwrap().visibilities, block.len() as u64);
+    }
+    assert!(bytes(&mut merged) == bytes(&mut low_engine(rest)));
+    let restored = HarmonicEngine::restore(&mut &expected[..]).unwrap();
+    let whole = whole.into_sums();
+    assert_eq!(whole.gain_error_right_hand_sides().len(), 4);
+    assert!(error_bits(&restored.into_sums()) == error_bits(&whole));
+    // The data themselves are summed as without draws; and with draws taken out again nothing is left of them.
+    let mut plain = low_engine(&bare);
+    let expected = bytes(&mut plain);
+    assert!(plain.sums().right_hand_side() == whole.right_hand_side());
+    let mut changed = low_engine(&drawn);
+    drawn.iter().for_each(|block| assert!(changed.remove(block).unwrap().refused.is_empty()));
+    bare.iter().for_each(|block| assert!(changed.add(block).unwrap().refused.is_empty()));
+    assert!(bytes(&mut changed) == expected);
+    assert!(error_bits(&changed.into_sums()) == [0.0_f64.to_bits()]);
+}
+
+/// Right-hand sides of draws by the forward model's rows, which the engine's are near; also of several ranks, and of sums in parts.
+#[test]
+fn right_hand_sides_of_draws_are_those_of_the_rows() {
+    let blocks = geometry();
+    let drawn = calibrated(&blocks, &observed(&sky(2), &blocks), &gains(4, 1));
+    let whole = low_engine(&drawn).into_sums();
+    let rows = dense_rows(&blocks);
+    let norm_of = |x: &[f64]| dot(x, x).sqrt();
+    for (draw, found) in whole.gain_error_right_hand_sides().iter().enumerate() {
+        let errors = drawn.iter().flat_map(|block| {
+            let of = move |k: usize| block.gain_errors_of(k)[draw] * block.value_k_sr[k] / NOISE_K_SR;
+            (0..block.len()).flat_map(move |k| [of(k).re, of(k).im])
+        });
+        let errors: Vec<f64> = errors.collect();
+        let expected = rows.transpose() * Mat::from_fn(errors.len(), 1, |row, _| errors[row]);
+        let away: Vec<f64> = found.iter().enumerate().map(|(k, x)| x - expected[(k, 0)]).collect();
+        // Interpolation between nodes errs by 4e-4 of a row.
+        assert!(norm_of(&away) < 1e-3 * norm_of(found), "{draw}: {} {}", norm_of(&away), norm_of(found));
+    }
+    let shared = on_threads(3, |ranks| {
+        let mut engine = HarmonicEngine::new(low_setup()).unwrap().with_ranks(ranks);
+        drawn.iter().for_each(|block| assert!(engine.add(block).unwrap().refused.is_empty()));
+        error_bits(&engine.into_sums())
+    });
+    assert!(shared.iter().all(|bits| *bits == error_bits(&whole)));
+    let folder = tempfile::tempdir().unwrap();
+    let mut part = Some(SumPart::first(3, folder.path()));
+    let mut parts = None;
+    while let Some(this) = part {
+        let mut engine = HarmonicEngine::new(low_setup()).unwrap().with_ranks(&this.ranks());
+        drawn.iter().for_each(|block| assert!(engine.add(block).unwrap().refused.is_empty()));
+        parts = engine.finish_part(&this).unwrap();
+        part = this.next();
+    }
+    let parts = parts.unwrap();
+    assert_eq!(parts.gain_error_power(), whole.gain_error_power());
+    for (part, whole) in parts.gain_error_right_hand_sides().iter().zip(whole.gain_error_right_hand_sides()) {
+        let away: Vec<f64> = part.iter().zip(whole).map(|(a, b)| a - b).collect();
+        // Parts are added in f64; each is rounded to 2^-51 of its largest element.
+        assert!(norm_of(&away) < 1e-12 * norm_of(whole), "{}", norm_of(&away));
+    }
+}
