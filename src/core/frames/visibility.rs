@@ -195,6 +195,7 @@ impl PlacedVisibilities {
 
     /// The draws of the relative error of visibility `k` by the gains; empty if none are known.
     #[must_use]
+    #[doc(hidden)]
     pub fn gain_errors_of(&self, k: usize) -> &[Complex64] {
         let draws = self.gain_errors.len().checked_div(self.len()).unwrap_or(0);
         self.gain_errors.get(k * draws..(k + 1) * draws).unwrap_or_default()
