@@ -1,4 +1,5 @@
 //! Tests of the errors by gains: against dense algebra with rows from the forward model, and against the truth of simulated errors.
+#![allow(clippy::print_stdout)] // The tests print what they measured.
 
 use faer::linalg::solvers::Solve;
 use faer::{Mat, Side};
