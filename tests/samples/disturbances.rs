@@ -76,6 +76,7 @@ fn gains_and_phases_scale_visibilities_and_calibration_corrects_them() {
     let solution = |t_s: f64| GainSolution {
         time_s: t_s,
         gains: (0..8).map(|n| gain(n, t_s)).map(|g| [g.re, g.im]).collect(),
+        errors: None,
     };
     let solutions = (0..=64).map(|k| solution(start_s + 0.25 * f64::from(k))).collect();
     let mut calibration = AntennaGains::new(&GainsFile {

@@ -41,6 +41,7 @@ impl Ephemeris {
             value_k_sr: Vec::with_capacity(block.len()),
             weight: Vec::with_capacity(block.len()),
             duration_s: Vec::with_capacity(block.len()),
+            gain_errors: Vec::new(),
         };
         let counts = self.runs(block, &mut |range, piece| extend(&mut out, block, range, piece));
         (out, counts)

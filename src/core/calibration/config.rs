@@ -5,8 +5,10 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    AntennaGains, BurstChoice, Calibration, CalibrationError, Identity, SolvedGains, SubBands, VanVleck,
+    AntennaGains, BurstChoice, Calibration, CalibrationError, GainSolution, GainsFile, Identity, SolvedGains,
+    SubBands, VanVleck,
 };
+use crate::frames::ERROR_DRAWS_MAX;
 use crate::units::{Checks, InvalidValue, keys};
 
 /// Maximum number of sub-bands of a channel.
@@ -39,6 +41,10 @@ keys! {
         #[only_with(r#"calibration.hook = "antenna-gains""#)]
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday gains_file: Option<PathBuf> = None;
+        /// Number of draws of the errors of the applied gains, if these are known, that the sums of harmonic maps carry: with them the errors of
+        /// a map include those of its gains. Even; 0 for errors without them.
+        #[only_with(r#"calibration.hook = "antenna-gains" or calibration.hook = "solve""#)]
+        expert error_draws: usize = 8;
         /// Bits of the samples, for whose quantisation correlations are corrected: 1, 2 or 4; 0 for no correction.
         expert quantiser_bits: u32 = 0;
         /// Number of successive channels of the downlink that are sub-bands of one channel of the map.
@@ -66,6 +72,9 @@ impl CalibrationConfig {
         );
         let sub_bands = self.sub_bands;
         checks.require("sub_bands", sub_bands, (1..=SUB_BANDS_MAX).contains(&sub_bands), "1 to 64");
+        let draws = self.error_draws;
+        let is_good = draws <= ERROR_DRAWS_MAX && draws.is_multiple_of(2);
+        checks.require("error_draws", draws, is_good, "an even number from 0 to 64");
         let single = self.hook != CalibrationHook::Solve || sub_bands == 1;
         let expected = "1 with hook = \"solve\", which finds gains for the channels as they are sent";
         checks.require("sub_bands", sub_bands, single, expected);
@@ -73,6 +82,23 @@ impl CalibrationConfig {
         let expected = "the path of a file, for hook = \"antenna-gains\"";
         checks.require("gains_file", "(missing)", has_file, expected);
         checks.finish()
+    }
+
+    /// Number of draws of the errors of the gains that are applied; 0 if no errors are known.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn known_error_draws(&self) -> usize {
+        let states_errors = |path: &PathBuf| {
+            let states = |solution: &GainSolution| solution.errors.is_some();
+            GainsFile::read(path)
+                .is_ok_and(|file| file.channels.iter().flat_map(|c| &c.solutions).any(states))
+        };
+        let is_known = match self.hook {
+            CalibrationHook::Identity => false,
+            CalibrationHook::AntennaGains => self.gains_file.as_ref().is_some_and(states_errors),
+            CalibrationHook::Solve => true,
+        };
+        if is_known { self.error_draws } else { 0 }
     }
 
     /// The van Vleck correction, if any.
@@ -107,7 +133,8 @@ impl CalibrationConfig {
             CalibrationHook::AntennaGains => {
                 // `problems` has required the file.
                 let file = self.gains_file.as_deref().unwrap_or(Path::new(""));
-                Box::new(AntennaGains::read(&folder.join(file))?)
+                let gains = AntennaGains::read(&folder.join(file))?;
+                Box::new(gains.with_error_draws(self.error_draws, 0))
             }
             CalibrationHook::Solve => Box::new(SolvedGains::default()),
         };

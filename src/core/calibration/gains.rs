@@ -1,12 +1,14 @@
 //! Division by complex gains of the antennas.
 
+use std::ops::Range;
 use std::path::Path;
 
 use num_complex::Complex64;
 
+use super::gain_errors::ErrorTable;
 use super::{Calibration, CalibrationError, CalibrationReport, GainsFile, Interpolation, PositionSolution};
 use crate::array::track_offset_m;
-use crate::frames::PlacedVisibilities;
+use crate::frames::{Instrument, PlacedVisibilities};
 use crate::units::Pair;
 use crate::units::vector::sub;
 
@@ -22,6 +24,9 @@ use crate::units::vector::sub;
 /// Between solutions at t_0 and t_1, with u = (t - t_0) / (t_1 - t_0), a gain is
 /// g_0 exp(u ln(g_1 / g_0)), ln the principal value: log amplitude and phase are linear. This is right
 /// while the phase turns by less than pi from one solution to the next.
+///
+/// Where the errors of gains are stated, each visibility carries draws of its relative error d_i + conj(d_j), d a draw of the error of ln g. That
+/// of ln g is interpolated as ln g is.
 #[derive(Clone, Debug)]
 pub struct AntennaGains {
     interpolation: Interpolation,
@@ -29,6 +34,10 @@ pub struct AntennaGains {
     satellites: usize,
     channels: Vec<ChannelTable>,
     positions: Vec<PositionSolution>,
+    /// Number of draws of the errors.
+    draws: usize,
+    /// Seed of the draws.
+    seed: u64,
 }
 
 /// Gains of one channel, prepared for interpolation.
@@ -41,6 +50,7 @@ struct ChannelTable {
     gain: Vec<Complex64>,
     /// ln(g_1 / g_0) to the next solution; one solution fewer than `gain`.
     log_step: Vec<Complex64>,
+    errors: ErrorTable,
 }
 
 impl AntennaGains {
@@ -73,7 +83,10 @@ impl AntennaGains {
                 let time_s = channel.solutions.iter().map(|solution| solution.time_s).collect();
                 let gains = channel.solutions.iter().flat_map(|solution| &solution.gains);
                 let gain = gains.map(|&[re, im]| Complex64::new(re, im)).collect();
-                ChannelTable::new(channel.frequency_hz, time_s, gain)
+                ChannelTable {
+                    errors: ErrorTable::new(channel),
+                    ..ChannelTable::new(channel.frequency_hz, time_s, gain)
+                }
             })
             .collect();
         Ok(Self {
@@ -82,7 +95,16 @@ impl AntennaGains {
             satellites: file.satellites(),
             channels,
             positions: file.positions.clone(),
+            draws: 0,
+            seed: 0,
         })
+    }
+
+    /// Gives visibilities this many draws of the errors of their gains, if any are stated.
+    #[must_use]
+    pub fn with_error_draws(self, draws: usize, seed: u64) -> Self {
+        let is_stated = self.channels.iter().any(|table| table.errors.is_stated());
+        Self { draws: if is_stated { draws } else { 0 }, seed, ..self }
     }
 
     /// The factor g_i conj(g_j) by which visibilities of `pair` at `frequency_hz` were multiplied at
@@ -126,6 +148,7 @@ impl AntennaGains {
         let (Ok(own), Ok(others)) = tables else { return false };
         self.interpolation == other.interpolation
             && own.rows(self.satellites, pair, span_s).eq(others.rows(other.satellites, pair, span_s))
+            && own.has_errors_of(others, span_s)
             && self.positions_within(span_s).eq(other.positions_within(span_s))
     }
 
@@ -155,7 +178,35 @@ impl ChannelTable {
     fn new(frequency_hz: f64, time_s: Vec<f64>, gain: Vec<Complex64>) -> Self {
         let satellites = gain.len() / time_s.len().max(1);
         let log_step = gain.iter().zip(gain.iter().skip(satellites)).map(|(g_0, g_1)| (g_1 / g_0).ln());
-        Self { frequency_hz, time_s, log_step: log_step.collect(), gain }
+        Self { frequency_hz, time_s, log_step: log_step.collect(), gain, errors: ErrorTable::default() }
+    }
+
+    /// The solutions that determine gains between two times.
+    fn rows_within(&self, [from_s, until_s]: [f64; 2]) -> Range<usize> {
+        let count_until = |time_s: f64| self.time_s.partition_point(|&t| t <= time_s);
+        count_until(from_s).saturating_sub(1)..(count_until(until_s) + 1).min(self.time_s.len())
+    }
+
+    /// Whether the errors that hold between two times are those of another table.
+    fn has_errors_of(&self, other: &Self, span_s: [f64; 2]) -> bool {
+        let entries = |table: &Self| {
+            table.rows_within(span_s).map(|row| table.errors.entry(row).cloned()).collect::<Vec<_>>()
+        };
+        entries(self) == entries(other)
+    }
+
+    /// The solutions between which a time lies, and how far it is towards the second; one alone before the first and after the last.
+    fn place(&self, interpolation: Interpolation, time_s: f64) -> (usize, Option<(usize, f64)>) {
+        let next = self.time_s.partition_point(|&t| t <= time_s);
+        let row = next.saturating_sub(1);
+        if next == 0 || next == self.time_s.len() || time_s == self.time_s[row] {
+            return (row, None);
+        }
+        let u = (time_s - self.time_s[row]) / (self.time_s[next] - self.time_s[row]);
+        match interpolation {
+            Interpolation::LogLinear => (row, Some((next, u))),
+            Interpolation::Nearest => (if u > 0.5 { next } else { row }, None),
+        }
     }
 
     /// Solutions of a pair (time and both gains) that determine its gains between two times.
@@ -163,12 +214,10 @@ impl ChannelTable {
         &self,
         satellites: usize,
         pair: Pair,
-        [from_s, until_s]: [f64; 2],
+        span_s: [f64; 2],
     ) -> impl Iterator<Item = (f64, Complex64, Complex64)> {
-        let count_until = |time_s: f64| self.time_s.partition_point(|&t| t <= time_s);
-        let rows = count_until(from_s).saturating_sub(1)..(count_until(until_s) + 1).min(self.time_s.len());
         let gain = move |row: usize, n: u8| self.gain[row * satellites + usize::from(n)];
-        rows.map(move |row| (self.time_s[row], gain(row, pair.i), gain(row, pair.j)))
+        self.rows_within(span_s).map(move |row| (self.time_s[row], gain(row, pair.i), gain(row, pair.j)))
     }
 
     fn factor(&self, interpolation: Interpolation, satellites: usize, pair: Pair, time_s: f64) -> Complex64 {
@@ -177,23 +226,11 @@ impl ChannelTable {
             // The gains of both satellites, or the logarithmic steps, the second conjugated.
             (table[row * satellites + i], table[row * satellites + j].conj())
         };
-        let next = self.time_s.partition_point(|&t| t <= time_s);
-        let row = next.saturating_sub(1);
+        let (row, towards) = self.place(interpolation, time_s);
         let (g_i, g_j) = row_of_pair(&self.gain, row);
-        if next == 0 || next == self.time_s.len() || time_s == self.time_s[row] {
-            return g_i * g_j;
-        }
-        let u = (time_s - self.time_s[row]) / (self.time_s[next] - self.time_s[row]);
-        match interpolation {
-            Interpolation::LogLinear => {
-                let (log_i, log_j) = row_of_pair(&self.log_step, row);
-                g_i * g_j * (u * (log_i + log_j)).exp()
-            }
-            Interpolation::Nearest => {
-                let (g_i, g_j) = row_of_pair(&self.gain, if u > 0.5 { next } else { row });
-                g_i * g_j
-            }
-        }
+        let Some((_, u)) = towards else { return g_i * g_j };
+        let (log_i, log_j) = row_of_pair(&self.log_step, row);
+        g_i * g_j * (u * (log_i + log_j)).exp()
     }
 }
 
@@ -202,10 +239,19 @@ impl Calibration for AntennaGains {
         "antenna-gains"
     }
 
+    fn describe(&mut self, instrument: &Instrument) -> Result<Instrument, CalibrationError> {
+        self.seed = instrument.seed;
+        Ok(instrument.clone())
+    }
+
     fn apply(&mut self, block: &mut PlacedVisibilities) -> Result<CalibrationReport, CalibrationError> {
         let pair = block.pair;
         let table = self.table(block.frequency_hz, pair)?;
         let count = block.len();
+        // An auto-correlation is in no map.
+        let draws = if pair.i == pair.j { 0 } else { self.draws };
+        let mut drawn = table.errors.drawn((table.frequency_hz, pair), self.seed, draws);
+        let mut errors = Vec::with_capacity(draws * count);
         let mut kept = 0;
         for k in 0..count {
             let factor = table.factor(self.interpolation, self.satellites, pair, block.time_s[k]);
@@ -215,6 +261,7 @@ impl Calibration for AntennaGains {
             if !(power.is_normal() && weight.is_normal()) {
                 continue;
             }
+            drawn.push_at(table.place(self.interpolation, block.time_s[k]), &mut errors);
             block.value_k_sr[kept] = block.value_k_sr[k] / factor;
             block.weight[kept] = weight;
             block.time_s[kept] = block.time_s[k];
@@ -226,6 +273,7 @@ impl Calibration for AntennaGains {
             kept += 1;
         }
         block.truncate(kept);
+        block.gain_errors = errors;
         self.correct_positions(block);
         Ok(CalibrationReport { kept, unusable_gain: count - kept })
     }

@@ -92,7 +92,26 @@ pub struct GainSolution {
     pub time_s: f64,
     /// Real and imaginary part of every satellite's voltage gain.
     pub gains: Vec<[f64; 2]>,
+    /// Errors of these gains; absent if they are not known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub errors: Option<GainErrors>,
 }
+
+/// Errors of the gains of one solution, independent of those of other solutions.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GainErrors {
+    /// Names the solution, s since the mission epoch: entries of one solution, such as of the start and the end of a pass, have one error.
+    pub solution_s: f64,
+    /// Standard deviations of the natural logarithm of the amplitude and of the phase, rad, of every satellite.
+    pub sigma: Vec<[f64; 2]>,
+    /// Correlations of the errors of ln amplitude and of phase, of satellite 2 with 1, 3 with 1, 3 with 2, and so on; empty for none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub correlations: Vec<[f64; 2]>,
+}
+
+/// Largest standard deviation of a gain's logarithm. Errors are taken to first order, which fails well below it.
+pub(super) const SIGMA_MAX: f64 = 1.0;
 
 impl GainsFile {
     /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check the values.
@@ -178,6 +197,25 @@ impl ChannelGains {
             checks.require(&gains_key, &found, is_accepted, "2 to 64 satellites");
             let is_equal = !is_accepted || count == satellites;
             checks.require(&gains_key, &found, is_equal, "as many satellites as in the first solution");
+            let Some(errors) = &solution.errors else { continue };
+            let solution_s = errors.solution_s;
+            checks.number(format!("{key}.errors.solution_s"), solution_s, true, "a finite time");
+            let (sigma_key, found) =
+                (format!("{key}.errors.sigma"), format!("({} satellites)", errors.sigma.len()));
+            checks.require(&sigma_key, found, errors.sigma.len() == count, "as many satellites as gains");
+            let (correlations, key) = (&errors.correlations, format!("{key}.errors.correlations"));
+            let is_triangle =
+                correlations.is_empty() || correlations.len() == count * count.saturating_sub(1) / 2;
+            checks.require(
+                &key,
+                format!("({})", correlations.len()),
+                is_triangle,
+                "none, or one for every pair",
+            );
+            let is_correlation = |value: f64| (-1.0..=1.0).contains(&value);
+            checks.numbers(&key, correlations.as_flattened(), is_correlation, "numbers of -1 to 1");
+            let is_sigma = |sigma: f64| (0.0..=SIGMA_MAX).contains(&sigma);
+            checks.numbers(&sigma_key, errors.sigma.as_flattened(), is_sigma, "numbers of 0 to 1");
         }
     }
 }

@@ -13,6 +13,7 @@ mod blocks;
 mod bursts;
 mod config;
 mod error;
+mod gain_errors;
 mod gains;
 mod gains_file;
 mod solved;
@@ -36,7 +37,7 @@ pub use error::CalibrationError;
 #[doc(hidden)]
 pub use gains::AntennaGains;
 #[doc(hidden)]
-pub use gains_file::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+pub use gains_file::{ChannelGains, GainErrors, GainSolution, GainsFile, Interpolation, PositionSolution};
 #[doc(hidden)]
 pub use solved::{ClosedPass, SolvedGains};
 pub use stage::Calibrator;

@@ -36,6 +36,7 @@ impl ClosedPass {
                 && solution.outlier_fractions.has_channels(channels)
                 && solution.model_error.len() == channels
                 && solution.models.len() == channels
+                && solution.correlations.len() == channels
                 && (1..=satellites).contains(&(solution.reference as usize))
         };
         self.span_s.iter().all(|time_s| time_s.is_finite())
@@ -52,6 +53,8 @@ pub struct SolvedGains(Arc<Mutex<SolvedTable>>);
 #[derive(Debug, Default)]
 struct SolvedTable {
     gap_s: f64,
+    /// Number of draws of the errors of gains.
+    error_draws: usize,
     instrument: Option<Instrument>,
     /// Passes in the order of time, with their gains if these are known.
     passes: Vec<(ClosedPass, Option<AntennaGains>)>,
@@ -80,10 +83,11 @@ impl SolvedTable {
 }
 
 impl SolvedGains {
-    /// Creates a table without passes. Gains of a pass apply to data up to `gap_s` away from it.
+    /// Creates a table without passes. Gains of a pass apply to data up to `gap_s` away from it, and visibilities get `error_draws` draws of
+    /// the errors of their gains.
     #[must_use]
-    pub fn new(gap_s: f64) -> Self {
-        Self(Arc::new(Mutex::new(SolvedTable { gap_s, ..SolvedTable::default() })))
+    pub fn new(gap_s: f64, error_draws: usize) -> Self {
+        Self(Arc::new(Mutex::new(SolvedTable { gap_s, error_draws, ..SolvedTable::default() })))
     }
 
     fn table(&self) -> MutexGuard<'_, SolvedTable> {
@@ -112,7 +116,8 @@ impl SolvedGains {
         let mut table = self.table();
         let known = table.instrument.as_ref().filter(|_| !pass.solutions.is_empty());
         let gains = known.map(|instrument| {
-            AntennaGains::new(&gains_file(&pass.solutions, &instrument.channels, false)).ok()
+            let gains = AntennaGains::new(&gains_file(&pass.solutions, &instrument.channels, false)).ok()?;
+            Some(gains.with_error_draws(table.error_draws, instrument.seed))
         });
         let (number, from_s) = (pass.number, pass.span_s[0]);
         let at = table.passes.partition_point(|(other, _)| other.span_s[0] <= from_s);

@@ -280,6 +280,7 @@ impl Calibrator {
             value_k_sr: good.iter().map(|&k| Complex64::new(block.value_k_sr[k].re.into(), 0.0)).collect(),
             weight: good.iter().map(|&k| f64::from(block.weight[k])).collect(),
             duration_s: Vec::new(),
+            gain_errors: Vec::new(),
         };
         // The spectrometer is not one of the antennas with gains.
         if !self.is_spectrum(block.pair) {

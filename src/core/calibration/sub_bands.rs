@@ -125,6 +125,7 @@ mod tests {
                 value_k_sr: vec![num_complex::Complex64::ONE],
                 weight: vec![1.0],
                 duration_s: Vec::new(),
+                gain_errors: Vec::new(),
             };
             assert_eq!(bands.apply(&mut block).unwrap().kept, 1);
             assert_eq!(

@@ -28,6 +28,7 @@ pub use reason::VisibilityReason;
 pub use samples::{SampleBlock, Samples, SpaceFrame};
 #[doc(hidden)]
 pub use visibility::AutoPower;
+pub(crate) use visibility::ERROR_DRAWS_MAX;
 pub use visibility::{PlacedVisibilities, UnequalLengths, VisibilityBlock};
 
 /// A frame that the ground reads from a downlink.

@@ -129,6 +129,9 @@ pub struct AutoPower {
     pub sigma_k_sr: f64,
 }
 
+/// Maximum number of draws of the errors of gains.
+pub(crate) const ERROR_DRAWS_MAX: usize = 64;
+
 /// Calibrated visibilities with the positions of their two satellites, ready for accumulation.
 ///
 /// A structure of arrays of equal length ([`PlacedVisibilities::check_lengths`]), with increasing times.
@@ -154,6 +157,8 @@ pub struct PlacedVisibilities {
     pub weight: Vec<f64>,
     /// Length of each integration, s; empty if integration times are neglected.
     pub duration_s: Vec<f32>,
+    /// Relative errors by the gains that were applied: of each visibility as many draws, one after another; empty if none are known.
+    pub gain_errors: Vec<Complex64>,
 }
 
 impl PlacedVisibilities {
@@ -174,16 +179,26 @@ impl PlacedVisibilities {
     /// # Errors
     /// The first array with another length.
     pub fn check_lengths(&self) -> Result<(), UnequalLengths> {
-        let Self { pair, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
+        let Self { pair, r_i_m, r_j_m, value_k_sr, weight, duration_s, gain_errors, .. } = self;
         let durations = if duration_s.is_empty() { self.len() } else { duration_s.len() };
+        let has_draws = !self.is_empty() && gain_errors.len().is_multiple_of(self.len());
         let arrays = [
             ("r_i_m", r_i_m.len()),
             ("r_j_m", r_j_m.len()),
             ("value_k_sr", value_k_sr.len()),
             ("weight", weight.len()),
             ("duration_s", durations),
+            ("gain_errors", if has_draws { self.len() } else { gain_errors.len() }),
         ];
         require_lengths(*pair, self.len(), arrays)
+    }
+
+    /// The draws of the relative error of visibility `k` by the gains; empty if none are known.
+    #[must_use]
+    #[doc(hidden)]
+    pub fn gain_errors_of(&self, k: usize) -> &[Complex64] {
+        let draws = self.gain_errors.len().checked_div(self.len()).unwrap_or(0);
+        self.gain_errors.get(k * draws..(k + 1) * draws).unwrap_or_default()
     }
 
     /// A block of the same channel and pair without visibilities.
@@ -197,6 +212,7 @@ impl PlacedVisibilities {
     /// Appends visibility `k` of `other`.
     #[doc(hidden)]
     pub fn push_from(&mut self, other: &Self, k: usize) {
+        self.gain_errors.extend_from_slice(other.gain_errors_of(k));
         self.time_s.push(other.time_s[k]);
         self.r_i_m.push(other.r_i_m[k]);
         self.r_j_m.push(other.r_j_m[k]);
@@ -208,7 +224,9 @@ impl PlacedVisibilities {
     /// Keeps the first `len` visibilities.
     #[doc(hidden)]
     pub fn truncate(&mut self, len: usize) {
-        let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, duration_s, .. } = self;
+        let draws = self.gain_errors.len().checked_div(self.len()).unwrap_or(0);
+        let Self { time_s, r_i_m, r_j_m, value_k_sr, weight, duration_s, gain_errors, .. } = self;
+        gain_errors.truncate(draws * len);
         time_s.truncate(len);
         r_i_m.truncate(len);
         r_j_m.truncate(len);

@@ -79,7 +79,8 @@ impl GroundConfig {
             return Err(problem.into());
         }
         let (van_vleck, maps) = (self.calibration.van_vleck()?, self.calibrate.models()?);
-        Ok(Some(PassGate::new(PassSolver::new(&self.calibrate, van_vleck, maps))))
+        let solver = PassSolver::new(&self.calibrate, van_vleck, maps);
+        Ok(Some(PassGate::new(solver, self.calibration.error_draws)))
     }
 
     /// A calibrator without data that posts to `ledger` and uses the gains of `gate`.

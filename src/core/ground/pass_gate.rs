@@ -52,9 +52,10 @@ pub(super) struct PassGate {
 }
 
 impl PassGate {
-    pub(super) fn new(solver: PassSolver) -> Self {
+    /// A gate with a solver, and draws of the errors of its gains.
+    pub(super) fn new(solver: PassSolver, error_draws: usize) -> Self {
         let gap_s = solver.config().pass_gap_s;
-        let gains = SolvedGains::new(gap_s);
+        let gains = SolvedGains::new(gap_s, error_draws);
         Self { solver, gains, gap_s, open: [None; 2], observer: None, must_register_held: true }
     }
 

@@ -60,7 +60,7 @@ pub use pixel::{
 };
 pub use pixel::{PixelEngine, PixelSetup, PixelSolution, PixelSums, solve_pixels};
 #[doc(hidden)]
-pub use power::{Sample, Samples, SkyPower, Uncertainty};
+pub use power::{GainUncertainty, Sample, Samples, SkyPower, Uncertainty};
 #[doc(hidden)]
 pub use regulariser::Regulariser;
 #[doc(hidden)]
@@ -253,6 +253,18 @@ pub trait NormalSums: Send {
     /// The right-hand side `BtN^-1n` of the noise-only map, n being simulated noise with the data's weights.
     #[doc(hidden)]
     fn noise_right_hand_side(&self) -> &[f64];
+
+    /// The right-hand sides `BtN^-1e` of draws of the errors e of the data by their gains; none where these are not known, or not summed.
+    #[doc(hidden)]
+    fn gain_error_right_hand_sides(&self) -> &[Vec<f64>] {
+        &[]
+    }
+
+    /// What these errors are expected to add to [`SumCounts::power`].
+    #[doc(hidden)]
+    fn gain_error_power(&self) -> f64 {
+        0.0
+    }
 
     /// Number, weight and power of the visibilities in the sums.
     fn counts(&self) -> SumCounts;

@@ -236,6 +236,7 @@ impl ChannelFolder {
             dipole_k: uncertainty.map(|found| found.dipole_k),
             dipole_sigma_k: uncertainty.map(|found| found.dipole_sigma_k),
             sky_power: uncertainty.map(|found| found.power.clone()),
+            gain_errors: uncertainty.and_then(|found| found.gains.clone()),
             noise_rms_k: (solution.noise_k.iter().map(|x| x * x).sum::<f64>() / pixels).sqrt(),
             diagnostics: solution.diagnostics,
             refinement: solution.refinement.clone(),

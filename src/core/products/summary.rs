@@ -10,7 +10,7 @@ use super::error_maps::{limits, told_vector};
 use super::latitudes::LatitudeError;
 use super::point_beams::{BeamWidths, PointBeamSummary};
 use crate::imaging::anywhere::Refinement;
-use crate::imaging::{Convergence, Diagnostics, SkyPower};
+use crate::imaging::{Convergence, Diagnostics, GainUncertainty, SkyPower};
 
 /// Summary of one snapshot.
 #[derive(Clone, Debug, Serialize, bincode::Encode, bincode::Decode)]
@@ -71,6 +71,9 @@ pub struct ChannelSummary {
     /// Angular power of the sky, whose inverse is R, with its uncertainty; absent unless R is from the data.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sky_power: Option<SkyPower>,
+    /// The part of the errors of map and power that is by errors of the applied gains; absent where it is not among them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gain_errors: Option<GainUncertainty>,
     /// RMS of the noise-only map, K.
     pub noise_rms_k: f64,
     /// Regularisation and solver diagnostics of the final solution.

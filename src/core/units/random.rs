@@ -25,6 +25,8 @@ pub enum StreamKind {
     Spectrometer = 8,
     /// Errors of the simulated instrument.
     Instrument = 9,
+    /// Errors of gains that calibration applied.
+    GainErrors = 10,
     /// Faults of a simulated link.
     Link = 20,
 }

@@ -7,7 +7,7 @@ use super::plan::Plan;
 use super::sections::Config;
 use crate::array::ObservingWindows;
 use crate::calibration::{CalibrationHook, GainsFile, VanVleck};
-use crate::imaging::Method;
+use crate::imaging::{Method, RegulariserChoice};
 use crate::mother::{Fidelity, largest_gap};
 use crate::units::Dimension;
 use crate::units::constants::{DAY_S, MOON_GM_M3_S2, MOON_RADIUS_M, SIDEREAL_MONTH_S};
@@ -33,6 +33,7 @@ impl Config {
             self.positions_note(),
             self.reach_note(),
             self.rate_note(),
+            self.gain_errors_note(),
         ];
         notes.into_iter().flatten().collect()
     }
@@ -41,6 +42,15 @@ impl Config {
     fn rate_note(&self) -> Option<String> {
         (self.downlink.rate_bits_per_s_max > 0.0).then(|| {
             "downlink.rate_bits_per_s_max does not limit the last pass, which sends everything that is left on board".to_owned()
+        })
+    }
+
+    /// A note if gains have known errors that those of the maps leave out.
+    fn gain_errors_note(&self) -> Option<String> {
+        let has_errors = self.map.regulariser() == RegulariserChoice::Data;
+        let leaves_out = has_errors && self.map.method() != Method::Harmonic;
+        (leaves_out && self.calibration.known_error_draws() > 0).then(|| {
+            "errors of the maps leave out those of the gains: only map.engine = \"harmonic\" without map.refine includes them".to_owned()
         })
     }
 
@@ -213,6 +223,28 @@ mod tests {
         assert_eq!(refined.positions_note(), None);
         config.map.engine = EngineKind::Pixel;
         assert_eq!(config.positions_note(), None);
+    }
+
+    #[test]
+    fn maps_without_the_errors_of_gains_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |errors: &str| {
+            let path = folder.path().join("gains.json");
+            let solution = format!(r#"{{"time_s": 0, "gains": [[1, 0], [1, 0]]{errors}}}"#);
+            let gains = format!(r#"{{"channels": [{{"frequency_hz": 1e7, "solutions": [{solution}]}}]}}"#);
+            std::fs::write(&path, gains).unwrap();
+            path
+        };
+        let mut config = Config::default();
+        config.map.engine = EngineKind::Pixel;
+        config.calibration.hook = CalibrationHook::AntennaGains;
+        config.calibration.gains_file = Some(file(""));
+        assert_eq!(config.notes(), Vec::<String>::new());
+        config.calibration.gains_file =
+            Some(file(r#", "errors": {"solution_s": 0, "sigma": [[0.1, 0.1], [0.1, 0.1]]}"#));
+        assert!(config.notes().join("").contains("leave out those of the gains"), "{:?}", config.notes());
+        config.map.engine = EngineKind::Harmonic;
+        assert_eq!(config.notes(), Vec::<String>::new());
     }
 
     #[test]

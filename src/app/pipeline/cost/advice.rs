@@ -29,8 +29,9 @@ impl MemoryAdvice {
     /// Advice for a ground segment with these settings; `None` if the complete sums fit.
     #[must_use]
     pub fn new(config: &Config, instrument: &Instrument, limit: MemoryLimit) -> Option<Self> {
+        let draws = config.calibration.known_error_draws();
         let needed = |map: &MapConfig| {
-            let costs: Vec<EngineCost> = complete_costs(instrument, map).into_values().collect();
+            let costs: Vec<EngineCost> = complete_costs(instrument, map, draws).into_values().collect();
             (costs.len(), memory_bytes(0.0, &costs, memory_solutions(map)))
         };
         let (channels, needed_bytes) = needed(&config.map);

@@ -119,7 +119,7 @@ pub(in crate::pipeline) fn map_groups(
     limit: Option<MemoryLimit>,
 ) -> Result<Vec<MapGroup>, PipelineError> {
     let map = &config.map;
-    let costs = complete_costs(instrument, map);
+    let costs = complete_costs(instrument, map, config.calibration.known_error_draws());
     let group_bytes = |costs: &[EngineCost]| memory_bytes(0.0, costs, memory_solutions(map));
     // Sums in parts have no snapshots before the end.
     let parts = |channel: &ChannelId| {
@@ -145,12 +145,13 @@ pub(in crate::pipeline) fn map_groups(
 pub(in crate::pipeline) fn complete_costs(
     instrument: &Instrument,
     map: &MapConfig,
+    error_draws: usize,
 ) -> BTreeMap<ChannelId, EngineCost> {
     let channels = (0..).map(ChannelId).zip(&instrument.channels);
     let cost = |frequency_hz: f64| {
         let (visibilities, solutions) = (map.refine.visibilities_max as f64, memory_solutions(map));
         let (windows, limb_range_rad) = (f64::INFINITY, f64::INFINITY);
-        map.cost(ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad })
+        map.cost(ChannelData { frequency_hz, visibilities, windows, solutions, limb_range_rad, error_draws })
     };
     channels
         .filter(|(channel, _)| map.is_mapped(*channel))

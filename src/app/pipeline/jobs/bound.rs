@@ -150,6 +150,7 @@ pub(super) fn observation(
         r_j_m: positions_m(1),
         weight: weight.collect(),
         duration_s: Vec::new(),
+        gain_errors: Vec::new(),
     })
 }
 

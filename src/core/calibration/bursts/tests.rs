@@ -312,6 +312,7 @@ fn a_light_curve_is_that_of_dense_least_squares() {
         frequency_hz: 299_792_458.0,
         time_s: vec![time_s],
         duration_s: vec![duration_s],
+        gain_errors: Vec::new(),
         r_i_m: vec![[0.0, 0.0, 2e6]],
         r_j_m: vec![[0.0, 0.0, 2e6 - u]],
         value_k_sr: vec![Complex64::new(re, im)],

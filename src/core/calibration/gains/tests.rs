@@ -12,7 +12,11 @@ const FREQUENCY_HZ: f64 = 10e6;
 fn file(interpolation: Interpolation, solutions: Vec<(f64, Vec<Complex64>)>) -> GainsFile {
     let solutions = solutions
         .into_iter()
-        .map(|(time_s, gains)| GainSolution { time_s, gains: gains.iter().map(|g| [g.re, g.im]).collect() })
+        .map(|(time_s, gains)| GainSolution {
+            time_s,
+            gains: gains.iter().map(|g| [g.re, g.im]).collect(),
+            errors: None,
+        })
         .collect();
     GainsFile {
         interpolation,
@@ -35,6 +39,7 @@ fn block(time_s: Vec<f64>) -> PlacedVisibilities {
         value_k_sr: time_s.iter().map(|&t| Complex64::new(1e5 + t, -3e4)).collect(),
         weight: by_time(|t| 1e-4 * (1.0 + t.abs())),
         duration_s: Vec::new(),
+        gain_errors: Vec::new(),
         time_s,
     }
 }

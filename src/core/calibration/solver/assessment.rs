@@ -14,6 +14,9 @@ use crate::numerics::median;
 /// the phase error of a gain exceeds the Cramer-Rao bound.
 const COVERAGE_SIGMAS: f64 = 4.0;
 
+/// Square radians in a square degree.
+const RAD2: f64 = (std::f64::consts::PI / 180.0) * (std::f64::consts::PI / 180.0);
+
 /// Factor by which stated standard deviations exceed the Cramer-Rao bound, as weights are estimates too.
 /// With it fewer than 1e-4 of the errors exceed [`COVERAGE_SIGMAS`] stated deviations: Gaussian errors exceed 4 deviations with
 /// a probability of 0.6e-4, 4.4 deviations with 0.1e-4.
@@ -125,12 +128,7 @@ impl GainAssessment<'_> {
 
     /// Standard deviation, due to noise, of a phase with the contribution of the clock, rad.
     fn phase_sigma(&self, c: usize, n: usize) -> f64 {
-        let layout = &self.fitted.layout;
-        let (phase, clock, rad_per_ns) = (layout.phase(c, n), layout.clock(n), layout.rad_per_ns(c));
-        let variance = self.covariance(phase, phase)
-            + 2.0 * rad_per_ns * self.covariance(phase, clock)
-            + rad_per_ns * rad_per_ns * self.covariance(clock, clock);
-        variance.max(0.0).sqrt()
+        self.gain_covariance(1, c, (n, n)).max(0.0).sqrt()
     }
 
     fn gain(&self, c: usize, n: usize) -> GainEstimate {
@@ -183,6 +181,59 @@ impl GainAssessment<'_> {
                 [noise[0].max(noise[1]), scatter[0].max(scatter[1]), model[1]],
             ),
         }
+    }
+
+    /// Correlations of the errors of the gains of a channel: of ln amplitude and of phase, of each daughter with those before it. Noise correlates
+    /// them as the solution says; all share the errors of the common amplitude (`common`, a variance) and of the reference's phase.
+    pub(super) fn correlations(
+        &self,
+        c: usize,
+        common: f64,
+        estimates: &[DaughterEstimate],
+    ) -> Vec<[f64; 2]> {
+        let layout = &self.fitted.layout;
+        let of = |n: usize| c * layout.satellites + n;
+        let reference = &self.excess[of(layout.reference)];
+        let of_reference =
+            reference.scatter[1] + reference.hidden + self.model_variance(of(layout.reference));
+        let correlation = |i: usize, j: usize| {
+            let [a, b] = [i, j].map(|n| &estimates[n].gains[c]);
+            let is_joint = ![i, j].iter().any(|n| self.fitted.dropped_gains[of(*n)]);
+            let is_relative = ![i, j].contains(&layout.reference);
+            let noise = [0, 1].map(|axis| {
+                let covariance = |i, j| self.gain_covariance(axis, c, (i, j));
+                let found = covariance(i, j) / (covariance(i, i) * covariance(j, j)).sqrt();
+                if is_joint && found.is_finite() {
+                    found * a.noise_sigma[axis] * b.noise_sigma[axis]
+                } else {
+                    0.0
+                }
+            });
+            let shared = [common, if is_relative { of_reference } else { 0.0 }];
+            let sigma =
+                [a.amplitude_sigma * b.amplitude_sigma, (a.phase_sigma_deg * b.phase_sigma_deg) * RAD2];
+            [0, 1].map(|axis| {
+                let found = (noise[axis] + shared[axis]) / sigma[axis];
+                if found.is_finite() { found.clamp(-1.0, 1.0) } else { 0.0 }
+            })
+        };
+        (0..layout.satellites)
+            .flat_map(|i| (0..i).map(move |j| (i, j)))
+            .map(|(i, j)| correlation(i, j))
+            .collect()
+    }
+
+    /// Covariance by noise of the gains of two daughters: of ln amplitude, or of the phase with that of the clock, rad^2.
+    fn gain_covariance(&self, axis: usize, c: usize, (i, j): (usize, usize)) -> f64 {
+        let layout = &self.fitted.layout;
+        if axis == 0 {
+            return self.covariance(layout.amplitude(c, i), layout.amplitude(c, j));
+        }
+        let ([a, b], rad_per_ns) =
+            ([i, j].map(|n| (layout.phase(c, n), layout.clock(n))), layout.rad_per_ns(c));
+        self.covariance(a.0, b.0)
+            + rad_per_ns * (self.covariance(a.0, b.1) + self.covariance(a.1, b.0))
+            + rad_per_ns * rad_per_ns * self.covariance(a.1, b.1)
     }
 
     /// State of a gain; `noise` is a standard deviation, `scatter` and `model` are variances.

@@ -264,6 +264,7 @@ mod tests {
                 .collect(),
             outlier_fractions: super::super::OutlierFractions::default(),
             normal_hat: Vec::new(),
+            correlations: Vec::new(),
         };
         parts.into_iter().map(solution).collect()
     }

@@ -2,9 +2,12 @@
 
 use std::fmt::Write;
 
-use super::estimates::GainState;
+use super::estimates::{DaughterEstimate, GainEstimate, GainState};
 use super::solution::PassSolution;
-use crate::calibration::{ChannelGains, GainSolution, GainsFile, Interpolation, PositionSolution};
+use crate::calibration::gains_file::SIGMA_MAX;
+use crate::calibration::{
+    ChannelGains, GainErrors, GainSolution, GainsFile, Interpolation, PositionSolution,
+};
 use crate::frames::Channel;
 
 /// Duration of a jump in a gains file, s.
@@ -57,6 +60,21 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
+/// Errors of the gains of a solution in a channel.
+fn errors_of(solution: &PassSolution, c: usize, is_used: impl Fn(&GainEstimate) -> bool) -> GainErrors {
+    let sigma = |daughter: &DaughterEstimate| {
+        let gain = &daughter.gains[c];
+        let stated = [gain.amplitude_sigma, gain.phase_sigma_deg.to_radians()];
+        // `min` takes the bound for what is not a number.
+        if is_used(gain) { stated.map(|sigma| sigma.min(SIGMA_MAX)) } else { [0.0; 2] }
+    };
+    GainErrors {
+        solution_s: 0.5 * (solution.from_s + solution.until_s),
+        sigma: solution.daughters.iter().map(sigma).collect(),
+        correlations: solution.correlations.get(c).cloned().unwrap_or_default(),
+    }
+}
+
 /// Gains file for `antenna-gains`: gains that are not good are zero, which removes their visibilities. With
 /// `without_held_out`, held-out passes have no gains either.
 ///
@@ -64,10 +82,13 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
 /// their middles.
 #[must_use]
 pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held_out: bool) -> GainsFile {
+    let is_used = |solution: &PassSolution, gain: &GainEstimate| {
+        gain.state == GainState::Good && !(without_held_out && solution.is_held_out)
+    };
     let gains = |c: usize, solution: &PassSolution| -> Vec<[f64; 2]> {
-        let gain_of = |daughter: &super::DaughterEstimate| {
+        let gain_of = |daughter: &DaughterEstimate| {
             let gain = &daughter.gains[c];
-            if gain.state != GainState::Good || (without_held_out && solution.is_held_out) {
+            if !is_used(solution, gain) {
                 return [0.0, 0.0];
             }
             let (sin, cos) = gain.phase_deg.to_radians().sin_cos();
@@ -80,7 +101,8 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         let mut push = |time_s: f64, solution: &PassSolution| {
             // Times must increase: of two equal ones the first is used.
             if found.last().is_none_or(|last| last.time_s < time_s) {
-                found.push(GainSolution { time_s, gains: gains(c, solution) });
+                let errors = Some(errors_of(solution, c, |gain| is_used(solution, gain)));
+                found.push(GainSolution { time_s, gains: gains(c, solution), errors });
             }
         };
         for (k, solution) in solutions.iter().enumerate() {

@@ -16,7 +16,7 @@ use crate::frames::EphemerisSegment;
 use crate::ground::{CollectorState, CollectorView, GroundError};
 use crate::imaging::AccumulatorState;
 
-const MAGIC: &[u8; 8] = b"LNRSTA10";
+const MAGIC: &[u8; 8] = b"LNRSTA11";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
 const VERSION: &str = "a checkpoint of version 10; version 09 lacks light curves of bursts, earlier ones lack more: make a new state \
 with `lunarray rebuild`, or replay the files into a new folder";

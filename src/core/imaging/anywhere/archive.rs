@@ -418,5 +418,6 @@ fn placed(setup: &RefinedSetup, block: &[ArchivedVisibility]) -> PlacedVisibilit
         value_k_sr: block.iter().map(|held| held.value_k_sr).collect(),
         weight: block.iter().map(|held| held.weight).collect(),
         duration_s: block.iter().map(|held| held.duration_s).collect(),
+        gain_errors: Vec::new(),
     }
 }

@@ -19,6 +19,7 @@ const SUMMED_VISIBILITY_BYTES: f64 = 120.0;
 /// The circle's sums, solved once per iteration; visibilities in memory; and tables of the true rows.
 pub(in crate::imaging) fn refined_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
     let ChannelData { frequency_hz, visibilities, limb_range_rad, .. } = data;
+    let data = ChannelData { error_draws: 0, ..data };
     let circle = harmonic_cost(map, data);
     // Intermediate maps are solved on the nearest circle.
     let circle_final = harmonic_cost(map, ChannelData { solutions: 1, ..data });

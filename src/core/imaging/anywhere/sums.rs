@@ -238,6 +238,7 @@ fn circle_sums(
             value_k_sr: data.value_k_sr[first..end].to_vec(),
             weight: data.weight[first..end].to_vec(),
             duration_s: Vec::new(),
+            gain_errors: Vec::new(),
         })?;
         first = end;
     }

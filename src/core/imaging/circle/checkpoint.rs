@@ -1,13 +1,16 @@
 //! The setup and the sums of the harmonic engine in checkpoints.
 //!
-//! Sums are a byte for every node (1 if it has data), then all rows of weights and right-hand sides of those nodes. A row is its bound (u64)
-//! and its sums: i32 for bounds below 2^31, else i64; only the bound 0 for an empty row.
+//! Sums are a byte for every node (if it has data, 1 and the number of pairs of draws of the errors by gains), then all rows of weights, of
+//! right-hand sides and of those of the pairs of those nodes. The highest bit of the first byte says that the power of the errors (u128)
+//! follows. A row is its bound (u64) and its sums: i32 for bounds below 2^31, else i64; only
+//! the bound 0 for an empty row.
 
 use super::HarmonicSetup;
 use super::exact::ExactTori;
 use super::grid::ALPHAS;
 use super::grid::Grids;
 use super::quanta::ExactNode;
+use crate::frames::ERROR_DRAWS_MAX;
 use crate::imaging::AccumulationError;
 use crate::imaging::exact::checkpoint::{FrameReader, FrameWriter, RESPONSES, number_of, refused};
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
@@ -77,16 +80,31 @@ impl HarmonicHead {
     }
 }
 
+/// The bit of the first node's byte by which the power of errors by gains is announced.
+const POWER_FOLLOWS: u8 = 1 << 7;
+
 impl ExactTori {
     pub(super) fn write(&self, grids: &Grids, out: &mut FrameWriter<'_>) -> Result<(), AccumulationError> {
         let has_data = |node: &Option<ExactNode>| node.as_ref().is_some_and(|node| !node.is_empty());
-        let held: Vec<u8> = self.nodes.iter().map(|node| u8::from(has_data(node))).collect();
+        let pairs = |node: &Option<ExactNode>| node.as_ref().map_or(0, ExactNode::error_pairs);
+        let held = self.nodes.iter().map(|node| if has_data(node) { 1 + pairs(node) as u8 } else { 0 });
+        let mut held: Vec<u8> = held.collect();
+        if let Some(first) = held.first_mut().filter(|_| self.error_power > 0) {
+            *first |= POWER_FOLLOWS;
+        }
         out.write(&held)?;
         for node in self.nodes.iter().flatten().filter(|node| !node.is_empty()) {
             node.weights
                 .iter()
                 .try_for_each(|row| row.write(grids.weight_row(), |bytes| out.write(bytes)))?;
-            node.right.iter().try_for_each(|row| row.write(grids.data_row(), |bytes| out.write(bytes)))?;
+            let pairs = node.gain_errors[..node.error_pairs()].iter().flatten();
+            node.right
+                .iter()
+                .chain(pairs)
+                .try_for_each(|row| row.write(grids.data_row(), |bytes| out.write(bytes)))?;
+        }
+        if self.error_power > 0 {
+            out.write(&self.error_power.to_le_bytes())?;
         }
         Ok(())
     }
@@ -101,14 +119,22 @@ impl ExactTori {
         let mut tori = Self::zeros(grids);
         let mut held = vec![0; tori.nodes.len()];
         from.read(&mut held)?;
+        let power_follows = held.first().is_some_and(|first| first & POWER_FOLLOWS > 0);
+        if let Some(first) = held.first_mut() {
+            *first &= !POWER_FOLLOWS;
+        }
         for (node, held) in tori.nodes.iter_mut().zip(held) {
-            if held > 1 {
-                return Err(refused(format!("{held} for a node"), "0 or 1"));
+            let pairs = usize::from(held).saturating_sub(1);
+            if pairs > ERROR_DRAWS_MAX / 2 {
+                return Err(refused(format!("{held} for a node"), "0 to 33"));
             }
-            if held == 1 {
+            if held > 0 {
                 // Memory is allocated row by row, so that a forged head takes none.
                 let mut read = ExactNode::zeros(grids);
-                let rows = [(&mut read.weights, grids.weight_row()), (&mut read.right, grids.data_row())];
+                read.gain_errors = vec![vec![IntegerRow::default(); grids.data_points()]; pairs];
+                let right = std::iter::once(&mut read.right).chain(&mut read.gain_errors);
+                let rows = std::iter::once((&mut read.weights, grids.weight_row()))
+                    .chain(right.map(|rows| (rows, grids.data_row())));
                 for (rows, layout) in rows {
                     for (alpha, kept_row) in rows.iter_mut().enumerate() {
                         let row = IntegerRow::read(layout, |bytes| from.read(bytes))?;
@@ -124,6 +150,11 @@ impl ExactTori {
                 }
                 *node = (!read.is_empty()).then_some(read);
             }
+        }
+        if power_follows {
+            let mut power = [0; 16];
+            from.read(&mut power)?;
+            tori.error_power = u128::from_le_bytes(power);
         }
         Ok(tori)
     }

@@ -1,5 +1,7 @@
 //! Estimates of what a map on one circular orbit takes, and of its sums that are shared or made in parts.
 
+use super::grid::ERROR_PAIR_MULTIPLY_ADDS;
+use super::setup::error_pair_share;
 use super::{SPREAD_MULTIPLY_ADDS, application_size, memory, shared_size};
 use crate::imaging::cost::{
     BASIS_VECTORS, ChannelData, EngineCost, ITERATIONS, iterations, over_maps, solved_together,
@@ -80,7 +82,7 @@ impl EngineCost {
 
 /// The cost of sums on one circular orbit.
 pub(in crate::imaging) fn harmonic_cost(map: &MapConfig, data: ChannelData) -> EngineCost {
-    let ChannelData { frequency_hz, windows, .. } = data;
+    let ChannelData { frequency_hz, windows, error_draws, .. } = data;
     let l_max = map.degree();
     let u_max = map.baseline_m_max(frequency_hz) * frequency_hz / SPEED_OF_LIGHT_M_S;
     let memory = memory(l_max, u_max, rayon::current_num_threads(), solved_together(map));
@@ -96,21 +98,29 @@ pub(in crate::imaging) fn harmonic_cost(map: &MapConfig, data: ChannelData) -> E
         |fraction: f64| ITERATIONS + SOLVED * iterations(fraction * windows).min(map.iterations_max as f64);
     let [intermediate, last] = over_maps(data, of_map);
     let from_data = map.regulariser() == RegulariserChoice::Data;
+    let draws = if from_data { error_draws as f64 } else { 0.0 };
     let products = intermediate
         + if from_data { DATA_PRODUCTS } else { 1.0 } * last
         + map.trace_probes as f64 * PROBE_APPLICATIONS
         // A beam takes half as many as the map and its noise map.
-        + 0.5 * last * map.beams_deg.len() as f64;
+        + 0.5 * last * map.beams_deg.len() as f64
+        // A draw takes as many as the map.
+        + draws / SOLVED * last;
+    let pairs = 0.5 * error_draws as f64;
+    let sums_bytes = memory.sums as f64 * reached * (1.0 + pairs * error_pair_share(l_max, u_max));
+    let visibility_multiply_adds = SPREAD_MULTIPLY_ADDS + pairs * ERROR_PAIR_MULTIPLY_ADDS;
     let vector_bytes = 8.0 * ((l_max + 1) as f64).powi(2);
     let vectors = BASIS_VECTORS[usize::from(map.trace_probes > 0)];
     EngineCost {
-        sums_bytes: memory.sums as f64 * reached,
+        sums_bytes,
         // The final map is solved in the memory of the sums, whose integers are freed node by node.
-        copy_bytes: memory.sums as f64 * reached,
-        other_bytes: (memory.tables + memory.workspace) as f64 + vectors * vector_bytes,
-        visibility_s: 1.0 / (HARMONIC_VISIBILITIES_PER_S * cores()),
+        copy_bytes: sums_bytes,
+        other_bytes: (memory.tables + memory.workspace) as f64 + (vectors + draws) * vector_bytes,
+        visibility_s: visibility_multiply_adds
+            / SPREAD_MULTIPLY_ADDS
+            / (HARMONIC_VISIBILITIES_PER_S * cores()),
         solving_s: products * application_s,
-        visibility_multiply_adds: SPREAD_MULTIPLY_ADDS,
+        visibility_multiply_adds,
         solving_multiply_adds: products * size.matrix_multiply_adds,
         products,
     }

@@ -7,13 +7,20 @@
 use rayon::prelude::*;
 
 use super::grid::{Grids, NODES};
-use super::quanta::{ExactNode, Quanta};
+use super::quanta::{ExactNode, Quanta, right_values};
 use super::spread::{GriddedVisibility, TorusPoint, add_visibilities};
-use super::tori::Tori;
+use super::tori::{NodeSums, Tori};
 use crate::imaging::AccumulationError;
 use crate::imaging::exact::checkpoint::refused;
 use crate::imaging::exact::engine::Accepted;
 use crate::imaging::exact::fixed_point::Direction;
+
+/// The mean power of draws of the error of a visibility by its gains, in steps.
+fn error_power(visibility: &Accepted<TorusPoint>) -> u128 {
+    let draws = &visibility.gain_errors_k_sr;
+    let power: f64 = draws.iter().map(|error| visibility.weight * error.norm_sqr()).sum();
+    (power / draws.len().max(1) as f64 * ERROR_POWER_STEPS).round() as u128
+}
 
 /// Maximum total weight in units of the scale: its 2^62 quanta, and a sixteenth more for kernel values above one, fit 63 bits.
 pub(super) const SCALES_MAX: f64 = 4_294_967_296.0 - 1.0; // 2^32
@@ -22,11 +29,16 @@ pub(super) const SCALES_MAX: f64 = 4_294_967_296.0 - 1.0; // 2^32
 #[derive(Clone, Debug, Default)]
 pub struct ExactTori {
     pub(super) nodes: Vec<Option<ExactNode>>,
+    /// What errors by gains are expected to add to the power of the data, in steps of `ERROR_POWER_STEPS`: of all visibilities on each rank.
+    pub(super) error_power: u128,
 }
+
+/// Steps per noise variance of the power of errors by gains: one visibility has at most 2^36, so there is room for 2^44 of them.
+const ERROR_POWER_STEPS: f64 = 281_474_976_710_656.0; // 2^48
 
 impl ExactTori {
     pub(super) fn zeros(grids: &Grids) -> Self {
-        Self { nodes: vec![None; grids.nodes.count] }
+        Self { nodes: vec![None; grids.nodes.count], error_power: 0 }
     }
 
     /// Adds visibilities or removes them, depending on the direction.
@@ -37,6 +49,8 @@ impl ExactTori {
         batch: &[Accepted<TorusPoint>],
         direction: Direction,
     ) {
+        let power = batch.iter().map(error_power).fold(0, u128::wrapping_add);
+        self.change_error_power(power, direction);
         let grid = |visibility| GriddedVisibility::new(grids, quanta, visibility, direction);
         let gridded: Vec<GriddedVisibility> = batch.par_iter().map(grid).collect();
         let mut reaching: Vec<Vec<&GriddedVisibility>> = vec![Vec::new(); self.nodes.len()];
@@ -56,12 +70,10 @@ impl ExactTori {
 
     /// Adds other sums or removes them, depending on the direction.
     pub(super) fn combine(&mut self, grids: &Grids, other: &Self, direction: Direction) {
+        self.change_error_power(other.error_power, direction);
         self.nodes.par_iter_mut().zip(&other.nodes).for_each(|(node, other)| {
             let Some(other) = other else { return };
-            let node = node.get_or_insert_with(|| ExactNode::zeros(grids));
-            for (rows, others) in [(&mut node.weights, &other.weights), (&mut node.right, &other.right)] {
-                rows.iter_mut().zip(others).for_each(|(row, other)| row.combine(other, direction));
-            }
+            node.get_or_insert_with(|| ExactNode::zeros(grids)).combine(grids, other, direction);
         });
     }
 
@@ -69,14 +81,37 @@ impl ExactTori {
     pub(super) fn join(&mut self, grids: &Grids, other: &Self) -> Result<(), AccumulationError> {
         for (node, other) in self.nodes.iter().zip(&other.nodes) {
             let (Some(node), Some(other)) = (node, other) else { continue };
-            let rows = node.weights.iter().chain(&node.right);
-            let mut both = rows.zip(other.weights.iter().chain(&other.right));
-            if both.any(|(row, other)| !row.is_empty() && !other.is_empty()) {
+            if node.overlaps(other) {
                 return Err(refused("the same alphas in two parts".into(), "each alpha in one"));
             }
         }
+        let error_power = self.error_power;
         self.combine(grids, other, Direction::In);
+        self.error_power = error_power;
         Ok(())
+    }
+
+    fn change_error_power(&mut self, power: u128, direction: Direction) {
+        self.error_power = match direction {
+            Direction::In => self.error_power.wrapping_add(power),
+            Direction::Out => self.error_power.wrapping_sub(power),
+        };
+    }
+
+    /// The power of errors by gains in units of the noise variance.
+    pub(super) fn error_power(&self) -> f64 {
+        self.error_power as f64 / ERROR_POWER_STEPS
+    }
+
+    /// Pairs of right-hand sides of draws of the errors by gains, in f32.
+    pub(super) fn gain_errors(&self, grids: &Grids, quanta: Quanta) -> Vec<Tori> {
+        let pairs = self.nodes.iter().flatten().map(ExactNode::error_pairs).max().unwrap_or(0);
+        let of_pair = |pair: usize| {
+            let right = |node: &ExactNode| Some(right_values(node.gain_errors.get(pair)?, grids, quanta));
+            let of_node = |node: &Option<ExactNode>| node.as_ref().and_then(right).map(NodeSums::of_right);
+            Tori::in_memory(self.nodes.par_iter().map(of_node).collect())
+        };
+        (0..pairs).map(of_pair).collect()
     }
 
     /// Converts the sums to f32.

@@ -32,6 +32,9 @@ const POINTS_PER_DEGREE: f64 = 4.75;
 pub const SPREAD_MULTIPLY_ADDS: f64 =
     ((NODES * (NODES + 1) / 2 * WEIGHT_ALPHAS + NODES * 11 * 4) * LANES) as f64;
 
+/// Multiply-adds of gridding a pair of draws of the errors by gains.
+pub(super) const ERROR_PAIR_MULTIPLY_ADDS: f64 = (NODES * 11 * 4 * LANES) as f64;
+
 /// Elements beyond the end of a row, into which a kernel may reach.
 pub(super) const OVERHANG: usize = LANES;
 

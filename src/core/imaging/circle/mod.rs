@@ -26,6 +26,7 @@ mod cost;
 mod coupling;
 mod coverage;
 mod exact;
+mod gain_errors;
 mod grid;
 mod lines;
 mod noise_maps;
@@ -147,7 +148,7 @@ impl HarmonicBasis {
         Self { setup: self.setup, quanta: self.quanta, grids, tables: Arc::default(), ranks: Ranks::single() }
     }
 
-    fn sums(&self, tori: Tori, counts: SumCounts) -> HarmonicSums {
+    fn sums(&self, tori: Tori, gain_error_tori: Vec<Tori>, counts: SumCounts) -> HarmonicSums {
         HarmonicSums {
             setup: self.setup,
             grids: Arc::clone(&self.grids),
@@ -160,6 +161,9 @@ impl HarmonicBasis {
             right: OnceLock::new(),
             noise: OnceLock::new(),
             noise_realisations: Vec::new(),
+            gain_error_tori,
+            gain_errors: OnceLock::new(),
+            gain_error_power: 0.0,
         }
     }
 }
@@ -219,11 +223,17 @@ impl SkyBasis for HarmonicBasis {
     }
 
     fn equations(&self, exact: &ExactTori, counts: SumCounts) -> HarmonicSums {
-        self.sums(exact.values(&self.grids, self.quanta), counts)
+        let (gain_errors, gain_error_power) =
+            (exact.gain_errors(&self.grids, self.quanta), exact.error_power());
+        let sums = self.sums(exact.values(&self.grids, self.quanta), gain_errors, counts);
+        HarmonicSums { gain_error_power, ..sums }
     }
 
     fn finish(&self, exact: ExactTori, counts: SumCounts) -> HarmonicSums {
-        self.sums(exact.into_values(&self.grids, self.quanta), counts)
+        let (gain_errors, gain_error_power) =
+            (exact.gain_errors(&self.grids, self.quanta), exact.error_power());
+        let sums = self.sums(exact.into_values(&self.grids, self.quanta), gain_errors, counts);
+        HarmonicSums { gain_error_power, ..sums }
     }
 
     fn head(setup: &HarmonicSetup) -> HarmonicHead {

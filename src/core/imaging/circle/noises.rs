@@ -8,17 +8,16 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use super::grid::{Grids, NODES};
-use super::operator::{RightHandSide, SharedTori};
-use super::quanta::Quanta;
-use super::spread::{GriddedNoise, TorusPoint, add_noise_pair};
+use super::quanta::{Quanta, right_values};
+use super::spread::{GriddedTerms, TorusPoint, add_pair};
 use super::sums::HarmonicSums;
 use super::tori::{NodeSums, Tori};
 use super::{HarmonicBasis, HarmonicEngine};
 use crate::frames::PlacedVisibilities;
 use crate::imaging::exact::engine::SkyBasis;
+use crate::imaging::exact::fixed_point::Direction;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
 use crate::imaging::exact::noise::{NoiseKey, unit_noise};
-use crate::imaging::unknowns::unknowns_of_gradient;
 
 /// A visibility whose noise realisations wait to be summed.
 #[derive(Clone, Copy, Debug)]
@@ -89,10 +88,10 @@ impl NoiseSums {
             let scale = visibility.sign * visibility.weight.sqrt();
             let noise = |seed: &u64| unit_noise(*seed, visibility.key) * scale;
             let pair = |seeds: &[u64]| [noise(&seeds[0]), seeds.get(1).map(noise).unwrap_or_default()];
-            GriddedNoise::new(grids, *quanta, &visibility.place, seeds.chunks(2).map(pair))
+            GriddedTerms::new(grids, *quanta, &visibility.place, seeds.chunks(2).map(pair))
         };
-        let gridded: Vec<GriddedNoise> = pending.par_iter().map(grid).collect();
-        let mut reaching: Vec<Vec<&GriddedNoise>> = vec![Vec::new(); grids.nodes.count];
+        let gridded: Vec<GriddedTerms> = pending.par_iter().map(grid).collect();
+        let mut reaching: Vec<Vec<&GriddedTerms>> = vec![Vec::new(); grids.nodes.count];
         for visibility in &gridded {
             for list in reaching.iter_mut().skip(visibility.first_node).take(NODES) {
                 list.push(visibility);
@@ -102,7 +101,7 @@ impl NoiseSums {
             nodes.par_iter_mut().zip(&reaching).enumerate().for_each(|(index, (node, reaching))| {
                 if !reaching.is_empty() {
                     let rows = node.get_or_insert_with(|| vec![IntegerRow::default(); grids.data_points()]);
-                    add_noise_pair(grids, index, pair_index, reaching, rows);
+                    add_pair(grids, Direction::In, (index, pair_index), reaching, rows);
                 }
             });
         });
@@ -114,19 +113,10 @@ impl NoiseSums {
         self.flush();
         let Self { seeds, grids, quanta, realisation_pairs, .. } = self;
         let of_pair = |nodes: PairTori| {
-            let value = |rows: Vec<IntegerRow>| {
-                let mut right = vec![0.0; grids.right_len()];
-                let layout = grids.data_row();
-                let held = (0..).zip(&rows).filter(|(alpha, _)| grids.holds(*alpha)).map(|(_, row)| row);
-                for (row, out) in held.zip(right.chunks_exact_mut(layout.len())) {
-                    row.write_values(layout, quanta.right, out);
-                }
-                NodeSums { weights: Vec::new(), right }
+            let value = |rows: Option<Vec<IntegerRow>>| {
+                Some(NodeSums::of_right(right_values(&rows?, &grids, quanta)))
             };
-            let tori = Tori::in_memory(nodes.into_par_iter().map(|rows| rows.map(value)).collect());
-            let shared = SharedTori { tori: &tori, ..sums.shared() };
-            [RightHandSide::Data, RightHandSide::Noise]
-                .map(|side| unknowns_of_gradient(&sums.operator().project(&shared, side)))
+            sums.projected(&Tori::in_memory(nodes.into_par_iter().map(value).collect()))
         };
         realisation_pairs.into_iter().flat_map(of_pair).take(seeds.len()).collect()
     }

@@ -6,16 +6,18 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
-use super::HarmonicEngine;
 use super::exact::ExactTori;
 use super::grid::ALPHAS;
 use super::grid::Grids;
+use super::operator::SharedTori;
 use super::quanta::{ExactNode, Quanta};
 use super::stored::{StoredBlock, StoredTori, TorusPart};
-use super::sums::HarmonicSums;
+use super::sums::{HarmonicSums, projected};
 use super::tori::{NodeSums, Tori};
+use super::{HarmonicBasis, HarmonicEngine};
 use crate::files::write_at;
 use crate::imaging::exact::fixed_point::rows::IntegerRow;
+use crate::imaging::solver::add;
 use crate::imaging::{AccumulationError, SumCounts};
 use crate::ranks::{RankShare, Ranks};
 
@@ -88,7 +90,7 @@ impl StoredTori {
         index: usize,
         node: ExactNode,
     ) -> io::Result<[Vec<usize>; 2]> {
-        let ExactNode { weights, right } = node;
+        let ExactNode { weights, right, .. } = node;
         let write = |part: TorusPart, rows: Vec<IntegerRow>, layout, quantum| -> io::Result<Vec<usize>> {
             let (row, mut used) = (part.row(grids), Vec::new());
             let blocks = &self.parts[part as usize].blocks;
@@ -128,13 +130,16 @@ struct FinishedParts {
     folder: PathBuf,
     tori: Option<StoredTori>,
     counts: Option<SumCounts>,
+    /// Right-hand sides of draws of the errors by gains, of the parts so far.
+    gain_errors: Vec<Vec<f64>>,
 }
 
 impl SumPart {
     /// The first of `count` parts, which are stored in a folder until the map is solved.
     #[must_use]
     pub fn first(count: usize, folder: &Path) -> Self {
-        let finished = FinishedParts { folder: folder.to_owned(), tori: None, counts: None };
+        let finished =
+            FinishedParts { folder: folder.to_owned(), tori: None, counts: None, gain_errors: Vec::new() };
         Self { share: RankShare { rank: 0, count: count.max(1) }, finished: Arc::new(Mutex::new(finished)) }
     }
 
@@ -170,6 +175,15 @@ impl HarmonicSums {
     }
 }
 
+impl HarmonicBasis {
+    /// The right-hand sides of a pair of draws of the errors by gains, of the alphas that this process holds.
+    fn projected_gain_errors(&self, tori: &Tori) -> [Vec<f64>; 2] {
+        let operator = self.tables.get_or_init(|| self.setup.operator(&self.grids));
+        let reached = tori.reached(&self.ranks);
+        projected(operator, &SharedTori { ranks: &self.ranks, tori, reached, used: &[] })
+    }
+}
+
 impl HarmonicEngine {
     /// Stores the sums of a part; after the last part, returns the complete sums.
     ///
@@ -182,6 +196,7 @@ impl HarmonicEngine {
             return Err(AccumulationError::Mismatch { what: "data" });
         }
         finished.counts = Some(counts);
+        let (pairs, gain_error_power) = (exact.gain_errors(&basis.grids, basis.quanta), exact.error_power());
         let folder = finished.folder.clone();
         let store_error = |source| AccumulationError::Store { folder: folder.clone(), source };
         let mut tori = match finished.tori.take() {
@@ -189,10 +204,19 @@ impl HarmonicEngine {
             None => StoredTori::create(&folder).map_err(store_error)?,
         };
         tori.append(&basis.grids, basis.quanta, exact).map_err(store_error)?;
+        let draws = pairs.iter().flat_map(|pair| basis.projected_gain_errors(pair));
+        for (number, right) in draws.enumerate() {
+            match finished.gain_errors.get_mut(number) {
+                Some(sum) => add(sum, &right),
+                None => finished.gain_errors.push(right),
+            }
+        }
         if part.next().is_some() {
             finished.tori = Some(tori);
             return Ok(None);
         }
-        Ok(Some(basis.unshared().sums(Tori::on_disk(tori), counts)))
+        let sums = basis.unshared().sums(Tori::on_disk(tori), Vec::new(), counts);
+        let gain_errors = std::mem::take(&mut finished.gain_errors).into();
+        Ok(Some(HarmonicSums { gain_errors, gain_error_power, ..sums }))
     }
 }

@@ -1,6 +1,7 @@
 //! Errors of a map over harmonics whose R is from the data, and draws from its posterior.
 
 use super::coefficients;
+use super::gain_errors::ErrorDraws;
 use super::sigma::{moments, moments_k, pixel_resolution_deg, pixel_sigma_k, sample};
 use crate::imaging::NormalSums;
 use crate::imaging::SolveError;
@@ -10,6 +11,7 @@ use crate::imaging::power::{
 use crate::imaging::power::{Sample, Samples, Uncertainty};
 use crate::imaging::regulariser::Diagonal;
 use crate::imaging::solver::{NamedWatch, StoppingRule, System, add, dot};
+use crate::imaging::unknowns::degrees;
 use crate::sky::harmonics::synthesis;
 
 /// Realisations or samples that are solved for together: a thread has a workspace for each.
@@ -57,25 +59,85 @@ impl Posterior<'_> {
         products: Products<'_>,
     ) -> Result<Uncertainty, SolveError> {
         let FoundPower { regularisation: r, power, ratio, .. } = self.found;
-        let (factor, nside) = (power.noise_factor, self.nside);
+        let nside = self.nside;
         let factors = Factors::new(self.blocks, r);
-        let mut sigma_k = pixel_sigma_k(self.blocks, &factors, ratio, nside);
-        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= factor);
-        let [mean_sigma_k, dipole_sigma_k @ ..] = self.moments_sigma(&factors).map(|sigma| factor * sigma);
+        let by_gains = self.gain_errors(&factors)?;
+        let shares = by_gains.as_ref().map(|draws| self.shares_without_gains(draws));
+        let shares = shares.unwrap_or_else(|| vec![1.0; r.len()]);
+        let ratio: Vec<f64> = ratio.iter().zip(&shares).map(|(ratio, share)| ratio * share).collect();
+        let scale: Vec<f64> = shares.iter().map(|share| power.noise_factor * share.sqrt()).collect();
+        let mut sigma_k = pixel_sigma_k(self.blocks, &factors, &ratio, nside);
+        sigma_k.iter_mut().for_each(|sigma_k| *sigma_k *= power.noise_factor);
+        let mut moments_sigma_k = self.moments_sigma(&factors);
+        moments_sigma_k.iter_mut().zip([0, 1, 1, 1]).for_each(|(sigma, l)| *sigma *= scale[l]);
+        let (mut power, mut gains) = (power.clone(), None);
+        if let Some(draws) = &by_gains {
+            let (pixels, moments) = (draws.pixel_variances_k2(nside)?, draws.moment_variances_k2());
+            let add = |sigma: &mut f64, variance: &f64| *sigma = (*sigma * *sigma + variance).sqrt();
+            sigma_k.iter_mut().zip(&pixels).for_each(|(sigma, variance)| add(sigma, variance));
+            moments_sigma_k.iter_mut().zip(&moments).for_each(|(sigma, variance)| add(sigma, variance));
+            let of_ln = draws.ln_power_variances(self.solved);
+            power.sigma_ln.iter_mut().zip(&of_ln).skip(2).for_each(|(sigma, variance)| add(sigma, variance));
+            gains = Some(draws.summary(&pixels, moments[0]));
+        }
+        let [mean_sigma_k, dipole_sigma_k @ ..] = moments_sigma_k;
         let [_, dipole_k @ ..] = moments_k(self.whole, self.l_max());
+        let mut samples = if samples.gibbs {
+            self.gibbs_samples(samples.count)?
+        } else {
+            self.samples(samples.count, &factors, products, &scale)?
+        };
+        if let Some(draws) = &by_gains {
+            (0..).zip(&mut samples).for_each(|(number, away)| add(away, &draws.drawn(number)));
+        }
         Ok(Uncertainty {
             sigma_k,
             resolution_deg: pixel_resolution_deg(self.blocks, &factors, (r, &power.constrained), nside),
             mean_sigma_k,
             dipole_k,
             dipole_sigma_k,
-            power: power.clone(),
-            samples: if samples.gibbs {
-                self.gibbs_samples(samples.count)?
-            } else {
-                self.samples(samples.count, &factors, products)?
-            },
+            power,
+            gains,
+            samples: samples.into_iter().map(|away| self.sample(away)).collect::<Result<_, _>>()?,
         })
+    }
+
+    /// Maps of draws of the errors by gains; `None` if these are not known.
+    fn gain_errors(&self, factors: &Factors<'_>) -> Result<Option<ErrorDraws>, SolveError> {
+        let mut unknowns = Vec::new();
+        let system = System {
+            sums: self.sums,
+            regularisation: Diagonal::ByDegree(self.found.regularisation.clone()),
+            precondition: &|v| factors.solve(v),
+        };
+        // As accurate as the map: what the data hardly decide, where errors are largest, converges last.
+        let rule = self.rule;
+        for right in self.sums.gain_error_right_hand_sides().chunks(NOISES_TOGETHER) {
+            let right: Vec<&[f64]> = right.iter().map(Vec::as_slice).collect();
+            let mut solved = vec![vec![0.0; self.right.len()]; right.len()];
+            let task = self.watch.start("errors by gains", rule.residual_max);
+            system.solve(&right, &mut solved, &vec![rule; right.len()], &task);
+            if !self.watch.may_continue() {
+                return Err(SolveError::Interrupted);
+            }
+            unknowns.append(&mut solved);
+        }
+        Ok((!unknowns.is_empty()).then(|| ErrorDraws { unknowns, l_max: self.l_max() }))
+    }
+
+    /// What is left of variances if errors by gains are taken off, by degree. The noise factor holds all that the map leaves of the data, also
+    /// what these leave: the noise that remains is that of the share of a degree that the data decide.
+    fn shares_without_gains(&self, draws: &ErrorDraws) -> Vec<f64> {
+        let FoundPower { regularisation: r, power, .. } = self.found;
+        let square = power.noise_factor.powi(2);
+        let fitted = draws.fitted_power(self.sums.gain_error_right_hand_sides(), r);
+        let left = (self.sums.gain_error_power() - fitted) / (2.0 * self.sums.counts().visibilities as f64);
+        let remains = (square - left.max(0.0)).max(1.0) / square;
+        let of_degree = |(l, decided): (usize, &f64)| {
+            let share = (decided / (2 * l + 1) as f64).min(1.0);
+            share * remains + (1.0 - share)
+        };
+        power.constrained.iter().enumerate().map(of_degree).collect()
     }
 
     /// Standard deviations of mean and dipole, K, for data of their noise: columns of the covariance, or of the blocks' where no time is left for
@@ -112,13 +174,14 @@ impl Posterior<'_> {
         Ok(sample(&away, self.l_max(), map_k))
     }
 
-    /// Maps as likely as this one, C_l as it was found.
+    /// What maps as likely as this one are away from it, C_l as it was found.
     fn samples(
         &self,
         count: usize,
         factors: &Factors<'_>,
         products: Products<'_>,
-    ) -> Result<Vec<Sample>, SolveError> {
+        scale: &[f64],
+    ) -> Result<Vec<Vec<f64>>, SolveError> {
         let regularisation = &Diagonal::ByDegree(self.found.regularisation.clone());
         let covariance = PosteriorPrecision { products, unknowns: self.right.len(), regularisation, factors };
         let mut samples = Vec::new();
@@ -127,15 +190,15 @@ impl Posterior<'_> {
             let name = format!("samples from {} of {count}", which[0] + 1);
             let task = self.watch.start(&name, SAMPLE_TOLERANCE);
             for PosteriorSample { exact: mut drawn, .. } in covariance.draw(which, SAMPLE_TOLERANCE, &task) {
-                drawn.iter_mut().for_each(|value| *value *= self.found.noise_factor());
-                samples.push(self.sample(drawn)?);
+                drawn.iter_mut().zip(degrees(self.l_max())).for_each(|(value, l)| *value *= scale[l]);
+                samples.push(drawn);
             }
         }
         Ok(samples)
     }
 
-    /// Maps and powers as likely as those that were found.
-    fn gibbs_samples(&self, count: usize) -> Result<Vec<Sample>, SolveError> {
+    /// The same of maps and powers as likely as those that were found.
+    fn gibbs_samples(&self, count: usize) -> Result<Vec<Vec<f64>>, SolveError> {
         let mut samples = Vec::new();
         for number in 0..count as u64 {
             if !self.watch.may_continue() {
@@ -147,8 +210,7 @@ impl Posterior<'_> {
                 turn += 1;
                 self.drawn_with(r, GIBBS + 16 * number + turn, &name)
             });
-            let away = drawn.iter().zip(self.solved).map(|(drawn, solved)| drawn - solved).collect();
-            samples.push(self.sample(away)?);
+            samples.push(drawn.iter().zip(self.solved).map(|(drawn, solved)| drawn - solved).collect());
         }
         Ok(samples)
     }

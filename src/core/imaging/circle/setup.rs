@@ -129,6 +129,12 @@ pub fn memory(l_max: usize, u_max: f64, threads: usize, at_once: usize) -> Harmo
     }
 }
 
+/// Memory of the sums of a pair of draws of the errors by gains, in units of all other sums.
+pub(super) fn error_pair_share(l_max: usize, u_max: f64) -> f64 {
+    let grids = Grids::new(l_max, u_max);
+    grids.right_len() as f64 / (grids.weights_len() + grids.right_len()) as f64
+}
+
 /// The amounts that ranks divide and exchange.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SharedSize {

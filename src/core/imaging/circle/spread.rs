@@ -53,6 +53,8 @@ pub(super) struct GriddedVisibility {
     /// Data and noise terms, each in 2^shift quanta.
     rhs: [f32; 4],
     rhs_shifts: [u32; 4],
+    /// Draws of the error by its gains, if there are any.
+    gain_errors: Option<Box<GriddedTerms>>,
 }
 
 /// Divides by the smallest power of two for which no value exceeds [`TERM_MAX`]; returns the values and the exponent.
@@ -87,6 +89,15 @@ impl GriddedVisibility {
             visibility.right_hand_sides().map(|term| sign * term / quanta.right);
         let ([data_re, data_im], data_shift) = scale_to_term_max([data_re, data_im]);
         let ([noise_re, noise_im], noise_shift) = scale_to_term_max([noise_re, noise_im]);
+        let draws = &visibility.gain_errors_k_sr;
+        let gain_errors = (!draws.is_empty()).then(|| {
+            let term = |error: &Complex64| {
+                let error = if visibility.place.is_conjugated { error.conj() } else { *error };
+                sign * visibility.weight * error
+            };
+            let pair = |draws: &[Complex64]| [term(&draws[0]), draws.get(1).map(term).unwrap_or_default()];
+            Box::new(GriddedTerms::new(grids, quanta, &visibility.place, draws.chunks(2).map(pair)))
+        });
         Self {
             first_node: first_node.max(0) as usize,
             u,
@@ -102,6 +113,7 @@ impl GriddedVisibility {
             weight_shift,
             rhs: [data_re, data_im, noise_re, noise_im],
             rhs_shifts: [data_shift, data_shift, noise_shift, noise_shift],
+            gain_errors,
         }
     }
 
@@ -178,35 +190,45 @@ pub(super) fn add_visibilities(
             });
         },
     );
+    let terms: Vec<&GriddedTerms> =
+        reaching.iter().filter_map(|visibility| visibility.gain_errors.as_deref()).collect();
+    for pair in 0..terms.iter().map(|terms| terms.pairs.len()).max().unwrap_or(0) {
+        let terms: Vec<&GriddedTerms> =
+            terms.iter().filter(|terms| pair < terms.pairs.len()).copied().collect();
+        if node.gain_errors.len() <= pair {
+            node.gain_errors.push(vec![IntegerRow::default(); grids.data_points()]);
+        }
+        add_pair(grids, direction, (index, pair), &terms, &mut node.gain_errors[pair]);
+    }
 }
 
-/// Noise realisations of a visibility in quanta, with its kernels on the grid of data.
+/// Terms of a visibility in further right-hand sides, in quanta, with its kernels on the grid of data.
 #[derive(Clone, Debug)]
-pub(super) struct GriddedNoise {
+pub(super) struct GriddedTerms {
     pub(super) first_node: usize,
     u: [f32; LANES],
     first: [u32; 2],
     kernel_alpha: [f32; LANES],
     kernel_bounds: [u16; LANES],
     kernel_gamma: [f32; LANES],
-    /// Pairs of realisations: four terms in 2^shift quanta, and their shifts.
-    realisation_pairs: Vec<([f32; 4], [u32; 4])>,
+    /// Pairs of right-hand sides: four terms in 2^shift quanta, and their shifts.
+    pairs: Vec<([f32; 4], [u32; 4])>,
 }
 
-impl GriddedNoise {
-    /// Computes kernels and terms from pairs of noise realisations times the square root of the weight, (K sr)^-1.
+impl GriddedTerms {
+    /// Computes kernels and terms from those of pairs of right-hand sides, (K sr)^-1.
     pub(super) fn new(
         grids: &Grids,
         quanta: Quanta,
         place: &TorusPoint,
-        realisation_pairs: impl Iterator<Item = [Complex64; 2]>,
+        pairs: impl Iterator<Item = [Complex64; 2]>,
     ) -> Self {
         let (first_node, u) = grids.u.spread((place.u - grids.nodes.first) / grids.nodes.step);
         let points = grids.data_points();
         let (a, kernel_alpha) = Grids::kernel_at(&grids.data, points, place.alpha_rad);
         let (g, kernel_gamma) = Grids::kernel_at(&grids.data, points, place.gamma_rad);
         let to_quanta =
-            |noise: Complex64| scale_to_term_max([noise.re, noise.im].map(|term| term / quanta.right));
+            |value: Complex64| scale_to_term_max([value.re, value.im].map(|term| term / quanta.right));
         let pair_to_quanta = |[first, second]: [Complex64; 2]| {
             let ([a, b], first_shift) = to_quanta(first);
             let ([c, d], second_shift) = to_quanta(second);
@@ -219,23 +241,23 @@ impl GriddedNoise {
             kernel_alpha,
             kernel_bounds: kernel_bounds(&kernel_alpha),
             kernel_gamma,
-            realisation_pairs: realisation_pairs.map(pair_to_quanta).collect(),
+            pairs: pairs.map(pair_to_quanta).collect(),
         }
     }
 }
 
-/// Adds the realisation pair `pair_index` of visibilities to the sums at node `index`, which must be within the kernels of all of them.
-pub(super) fn add_noise_pair(
+/// Adds a pair of further right-hand sides to their sums at node `index`, which must be within the kernels of all visibilities.
+pub(super) fn add_pair(
     grids: &Grids,
-    index: usize,
-    pair_index: usize,
-    reaching: &[&GriddedNoise],
+    direction: Direction,
+    (index, pair): (usize, usize),
+    reaching: &[&GriddedTerms],
     rows: &mut [IntegerRow],
 ) {
     let arch = Arch::new();
     in_groups(
         reaching,
-        |noise| (noise.first_node, noise.first, noise.realisation_pairs[pair_index].1),
+        |terms| (terms.first_node, terms.first, terms.pairs[pair].1),
         |first, group| {
             let rows = Rows {
                 rows: &mut *rows,
@@ -244,16 +266,14 @@ pub(super) fn add_noise_pair(
                 first: first.first,
                 kernel_width: grids.data.width(),
                 rows_used: 4,
-                shifts: first.realisation_pairs[pair_index].1,
-                direction: Direction::In,
+                shifts: first.pairs[pair].1,
+                direction,
             };
-            rows.add(arch, group, |noise| Term {
-                values: noise.realisation_pairs[pair_index]
-                    .0
-                    .map(|term| term * noise.u[index - noise.first_node]),
-                kernel_alpha: &noise.kernel_alpha,
-                kernel_bounds: &noise.kernel_bounds,
-                kernel_gamma: &noise.kernel_gamma,
+            rows.add(arch, group, |terms| Term {
+                values: terms.pairs[pair].0.map(|term| term * terms.u[index - terms.first_node]),
+                kernel_alpha: &terms.kernel_alpha,
+                kernel_bounds: &terms.kernel_bounds,
+                kernel_gamma: &terms.kernel_gamma,
             });
         },
     );

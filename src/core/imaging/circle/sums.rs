@@ -41,6 +41,11 @@ pub struct HarmonicSums {
     pub(super) noise: OnceLock<Vec<f64>>,
     /// Right-hand sides of additional noise realisations.
     pub(super) noise_realisations: Vec<Vec<f64>>,
+    /// The share of pairs of right-hand sides of draws of the errors by gains.
+    pub(super) gain_error_tori: Vec<Tori>,
+    pub(super) gain_errors: OnceLock<Vec<Vec<f64>>>,
+    /// The power of errors by gains, in units of the noise variance.
+    pub(super) gain_error_power: f64,
 }
 
 impl HarmonicSums {
@@ -66,6 +71,11 @@ impl HarmonicSums {
         SharedTori { ranks: &self.ranks, tori: &self.tori, reached, used }
     }
 
+    /// The two right-hand sides of a pair on the grid.
+    pub(super) fn projected(&self, tori: &Tori) -> [Vec<f64>; 2] {
+        projected(self.operator(), &SharedTori { tori, ..self.shared() })
+    }
+
     /// Floating-point operations of this process's matrix products in one [`NormalSums::apply`].
     #[must_use]
     pub fn matrix_product_flops(&self) -> f64 {
@@ -84,6 +94,12 @@ impl HarmonicSums {
     pub fn order_blocks(&self) -> OrderBlocks {
         OrderBlocks::new(&self.operator().patterns, &self.grids, &self.tori, &self.setup, &self.ranks)
     }
+}
+
+/// The two right-hand sides of sums.
+pub(super) fn projected(operator: &Operator, shared: &SharedTori<'_>) -> [Vec<f64>; 2] {
+    [RightHandSide::Data, RightHandSide::Noise]
+        .map(|side| unknowns_of_gradient(&operator.project(shared, side)))
 }
 
 impl NormalSums for HarmonicSums {
@@ -112,6 +128,21 @@ impl NormalSums for HarmonicSums {
         self.noise.get_or_init(|| {
             unknowns_of_gradient(&self.operator().project(&self.shared(), RightHandSide::Noise))
         })
+    }
+
+    fn gain_error_right_hand_sides(&self) -> &[Vec<f64>] {
+        self.gain_errors.get_or_init(|| {
+            // Alphas of a rank may have no draws.
+            let mut pairs = [self.gain_error_tori.len() as i64];
+            self.ranks.max(&mut pairs);
+            let none = Tori::in_memory(vec![None; self.grids.nodes.count]);
+            let tori = |pair: usize| self.gain_error_tori.get(pair).unwrap_or(&none);
+            (0..pairs[0] as usize).flat_map(|pair| self.projected(tori(pair))).collect()
+        })
+    }
+
+    fn gain_error_power(&self) -> f64 {
+        self.gain_error_power
     }
 
     fn counts(&self) -> SumCounts {

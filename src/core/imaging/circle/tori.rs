@@ -40,8 +40,9 @@ pub(super) enum BlockRows<'a> {
 }
 
 impl NodeSums {
-    pub(super) fn zeros(grids: &Grids) -> Self {
-        Self { weights: vec![0.0; grids.weights_len()], right: vec![0.0; grids.right_len()] }
+    /// Right-hand sides alone.
+    pub(super) fn of_right(right: Vec<f32>) -> Self {
+        Self { weights: Vec::new(), right }
     }
 
     pub(super) fn part(&self, part: TorusPart) -> &[f32] {

@@ -11,7 +11,7 @@ use super::checkpoint::{BasisKind, FrameReader, FrameWriter};
 use super::deferred::Deferred;
 use super::fixed_point::{Direction, Totals, WeightScale};
 use super::noise::companion_noise;
-use crate::frames::PlacedVisibilities;
+use crate::frames::{ERROR_DRAWS_MAX, PlacedVisibilities};
 use crate::imaging::{AccumulationError, Added, NormalEngine, NormalSums, Refusal, SumCounts};
 use crate::units::vector::Vec3;
 use num_complex::Complex64;
@@ -101,8 +101,11 @@ pub struct CommonSetup {
     pub companion_seed: u64,
 }
 
+/// Largest relative error of a visibility by its gains: eight of the largest standard deviations that gains may have, of both.
+const GAIN_ERROR_MAX: f64 = 16.0;
+
 /// An accepted visibility that waits for its batch.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Accepted<P> {
     /// Position in the sums.
     pub place: P,
@@ -112,6 +115,8 @@ pub struct Accepted<P> {
     pub value_k_sr: Complex64,
     /// Simulated noise for the noise-only map, in units of the standard deviation.
     pub noise: Complex64,
+    /// Draws of the error of the value by its gains, K sr; empty if it is not known.
+    pub gain_errors_k_sr: Box<[Complex64]>,
 }
 
 /// Exact normal equations of one channel over a basis; see [`NormalEngine`].
@@ -181,7 +186,14 @@ impl<B: SkyBasis> ExactEngine<B> {
         let place = self.basis.place(placed.r_i_m[k], placed.r_j_m[k])?;
         let (weight, value_k_sr) = (placed.weight[k], placed.value_k_sr[k]);
         self.scale.check(value_k_sr, weight, weight_max)?;
-        Ok(Accepted { place, weight, value_k_sr, noise: companion_noise(companion_seed, placed, k) })
+        let errors = placed.gain_errors_of(k);
+        let is_bounded = errors.iter().all(|error| error.norm() <= GAIN_ERROR_MAX);
+        if !is_bounded || errors.len() > ERROR_DRAWS_MAX {
+            return Err(Refusal::NotFinite);
+        }
+        let gain_errors_k_sr = errors.iter().map(|error| error * value_k_sr).collect();
+        let noise = companion_noise(companion_seed, placed, k);
+        Ok(Accepted { place, weight, value_k_sr, noise, gain_errors_k_sr })
     }
 
     /// Adds visibilities or removes them.

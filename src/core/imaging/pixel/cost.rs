@@ -98,7 +98,7 @@ pub(in crate::imaging) fn matrix_free_cost(map: &MapConfig, data: ChannelData) -
     } else {
         // Blocks reach as far as the data; a limit far beyond them says nothing.
         let map = &MapConfig { baseline_bp_max: map.baseline_bp_max.min(BLOCKS_BP_MAX), ..map.clone() };
-        let circle = harmonic_cost(map, ChannelData { solutions: 1, ..data });
+        let circle = harmonic_cost(map, ChannelData { solutions: 1, error_draws: 0, ..data });
         circle.sums_bytes + circle.copy_bytes + circle.other_bytes
     };
     let held = visibilities * REFINED_VISIBILITY_BYTES as f64;
@@ -272,6 +272,7 @@ mod tests {
                 windows: windows as f64,
                 solutions: 1,
                 limb_range_rad: 0.0,
+                error_draws: 0,
             };
             let estimated = matrix_free_cost(&map, data).products;
             let counted = sums.products.into_inner();
@@ -298,7 +299,14 @@ mod tests {
             let blocks = archive.order_blocks(degree_max(map.nside)).unwrap();
             let diagonal: Vec<f64> = blocks.blocks().iter().map(|block| block.matrix[(0, 0)]).collect();
             let (windows, frequency_hz) = (windows as f64, 3e6);
-            let data = ChannelData { frequency_hz, visibilities, windows, solutions: 1, limb_range_rad: 0.0 };
+            let data = ChannelData {
+                frequency_hz,
+                visibilities,
+                windows,
+                solutions: 1,
+                limb_range_rad: 0.0,
+                error_draws: 0,
+            };
             (diagonal, matrix_free_cost(&map, data).other_bytes)
         });
         assert!(!near.0.is_empty() && near.0.len() == far.0.len());

@@ -150,6 +150,7 @@ impl PixelPosterior<'_> {
             dipole_k,
             dipole_sigma_k,
             power: power.clone(),
+            gains: None,
             samples,
         })
     }

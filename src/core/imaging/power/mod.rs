@@ -148,8 +148,34 @@ pub struct Uncertainty {
     pub dipole_sigma_k: [f64; 3],
     /// The sky's power, the inverse of R.
     pub power: SkyPower,
+    /// The part of these errors that is by errors of the applied gains; `None` if it is not known, and not among them.
+    pub gains: Option<GainUncertainty>,
     /// Posterior samples, if requested.
     pub samples: Vec<Sample>,
+}
+
+/// The part of a map's errors that is by errors of the applied gains. Standard deviations from K draws are themselves uncertain by
+/// `1 / sqrt(2 K)`; those of pixels less, as they are means over a ring.
+#[derive(Clone, Debug, PartialEq, Serialize, bincode::Encode, bincode::Decode)]
+pub struct GainUncertainty {
+    /// Number of draws.
+    pub draws: usize,
+    /// Standard deviation of a pixel, K: rms over the sphere.
+    pub sigma_rms_k: f64,
+    /// Standard deviation of the mean, K.
+    pub mean_sigma_k: f64,
+    /// Angular power that the errors add to that of the map, K^2, from l = 0.
+    pub power_k2: Vec<f64>,
+}
+
+impl GainUncertainty {
+    /// That of the map divided by `factor`.
+    pub(in crate::imaging) fn divided_by(mut self, factor: f64) -> Self {
+        self.sigma_rms_k /= factor;
+        self.mean_sigma_k /= factor;
+        self.power_k2.iter_mut().for_each(|power| *power /= factor * factor);
+        self
+    }
 }
 
 /// How many draws from the posterior are wanted beside a map.
@@ -181,6 +207,7 @@ impl Uncertainty {
         let dipole = self.dipole_k.iter_mut().chain(&mut self.dipole_sigma_k);
         self.sigma_k.iter_mut().chain(samples).chain(dipole).for_each(|value| *value /= factor);
         self.mean_sigma_k /= factor;
+        self.gains = self.gains.map(|gains| gains.divided_by(factor));
         let powers = self.samples.iter_mut().flat_map(|sample| &mut sample.power_k2);
         self.power.power_k2.iter_mut().chain(powers).for_each(|power| *power /= factor * factor);
         self

@@ -1,4 +1,5 @@
 mod coverage;
+mod gain_errors;
 mod resolution;
 mod shared;
 
