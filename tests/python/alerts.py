@@ -149,12 +149,11 @@ def trickle(port, packets):
 
 
 def keep_sending(connection, packets, stop):
-    """Sends packets slowly, over and over, until told to stop."""
-    while not stop.is_set():
-        for _, data in packets:
-            if stop.wait(0.1):
-                return
-            connection.sendall(data)
+    """Sends packets slowly until told to stop."""
+    for _, data in packets:
+        if stop.wait(0.5):
+            return
+        connection.sendall(data)
 
 
 def used_address_space(process):
@@ -253,24 +252,27 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
     running = [ground, alerts.process]
     try:
         first, second, last = parts_of(packets)
+        half = len(second) // 2
         # Packets come one by one, and wait.
         over = threading.Event()
         busy = threading.Thread(target=slowed, args=(ground, over), daemon=True)
         busy.start()
         arrived = []
-        sender = threading.Thread(target=lambda: arrived.append(trickle(port, [data for _, data in first])), daemon=True)
+        sender = threading.Thread(target=lambda: arrived.append(trickle(port, [data for _, data in first + last])), daemon=True)
         sender.start()
         alerts.fire("QueueFull SlowToSums")
         over.set()
         busy.join(PATIENCE_S)
         sender.join(PATIENCE_S)
         alerts.clear("QueueFull SlowToSums")
-        # It has one place, which the first of these takes.
+        # It has one place, which a sender has as long as it brings new packets.
+        arrived[0].close()
         with trickle(port, []) as holder:
             stop = threading.Event()
-            keep = threading.Thread(target=keep_sending, args=(holder, second, stop), daemon=True)
+            keep = threading.Thread(target=keep_sending, args=(holder, second[:half], stop), daemon=True)
             keep.start()
             while "busy" not in send(port, whole(last)):
+                assert keep.is_alive(), "no sender was refused while another one delivered"
                 time.sleep(0.2)
             alerts.fire("SendersRefused")
             stop.set()
@@ -281,7 +283,7 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
         ground.wait(PATIENCE_S)
         ground = start(words, folder, "loaded.log")
         running.append(ground)
-        print(send(port, whole(second)).strip())
+        print(send(port, whole(second[half:])).strip())
         alerts.fire("ArchiveCut")
         # Memory of its own, and then as before.
         limits = resource.prlimit(ground.pid, resource.RLIMIT_AS)
