@@ -42,9 +42,9 @@ keys! {
         #[serde(skip_serializing_if = "Option::is_none")]
         everyday gains_file: Option<PathBuf> = None;
         /// Number of draws of the errors of the applied gains, if these are known, that the sums of harmonic maps carry: with them the errors of
-        /// a map include those of its gains. Even; 0 for errors without them.
+        /// a map include those of its gains. Even, such as 8, which nearly doubles the memory of the sums; 0 for errors without them.
         #[only_with(r#"calibration.hook = "antenna-gains" or calibration.hook = "solve""#)]
-        expert error_draws: usize = 8;
+        expert error_draws: usize = 0;
         /// Bits of the samples, for whose quantisation correlations are corrected: 1, 2 or 4; 0 for no correction.
         expert quantiser_bits: u32 = 0;
         /// Number of successive channels of the downlink that are sub-bands of one channel of the map.

@@ -61,7 +61,7 @@ impl Posterior<'_> {
         let FoundPower { regularisation: r, power, ratio, .. } = self.found;
         let nside = self.nside;
         let factors = Factors::new(self.blocks, r);
-        let by_gains = self.gain_errors(&factors)?;
+        let by_gains = self.gain_errors(&factors);
         let shares = by_gains.as_ref().map(|draws| self.shares_without_gains(draws));
         let shares = shares.unwrap_or_else(|| vec![1.0; r.len()]);
         let ratio: Vec<f64> = ratio.iter().zip(&shares).map(|(ratio, share)| ratio * share).collect();
@@ -102,8 +102,8 @@ impl Posterior<'_> {
         })
     }
 
-    /// Maps of draws of the errors by gains; `None` if these are not known.
-    fn gain_errors(&self, factors: &Factors<'_>) -> Result<Option<ErrorDraws>, SolveError> {
+    /// Maps of draws of the errors by gains; `None` if these are not known, or if not all maps converged: errors would be too small.
+    fn gain_errors(&self, factors: &Factors<'_>) -> Option<ErrorDraws> {
         let mut unknowns = Vec::new();
         let system = System {
             sums: self.sums,
@@ -116,13 +116,13 @@ impl Posterior<'_> {
             let right: Vec<&[f64]> = right.iter().map(Vec::as_slice).collect();
             let mut solved = vec![vec![0.0; self.right.len()]; right.len()];
             let task = self.watch.start("errors by gains", rule.residual_max);
-            system.solve(&right, &mut solved, &vec![rule; right.len()], &task);
-            if !self.watch.may_continue() {
-                return Err(SolveError::Interrupted);
+            let convergence = system.solve(&right, &mut solved, &vec![rule; right.len()], &task);
+            if !convergence.iter().all(|found| found.converged) {
+                return None;
             }
             unknowns.append(&mut solved);
         }
-        Ok((!unknowns.is_empty()).then(|| ErrorDraws { unknowns, l_max: self.l_max() }))
+        (!unknowns.is_empty()).then(|| ErrorDraws { unknowns, l_max: self.l_max() })
     }
 
     /// What is left of variances if errors by gains are taken off, by degree. The noise factor holds all that the map leaves of the data, also
