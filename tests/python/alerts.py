@@ -1,4 +1,5 @@
-"""Alerts as they are shipped, in a real Prometheus: every fault is caused, its alert is seen to fire, and to clear.
+"""Alerts as they are shipped, in a real Prometheus: every fault is caused, its alert is seen to fire, and to clear (but ArchiveCut: what a
+raw archive has deleted does not come back).
 
 alerts.py PROMETHEUS LUNARRAY PIPELINE DOWNLINK ALERTS FOLDER
 
@@ -151,14 +152,14 @@ def trickle(port, packets):
 def keep_sending(connection, packets, stop):
     """Sends packets slowly until told to stop."""
     for _, data in packets:
-        if stop.wait(0.5):
-            return
         connection.sendall(data)
+        if stop.wait(0.3):
+            return
 
 
-def used_address_space(process):
+def memory(process, name):
     status = Path(f"/proc/{process}/status").read_text()
-    return int(re.search(r"VmSize:\s+(\d+) kB", status)[1]) * 1024
+    return int(re.search(rf"{name}:\s+(\d+) kB", status)[1]) * 1024
 
 
 def packets_of(data):
@@ -239,16 +240,14 @@ def faults_of_operation(prometheus, lunarray, pipeline, packets, rules, folder):
 
 
 def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folder):
-    """Too little processor time, places, archive, memory and disk; returns the alerts that were seen."""
+    """Too little processor time, places, archive and memory; returns the alerts that were seen."""
     page, port = free_port(), free_port()
     words = [lunarray, "replay", "--map", pipeline, "--state", str(folder / "loaded"), "--out", str(folder / "loaded.out")]
     words += ["--listen", f"tcp://127.0.0.1:{port}", "--serve", str(page), "--archive-max", "1kB"]
     for setting in ["map.engine=pixel", "map.nside=16", "runtime.queue_capacity=1", "downlink.listen.connections_max=1"]:
         words += ["--set", setting]
-    free, size = space(folder)
-    large = min(2 << 30, free // 2)
     ground = start(words, folder, "loaded.log")
-    alerts = Prometheus(prometheus, folder / "loaded.rules", [page], rules, (free - large // 2) / size)
+    alerts = Prometheus(prometheus, folder / "loaded.rules", [page], rules, 0.0)
     running = [ground, alerts.process]
     try:
         first, second, last = parts_of(packets)
@@ -266,10 +265,11 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
         sender.join(PATIENCE_S)
         alerts.clear("QueueFull SlowToSums")
         # It has one place, which a sender has as long as it brings new packets.
+        assert arrived, "not all packets could be sent"
         arrived[0].close()
-        with trickle(port, []) as holder:
+        with trickle(port, [second[0][1]]) as holder:
             stop = threading.Event()
-            keep = threading.Thread(target=keep_sending, args=(holder, second[:half], stop), daemon=True)
+            keep = threading.Thread(target=keep_sending, args=(holder, second[1:half], stop), daemon=True)
             keep.start()
             while "busy" not in send(port, whole(last)):
                 assert keep.is_alive(), "no sender was refused while another one delivered"
@@ -287,22 +287,41 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
         alerts.fire("ArchiveCut")
         # Memory of its own, and then as before.
         limits = resource.prlimit(ground.pid, resource.RLIMIT_AS)
-        resource.prlimit(ground.pid, resource.RLIMIT_AS, (used_address_space(ground.pid) + (64 << 20), limits[1]))
+        room = max(64 << 20, memory(ground.pid, "VmRSS") // 2)
+        resource.prlimit(ground.pid, resource.RLIMIT_AS, (memory(ground.pid, "VmSize") + room, limits[1]))
         alerts.fire("MemoryLow")
         resource.prlimit(ground.pid, resource.RLIMIT_AS, limits)
         alerts.clear("MemoryLow")
-        # Something else fills the disk.
-        filler = folder / "filler"
+        assert ground.poll() is None, "the ground has ended"
+    finally:
+        for process in running:
+            if process.poll() is None:
+                process.kill()
+                process.wait()
+    return alerts.seen
+
+
+def disk_that_fills(prometheus, lunarray, pipeline, packets, rules, folder):
+    """Something else fills the disk; returns the alerts that were seen."""
+    page, port = free_port(), free_port()
+    words = [lunarray, "replay", "--map", pipeline, "--out", str(folder / "disk.out"), "--serve", str(page)]
+    ground = start([*words, "--listen", f"tcp://127.0.0.1:{port}"], folder, "disk.log")
+    # The limit lies in the middle of what the file takes, which is far more than others write or delete meanwhile.
+    free, size = space(folder)
+    large = min(8 << 30, free // 2)
+    alerts = Prometheus(prometheus, folder / "disk.rules", [page], rules, (free - large // 2) / size)
+    filler = folder / "filler"
+    try:
         with filler.open("wb") as file:
             os.posix_fallocate(file.fileno(), 0, large)
         alerts.fire("DiskLow")
         filler.unlink()
         alerts.clear("DiskLow")
     finally:
-        for process in running:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+        filler.unlink(missing_ok=True)
+        for process in [ground, alerts.process]:
+            process.kill()
+            process.wait()
     return alerts.seen
 
 
@@ -312,7 +331,7 @@ def main(prometheus, lunarray, pipeline, downlink, rules, folder):
     packets = list(packets_of(Path(downlink).read_bytes()))
     rules = Path(rules).read_text()
     given = (prometheus, lunarray, pipeline, packets, rules, folder)
-    seen = faults_of_operation(*given) | ground_with_too_little(*given)
+    seen = faults_of_operation(*given) | ground_with_too_little(*given) | disk_that_fills(*given)
     names = set(re.findall(r"- alert: (\w+)", rules))
     assert seen == names, f"not seen: {names - seen}; without a rule: {seen - names}"
     print(f"seen: {' '.join(sorted(seen))}; {time.monotonic() - BEGUN:.0f} s")

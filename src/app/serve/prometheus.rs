@@ -277,8 +277,7 @@ impl Scrape {
         let size = disks.iter().map(|(name, [_, size])| (label(name), *size as f64));
         gauges(out, MetricInfo("disk_size", "Size of the disk of a folder", Some(Unit::Bytes)), size)?;
         let available = MemoryLimit::of_machine().map(|limit| limit.bytes as f64);
-        let about =
-            "Memory available to this process: of the machine, or below the limit of its control group";
+        let about = "Memory available to this process: of the machine, or below its own limit or that of its control group";
         gauge_if(out, MetricInfo("memory_available", about, Some(Unit::Bytes)), available)?;
         let resident = resident_bytes().map(|bytes| bytes as f64);
         gauge_if(out, MetricInfo("memory_resident", "Memory of this process", Some(Unit::Bytes)), resident)

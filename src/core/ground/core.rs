@@ -34,9 +34,11 @@ const STEPS_PER_UPDATE: u64 = 32;
 pub struct Ground {
     pub(super) collector: Collector,
     pub(super) calibrator: Calibrator,
+    /// Holds visibilities back until the gains of their pass are solved; `None` if gains are not solved here.
     pub(super) gate: Option<PassGate>,
     pub(super) accumulator: Accumulator,
     pub(super) outcome: GroundOutcome,
+    /// The state on disk: journal, checkpoints, raw archive.
     pub(super) archive: Option<Archive>,
     pub(super) cancel: Cancel,
     /// Time for which visibilities are still added after cancellation, without an archive.
@@ -211,7 +213,7 @@ impl Ground {
         }
     }
 
-    /// Registers a packet that waits for its gains, and closes the pass that it ends.
+    /// Registers a packet that waits for its gains; if it ends a pass, solves for the gains of that.
     fn register(&mut self, header: &PacketHeader, is_new: bool) {
         let Self { collector, gate: Some(gate), archive, cancel, .. } = self else { return };
         if archive.is_some() && cancel.is_cancelled() {
@@ -350,7 +352,7 @@ impl Ground {
         Ok(())
     }
 
-    /// Closes open passes, and applies held packets although their positions are unknown.
+    /// Closes open passes, and applies all held packets: visibilities without positions are counted as such.
     pub(super) fn flush(&mut self, out: &mut Outlet<Snapshot>) -> Result<(), GroundError> {
         if !(self.archive.is_some() && self.cancel.is_cancelled()) {
             self.register_all_held();
@@ -504,7 +506,7 @@ impl Stage for Ground {
         self.collector.finish();
         self.advance(out)?;
         self.take_out_bursts()?;
-        // The checkpoint keeps held packets held; the final maps use them although their positions are unknown.
+        // The checkpoint keeps held packets held. The final maps use those of their visibilities that have positions.
         self.last_checkpoint()?;
         self.flush(out)?;
         self.take_out_bursts()?;

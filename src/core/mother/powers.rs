@@ -9,7 +9,7 @@ use crate::units::TICKS_PER_SECOND;
 /// does not resolve structure beyond l = 20, which the unocculted half of the sky attenuates by about l^-1.5. The relative error of a power is
 /// 5e-4 for a sky with as much in each degree up to l = 40 as in its mean, and far less for a smoother sky.
 pub(super) const NOISE_STEP_S: f64 = 150.0;
-/// The same for powers that are sent. Interpolation lowers degree l by `11/720 (l step)^4` on average, 6e-4 for l = 5 at 150 s: as large as the
+/// The same for powers that are sent. Interpolation lowers degree l by `11/720 (l step)^4` on average, 7e-4 for l = 4 at 150 s: as large as the
 /// error of the mean of a map with powers, which finds the gains by such structure. At 50 s it is 81 times less.
 pub(super) const SENT_STEP_S: f64 = 50.0;
 

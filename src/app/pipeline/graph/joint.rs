@@ -132,7 +132,8 @@ impl JointData {
         let request = config.joint.request(config.stopping_rule(), !self.powers.is_empty(), constant_k_sr);
         let held: u64 = sums.iter().map(|(.., sums)| sums.weight_bytes()).sum();
         // What the sums take is not available any more, but theirs.
-        let limit = MemoryLimit::of_machine().map(|limit| MemoryLimit { bytes: limit.bytes + held, ..limit });
+        let limit = MemoryLimit::of_machine()
+            .map(|limit| MemoryLimit { bytes: limit.bytes.saturating_add(held), ..limit });
         let mut kept = KeptChannels::new(SumsStorage { limit, folder: &folder }, 0);
         for (channel, nside, sums) in sums {
             if cancel.is_cancelled() {

@@ -18,7 +18,7 @@ use crate::imaging::AccumulatorState;
 
 const MAGIC: &[u8; 8] = b"LNRSTA11";
 const ANY_VERSION: &[u8; 6] = b"LNRSTA";
-const VERSION: &str = "a checkpoint of version 10; version 09 lacks light curves of bursts, earlier ones lack more: make a new state \
+const VERSION: &str = "a checkpoint of version 11; version 10 lacks correlations of gains, earlier ones lack more: make a new state \
 with `lunarray rebuild`, or replay the files into a new folder";
 /// Size of the magic, the length of the head, and the checksum, bytes.
 const FIXED_BYTES: u64 = 24;
@@ -74,12 +74,12 @@ impl<W: Write> Write for ChecksumWriter<'_, W> {
     }
 }
 
-/// Writes a checkpoint; `engines` writes the sums.
+/// Writes a checkpoint; `sums` writes its sums.
 pub(in crate::ground) fn write(
     out: &mut impl Write,
     path: &Path,
     head: &ArchiveHeadView<'_>,
-    engines: impl FnOnce(&mut dyn Write) -> Result<(), GroundError>,
+    sums: impl FnOnce(&mut dyn Write) -> Result<(), GroundError>,
 ) -> Result<(), GroundError> {
     let failed = || GroundError::io(path, "write");
     let damaged = |found: String| GroundError::Damaged {
@@ -102,15 +102,15 @@ pub(in crate::ground) fn write(
     })?;
     buffered.flush().map_err(failed())?;
     drop(buffered);
-    engines(&mut summed)?;
+    sums(&mut summed)?;
     let crc = summed.crc.finalize();
     out.write_all(&crc.to_le_bytes()).map_err(failed())
 }
 
 /// Whether a checkpoint is intact and has this head.
 pub(in crate::ground) fn is_of_head(path: &Path, head: &ArchiveHeadView<'_>) -> Result<bool, GroundError> {
-    let found = read(path, |head, engines| {
-        std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+    let found = read(path, |head, sums| {
+        std::io::copy(sums, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
         Ok(head.checksum)
     });
     let crc = Digest::new(CrcAlgorithm::Crc64Nvme);
@@ -186,9 +186,9 @@ pub(in crate::ground) fn read_from<T>(
     if !head.calibration.bursts.iter().all(|burst| burst.is_sound(channels)) {
         return Err(damaged("invalid bursts".into(), "bursts in channels of the instrument"));
     }
-    let mut engines = from.take(bytes - FIXED_BYTES - length);
-    let found = rest(head, &mut engines)?;
-    match engines.limit() {
+    let mut sums = from.take(bytes - FIXED_BYTES - length);
+    let found = rest(head, &mut sums)?;
+    match sums.limit() {
         0 => Ok(found),
         left => Err(damaged(format!("{left} bytes after the sums"), "none")),
     }
@@ -350,17 +350,17 @@ mod tests {
 
     fn written(head: &ArchiveHeadView<'_>) -> Vec<u8> {
         let mut bytes = Vec::new();
-        let engines =
+        let sums =
             |out: &mut dyn Write| out.write_all(b"engines").map_err(GroundError::io(Path::new("x"), "write"));
-        write(&mut bytes, Path::new("x"), head, engines).unwrap();
+        write(&mut bytes, Path::new("x"), head, sums).unwrap();
         bytes
     }
 
     fn read_back(bytes: &[u8]) -> Result<ArchiveHead, GroundError> {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), bytes).unwrap();
-        read(file.path(), |head, engines| {
-            std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(file.path(), "read"))?;
+        read(file.path(), |head, sums| {
+            std::io::copy(sums, &mut std::io::sink()).map_err(GroundError::io(file.path(), "read"))?;
             Ok(head)
         })
     }
@@ -466,16 +466,16 @@ mod tests {
     #[test]
     fn an_earlier_version_is_refused_and_says_what_to_do() {
         with_head(|head| {
-            let mut old = written(head);
-            old[..8].copy_from_slice(b"LNRSTA09");
-            let body = old.len() - 8;
-            let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
-            old[body..].copy_from_slice(&crc.to_le_bytes());
-            let said = read_back(&old).unwrap_err().to_string();
-            assert!(
-                said.contains("version 10") && said.contains("replay the files into a new folder"),
-                "{said}"
-            );
+            for earlier in [b"LNRSTA09", b"LNRSTA10"] {
+                let mut old = written(head);
+                old[..8].copy_from_slice(earlier);
+                let body = old.len() - 8;
+                let crc = crc_fast::checksum(CrcAlgorithm::Crc64Nvme, &old[..body]);
+                old[body..].copy_from_slice(&crc.to_le_bytes());
+                let said = read_back(&old).unwrap_err().to_string();
+                let is_said = said.contains("a checkpoint of version 11;") && MAGIC.ends_with(b"11");
+                assert!(is_said && said.contains("replay the files into a new folder"), "{said}");
+            }
         });
     }
 }

@@ -211,8 +211,8 @@ fn settings_at(path: &Path) -> Result<Vec<(String, String)>, GroundError> {
 }
 
 fn head_at<T>(path: &Path, choose: impl FnOnce(ArchiveHead) -> T) -> Result<T, GroundError> {
-    checkpoint::read(path, |head, engines| {
-        std::io::copy(engines, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
+    checkpoint::read(path, |head, sums| {
+        std::io::copy(sums, &mut std::io::sink()).map_err(GroundError::io(path, "read"))?;
         Ok(choose(head))
     })
 }

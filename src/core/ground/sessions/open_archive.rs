@@ -75,9 +75,9 @@ fn read_parts(
     check: impl Fn(&ArchiveHead) -> Result<(), GroundError>,
 ) -> Result<(ArchiveHead, Accumulator), GroundError> {
     let read_part = |path: &Path, part: RankShare, empty: Accumulator| {
-        checkpoint::read(path, |head, engines| {
+        checkpoint::read(path, |head, from| {
             check(&head)?;
-            let sums = empty.resume_share(head.accumulator.clone(), engines, path.parent(), part);
+            let sums = empty.resume_share(head.accumulator.clone(), from, path.parent(), part);
             Ok((head, sums.map_err(|error| unreadable(path, error))?))
         })
     };

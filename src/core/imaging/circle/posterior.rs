@@ -133,8 +133,8 @@ impl Posterior<'_> {
         let fitted = draws.fitted_power(self.sums.gain_error_right_hand_sides(), r);
         let left = (self.sums.gain_error_power() - fitted) / (2.0 * self.sums.counts().visibilities as f64);
         let remains = (square - left.max(0.0)).max(1.0) / square;
-        let of_degree = |(l, decided): (usize, &f64)| {
-            let share = (decided / (2 * l + 1) as f64).min(1.0);
+        let of_degree = |(l, constrained): (usize, &f64)| {
+            let share = (constrained / (2 * l + 1) as f64).min(1.0);
             share * remains + (1.0 - share)
         };
         power.constrained.iter().enumerate().map(of_degree).collect()

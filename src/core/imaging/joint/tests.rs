@@ -332,7 +332,6 @@ fn blocks_and_coupling_are_the_matrix_of_the_powers() {
     }
 }
 
-/// The agreement is that of the dense covariance, and powers are averaged while the Moon turns little.
 /// A power is an average over its integration, in which the Moon moves: of degrees up to 8 over 2.7 degrees, also where several powers make one
 /// row. Compared with the mean over many instants.
 #[test]
@@ -368,6 +367,7 @@ fn integrated_powers_are_averages_over_the_moons_motion() {
     }
 }
 
+/// Powers are averaged while the Moon's direction changes little.
 #[test]
 fn powers_are_averaged_and_split_into_passes() {
     let priors = PowerPriors { gain: 0.1, offset: 0.01, slope: 0.01, constant_k_sr: Vec::new() };

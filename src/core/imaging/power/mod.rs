@@ -1,6 +1,6 @@
-//! Maximum-likelihood estimate of the sky's angular power C_l from the data (empirical Bayes), whose inverse is R.
+//! Maximum-likelihood estimate of the sky's angular power C_l from the data (empirical Bayes), which gives R = s^2 / C_l, s the noise factor.
 //!
-//! With `b = A x + n`, n of covariance A, and a Gaussian sky of power C_l(theta), `R_l = 1 / C_l`,
+//! With `b = A x + n`, n of covariance A, and a Gaussian sky of power C_l(theta), for data divided by s, `R_l = 1 / C_l`,
 //!
 //! ```text
 //! ln p(b | theta) = 1/2 b.(A + R)^-1 b + 1/2 ln det R - 1/2 ln det(A + R) + const,
@@ -146,7 +146,7 @@ pub struct Uncertainty {
     pub dipole_k: [f64; 3],
     /// Standard deviations of the dipole, K.
     pub dipole_sigma_k: [f64; 3],
-    /// The sky's power, the inverse of R.
+    /// The sky's power.
     pub power: SkyPower,
     /// The part of these errors that is by errors of the applied gains; `None` if it is not known, and not among them.
     pub gains: Option<GainUncertainty>,

@@ -136,7 +136,7 @@ impl PowerProblem<'_> {
 
     /// Estimates the power in rounds, from the initial solution `start`.
     ///
-    /// Early rounds stop their solutions early and draw no samples; an intermediate map has no others. While data are few, the C_l of the blocks,
+    /// Early rounds stop their solutions early and draw no samples; intermediate maps have only such rounds. While data are few, the C_l of the blocks,
     /// from which rounds start, is far too large, and a converged solution would fit rounding errors of the matrix.
     pub(in crate::imaging) fn solve(
         &self,
@@ -326,8 +326,8 @@ impl PowerProblem<'_> {
 /// Largest relative residual of an intermediate noise map.
 const NOISE_RESIDUAL_MAX: f64 = 0.1;
 
-/// The stopping rule of an intermediate noise map, the second of two right-hand sides: the map's absolute residual, which is larger relative to the
-/// noise's much smaller right-hand side.
+/// The stopping rule of an intermediate noise map, the second of two right-hand sides: the map's absolute residual. Relative to its own, much smaller
+/// right-hand side it may be larger.
 fn noise_rule([map, noise]: [&[f64]; 2], factors: &Factors<'_>, rule: StoppingRule) -> StoppingRule {
     let square = |right: &[f64]| {
         let mut solved = right.to_vec();

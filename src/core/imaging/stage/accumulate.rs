@@ -407,7 +407,7 @@ impl Accumulator {
         let usable = self.usable(placed)?;
         self.ledger.add_left_out(VisibilityReason::BaselineBeyondMap, (placed.len() - usable.len()) as u64);
         if usable.is_empty() {
-            // A channel without usable data gets no engine and no map.
+            // A channel without usable data gets no sums and no map.
             return Ok(None);
         }
         let state = match self.channel_or_new(&usable)? {
