@@ -243,7 +243,7 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
     """Too little processor time, places, archive and memory; returns the alerts that were seen."""
     page, port = free_port(), free_port()
     words = [lunarray, "replay", "--map", pipeline, "--state", str(folder / "loaded"), "--out", str(folder / "loaded.out")]
-    words += ["--listen", f"tcp://127.0.0.1:{port}", "--serve", str(page), "--archive-max", "1kB"]
+    words += ["--listen", f"tcp://127.0.0.1:{port}", "--serve", str(page), "--archive-max", "1kB", "--snapshot-every", "1h"]
     for setting in ["map.engine=pixel", "map.nside=16", "runtime.queue_capacity=1", "downlink.listen.connections_max=1"]:
         words += ["--set", setting]
     ground = start(words, folder, "loaded.log")

@@ -239,6 +239,7 @@ mod tests {
         config.map.engine = EngineKind::Pixel;
         config.calibration.hook = CalibrationHook::AntennaGains;
         config.calibration.gains_file = Some(file(""));
+        config.calibration.error_draws = 8;
         assert_eq!(config.notes(), Vec::<String>::new());
         config.calibration.gains_file =
             Some(file(r#", "errors": {"solution_s": 0, "sigma": [[0.1, 0.1], [0.1, 0.1]]}"#));
