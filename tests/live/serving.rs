@@ -374,6 +374,11 @@ fn metrics_keep_to_their_format() {
         "lunarray_stage_latency_seconds_count{{stage=\"ground\"}} {}\n",
         ground["since_source"]["count"]
     ));
+    // Without this class Prometheus finds no quantile.
+    has(format!(
+        "lunarray_stage_latency_seconds_bucket{{le=\"+Inf\",stage=\"ground\"}} {}\n",
+        ground["since_source"]["count"]
+    ));
     has(format!("lunarray_stage_step_seconds_count{{stage=\"ground\"}} {}\n", ground["working"]["count"]));
 }
 

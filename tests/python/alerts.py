@@ -129,12 +129,12 @@ def processor_s(process):
 
 
 def slowed(process, over):
-    """Stops a process for a moment after every 30 ms of processor time."""
+    """Stops a process for a moment after every tenth of a second of processor time."""
     begun = processor_s(process)
     while not over.wait(0.01):
-        if processor_s(process) - begun >= 0.03:
+        if processor_s(process) - begun >= 0.1:
             process.send_signal(signal.SIGSTOP)
-            over.wait(0.27)
+            over.wait(0.3)
             process.send_signal(signal.SIGCONT)
             begun = processor_s(process)
 
@@ -278,12 +278,16 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
             stop.set()
             keep.join(PATIENCE_S)
         alerts.clear("SendersRefused")
-        # Its archive holds nothing: after a restart a checkpoint comes, and what was there goes.
+        # Its archive has no room: after a restart checkpoints come, and the first segment goes.
         ground.terminate()
         ground.wait(PATIENCE_S)
         ground = start(words, folder, "loaded.log")
         running.append(ground)
-        print(send(port, whole(second[half:])).strip())
+        rest = second[half:]
+        for part in parts_of(rest):
+            # A checkpoint for each; a segment goes when two hold it.
+            print(send(port, whole(part)).strip())
+            time.sleep(5)
         alerts.fire("ArchiveCut")
         # Memory of its own, and then as before.
         limits = resource.prlimit(ground.pid, resource.RLIMIT_AS)

@@ -179,7 +179,7 @@ impl Scrape {
             let mut classes: Vec<(f64, u64)> = durations.classes().collect();
             // The last class also counts all longer durations.
             if let Some(last) = classes.last_mut() {
-                last.0 = f64::MAX;
+                last.0 = f64::INFINITY;
             }
             let labels = [("stage", stage.name.clone())];
             let mut encoder = metric.encode_family(&labels)?;
