@@ -103,6 +103,13 @@ def start(words, folder, name):
     return subprocess.Popen(words, stdout=log, stderr=log, restore_signals=False)
 
 
+def end(processes):
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
 def connect(port):
     deadline = time.monotonic() + PATIENCE_S
     while True:
@@ -232,10 +239,7 @@ def faults_of_operation(prometheus, lunarray, pipeline, packets, rules, folder):
         follower.wait(PATIENCE_S)
         alerts.clear("RunFailed")
     finally:
-        for process in running:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+        end(running)
     return alerts.seen
 
 
@@ -298,10 +302,7 @@ def ground_with_too_little(prometheus, lunarray, pipeline, packets, rules, folde
         alerts.clear("MemoryLow")
         assert ground.poll() is None, "the ground has ended"
     finally:
-        for process in running:
-            if process.poll() is None:
-                process.kill()
-                process.wait()
+        end(running)
     return alerts.seen
 
 
@@ -323,9 +324,7 @@ def disk_that_fills(prometheus, lunarray, pipeline, packets, rules, folder):
         alerts.clear("DiskLow")
     finally:
         filler.unlink(missing_ok=True)
-        for process in [ground, alerts.process]:
-            process.kill()
-            process.wait()
+        end([ground, alerts.process])
     return alerts.seen
 
 

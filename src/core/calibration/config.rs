@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    AntennaGains, BurstChoice, Calibration, CalibrationError, GainSolution, GainsFile, Identity, SolvedGains,
-    SubBands, VanVleck,
+    AntennaGains, BurstChoice, Calibration, CalibrationError, GainsFile, Identity, SolvedGains, SubBands,
+    VanVleck,
 };
 use crate::frames::ERROR_DRAWS_MAX;
 use crate::units::{Checks, InvalidValue, keys};
@@ -88,11 +88,11 @@ impl CalibrationConfig {
     #[must_use]
     #[doc(hidden)]
     pub fn known_error_draws(&self) -> usize {
-        let states_errors = |path: &PathBuf| {
-            let states = |solution: &GainSolution| solution.errors.is_some();
-            GainsFile::read(path)
-                .is_ok_and(|file| file.channels.iter().flat_map(|c| &c.solutions).any(states))
-        };
+        // Without draws the file need not be read.
+        if self.error_draws == 0 {
+            return 0;
+        }
+        let states_errors = |path: &PathBuf| GainsFile::read(path).is_ok_and(|file| file.states_errors());
         let is_known = match self.hook {
             CalibrationHook::Identity => false,
             CalibrationHook::AntennaGains => self.gains_file.as_ref().is_some_and(states_errors),
@@ -133,8 +133,7 @@ impl CalibrationConfig {
             CalibrationHook::AntennaGains => {
                 // `problems` has required the file.
                 let file = self.gains_file.as_deref().unwrap_or(Path::new(""));
-                let gains = AntennaGains::read(&folder.join(file))?;
-                Box::new(gains.with_error_draws(self.error_draws, 0))
+                Box::new(AntennaGains::read(&folder.join(file), self.error_draws)?)
             }
             CalibrationHook::Solve => Box::new(SolvedGains::default()),
         };

@@ -63,17 +63,12 @@ impl Entry {
     }
 }
 
-/// A pivot below which a number is a combination of those before it.
-const PIVOT_MIN: f64 = 1e-9;
+/// A pivot below which a number is a combination of those before it: correlations in files are rounded to 1e-6.
+const PIVOT_MIN: f64 = 2e-3;
 
 impl ErrorTable {
     pub(super) fn new(channel: &ChannelGains) -> Self {
         Self { entries: channel.solutions.iter().map(|one| one.errors.as_ref().map(Entry::new)).collect() }
-    }
-
-    /// Whether any errors are stated.
-    pub(super) fn is_stated(&self) -> bool {
-        self.entries.iter().any(Option::is_some)
     }
 
     /// Errors of an entry; `None` if they are not stated.

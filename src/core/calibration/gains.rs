@@ -54,20 +54,22 @@ struct ChannelTable {
 }
 
 impl AntennaGains {
-    /// Reads a file of gains.
+    /// Reads a file of gains; visibilities get this many draws of their errors, if any are stated.
     ///
     /// # Errors
     /// [`CalibrationError`] if the file cannot be read or parsed, or with all its invalid values.
-    pub fn read(path: &Path) -> Result<Self, CalibrationError> {
-        Self::new(&GainsFile::read(path)?).map_err(|error| match error {
+    pub fn read(path: &Path, error_draws: usize) -> Result<Self, CalibrationError> {
+        let file = GainsFile::read(path)?;
+        let gains = Self::new(&file).map_err(|error| match error {
             CalibrationError::Gains { problems } => {
                 CalibrationError::Values { path: path.to_owned(), problems }
             }
             other => other,
-        })
+        })?;
+        Ok(gains.with_error_draws(&file, error_draws, 0))
     }
 
-    /// Uses gains that are already in memory.
+    /// Uses gains that are already in memory, without their errors.
     ///
     /// # Errors
     /// [`CalibrationError::Gains`] with all invalid values.
@@ -83,10 +85,7 @@ impl AntennaGains {
                 let time_s = channel.solutions.iter().map(|solution| solution.time_s).collect();
                 let gains = channel.solutions.iter().flat_map(|solution| &solution.gains);
                 let gain = gains.map(|&[re, im]| Complex64::new(re, im)).collect();
-                ChannelTable {
-                    errors: ErrorTable::new(channel),
-                    ..ChannelTable::new(channel.frequency_hz, time_s, gain)
-                }
+                ChannelTable::new(channel.frequency_hz, time_s, gain)
             })
             .collect();
         Ok(Self {
@@ -100,11 +99,16 @@ impl AntennaGains {
         })
     }
 
-    /// Gives visibilities this many draws of the errors of their gains, if any are stated.
+    /// Gives visibilities this many draws of the errors of their gains, if the file of these states any.
     #[must_use]
-    pub fn with_error_draws(self, draws: usize, seed: u64) -> Self {
-        let is_stated = self.channels.iter().any(|table| table.errors.is_stated());
-        Self { draws: if is_stated { draws } else { 0 }, seed, ..self }
+    pub fn with_error_draws(mut self, file: &GainsFile, draws: usize, seed: u64) -> Self {
+        if draws > 0 && file.states_errors() {
+            (self.draws, self.seed) = (draws, seed);
+            for (table, channel) in self.channels.iter_mut().zip(&file.channels) {
+                table.errors = ErrorTable::new(channel);
+            }
+        }
+        self
     }
 
     /// The factor g_i conj(g_j) by which visibilities of `pair` at `frequency_hz` were multiplied at

@@ -92,7 +92,7 @@ pub struct GainSolution {
     pub time_s: f64,
     /// Real and imaginary part of every satellite's voltage gain.
     pub gains: Vec<[f64; 2]>,
-    /// Errors of these gains; absent if they are not known.
+    /// Errors of these gains; absent if they are not known, as with more than 16 daughters.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub errors: Option<GainErrors>,
 }
@@ -114,6 +114,11 @@ pub struct GainErrors {
 pub(super) const SIGMA_MAX: f64 = 1.0;
 
 impl GainsFile {
+    /// Whether errors of any gains are stated.
+    pub(super) fn states_errors(&self) -> bool {
+        self.channels.iter().flat_map(|channel| &channel.solutions).any(|solution| solution.errors.is_some())
+    }
+
     /// Reads a file: JSON if its name ends in `.json`, TOML otherwise. Does not check the values.
     ///
     /// # Errors

@@ -116,8 +116,9 @@ impl SolvedGains {
         let mut table = self.table();
         let known = table.instrument.as_ref().filter(|_| !pass.solutions.is_empty());
         let gains = known.map(|instrument| {
-            let gains = AntennaGains::new(&gains_file(&pass.solutions, &instrument.channels, false)).ok()?;
-            Some(gains.with_error_draws(table.error_draws, instrument.seed))
+            let file = gains_file(&pass.solutions, &instrument.channels, false);
+            let gains = AntennaGains::new(&file).ok()?;
+            Some(gains.with_error_draws(&file, table.error_draws, instrument.seed))
         });
         let (number, from_s) = (pass.number, pass.span_s[0]);
         let at = table.passes.partition_point(|(other, _)| other.span_s[0] <= from_s);

@@ -229,7 +229,7 @@ fn invalid_values_are_reported_with_their_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("gains.toml");
     std::fs::write(&path, "channels = []").unwrap();
-    let error = AntennaGains::read(&path).unwrap_err();
+    let error = AntennaGains::read(&path, 0).unwrap_err();
     assert!(matches!(error, CalibrationError::Values { .. }), "{error}");
     let text = error.to_string();
     assert!(text.contains("gains.toml") && text.contains("at least one channel"), "{text}");

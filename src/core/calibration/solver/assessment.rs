@@ -14,6 +14,9 @@ use crate::numerics::median;
 /// the phase error of a gain exceeds the Cramer-Rao bound.
 const COVERAGE_SIGMAS: f64 = 4.0;
 
+/// Maximum number of daughters whose errors are stated with their correlations.
+const CORRELATED_MAX: usize = 16;
+
 /// Square radians in a square degree.
 const RAD2: f64 = (std::f64::consts::PI / 180.0) * (std::f64::consts::PI / 180.0);
 
@@ -184,7 +187,8 @@ impl GainAssessment<'_> {
     }
 
     /// Correlations of the errors of the gains of a channel: of ln amplitude and of phase, of each daughter with those before it. Noise correlates
-    /// them as the solution says; all share the errors of the common amplitude (`common`, a variance) and of the reference's phase.
+    /// them as the solution says; all share the errors of the common amplitude (`common`, a variance) and of the reference's phase. None for more
+    /// than [`CORRELATED_MAX`] daughters, as files and states would grow with the square of their number.
     pub(super) fn correlations(
         &self,
         c: usize,
@@ -192,6 +196,9 @@ impl GainAssessment<'_> {
         estimates: &[DaughterEstimate],
     ) -> Vec<[f64; 2]> {
         let layout = &self.fitted.layout;
+        if layout.satellites > CORRELATED_MAX {
+            return Vec::new();
+        }
         let of = |n: usize| c * layout.satellites + n;
         let reference = &self.excess[of(layout.reference)];
         let of_reference =

@@ -60,19 +60,25 @@ pub fn solutions_csv(solutions: &[PassSolution]) -> String {
     text
 }
 
-/// Errors of the gains of a solution in a channel.
-fn errors_of(solution: &PassSolution, c: usize, is_used: impl Fn(&GainEstimate) -> bool) -> GainErrors {
+/// Errors of the gains of a solution in a channel, rounded to 1e-6; `None` if their correlations are not known.
+fn errors_of(
+    solution: &PassSolution,
+    c: usize,
+    is_used: impl Fn(&GainEstimate) -> bool,
+) -> Option<GainErrors> {
+    let rounded = |values: [f64; 2]| values.map(|value| (value * 1e6).round() / 1e6);
+    let correlations = solution.correlations.get(c).filter(|found| !found.is_empty())?;
     let sigma = |daughter: &DaughterEstimate| {
         let gain = &daughter.gains[c];
         let stated = [gain.amplitude_sigma, gain.phase_sigma_deg.to_radians()];
         // `min` takes the bound for what is not a number.
-        if is_used(gain) { stated.map(|sigma| sigma.min(SIGMA_MAX)) } else { [0.0; 2] }
+        if is_used(gain) { rounded(stated.map(|sigma| sigma.min(SIGMA_MAX))) } else { [0.0; 2] }
     };
-    GainErrors {
+    Some(GainErrors {
         solution_s: 0.5 * (solution.from_s + solution.until_s),
         sigma: solution.daughters.iter().map(sigma).collect(),
-        correlations: solution.correlations.get(c).cloned().unwrap_or_default(),
-    }
+        correlations: correlations.iter().map(|pair| rounded(*pair)).collect(),
+    })
 }
 
 /// Gains file for `antenna-gains`: gains that are not good are zero, which removes their visibilities. With
@@ -101,7 +107,7 @@ pub fn gains_file(solutions: &[PassSolution], channels: &[Channel], without_held
         let mut push = |time_s: f64, solution: &PassSolution| {
             // Times must increase: of two equal ones the first is used.
             if found.last().is_none_or(|last| last.time_s < time_s) {
-                let errors = Some(errors_of(solution, c, |gain| is_used(solution, gain)));
+                let errors = errors_of(solution, c, |gain| is_used(solution, gain));
                 found.push(GainSolution { time_s, gains: gains(c, solution), errors });
             }
         };

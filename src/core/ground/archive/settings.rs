@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::calibration::{BurstChoice, CalibrationConfig, CalibrationHook};
+use crate::calibration::{BurstChoice, CalibrationHook};
 use crate::ground::{GroundConfig, GroundError};
 use crate::imaging::RegulariserChoice;
 
@@ -20,15 +20,8 @@ pub(in crate::ground) fn settings_of(config: &GroundConfig) -> Result<Vec<(Strin
         BurstChoice::Keep => settings.push(("calibration.bursts".to_owned(), "keep".to_owned())),
         BurstChoice::Peel => settings.push(("calibration.bursts".to_owned(), "peel".to_owned())),
     }
-    // Nothing for the default with a file, whose checksum says whether errors are known; nor for sums without draws.
     let draws = config.calibration.error_draws;
-    let is_default = draws == CalibrationConfig::default().error_draws;
-    let is_said = match config.calibration.hook {
-        CalibrationHook::Identity => false,
-        CalibrationHook::AntennaGains => !is_default,
-        CalibrationHook::Solve => draws > 0,
-    };
-    if is_said {
+    if draws > 0 && config.calibration.hook != CalibrationHook::Identity {
         settings.push(("calibration.error_draws".to_owned(), draws.to_string()));
     }
     if let Some(path) = &config.calibration.gains_file {

@@ -101,7 +101,8 @@ impl Ground {
 fn gains_of(config: &GroundConfig) -> Result<Option<AntennaGains>, GroundError> {
     let file = config.calibration.gains_file.as_ref();
     let file = file.filter(|_| config.calibration.hook == CalibrationHook::AntennaGains);
-    Ok(file.map(|file| AntennaGains::read(file)).transpose()?)
+    let draws = config.calibration.error_draws;
+    Ok(file.map(|file| AntennaGains::read(file, draws)).transpose()?)
 }
 
 fn packets_to_change(

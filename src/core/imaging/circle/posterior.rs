@@ -110,7 +110,7 @@ impl Posterior<'_> {
             regularisation: Diagonal::ByDegree(self.found.regularisation.clone()),
             precondition: &|v| factors.solve(v),
         };
-        // As accurate as the map: what the data hardly decide, where errors are largest, converges last.
+        // As accurate as the map: what the data hardly constrain, where errors are largest, converges last.
         let rule = self.rule;
         for right in self.sums.gain_error_right_hand_sides().chunks(NOISES_TOGETHER) {
             let right: Vec<&[f64]> = right.iter().map(Vec::as_slice).collect();
@@ -126,7 +126,7 @@ impl Posterior<'_> {
     }
 
     /// What is left of variances if errors by gains are taken off, by degree. The noise factor holds all that the map leaves of the data, also
-    /// what these leave: the noise that remains is that of the share of a degree that the data decide.
+    /// what these leave: the noise that remains is that of the share of a degree that the data constrain.
     fn shares_without_gains(&self, draws: &ErrorDraws) -> Vec<f64> {
         let FoundPower { regularisation: r, power, .. } = self.found;
         let square = power.noise_factor.powi(2);

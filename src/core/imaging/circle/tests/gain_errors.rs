@@ -114,7 +114,7 @@ fn gains(draws: usize, seed: u64) -> AntennaGains {
         channels: vec![ChannelGains { frequency_hz: LOW_HZ, solutions: solutions.collect() }],
         positions: Vec::new(),
     };
-    AntennaGains::new(&file).unwrap().with_error_draws(draws, seed)
+    AntennaGains::new(&file).unwrap().with_error_draws(&file, draws, seed)
 }
 
 /// The blocks with these values, calibrated.
