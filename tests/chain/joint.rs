@@ -78,6 +78,14 @@ fn channels_see_together_what_one_misses() {
     assert!(std::fs::metadata(format!("{joint}/spectra.fits")).unwrap().len() > 0);
     let said = fail(&["joint", &state, "--at", "12MHz", "--out", &place.path("beyond")]);
     assert!(said.contains("between 5.000 and 10.000 MHz"), "{said}");
+    // Settings of the state's maps that joint maps do not have are not passed over.
+    for key in ["map.moon_reflection=0.07", "map.prior_k=1e5"] {
+        let said = fail(&["joint", &state, "--set", key, "--out", &place.path("without")]);
+        assert!(
+            said.contains(key.split('=').next().unwrap()) && said.contains("joint maps do not have"),
+            "{said}"
+        );
+    }
     // An iteration that may not go on says so, where people and where programs look.
     let (short, cut) = (place.path("cut"), ["--set", "map.iterations_max=3", "--count", "2", "--out"]);
     let said = succeed(&[&["joint", &state], &cut[..], &[&short]].concat());

@@ -241,6 +241,19 @@ pub enum PipelineError {
         /// What does not go with it.
         with: &'static str,
     },
+    /// A setting of a map that joint maps do not have.
+    #[error(
+        "{}: found {key} in the settings of its maps, which joint maps do not have; expected none: override it, such as --set {key}={none}",
+        state.display()
+    )]
+    JointWithout {
+        /// Folder of the state.
+        state: std::path::PathBuf,
+        /// The key.
+        key: &'static str,
+        /// Its value for none.
+        none: &'static str,
+    },
     /// A run that cannot be done group by group.
     #[error("--groups: found {found}, expected {expected}")]
     NotInGroups {

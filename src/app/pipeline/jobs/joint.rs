@@ -36,7 +36,7 @@ pub fn solve_states_jointly(
 /// A state is read several times if memory does not hold the sums of all its channels; those that do not fit are moved to disk.
 ///
 /// # Errors
-/// As [`super::solve_state`]; sums of another engine than the harmonic one; total powers of dipoles; a full disk.
+/// As [`super::solve_state`]; a prior map, or a share of reflected power to divide by; sums of another engine than the harmonic one; total powers of dipoles; a full disk.
 pub fn joint_channels(
     states: &[(&Path, Config)],
     request: &JointRequest,
@@ -45,6 +45,7 @@ pub fn joint_channels(
 ) -> Result<Vec<JointChannel>, PipelineError> {
     let mut of_states = Vec::new();
     for (folder, config) in states {
+        require_joint_settings(folder, config)?;
         of_states.push(MappedChannels::new(Ground::channels_in(folder)?, config));
     }
     // Two channels of one frequency are an error if both have sums. Powers are not known yet: with them one channel suffices.
@@ -75,6 +76,19 @@ pub fn joint_channels(
         }
     }
     Ok(kept.channels)
+}
+
+/// Requires that nothing is set for the maps of a state that joint maps would leave out.
+fn require_joint_settings(folder: &Path, Config { map, .. }: &Config) -> Result<(), PipelineError> {
+    let settings = [
+        ("map.prior_k", map.prior_k.values().iter().any(|&level_k| level_k != 0.0), "0"),
+        ("map.prior_files", !map.prior_files.is_empty(), "[]"),
+        ("map.moon_reflection", map.moon_reflection != 0.0, "0"),
+    ];
+    match settings.into_iter().find(|(_, is_set, _)| *is_set) {
+        Some((key, _, none)) => Err(PipelineError::JointWithout { state: folder.to_path_buf(), key, none }),
+        None => Ok(()),
+    }
 }
 
 /// Reads the channels of a group from a state, and solves for the map of each alone.
